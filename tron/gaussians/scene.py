@@ -1,0 +1,201 @@
+"""The Gaussian scene: oriented flat Gaussians (surfels) with radiance and materials.
+
+A surfel is the flat Gaussian of 2D Gaussian Splatting (Huang et al. 2024): a centre, an orientation whose third
+axis is the normal, two standard deviations in the plane, an opacity, and what it looks like. Everything is
+NumPy at rest, in the world frame; trainable copies and device arrays are made by those who need them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from tron.errors import TronError
+
+SH_COUNT = 16
+KERNEL_DEGREES = (2, 4)
+# Densities are measured on at most this many surfels: the median does not move, a million queries take seconds.
+SPACING_QUERIES = 50_000
+
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "means": (3,),
+    "quats": (4,),
+    "log_scales": (2,),
+    "opacity_logits": (),
+    "sh": (SH_COUNT, 3),
+    "base_color": (3,),
+    "roughness": (),
+    "metallic": (),
+    "object_id": (),
+}
+_UNIT_INTERVAL = ("base_color", "roughness", "metallic")
+_TOLERANCE = 1e-3
+
+
+@dataclass(eq=False)
+class GaussianScene:
+    """M surfels in the world frame (right-handed; z up in the scenes we make).
+
+    Arrays are float32 (object_id int32); other dtypes are converted on construction.
+
+    means           (M, 3)     centres, world units
+    quats           (M, 4)     unit quaternions (w, x, y, z); the columns of R are tangent u, tangent v, normal
+    log_scales      (M, 2)     natural logarithm of the standard deviations along u and v, world units
+    opacity_logits  (M,)       opacity = 1 / (1 + exp(-logit))
+    sh              (M, 16, 3) degree-3 harmonics of the radiance in *display* space: colour = max(0, SH + 0.5)
+    base_color      (M, 3)     linear, in [0, 1]
+    roughness       (M,)       in [0, 1]; GGX alpha is its square
+    metallic        (M,)       in [0, 1]
+    object_id       (M,)       which object a surfel belongs to; 0 where nothing is known
+    kernel_degree              2: exp(-d^2 / 2), as in 2DGS; 4: exp(-4.5/81 d^4), flatter and sharper
+    spacing                    distance between neighbouring surfels, world units (see measure_spacing)
+    up              (3,)       unit up direction
+    materials_guessed          True where the materials were derived from colours, not measured
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    base_color: np.ndarray
+    roughness: np.ndarray
+    metallic: np.ndarray
+    object_id: np.ndarray
+    kernel_degree: int = 2
+    spacing: float = 0.0
+    up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    materials_guessed: bool = False
+
+    def __post_init__(self) -> None:
+        for name in _SHAPES:
+            dtype = np.int32 if name == "object_id" else np.float32
+            setattr(self, name, np.ascontiguousarray(getattr(self, name), dtype=dtype))
+        self.up = np.asarray(self.up, dtype=np.float64)
+        self.kernel_degree = int(self.kernel_degree)
+        self.spacing = float(self.spacing)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def rotations(self) -> np.ndarray:
+        """(M, 3, 3) float32 rotation matrices, local to world; columns are tangent u, tangent v, normal."""
+        return rotation_matrices(self.quats)
+
+    def normals(self) -> np.ndarray:
+        """(M, 3) float32 unit normals, world: the third column of the rotation."""
+        return np.ascontiguousarray(self.rotations()[:, :, 2])
+
+    def tangents(self) -> tuple[np.ndarray, np.ndarray]:
+        """Two (M, 3) float32 arrays of unit tangents u and v, world; u x v is the normal."""
+        rotations = self.rotations()
+        return np.ascontiguousarray(rotations[:, :, 0]), np.ascontiguousarray(rotations[:, :, 1])
+
+    def scales(self) -> np.ndarray:
+        """(M, 2) float32 standard deviations along u and v, world units."""
+        return np.exp(self.log_scales)
+
+    def opacities(self) -> np.ndarray:
+        """(M,) float32 opacities in (0, 1)."""
+        # tanh form: exp(-logit) would overflow for strongly negative logits.
+        return 0.5 + 0.5 * np.tanh(0.5 * self.opacity_logits)
+
+    def bounds(self, trim: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner, two (3,) float64 arrays, of the axis-aligned box around the centres.
+
+        `trim` in [0, 0.5) is the fraction of surfels left out at each end of each axis: captures have stray
+        surfels far away, and a frame that holds them all shows nothing.
+        """
+        low, high = np.quantile(self.means.astype(np.float64), [trim, 1.0 - trim], axis=0)
+        return low, high
+
+    def validate(self) -> GaussianScene:
+        """Return the scene itself if it is whole; raise TronError naming the first field that is not."""
+        count = len(self.means)
+        if count == 0:
+            raise TronError("the scene has no surfels")
+        for name, shape in _SHAPES.items():
+            values = getattr(self, name)
+            if values.shape != (count, *shape):
+                raise TronError(f"{name} has shape {values.shape}, expected {(count, *shape)}")
+            bad = ~np.isfinite(values.reshape(count, -1)).all(axis=1)
+            if bad.any():
+                raise TronError(f"{name} of {bad.sum()} of {count} surfels is not finite (first: {bad.argmax()})")
+        for name in _UNIT_INTERVAL:
+            values = getattr(self, name).reshape(count, -1)
+            bad = ((values < -_TOLERANCE) | (values > 1 + _TOLERANCE)).any(axis=1)
+            if bad.any():
+                raise TronError(f"{name} of {bad.sum()} surfels is outside [0, 1] (first: {bad.argmax()})")
+        lengths = np.linalg.norm(self.quats, axis=1)
+        bad = np.abs(lengths - 1) > _TOLERANCE
+        if bad.any():
+            raise TronError(
+                f"quaternion of {bad.sum()} surfels is not a unit one (first: surfel {bad.argmax()}, "
+                f"length {lengths[bad.argmax()]:.3g})"
+            )
+        if self.kernel_degree not in KERNEL_DEGREES:
+            raise TronError(f"kernel_degree is {self.kernel_degree}", mend="use 2 or 4")
+        if not (np.isfinite(self.spacing) and self.spacing > 0):
+            raise TronError(f"spacing is {self.spacing}", mend="give a positive length, or measure_spacing(means)")
+        if self.up.shape != (3,) or not abs(np.linalg.norm(self.up) - 1) < _TOLERANCE:
+            raise TronError(f"up is {self.up.tolist()}", mend="give a unit vector of three numbers")
+        return self
+
+    def save(self, path: str | Path) -> None:
+        """Write a PLY that 3DGS readers open too (tron.gaussians.ply.write_ply)."""
+        from tron.gaussians.ply import write_ply
+
+        write_ply(path, self)
+
+    @classmethod
+    def load(cls, path: str | Path) -> GaussianScene:
+        """Read a TRON, 2DGS or 3DGS PLY (tron.gaussians.ply.read_ply)."""
+        from tron.gaussians.ply import read_ply
+
+        return read_ply(path)
+
+
+def rotation_matrices(quats: np.ndarray) -> np.ndarray:
+    """(M, 4) quaternions (w, x, y, z) of any non-zero length -> (M, 3, 3) float32 rotation matrices."""
+    xyzw = np.asarray(quats, dtype=np.float64)[:, [1, 2, 3, 0]]
+    return Rotation.from_quat(xyzw).as_matrix().astype(np.float32)
+
+
+def quats_from_matrices(rotations: np.ndarray) -> np.ndarray:
+    """(M, 3, 3) rotation matrices -> (M, 4) float32 unit quaternions (w, x, y, z) with w >= 0."""
+    xyzw = Rotation.from_matrix(np.asarray(rotations, dtype=np.float64)).as_quat(canonical=True)
+    return xyzw[:, [3, 0, 1, 2]].astype(np.float32)
+
+
+def neighbour_distances(means: np.ndarray, queries: np.ndarray | None = None, neighbours: int = 3) -> np.ndarray:
+    """Root mean square distance of each centre to its nearest others, as 3DGS initialises its scales.
+
+    means (M, 3), world; queries (Q,) indices into means, all of them by default. Returns (Q,) float64, world
+    units. With fewer centres than neighbours + 1, those that exist are used; a single centre gives 0.
+    """
+    points = np.asarray(means, dtype=np.float64)
+    asked = points if queries is None else points[queries]
+    count = min(neighbours + 1, len(points))
+    distances = np.asarray(cKDTree(points).query(asked, k=list(range(1, count + 1)))[0])
+    if count == 1:
+        return np.zeros(len(asked))
+    return np.sqrt((distances[:, 1:] ** 2).mean(axis=1))
+
+
+def measure_spacing(means: np.ndarray) -> float:
+    """The scene's surfel spacing nn: median of neighbour_distances, world units, never zero.
+
+    Shadow rays start and count back faces in units of it (facts.md section 4). Large scenes are measured on an
+    evenly strided part of their surfels, against all of them.
+    """
+    stride = -(-len(means) // SPACING_QUERIES)
+    distances = neighbour_distances(means, np.arange(0, len(means), max(stride, 1)))
+    apart = distances[distances > 0]
+    if len(apart):
+        return float(np.median(apart))
+    extent = float(np.ptp(means, axis=0).max()) if len(means) else 0.0
+    return extent or 1.0
