@@ -1,0 +1,1 @@
+"""Hydra configuration: one folder a command; `experiment/` in each holds whole recipes."""

@@ -1,0 +1,55 @@
+"""Fixtures for every test: one torch thread, the Mitsuba variants of this machine, the real data if present."""
+
+import ctypes
+import importlib.util
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def has_cuda() -> bool:
+    """Whether a CUDA driver with at least one device is present; asked of the driver, not of torch."""
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    count = ctypes.c_int(0)
+    return driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
+
+
+def available_variants() -> list[str]:
+    """Mitsuba variants that can run here: LLVM always (the set-up guarantees it), CUDA with a device."""
+    return ["llvm_ad_rgb"] + (["cuda_ad_rgb"] if has_cuda() else [])
+
+
+@pytest.fixture(scope="session", params=available_variants())
+def variant(request: pytest.FixtureRequest) -> str:
+    """The active Mitsuba variant. A test that touches Dr.Jit types asks for it."""
+    from tron.runtime import activate
+
+    activate(request.param)
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real assets, HDRIs and captures beside the repository."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip(f"no real data: {SHARED_DATA} is absent")
+    return SHARED_DATA
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_torch_thread() -> Iterator[None]:
+    """Results of torch depend on its thread count; a test must not depend on the machine's cores."""
+    if importlib.util.find_spec("torch") is not None:
+        import torch
+
+        torch.set_num_threads(1)
+    yield

@@ -1,0 +1,1 @@
+"""Entry points of the library; the only place in `tron` that knows Hydra."""
