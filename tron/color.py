@@ -1,0 +1,99 @@
+"""Luminance, the sRGB curve and the AgX tone curve, for NumPy arrays and torch tensors alike.
+
+All RGB is BT.709 (sRGB primaries, D65), channel last unless an axis is given. Gradients flow through torch
+tensors; torch itself is never imported here. Sources: IEC 61966-2-1 for sRGB; Troy Sobotka's AgX configuration
+(github.com/sobotka/AgX-S2O3) for AgX.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import array_api_compat
+
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+"""BT.709 weights of linear R, G, B in relative luminance."""
+
+# Rows give each inset channel as a blend of linear BT.709 R, G, B.
+_AGX_INSET = (
+    (0.842479062253094, 0.0784335999999992, 0.0792237451477643),
+    (0.0423282422610123, 0.878468636469772, 0.0791661274605434),
+    (0.0423756549057051, 0.0784336, 0.879142973793104),
+)
+_AGX_LOG2_RANGE = (-12.47393, 4.026069)
+_AGX_PIVOT = (0.606060, 0.18 ** (1 / 2.2))
+_AGX_SLOPE = 2.4
+_AGX_POWER = 1.5  # of the toe and of the shoulder
+
+
+def _channels(x: Any, axis: int) -> tuple[Any, Any, Any]:
+    if x.shape[axis] != 3:
+        raise ValueError(f"axis {axis} must hold 3 channels, shape is {tuple(x.shape)}")
+    index: list[Any] = [slice(None)] * x.ndim
+
+    def channel(i: int) -> Any:
+        index[axis] = i
+        return x[tuple(index)]
+
+    return channel(0), channel(1), channel(2)
+
+
+def luminance(rgb: Any, axis: int = -1) -> Any:
+    """Relative luminance of linear RGB: (..., 3) -> (...), in the unit of the input."""
+    r, g, b = _channels(rgb, axis)
+    return LUMINANCE[0] * r + LUMINANCE[1] * g + LUMINANCE[2] * b
+
+
+def srgb_to_linear(x: Any) -> Any:
+    """Decode sRGB display values to linear light, elementwise; negative values keep the curve's linear part."""
+    xp = array_api_compat.array_namespace(x)
+    # The unused branch of `where` still gets gradients, so its base is kept off the power's singular point.
+    curve = ((xp.where(x > 0.04045, x, xp.ones_like(x)) + 0.055) / 1.055) ** 2.4
+    return xp.where(x > 0.04045, curve, x / 12.92)
+
+
+def linear_to_srgb(x: Any) -> Any:
+    """Encode linear light to sRGB display values, elementwise and without clamping."""
+    xp = array_api_compat.array_namespace(x)
+    curve = 1.055 * xp.where(x > 0.0031308, x, xp.ones_like(x)) ** (1 / 2.4) - 0.055
+    return xp.where(x > 0.0031308, curve, 12.92 * x)
+
+
+def agx(linear: Any, axis: int = -1) -> Any:
+    """Tone-map linear BT.709 to display values in [0, 1] with Troy Sobotka's original AgX, without a look.
+
+    inset matrix -> log2 over 16.5 stops around middle grey -> sigmoid. The result is display-encoded already: no
+    sRGB curve follows. Gradients are finite everywhere, zero where the log range clips.
+
+    Args:
+        linear: scene-linear RGB with 3 channels on ``axis``, any range; shape kept.
+        axis: the channel axis.
+    """
+    xp = array_api_compat.array_namespace(linear)
+    rgb = _channels(linear, axis)
+    low, high = _AGX_LOG2_RANGE
+    inset = xp.stack([r * rgb[0] + g * rgb[1] + b * rgb[2] for r, g, b in _AGX_INSET], axis=axis)
+    # Clamping before the logarithm rather than after it gives the same values and no infinite gradients.
+    stops = xp.log2(xp.clip(inset, 2.0**low, 2.0**high))
+    return _agx_sigmoid(xp, (stops - low) / (high - low))
+
+
+def _agx_sigmoid(xp: Any, x: Any) -> Any:
+    """The AgX contrast curve on [0, 1]: slope 2.4 at the pivot, bent at both ends to reach (0, 0) and (1, 1)."""
+    pivot_x, pivot_y = _AGX_PIVOT
+
+    def bend(run: float, rise: float) -> float:
+        # Scale s of u / (1 + (u/s)^p)^(1/p), u = slope * distance, such that distance `run` gives `rise`.
+        return (rise**-_AGX_POWER - (_AGX_SLOPE * run) ** -_AGX_POWER) ** (-1 / _AGX_POWER)
+
+    toe, shoulder = bend(pivot_x, pivot_y), bend(1 - pivot_x, 1 - pivot_y)
+    above = x >= pivot_x
+    scale = xp.where(above, xp.full_like(x, shoulder), xp.full_like(x, toe))
+    u = _AGX_SLOPE * xp.abs(x - pivot_x)
+    distance = u / (1 + (u / scale) ** _AGX_POWER) ** (1 / _AGX_POWER)
+    return xp.clip(pivot_y + xp.where(above, distance, -distance), 0.0, 1.0)
+
+
+def to_display(linear: Any, exposure: Any, axis: int = -1) -> Any:
+    """Display values in [0, 1] of linear RGB under an exposure (a factor, not stops): ``agx(exposure * linear)``."""
+    return agx(exposure * linear, axis=axis)
