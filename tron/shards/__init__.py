@@ -1,0 +1,23 @@
+"""Neutral ground between the data engine, training and evaluation: what a dataset folder holds.
+
+`schema` names the members of a clip, `writer` makes byte-identical tar shards, `manifest` accounts for
+them and finds damage, `reader` opens them again without ever unpickling anything.
+"""
+
+from tron.shards.manifest import Manifest, ShardEntry, verify
+from tron.shards.reader import read_clips
+from tron.shards.schema import MEMBERS, REFERENCE_MEMBERS, SCHEMA_VERSION, Clip, ClipMeta
+from tron.shards.writer import ShardWriter
+
+__all__ = [
+    "MEMBERS",
+    "REFERENCE_MEMBERS",
+    "SCHEMA_VERSION",
+    "Clip",
+    "ClipMeta",
+    "Manifest",
+    "ShardEntry",
+    "ShardWriter",
+    "read_clips",
+    "verify",
+]

@@ -1,0 +1,150 @@
+"""Read shards back: an explicit table of decoders, nothing is ever unpickled or extracted to disk."""
+
+from __future__ import annotations
+
+import tarfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from tron.errors import TronError
+from tron.images import decode_exr, decode_png
+from tron.shards.manifest import Manifest
+from tron.shards.schema import ALL_MEMBERS, META_SUFFIX, REFERENCE_MEMBERS, Clip, ClipMeta, parse_name
+
+LARGEST_MEMBER = 256 * 2**20
+LARGEST_META = 16 * 2**20
+MOST_FILES = 200_000  # of one shard: 64 clips of 93 frames x 12 members are 71,424
+_DECODERS: dict[str, Callable[[bytes], np.ndarray]] = {"exr": decode_exr, "png": decode_png}
+
+
+def tar_files(path: str | Path) -> Iterator[tuple[str, str, bytes]]:
+    """Files of one shard in order: (key, name within the clip such as "f00.pbr.exr", bytes).
+
+    Refuses with TronError links, devices, folders, names outside the schema (so also absolute paths and
+    `..`), compressed or damaged tars and files beyond the size limit; such a file's bytes are not read.
+    """
+    try:
+        with tarfile.open(path, "r:") as tar:  # "r:" reads plain tars only: no decompression bombs
+            for count, info in enumerate(tar):
+                if not info.isreg():
+                    raise TronError(f"member {info.name[:80]!r} is not a plain file", str(path))
+                if info.size > LARGEST_MEMBER or count >= MOST_FILES:
+                    raise TronError(f"member {info.name[:80]!r} goes beyond the size limits", str(path))
+                key, _, _ = parse_name(info.name)
+                file = tar.extractfile(info)
+                data = file.read() if file else b""
+                if len(data) != info.size:
+                    raise TronError(f"shard ends within member {info.name!r}", str(path), _MEND)
+                yield key, info.name[len(key) + 1 :], data
+    except (tarfile.TarError, OSError, EOFError, UnicodeError, ValueError) as error:
+        raise TronError(f"shard is damaged: {error}", str(path), _MEND) from error
+
+
+_MEND = "make the shard again with tron-datagen"
+
+
+def decode_member(name: str, data: bytes) -> np.ndarray:
+    """Decode one member's file, "f00.pbr.exr", to (H, W, C) float32, by the schema's table alone."""
+    _, _, member = parse_name(f"x.{name}")
+    if member == "meta":
+        raise TronError(f"{name} is metadata, not an image")
+    image = _DECODERS[ALL_MEMBERS[member].extension](data)
+    if image.ndim == 2:
+        image = image[..., None]
+    channels = ALL_MEMBERS[member].channels
+    if image.shape[-1] != channels:
+        image = image[..., :channels]  # a PNG decoder may hand back grey as RGB
+    return np.ascontiguousarray(image, np.float32)
+
+
+def decode_meta(data: bytes) -> ClipMeta:
+    """Parse and validate a clip's meta.json."""
+    if len(data) > LARGEST_META:
+        raise TronError("a clip's meta.json is too large to be one")
+    try:
+        return ClipMeta.model_validate_json(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise TronError(f"meta.json is damaged at {first['loc']}: {first['msg']}") from error
+
+
+def decode_clip(
+    files: Mapping[str, bytes],
+    members: Iterable[str] | None = None,
+    frames: Sequence[int] | None = None,
+) -> Clip:
+    """Decode a clip from its files, {"f00.pbr.exr": bytes, ..., "meta.json": bytes}.
+
+    members: only these (default: all present); frames: only these indices, in this order (default: all).
+    Raises TronError where a file is missing, does not decode, has another size than the metadata say, or
+    holds values that are not finite.
+    """
+    if META_SUFFIX not in files:
+        raise TronError("clip has no meta.json")
+    meta = decode_meta(files[META_SUFFIX])
+    indices = range(meta.frames) if frames is None else frames
+    if members is None:
+        references = [m for m in REFERENCE_MEMBERS if _file_name(0, m) in files]
+        names = [m for m in ALL_MEMBERS if m not in REFERENCE_MEMBERS or m in references]
+    else:
+        names = list(members)
+    decoded: dict[str, np.ndarray] = {}
+    for member in names:
+        images = []
+        for index in indices:
+            name = _file_name(index, member)
+            if name not in files:
+                raise TronError(f"clip {meta.key} has no member {name}")
+            image = decode_member(name, files[name])
+            if image.shape[:2] != (meta.height, meta.width):
+                raise TronError(f"clip {meta.key} {name} has size {image.shape[1::-1]}, not the clip's")
+            if not np.isfinite(image).all():
+                raise TronError(f"clip {meta.key} {name} holds values that are not finite")
+            images.append(image)
+        decoded[member] = np.stack(images)
+    return Clip(meta, decoded)
+
+
+def _file_name(frame: int, member: str) -> str:
+    if member not in ALL_MEMBERS:
+        raise TronError(f"no member is called {member!r}", mend=f"they are {', '.join(ALL_MEMBERS)}")
+    return f"f{frame:02d}.{member}.{ALL_MEMBERS[member].extension}"
+
+
+def read_clips(folder: str | Path, split: str, members: Iterable[str] | None = None) -> Iterator[Clip]:
+    """All clips of a split in the manifest's order, (K, H, W, C) float32 a member.
+
+    Raises TronError where the folder is no dataset, lacks the split, or a shard does not hold the clips
+    that its manifest names.
+    """
+    wanted = None if members is None else list(members)
+    for entry in Manifest.load(folder).of_split(split):
+        seen: list[str] = []
+        for key, files in group_clips(tar_files(Path(folder) / entry.name)):
+            seen.append(key)
+            yield decode_clip(files, wanted)
+        if seen != entry.keys:
+            raise TronError(
+                f"shard holds {len(seen)} clips, the manifest names {len(entry.keys)}",
+                str(Path(folder) / entry.name),
+                "check the dataset with tron-datagen's validate, then make the shard again",
+            )
+
+
+def group_clips(files: Iterable[tuple[str, str, bytes]]) -> Iterator[tuple[str, dict[str, bytes]]]:
+    """Gather consecutive files of one key into {name: bytes}."""
+    current: str | None = None
+    gathered: dict[str, bytes] = {}
+    for key, name, data in files:
+        if key != current and current is not None:
+            yield current, gathered
+            gathered = {}
+        if name in gathered:
+            raise TronError(f"clip {key} has member {name} twice")
+        current = key
+        gathered[name] = data
+    if current is not None:
+        yield current, gathered
