@@ -88,7 +88,9 @@ class Camera:
             raise TronError(f"horizontal field of view must lie between 0 and 180 degrees, not {fov_deg}")
         origin = np.asarray(position, dtype=np.float64)
         forward = _unit(np.asarray(target, dtype=np.float64) - origin, "camera position and target coincide")
-        right = _unit(np.cross(forward, np.asarray(up, dtype=np.float64)), "camera looks along its up direction")
+        right = _unit(
+            np.cross(forward, np.asarray(up, dtype=np.float64)), "camera looks along its up direction"
+        )
         rotation = np.stack([right, np.cross(forward, right), forward])
         matrix = np.eye(4)
         matrix[:3, :3] = rotation
@@ -134,7 +136,13 @@ class Camera:
         """The same view on another pixel grid: intrinsics scale with the image."""
         sx, sy = width / self.width, height / self.height
         return replace(
-            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+            self,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+            width=width,
+            height=height,
         )
 
     def rays(self) -> np.ndarray:
@@ -150,7 +158,10 @@ class Camera:
 
         Depths are z, not distances; points behind the camera have depth <= 0 and pixels without meaning.
         """
-        local = np.asarray(points, dtype=np.float64) @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        local = (
+            np.asarray(points, dtype=np.float64) @ self.world_to_camera[:3, :3].T
+            + self.world_to_camera[:3, 3]
+        )
         depth = local[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             pixels = local[:, :2] / depth[:, None] * (self.fx, self.fy) + (self.cx, self.cy)

@@ -1,0 +1,225 @@
+"""The machine under TRON: finding LLVM, choosing the Mitsuba variant, setting threads, describing it all.
+
+Entry points and test fixtures call :func:`activate` once, before anything touches ``mi.Float``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import glob
+import importlib.metadata
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from tron.errors import TronError
+
+MINIMUM_LLVM = 17
+"""Below it a kernel with min or max aborts the whole process ("Cannot select: fminimum")."""
+
+_TESTED_LLVM = 19
+_STACK = ("tron", "mitsuba", "drjit", "numpy", "scipy", "torch", "diffusers", "lightning", "OpenEXR", "av")
+_LLVM_FOLDERS = (
+    "/usr/lib/*-linux-gnu",  # Debian, Ubuntu
+    "/usr/lib/llvm-*/lib",
+    "/usr/lib64",  # Fedora, openSUSE
+    "/usr/lib64/llvm*/lib*",
+    "/usr/lib",  # Arch
+    "/usr/local/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+    "/usr/local/opt/llvm*/lib",
+)
+
+
+def find_llvm() -> Path:
+    """Return the LLVM library that Dr.Jit should load: version 17 or newer, 19 where there is a choice.
+
+    ``DRJIT_LIBLLVM_PATH`` is taken at its word; otherwise the active conda environment, the loader's cache and
+    the usual folders of Debian, Fedora, Arch and Homebrew are searched.
+
+    Raises:
+        TronError: nothing suitable was found, or DRJIT_LIBLLVM_PATH names something else; it says what to install.
+    """
+    chosen = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if chosen:
+        version = llvm_version(Path(chosen))
+        if version is None or version[0] < MINIMUM_LLVM:
+            found = "no LLVM library" if version is None else f"LLVM {version[0]}"
+            raise TronError(
+                f"DRJIT_LIBLLVM_PATH names {found}, but {MINIMUM_LLVM} or newer is needed",
+                chosen,
+                "unset it, or point it at libLLVM of version 17 or newer",
+            )
+        return Path(chosen)
+    versions = {path: llvm_version(path) for path in _llvm_candidates()}
+    usable = {path: v for path, v in versions.items() if v is not None and v[0] >= MINIMUM_LLVM}
+    if not usable:
+        others = sorted({v[0] for v in versions.values() if v is not None})
+        raise TronError(
+            f"LLVM {MINIMUM_LLVM} or newer not found"
+            + (f", only {', '.join(map(str, others))}" if others else ""),
+            mend=_llvm_remedy(),
+        )
+    return max(usable, key=lambda path: (usable[path][0] == _TESTED_LLVM, usable[path]))
+
+
+def llvm_version(path: Path) -> tuple[int, ...] | None:
+    """Version of an LLVM shared library, read from its name or else asked of the library; None if it has none."""
+    if not path.is_file():
+        return None
+    for name in (path.name, path.resolve().name, *reversed(path.resolve().parts)):
+        match = re.search(r"llvm(?:[-@/]|\.so\.)?(\d+(?:\.\d+)*)", name, re.IGNORECASE)
+        if match:
+            return tuple(int(part) for part in match[1].split("."))
+    try:
+        numbers = [ctypes.c_uint() for _ in range(3)]
+        ctypes.CDLL(str(path)).LLVMGetVersion(*map(ctypes.byref, numbers))  # exists since LLVM 16
+    except (OSError, AttributeError):
+        return None
+    return tuple(number.value for number in numbers)
+
+
+def _llvm_candidates() -> list[Path]:
+    folders = [
+        os.path.join(sys.prefix, "lib"),
+        os.path.join(os.environ.get("CONDA_PREFIX", sys.prefix), "lib"),
+    ]
+    if shutil.which("ldconfig", path=f"{os.environ.get('PATH', '')}:/sbin:/usr/sbin"):
+        cache = _output(["ldconfig", "-p"]) or _output(["/sbin/ldconfig", "-p"]) or ""
+        folders += sorted({os.path.dirname(path) for path in re.findall(r"=> (\S*libLLVM\S*)", cache)})
+    folders += _LLVM_FOLDERS
+    names = ("libLLVM.dylib", "libLLVM-[0-9]*.dylib") if sys.platform == "darwin" else ("libLLVM*.so*",)
+    found = (glob.glob(os.path.join(folder, name)) for folder in folders for name in names)
+    return [Path(path) for path in dict.fromkeys(path for paths in found for path in sorted(paths))]
+
+
+def _llvm_remedy() -> str:
+    if sys.platform == "darwin":
+        return "run `brew install llvm@19`, or set DRJIT_LIBLLVM_PATH to libLLVM.dylib"
+    return (
+        "install it with `apt-get install libllvm19` (Debian, Ubuntu), `dnf install llvm-libs` (Fedora) or "
+        "`conda install -c conda-forge libllvm19`, or set DRJIT_LIBLLVM_PATH to libLLVM.so"
+    )
+
+
+def activate(variant: str = "llvm_ad_rgb", threads: int | None = None) -> None:
+    """Set the Mitsuba variant of this process and, if given, Dr.Jit's number of threads; safe to repeat.
+
+    Args:
+        variant: ``llvm_ad_rgb``, ``cuda_ad_rgb`` or another that this Mitsuba build has.
+        threads: worker threads of Dr.Jit's LLVM backend; 1 makes sums reproducible bit by bit.
+
+    Raises:
+        TronError: an unknown variant, LLVM missing or too old, or no usable CUDA device.
+    """
+    if variant.startswith("llvm"):
+        os.environ["DRJIT_LIBLLVM_PATH"] = str(find_llvm())  # read by Dr.Jit when its LLVM backend starts
+    import drjit as dr
+    import mitsuba as mi
+
+    if variant not in mi.variants():
+        raise TronError(
+            f"unknown Mitsuba variant {variant!r}", mend=f"choose one of {', '.join(mi.variants())}"
+        )
+    if threads is not None:
+        if threads < 1:
+            raise TronError(f"number of threads must be at least 1, not {threads}")
+        dr.set_thread_count(threads)
+    if mi.variant() == variant:
+        return
+    try:
+        mi.set_variant(variant)
+    except ImportError as error:
+        if variant.startswith("cuda"):
+            raise TronError(
+                f"variant {variant} needs an NVIDIA GPU, and Dr.Jit found none it can use",
+                mend="use llvm_ad_rgb, or install a current NVIDIA driver",
+            ) from error
+        raise TronError(f"variant {variant} does not start: {error}") from error
+    loaded = dr.detail.llvm_version() if variant.startswith("llvm") else None
+    if loaded is not None and loaded[0] < MINIMUM_LLVM:
+        raise TronError(
+            f"Dr.Jit has loaded LLVM {loaded[0]} already, {MINIMUM_LLVM} or newer is needed",
+            mend="call tron.runtime.activate before any other use of Dr.Jit",
+        )
+
+
+def set_torch_threads(n: int) -> None:
+    """Let torch use ``n`` threads within an operation; 1 makes sums reproducible bit by bit."""
+    import torch
+
+    torch.set_num_threads(n)
+
+
+def describe_machine() -> dict[str, Any]:
+    """Describe hardware, software and commit, as plain values for reports and manifests of measurements.
+
+    Neither Mitsuba nor torch is loaded for it. Keys: ``cpu``, ``cores`` (those this process may use),
+    ``memory_gb``, ``gpu`` (names, or "none"), ``os``, ``python``, ``packages`` (name -> version, installed ones),
+    ``llvm`` (version or "none"), ``variant`` (the active one or "none"), ``commit`` and ``dirty`` (both None
+    outside a checkout).
+    """
+    mitsuba = sys.modules.get("mitsuba")
+    return {
+        "cpu": _cpu_model(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "memory_gb": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1),
+        "gpu": (_output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]) or "none").replace(
+            "\n", ", "
+        ),
+        "os": platform.platform(),
+        "python": platform.python_version(),
+        "packages": _package_versions(),
+        "llvm": _llvm_in_use(),
+        "variant": (mitsuba.variant() if mitsuba else None) or "none",
+        **_git_state(Path(__file__).resolve().parent.parent),
+    }
+
+
+def _cpu_model() -> str:
+    if sys.platform == "darwin":
+        return _output(["sysctl", "-n", "machdep.cpu.brand_string"]) or platform.machine()
+    try:
+        match = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
+    except OSError:
+        match = None
+    return match[1].strip() if match else platform.machine()
+
+
+def _package_versions() -> dict[str, str]:
+    versions = {}
+    for name in _STACK:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return versions
+
+
+def _llvm_in_use() -> str:
+    try:
+        version = llvm_version(find_llvm())
+    except TronError:
+        return "none"
+    return ".".join(map(str, version or ()))
+
+
+def _git_state(root: Path) -> dict[str, Any]:
+    if not (root / ".git").exists():
+        return {"commit": None, "dirty": None}
+    commit = _output(["git", "-C", str(root), "rev-parse", "HEAD"])
+    status = _output(["git", "-C", str(root), "status", "--porcelain"])
+    return {"commit": commit or None, "dirty": None if status is None else bool(status)}
+
+
+def _output(command: list[str]) -> str | None:
+    """Standard output of a short command, stripped; None if it is missing, fails or takes over ten seconds."""
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
