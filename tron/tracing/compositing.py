@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from tron.gaussians.harmonics import basis
+from tron.gaussians.harmonics import sh_basis
 from tron.tracing.hits import MAX_HITS, LocalHits
 from tron.tracing.kernel import FEATURE_PACKETS, SH_PACKETS, SurfelRecords
 
@@ -59,7 +59,7 @@ class Composite:
     count: mi.UInt32
 
 
-def _radiance(records: SurfelRecords, index: mi.UInt32, sh_basis: list[mi.Float]) -> mi.Color3f:
+def _radiance(records: SurfelRecords, index: mi.UInt32, basis: list[mi.Float]) -> mi.Color3f:
     """Display-space radiance ``max(0, SH(d) + 0.5)`` of one surfel; gathers only the degrees in use."""
     coefficients = (records.sh_degree + 1) ** 2
     color = []
@@ -68,7 +68,7 @@ def _radiance(records: SurfelRecords, index: mi.UInt32, sh_basis: list[mi.Float]
         for packet in range(-(-coefficients // 4)):
             values = dr.gather(mi.Vector4f, records.harmonics, index * SH_PACKETS + channel * 4 + packet)
             for lane in range(min(4, coefficients - 4 * packet)):
-                total = dr.fma(values[lane], sh_basis[4 * packet + lane], total)
+                total = dr.fma(values[lane], basis[4 * packet + lane], total)
         color.append(dr.select(total > 0, total, 0))
     return mi.Color3f(*color)
 
@@ -86,7 +86,7 @@ def composite(records: SurfelRecords, hits: LocalHits, direction: mi.Vector3f, o
     channels = [mi.Float(0) for _ in range(CHANNELS)]
     mean_depth, median_depth, remaining = mi.Float(0), mi.Float(0), mi.Float(1)
     lane, slot = dr.arange(mi.UInt32, out.rays), mi.UInt32(0)
-    sh_basis = basis(direction, records.sh_degree) if records.sh_degree > 0 else []
+    basis = sh_basis(direction.x, direction.y, direction.z)
     active = slot < hits.count
     while active:
         alpha, index, t = hits.alpha[slot], hits.index[slot], hits.t[slot]
@@ -97,7 +97,7 @@ def composite(records: SurfelRecords, hits: LocalHits, direction: mi.Vector3f, o
             for k in range(4):
                 channels[4 * packet + k] = dr.fma(weight, feature[k], channels[4 * packet + k])
         if dr.hint(records.sh_degree > 0, mode="scalar"):
-            extra = _radiance(records, index, sh_basis)
+            extra = _radiance(records, index, basis)
             base = dr.gather(mi.Vector4f, records.features, index * FEATURE_PACKETS + 2)
             for k in range(3):
                 channels[8 + k] = dr.fma(weight, extra[k] - base[k], channels[8 + k])

@@ -66,14 +66,14 @@ def response(q: Any, degree: int) -> Any:
     return dr.exp(-0.5 * q) if degree == 2 else dr.exp((-1.0 / 18.0) * q * q)
 
 
-@dataclass(frozen=True)
+@dataclass
 class SurfelRecords:
     """A scene's surfels as packed Dr.Jit buffers, in the scene's order or in the order of a hierarchy's leaves.
 
     Attributes:
         geometry: mi.Float, M records of ``4 * GEOMETRY_PACKETS``.
         features: mi.Float, M records of ``4 * FEATURE_PACKETS``.
-        harmonics: mi.Float, M records of ``4 * SH_PACKETS``; empty where ``sh_degree`` is 0.
+        harmonics: mi.Float, M records of ``4 * SH_PACKETS``; one unused zero where ``sh_degree`` is 0.
         count: M.
         degree: kernel degree, 2 or 4.
         sh_degree: highest SH degree with a coefficient that is not zero.
@@ -119,12 +119,13 @@ def sh_degree(scene: GaussianScene) -> int:
     return math.isqrt(int(np.flatnonzero(used).max())) if used.any() else 0
 
 
-def pack(scene: GaussianScene) -> SurfelRecords:
-    """Upload a scene's surfels in the scene's own order."""
+def upload(scene: GaussianScene, geometry: np.ndarray) -> SurfelRecords:
+    """Upload a scene's surfels and their ``pack_geometry`` records, in the scene's own order."""
     degree = sh_degree(scene)
-    harmonics = scene.sh.transpose(0, 2, 1).astype(np.float32).ravel() if degree > 0 else np.zeros(0, np.float32)
+    # Dr.Jit refuses empty arrays as loop state: an unused scalar stands in.
+    harmonics = scene.sh.transpose(0, 2, 1).astype(np.float32).ravel() if degree > 0 else np.zeros(1, np.float32)
     records = SurfelRecords(
-        geometry=mi.Float(pack_geometry(scene).ravel()),
+        geometry=mi.Float(geometry.ravel()),
         features=mi.Float(pack_features(scene).ravel()),
         harmonics=mi.Float(harmonics),
         count=len(scene),
@@ -135,7 +136,7 @@ def pack(scene: GaussianScene) -> SurfelRecords:
     return records
 
 
-@dataclass(frozen=True)
+@dataclass
 class SurfelHit:
     """One ray against one surfel. All fields are Dr.Jit variables.
 

@@ -104,7 +104,7 @@ def composite(scene: GaussianScene, origins: np.ndarray, directions: np.ndarray)
         margins[ray] = margin[near_cut].min() if near_cut.any() else np.inf
         ids = np.flatnonzero(counted & front & (t > T_MIN))
         ids = ids[np.lexsort((ids, t[ids]))]
-        rgb = np.maximum(eval_sh(scene.sh[ids].astype(np.float64), np.tile(direction, (len(ids), 1))) + 0.5, 0.0)
+        rgb = eval_sh(scene.sh[ids].astype(np.float64), np.tile(direction, (len(ids), 1)))
         remaining = 1.0
         for i, color in zip(ids, rgb, strict=True):
             weight, after = remaining * alpha[i], remaining * (1 - alpha[i])

@@ -1,0 +1,50 @@
+"""SurfelTracer: a scene made ready for rays of both kinds, camera rays by tiles and shadow rays by a hierarchy."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.tracing.bvh import Bvh, build_bvh
+from tron.tracing.gbuffer import GBuffer, trace_gbuffer
+from tron.tracing.kernel import pack_geometry, upload
+from tron.tracing.tiles import build_tiles
+from tron.tracing.transmittance import BACK_FACE_SPACINGS, transmittance
+
+if TYPE_CHECKING:
+    from tron.cameras import Camera
+    from tron.gaussians.scene import GaussianScene
+
+
+class SurfelTracer:
+    """Traces one :class:`GaussianScene`. Uploads on construction; the hierarchy is built when first needed.
+
+    Args:
+        scene: the surfels; must be valid (``scene.validate()``), and must not change while the tracer lives.
+        two_sided: let back faces block shadow rays beyond two spacings (the default); False is the paper's rule.
+    """
+
+    def __init__(self, scene: GaussianScene, *, two_sided: bool = True) -> None:
+        self.scene = scene
+        self._geometry = pack_geometry(scene)
+        self._records = upload(scene, self._geometry)
+        reach = BACK_FACE_SPACINGS * scene.spacing if two_sided else float("inf")
+        self._back_faces_from = dr.opaque(mi.Float, reach)
+
+    @cached_property
+    def bvh(self) -> Bvh:
+        """The hierarchy for shadow rays."""
+        return build_bvh(self._geometry, self.scene.kernel_degree)
+
+    def gbuffer(self, camera: Camera) -> GBuffer:
+        """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it."""
+        return trace_gbuffer(self._records, build_tiles(self._geometry, camera), camera)
+
+    def transmittance(
+        self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
+    ) -> mi.Float:
+        """Transmittance from ``origin`` to infinity along unit ``direction`` (world); exactly 0 below 0.01."""
+        return transmittance(self.bvh, origin, direction, self._back_faces_from, mi.Bool(active))
