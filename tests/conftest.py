@@ -1,14 +1,13 @@
-"""Fixtures for every test: one torch thread, the Mitsuba variants of this machine, the real data if present."""
+"""Fixtures for every test: one torch thread, this machine's Mitsuba variants, the real data."""
 
 import ctypes
-import importlib.util
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Read by torch when it is first imported: sums depend on the thread count, tests must not.
+os.environ["OMP_NUM_THREADS"] = "1"
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -43,13 +42,3 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"no real data: {SHARED_DATA} is absent")
     return SHARED_DATA
-
-
-@pytest.fixture(scope="session", autouse=True)
-def one_torch_thread() -> Iterator[None]:
-    """Results of torch depend on its thread count; a test must not depend on the machine's cores."""
-    if importlib.util.find_spec("torch") is not None:
-        import torch
-
-        torch.set_num_threads(1)
-    yield

@@ -1,0 +1,234 @@
+"""The way into every command, tried on a toy one: what a user types wrong costs one line, not a traceback."""
+
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Literal
+
+import pytest
+import yaml
+from pydantic import BaseModel, ConfigDict, Field
+
+from tron.apps.command_line import command
+from tron.errors import TronError
+
+CONFIG = """
+defaults:
+  - _self_
+  - lens: wide
+  - optional experiment: null
+output_dir: ???
+frames: 3
+quality: preview
+note: null
+trajectory:
+  turns: 2
+"""
+
+
+class Trajectory(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    turns: int = Field(description="Turns around the target.")
+
+
+class Lens(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    fov_deg: float = Field(gt=0, description="Horizontal field of view, degrees.")
+
+
+class Settings(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    output_dir: Path = Field(description="Folder of the results.")
+    frames: int = Field(ge=1, description="Number of frames.")
+    quality: Literal["preview", "final"] = Field(description="How many rays are spent.")
+    trajectory: Trajectory
+    lens: Lens
+    note: str | None = Field(default=None, description="Free text.")
+
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def toy_conf(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    folder = tmp_path_factory.mktemp("packages")
+    for name, text in {
+        "toy_conf/__init__.py": "",
+        "toy_conf/config.yaml": CONFIG,
+        "toy_conf/lens/wide.yaml": "# 90 degrees\nfov_deg: 90\n",
+        "toy_conf/lens/tele.yaml": "fov_deg: 20\n",
+        "toy_conf/experiment/demo.yaml": "# @package _global_\n# Two frames, quickly.\nframes: 2\n",
+    }.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    sys.path.insert(0, str(folder))
+    yield "toy_conf"
+    sys.path.remove(str(folder))
+
+
+@pytest.fixture
+def run(toy_conf: str, capsys: pytest.CaptureFixture[str], monkeypatch, tmp_path: Path) -> Run:
+    """Runs the toy command in an empty folder: exit code, stdout, stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def main(settings: Settings) -> int | None:
+        """Take a toy picture.
+
+        A second paragraph.
+        """
+        seen.append(settings)
+        return action(settings)
+
+    def run(*arguments: str, does: Callable[[Settings], int | None] = lambda _: None):
+        nonlocal action
+        action = does
+        seen.clear()
+        with pytest.raises(SystemExit) as stop:
+            command("tron-toy", toy_conf, Settings, main)(arguments)
+        out, err = capsys.readouterr()
+        return int(stop.value.code or 0), out, err
+
+    action: Callable[[Settings], int | None] = lambda _: None  # noqa: E731
+    seen: list[Settings] = []
+    run.seen = seen  # type: ignore[attr-defined]
+    return run
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["framez=3"], ["'framez'", "did you mean 'frames'?"]),
+        (["turns=3"], ["'turns'", "did you mean 'trajectory.turns'?"]),
+        (["trajectory.turnz=3"], ["'trajectory.turnz'", "did you mean 'trajectory.turns'?"]),
+        (["+extra=3", "output_dir=o"], ["'extra'"]),
+        (["expriment=demo"], ["'expriment'", "did you mean 'experiment'?"]),
+        (["experiment=dem"], ["experiment 'dem'", "did you mean 'demo'?"]),
+        (["lens=fisheye"], ["lens 'fisheye'", "tele, wide"]),
+        (["output_dir=o", "frames=three"], ["'frames'", "'three'", "integer"]),
+        (["output_dir=o", "frames=0"], ["'frames'", "greater than or equal to 1"]),
+        (["output_dir=o", "frames=null"], ["'frames' has no value"]),
+        (["output_dir=o", "~frames"], ["'frames' has no value"]),
+        (["output_dir=o", "lens.fov_deg=-1"], ["'lens.fov_deg'", "greater than 0"]),
+        (["output_dir=o", "quality=best"], ["'quality'", "'preview' or 'final'"]),
+        (["output_dir=o", "frames=1,2"], ["'frames'", "one value", "[1,2]"]),
+        (["output_dir=o", "note=${nowhere}"], ["nowhere"]),
+        (["frames=3"], ["'output_dir' has no value", "output_dir=VALUE"]),
+        (["demo"], ["'demo'", "write key=value"]),
+        (["output_dir=a(1).ply"], ["cannot read", """'output_dir="a(1).ply"'"""]),
+        (["--multirun"], ["--multirun", "--help"]),
+        (["--cfg", "hydra"], ["--cfg", "hydra"]),
+        (["--config-dir", "nowhere"], ["folder not found (nowhere)"]),
+    ],
+    ids=lambda value: "_".join(value) if isinstance(value, list) else None,
+)
+def test_a_mistake_is_one_line_that_names_it_and_nothing_runs(run: Run, tmp_path, arguments, said):
+    code, out, err = run(*arguments)
+    assert code == 2
+    assert out == ""
+    assert err.startswith("tron-toy: ")
+    assert err.endswith("\n")
+    assert len(err.splitlines()) == 1
+    assert [each for each in said if each not in err] == [], err
+    assert run.seen == []  # type: ignore[attr-defined]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_overrides_groups_and_experiments_reach_the_settings(run: Run):
+    assert run("output_dir=o", "experiment=demo", "lens=tele", "trajectory.turns=5", "note=a b")[0] == 0
+    (settings,) = run.seen  # type: ignore[attr-defined]
+    assert (settings.frames, settings.lens.fov_deg, settings.trajectory.turns) == (2, 20, 5)
+    assert (settings.output_dir, settings.note) == (Path("o"), "a b")
+    assert run("output_dir=o", "experiment=demo", "frames=7")[0] == 0
+    assert run.seen[0].frames == 7, "the command line wins over the experiment"  # type: ignore[attr-defined]
+
+
+def test_a_quoted_value_may_hold_anything(run: Run):
+    assert run('output_dir="a(1), =b.ply"')[0] == 0
+    assert run.seen[0].output_dir == Path("a(1), =b.ply")  # type: ignore[attr-defined]
+
+
+def test_own_recipes_come_from_a_config_dir(run: Run, tmp_path: Path):
+    (tmp_path / "my recipes" / "experiment").mkdir(parents=True)
+    (tmp_path / "my recipes" / "experiment" / "mine.yaml").write_text("# @package _global_\nframes: 9\n")
+    assert run("--config-dir", "my recipes", "experiment=mine", "output_dir=o")[0] == 0
+    assert run.seen[0].frames == 9  # type: ignore[attr-defined]
+    assert run("experiment=mine", "output_dir=o")[0] == 2
+
+
+def test_nothing_is_written_and_the_working_directory_stays(run: Run, tmp_path: Path):
+    where = []
+    assert run("output_dir=o", does=lambda _: where.append(Path.cwd()))[0] == 0
+    assert where == [tmp_path]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cfg_prints_yaml_that_holds_every_override(run: Run):
+    code, out, err = run("--cfg", "job", "output_dir=o", "experiment=demo")
+    assert (code, err) == (0, "")
+    assert yaml.safe_load(out) == {
+        "output_dir": "o",
+        "frames": 2,
+        "quality": "preview",
+        "note": None,
+        "trajectory": {"turns": 2},
+        "lens": {"fov_deg": 90},
+    }
+    assert run.seen == []  # type: ignore[attr-defined]
+
+
+def test_help_teaches_purpose_keys_defaults_recipes_and_examples(run: Run, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "72")
+    code, out, err = run("--help")
+    assert (code, err) == (0, "")
+    for text in (
+        "Take a toy picture.",
+        "output_dir=VALUE (required)   [path]",
+        "Folder of the results.",
+        "frames=3   [integer]",
+        "quality=preview   [preview | final]",
+        "trajectory.turns=2",
+        "lens.fov_deg=90",
+        "note=null   [text | null]",
+        "Two frames, quickly.",
+        "tele",
+        "tron-toy experiment=demo output_dir=outputs/first",
+    ):
+        assert text in out
+    assert max(map(len, out.splitlines())) <= 72
+
+
+def test_an_error_of_the_work_is_one_line_too(run: Run):
+    def fail(_):
+        raise TronError("file not found", where="a.ply", mend="check\nthe path")
+
+    assert run("output_dir=o", does=fail) == (2, "", "tron-toy: file not found (a.ply): check the path\n")
+
+
+def test_what_main_returns_is_the_exit_code(run: Run):
+    assert run("output_dir=o", does=lambda _: 1)[0] == 1
+
+
+def test_an_interruption_exits_130_without_a_traceback(run: Run):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    assert run("output_dir=o", does=interrupt) == (130, "", "tron-toy: interrupted\n")
+
+
+def test_a_defect_keeps_its_traceback(run: Run):
+    def defect(_):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        run("output_dir=o", does=defect)
+
+
+def test_log_lines_are_neither_wrapped_nor_coloured_in_a_pipe(run: Run, monkeypatch):
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    monkeypatch.setattr(logging.getLogger(), "level", logging.WARNING)
+    long = "word " * 60
+
+    _, _, err = run("output_dir=o", does=lambda _: logging.getLogger("tron").info(long))
+    assert long in err
+    assert "\x1b" not in err

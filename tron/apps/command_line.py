@@ -1,0 +1,116 @@
+"""One way into every command: compose, check, then run; a mistake of the user is one line and exit code 2.
+
+    cli = command("tron-relight", "conf.relight", Settings, main)
+
+Exit codes: 0 done; 1 a defect (with its traceback), or what `main` returns; 2 a mistake that the user can
+mend, said in one line on stderr before long work starts; 130 interrupted.
+"""
+
+import argparse
+import inspect
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+import pydantic
+from omegaconf import OmegaConf
+from rich.console import Console
+from rich.logging import RichHandler
+
+import tron
+from tron.apps.help_page import default_examples, render_help
+from tron.apps.recipes import check, compose_recipe, group_options
+from tron.errors import TronError
+
+Settings = TypeVar("Settings", bound=pydantic.BaseModel)
+
+USER_ERROR = 2
+INTERRUPTED = 130
+
+
+def command(
+    name: str,
+    config_module: str,
+    settings: type[Settings],
+    main: Callable[[Settings], int | None],
+    examples: Sequence[str] = (),
+) -> Callable[..., NoReturn]:
+    """Make a console entry point.
+
+    Args:
+        name: the command as typed, such as `tron-datagen`; every error line starts with it.
+        config_module: importable package with `config.yaml` and groups beside it, such as `conf.datagen`.
+        settings: pydantic model of the whole configuration, `extra="forbid"`; its descriptions make `--help`.
+        main: does the work; its docstring is what `--help` says the command does. It may return an exit code.
+        examples: command lines for `--help`.
+
+    Returns:
+        A function that ends in `SystemExit`. It reads `sys.argv`, or the arguments it is given.
+    """
+
+    def cli(arguments: Sequence[str] | None = None) -> NoReturn:
+        sys.exit(_run(sys.argv[1:] if arguments is None else arguments))
+
+    def _run(arguments: Sequence[str]) -> int:
+        try:
+            options = _arguments(name).parse_args(arguments)
+            if options.help:
+                print(_help(), end="")
+                return 0
+            if options.version:
+                print(f"{name} {tron.__version__}")
+                return 0
+            recipe = compose_recipe(config_module, options.overrides, options.config_dir)
+            if options.cfg:
+                print(OmegaConf.to_yaml(recipe, resolve=True), end="")
+                return 0
+            checked = check(recipe, settings)
+            configure_logging()
+            return main(checked) or 0
+        except TronError as error:
+            print(f"{name}: {error}", file=sys.stderr)
+            return USER_ERROR
+        except KeyboardInterrupt:
+            print(f"{name}: interrupted", file=sys.stderr)
+            return INTERRUPTED
+
+    def _help() -> str:
+        groups = group_options(config_module)
+        defaults: Any = OmegaConf.to_container(compose_recipe(config_module, []), resolve=False)
+        purpose = inspect.getdoc(main) or settings.__doc__ or name
+        return render_help(
+            name, purpose, settings, defaults, groups, examples or default_examples(name, groups)
+        )
+
+    return cli
+
+
+def configure_logging(level: int = logging.INFO) -> None:
+    """Send the log to stderr: coloured on a terminal, plain unwrapped lines into a file or a pipe."""
+    if sys.stderr.isatty():
+        handler: logging.Handler = RichHandler(console=Console(stderr=True), show_path=False)
+        handler.setFormatter(logging.Formatter("%(message)s", datefmt="%X"))
+    else:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", datefmt="%X"))
+    logging.basicConfig(level=level, handlers=[handler])
+    logging.captureWarnings(True)
+
+
+class _Arguments(argparse.ArgumentParser):
+    """argparse, but a mistake is an exception: the caller prints it in its own one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise TronError(message, mend="--help shows how it is used")
+
+
+def _arguments(name: str) -> argparse.ArgumentParser:
+    parser = _Arguments(prog=name, add_help=False, allow_abbrev=False)
+    parser.add_argument("overrides", nargs="*")
+    parser.add_argument("-h", "--help", action="store_true")
+    parser.add_argument("--version", action="store_true")
+    parser.add_argument("--cfg", choices=["job"])
+    parser.add_argument("--config-dir", type=Path)
+    return parser

@@ -1,0 +1,137 @@
+"""The page that `--help` prints: what a command does, every key with its default, recipes, and examples."""
+
+import shutil
+import textwrap
+import types
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin
+
+import pydantic
+import yaml
+
+from tron.apps.recipes import nested_model
+
+OPTIONS = {
+    "-h, --help": "print this page",
+    "--cfg job": "print the resolved configuration as YAML and stop",
+    "--config-dir DIR": "look for your own recipes in DIR first (DIR/experiment/NAME.yaml)",
+    "--version": "print the version",
+}
+TYPE_NAMES = {
+    Path: "path",
+    str: "text",
+    int: "integer",
+    float: "number",
+    bool: "true | false",
+    type(None): "null",
+}
+
+
+def render_help(
+    name: str,
+    purpose: str,
+    settings: type[pydantic.BaseModel],
+    defaults: Mapping[str, Any],
+    groups: Mapping[str, Mapping[str, str]],
+    examples: Sequence[str],
+    columns: int | None = None,
+) -> str:
+    """The whole page as text.
+
+    Args:
+        name: the command, such as `tron-relight`.
+        purpose: what it does; reflowed.
+        settings: the model whose fields are the keys.
+        defaults: the composed configuration without overrides, nested; it wins over the model's defaults.
+        groups: group -> option -> one line about it.
+        examples: whole command lines.
+        columns: width; the terminal's (at most 110) where None.
+    """
+    width = columns or min(shutil.get_terminal_size().columns, 110)
+    page = [
+        *_reflow(purpose, width),
+        "",
+        f"usage: {name} [key=value ...] [group=option ...]",
+        "",
+        "keys (default)",
+    ]
+    for key, field, default in _fields(settings, defaults):
+        page.append(f"  {key}={_yaml(default)}   [{describe_type(field.annotation)}]")
+        page += textwrap.wrap(
+            field.description or "", width, initial_indent=" " * 6, subsequent_indent=" " * 6
+        )
+    for group, options in groups.items():
+        page += ["", f"{group}=NAME"]
+        page += _table(options, width)
+    page += ["", "options", *_table(OPTIONS, width), "", "examples"]
+    page += [f"  {example}" for example in examples]
+    return "\n".join(page) + "\n"
+
+
+def default_examples(name: str, groups: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """Command lines that hold for any command, for one that brings none of its own."""
+    option = next(iter(groups.get("experiment", {})), None)
+    recipe = f" experiment={option}" if option else ""
+    return [f"{name}{recipe} output_dir=outputs/first", f"{name}{recipe} --cfg job"]
+
+
+def describe_type(annotation: Any) -> str:
+    """An annotation in a user's words: `Literal["a", "b"] | None` -> `a | b | null`."""
+    origin = get_origin(annotation)
+    if origin is Literal:
+        return " | ".join(str(value) for value in get_args(annotation))
+    if origin in (Union, types.UnionType):
+        return " | ".join(describe_type(each) for each in get_args(annotation))
+    if origin in (list, tuple, Sequence):
+        inner = [describe_type(each) for each in get_args(annotation) if each is not Ellipsis]
+        return f"list of {', '.join(dict.fromkeys(inner))}" if inner else "list"
+    if hasattr(annotation, "__metadata__"):  # Annotated
+        return describe_type(annotation.__origin__)
+    return TYPE_NAMES.get(annotation, getattr(annotation, "__name__", str(annotation)))
+
+
+def _fields(
+    model: type[pydantic.BaseModel], defaults: Any, prefix: str = ""
+) -> Iterator[tuple[str, pydantic.fields.FieldInfo, Any]]:
+    """Leaves of a settings model: dotted key, field, default."""
+    for name, field in model.model_fields.items():
+        if isinstance(defaults, Mapping) and name in defaults:
+            default = defaults[name]
+        else:
+            default = "???" if field.is_required() else field.get_default(call_default_factory=True)
+        inner = nested_model(field.annotation)
+        if inner is None:
+            yield prefix + name, field, default
+        else:
+            yield from _fields(inner, default, f"{prefix}{name}.")
+
+
+def _yaml(value: Any) -> str:
+    if isinstance(value, pydantic.BaseModel):
+        value = value.model_dump(mode="json")
+    elif isinstance(value, Path):
+        value = str(value)
+    elif isinstance(value, tuple):
+        value = list(value)
+    if value == "???":
+        return "VALUE (required)"
+    return yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
+
+
+def _reflow(text: str, width: int) -> list[str]:
+    paragraphs = textwrap.dedent(text).strip().split("\n\n")
+    lines: list[str] = []
+    for paragraph in paragraphs:
+        lines += [*textwrap.wrap(paragraph, width), ""]
+    return lines[:-1]
+
+
+def _table(rows: Mapping[str, str], width: int) -> list[str]:
+    gap = max((len(name) for name in rows), default=0) + 4
+    lines: list[str] = []
+    for name, text in rows.items():
+        lines += textwrap.wrap(
+            text, width, initial_indent=f"  {name}".ljust(gap), subsequent_indent=" " * gap
+        ) or [f"  {name}"]
+    return lines

@@ -1,0 +1,213 @@
+"""From command-line overrides to checked settings: Hydra composes, pydantic checks, errors name the key.
+
+A *recipe* is what Hydra composes from a command's folder of YAML files and the user's overrides. Everything
+that can be wrong with it is found here, before any long work starts, and raised as a `TronError` of one line.
+"""
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pydantic
+from hydra import compose, initialize_config_module
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from tron.errors import TronError
+
+Settings = TypeVar("Settings", bound=pydantic.BaseModel)
+
+SHOWN_CHARACTERS = 80  # of a wrong value, so that the error stays one readable line
+
+
+def compose_recipe(
+    config_module: str, overrides: Sequence[str], config_dir: Path | None = None
+) -> DictConfig:
+    """Compose `config_module`'s `config.yaml` with overrides in Hydra's grammar (`key=value`, `group=name`).
+
+    Hydra's compose API is used instead of `hydra.main`: nothing is written and the working directory stays.
+
+    Args:
+        config_module: importable package that holds `config.yaml` and its groups.
+        overrides: as typed on the command line; a later one wins.
+        config_dir: the user's own folder of groups, searched beside the package's.
+
+    Raises:
+        TronError: an override cannot be parsed, or names a key, group or option that does not exist.
+    """
+    parsed = [_parse(override) for override in overrides]
+    if config_dir is not None and not config_dir.is_dir():
+        raise TronError("folder not found", where=config_dir, mend="--config-dir names a folder of recipes")
+    search = [] if config_dir is None else [f'hydra.searchpath=["file://{config_dir.resolve()}"]']
+    with _loader(config_module) as loader:
+        groups = {name: _options(loader, name, config_dir) for name in _groups(loader)}
+        selections = [each for each in parsed if each.key_or_group in groups]
+        for each in selections:
+            _require_option(each, groups[each.key_or_group])
+        try:
+            base = compose("config", overrides=[*search, *(str(each.input_line) for each in selections)])
+            known = [*keys(base), *groups]
+            for each in parsed:
+                if not each.is_add() and not each.is_force_add() and each.key_or_group not in known:
+                    raise unknown_key(each.key_or_group, known)
+            return compose("config", overrides=[*search, *overrides])
+        except (HydraException, OmegaConfBaseException) as error:
+            raise TronError(_first_line(error), where=config_module) from error
+
+
+def check(recipe: DictConfig, settings: type[Settings]) -> Settings:
+    """Resolve a composed recipe and validate it with its pydantic model.
+
+    Raises:
+        TronError: a required key has no value, or a key is unknown or of the wrong type; the first of them
+            is named.
+    """
+    for key in sorted(OmegaConf.missing_keys(recipe)):
+        raise _required(key)
+    try:
+        values = OmegaConf.to_container(recipe, resolve=True)
+    except OmegaConfBaseException as error:
+        raise TronError(_first_line(error)) from error
+    try:
+        return settings.model_validate(values)
+    except pydantic.ValidationError as error:
+        raise _one_line(error, values, settings) from error
+
+
+def keys(values: Any, prefix: str = "") -> Iterator[str]:
+    """Every key of a nested mapping, dotted, parents before children."""
+    if OmegaConf.is_config(values):
+        values = OmegaConf.to_container(values, resolve=False)
+    if isinstance(values, Mapping):
+        for name, value in values.items():
+            yield f"{prefix}{name}"
+            yield from keys(value, f"{prefix}{name}.")
+
+
+def group_options(config_module: str) -> dict[str, dict[str, str]]:
+    """Groups of a configuration folder, their options, and the first comment line of each option."""
+    root = resources.files(config_module)
+    with _loader(config_module) as loader:
+        options = {group: loader.get_group_options(group) for group in _groups(loader)}
+    return {
+        group: {name: _comment(root.joinpath(group, f"{name}.yaml").read_text("utf-8")) for name in names}
+        for group, names in options.items()
+    }
+
+
+def unknown_key(key: str, known: Sequence[str]) -> TronError:
+    """The error for a key that does not exist, with the nearest one that does."""
+    return TronError(f"unknown key '{key}'", mend=f"{did_you_mean(key, known)}--help lists every key")
+
+
+def did_you_mean(name: str, known: Sequence[str]) -> str:
+    """`"did you mean 'x'? "`, or nothing where no known name is near."""
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    if not near:  # the right leaf under the wrong parent: `frames` for `trajectory.frames`
+        leaves = {each.rpartition(".")[2]: each for each in known}
+        near = [leaves[leaf] for leaf in difflib.get_close_matches(name.rpartition(".")[2], leaves, n=1)]
+    return f"did you mean '{near[0]}'? " if near else ""
+
+
+@contextmanager
+def _loader(config_module: str) -> Iterator[ConfigLoader]:
+    with initialize_config_module(config_module, version_base="1.3"):
+        yield GlobalHydra.instance().config_loader()
+
+
+def _groups(loader: ConfigLoader) -> list[str]:
+    return [name for name in loader.list_groups("") if name != "hydra"]
+
+
+def _options(loader: ConfigLoader, group: str, config_dir: Path | None) -> list[str]:
+    own = sorted(path.stem for path in (config_dir / group).glob("*.yaml")) if config_dir else []
+    return [*loader.get_group_options(group), *own]
+
+
+def _parse(text: str) -> Override:
+    try:
+        override = OverridesParser.create().parse_override(text)
+    except HydraException as error:
+        key, equals, value = text.partition("=")
+        mend = f"""quote the value: '{key}="{value}"'""" if equals else "write key=value"
+        raise TronError(f"cannot read '{text}'", mend=mend) from error
+    if override.is_sweep_override():
+        key, _, value = text.partition("=")
+        raise TronError(f"'{key}' takes one value", where=value, mend=f"for a list write '{key}=[{value}]'")
+    return override
+
+
+def _require_option(override: Override, options: Sequence[str]) -> None:
+    value = override.value()
+    for name in value if isinstance(value, list) else [value]:
+        if name is not None and name not in options:
+            group = override.key_or_group
+            mend = did_you_mean(str(name), options) + "available: " + ", ".join(options)
+            raise TronError(f"unknown {group} '{name}'", mend=mend)
+
+
+def _one_line(error: pydantic.ValidationError, values: Any, settings: type[pydantic.BaseModel]) -> TronError:
+    # Unknown keys first: a misspelt key often leaves a second error behind, of the key that was meant.
+    first = min(error.errors(), key=lambda each: each["type"] != "extra_forbidden")
+    key = _written_key(first["loc"], values)
+    if first["type"] == "extra_forbidden":
+        return unknown_key(key, list(field_keys(settings)))
+    if first["type"] == "missing" or first["input"] is None:
+        return _required(key)
+    shown = repr(first["input"])
+    if len(shown) > SHOWN_CHARACTERS:
+        shown = shown[:SHOWN_CHARACTERS] + "..."
+    reason = first["msg"].removeprefix("Value error, ")
+    return TronError(f"wrong value for '{key}'", where=shown, mend=reason[:1].lower() + reason[1:])
+
+
+def field_keys(model: type[pydantic.BaseModel], prefix: str = "") -> Iterator[str]:
+    """Every field of a settings model, dotted, parents before children."""
+    for name, field in model.model_fields.items():
+        yield f"{prefix}{name}"
+        inner = nested_model(field.annotation)
+        if inner is not None:
+            yield from field_keys(inner, f"{prefix}{name}.")
+
+
+def nested_model(annotation: Any) -> type[pydantic.BaseModel] | None:
+    """The settings model that an annotation holds, `Model` or `Model | None`; None for anything else."""
+    for each in (annotation, *getattr(annotation, "__args__", ())):
+        if isinstance(each, type) and issubclass(each, pydantic.BaseModel):
+            return each
+    return None
+
+
+def _required(key: str) -> TronError:
+    return TronError(f"'{key}' has no value", mend=f"give {key}=VALUE")
+
+
+def _written_key(location: Sequence[str | int], values: Any) -> str:
+    """The dotted key as the user writes it: pydantic's location also names branches of unions."""
+    parts = [str(location[0])]
+    inside = values.get(location[0]) if isinstance(values, Mapping) else None
+    for part in location[1:]:
+        if isinstance(inside, Mapping):
+            parts.append(str(part))
+            inside = inside.get(part)
+        elif isinstance(inside, list) and isinstance(part, int):
+            parts.append(str(part))
+            inside = inside[part]
+    return ".".join(parts)
+
+
+def _comment(text: str) -> str:
+    lines = [line.lstrip("# ").strip() for line in text.splitlines() if line.startswith("#")]
+    return next((line for line in lines if line and not line.startswith("@package")), "")
+
+
+def _first_line(error: Exception) -> str:
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
