@@ -1,24 +1,26 @@
 """The Gaussian scene: oriented flat Gaussians (surfels) with radiance and materials.
 
-A surfel is the flat Gaussian of 2D Gaussian Splatting (Huang et al. 2024): a centre, an orientation whose third
-axis is the normal, two standard deviations in the plane, an opacity, and what it looks like. Everything is
-NumPy at rest, in the world frame; trainable copies and device arrays are made by those who need them.
+A surfel is the flat Gaussian of 2D Gaussian Splatting (Huang et al. 2024): a centre, an orientation whose
+third axis is the normal, two standard deviations in the plane, an opacity, and what it looks like. Everything
+is NumPy at rest, in the world frame; trainable copies and device arrays are made by those who need them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from tron.errors import TronError
+from tron.gaussians.harmonics import SH_COUNT, rotate_sh
 
-SH_COUNT = 16
 KERNEL_DEGREES = (2, 4)
-# Densities are measured on at most this many surfels: the median does not move, a million queries take seconds.
+# Densities are measured on at most this many surfels: the median does not move, a million queries take
+# seconds.
 SPACING_QUERIES = 50_000
 
 _SHAPES: dict[str, tuple[int, ...]] = {
@@ -34,6 +36,8 @@ _SHAPES: dict[str, tuple[int, ...]] = {
 }
 _UNIT_INTERVAL = ("base_color", "roughness", "metallic")
 _TOLERANCE = 1e-3
+# Scales beyond e^+-40 overflow float32 once they are squared.
+_LOG_SCALE_LIMIT = 40.0
 
 
 @dataclass(eq=False)
@@ -43,11 +47,11 @@ class GaussianScene:
     Arrays are float32 (object_id int32); other dtypes are converted on construction.
 
     means           (M, 3)     centres, world units
-    quats           (M, 4)     unit quaternions (w, x, y, z); the columns of R are tangent u, tangent v, normal
-    log_scales      (M, 2)     natural logarithm of the standard deviations along u and v, world units
+    quats           (M, 4)     unit quaternions (w, x, y, z); the columns of R are tangent u, tangent v,
+    normal log_scales      (M, 2)     natural logarithm of the standard deviations along u and v, world units
     opacity_logits  (M,)       opacity = 1 / (1 + exp(-logit))
-    sh              (M, 16, 3) degree-3 harmonics of the radiance in *display* space: colour = max(0, SH + 0.5)
-    base_color      (M, 3)     linear, in [0, 1]
+    sh              (M, 16, 3) degree-3 harmonics of the radiance in *display* space: colour = max(0, SH +
+    0.5) base_color      (M, 3)     linear, in [0, 1]
     roughness       (M,)       in [0, 1]; GGX alpha is its square
     metallic        (M,)       in [0, 1]
     object_id       (M,)       which object a surfel belongs to; 0 where nothing is known
@@ -55,6 +59,9 @@ class GaussianScene:
     spacing                    distance between neighbouring surfels, world units (see measure_spacing)
     up              (3,)       unit up direction
     materials_guessed          True where the materials were derived from colours, not measured
+    oriented                   False where the sign of the normals means nothing, as in files of 3DGS: camera
+    rays
+                               skip back faces, so such scenes are turned towards each camera first (`facing`)
     """
 
     means: np.ndarray
@@ -70,6 +77,7 @@ class GaussianScene:
     spacing: float = 0.0
     up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     materials_guessed: bool = False
+    oriented: bool = True
 
     def __post_init__(self) -> None:
         for name in _SHAPES:
@@ -101,8 +109,7 @@ class GaussianScene:
 
     def opacities(self) -> np.ndarray:
         """(M,) float32 opacities in (0, 1)."""
-        # tanh form: exp(-logit) would overflow for strongly negative logits.
-        return 0.5 + 0.5 * np.tanh(0.5 * self.opacity_logits)
+        return expit(self.opacity_logits)
 
     def bounds(self, trim: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corner, two (3,) float64 arrays, of the axis-aligned box around the centres.
@@ -113,8 +120,40 @@ class GaussianScene:
         low, high = np.quantile(self.means.astype(np.float64), [trim, 1.0 - trim], axis=0)
         return low, high
 
-    def validate(self) -> GaussianScene:
-        """Return the scene itself if it is whole; raise TronError naming the first field that is not."""
+    def facing(self, point: np.ndarray) -> GaussianScene:
+        """The scene with every surfel's normal on the side of a point (3,), world.
+
+        A surfel that looks away is turned half about its tangent u: same disk, other side. Arrays that do not
+        change are shared with this scene.
+        """
+        away = np.einsum("mi,mi->m", self.normals(), self.means - np.asarray(point, np.float32)) > 0
+        w, x, y, z = self.quats.T
+        turned = np.stack([-x, w, z, -y], axis=-1)
+        return replace(self, quats=np.where(away[:, None], turned, self.quats))
+
+    def rotated(self, rotation: np.ndarray) -> GaussianScene:
+        """The scene turned about the origin by a (3, 3) rotation: centres, frames, radiance and up."""
+        rotation = np.asarray(rotation, dtype=np.float64)
+        return replace(
+            self,
+            means=self.means @ rotation.T,
+            quats=quats_from_matrices(rotation @ self.rotations()),
+            sh=rotate_sh(self.sh, rotation),
+            up=rotation @ self.up,
+        )
+
+    def validate(self, where: str | Path | None = None) -> GaussianScene:
+        """Return the scene itself if it is whole; raise TronError naming the first field that is not.
+
+        `where`, the file the scene comes from, is added to the message.
+        """
+        try:
+            self._check()
+        except TronError as error:
+            raise TronError(error.what, where, error.mend) from None
+        return self
+
+    def _check(self) -> None:
         count = len(self.means)
         if count == 0:
             raise TronError("the scene has no surfels")
@@ -124,12 +163,17 @@ class GaussianScene:
                 raise TronError(f"{name} has shape {values.shape}, expected {(count, *shape)}")
             bad = ~np.isfinite(values.reshape(count, -1)).all(axis=1)
             if bad.any():
-                raise TronError(f"{name} of {bad.sum()} of {count} surfels is not finite (first: {bad.argmax()})")
+                raise TronError(
+                    f"{name} of {bad.sum()} of {count} surfels is not finite (first: {bad.argmax()})"
+                )
         for name in _UNIT_INTERVAL:
             values = getattr(self, name).reshape(count, -1)
             bad = ((values < -_TOLERANCE) | (values > 1 + _TOLERANCE)).any(axis=1)
             if bad.any():
                 raise TronError(f"{name} of {bad.sum()} surfels is outside [0, 1] (first: {bad.argmax()})")
+        bad = (np.abs(self.log_scales) > _LOG_SCALE_LIMIT).any(axis=1)
+        if bad.any():
+            raise TronError(f"log_scales of {bad.sum()} surfels are absurd (first: surfel {bad.argmax()})")
         lengths = np.linalg.norm(self.quats, axis=1)
         bad = np.abs(lengths - 1) > _TOLERANCE
         if bad.any():
@@ -140,10 +184,11 @@ class GaussianScene:
         if self.kernel_degree not in KERNEL_DEGREES:
             raise TronError(f"kernel_degree is {self.kernel_degree}", mend="use 2 or 4")
         if not (np.isfinite(self.spacing) and self.spacing > 0):
-            raise TronError(f"spacing is {self.spacing}", mend="give a positive length, or measure_spacing(means)")
+            raise TronError(
+                f"spacing is {self.spacing}", mend="give a positive length, or measure_spacing(means)"
+            )
         if self.up.shape != (3,) or not abs(np.linalg.norm(self.up) - 1) < _TOLERANCE:
             raise TronError(f"up is {self.up.tolist()}", mend="give a unit vector of three numbers")
-        return self
 
     def save(self, path: str | Path) -> None:
         """Write a PLY that 3DGS readers open too (tron.gaussians.ply.write_ply)."""
@@ -171,7 +216,9 @@ def quats_from_matrices(rotations: np.ndarray) -> np.ndarray:
     return xyzw[:, [3, 0, 1, 2]].astype(np.float32)
 
 
-def neighbour_distances(means: np.ndarray, queries: np.ndarray | None = None, neighbours: int = 3) -> np.ndarray:
+def neighbour_distances(
+    means: np.ndarray, queries: np.ndarray | None = None, neighbours: int = 3
+) -> np.ndarray:
     """Root mean square distance of each centre to its nearest others, as 3DGS initialises its scales.
 
     means (M, 3), world; queries (Q,) indices into means, all of them by default. Returns (Q,) float64, world
@@ -180,17 +227,17 @@ def neighbour_distances(means: np.ndarray, queries: np.ndarray | None = None, ne
     points = np.asarray(means, dtype=np.float64)
     asked = points if queries is None else points[queries]
     count = min(neighbours + 1, len(points))
-    distances = np.asarray(cKDTree(points).query(asked, k=list(range(1, count + 1)))[0])
     if count == 1:
         return np.zeros(len(asked))
+    distances = KDTree(points).query(asked, k=count)[0]
     return np.sqrt((distances[:, 1:] ** 2).mean(axis=1))
 
 
 def measure_spacing(means: np.ndarray) -> float:
     """The scene's surfel spacing nn: median of neighbour_distances, world units, never zero.
 
-    Shadow rays start and count back faces in units of it (facts.md section 4). Large scenes are measured on an
-    evenly strided part of their surfels, against all of them.
+    Shadow rays start and count back faces in units of it (facts.md section 4). Large scenes are measured on
+    an evenly strided part of their surfels, against all of them.
     """
     stride = -(-len(means) // SPACING_QUERIES)
     distances = neighbour_distances(means, np.arange(0, len(means), max(stride, 1)))

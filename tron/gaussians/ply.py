@@ -1,0 +1,264 @@
+"""Gaussian scenes as PLY files that every 3D Gaussian Splatting reader opens.
+
+The vertex element holds float32, little endian, in the order of the 3DGS reference code: x y z, nx ny nz,
+f_dc_0..2, f_rest_0..44 (channel-major: 15 red, 15 green, 15 blue), opacity (logit), scale_0..2 (log),
+rot_0..3 (w, x, y, z). A surfel has two scales; the third, along the normal, is written negligibly small for
+readers that expect it. Our materials follow as extra properties that other readers skip: base_color_0..2
+(linear), roughness, metallic and object_id (int). What belongs to the whole scene stands in comments:
+``comment tron spacing 0.01``.
+
+The header of a file is held against the file's size before anything is allocated, so that a few hostile bytes
+cannot ask for terabytes.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import plyfile
+
+from tron.color import srgb_to_linear
+from tron.errors import TronError
+from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
+from tron.gaussians.scene import GaussianScene, measure_spacing
+from tron.storage import atomic_path
+
+POSITION = ("x", "y", "z")
+NORMAL = ("nx", "ny", "nz")
+DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+REST = tuple(f"f_rest_{i}" for i in range(3 * (SH_COUNT - 1)))
+SCALES = ("scale_0", "scale_1", "scale_2")
+ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+BASE_COLOR = ("base_color_0", "base_color_1", "base_color_2")
+MATERIALS = (*BASE_COLOR, "roughness", "metallic")
+REQUIRED = (*POSITION, *DC, "opacity", *SCALES[:2], *ROTATION)
+
+# The third scale of a surfel, as a fraction of its smaller one: flat, yet far from underflow in any reader.
+FLATNESS = 1e-3
+# What a Gaussian without materials is taken to be made of: a rough dielectric in its own colours.
+GUESSED_ROUGHNESS = 0.6
+GUESSED_METALLIC = 0.0
+
+_HEADER_LIMIT = 1 << 16
+_TYPE_BYTES = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}
+_EXPORT = "is it a Gaussian scene? export it as an uncompressed 3DGS or 2DGS PLY"
+
+
+def write_ply(path: str | Path, scene: GaussianScene) -> None:
+    """Write a scene, atomically. Raises TronError if the scene is not whole or the file cannot be written."""
+    scene.validate()
+    columns: dict[str, np.ndarray] = {}
+    columns.update(zip(POSITION, scene.means.T))
+    columns.update(zip(NORMAL, scene.normals().T))
+    columns.update(zip(DC, scene.sh[:, 0].T))
+    columns.update(zip(REST, scene.sh[:, 1:].transpose(2, 1, 0).reshape(len(REST), len(scene))))
+    columns["opacity"] = scene.opacity_logits
+    columns.update(zip(SCALES, scene.log_scales.T))
+    columns[SCALES[2]] = scene.log_scales.min(axis=1) + np.float32(np.log(FLATNESS))
+    columns.update(zip(ROTATION, scene.quats.T))
+    columns.update(zip(BASE_COLOR, scene.base_color.T))
+    columns.update(roughness=scene.roughness, metallic=scene.metallic, object_id=scene.object_id)
+    rows = np.empty(len(scene), dtype=[(name, "<i4" if name == "object_id" else "<f4") for name in columns])
+    for name, values in columns.items():
+        rows[name] = values
+    element = plyfile.PlyElement.describe(rows, "vertex")
+    with atomic_path(path) as temporary:
+        plyfile.PlyData([element], byte_order="<", comments=_constants(scene)).write(str(temporary))
+
+
+def read_ply(path: str | Path) -> GaussianScene:
+    """Read a TRON, 2DGS or 3DGS PLY, binary or ascii.
+
+    Of three scales the smallest is dropped and the rotation permuted, so that the surfel's normal is the axis
+    along which the Gaussian was thinnest; quaternions are normalised. f_rest of degree 0 to 3 is accepted. A
+    file without materials gets guessed ones (base colour from the mean colour, rough, not metallic) and says
+    so in `materials_guessed`; a file that is not TRON's has unoriented normals (`oriented` is False), kernel
+    degree 2, z up and a measured spacing.
+
+    Raises TronError, one line, for files that are missing, are no PLY, lack properties (named), declare more
+    than they hold, or hold NaN, infinities or zero quaternions.
+    """
+    path = Path(path)
+    try:
+        with open(path, "rb") as stream:
+            _check_header(stream.read(_HEADER_LIMIT), os.fstat(stream.fileno()).st_size, path)
+        data = plyfile.PlyData.read(str(path))
+    except OSError as error:
+        raise TronError(f"cannot read: {error.strerror or error}", path) from error
+    except (
+        plyfile.PlyParseError,
+        ValueError,
+    ) as error:  # ValueError: ascii numbers and mappings beyond the end
+        raise TronError(f"not a readable PLY: {error}", path) from error
+    constants = _read_constants(data.comments, path)
+    columns = {p.name: data["vertex"][p.name] for p in data["vertex"].properties}
+    _check_properties(columns, path)
+
+    def stack(names: tuple[str, ...]) -> np.ndarray:
+        return np.stack([np.asarray(columns[name], dtype=np.float32) for name in names], axis=-1)
+
+    quats, log_scales = _flatten(stack(ROTATION), stack(tuple(n for n in SCALES if n in columns)), path)
+    sh = _harmonics(columns, stack, path)
+    guessed = MATERIALS[0] not in columns
+    if guessed:
+        base_color = srgb_to_linear(np.clip(dc_to_rgb(sh[:, 0]), 0, 1)).astype(np.float32)
+        roughness = np.full(len(sh), GUESSED_ROUGHNESS, np.float32)
+        metallic = np.full(len(sh), GUESSED_METALLIC, np.float32)
+    else:
+        base_color, roughness, metallic = (
+            stack(BASE_COLOR),
+            stack(("roughness",))[:, 0],
+            stack(("metallic",))[:, 0],
+        )
+    means = stack(POSITION)
+    if not np.isfinite(means).all():
+        raise TronError("a position is not finite", path)
+    scene = GaussianScene(
+        means=means,
+        quats=quats,
+        log_scales=log_scales,
+        opacity_logits=stack(("opacity",))[:, 0],
+        sh=sh,
+        base_color=base_color,
+        roughness=roughness,
+        metallic=metallic,
+        object_id=_object_id(columns, len(means), path),
+        kernel_degree=int(constants.get("kernel_degree", [2])[0]),
+        spacing=constants["spacing"][0] if "spacing" in constants else measure_spacing(means),
+        up=np.array(constants.get("up", (0.0, 0.0, 1.0))),
+        materials_guessed=guessed or bool(constants.get("materials_guessed", [0])[0]),
+        oriented=bool(constants.get("oriented", [0])[0]),
+    )
+    return scene.validate(path)
+
+
+def _constants(scene: GaussianScene) -> list[str]:
+    up = " ".join(repr(float(v)) for v in scene.up)
+    return [
+        f"tron kernel_degree {scene.kernel_degree}",
+        f"tron spacing {scene.spacing!r}",
+        f"tron up {up}",
+        f"tron oriented {int(scene.oriented)}",
+        f"tron materials_guessed {int(scene.materials_guessed)}",
+    ]
+
+
+def _read_constants(comments: list[str], path: Path) -> dict[str, list[float]]:
+    """{name: numbers} of the comments that are ours, those that we do not know included."""
+    constants = {}
+    for comment in comments:
+        words = comment.split()
+        if len(words) < 3 or words[0] != "tron":
+            continue
+        try:
+            constants[words[1]] = [float(word) for word in words[2:]]
+        except ValueError:
+            raise TronError(f"comment '{comment[:60]}' does not hold numbers", path) from None
+    return constants
+
+
+def _check_header(head: bytes, size: int, path: Path) -> None:
+    """Raise TronError unless the elements that the header declares fit into the bytes that follow it.
+
+    `head` holds the first bytes of the file, `size` is the file's length. Only sizes are judged here; the
+    grammar is plyfile's business.
+    """
+    if not head.startswith(b"ply"):
+        raise TronError("not a PLY file", path)
+    end = head.find(b"end_header")
+    if end < 0:
+        raise TronError("the PLY header has no end", path)
+    ascii_body = False
+    elements: list[tuple[str, int, int]] = []  # name, count, least bytes of a row
+    for line in head[:end].decode("ascii", "replace").splitlines():
+        words = line.split()
+        if words[:2] == ["format", "ascii"]:
+            ascii_body = True
+        elif len(words) == 3 and words[0] == "element" and words[2].isdigit():
+            elements.append((words[1], int(words[2]), 0))
+        elif words[:1] == ["property"] and elements and len(words) >= 3:
+            name, count, row = elements[-1]
+            # Of a list only its length is certain to be there. In text, a digit and a separator are.
+            kind = words[2] if words[1] == "list" else words[1]
+            elements[-1] = (name, count, row + (2 if ascii_body else _TYPE_BYTES.get(kind, 1)))
+    if "vertex" not in [name for name, _, _ in elements]:
+        raise TronError("the PLY has no vertex element", path, _EXPORT)
+    if any(row == 0 and count for _, count, row in elements):
+        raise TronError("the PLY declares an element without properties", path)
+    needed = sum(count * row for _, count, row in elements)
+    if needed > size - end:
+        rows = max(elements, key=lambda element: element[1] * element[2])
+        raise TronError(
+            f"the PLY declares {rows[1]} rows of '{rows[0]}', {needed} bytes or more, and holds {size - end}",
+            path,
+            "the file is cut short or damaged",
+        )
+
+
+def _check_properties(columns: dict[str, np.ndarray], path: Path) -> None:
+    missing = [name for name in REQUIRED if name not in columns]
+    if missing:
+        raise TronError(f"the PLY lacks {', '.join(missing)}", path, _EXPORT)
+    for name, values in columns.items():
+        if values.dtype == object and name in (*REQUIRED, *REST, *MATERIALS, SCALES[2], "object_id"):
+            raise TronError(f"property {name} is a list", path, _EXPORT)
+    present = [name for name in MATERIALS if name in columns]
+    if present and len(present) < len(MATERIALS):
+        absent = ", ".join(name for name in MATERIALS if name not in columns)
+        raise TronError(f"the PLY has {present[0]} but lacks {absent}", path, "write all materials or none")
+
+
+def _harmonics(
+    columns: dict[str, np.ndarray], stack: Callable[[tuple[str, ...]], np.ndarray], path: Path
+) -> np.ndarray:
+    """(M, 16, 3) coefficients; degrees that the file does not have are zero."""
+    dc = stack(DC)
+    sh = np.zeros((len(dc), SH_COUNT, 3), np.float32)
+    sh[:, 0] = dc
+    count = sum(name.startswith("f_rest_") for name in columns)
+    if count not in (0, 9, 24, 45) or any(name not in columns for name in REST[:count]):
+        raise TronError(f"the PLY has {count} f_rest properties", path, "degrees 0 to 3 have 0, 9, 24 or 45")
+    bands = count // 3
+    if bands:
+        sh[:, 1 : 1 + bands] = stack(REST[: 3 * bands]).reshape(len(dc), 3, bands).transpose(0, 2, 1)
+    return sh
+
+
+def _object_id(columns: dict[str, np.ndarray], count: int, path: Path) -> np.ndarray:
+    if "object_id" not in columns:
+        return np.zeros(count, np.int32)
+    values = np.asarray(columns["object_id"], dtype=np.float64)
+    whole = np.abs(values) < 2**31
+    if not whole.all():
+        raise TronError(f"object_id of surfel {int((~whole).argmax())} is no 32-bit number", path)
+    return values.astype(np.int32)
+
+
+def _flatten(quats: np.ndarray, log_scales: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Drop the smallest of three scales: (M, 4), (M, 2 or 3) -> unit quats with the thin axis last, (M, 2)."""
+    if not (np.isfinite(quats).all() and np.isfinite(log_scales).all()):
+        raise TronError("a rotation or scale is not finite", path)
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+    if (lengths < 1e-6).any():
+        raise TronError(f"rotation of surfel {int(lengths.argmin())} is a zero quaternion", path)
+    # Unit quaternions are left alone to the last bit: a scene written and read is the same scene.
+    quats = np.where(np.abs(lengths - 1) > 1e-6, quats / lengths, quats)
+    if log_scales.shape[1] == 2:
+        return quats, log_scales
+    thin = log_scales.argmin(axis=1)
+    # A third turn about (1, 1, 1) cycles the axes (u, v, n) -> (v, n, u), two of them -> (n, u, v): the thin
+    # axis becomes the third column and the frame stays right-handed.
+    w, x, y, z = quats.T
+    cycled = np.stack([w - x - y - z, w + x + y - z, w - x + y + z, w + x - y + z], axis=-1) / 2
+    twice = np.stack([w + x + y + z, -w + x - y + z, -w + x + y - z, -w - x + y + z], axis=-1) / 2
+    kept = np.array([[1, 2], [2, 0], [0, 1]])[thin]
+    quats = np.choose(thin[:, None], [cycled, twice, quats])
+    return quats.astype(np.float32), np.take_along_axis(log_scales, kept, axis=1)
