@@ -1,0 +1,179 @@
+"""Camera paths around a target: the data engine's spiral and oscillation, an orbit, and keyframes.
+
+Angles are in degrees. Azimuth turns counter-clockwise about ``up`` seen from its tip, and is measured from the
+world's x axis where up is +z. Elevation is the angle above the plane through the target orthogonal to ``up``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from tron.cameras import Camera
+from tron.errors import TronError
+
+Vector = Sequence[float] | np.ndarray
+Z_UP = (0.0, 0.0, 1.0)
+
+
+def spiral(
+    n: int,
+    *,
+    target: Vector,
+    radius: float,
+    width: int,
+    height: int,
+    fov_deg: float,
+    elevation_deg: tuple[float, float] = (10.0, 75.0),
+    turns: float = 3.0,
+    phase: float = 0.0,
+    up: Vector = Z_UP,
+) -> list[Camera]:
+    """Wind around the target from the lower to the upper elevation, evenly over the sphere's area.
+
+    Views used for reconstruction should neither crowd at the top nor miss a side; equal steps in the sine of
+    the elevation are equal steps in area.
+
+    Args:
+        n: number of cameras.
+        target: (3,) world point in the middle of every image.
+        radius: distance of the cameras from the target, world units.
+        width, height, fov_deg: image size in pixels and horizontal field of view.
+        elevation_deg: of the first and the last camera, within (-90, 90).
+        turns: windings from the first to the last camera.
+        phase: azimuth of the first camera in degrees.
+        up: (3,) world direction.
+    """
+    fraction = _fractions(n)
+    low, high = np.sin(np.radians(elevation_deg))
+    elevation = np.degrees(np.arcsin(low + (high - low) * fraction))
+    azimuth = phase + 360.0 * turns * fraction
+    return _around(azimuth, elevation, target, radius, up, fov_deg, width, height)
+
+
+def oscillating(
+    n: int,
+    *,
+    target: Vector,
+    radius: float,
+    width: int,
+    height: int,
+    fov_deg: float,
+    elevation_deg: float = 28.0,
+    amplitude_deg: float = 14.0,
+    azimuth_deg: tuple[float, float] = (17.0, 338.0),
+    swings: float = 2.0,
+    up: Vector = Z_UP,
+) -> list[Camera]:
+    """Travel around the target while rising and sinking: the path of the benchmark's test clips.
+
+    Args:
+        n: number of cameras.
+        target, radius, width, height, fov_deg, up: as in :func:`spiral`.
+        elevation_deg: mean elevation.
+        amplitude_deg: largest deviation from it.
+        azimuth_deg: of the first and the last camera.
+        swings: full up-and-down periods from the first to the last camera.
+    """
+    fraction = _fractions(n)
+    azimuth = azimuth_deg[0] + (azimuth_deg[1] - azimuth_deg[0]) * fraction
+    elevation = elevation_deg + amplitude_deg * np.sin(2 * np.pi * swings * fraction)
+    return _around(azimuth, elevation, target, radius, up, fov_deg, width, height)
+
+
+def orbit(
+    n: int,
+    *,
+    target: Vector,
+    radius: float,
+    width: int,
+    height: int,
+    fov_deg: float,
+    elevation_deg: float = 25.0,
+    phase: float = 0.0,
+    up: Vector = Z_UP,
+) -> list[Camera]:
+    """Go once around the target at one elevation; frame n would be frame 0 again, so the clip loops.
+
+    Args: as in :func:`spiral`.
+    """
+    _fractions(n)
+    azimuth = phase + 360.0 * np.arange(n) / n
+    return _around(azimuth, np.full(n, elevation_deg), target, radius, up, fov_deg, width, height)
+
+
+def keyframed(cameras: Sequence[Camera], n: int) -> list[Camera]:
+    """Move through the given cameras in order, in n frames that include the first and the last.
+
+    Rotations are interpolated on the sphere (slerp), positions and intrinsics linearly, at equal time from
+    one keyframe to the next.
+
+    Args:
+        cameras: at least one; all of one image size.
+        n: number of frames.
+
+    Raises:
+        TronError: no camera, or image sizes that differ.
+    """
+    if not cameras:
+        raise TronError("a keyframed path needs at least one camera")
+    first = cameras[0]
+    if any((camera.width, camera.height) != (first.width, first.height) for camera in cameras):
+        raise TronError("the cameras of a keyframed path must share one image size")
+    if len(cameras) == 1:
+        return [first for _ in _fractions(n)]
+    keys = np.arange(len(cameras), dtype=np.float64)
+    times = _fractions(n) * keys[-1]
+    rotations = Slerp(keys, Rotation.from_matrix([camera.world_to_camera[:3, :3] for camera in cameras]))(times)
+    values = [[*camera.position, camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras]
+    tracks = np.stack([np.interp(times, keys, track) for track in np.transpose(values)], axis=1)
+    path = []
+    for rotation, track in zip(rotations.as_matrix(), tracks):
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation
+        matrix[:3, 3] = -rotation @ track[:3]
+        path.append(Camera(*track[3:].tolist(), first.width, first.height, matrix))
+    return path
+
+
+def _fractions(n: int) -> np.ndarray:
+    """(n,) from 0 to 1, both included; a path of a single camera is its start."""
+    if n < 1:
+        raise TronError(f"a camera path needs at least one camera, not {n}")
+    return np.arange(n) / max(n - 1, 1)
+
+
+def _around(
+    azimuth_deg: np.ndarray,
+    elevation_deg: np.ndarray,
+    target: Vector,
+    radius: float,
+    up: Vector,
+    fov_deg: float,
+    width: int,
+    height: int,
+) -> list[Camera]:
+    if np.abs(elevation_deg).max() >= 90:
+        raise TronError("elevations of a camera path must stay between -90 and 90 degrees")
+    if not radius > 0:
+        raise TronError(f"radius of a camera path must be positive, not {radius}")
+    east, north, zenith = _frame(np.asarray(up, dtype=np.float64))
+    azimuth, elevation = np.radians(azimuth_deg)[:, None], np.radians(elevation_deg)[:, None]
+    outward = np.cos(elevation) * (np.cos(azimuth) * east + np.sin(azimuth) * north) + np.sin(elevation) * zenith
+    return [
+        Camera.look_at(position, target, up=zenith, fov_deg=fov_deg, width=width, height=height)
+        for position in np.asarray(target, dtype=np.float64) + radius * outward
+    ]
+
+
+def _frame(up: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Right-handed east, north, zenith; east is the world's x axis made orthogonal to up where that exists."""
+    if not np.linalg.norm(up) > 0:
+        raise TronError("up direction must not be zero")
+    zenith = up / np.linalg.norm(up)
+    axis = np.array([1.0, 0.0, 0.0]) if abs(zenith[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    east = axis - zenith * (axis @ zenith)
+    east /= np.linalg.norm(east)
+    return east, np.cross(zenith, east), zenith
