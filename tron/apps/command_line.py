@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import pydantic
+import yaml
 from omegaconf import OmegaConf
 from rich.console import Console
 from rich.logging import RichHandler
 
 import tron
 from tron.apps.help_page import default_examples, render_help
-from tron.apps.recipes import check, compose_recipe, group_options
+from tron.apps.recipes import check, compose_recipe, group_options, resolve
 from tron.errors import TronError
 
 Settings = TypeVar("Settings", bound=pydantic.BaseModel)
@@ -64,7 +65,7 @@ def command(
                 return 0
             recipe = compose_recipe(config_module, options.overrides, options.config_dir)
             if options.cfg:
-                print(OmegaConf.to_yaml(recipe, resolve=True), end="")
+                print(yaml.safe_dump(resolve(recipe), sort_keys=False), end="")
                 return 0
             checked = check(recipe, settings)
             configure_logging()

@@ -54,7 +54,7 @@ def compose_recipe(
             _require_option(each, groups[each.key_or_group])
         try:
             base = compose("config", overrides=[*search, *(str(each.input_line) for each in selections)])
-            known = [*keys(base), *groups]
+            known = [*(key for key, _ in nested_items(OmegaConf.to_container(base))), *groups]
             for each in parsed:
                 if not each.is_add() and not each.is_force_add() and each.key_or_group not in known:
                     raise unknown_key(each.key_or_group, known)
@@ -70,26 +70,34 @@ def check(recipe: DictConfig, settings: type[Settings]) -> Settings:
         TronError: a required key has no value, or a key is unknown or of the wrong type; the first of them
             is named.
     """
-    for key in sorted(OmegaConf.missing_keys(recipe)):
-        raise _required(key)
-    try:
-        values = OmegaConf.to_container(recipe, resolve=True)
-    except OmegaConfBaseException as error:
-        raise TronError(_first_line(error)) from error
+    for key, value in nested_items(OmegaConf.to_container(recipe)):
+        if value == "???":
+            raise _required(key)
+    values = resolve(recipe)
     try:
         return settings.model_validate(values)
     except pydantic.ValidationError as error:
         raise _one_line(error, values, settings) from error
 
 
-def keys(values: Any, prefix: str = "") -> Iterator[str]:
-    """Every key of a nested mapping, dotted, parents before children."""
-    if OmegaConf.is_config(values):
-        values = OmegaConf.to_container(values, resolve=False)
+def resolve(recipe: DictConfig) -> Any:
+    """The recipe as nested dicts and lists, with every interpolation replaced by its value.
+
+    Raises:
+        TronError: an interpolation names a key that does not exist or has no value.
+    """
+    try:
+        return OmegaConf.to_container(recipe, resolve=True)
+    except OmegaConfBaseException as error:
+        raise TronError(_first_line(error)) from error
+
+
+def nested_items(values: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every dotted key of a nested mapping with its value, parents before children."""
     if isinstance(values, Mapping):
         for name, value in values.items():
-            yield f"{prefix}{name}"
-            yield from keys(value, f"{prefix}{name}.")
+            yield f"{prefix}{name}", value
+            yield from nested_items(value, f"{prefix}{name}.")
 
 
 def group_options(config_module: str) -> dict[str, dict[str, str]]:
