@@ -64,7 +64,7 @@ def oscillating(
     elevation_deg: float = 28.0,
     amplitude_deg: float = 14.0,
     azimuth_deg: tuple[float, float] = (17.0, 338.0),
-    swings: float = 2.0,
+    swings: float = 1.5,
     up: Vector = Z_UP,
 ) -> list[Camera]:
     """Travel around the target while rising and sinking: the path of the benchmark's test clips.
