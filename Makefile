@@ -1,0 +1,34 @@
+BIN := .venv/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-long lint format clean
+
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup:  ## make .venv, install the pinned dependencies, check LLVM
+	@.ci/setup
+
+demo: setup  ## from a procedural scene to an evaluated neural renderer (15 minutes on two cores)
+	$(BIN)/tron-eval benchmark=demo output_dir=outputs/demo
+	@echo "report: $(CURDIR)/outputs/demo/report.html"
+
+test: setup  ## the fast tests
+	$(BIN)/python -m pytest -m "not long"
+
+test-long: setup  ## the tests marked long
+	$(BIN)/python -m pytest -m long || [ $$? -eq 5 ]  # 5: pytest collected none
+
+lint: setup  ## style, formatting, who may import whom, types
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/lint-imports
+	$(BIN)/pyright
+
+format: setup  ## let ruff mend and format the code
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+clean:  ## remove caches, build results and .venv; outputs/ stays
+	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
