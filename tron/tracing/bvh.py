@@ -1,10 +1,10 @@
 """A bounding volume hierarchy for arbitrary rays: perfectly balanced, threaded with skip links, no stack.
 
-Built by median splits of the longest axis, level by level, all nodes of a level at once.  The tree is perfect, so
-nodes in depth-first order follow from arithmetic: a node's left child is the next one, and its skip link (where to go
-when the box is missed, or after a leaf) is itself plus the size of its subtree.  A node is four 32-bit words: six
-16-bit bounds on a grid over the scene, rounded outwards, and the skip link or leaf word.  Four words are one packet;
-float bounds took 2.7 times as long (tracer.md).
+Built by median splits of the longest axis, level by level, all nodes of a level at once. The tree is
+perfect, so nodes in depth-first order follow from arithmetic: a node's left child is the next one, and
+its skip link (where to go when the box is missed, or after a leaf) is itself plus the size of its
+subtree. A node is four 32-bit words: six 16-bit bounds on a grid over the scene, rounded outwards, and
+the skip link or leaf word. Four words are one packet; float bounds took 2.7 times as long (tracer.md).
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _depth_first(levels: int) -> list[np.ndarray]:
     indices = [np.zeros(1, np.int64)]
     for level in range(levels):
         parent = indices[-1]
-        right = parent + (1 << (levels - level))  # one past the left child's subtree of 2^(levels - level) - 1 nodes
+        right = parent + (1 << (levels - level))  # past the left subtree of 2^(levels - level) - 1 nodes
         indices.append(np.stack([parent + 1, right], 1).ravel())
     return indices
 
@@ -91,7 +91,9 @@ def build_bvh(geometry: np.ndarray, degree: int) -> Bvh:
     count = len(geometry)
     if count == 0:
         empty = np.array([0, 0, 0, LEAF_BIT], np.uint32)
-        return _upload(empty, np.zeros(12, np.float32), np.zeros(0, np.int64), np.zeros(3), np.ones(3), degree)
+        return _upload(
+            empty, np.zeros(12, np.float32), np.zeros(0, np.int64), np.zeros(3), np.ones(3), degree
+        )
     low, high = surfel_bounds(geometry)
     levels = max(0, int(np.ceil(np.log2(count / LEAF_SIZE))))
     order, counts = median_order((low + high) / 2, levels)
@@ -121,12 +123,23 @@ def build_bvh(geometry: np.ndarray, degree: int) -> Bvh:
 
 
 def _upload(
-    words: np.ndarray, geometry: np.ndarray, order: np.ndarray, origin: np.ndarray, scale: np.ndarray, degree: int
+    words: np.ndarray,
+    geometry: np.ndarray,
+    order: np.ndarray,
+    origin: np.ndarray,
+    scale: np.ndarray,
+    degree: int,
 ) -> Bvh:
     grid_origin, grid_scale = mi.Point3f([float(v) for v in origin]), mi.Vector3f([float(v) for v in scale])
     dr.make_opaque(grid_origin, grid_scale)
     bvh = Bvh(
-        mi.UInt32(words), dr.opaque(mi.UInt32, len(words) // 4), mi.Float(geometry), order, grid_origin, grid_scale, degree
+        mi.UInt32(words),
+        dr.opaque(mi.UInt32, len(words) // 4),
+        mi.Float(geometry),
+        order,
+        grid_origin,
+        grid_scale,
+        degree,
     )
     dr.eval(bvh.nodes, bvh.geometry)
     return bvh

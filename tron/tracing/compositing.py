@@ -1,7 +1,7 @@
-"""Front-to-back compositing of sorted hits: ``sum_i T_i alpha_i f_i`` with ``T_i = prod_{j<i} (1 - alpha_j)``.
+"""Front-to-back compositing of sorted hits: ``sum_i T_i alpha_i f_i``, ``T_i = prod_{j<i} (1 - alpha_j)``.
 
-(Equation 3 of the TRON paper.)  Compositing ends at the first hit after which T < 0.001.  The ids of the composited
-hits are written out in order, so that an adjoint can replay exactly this list.
+(Equation 3 of the TRON paper.)  Compositing ends at the first hit after which T < 0.001.  The ids of the
+composited hits are written out in order, so that an adjoint can replay exactly this list.
 """
 
 from __future__ import annotations
@@ -86,11 +86,12 @@ def composite(records: SurfelRecords, hits: LocalHits, direction: mi.Vector3f, o
     channels = [mi.Float(0) for _ in range(CHANNELS)]
     mean_depth, median_depth, remaining = mi.Float(0), mi.Float(0), mi.Float(1)
     lane, slot = dr.arange(mi.UInt32, out.rays), mi.UInt32(0)
+    stride = dr.opaque(mi.UInt32, out.rays)  # a literal would compile a kernel for each image size
     basis = sh_basis(direction.x, direction.y, direction.z)
     active = slot < hits.count
     while active:
         alpha, index, t = hits.alpha[slot], hits.index[slot], hits.t[slot]
-        dr.scatter(out.ids, index, slot * out.rays + lane, active)
+        dr.scatter(out.ids, index, slot * stride + lane, active)
         weight = remaining * alpha
         for packet in range(FEATURE_PACKETS):
             feature = dr.gather(mi.Vector4f, records.features, index * FEATURE_PACKETS + packet)

@@ -1,9 +1,13 @@
 """Camera + scene -> GBuffer: one traced, composited and normalised surface point a pixel.
 
-Normalising (facts.md 4b): composited channels are alpha-weighted sums, so materials are divided by opacity and the
-normal is brought back to unit length.  The surface point is at the median depth; where transmittance never falls
-below one half there is no median, and the alpha-weighted mean depth stands in wherever opacity is not zero.
+Normalising (facts.md 4b): composited channels are alpha-weighted sums, so materials are divided by
+opacity and the normal is brought back to unit length. The surface point is at the median depth; where
+transmittance never falls below one half there is no median, and the alpha-weighted mean depth stands in
+where opacity is not zero.
 """
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations
 
@@ -59,9 +63,8 @@ class GBuffer:
 
     def _image(self, value: mi.Float) -> np.ndarray:
         array = np.array(value)
-        return array.reshape(self.height, self.width) if array.ndim == 1 else np.ascontiguousarray(
-            array.T.reshape(self.height, self.width, -1)
-        )
+        shape = (self.height, self.width) if array.ndim == 1 else (self.height, self.width, -1)
+        return np.ascontiguousarray(array.T.reshape(shape))
 
 
 @dataclass
@@ -100,8 +103,10 @@ def _row_major_lanes(width: int, height: int, tiles_x: int) -> mi.UInt32:
     return ((y // TILE) * across + x // TILE) * LANES + (y % TILE) * TILE + x % TILE
 
 
-def trace_tiles(records: SurfelRecords, lists: TileLists, rays: _TileRays) -> tuple[Composite, HitList, mi.UInt32]:
-    """Collect, sort and composite in one kernel; returns the sums, the hit list and the hits met, in tile order."""
+def trace_tiles(
+    records: SurfelRecords, lists: TileLists, rays: _TileRays
+) -> tuple[Composite, HitList, mi.UInt32]:
+    """Collect, sort and composite in one kernel: the sums, the hit list and the hits met, in tile order."""
     start = dr.gather(mi.UInt32, lists.start, rays.tile)
     count = dr.select(rays.inside, dr.gather(mi.UInt32, lists.count, rays.tile), 0)
     out = HitList.empty(dr.width(rays.tile))
@@ -109,7 +114,9 @@ def trace_tiles(records: SurfelRecords, lists: TileLists, rays: _TileRays) -> tu
     sort(hits)
     sums = composite(records, hits, rays.direction, out)
     out.count = sums.count
-    dr.eval(sums.channels, sums.mean_depth, sums.transmittance, sums.median_depth, out.ids, out.count, hits.met)
+    dr.eval(
+        sums.channels, sums.mean_depth, sums.transmittance, sums.median_depth, out.ids, out.count, hits.met
+    )
     return sums, out, hits.met
 
 

@@ -15,7 +15,7 @@ import mitsuba as mi
 from tron.tracing.kernel import T_MIN, SurfelRecords, intersect
 
 MAX_HITS = 64
-"""Hits kept a ray. Rays that meet more keep the 64 whose surfels come nearest; they are counted (GBuffer.overflow)."""
+"""Hits kept a ray. Of more, those of the nearest surfels are kept; GBuffer.overflow counts the rest."""
 
 
 @dataclass
@@ -23,7 +23,7 @@ class LocalHits:
     """The hits of each lane in thread-local memory, slot 0 nearest; alive inside one kernel only.
 
     Attributes:
-        t, alpha: local arrays of mi.Float; index: of mi.UInt32. Each has ``MAX_HITS`` slots and one for rejects.
+        t, alpha: local arrays of mi.Float; index: of mi.UInt32. ``MAX_HITS`` slots and one for rejects.
         count: mi.UInt32, hits kept; met: hits met before the cap.
     """
 
@@ -58,9 +58,9 @@ def collect(
 ) -> LocalHits:  # fmt: skip
     """Walk each lane's candidate list and keep its front-facing hits, unsorted.
 
-    Exact early end: once the product of (1 - alpha) over what was met falls below ``stop``, nothing beyond the
-    farthest hit met so far can matter, because those hits alone already stop the ray.  Lists are sorted by ``near``,
-    so traversal ends at the first candidate that begins beyond that distance.
+    Exact early end: once the product of (1 - alpha) over what was met falls below ``stop``, nothing beyond
+    the farthest hit met so far can matter, because those hits alone already stop the ray.  Lists are sorted
+    by ``near``, so traversal ends at the first candidate that begins beyond that distance.
 
     Args:
         records: the surfels.
@@ -95,7 +95,7 @@ def collect(
 
 
 def sort(hits: LocalHits) -> None:
-    """Order each lane's hits by (t, id) in place, by a sorting network in registers: no branches, no divergence."""
+    """Order each lane's hits by (t, id) in place, by a sorting network in registers: no branches."""
     t, index, alpha = [], [], []
     for slot in range(MAX_HITS):
         t.append(dr.select(hits.count > slot, hits.t[mi.UInt32(slot)], dr.inf))
@@ -104,7 +104,8 @@ def sort(hits: LocalHits) -> None:
     for low, high in odd_even_merge_network(MAX_HITS):
         swap = (t[high] < t[low]) | ((t[high] == t[low]) & (index[high] < index[low]))
         for keys in (t, index, alpha):
-            keys[low], keys[high] = dr.select(swap, keys[high], keys[low]), dr.select(swap, keys[low], keys[high])
+            first, second = keys[low], keys[high]
+            keys[low], keys[high] = dr.select(swap, second, first), dr.select(swap, first, second)
     for slot in range(MAX_HITS):
         hits.t[mi.UInt32(slot)] = t[slot]
         hits.index[mi.UInt32(slot)] = index[slot]

@@ -1,14 +1,18 @@
-"""The kernel of a 2D Gaussian surfel: where a ray meets its disk, and how opaque the disk is there.
+"""The kernel of a 2D Gaussian surfel: where a ray meets its disk and how opaque it is there.
 
-A surfel is a flat Gaussian in the plane of its tangents ``t_u, t_v``.  With ``p`` the point where the ray meets
-that plane, ``u = (p - c) . t_u / s_u``, ``v = (p - c) . t_v / s_v`` and ``q = u^2 + v^2``, its opacity there is
+A surfel is a flat Gaussian in the plane of its tangents ``t_u, t_v``. With ``p`` the point where the ray
+meets that plane, ``u = (p - c) . t_u / s_u``, ``v = (p - c) . t_v / s_v`` and ``q = u^2 + v^2``, its
+opacity is
 
     alpha = min(o * response(q), 0.99),     ignored where response(q) < 0.0113 or alpha < 1/255
 
-with ``response(q) = exp(-q / 2)`` for degree 2 (2DGS, Huang et al. 2024) and ``exp(-(4.5 / 81) q^2)`` for degree 4
-(3DGRT's generalised Gaussian, Moenne-Loccoz et al. 2024).  Both reach the same value at three sigma.  Nothing else
-in the house evaluates this formula, except the float64 oracle in :mod:`tron.tracing.reference`.
+with ``response(q) = exp(-q / 2)`` for degree 2 (2DGS, Huang et al. 2024) and ``exp(-(4.5 / 81) q^2)`` for
+degree 4 (3DGRT's generalised Gaussian, Moenne-Loccoz et al. 2024). Both reach the same value at three
+sigma. Nothing else evaluates this formula, except the float64 oracle in :mod:`tron.tracing.reference`.
 """
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations
 
@@ -41,7 +45,7 @@ SH_PACKETS = 12
 
 
 def cut_radius_squared(opacities: np.ndarray, degree: int) -> np.ndarray:
-    """Largest squared Mahalanobis distance ``q`` at which a surfel still counts; negative where it never does.
+    """Largest squared Mahalanobis distance at which a surfel still counts; negative where it never does.
 
     Args:
         opacities: (M,) float, after the sigmoid.
@@ -68,7 +72,7 @@ def response(q: Any, degree: int) -> Any:
 
 @dataclass
 class SurfelRecords:
-    """A scene's surfels as packed Dr.Jit buffers, in the scene's order or in the order of a hierarchy's leaves.
+    """A scene's surfels as packed Dr.Jit buffers, in the scene's order.
 
     Attributes:
         geometry: mi.Float, M records of ``4 * GEOMETRY_PACKETS``.
@@ -123,7 +127,7 @@ def upload(scene: GaussianScene, geometry: np.ndarray) -> SurfelRecords:
     """Upload a scene's surfels and their ``pack_geometry`` records, in the scene's own order."""
     degree = sh_degree(scene)
     # Dr.Jit refuses empty arrays as loop state: an unused scalar stands in.
-    harmonics = scene.sh.transpose(0, 2, 1).astype(np.float32).ravel() if degree > 0 else np.zeros(1, np.float32)
+    harmonics = scene.sh.transpose(0, 2, 1).ravel() if degree > 0 else np.zeros(1, np.float32)
     records = SurfelRecords(
         geometry=mi.Float(geometry.ravel()),
         features=mi.Float(pack_features(scene).ravel()),
@@ -155,10 +159,12 @@ class SurfelHit:
     near: mi.Float
 
 
-def intersect(geometry: mi.Float, index: mi.UInt32, origin: mi.Point3f, direction: mi.Vector3f, degree: int) -> SurfelHit:
+def intersect(
+    geometry: mi.Float, index: mi.UInt32, origin: mi.Point3f, direction: mi.Vector3f, degree: int
+) -> SurfelHit:
     """Meet a ray with the surfel ``index`` (formula: module docstring).
 
-    The normal is not stored: ``(t_u / s_u) x (t_v / s_v)`` points the same way and its length cancels in ``t``.
+    The normal is not stored: ``(t_u / s_u) x (t_v / s_v)`` points the same way and its length cancels in t.
     Reading memory dominates, so a record is three packets and everything else is recomputed.
     An edge-on ray divides zero by zero; the comparisons are then false and the hit does not count.
     """
@@ -167,7 +173,8 @@ def intersect(geometry: mi.Float, index: mi.UInt32, origin: mi.Point3f, directio
     axis_u = dr.gather(mi.Vector4f, geometry, base + 1)
     axis_v = dr.gather(mi.Vector4f, geometry, base + 2)
     to_centre = mi.Vector3f(centre[0] - origin.x, centre[1] - origin.y, centre[2] - origin.z)
-    u_axis, v_axis = mi.Vector3f(axis_u[0], axis_u[1], axis_u[2]), mi.Vector3f(axis_v[0], axis_v[1], axis_v[2])
+    u_axis = mi.Vector3f(axis_u[0], axis_u[1], axis_u[2])
+    v_axis = mi.Vector3f(axis_v[0], axis_v[1], axis_v[2])
     normal = dr.cross(u_axis, v_axis)
     facing = dr.dot(normal, direction)
     t = dr.dot(normal, to_centre) / facing

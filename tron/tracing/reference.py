@@ -1,7 +1,7 @@
 """Slow float64 NumPy versions of the tracer: the oracle of every test, sharing no code with what it judges.
 
-Only the constants of :mod:`tron.tracing.kernel` are shared; intersection, ordering, stopping and compositing are
-written again here in the most obvious way.
+Only constants are shared; intersection, ordering, stopping and compositing are written again here in the most
+obvious way.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class ReferenceHits:
         median_depth: (P,) distance of the first hit after which T < 0.5, or 0.
         hits: (P,) int, number of composited hits.
         margin: (P,) smallest distance of any compared value to a threshold (alpha cut, stop, median): pixels
-            with a tiny margin may legitimately differ in float32.
+            with a tiny margin may differ in float32.
     """
 
     normal: np.ndarray
@@ -97,8 +97,10 @@ def composite(scene: GaussianScene, origins: np.ndarray, directions: np.ndarray)
         [surfels.normals, scene.base_color, scene.roughness[:, None], scene.metallic[:, None]], 1
     ).astype(np.float64)
     out = np.zeros((rays, 12))
-    transmittance, median, hits, margins = np.ones(rays), np.zeros(rays), np.zeros(rays, int), np.full(rays, np.inf)
-    for ray, (origin, direction) in enumerate(zip(origins.astype(np.float64), directions.astype(np.float64), strict=True)):
+    transmittance, median, hits = np.ones(rays), np.zeros(rays), np.zeros(rays, int)
+    margins = np.full(rays, np.inf)
+    for ray in range(rays):
+        origin, direction = origins[ray].astype(np.float64), directions[ray].astype(np.float64)
         t, alpha, counted, front, margin = surfels.intersect(origin, direction)
         near_cut = front & (t > 0)
         margins[ray] = margin[near_cut].min() if near_cut.any() else np.inf
@@ -118,8 +120,16 @@ def composite(scene: GaussianScene, origins: np.ndarray, directions: np.ndarray)
                 break
         transmittance[ray] = remaining
     return ReferenceHits(
-        normal=out[:, 0:3], base_color=out[:, 3:6], roughness=out[:, 6], metallic=out[:, 7], rgb=out[:, 8:11],
-        mean_depth=out[:, 11], transmittance=transmittance, median_depth=median, hits=hits, margin=margins,
+        normal=out[:, 0:3],
+        base_color=out[:, 3:6],
+        roughness=out[:, 6],
+        metallic=out[:, 7],
+        rgb=out[:, 8:11],
+        mean_depth=out[:, 11],
+        transmittance=transmittance,
+        median_depth=median,
+        hits=hits,
+        margin=margins,
     )
 
 
@@ -128,16 +138,18 @@ def transmittance(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Transmittance of shadow rays and its margin to a threshold, both (P,) float64.
 
-    Front faces count from t = 0, back faces beyond ``BACK_FACE_SPACINGS`` surfel spacings (never, if one-sided).
+    Front faces count from t = 0, back faces beyond ``BACK_FACE_SPACINGS`` spacings (never, if one-sided).
     """
     surfels = _Surfels(scene)
     result, margins = np.ones(len(origins)), np.full(len(origins), np.inf)
     reach = BACK_FACE_SPACINGS * scene.spacing
-    for ray, (origin, direction) in enumerate(zip(origins.astype(np.float64), directions.astype(np.float64), strict=True)):
+    for ray in range(len(origins)):
+        origin, direction = origins[ray].astype(np.float64), directions[ray].astype(np.float64)
         t, alpha, counted, front, margin = surfels.intersect(origin, direction)
         blocks = counted & np.where(front, t > 0, two_sided & (t > reach))
         product = np.prod(1 - alpha[blocks])
         result[ray] = product if product >= OPAQUE_TRANSMITTANCE else 0.0
         near = np.where(front, np.abs(t), np.abs(t - reach))
-        margins[ray] = min(np.minimum(margin, np.where(counted, near, np.inf)).min(initial=np.inf), abs(product - OPAQUE_TRANSMITTANCE))
+        thresholds = np.minimum(margin, np.where(counted, near, np.inf))
+        margins[ray] = min(thresholds.min(initial=np.inf), abs(product - OPAQUE_TRANSMITTANCE))
     return result, margins

@@ -1,9 +1,9 @@
 """Screen tiles: which surfels can touch which 4x4 block of pixels, nearest first.
 
-A tile's 16 pixels fill one 16-lane packet, so every lane of a packet walks the same list.  A surfel is a candidate
-for a tile where the exact screen-space bounds of its (cut) ellipse overlap the tile's pixel centres.  Lists are
-sorted by ``near = |c - o| - r``, a lower bound of the distance to any point of the surfel, which lets traversal stop
-early without being wrong.
+A tile's 16 pixels fill one 16-lane packet, so every lane of a packet walks the same list. A surfel is a
+candidate for a tile where the exact screen-space bounds of its (cut) ellipse overlap the tile's pixel
+centres. Lists are sorted by ``near = |c - o| - r``, a lower bound of the distance to any point of the
+surfel, which lets traversal stop early without being wrong.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class TileLists:
 def _screen_bounds(
     centre: np.ndarray, axis_a: np.ndarray, axis_b: np.ndarray, k: int, focal: float, principal: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel range of the ellipses ``c + a cos + b sin`` along image axis ``k``; the whole line where one crosses z = 0.
+    """Pixel range of the ellipses ``c + a cos + b sin`` along image axis k; unbounded where z = 0 is crossed.
 
     The bounds of x/z over the ellipse are the roots m at which the plane x = m z is tangent to it:
     ``(c_x - m c_z)^2 = (a_x - m a_z)^2 + (b_x - m b_z)^2``.
@@ -51,15 +51,14 @@ def _screen_bounds(
     root = np.sqrt(np.maximum(cross**2 - in_front * constant, 0.0))
     divisor = np.where(clear, in_front, 1.0)
     low, high = (cross - root) / divisor, (cross + root) / divisor
-    whole = np.inf
     return (
-        np.where(clear, focal * low + principal, -whole),
-        np.where(clear, focal * high + principal, whole),
+        np.where(clear, focal * low + principal, -np.inf),
+        np.where(clear, focal * high + principal, np.inf),
     )
 
 
 def _tile_range(low: np.ndarray, high: np.ndarray, pixels: int, tiles: int) -> tuple[np.ndarray, np.ndarray]:
-    """First and last tile (inclusive) whose pixel centres (i + 0.5) lie in [low, high]; first > last where none."""
+    """First and last tile with pixel centres (i + 0.5) in [low, high]; first > last where there are none."""
     margin = 1e-2  # pixels; candidates may be too many, never too few
     first = np.ceil(np.clip(low - 0.5 - margin, -1.0, pixels + 1.0))
     last = np.floor(np.clip(high - 0.5 + margin, -2.0, pixels))
@@ -90,13 +89,19 @@ def build_tiles(geometry: np.ndarray, camera: Camera) -> TileLists:
     half_v = axis_v * (reach / np.maximum((axis_v**2).sum(1), 1e-30))[:, None] @ rotation.T
     centre = to_centre @ rotation.T
     ahead = centre[:, 2] + np.sqrt(half_u[:, 2] ** 2 + half_v[:, 2] ** 2) > 0
-    x0, x1 = _tile_range(*_screen_bounds(centre, half_u, half_v, 0, camera.fx, camera.cx), camera.width, tiles_x)
-    y0, y1 = _tile_range(*_screen_bounds(centre, half_u, half_v, 1, camera.fy, camera.cy), camera.height, tiles_y)
+    x0, x1 = _tile_range(
+        *_screen_bounds(centre, half_u, half_v, 0, camera.fx, camera.cx), camera.width, tiles_x
+    )
+    y0, y1 = _tile_range(
+        *_screen_bounds(centre, half_u, half_v, 1, camera.fy, camera.cy), camera.height, tiles_y
+    )
     across, down = np.maximum(x1 - x0 + 1, 0), np.maximum(y1 - y0 + 1, 0)
     touched = np.where(facing & ahead & (q_cut >= 0), across * down, 0)
 
     near = np.linalg.norm(to_centre, axis=1) - geometry[:, 7]
-    order = np.argsort(near, kind="stable")  # emit surfels nearest first: one stable sort by tile then orders both
+    order = np.argsort(
+        near, kind="stable"
+    )  # emit surfels nearest first: one stable sort by tile then orders both
     surfel = np.repeat(order, touched[order])
     within = np.arange(len(surfel)) - np.repeat(np.cumsum(touched[order]) - touched[order], touched[order])
     tile = (y0[surfel] + within // across[surfel]) * tiles_x + x0[surfel] + within % across[surfel]

@@ -1,4 +1,4 @@
-"""SurfelTracer: a scene made ready for rays of both kinds, camera rays by tiles and shadow rays by a hierarchy."""
+"""SurfelTracer: a scene made ready for camera rays (by tiles) and shadow rays (by a hierarchy)."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 
 class SurfelTracer:
-    """Traces one :class:`GaussianScene`. Uploads on construction; the hierarchy is built when first needed.
+    """Traces one :class:`GaussianScene`: uploads it at once, builds the hierarchy when first needed.
 
     Args:
         scene: the surfels; must be valid (``scene.validate()``), and must not change while the tracer lives.
-        two_sided: let back faces block shadow rays beyond two spacings (the default); False is the paper's rule.
+        two_sided: let back faces block shadow rays beyond two spacings; False is the paper's rule.
     """
 
     def __init__(self, scene: GaussianScene, *, two_sided: bool = True) -> None:
@@ -46,5 +46,5 @@ class SurfelTracer:
     def transmittance(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
     ) -> mi.Float:
-        """Transmittance from ``origin`` to infinity along unit ``direction`` (world); exactly 0 below 0.01."""
+        """Transmittance from ``origin`` to infinity along unit ``direction``; exactly 0 below 0.01."""
         return transmittance(self.bvh, origin, direction, self._back_faces_from, mi.Bool(active))

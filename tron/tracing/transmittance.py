@@ -1,9 +1,12 @@
-"""Transmittance along arbitrary rays: a product over hits, so the order in which they are met does not matter.
+"""Transmittance along arbitrary rays: a product over hits, so the order in which they are met is free.
 
-Sidedness (measured in guidance.md): one-sided surfels leak, because undersides that no camera saw do not exist; naive
-two-sided surfels darken their own surface.  So front faces block from t = 0, and back faces only beyond two surfel
-spacings, where they can no longer belong to the surface that the ray left.
+Sidedness (measured in guidance.md): one-sided surfels leak, because undersides that no camera saw do not
+exist; naive two-sided surfels darken their own surface. So front faces block from t = 0, and back faces
+only beyond two surfel spacings, where they can no longer belong to the surface that the ray left.
 """
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations
 

@@ -1,0 +1,88 @@
+"""Laws of shadow rays: agreement with the reference, order invariance, the sidedness rule."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tron import seeds
+from tron.tracing import SurfelTracer, reference
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def random_rays(count):
+    rng = seeds.generator(0, "tests", "shadow rays")
+    directions = rng.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return rng.uniform(-1.5, 1.5, (count, 3)).astype(np.float32), directions.astype(np.float32)
+
+
+def trace(tracer, origins, directions):
+    origin = mi.Point3f(np.asarray(origins, np.float32).T.copy())
+    return np.array(tracer.transmittance(origin, mi.Vector3f(np.asarray(directions, np.float32).T.copy())))
+
+
+@pytest.mark.parametrize("degree", [2, 4])
+@pytest.mark.parametrize("two_sided", [True, False])
+@pytest.mark.parametrize("count", [1, 2, 3, 400])
+def test_agrees_with_the_float64_reference(random_scene, degree, two_sided, count):
+    scene = random_scene(count, degree=degree)
+    origins, directions = random_rays(1000)
+    truth, margin = reference.transmittance(scene, origins, directions, two_sided=two_sided)
+    steady = margin > 1e-5
+    assert (~steady).mean() < 0.05
+    found = trace(SurfelTracer(scene, two_sided=two_sided), origins, directions)
+    np.testing.assert_allclose(found[steady], truth[steady], atol=1e-4)
+
+
+def test_order_of_surfels_does_not_matter(random_scene):
+    scene = random_scene(300)
+    order = seeds.generator(0, "tests", "order").permutation(len(scene))
+    arrays = {
+        f.name: getattr(scene, f.name)[order]
+        for f in dataclasses.fields(scene)
+        if isinstance(getattr(scene, f.name), np.ndarray) and f.name != "up"
+    }
+    origins, directions = random_rays(1000)
+    first = trace(SurfelTracer(scene), origins, directions)
+    second = trace(SurfelTracer(dataclasses.replace(scene, **arrays)), origins, directions)
+    np.testing.assert_allclose(first, second, atol=1e-5)
+
+
+def test_front_faces_block_from_zero_and_back_faces_beyond_two_spacings(disks):
+    heights = np.array([0.15, 0.25])  # spacing is 0.1: the rule's threshold lies between them
+    up = [[0, 0, 1]] * 2
+    for down, expected in ((True, [0.2, 0.2]), (False, [1.0, 0.2])):
+        found = [
+            trace(SurfelTracer(disks([[0, 0, h]], [down], opacity=0.8, sigma=0.2)), [[0, 0, 0]], up[:1])[0]
+            for h in heights
+        ]
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
+    one_sided = SurfelTracer(disks([[0, 0, 0.25]], [False], opacity=0.8, sigma=0.2), two_sided=False)
+    assert trace(one_sided, [[0, 0, 0]], up[:1])[0] == 1.0
+
+
+def test_behind_the_origin_nothing_blocks(disks):
+    tracer = SurfelTracer(disks([[0, 0, -0.5]], [False], opacity=0.8, sigma=0.2))
+    assert trace(tracer, [[0, 0, 0]], [[0, 0, 1]])[0] == 1.0
+
+
+def test_many_layers_are_exactly_opaque(disks):
+    layers = disks([[0, 0, 0.3 + 0.1 * k] for k in range(6)], [True] * 6, opacity=0.8, sigma=0.5)
+    assert trace(SurfelTracer(layers), [[0, 0, 0]], [[0, 0, 1]])[0] == 0.0
+
+
+def test_inactive_lanes_are_clear(disks):
+    tracer = SurfelTracer(disks([[0, 0, 0.5]], [True], opacity=0.8, sigma=0.5))
+    origin, direction = mi.Point3f([0, 0], [0, 0], [0, 0]), mi.Vector3f([0, 0], [0, 0], [1, 1])
+    found = np.array(tracer.transmittance(origin, direction, mi.Bool([True, False])))
+    np.testing.assert_allclose(found, [0.2, 1.0], rtol=1e-5)
+
+
+def test_faint_surfels_block_nothing(disks):
+    tracer = SurfelTracer(disks([[0, 0, 0.5]], [True], opacity=0.003, sigma=0.5))
+    assert trace(tracer, [[0, 0, 0]], [[0, 0, 1]])[0] == 1.0
