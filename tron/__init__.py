@@ -1,6 +1,6 @@
 """TRON: relighting captured and synthetic 3D worlds made of Gaussian surfels.
 
-Importing the package is light on purpose: neither Mitsuba nor torch is loaded until a module that needs them is.
+Importing the package is light on purpose: it loads neither Mitsuba nor torch.
 """
 
 __version__ = "0.1.0"

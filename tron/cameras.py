@@ -1,8 +1,8 @@
 """The pinhole camera and its conversions.
 
-TRON's cameras are OpenCV's: x right, y down, z forward, world-to-camera matrices, intrinsics in pixels. The pixel
-in column i and row j covers [i, i+1] x [j, j+1] and has its centre at (i + 0.5, j + 0.5). Other conventions are
-converted once, where a file or a library is met:
+TRON's cameras are OpenCV's: x right, y down, z forward, world-to-camera matrices, intrinsics in pixels. The
+pixel in column i and row j covers [i, i+1] x [j, j+1] and has its centre at (i + 0.5, j + 0.5). Other
+conventions are converted once, where a file or a library is met:
 
 - OpenGL, Blender, NeRF: x right, y up, z backward, camera-to-world;
 - Mitsuba: x left, y up, z forward, camera-to-world.
@@ -30,7 +30,8 @@ class Camera:
 
     Attributes:
         fx, fy: focal lengths in pixels.
-        cx, cy: principal point in pixels from the top left corner of the image; (width / 2, height / 2) is its centre.
+        cx, cy: principal point in pixels from the top left corner of the image; (width / 2, height / 2) is
+            its centre.
         width, height: image size in pixels.
         world_to_camera: (4, 4) float64 rigid transform from world to OpenCV camera coordinates.
 
@@ -82,7 +83,8 @@ class Camera:
             width, height: image size in pixels.
 
         Raises:
-            TronError: position and target coincide, the view runs along ``up``, or fov_deg is not in (0, 180).
+            TronError: position and target coincide, the view runs along ``up``, or fov_deg is outside
+                (0, 180).
         """
         if not 0 < fov_deg < 180:
             raise TronError(f"horizontal field of view must lie between 0 and 180 degrees, not {fov_deg}")
@@ -146,7 +148,7 @@ class Camera:
         )
 
     def rays(self) -> np.ndarray:
-        """Unit world directions (height, width, 3) float32 through the pixel centres; all start at ``position``."""
+        """Unit world directions (height, width, 3) float32 through the pixel centres, from ``position``."""
         x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
         y = (np.arange(self.height) + 0.5 - self.cy) / self.fy
         local = np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=-1)

@@ -1,8 +1,8 @@
 """Luminance, the sRGB curve and the AgX tone curve, for NumPy arrays and torch tensors alike.
 
 All RGB is BT.709 (sRGB primaries, D65), channel last unless an axis is given. Gradients flow through torch
-tensors; torch itself is never imported here. Sources: IEC 61966-2-1 for sRGB; Troy Sobotka's AgX configuration
-(github.com/sobotka/AgX-S2O3) for AgX.
+tensors; torch itself is never imported here. Sources: IEC 61966-2-1 for sRGB; Troy Sobotka's AgX
+configuration (github.com/sobotka/AgX-S2O3) for AgX.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ _AGX_INSET = (
     (0.0423282422610123, 0.878468636469772, 0.0791661274605434),
     (0.0423756549057051, 0.0784336, 0.879142973793104),
 )
-_AGX_LOG2_RANGE = (-12.47393, 4.026069)
-_AGX_PIVOT = (0.606060, 0.18 ** (1 / 2.2))
-_AGX_SLOPE = 2.4
-_AGX_POWER = 1.5  # of the toe and of the shoulder
+_AGX_LOG2_RANGE = (-12.47393, 4.026069)  # 10 stops below and 6.5 above middle grey, 0.18
+_AGX_PIVOT = (10 / 16.5, 0.5)  # middle grey
+_AGX_SLOPE = 2.0
+_AGX_TOE_POWER, _AGX_SHOULDER_POWER = 3.0, 3.25
 
 
 def _channels(x: Any, axis: int) -> tuple[Any, Any, Any]:
@@ -45,7 +45,7 @@ def luminance(rgb: Any, axis: int = -1) -> Any:
 
 
 def srgb_to_linear(x: Any) -> Any:
-    """Decode sRGB display values to linear light, elementwise; negative values keep the curve's linear part."""
+    """Decode sRGB display values to linear light, elementwise; negative values stay on its linear part."""
     xp = array_api_compat.array_namespace(x)
     # The unused branch of `where` still gets gradients, so its base is kept off the power's singular point.
     curve = ((xp.where(x > 0.04045, x, xp.ones_like(x)) + 0.055) / 1.055) ** 2.4
@@ -62,15 +62,15 @@ def linear_to_srgb(x: Any) -> Any:
 def agx(linear: Any, axis: int = -1) -> Any:
     """Tone-map linear BT.709 to display values in [0, 1] with Troy Sobotka's original AgX, without a look.
 
-    inset matrix -> log2 over 16.5 stops around middle grey -> sigmoid. The result is display-encoded already: no
-    sRGB curve follows. Gradients are finite everywhere, zero where the log range clips.
+    negatives to zero -> inset matrix -> log2 over 16.5 stops -> sigmoid. The result is display-encoded already:
+    no sRGB curve follows. Gradients are finite everywhere, zero where the log range clips.
 
     Args:
         linear: scene-linear RGB with 3 channels on ``axis``, any range; shape kept.
         axis: the channel axis.
     """
     xp = array_api_compat.array_namespace(linear)
-    rgb = _channels(linear, axis)
+    rgb = _channels(xp.where(linear > 0, linear, xp.zeros_like(linear)), axis)
     low, high = _AGX_LOG2_RANGE
     inset = xp.stack([r * rgb[0] + g * rgb[1] + b * rgb[2] for r, g, b in _AGX_INSET], axis=axis)
     # Clamping before the logarithm rather than after it gives the same values and no infinite gradients.
@@ -79,21 +79,20 @@ def agx(linear: Any, axis: int = -1) -> Any:
 
 
 def _agx_sigmoid(xp: Any, x: Any) -> Any:
-    """The AgX contrast curve on [0, 1]: slope 2.4 at the pivot, bent at both ends to reach (0, 0) and (1, 1)."""
-    pivot_x, pivot_y = _AGX_PIVOT
+    """The AgX contrast curve on [0, 1]: slope 2 at the pivot, bent to end at (0, 0) and (1, 1)."""
+    (px, py), slope = _AGX_PIVOT, _AGX_SLOPE
 
-    def bend(run: float, rise: float) -> float:
-        # Scale s of u / (1 + (u/s)^p)^(1/p), u = slope * distance, such that distance `run` gives `rise`.
-        return (rise**-_AGX_POWER - (_AGX_SLOPE * run) ** -_AGX_POWER) ** (-1 / _AGX_POWER)
+    def bent(run: Any, full_run: float, full_rise: float, power: float) -> Any:
+        # u / (1 + (u / s)^p)^(1/p) rises with the slope at first; s is such that the full run ends at the full rise.
+        scale = (full_rise**-power - (slope * full_run) ** -power) ** (-1 / power)
+        u = slope * xp.clip(run, 0.0, 1.0)
+        return u / (1 + (u / scale) ** power) ** (1 / power)
 
-    toe, shoulder = bend(pivot_x, pivot_y), bend(1 - pivot_x, 1 - pivot_y)
-    above = x >= pivot_x
-    scale = xp.where(above, xp.full_like(x, shoulder), xp.full_like(x, toe))
-    u = _AGX_SLOPE * xp.abs(x - pivot_x)
-    distance = u / (1 + (u / scale) ** _AGX_POWER) ** (1 / _AGX_POWER)
-    return xp.clip(pivot_y + xp.where(above, distance, -distance), 0.0, 1.0)
+    toe = bent(px - x, px, py, _AGX_TOE_POWER)
+    shoulder = bent(x - px, 1 - px, 1 - py, _AGX_SHOULDER_POWER)
+    return xp.clip(py + shoulder - toe, 0.0, 1.0)
 
 
 def to_display(linear: Any, exposure: Any, axis: int = -1) -> Any:
-    """Display values in [0, 1] of linear RGB under an exposure (a factor, not stops): ``agx(exposure * linear)``."""
+    """``agx(exposure * linear)``: display values in [0, 1]; the exposure is a factor, not stops."""
     return agx(exposure * linear, axis=axis)

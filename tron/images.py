@@ -1,7 +1,8 @@
 """Images in and out: OpenEXR and Radiance HDR hold linear values, PNG and JPEG display values in [0, 1].
 
 No colour conversion is made here: what is in the file is what the array holds, float32 and (H, W, C) with the
-first row at the top. Input is not trusted: sizes are read from the header and refused before anything is decoded.
+first row at the top. Input is not trusted: sizes are read from the header and refused before anything is
+decoded.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ _JPEG_QUALITY = 95
 
 
 def read_image(path: str | os.PathLike[str], channels: int | None = 3) -> np.ndarray:
-    """Read an image as (H, W, C) float32: linear from .exr and .hdr, display in [0, 1] from .png, .jpg and .jpeg.
+    """Read an image as (H, W, C) float32: linear from .exr and .hdr, display in [0, 1] from .png and .jpg.
 
     Args:
         path: the file; its suffix says its format.
-        channels: 1, 3 or 4 channels are made of what the file holds (grey is repeated, alpha dropped or added as
-            1, equal RGB taken as grey), or None for the file's own.
+        channels: 1, 3 or 4 channels are made of what the file holds (grey is repeated, alpha dropped or added
+            as 1, equal RGB taken as grey), or None for the file's own.
 
     Raises:
         TronError: the file is missing, unreadable, not an image, too large, or cannot give ``channels``.
@@ -63,7 +64,8 @@ def write_image(path: str | os.PathLike[str], image: np.ndarray, half: bool = Tr
 
     Args:
         path: .exr (PIZ) and .hdr take linear values, .png and .jpg display values, clipped to [0, 1].
-        image: (H, W), (H, W, 1), (H, W, 3) or, for EXR and PNG, (H, W, 4), any float type, or uint8 for PNG and JPEG.
+        image: (H, W), (H, W, 1), (H, W, 3) or, for EXR and PNG, (H, W, 4), any float type, or uint8 for PNG
+            and JPEG.
         half: store EXR in 16 bits; values beyond 65504 are then stored as 65504. Use False for lights.
 
     Raises:
@@ -82,8 +84,8 @@ def write_image(path: str | os.PathLike[str], image: np.ndarray, half: bool = Tr
 def encode_exr(image: np.ndarray, half: bool = True) -> bytes:
     """Encode linear (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) as OpenEXR scanlines with PIZ compression.
 
-    NaN and infinity are stored as they are; finite values beyond half's range saturate at 65504. The same input
-    gives the same bytes.
+    NaN and infinity are stored as they are; finite values beyond half's range saturate at 65504. The same
+    input gives the same bytes.
     """
     import OpenEXR
 
@@ -104,7 +106,8 @@ def decode_exr(data: bytes) -> np.ndarray:
     """Decode OpenEXR to (H, W, C) float32, linear: RGB, RGBA, or the single channel of a one-channel file.
 
     Raises:
-        TronError: not an OpenEXR file, damaged, several parts, deep or cropped pixels, other channels, or too large.
+        TronError: not an OpenEXR file, damaged, several parts, deep or cropped pixels, other channels, or too
+            large.
     """
     import OpenEXR
 

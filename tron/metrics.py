@@ -1,7 +1,7 @@
 """Image and G-buffer metrics: PSNR, SSIM, LPIPS, angular error of normals, albedo scaling.
 
-Arrays are NumPy, images (H, W, 3) of display values in [0, 1] unless said otherwise, masks (H, W) bool with True
-for the pixels that count. torch and torchmetrics are imported only by SSIM and LPIPS.
+Arrays are NumPy, images (H, W, 3) of display values in [0, 1] unless said otherwise, masks (H, W) bool with
+True for the pixels that count. torch and torchmetrics are imported only by SSIM and LPIPS.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
 
 
 def angular_error_deg(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Mean angle in degrees between two normal maps (H, W, 3), vectors of any length; a zero vector counts 90.
+    """Mean angle in degrees between two normal maps (H, W, 3) of any length; a zero vector counts as 90.
 
     Raises:
         TronError: the mask selects nothing.
@@ -76,14 +76,14 @@ def scale_albedo(
 ) -> np.ndarray:
     """Scale a predicted albedo to the truth, one factor a channel: reflectance is known only up to it.
 
-    Papers disagree, and the figures differ: TRON fits by least squares for each view (call once a view), TensoIR,
-    GS-IR and IRGS take the median ratio of all views together (call once with the views stacked).
+    Papers disagree, and the figures differ: TRON fits by least squares for each view (call once a view),
+    TensoIR, GS-IR and IRGS take the median ratio of all views together (call once with the views stacked).
 
     Args:
         prediction, truth: (..., 3) linear.
         mask: (...) bool, pixels that are fitted.
-        method: ``least_squares`` minimises the squared error, ``median_ratio`` is the median of truth / prediction
-            where the prediction exceeds 1e-6.
+        method: ``least_squares`` minimises the squared error, ``median_ratio`` is the median of truth /
+            prediction where the prediction exceeds 1e-6.
 
     Returns:
         The whole prediction, scaled, (..., 3) float32, not clipped.
@@ -120,12 +120,13 @@ def _selected(values: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
 class LPIPS:
     """Learned perceptual distance (Zhang et al. 2018, version 0.1) with the VGG-16 backbone, differentiable.
 
-    ``lpips(a, b)`` takes torch images (B, 3, H, W) scaled to [-1, 1] and gives (B,) distances, on the device and
-    in the precision of ``a``. It is a plain object rather than a module on purpose: its frozen 15 million weights
-    must stay out of a model's parameters, checkpoints and moving averages.
+    ``lpips(a, b)`` takes torch images (B, 3, H, W) scaled to [-1, 1] and gives (B,) distances, on the device
+    and in the precision of ``a``. It is a plain object rather than a module on purpose: its frozen 15 million
+    weights must stay out of a model's parameters, checkpoints and moving averages.
     """
 
-    _CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)  # their places in torchvision's vgg16.features
+    # Places in torchvision's vgg16.features.
+    _CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
     _AFTER_POOLING = (5, 10, 17, 24)
     _TAPS = (2, 7, 14, 21, 28)  # compared after their ReLU
     _CHANNELS = (64, 128, 256, 512, 512)  # at the taps

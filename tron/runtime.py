@@ -39,11 +39,12 @@ _LLVM_FOLDERS = (
 def find_llvm() -> Path:
     """Return the LLVM library that Dr.Jit should load: version 17 or newer, 19 where there is a choice.
 
-    ``DRJIT_LIBLLVM_PATH`` is taken at its word; otherwise the active conda environment, the loader's cache and
-    the usual folders of Debian, Fedora, Arch and Homebrew are searched.
+    ``DRJIT_LIBLLVM_PATH`` is taken at its word; otherwise the active conda environment, the loader's cache
+    and the usual folders of Debian, Fedora, Arch and Homebrew are searched.
 
     Raises:
-        TronError: nothing suitable was found, or DRJIT_LIBLLVM_PATH names something else; it says what to install.
+        TronError: nothing suitable was found, or DRJIT_LIBLLVM_PATH names something else; it says what to
+            install.
     """
     chosen = os.environ.get("DRJIT_LIBLLVM_PATH")
     if chosen:
@@ -69,7 +70,7 @@ def find_llvm() -> Path:
 
 
 def llvm_version(path: Path) -> tuple[int, ...] | None:
-    """Version of an LLVM shared library, read from its name or else asked of the library; None if it has none."""
+    """Version of an LLVM library, read from its name or else asked of the library; None if it has none."""
     if not path.is_file():
         return None
     for name in (path.name, path.resolve().name, *reversed(path.resolve().parts)):
@@ -160,9 +161,9 @@ def describe_machine() -> dict[str, Any]:
     """Describe hardware, software and commit, as plain values for reports and manifests of measurements.
 
     Neither Mitsuba nor torch is loaded for it. Keys: ``cpu``, ``cores`` (those this process may use),
-    ``memory_gb``, ``gpu`` (names, or "none"), ``os``, ``python``, ``packages`` (name -> version, installed ones),
-    ``llvm`` (version or "none"), ``variant`` (the active one or "none"), ``commit`` and ``dirty`` (both None
-    outside a checkout).
+    ``memory_gb``, ``gpu`` (names, or "none"), ``os``, ``python``, ``packages`` (name -> version, installed
+    ones), ``llvm`` (version or "none"), ``variant`` (the active one or "none"), ``commit`` and ``dirty``
+    (both None outside a checkout).
     """
     mitsuba = sys.modules.get("mitsuba")
     return {
@@ -218,7 +219,7 @@ def _git_state(root: Path) -> dict[str, Any]:
 
 
 def _output(command: list[str]) -> str | None:
-    """Standard output of a short command, stripped; None if it is missing, fails or takes over ten seconds."""
+    """Stripped output of a short command; None if it is missing, fails or takes over ten seconds."""
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
     except (OSError, subprocess.SubprocessError):

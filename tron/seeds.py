@@ -1,8 +1,8 @@
 """The seed tree: every random number in TRON comes from a root seed and a path of names.
 
-``generator(root, "scene", 12, "lights")`` is a stream of its own: it does not depend on what else was drawn, on
-the order of the calls or on the process that makes them. Names are hashed with SHA-256, never with Python's
-``hash``, which changes from run to run; the stream itself is NumPy's PCG64, specified bit by bit.
+``generator(root, "scene", 12, "lights")`` is a stream of its own: it does not depend on what else was drawn,
+on the order of the calls or on the process that makes them. Names are hashed with SHA-256, never with
+Python's ``hash``, which changes from run to run; the stream itself is NumPy's PCG64, specified bit by bit.
 """
 
 from __future__ import annotations

@@ -21,9 +21,9 @@ LOCK_NAME = ".tron.lock"
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside ``path``; what is written there becomes ``path`` when the block succeeds.
 
-    The temporary file keeps the suffix (writers choose their format by it) and is flushed to disk before it is
-    renamed, so that neither a crash nor a power cut leaves half a file under the final name. On any exception it
-    is removed. Parent folders are made.
+    The temporary file keeps the suffix (writers choose their format by it) and is flushed to disk before it
+    is renamed, so that neither a crash nor a power cut leaves half a file under the final name. On any
+    exception it is removed. Parent folders are made.
 
     Raises:
         TronError: the folder cannot be made or written to, or the disk is full.
@@ -62,7 +62,7 @@ def _flush(path: Path) -> None:
 
 
 def write_atomic(path: str | os.PathLike[str], data: bytes | str) -> None:
-    """Write ``data`` (text as UTF-8) to ``path``, whole or not at all; raises TronError as atomic_path does."""
+    """Write ``data`` (text as UTF-8) to ``path``, whole or not at all; TronError as in atomic_path."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
 
@@ -101,7 +101,7 @@ def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def require_free_space(folder: str | os.PathLike[str], n_bytes: int) -> None:
-    """Raise TronError unless the disk of ``folder`` (or of its nearest existing parent) has ``n_bytes`` free."""
+    """Raise TronError unless the disk of ``folder``, which need not exist yet, has ``n_bytes`` free."""
     existing = Path(folder).absolute()
     while not existing.exists():
         existing = existing.parent

@@ -1,7 +1,8 @@
 """Camera paths around a target: the data engine's spiral and oscillation, an orbit, and keyframes.
 
-Angles are in degrees. Azimuth turns counter-clockwise about ``up`` seen from its tip, and is measured from the
-world's x axis where up is +z. Elevation is the angle above the plane through the target orthogonal to ``up``.
+Angles are in degrees. Azimuth turns counter-clockwise about ``up`` seen from its tip, and is measured from
+the world's x axis where up is +z. Elevation is the angle above the plane through the target orthogonal to
+``up``.
 """
 
 from __future__ import annotations
@@ -126,7 +127,8 @@ def keyframed(cameras: Sequence[Camera], n: int) -> list[Camera]:
         return [first for _ in _fractions(n)]
     keys = np.arange(len(cameras), dtype=np.float64)
     times = _fractions(n) * keys[-1]
-    rotations = Slerp(keys, Rotation.from_matrix([camera.world_to_camera[:3, :3] for camera in cameras]))(times)
+    matrices = [camera.world_to_camera[:3, :3] for camera in cameras]
+    rotations = Slerp(keys, Rotation.from_matrix(matrices))(times)
     values = [[*camera.position, camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras]
     tracks = np.stack([np.interp(times, keys, track) for track in np.transpose(values)], axis=1)
     path = []
@@ -161,7 +163,8 @@ def _around(
         raise TronError(f"radius of a camera path must be positive, not {radius}")
     east, north, zenith = _frame(np.asarray(up, dtype=np.float64))
     azimuth, elevation = np.radians(azimuth_deg)[:, None], np.radians(elevation_deg)[:, None]
-    outward = np.cos(elevation) * (np.cos(azimuth) * east + np.sin(azimuth) * north) + np.sin(elevation) * zenith
+    level = np.cos(azimuth) * east + np.sin(azimuth) * north
+    outward = np.cos(elevation) * level + np.sin(elevation) * zenith
     return [
         Camera.look_at(position, target, up=zenith, fov_deg=fov_deg, width=width, height=height)
         for position in np.asarray(target, dtype=np.float64) + radius * outward
@@ -169,7 +172,7 @@ def _around(
 
 
 def _frame(up: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Right-handed east, north, zenith; east is the world's x axis made orthogonal to up where that exists."""
+    """Right-handed east, north, zenith; east is the world's x axis made orthogonal to up if it can be."""
     if not np.linalg.norm(up) > 0:
         raise TronError("up direction must not be zero")
     zenith = up / np.linalg.norm(up)
