@@ -13,6 +13,7 @@ cannot ask for terabytes.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -93,10 +94,7 @@ def read_ply(path: str | Path) -> GaussianScene:
         data = plyfile.PlyData.read(str(path))
     except OSError as error:
         raise TronError(f"cannot read: {error.strerror or error}", path) from error
-    except (
-        plyfile.PlyParseError,
-        ValueError,
-    ) as error:  # ValueError: ascii numbers and mappings beyond the end
+    except (plyfile.PlyParseError, ValueError) as error:  # ValueError: text that is no number
         raise TronError(f"not a readable PLY: {error}", path) from error
     constants = _read_constants(data.comments, path)
     columns = {p.name: data["vertex"][p.name] for p in data["vertex"].properties}
@@ -105,22 +103,17 @@ def read_ply(path: str | Path) -> GaussianScene:
     def stack(names: tuple[str, ...]) -> np.ndarray:
         return np.stack([np.asarray(columns[name], dtype=np.float32) for name in names], axis=-1)
 
+    means = stack(POSITION)
+    if not len(means):
+        raise TronError("the scene has no surfels", path)
+    if not np.isfinite(means).all():
+        raise TronError("a position is not finite", path)
     quats, log_scales = _flatten(stack(ROTATION), stack(tuple(n for n in SCALES if n in columns)), path)
     sh = _harmonics(columns, stack, path)
     guessed = MATERIALS[0] not in columns
-    if guessed:
-        base_color = srgb_to_linear(np.clip(dc_to_rgb(sh[:, 0]), 0, 1)).astype(np.float32)
-        roughness = np.full(len(sh), GUESSED_ROUGHNESS, np.float32)
-        metallic = np.full(len(sh), GUESSED_METALLIC, np.float32)
-    else:
-        base_color, roughness, metallic = (
-            stack(BASE_COLOR),
-            stack(("roughness",))[:, 0],
-            stack(("metallic",))[:, 0],
-        )
-    means = stack(POSITION)
-    if not np.isfinite(means).all():
-        raise TronError("a position is not finite", path)
+    base_color, roughness, metallic = (
+        _guess(sh) if guessed else map(stack, (BASE_COLOR, ("roughness",), ("metallic",)))
+    )
     scene = GaussianScene(
         means=means,
         quats=quats,
@@ -128,8 +121,8 @@ def read_ply(path: str | Path) -> GaussianScene:
         opacity_logits=stack(("opacity",))[:, 0],
         sh=sh,
         base_color=base_color,
-        roughness=roughness,
-        metallic=metallic,
+        roughness=roughness[:, 0],
+        metallic=metallic[:, 0],
         object_id=_object_id(columns, len(means), path),
         kernel_degree=int(constants.get("kernel_degree", [2])[0]),
         spacing=constants["spacing"][0] if "spacing" in constants else measure_spacing(means),
@@ -159,9 +152,12 @@ def _read_constants(comments: list[str], path: Path) -> dict[str, list[float]]:
         if len(words) < 3 or words[0] != "tron":
             continue
         try:
-            constants[words[1]] = [float(word) for word in words[2:]]
+            values = [float(word) for word in words[2:]]
         except ValueError:
-            raise TronError(f"comment '{comment[:60]}' does not hold numbers", path) from None
+            values = [math.nan]
+        if not all(map(math.isfinite, values)):
+            raise TronError(f"comment '{comment[:60]}' does not hold finite numbers", path)
+        constants[words[1]] = values
     return constants
 
 
@@ -194,10 +190,11 @@ def _check_header(head: bytes, size: int, path: Path) -> None:
     if any(row == 0 and count for _, count, row in elements):
         raise TronError("the PLY declares an element without properties", path)
     needed = sum(count * row for _, count, row in elements)
-    if needed > size - end:
+    body = size - end - len("end_header\n")
+    if needed > body:
         rows = max(elements, key=lambda element: element[1] * element[2])
         raise TronError(
-            f"the PLY declares {rows[1]} rows of '{rows[0]}', {needed} bytes or more, and holds {size - end}",
+            f"the PLY declares {rows[1]} rows of '{rows[0]}', {needed} bytes or more, and holds {body}",
             path,
             "the file is cut short or damaged",
         )
@@ -214,6 +211,12 @@ def _check_properties(columns: dict[str, np.ndarray], path: Path) -> None:
     if present and len(present) < len(MATERIALS):
         absent = ", ".join(name for name in MATERIALS if name not in columns)
         raise TronError(f"the PLY has {present[0]} but lacks {absent}", path, "write all materials or none")
+
+
+def _guess(sh: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Base colour (M, 3) linear, roughness and metallic (M, 1) of Gaussians known by colour alone."""
+    base_color = srgb_to_linear(np.clip(dc_to_rgb(sh[:, 0]), 0, 1))
+    return base_color, np.full((len(sh), 1), GUESSED_ROUGHNESS), np.full((len(sh), 1), GUESSED_METALLIC)
 
 
 def _harmonics(
@@ -243,7 +246,7 @@ def _object_id(columns: dict[str, np.ndarray], count: int, path: Path) -> np.nda
 
 
 def _flatten(quats: np.ndarray, log_scales: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Drop the smallest of three scales: (M, 4), (M, 2 or 3) -> unit quats with the thin axis last, (M, 2)."""
+    """Drop the smallest of three scales: (M, 4), (M, 2 or 3) -> unit quats, thin axis last, (M, 2)."""
     if not (np.isfinite(quats).all() and np.isfinite(log_scales).all()):
         raise TronError("a rotation or scale is not finite", path)
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)

@@ -1,0 +1,262 @@
+"""PLY files: round trips, foreign files of every kind, and hostile ones."""
+
+import dataclasses
+import struct
+import time
+
+import numpy as np
+import plyfile
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tron.color import srgb_to_linear
+from tron.errors import TronError
+from tron.gaussians.ply import MATERIALS, read_ply
+from tron.gaussians.scene import GaussianScene, quats_from_matrices
+from tron.seeds import generator
+
+LAYOUT = (
+    ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    + [f"f_rest_{i}" for i in range(45)]
+    + ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+)
+
+
+@pytest.fixture
+def scene() -> GaussianScene:
+    rng = generator(0, "test", "ply")
+    count = 25
+    return GaussianScene(
+        means=rng.normal(size=(count, 3)),
+        quats=quats_from_matrices(Rotation.random(count, rng).as_matrix()),
+        log_scales=rng.uniform(-4, -2, (count, 2)),
+        opacity_logits=rng.normal(size=count),
+        sh=rng.normal(size=(count, 16, 3)) * 0.2,
+        base_color=rng.uniform(size=(count, 3)),
+        roughness=rng.uniform(size=count),
+        metallic=rng.uniform(size=count),
+        object_id=rng.integers(0, 2**30, count),
+        kernel_degree=4,
+        spacing=0.0123456789,
+        up=np.array([0.0, -1.0, 0.0]),
+    )
+
+
+def rewrite(path, drop=(), change=None, text=False, order="<", comments=()):
+    """Rewrite a PLY with plyfile alone: without some properties, with other values, in another encoding."""
+    rows = plyfile.PlyData.read(str(path))["vertex"].data
+    names = [name for name in rows.dtype.names if name not in drop]
+    kept = np.empty(len(rows), [(name, rows.dtype[name].newbyteorder("=")) for name in names])
+    for name in names:
+        kept[name] = (change or {}).get(name, rows[name])
+    del rows  # mapped from the file that is about to be overwritten
+    element = plyfile.PlyElement.describe(kept, "vertex")
+    plyfile.PlyData([element], text=text, byte_order=order, comments=list(comments)).write(str(path))
+
+
+def test_a_scene_survives_the_file_to_the_last_bit(scene, tmp_path):
+    scene.save(tmp_path / "a.ply")
+    back = GaussianScene.load(tmp_path / "a.ply")
+    for field in dataclasses.fields(GaussianScene):
+        np.testing.assert_array_equal(getattr(back, field.name), getattr(scene, field.name), field.name)
+    back.save(tmp_path / "b.ply")
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_bytes_are_those_a_3dgs_reader_expects(scene, tmp_path):
+    scene.save(tmp_path / "a.ply")
+    header, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    properties = [line.split()[1:] for line in header.decode().splitlines() if line.startswith("property")]
+    assert [name for _, name in properties[: len(LAYOUT)]] == LAYOUT
+    assert {kind for kind, _ in properties[: len(LAYOUT)]} == {"float"}
+    assert b"format binary_little_endian 1.0" in header
+    stride = 4 * len(properties)
+    assert len(body) == stride * len(scene)
+    row = dict(zip(LAYOUT, struct.unpack_from(f"<{len(LAYOUT)}f", body, 3 * stride)))
+    assert [row[k] for k in ("x", "y", "z")] == scene.means[3].tolist()
+    assert [row[f"rot_{k}"] for k in range(4)] == scene.quats[3].tolist()
+    assert row["f_rest_0"] == scene.sh[3, 1, 0]
+    assert row["f_rest_14"] == scene.sh[3, 15, 0]
+    assert row["f_rest_15"] == scene.sh[3, 1, 1]
+    assert row["f_rest_44"] == scene.sh[3, 15, 2]
+    assert row["opacity"] == scene.opacity_logits[3]
+    assert [row["nx"], row["ny"], row["nz"]] == pytest.approx(scene.normals()[3].tolist())
+    assert row["scale_2"] < min(row["scale_0"], row["scale_1"]) - 6
+
+
+@pytest.mark.parametrize(("text", "order"), [(True, "="), (False, ">"), (False, "<")])
+def test_every_encoding_gives_the_same_scene(scene, tmp_path, text, order):
+    path = tmp_path / "a.ply"
+    scene.save(path)
+    rewrite(path, text=text, order=order)
+    back = read_ply(path)
+    np.testing.assert_allclose(back.means, scene.means, rtol=1e-6)
+    np.testing.assert_allclose(back.sh, scene.sh, rtol=1e-6)
+    np.testing.assert_array_equal(back.object_id, scene.object_id)
+
+
+def test_a_plain_3dgs_file_gets_guessed_materials(scene, tmp_path):
+    path = tmp_path / "a.ply"
+    scene.save(path)
+    rewrite(path, drop=(*MATERIALS, "object_id"))
+    back = read_ply(path)
+    assert back.materials_guessed
+    assert not back.oriented
+    assert back.kernel_degree == 2
+    mean = np.clip(scene.sh[:, 0] * 0.28209479177387814 + 0.5, 0, 1)
+    np.testing.assert_allclose(back.base_color, srgb_to_linear(mean), atol=1e-6)
+    assert (back.metallic == 0).all()
+    assert (back.object_id == 0).all()
+    assert 0 < back.spacing < 3
+
+
+def test_a_2dgs_file_with_two_scales_loads(scene, tmp_path):
+    path = tmp_path / "a.ply"
+    scene.save(path)
+    rewrite(path, drop=(*MATERIALS, "object_id", "scale_2"))
+    back = read_ply(path)
+    np.testing.assert_array_equal(back.log_scales, scene.log_scales)
+    np.testing.assert_array_equal(back.quats, scene.quats)
+
+
+def test_dropping_the_thin_axis_keeps_the_gaussian(scene, tmp_path):
+    # Independent witness: the covariance R diag(s^2) R^T of the file, with its smallest eigenvalue set to zero.
+    path = tmp_path / "a.ply"
+    scene.save(path)
+    scales = generator(0, "test", "scales").uniform(-4, -2, (len(scene), 3)).astype(np.float32)
+    quats = scene.quats * np.linspace(0.5, 3, len(scene), dtype=np.float32)[:, None]
+    change = {f"scale_{k}": scales[:, k] for k in range(3)} | {f"rot_{k}": quats[:, k] for k in range(4)}
+    rewrite(path, change=change)
+    assert len(np.unique(scales.argmin(axis=1))) == 3
+    back = read_ply(path)
+    rotation = Rotation.from_quat(scene.quats, scalar_first=True).as_matrix()
+    variances = np.exp(2 * scales.astype(np.float64))
+    variances[np.arange(len(scene)), scales.argmin(axis=1)] = 0
+    expected = np.einsum("mij,mj,mkj->mik", rotation, variances, rotation)
+    ours = np.einsum(
+        "mij,mj,mkj->mik", back.rotations()[:, :, :2], back.scales() ** 2, back.rotations()[:, :, :2]
+    )
+    np.testing.assert_allclose(ours, expected, atol=1e-8)
+    np.testing.assert_allclose(np.linalg.det(back.rotations()), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize(("rest", "bands"), [(0, 0), (9, 3), (24, 8)])
+def test_lower_degrees_fill_the_low_bands(scene, tmp_path, rest, bands):
+    path = tmp_path / "a.ply"
+    scene.save(path)
+    values = {f"f_rest_{i}": np.full(len(scene), i, np.float32) for i in range(rest)}
+    rewrite(path, drop=[f"f_rest_{i}" for i in range(rest, 45)], change=values)
+    back = read_ply(path)
+    assert (back.sh[:, bands + 1 :] == 0).all()
+    if bands:
+        np.testing.assert_array_equal(back.sh[0, 1 : bands + 1, 1], np.arange(bands, 2 * bands))
+
+
+def refuse(path, words):
+    started = time.perf_counter()
+    with pytest.raises(TronError, match=words) as caught:
+        read_ply(path)
+    assert time.perf_counter() - started < 1
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_properties_are_named(scene, tmp_path):
+    path = tmp_path / "a.ply"
+    scene.save(path)
+    rewrite(path, drop=("opacity", "rot_2"))
+    refuse(path, "lacks opacity, rot_2")
+
+
+def test_half_a_set_of_materials_is_refused(scene, tmp_path):
+    path = tmp_path / "a.ply"
+    scene.save(path)
+    rewrite(path, drop=("roughness",))
+    refuse(path, "has base_color_0 but lacks roughness")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("x", np.nan, "position"),
+        ("f_rest_7", np.inf, "sh of 1"),
+        ("roughness", np.nan, "roughness"),
+        ("scale_0", np.inf, "scale is not finite"),
+        ("base_color_1", 7.0, r"base_color of 1 surfels is outside \[0, 1\]"),
+    ],
+)
+def test_bad_values_are_refused(scene, tmp_path, name, value, words):
+    path = tmp_path / "a.ply"
+    scene.save(path)
+    rows = plyfile.PlyData.read(str(path))["vertex"][name].copy()
+    rows[5] = value
+    rewrite(path, change={name: rows})
+    refuse(path, words)
+
+
+def test_a_zero_quaternion_is_refused_and_named(scene, tmp_path):
+    path = tmp_path / "a.ply"
+    scene.save(path)
+    keep = np.ones(len(scene), np.float32)
+    keep[11] = 0
+    rewrite(path, change={f"rot_{k}": scene.quats[:, k] * keep for k in range(4)})
+    refuse(path, "surfel 11 is a zero quaternion")
+
+
+HEADER = "ply\nformat {format} 1.0\n{body}end_header\n"
+FLOATS = "".join(f"property float {name}\n" for name in LAYOUT)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "not a PLY"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(100), "not a PLY"),
+        (b"ply\nformat ascii 1.0\n" + b"comment x\n" * 50_000, "no end"),
+        (HEADER.format(format="binary_little_endian", body=f"element vertex {10**12}\n{FLOATS}"), "declares"),
+        (HEADER.format(format="ascii", body=f"element vertex {10**12}\n{FLOATS}"), "declares"),
+        (
+            HEADER.format(format="binary_little_endian", body=f"element vertex {10**12}\n"),
+            "without properties",
+        ),
+        (
+            HEADER.format(
+                format="binary_little_endian",
+                body=f"element vertex 0\n{FLOATS}element face {10**12}\nproperty list uchar int i\n",
+            ),
+            "declares",
+        ),
+        (HEADER.format(format="ascii", body=f"element vertex -3\n{FLOATS}"), "no vertex|not a readable"),
+        (HEADER.format(format="ascii", body=f"element vertex 0\n{FLOATS}"), "no surfels"),
+        (HEADER.format(format="ascii", body="element face 0\nproperty float x\n"), "no vertex element"),
+        (HEADER.format(format="purple", body=f"element vertex 0\n{FLOATS}"), "not a readable PLY"),
+        (
+            HEADER.format(format="ascii", body=f"element vertex 1\n{FLOATS}") + "pickle " * 62,
+            "not a readable",
+        ),
+        (
+            HEADER.format(format="ascii", body=f"comment tron spacing wide\nelement vertex 0\n{FLOATS}"),
+            "does not hold finite numbers",
+        ),
+    ],
+)
+def test_hostile_files_are_refused_at_once(tmp_path, content, words):
+    path = tmp_path / "hostile.ply"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    refuse(path, words)
+
+
+def test_truncated_and_missing_files_are_refused(scene, tmp_path):
+    path = tmp_path / "a.ply"
+    scene.save(path)
+    path.write_bytes(path.read_bytes()[:-7])
+    refuse(path, "cut short")
+    refuse(tmp_path / "absent.ply", "cannot read")
+    refuse(tmp_path, "cannot read")
+
+
+def test_a_broken_scene_leaves_no_file(scene, tmp_path):
+    scene.means[0] = np.nan
+    with pytest.raises(TronError, match="means"):
+        scene.save(tmp_path / "a.ply")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,235 @@
+"""Surfels straight from G-buffers, without optimisation: the recipe measured in guidance.md.
+
+All pixels of all views are samples of the surface. A uniform grid, in which a cell also tells apart objects
+and the six directions a surface can face, gathers them; each occupied cell becomes one surfel with the mean
+position, normal and material of its samples. The cell size follows from the wanted count by bisection. A
+surfel's scale is a fixed fraction of the distance to its neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logit
+
+from tron.cameras import Camera
+from tron.color import linear_to_srgb
+from tron.errors import TronError
+from tron.gaussians.harmonics import SH_COUNT, rgb_to_dc
+from tron.gaussians.scene import GaussianScene, neighbour_distances, quats_from_matrices
+
+# Fractions of a cell by which the grid is moved: with a cell boundary at 0, a flat floor at z = 0 would fall
+# into two layers of cells by rounding alone.
+GRID_SHIFT = np.array([0.37, 0.41, 0.43])
+# Surfels far from all others (grazing views, lone pixels) would cover their surroundings.
+SCALE_CAP = 3.0
+
+# More samples than this are first merged in cells FINE times smaller than those of the surfels.
+_SAMPLES_AT_ONCE = 2_000_000
+_FINE = 4
+_OBJECTS = 2**20
+_BISECTIONS = 24
+_CLOSE_ENOUGH = 0.005
+
+_CHANNELS = {"position": 3, "normal": 3, "base_color": 3, "roughness": 1, "metallic": 1, "rgb": 3}
+
+
+@dataclass(eq=False)
+class GBufferView:
+    """What one camera sees of a surface, by rays through the pixel centres (never anti-aliased: a mean of two
+    surfaces lies on neither).
+
+    position    (H, W, 3) world
+    normal      (H, W, 3) unit, world, on the camera's side of the surface
+    base_color  (H, W, 3) linear, in [0, 1]
+    roughness   (H, W)
+    metallic    (H, W)
+    rgb         (H, W, 3) radiance in display space, or None
+    valid       (H, W) bool, True where the ray met a surface; elsewhere nothing is read
+    object_id   (H, W) int, in [0, 2**20)
+    """
+
+    camera: Camera
+    position: np.ndarray
+    normal: np.ndarray
+    base_color: np.ndarray
+    roughness: np.ndarray
+    metallic: np.ndarray
+    rgb: np.ndarray | None
+    valid: np.ndarray
+    object_id: np.ndarray
+
+
+def surfels_from_gbuffers(
+    views: Sequence[GBufferView],
+    count: int = 20000,
+    kernel_degree: int = 4,
+    scale: float = 0.4,
+    opacity: float = 0.99,
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+) -> GaussianScene:
+    """A scene of about `count` surfels through the surfaces that the views see.
+
+    kernel_degree and scale belong together: a surfel's standard deviation is `scale` times the root mean
+    square distance to its three nearest neighbours, 0.4 for degree 4 and 0.6 for degree 2 (guidance.md).
+    opacity in (0, 1). up: (3,) unit, world. The result does not depend on the order of the views, and holds
+    fewer surfels only where the views have fewer samples. SH degree 0 is the views' mean rgb, display space;
+    without rgb it is the sRGB-encoded base colour.
+
+    Raises TronError if no view sees a surface, if maps disagree in shape or are not finite, or if only some
+    of the views have rgb.
+    """
+    if count < 1:
+        raise TronError(f"surfel count is {count}", mend="ask for at least one")
+    has_rgb = _agree_on_rgb(views)
+    samples = _gather(views, count)
+    if not len(samples.weight):
+        raise TronError("no view sees any surface, so there are no surfels to make")
+    samples = samples.merged(_cell_size(samples, count))
+    means, normals = samples.values["position"], samples.values["normal"]
+    distances = neighbour_distances(means)
+    spacing = float(np.median(distances)) or _extent(means) or 1.0
+    sigma = scale * np.clip(distances, 1e-3 * spacing, SCALE_CAP * spacing)
+    base_color = np.clip(samples.values["base_color"], 0, 1)
+    sh = np.zeros((len(means), SH_COUNT, 3))
+    sh[:, 0] = rgb_to_dc(samples.values["rgb"] if has_rgb else linear_to_srgb(base_color))
+    return GaussianScene(
+        means=means,
+        quats=quats_from_matrices(_frames(normals)),
+        log_scales=np.repeat(np.log(sigma)[:, None], 2, axis=1),
+        opacity_logits=np.full(len(means), logit(opacity)),
+        sh=sh,
+        base_color=base_color,
+        roughness=np.clip(samples.values["roughness"][:, 0], 0, 1),
+        metallic=np.clip(samples.values["metallic"][:, 0], 0, 1),
+        object_id=samples.object_id,
+        kernel_degree=kernel_degree,
+        spacing=spacing,
+        up=np.asarray(up),
+    ).validate()
+
+
+@dataclass
+class _Samples:
+    """N surface samples: mean values[name] (N, C) float32 of weight (N,) pixels each, and object_id (N,)."""
+
+    values: dict[str, np.ndarray]
+    weight: np.ndarray
+    object_id: np.ndarray
+
+    def keys(self, cell: float) -> np.ndarray:
+        """(N,) int64: one number for each pair of (cell, facing, object)."""
+        normal = self.values["normal"]
+        grid = np.floor(self.values["position"] / cell + GRID_SHIFT).astype(np.int64)
+        axis = np.abs(normal).argmax(axis=1)
+        facing = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0)
+        key = self.object_id
+        for digit, size in ((facing, 6), *((g, np.ptp(g) + 1) for g in (grid - grid.min(axis=0)).T)):
+            key = key * size + digit
+        return key
+
+    def merged(self, cell: float) -> _Samples:
+        """One sample for each key, ordered by it: weighted means, normals unit again."""
+        _, first, index = np.unique(self.keys(cell), return_index=True, return_inverse=True)
+        weight = np.bincount(index, self.weight)
+        values = {}
+        for name, value in self.values.items():
+            sums = [np.bincount(index, self.weight * channel) for channel in value.T]
+            values[name] = (np.stack(sums, axis=-1) / weight[:, None]).astype(np.float32)
+        values["normal"] /= np.linalg.norm(values["normal"], axis=1, keepdims=True)
+        return _Samples(values, weight, self.object_id[first])
+
+    @staticmethod
+    def joined(parts: Sequence[_Samples]) -> _Samples:
+        names = parts[0].values
+        values = {name: np.concatenate([part.values[name] for part in parts]) for name in names}
+        return _Samples(
+            values,
+            np.concatenate([part.weight for part in parts]),
+            np.concatenate([part.object_id for part in parts]),
+        )
+
+
+def _gather(views: Sequence[GBufferView], count: int) -> _Samples:
+    """All samples of all views; beyond a bound they are merged in cells much finer than the surfels'."""
+    bound = max(_SAMPLES_AT_ONCE, 3 * _FINE**2 * count)
+    parts: list[_Samples] = []
+    held = 0
+    for index, view in enumerate(views):
+        part = _samples(view, index)
+        parts.append(part)
+        held += len(part.weight)
+        if held > bound:
+            # The cell size only grows with what is still to be seen, so these cells stay fine enough.
+            everything = _Samples.joined(parts)
+            parts = [everything.merged(_cell_size(everything, count) / _FINE)]
+            held = len(parts[0].weight)
+    return _Samples.joined(parts)
+
+
+def _samples(view: GBufferView, index: int) -> _Samples:
+    height, width = view.valid.shape
+    valid = np.asarray(view.valid, dtype=bool)
+    values = {}
+    for name, channels in _CHANNELS.items():
+        image = getattr(view, name)
+        if image is None:
+            continue
+        if image.shape[:2] != (height, width) or image.size != height * width * channels:
+            raise TronError(
+                f"{name} of view {index} has shape {image.shape}, expected {height} x {width} pixels"
+            )
+        value = image[valid].reshape(-1, channels).astype(np.float32)
+        if not np.isfinite(value).all():
+            raise TronError(f"{name} of view {index} is not finite where the view is valid")
+        values[name] = value
+    lengths = np.linalg.norm(values["normal"], axis=1)
+    if (np.abs(lengths - 1) > 1e-2).any():
+        raise TronError(f"normals of view {index} are not unit vectors")
+    object_id = np.asarray(view.object_id)[valid]
+    if len(object_id) and not 0 <= object_id.min() <= object_id.max() < _OBJECTS:
+        raise TronError(f"an object_id of view {index} is outside 0..{_OBJECTS - 1}")
+    return _Samples(values, np.ones(len(lengths)), object_id.astype(np.int64))
+
+
+def _agree_on_rgb(views: Sequence[GBufferView]) -> bool:
+    if not views:
+        raise TronError("no views to make surfels from")
+    with_rgb = sum(view.rgb is not None for view in views)
+    if with_rgb not in (0, len(views)):
+        raise TronError(f"{with_rgb} of {len(views)} views have rgb", mend="give it in all views or in none")
+    return with_rgb > 0
+
+
+def _cell_size(samples: _Samples, count: int) -> float:
+    """The cell size, world units, for which about `count` cells are occupied; bisection of its logarithm."""
+    extent = _extent(samples.values["position"]) or 1.0
+    # Below the first the integer keys could overflow; above the second everything is one cell.
+    low, high = np.log(extent * 1e-4), np.log(extent * 4)
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        occupied = len(np.unique(samples.keys(np.exp(middle))))
+        if abs(occupied - count) <= _CLOSE_ENOUGH * count:
+            return float(np.exp(middle))
+        low, high = (middle, high) if occupied > count else (low, middle)
+    return float(np.exp(high))
+
+
+def _extent(points: np.ndarray) -> float:
+    return float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+
+
+def _frames(normals: np.ndarray) -> np.ndarray:
+    """(M, 3) unit normals -> (M, 3, 3) rotations with the normal as third column; the tangents are arbitrary.
+
+    Branchless basis of Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
+    """
+    x, y, z = normals.T
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    u = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=-1)
+    v = np.stack([b, sign + y * y * a, -y], axis=-1)
+    return np.stack([u, v, normals], axis=-1)
