@@ -186,10 +186,13 @@ class Camera:
         """Inverse of :meth:`to_dict`; TronError names a missing or unreadable field."""
         try:
             return cls(
-                *(float(data[key]) for key in ("fx", "fy", "cx", "cy")),
-                int(data["width"]),
-                int(data["height"]),
-                np.asarray(data["world_to_camera"], dtype=np.float64),
+                fx=float(data["fx"]),
+                fy=float(data["fy"]),
+                cx=float(data["cx"]),
+                cy=float(data["cy"]),
+                width=int(data["width"]),
+                height=int(data["height"]),
+                world_to_camera=np.asarray(data["world_to_camera"], dtype=np.float64),
             )
         except KeyError as error:
             raise TronError(f"camera lacks the field {error.args[0]!r}") from error

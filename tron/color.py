@@ -62,8 +62,8 @@ def linear_to_srgb(x: Any) -> Any:
 def agx(linear: Any, axis: int = -1) -> Any:
     """Tone-map linear BT.709 to display values in [0, 1] with Troy Sobotka's original AgX, without a look.
 
-    negatives to zero -> inset matrix -> log2 over 16.5 stops -> sigmoid. The result is display-encoded already:
-    no sRGB curve follows. Gradients are finite everywhere, zero where the log range clips.
+    Negatives to zero, inset matrix, log2 over 16.5 stops, sigmoid. The result is display-encoded already: no
+    sRGB curve follows. Gradients are finite everywhere, zero where the log range clips.
 
     Args:
         linear: scene-linear RGB with 3 channels on ``axis``, any range; shape kept.
@@ -83,7 +83,7 @@ def _agx_sigmoid(xp: Any, x: Any) -> Any:
     (px, py), slope = _AGX_PIVOT, _AGX_SLOPE
 
     def bent(run: Any, full_run: float, full_rise: float, power: float) -> Any:
-        # u / (1 + (u / s)^p)^(1/p) rises with the slope at first; s is such that the full run ends at the full rise.
+        # u / (1 + (u/s)^p)^(1/p) starts with the slope; s makes the full run end at the full rise.
         scale = (full_rise**-power - (slope * full_run) ** -power) ** (-1 / power)
         u = slope * xp.clip(run, 0.0, 1.0)
         return u / (1 + (u / scale) ** power) ** (1 / power)

@@ -129,14 +129,15 @@ def keyframed(cameras: Sequence[Camera], n: int) -> list[Camera]:
     times = _fractions(n) * keys[-1]
     matrices = [camera.world_to_camera[:3, :3] for camera in cameras]
     rotations = Slerp(keys, Rotation.from_matrix(matrices))(times)
-    values = [[*camera.position, camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras]
+    values = [(*camera.position, camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras]
     tracks = np.stack([np.interp(times, keys, track) for track in np.transpose(values)], axis=1)
     path = []
-    for rotation, track in zip(rotations.as_matrix(), tracks):
+    for rotation, (x, y, z, *intrinsics) in zip(rotations.as_matrix(), tracks.tolist()):
         matrix = np.eye(4)
         matrix[:3, :3] = rotation
-        matrix[:3, 3] = -rotation @ track[:3]
-        path.append(Camera(*track[3:].tolist(), first.width, first.height, matrix))
+        matrix[:3, 3] = -rotation @ (x, y, z)
+        fx, fy, cx, cy = intrinsics
+        path.append(Camera(fx, fy, cx, cy, first.width, first.height, matrix))
     return path
 
 

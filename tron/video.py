@@ -10,6 +10,7 @@ from types import TracebackType
 
 import av
 import numpy as np
+from av.error import FFmpegError
 from av.video.reformatter import ColorRange, Colorspace
 
 from tron.errors import TronError
@@ -45,16 +46,18 @@ class VideoWriter:
         with ExitStack() as exits:
             temporary = exits.enter_context(atomic_path(self._path))
             self._container = exits.enter_context(av.open(str(temporary), "w", format="mp4"))
-            self._stream = self._container.add_stream(_codec(), rate=self._fps)
-            self._stream.width, self._stream.height = (side + side % 2 for side in self._size)
-            self._stream.pix_fmt = "yuv420p"
+            stream = self._container.add_stream(_codec(), rate=self._fps)
+            assert isinstance(stream, av.VideoStream)
+            stream.width, stream.height = (side + side % 2 for side in self._size)
+            stream.pix_fmt = "yuv420p"
+            context = stream.codec_context
             # BT.709 is declared and converted to, or players would guess by size and shift the colours.
-            context = self._stream.codec_context
             context.color_primaries = context.color_trc = context.colorspace = Colorspace.ITU709.value
             context.color_range = ColorRange.MPEG.value
-            context.thread_count = 1
-            if self._stream.codec_context.name == "libx264":
-                self._stream.options = {"crf": _CRF, "preset": "medium"}
+            context.thread_count = 1  # the same bytes on every machine
+            if context.name == "libx264":
+                stream.options = {"crf": _CRF, "preset": "medium"}
+            self._stream = stream
             self._exits = exits.pop_all()
         return self
 
@@ -94,7 +97,7 @@ def read_video(path: str | os.PathLike[str]) -> np.ndarray:
                 if (len(frames) + 1) * frame.width * frame.height * 3 > _MAX_DECODED_BYTES:
                     raise TronError("video is too large to be read at once", path)
                 frames.append(frame.to_ndarray(format="rgb24"))
-    except (av.FFmpegError, OSError, IndexError) as error:
+    except (FFmpegError, OSError, IndexError) as error:
         raise TronError(f"cannot read video: {getattr(error, 'strerror', None) or error}", path) from error
     if not frames:
         raise TronError("video has no frames", path)
