@@ -1,0 +1,130 @@
+"""What the sources may not hold: chance that no seed governs, drawers of leftovers, unreadably long files."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("tron", "datagen", "train", "eval", "conf")
+SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+SEEDS = ROOT / "tron" / "seeds.py"
+
+CHANCE_MODULES = {"random", "uuid", "secrets"}
+CHANCE_CALLS = {"os.urandom", "torch.seed", "torch.initial_seed"}
+WALL_CLOCKS = {"time.time", "time.time_ns", "time.ctime", "time.localtime", "time.gmtime", "time.strftime"}
+WALL_CLOCKS |= {
+    f"datetime.{name}" for name in ("datetime.now", "datetime.utcnow", "date.today", "now", "utcnow")
+}
+CLOCKS = WALL_CLOCKS | {"time.perf_counter", "time.perf_counter_ns", "time.monotonic", "time.process_time"}
+# Types and constructors of explicit streams; everything else in np.random shares one hidden state.
+EXPLICIT = {"Generator", "SeedSequence", "PCG64", "Philox", "BitGenerator"}
+SEEDED = ("seed", "generator", "integer", "default_rng", "Random", "SeedSequence", "PCG64", "Philox")
+
+
+def offences(source: str) -> list[str]:
+    """Uses of randomness or clocks that would make two runs differ, as `line: what`."""
+    tree = ast.parse(source)
+    imported = dict(_imports(tree))
+    return sorted({f"{node.lineno}: {what}" for node, what in _offences(tree, imported)})
+
+
+def _imports(tree: ast.AST) -> Iterator[tuple[str, str]]:
+    """(local name, full name) of everything imported."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield (
+                    alias.asname or alias.name.split(".")[0],
+                    alias.name if alias.asname else alias.name.split(".")[0],
+                )
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                yield (alias.asname or alias.name, f"{node.module}.{alias.name}")
+
+
+def _full_name(node: ast.AST, imported: dict[str, str]) -> str:
+    parts = []
+    while isinstance(node, ast.Attribute):
+        parts.append(node.attr)
+        node = node.value
+    if not isinstance(node, ast.Name):
+        return ""
+    return ".".join([imported.get(node.id, node.id), *reversed(parts)])
+
+
+def _offences(tree: ast.AST, imported: dict[str, str]) -> Iterator[tuple[ast.expr | ast.stmt, str]]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                if alias.name.split(".")[0] in CHANCE_MODULES:
+                    yield node, alias.name
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in CHANCE_MODULES:
+            yield node, node.module or ""
+        elif isinstance(node, ast.Attribute | ast.Name):
+            name = _full_name(node, imported)
+            hidden_state = name.startswith("numpy.random.") and name.split(".")[2] not in EXPLICIT
+            if hidden_state or name in CHANCE_CALLS or name in WALL_CLOCKS:
+                yield node, name
+        elif isinstance(node, ast.Call):
+            function = _full_name(node.func, imported).rpartition(".")[2]
+            keywords = [word.value for word in node.keywords if word.arg and "seed" in word.arg]
+            arguments = [*node.args, *keywords] if any(part in function for part in SEEDED) else keywords
+            for inner in (each for argument in arguments for each in ast.walk(argument)):
+                if isinstance(inner, ast.Call) and _full_name(inner.func, imported) in CLOCKS:
+                    yield node, "a clock as a seed"
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import random",
+        "from random import shuffle",
+        "import uuid as names",
+        "import numpy as np\nnp.random.seed(0)",
+        "import numpy as np\nnp.random.default_rng()",
+        "import numpy\nx = numpy.random.rand(3)",
+        "from numpy.random import randn\nrandn(3)",
+        "from numpy import random as r\nr.shuffle([])",
+        "import os\nos.urandom(4)",
+        "import time\nt = time.time()",
+        "from time import time\nt = time()",
+        "from datetime import datetime\ndatetime.now()",
+        "import time, torch\ntorch.manual_seed(int(time.perf_counter()))",
+        "import time\nfit(seed=time.monotonic())",
+    ],
+)
+def test_the_check_catches(source):
+    assert offences(source)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import numpy as np\ndef f(rng: np.random.Generator): return rng.random()",
+        "import time\nstart = time.perf_counter()",
+        "import torch\ntorch.manual_seed(3)",
+        "from tron.seeds import generator\ngenerator(0, 'lens').uniform()",
+    ],
+)
+def test_the_check_lets_pass(source):
+    assert not offences(source)
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_all_chance_comes_from_seeds(path: Path):
+    if path != SEEDS:
+        assert offences(path.read_text("utf-8")) == []
+
+
+def test_no_file_is_a_drawer_for_leftovers():
+    drawers = {"utils", "util", "helpers", "helper", "common", "misc"}
+    found = [path for path in SOURCES if drawers & {path.stem, *path.relative_to(ROOT).parts}]
+    assert found == []
+
+
+def test_every_file_holds_one_idea_of_readable_length():
+    files = [*SOURCES, *(ROOT / "tests").rglob("*.py")]
+    lengths = {str(path.relative_to(ROOT)): len(path.read_text("utf-8").splitlines()) for path in files}
+    assert {name: lines for name, lines in lengths.items() if lines > 500} == {}
