@@ -60,6 +60,14 @@ def test_agrees_with_the_float64_reference(random_scene, degree, sh_degree):
     assert truth.hits.max() > 10  # the scene is dense enough for ordering to matter
 
 
+def test_ending_early_behind_opaque_surfels_loses_nothing(random_scene):
+    scene = random_scene(400, seed=8, sh_degree=0)
+    scene.opacity_logits[:] = 6.0  # rays stop after few hits, while nearer ones still wait in the list
+    camera = Camera.look_at((2.5, 1, 0.7), (0, 0, 0), fov_deg=50, width=30, height=22)
+    truth = compare(scene, camera)
+    assert (truth.transmittance < 1e-3).mean() > 0.3
+
+
 def test_agrees_for_a_camera_among_the_surfels_with_an_off_centre_principal_point(random_scene):
     look = Camera.look_at((0.1, 0.0, 0.05), (1, 0.2, 0), fov_deg=100, width=19, height=13)
     compare(random_scene(300, seed=3), Camera(20.0, 14.0, 3.0, 11.0, 19, 13, look.world_to_camera))
