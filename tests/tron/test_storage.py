@@ -1,0 +1,114 @@
+"""Files appear whole or not at all, folders are held by one process, and the disk is asked first."""
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tron import storage
+from tron.errors import TronError
+
+HOLD = "import sys, time\nfrom tron.storage import locked\nwith locked(sys.argv[1]):\n    print('held', flush=True)\n    time.sleep(60)\n"
+
+
+def test_success_leaves_exactly_the_file(tmp_path: Path):
+    with storage.atomic_path(tmp_path / "deep" / "a.txt") as temporary:
+        assert temporary.suffix == ".txt"
+        assert temporary.parent == tmp_path / "deep"  # the same disk, so that the rename is atomic
+        temporary.write_text("whole")
+        assert not (tmp_path / "deep" / "a.txt").exists()
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["a.txt"]
+    assert (tmp_path / "deep" / "a.txt").read_text() == "whole"
+
+
+def test_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path):
+    storage.write_atomic(tmp_path / "a.txt", "old")
+    with pytest.raises(RuntimeError), storage.atomic_path(tmp_path / "a.txt") as temporary:
+        temporary.write_text("half")
+        raise RuntimeError
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+    assert (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_killed_writer_leaves_nothing_under_the_final_name(tmp_path: Path):
+    code = (
+        "import sys, time\nfrom tron.storage import atomic_path\n"
+        "with atomic_path(sys.argv[1]) as p:\n    p.write_bytes(b'half'); print('on', flush=True); time.sleep(60)"
+    )
+    child = subprocess.Popen([sys.executable, "-c", code, tmp_path / "a.bin"], stdout=subprocess.PIPE)
+    assert child.stdout is not None
+    child.stdout.readline()
+    child.kill()
+    child.communicate()
+    assert not (tmp_path / "a.bin").exists()
+
+
+def test_new_files_follow_the_umask(tmp_path: Path):
+    old = os.umask(0o027)
+    try:
+        storage.write_atomic(tmp_path / "a", b"")
+    finally:
+        os.umask(old)
+    assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
+
+
+def test_unwritable_target_is_one_line(tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(TronError, match=r"^cannot write: .*file"):
+        storage.write_atomic(tmp_path / "file" / "below", "x")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(TronError, match="cannot write"):
+        storage.write_atomic(tmp_path / "folder", "x")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_full_disk_is_one_line(tmp_path: Path):
+    with pytest.raises(TronError, match="No space left"), storage.atomic_path(tmp_path / "a"):
+        with open("/dev/full", "wb", buffering=0) as file:
+            file.write(b"x")
+    assert not list(tmp_path.iterdir())
+
+
+def test_sha256_agrees_with_the_library_and_names_a_missing_file(tmp_path: Path):
+    data = bytes(range(256)) * 5000
+    storage.write_atomic(tmp_path / "a", data)
+    assert storage.sha256(tmp_path / "a") == hashlib.sha256(data).hexdigest()
+    with pytest.raises(TronError, match="cannot read"):
+        storage.sha256(tmp_path / "missing")
+
+
+def test_folder_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path):
+    child = subprocess.Popen([sys.executable, "-c", HOLD, tmp_path], stdout=subprocess.PIPE)
+    assert child.stdout is not None
+    try:
+        assert child.stdout.readline() == b"held\n"
+        with pytest.raises(TronError, match="in use by another run"), storage.locked(tmp_path):
+            pass
+    finally:
+        child.send_signal(signal.SIGKILL)
+        child.communicate()
+    for _ in range(50):  # the operating system frees the lock as it buries the process
+        try:
+            with storage.locked(tmp_path):
+                return
+        except TronError:
+            time.sleep(0.1)
+    pytest.fail("the lock outlived its process")
+
+
+def test_lock_can_be_taken_again_after_use(tmp_path: Path):
+    for _ in range(2):
+        with storage.locked(tmp_path / "new"):
+            pass
+
+
+def test_free_space_is_checked_where_the_folder_will_be(tmp_path: Path):
+    storage.require_free_space(tmp_path / "not" / "yet", 1)
+    with pytest.raises(TronError, match="not enough disk space"):
+        storage.require_free_space(tmp_path / "not" / "yet", 2**60)
