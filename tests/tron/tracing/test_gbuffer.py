@@ -60,12 +60,13 @@ def test_agrees_with_the_float64_reference(random_scene, degree, sh_degree):
     assert truth.hits.max() > 10  # the scene is dense enough for ordering to matter
 
 
-def test_ending_early_behind_opaque_surfels_loses_nothing(random_scene):
-    scene = random_scene(400, seed=8, sh_degree=0)
-    scene.opacity_logits[:] = 6.0  # rays stop after few hits, while nearer ones still wait in the list
-    camera = Camera.look_at((2.5, 1, 0.7), (0, 0, 0), fov_deg=50, width=30, height=22)
-    truth = compare(scene, camera)
-    assert (truth.transmittance < 1e-3).mean() > 0.3
+def test_ending_early_loses_no_small_surfel_in_front_of_large_ones(disks):
+    # The large disks begin near the camera, come first in the list and stop the ray at t = 1; the small one
+    # begins beyond them in the list's order and still lies in front.
+    scene = disks([[0, 0, 0.0], [0, 0, 0.001], [0, 0, 0.05]], [False] * 3, opacity=0.99, sigma=0.3)
+    scene.log_scales[2] = np.log(0.005)
+    seen = SurfelTracer(scene).gbuffer(looking_down()).numpy()
+    assert seen["depth"][4, 4] == pytest.approx(0.95)
 
 
 def test_agrees_for_a_camera_among_the_surfels_with_an_off_centre_principal_point(random_scene):
