@@ -11,8 +11,9 @@ import inspect
 import logging
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, Generic, NoReturn, TypeVar
 
 import pydantic
 import yaml
@@ -31,13 +32,58 @@ USER_ERROR = 2
 INTERRUPTED = 130
 
 
+@dataclass(frozen=True)
+class Command(Generic[Settings]):
+    """A console entry point: call it without arguments to read `sys.argv`; it ends in `SystemExit`."""
+
+    name: str
+    config_module: str
+    settings: type[Settings]
+    main: Callable[[Settings], int | None]
+    examples: Sequence[str] = ()
+
+    def __call__(self, arguments: Sequence[str] | None = None) -> NoReturn:
+        """Run on `arguments`, those of the process where None."""
+        sys.exit(self._run(sys.argv[1:] if arguments is None else arguments))
+
+    def _run(self, arguments: Sequence[str]) -> int:
+        try:
+            options = _parser(self.name).parse_args(arguments)
+            if options.help:
+                print(self._help(), end="")
+                return 0
+            if options.version:
+                print(f"{self.name} {tron.__version__}")
+                return 0
+            recipe = compose_recipe(self.config_module, options.overrides, options.config_dir)
+            if options.cfg:
+                print(yaml.safe_dump(resolve(recipe), sort_keys=False), end="")
+                return 0
+            settings = check(recipe, self.settings)
+            configure_logging()
+            return self.main(settings) or 0
+        except TronError as error:
+            print(f"{self.name}: {error}", file=sys.stderr)
+            return USER_ERROR
+        except KeyboardInterrupt:
+            print(f"{self.name}: interrupted", file=sys.stderr)
+            return INTERRUPTED
+
+    def _help(self) -> str:
+        groups = group_options(self.config_module)
+        defaults: Any = OmegaConf.to_container(compose_recipe(self.config_module, []), resolve=False)
+        purpose = inspect.getdoc(self.main) or self.settings.__doc__ or self.name
+        examples = self.examples or default_examples(self.name, groups)
+        return render_help(self.name, purpose, self.settings, defaults, groups, examples)
+
+
 def command(
     name: str,
     config_module: str,
     settings: type[Settings],
     main: Callable[[Settings], int | None],
     examples: Sequence[str] = (),
-) -> Callable[..., NoReturn]:
+) -> Command[Settings]:
     """Make a console entry point.
 
     Args:
@@ -46,46 +92,8 @@ def command(
         settings: pydantic model of the whole configuration, `extra="forbid"`; its descriptions make `--help`.
         main: does the work; its docstring is what `--help` says the command does. It may return an exit code.
         examples: command lines for `--help`.
-
-    Returns:
-        A function that ends in `SystemExit`. It reads `sys.argv`, or the arguments it is given.
     """
-
-    def cli(arguments: Sequence[str] | None = None) -> NoReturn:
-        sys.exit(_run(sys.argv[1:] if arguments is None else arguments))
-
-    def _run(arguments: Sequence[str]) -> int:
-        try:
-            options = _arguments(name).parse_args(arguments)
-            if options.help:
-                print(_help(), end="")
-                return 0
-            if options.version:
-                print(f"{name} {tron.__version__}")
-                return 0
-            recipe = compose_recipe(config_module, options.overrides, options.config_dir)
-            if options.cfg:
-                print(yaml.safe_dump(resolve(recipe), sort_keys=False), end="")
-                return 0
-            checked = check(recipe, settings)
-            configure_logging()
-            return main(checked) or 0
-        except TronError as error:
-            print(f"{name}: {error}", file=sys.stderr)
-            return USER_ERROR
-        except KeyboardInterrupt:
-            print(f"{name}: interrupted", file=sys.stderr)
-            return INTERRUPTED
-
-    def _help() -> str:
-        groups = group_options(config_module)
-        defaults: Any = OmegaConf.to_container(compose_recipe(config_module, []), resolve=False)
-        purpose = inspect.getdoc(main) or settings.__doc__ or name
-        return render_help(
-            name, purpose, settings, defaults, groups, examples or default_examples(name, groups)
-        )
-
-    return cli
+    return Command(name, config_module, settings, main, examples)
 
 
 def configure_logging(level: int = logging.INFO) -> None:
@@ -107,7 +115,7 @@ class _Arguments(argparse.ArgumentParser):
         raise TronError(message, mend="--help shows how it is used")
 
 
-def _arguments(name: str) -> argparse.ArgumentParser:
+def _parser(name: str) -> argparse.ArgumentParser:
     parser = _Arguments(prog=name, add_help=False, allow_abbrev=False)
     parser.add_argument("overrides", nargs="*")
     parser.add_argument("-h", "--help", action="store_true")

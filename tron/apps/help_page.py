@@ -10,7 +10,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 import pydantic
 import yaml
 
-from tron.apps.recipes import nested_model
+from tron.apps.recipes import nested_items, nested_model
 
 OPTIONS = {
     "-h, --help": "print this page",
@@ -57,10 +57,16 @@ def render_help(
         "keys (default)",
     ]
     for key, field, default in _fields(settings, defaults):
-        page.append(f"  {key}={_yaml(default)}   [{describe_type(field.annotation)}]")
+        if isinstance(default, Mapping) and default:
+            page.append(f"  {key}.*")
+        else:
+            page.append(_shorten(f"  {key}={_yaml(default)}   [{describe_type(field.annotation)}]", width))
         page += textwrap.wrap(
             field.description or "", width, initial_indent=" " * 6, subsequent_indent=" " * 6
         )
+        for inner, value in nested_items(default, f"{key}."):
+            if not isinstance(value, Mapping) and not inner.endswith("_target_"):
+                page.append(_shorten(f"    {inner}={_yaml(value)}", width))
     for group, options in groups.items():
         page += ["", f"{group}=NAME"]
         page += _table(options, width)
@@ -117,6 +123,10 @@ def _yaml(value: Any) -> str:
     if value == "???":
         return "VALUE (required)"
     return yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
+
+
+def _shorten(line: str, width: int) -> str:
+    return line if len(line) <= width else line[: width - 3] + "..."
 
 
 def _reflow(text: str, width: int) -> list[str]:

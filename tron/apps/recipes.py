@@ -101,14 +101,17 @@ def nested_items(values: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def group_options(config_module: str) -> dict[str, dict[str, str]]:
-    """Groups of a configuration folder, their options, and the first comment line of each option."""
+    """Groups of a configuration folder, their options, and what is said of each: its first comment line."""
     root = resources.files(config_module)
     with _loader(config_module) as loader:
         options = {group: loader.get_group_options(group) for group in _groups(loader)}
-    return {
-        group: {name: _comment(root.joinpath(group, f"{name}.yaml").read_text("utf-8")) for name in names}
-        for group, names in options.items()
-    }
+        chosen = compose("config", return_hydra_config=True).hydra.runtime.choices
+
+    def describe(group: str, name: str) -> str:
+        comment = _comment(root.joinpath(group, f"{name}.yaml").read_text("utf-8"))
+        return f"{comment} (default)".strip() if chosen.get(group) == name else comment
+
+    return {group: {name: describe(group, name) for name in names} for group, names in options.items()}
 
 
 def unknown_key(key: str, known: Sequence[str]) -> TronError:

@@ -4,7 +4,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 import yaml
@@ -24,6 +24,7 @@ quality: preview
 note: null
 trajectory:
   turns: 2
+cluster: {_target_: some.Cluster, workers: 4, names: [averylongname, averylongname, averylongname, averylongname, averylongname, averylongname]}
 """
 
 
@@ -44,6 +45,7 @@ class Settings(BaseModel):
     quality: Literal["preview", "final"] = Field(description="How many rays are spent.")
     trajectory: Trajectory
     lens: Lens
+    cluster: dict[str, Any] = Field(description="Where it runs.")
     note: str | None = Field(default=None, description="Free text.")
 
 
@@ -172,6 +174,7 @@ def test_cfg_prints_yaml_that_holds_every_override(run: Run):
         "quality": "preview",
         "note": None,
         "trajectory": {"turns": 2},
+        "cluster": {"_target_": "some.Cluster", "workers": 4, "names": ["averylongname"] * 6},
         "lens": {"fov_deg": 90},
     }
     assert run.seen == []  # type: ignore[attr-defined]
@@ -189,12 +192,17 @@ def test_help_teaches_purpose_keys_defaults_recipes_and_examples(run: Run, monke
         "quality=preview   [preview | final]",
         "trajectory.turns=2",
         "lens.fov_deg=90",
+        "cluster.*",
+        "cluster.workers=4",
+        "cluster.names=[averylongname, ",
+        "90 degrees (default)",
         "note=null   [text | null]",
         "Two frames, quickly.",
         "tele",
         "tron-toy experiment=demo output_dir=outputs/first",
     ):
         assert text in out
+    assert "_target_" not in out
     assert max(map(len, out.splitlines())) <= 72
 
 
