@@ -247,8 +247,9 @@ def mitsuba_sensor(camera: Camera, spp: int = 16, **film: Any) -> dict[str, Any]
         "type": "perspective",
         "fov_axis": "x",
         "fov": math.degrees(2 * math.atan(0.5 * camera.width / camera.fx)),
-        "principal_point_offset_x": camera.cx / camera.width - 0.5,
-        "principal_point_offset_y": camera.cy / camera.height - 0.5,
+        # Mitsuba counts how far the image lies from the principal point, not the reverse.
+        "principal_point_offset_x": 0.5 - camera.cx / camera.width,
+        "principal_point_offset_y": 0.5 - camera.cy / camera.height,
         "near_clip": 1e-4,
         "far_clip": 1e6,
         "to_world": mi.ScalarTransform4f(mitsuba_to_world(camera).tolist()),

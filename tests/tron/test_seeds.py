@@ -16,7 +16,14 @@ PATHS = st.lists(st.one_of(st.text(max_size=8), st.integers(-(2**70), 2**70)), m
 def test_known_values_never_change():
     """Every data set ever made from a seed depends on these numbers."""
     assert seeds.integer(0, "scene", 12, "lights") == 3572106527
-    assert seeds.generator(0, "scene", 12, "lights").integers(0, 1000, 6).tolist() == [842, 293, 814, 731, 36, 519]
+    assert seeds.generator(0, "scene", 12, "lights").integers(0, 1000, 6).tolist() == [
+        842,
+        293,
+        814,
+        731,
+        36,
+        519,
+    ]
 
 
 @given(PATHS, PATHS)
@@ -44,7 +51,11 @@ def test_stream_does_not_depend_on_what_else_was_drawn():
 def test_stream_does_not_depend_on_the_process():
     code = "from tron import seeds; print(seeds.integer(5, 'x', 1, bits=64))"
     printed = subprocess.run(
-        [sys.executable, "-c", code], env={"PYTHONHASHSEED": "12345"}, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code],
+        env={"PYTHONHASHSEED": "12345"},
+        capture_output=True,
+        text=True,
+        check=True,
     ).stdout
     assert int(printed) == seeds.integer(5, "x", 1, bits=64)
 

@@ -24,7 +24,10 @@ quality: preview
 note: null
 trajectory:
   turns: 2
-cluster: {_target_: some.Cluster, workers: 4, names: [averylongname, averylongname, averylongname, averylongname, averylongname, averylongname]}
+cluster:
+  _target_: some.Cluster
+  workers: 4
+  names: [averylongname, averylongname, averylongname, averylongname, averylongname]
 """
 
 
@@ -174,7 +177,7 @@ def test_cfg_prints_yaml_that_holds_every_override(run: Run):
         "quality": "preview",
         "note": None,
         "trajectory": {"turns": 2},
-        "cluster": {"_target_": "some.Cluster", "workers": 4, "names": ["averylongname"] * 6},
+        "cluster": {"_target_": "some.Cluster", "workers": 4, "names": ["averylongname"] * 5},
         "lens": {"fov_deg": 90},
     }
     assert run.seen == []  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Laws of the environment map: Mitsuba's convention to the letter, exact integrals, a density that means it."""
+"""Laws of the environment map: Mitsuba's convention to the letter, exact integrals, an honest density."""
 
 from pathlib import Path
 
@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from tron.errors import TronError
+from tron.seeds import generator
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
 
 
 def sphere_directions(n: int, seed: int = 0) -> np.ndarray:
-    d = np.random.default_rng(seed).normal(size=(n, 3))
+    d = generator(seed, "directions").normal(size=(n, 3))
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
@@ -29,7 +30,7 @@ def plugin_radiance(environment: EnvironmentMap, d: np.ndarray) -> np.ndarray:
 
 
 def random_map(height: int = 16, seed: int = 1, rotation: float = 0.0) -> EnvironmentMap:
-    image = np.random.default_rng(seed).random((height, 2 * height, 3)) ** 4 * 5
+    image = generator(seed, "map").random((height, 2 * height, 3)) ** 4 * 5
     return EnvironmentMap(image.astype(np.float32), rotation)
 
 
@@ -124,7 +125,8 @@ def test_what_cannot_be_a_light_is_refused_in_one_line(tmp_path: Path, image: np
     write_image(tmp_path / "bad.exr", image, half=False)
     with pytest.raises(TronError, match=what) as error:
         EnvironmentMap.load(tmp_path / "bad.exr")
-    assert "\n" not in str(error.value) and "bad.exr" in str(error.value)
+    assert "\n" not in str(error.value)
+    assert "bad.exr" in str(error.value)
     with pytest.raises(TronError, match=what):
         EnvironmentMap(image)
 
@@ -193,7 +195,7 @@ def test_resizing_keeps_energy_and_does_not_move_lights(height: int) -> None:
 )
 def test_density_is_that_of_the_samples_and_integrates_to_one(variant: str, make) -> None:
     light = EnvironmentLight(make())
-    u = np.random.default_rng(2).random((2, 400000)).astype(np.float32)
+    u = generator(2, "u").random((2, 400000)).astype(np.float32)
     d, density = light.sample(mi.Point2f(u))
     direction = np.array(d).T
     np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1, atol=1e-5)
@@ -207,7 +209,7 @@ def test_density_is_that_of_the_samples_and_integrates_to_one(variant: str, make
 def test_samples_fill_the_sphere_as_the_density_says(variant: str) -> None:
     light = EnvironmentLight(random_map(height=6))
     n = 1_000_000
-    u = np.random.default_rng(3).random((2, n)).astype(np.float32)
+    u = generator(3, "u").random((2, n)).astype(np.float32)
     d, density = light.sample(mi.Point2f(u))
     assert np.mean(1 / np.array(density, dtype=np.float64)) == pytest.approx(4 * np.pi, rel=0.01)
     # Bins of equal solid angle, none of them aligned with the light's own cells.
@@ -227,7 +229,7 @@ def test_samples_fill_the_sphere_as_the_density_says(variant: str) -> None:
 def test_radiance_over_density_averages_to_the_quadrature(variant: str, pdf_width: int) -> None:
     environment = sun_map(32)
     light = EnvironmentLight(environment, pdf_width=pdf_width)
-    u = np.random.default_rng(4).random((2, 1_000_000)).astype(np.float32)
+    u = generator(4, "u").random((2, 1_000_000)).astype(np.float32)
     d, density = light.sample(mi.Point2f(u))
     estimate = np.array(light.radiance(d), dtype=np.float64) / np.array(density, dtype=np.float64)
     np.testing.assert_allclose(estimate.mean(1), environment.mean() * 4 * np.pi, rtol=0.01)

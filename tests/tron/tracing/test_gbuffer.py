@@ -63,7 +63,7 @@ def test_agrees_with_the_float64_reference(random_scene, degree, sh_degree):
 def test_ending_early_loses_no_small_surfel_in_front_of_large_ones(disks):
     # The large disks begin near the camera, come first in the list and stop the ray at t = 1; the small ones
     # begin beyond them in the list's order, and the last of these still lies in front.
-    means = [[0, 0, 0.0], [0, 0, 0.001], [0.05, 0.05, 0.07], [0, 0, 0.05]]
+    means = [[0, 0, 0.0], [0, 0, 0.001], [0.05, -0.05, 0.07], [0, 0, 0.05]]
     scene = disks(means, [False] * 4, opacity=0.99, sigma=0.3)
     scene.log_scales[2:] = np.log(0.005)
     seen = SurfelTracer(scene).gbuffer(looking_down()).numpy()
