@@ -9,6 +9,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 import pydantic
 import yaml
+from pydantic.fields import FieldInfo
 
 from tron.apps.recipes import nested_items, nested_model
 
@@ -99,7 +100,7 @@ def describe_type(annotation: Any) -> str:
 
 def _fields(
     model: type[pydantic.BaseModel], defaults: Any, prefix: str = ""
-) -> Iterator[tuple[str, pydantic.fields.FieldInfo, Any]]:
+) -> Iterator[tuple[str, FieldInfo, Any]]:
     """Leaves of a settings model: dotted key, field, default."""
     for name, field in model.model_fields.items():
         if isinstance(defaults, Mapping) and name in defaults:

@@ -1,0 +1,83 @@
+"""Every shipped recipe composes, holds only keys its command knows, and names classes that exist."""
+
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra.utils import get_object
+from omegaconf import OmegaConf
+
+from tron.apps.command_line import Command
+from tron.apps.recipes import check, compose_recipe, field_keys, group_options, nested_items, resolve
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+COMMANDS = {name.removeprefix("tron-"): target for name, target in SCRIPTS.items()}
+
+
+def shipped_recipes() -> Iterator[Any]:
+    """(folder, overrides) of every YAML file under conf/."""
+    for path in sorted((ROOT / "conf").rglob("*.yaml")):
+        folder, *group, name = path.relative_to(ROOT / "conf").with_suffix("").parts
+        overrides = [f"{'/'.join(group)}={name}"] if group else []
+        yield pytest.param(folder, overrides, id=str(path.relative_to(ROOT)))
+
+
+def load_command(folder: str) -> Command:
+    return get_object(COMMANDS[folder].replace(":", "."))
+
+
+def with_required_values(command: Command, overrides: list[str]) -> list[str]:
+    """The overrides and a stand-in for every key that only the user can know: all names or paths."""
+    recipe = compose_recipe(command.config_module, overrides)
+    required = [key for key, value in nested_items(OmegaConf.to_container(recipe)) if value == "???"]
+    return [*overrides, *(f"{key}=stand-in" for key in required)]
+
+
+def test_every_command_has_a_folder_of_recipes_and_no_folder_is_without_a_command():
+    folders = {path.parent.name for path in (ROOT / "conf").glob("*/config.yaml")}
+    assert folders == set(COMMANDS)
+
+
+@pytest.mark.parametrize(("folder", "overrides"), shipped_recipes())
+def test_a_shipped_recipe_is_valid(folder: str, overrides: list[str]):
+    command = load_command(folder)
+    recipe = compose_recipe(command.config_module, with_required_values(command, overrides))
+    check(recipe, command.settings)
+
+
+@pytest.mark.parametrize(("folder", "overrides"), shipped_recipes())
+def test_a_class_that_a_recipe_names_exists(folder: str, overrides: list[str]):
+    command = load_command(folder)
+    values = resolve(compose_recipe(command.config_module, with_required_values(command, overrides)))
+    for key, value in nested_items(values):
+        if key.rpartition(".")[2] == "_target_":
+            assert callable(get_object(value)), f"{key}={value}"
+
+
+@pytest.mark.parametrize("folder", sorted(COMMANDS))
+def test_every_setting_can_be_set_from_the_command_line(folder: str):
+    """A field that its YAML leaves out would be an unknown key to Hydra."""
+    command = load_command(folder)
+    values = OmegaConf.to_container(compose_recipe(command.config_module, []))
+    written = {key for key, _ in nested_items(values)}
+    optional = {
+        key for key, value in nested_items(values) if value is None
+    }  # a nested model that is left out
+    missing = set(field_keys(command.settings)) - written
+    assert {key for key in missing if key.rpartition(".")[0] not in optional} == set()
+
+
+@pytest.mark.parametrize("folder", sorted(COMMANDS))
+def test_every_setting_is_described(folder: str):
+    command = load_command(folder)
+    assert [name for name, field in command.settings.model_fields.items() if not field.description] == []
+    assert len(command.examples) >= 2
+
+
+@pytest.mark.parametrize("folder", sorted(COMMANDS))
+def test_every_group_option_says_what_it_is_for(folder: str):
+    options = group_options(load_command(folder).config_module)
+    assert [f"{group}={name}" for group in options for name, said in options[group].items() if not said] == []
