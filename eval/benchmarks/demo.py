@@ -1,0 +1,104 @@
+"""Benchmark `demo`: make a small data set, train on it, evaluate. One command from nothing to a report."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import ClassVar
+
+from pydantic import Field, PositiveFloat, PositiveInt
+
+from eval.benchmarks import Benchmark, Outcome
+from eval.benchmarks.relighting import Relighting
+from eval.report.figures import written
+from eval.report.page import Cell, Section, Table
+from eval.results import Row
+from eval.stages import Child, Stages
+
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+WORDS = {
+    "datagen": "path-trace scenes, make surfels, render pbr and irradiance",
+    "train": "train the neural renderer and, at the same time, the pixel MLP",
+    "eval": "fit the baselines, score every held-out frame",
+}
+
+
+class Demo(Benchmark):
+    """Settings: the recipe of each stage; the evaluation's own settings lie under ``relighting``."""
+
+    name: ClassVar[str] = "demo"
+
+    relighting: Relighting = Field(description="settings of the evaluation; its inputs are filled in")
+    datagen: list[str] = Field(default=["experiment=demo"], description="arguments of tron-datagen")
+    train: list[str] = Field(
+        default=["experiment=demo"], description="arguments of tron-train, for both networks"
+    )
+    max_seconds: PositiveFloat | None = Field(
+        default=None, description="wall time of each training; null leaves it to the training recipe"
+    )
+    train_threads: PositiveInt = Field(default=1, description="threads of each of the two trainings")
+
+    def run(self, output_dir: Path) -> Outcome:
+        """Run the stages that are not finished, evaluate, and add the ``demo.*`` rows.
+
+        Raises:
+            StageFailed: a command failed; what was finished before it is kept and is not redone.
+        """
+        folder = output_dir.absolute()
+        stages, dataset = Stages(folder), folder / "dataset"
+        stages.run("datagen", [Child("datagen", "tron-datagen", [*self.datagen, f"output_dir={dataset}"])])
+        networks = {name: folder / "train" / name for name in ("tiny", "pixel_mlp")}
+        stages.run("train", [self._training(name, dataset, place) for name, place in networks.items()])
+        evaluation = self.relighting.model_copy(
+            update={
+                "dataset": dataset,
+                "renderer": networks["tiny"] / "renderer.safetensors",
+                "pixel_mlp": networks["pixel_mlp"] / "renderer.safetensors",
+            }
+        )
+        stages.restart("eval")  # never stale: it costs a minute and shows the code as it is now
+        with stages.timed("eval", [["tron-eval", "benchmark=demo", f"output_dir={output_dir}"]]):
+            outcome = evaluation.run(output_dir)
+        return self._with_stages(outcome, stages, output_dir)
+
+    def _training(self, name: str, dataset: Path, folder: Path) -> Child:
+        arguments = [*self.train, f"renderer={name}", f"dataset={dataset}", f"output_dir={folder}"]
+        if self.max_seconds is not None:
+            arguments.append(f"max_seconds={self.max_seconds:g}")
+        threads = {variable: str(self.train_threads) for variable in ONE_THREAD}
+        return Child(name, "tron-train", arguments, threads)
+
+    def _with_stages(self, outcome: Outcome, stages: Stages, output_dir: Path) -> Outcome:
+        seconds = {name: record.seconds for name, record in stages.records.items()}
+        rows = [Row(metric="demo.seconds", value=sum(seconds.values()), unit="s", n=1)]
+        rows += [
+            Row(metric=f"demo.{name}_seconds", value=value, unit="s", n=1) for name, value in seconds.items()
+        ]
+        table = [
+            [
+                Cell(name),
+                Cell(written(record.seconds, "s"), "strong"),
+                Cell(WORDS.get(name, "")),
+                Cell("; ".join(" ".join(command) for command in record.commands), "faint"),
+            ]
+            for name, record in stages.records.items()
+        ]
+        caption = f"Wall time of the stages, {written(sum(seconds.values()), 's')} in all."
+        if any(record.attempts > 1 for record in stages.records.values()):
+            caption += " Interrupted attempts are counted."
+        section = Section(
+            "stages",
+            "Where the time went",
+            [Table(caption, ["Stage", "Time", "What", "Command"], table, True)],
+        )
+        return dataclasses.replace(
+            outcome,
+            rows=[*outcome.rows, *rows],
+            title="Demo: from path-traced scenes to an evaluated neural renderer",
+            sections=[*outcome.sections, section],
+            headline={**outcome.headline, "demo.seconds": "The whole demo, after set-up"},
+            reproduce=[
+                "make demo",
+                f"# or, once installed: tron-eval benchmark=demo output_dir={output_dir}",
+            ],
+        )

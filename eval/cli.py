@@ -1,0 +1,89 @@
+"""`tron-eval`: run one benchmark, write results.json and report.html, and print what was found."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pydantic
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt
+
+from tron.apps.command_line import command
+from tron.errors import TronError
+from tron.storage import locked
+
+
+class Settings(BaseModel):
+    """Settings of `tron-eval`; what belongs to one benchmark alone lies under `benchmark`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    benchmark: dict[str, Any] = Field(description="settings of the benchmark; benchmark=NAME chooses it")
+    output_dir: Path = Field(description="folder for results.json, report.html and the pictures")
+    dataset: Path | None = Field(default=None, description="data set to evaluate on, made by tron-datagen")
+    renderer: Path | None = Field(default=None, description="weights of the neural renderer (.safetensors)")
+    pixel_mlp: Path | None = Field(default=None, description="weights of the pixel MLP baseline")
+    threads: PositiveInt = Field(default=1, description="threads that the networks use")
+    seed: int = Field(default=0, description="seed of every random choice")
+
+
+def main(settings: Settings) -> int:
+    """Measure TRON against baselines and targets; write results.json and a self-contained report.html.
+
+    Exits with 0 whether or not the targets are reached: the report says so, and by how much.
+    """
+    from eval.report.assemble import assemble
+    from eval.report.render import write_report
+    from eval.report.terminal import print_results
+    from eval.results import Results
+    from eval.stages import StageFailed
+    from tron.runtime import describe_machine
+
+    benchmark = make_benchmark(settings.benchmark)
+    with locked(settings.output_dir):
+        try:
+            outcome = benchmark.run(settings.output_dir)
+        except StageFailed as failure:
+            print(f"tron-eval: {failure}", file=sys.stderr)
+            return failure.exit_code
+        environment = {**describe_machine(), "inputs": outcome.inputs}
+        results = Results(benchmark=benchmark.name, environment=environment, rows=list(outcome.rows))
+        results = results.held_to(benchmark.targets)
+        results.save(settings.output_dir / "results.json")
+        report = settings.output_dir / "report.html"
+        write_report(assemble(outcome, results, benchmark.targets), report)
+        print_results(results, benchmark.targets, report)
+    return 0
+
+
+def make_benchmark(config: dict[str, Any]) -> Any:
+    """Instantiate the class that ``_target_`` names; TronError for a wrong setting."""
+    import hydra.utils
+    from hydra.errors import InstantiationException
+
+    try:
+        return hydra.utils.instantiate(config, _convert_="all")
+    except InstantiationException as error:
+        cause = error.__cause__
+        if isinstance(cause, pydantic.ValidationError):
+            first = cause.errors()[0]
+            key = ".".join(["benchmark", *map(str, first["loc"])])
+            raise TronError(first["msg"], key, "--cfg job shows the composed configuration") from error
+        raise TronError(str(error).splitlines()[0], "benchmark") from error
+
+
+cli = command(
+    "tron-eval",
+    "conf.eval",
+    Settings,
+    main,
+    examples=(
+        "tron-eval benchmark=demo output_dir=outputs/demo",
+        "tron-eval benchmark=relighting dataset=outputs/data renderer=outputs/train/renderer.safetensors "
+        "output_dir=outputs/relighting",
+    ),
+)
+
+if __name__ == "__main__":
+    cli()

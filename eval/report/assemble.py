@@ -1,0 +1,103 @@
+"""Outcome of a benchmark + its results -> the page: verdict, targets, its own sections, provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from eval.benchmarks import Outcome
+from eval.report.figures import bound, verdict, written
+from eval.report.page import Cell, Code, Page, Section, Table, Text, Tile
+from eval.results import Results, Target
+
+UNITS = {"gain": "dB", "psnr": "dB", "seconds": "s", "deg": "deg", "leak": "fraction", "darkened": "fraction"}
+
+
+def assemble(outcome: Outcome, results: Results, targets: Sequence[Target]) -> Page:
+    """Build the whole page; every figure on it is a row of ``results`` or stands in the benchmark's
+    sections.
+    """
+    reached = sum(1 for t in targets if (v := results.value(t.metric)) is not None and t.reached(v))
+    tally = f" {reached} of {len(targets)} targets are reached." if targets else ""
+    environment = results.environment
+    commit = str(environment.get("commit") or "unknown")
+    if environment.get("dirty"):
+        commit += " with uncommitted changes"
+    sections = [*([_targets(results, targets)] if targets else []), *outcome.sections]
+    sections.append(_provenance(environment, commit, outcome.reproduce))
+    return Page(
+        title=outcome.title,
+        verdict=outcome.verdict + tally,
+        lead=outcome.lead,
+        tiles=_tiles(outcome.headline, results, targets),
+        sections=sections,
+        footer=f"Benchmark {results.benchmark}, commit {commit}. All figures: results.json beside this page.",
+    )
+
+
+def _unit(results: Results, target: Target) -> str:
+    row = results.find(target.metric)
+    if row is not None:
+        return row.unit
+    return next((unit for word, unit in UNITS.items() if word in target.metric), "")
+
+
+def _tiles(headline: dict[str, str], results: Results, targets: Sequence[Target]) -> list[Tile]:
+    by_metric = {target.metric: target for target in targets}
+    tiles = []
+    for metric, label in headline.items():
+        row, target = results.find(metric), by_metric.get(metric)
+        if row is None:
+            continue
+        value = written(row.value, row.unit, signed=".gain" in metric)
+        if target is None:
+            tiles.append(Tile(label, value))
+        else:
+            words, tone = verdict(target, row.value, row.unit)
+            tiles.append(Tile(label, value, f"{bound(target, row.unit)}: {words}", tone))
+    return tiles
+
+
+def _targets(results: Results, targets: Sequence[Target]) -> Section:
+    rows = []
+    for target in targets:
+        measured, unit = results.value(target.metric), _unit(results, target)
+        words, tone = verdict(target, measured, unit)
+        rows.append(
+            [
+                Cell(target.what or target.metric),
+                Cell(
+                    "—" if measured is None else written(measured, unit, ".gain" in target.metric), "strong"
+                ),
+                Cell(bound(target, unit)),
+                Cell(words, tone),
+            ]
+        )
+    caption = "Bounds set before the measurement; verdicts are on the unrounded figures."
+    table = Table(caption, ["Figure", "Measured", "Target", "Verdict"], rows)
+    return Section("targets", "Targets", [table])
+
+
+def _provenance(environment: dict[str, Any], commit: str, reproduce: Sequence[str]) -> Section:
+    described: dict[str, str] = {"commit": commit}
+    for key, value in environment.items():
+        if key not in ("commit", "dirty") and value not in (None, "", {}):
+            described[key.replace("_", " ")] = _plain(value)
+    table = Table(
+        "Where and with what this was measured.",
+        ["Property", "Value"],
+        [[Cell(key), Cell(value)] for key, value in described.items()],
+        prose=True,
+    )
+    blocks = [table]
+    if reproduce:
+        blocks += [Text("To measure it again, from a checkout of that commit:"), Code("\n".join(reproduce))]
+    return Section("machine", "Machine, commit and how to reproduce", blocks)
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_plain(item)}" for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_plain, value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,151 @@
+"""Side-by-side pictures of held-out frames: methods against the truth, the guidance against its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from eval.guidance import DARKENED_BELOW, LEAK_OVER_MEAN, shadow_errors, surface_mask
+from eval.report.page import Picture, Pictures
+from eval.scores import PSNR_CAP
+from tron import metrics
+from tron.color import linear_to_srgb, luminance, to_display
+from tron.images import write_image
+from tron.shards.schema import Clip, ClipMeta
+
+METHOD_TITLES = {
+    "pbr": "pbr",
+    "irradiance": "irradiance",
+    "shadow_ratio": "shadow_ratio",
+    "affine_ratio": "affine_ratio",
+    "pixel_mlp": "pixel_mlp",
+    "neural": "neural renderer",
+}
+METHOD_ALTS = {
+    "pbr": "split-sum shading of the surfels without shadows",
+    "irradiance": "light arriving at each surface, with shadows, as a white surface would show it",
+    "shadow_ratio": "pbr darkened by the share of light that arrives",
+    "affine_ratio": "best linear blend of pbr, irradiance and shadow_ratio",
+    "pixel_mlp": "a network that sees one pixel at a time",
+    "neural": "the neural renderer's image",
+}
+ERROR_GAIN = 3
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The middle frame of a clip, display values (H, W, 3): by every method, the truth, and the guidance
+    pictures.
+
+    ``psnr`` holds dB on the foreground of these very pictures; ``guidance`` is empty without references.
+    """
+
+    meta: ClipMeta
+    frame: int
+    methods: dict[str, np.ndarray]
+    truth: np.ndarray
+    psnr: dict[str, float]
+    guidance: dict[str, np.ndarray]
+
+    @property
+    def title(self) -> str:
+        """Scene, light and frame in words."""
+        light = f"{self.meta.light} ({self.meta.light_family})"
+        return f"Scene {self.meta.scene} · light {light} · frame {self.frame + 1} of {self.meta.frames}"
+
+
+def middle_frame(clip: Clip, shown: dict[str, np.ndarray], truth: np.ndarray) -> Shown:
+    """Take the middle frame of a clip's predictions (method -> (K, H, W, 3)) and of its truth."""
+    k = clip.meta.frames // 2
+    frames, exposure = clip.frames, clip.meta.exposure
+    methods = {name: images[k] for name, images in shown.items()}
+    methods["irradiance"] = to_display(frames["irr"][k], exposure)
+    foreground = frames["foreground"][k, ..., 0] > 0.5
+    where = foreground if foreground.any() else None
+    psnr = {
+        name: min(metrics.psnr(image, truth[k], where), PSNR_CAP)
+        for name, image in methods.items()
+        if name != "irradiance"
+    }
+    return Shown(clip.meta, k, methods, truth[k], psnr, _guidance_pictures(clip, k))
+
+
+def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
+    frames = {name: images[k] for name, images in clip.frames.items()}
+    if not {"irr_ref", "base_color", "base_color_ref", "normal", "normal_ref"} <= frames.keys():
+        return {}
+    foreground = frames["foreground"] > 0.5
+    ours, truth = (
+        np.where(foreground, to_display(frames[name], clip.meta.exposure), 0) for name in ("irr", "irr_ref")
+    )
+    pictures = {
+        "irradiance": ours,
+        "irradiance, path-traced": truth,
+        f"difference ×{ERROR_GAIN}": np.clip(np.abs(ours - truth) * ERROR_GAIN, 0, 1),
+        "shadow errors": _shadow_error_picture(frames, truth),
+    }
+    for name, title in (("base_color", "base color"), ("normal", "normals")):
+        for member, whose in ((name, "surfels"), (f"{name}_ref", "true")):
+            image = frames[member]
+            if name == "base_color":
+                picture = linear_to_srgb(np.clip(image, 0, 1))
+            else:
+                picture = np.where(np.linalg.norm(image, axis=-1, keepdims=True) > 0.5, image / 2 + 0.5, 0)
+            pictures[f"{title}, {whose}"] = np.clip(np.where(foreground, picture, 0), 0, 1)
+    return pictures
+
+
+def _shadow_error_picture(frames: dict[str, np.ndarray], truth: np.ndarray) -> np.ndarray:
+    """The true irradiance in faint grey, leaking pixels orange, darkened pixels blue."""
+    leaking, darkened = shadow_errors(
+        frames["irr"], frames["unshadowed"], frames["irr_ref"], surface_mask(frames)
+    )
+    picture = np.repeat(luminance(truth)[..., None] * 0.6, 3, axis=-1)
+    picture[leaking] = (1.0, 0.5, 0.05)
+    picture[darkened] = (0.2, 0.6, 1.0)
+    return picture
+
+
+def comparison(shown: Shown) -> Pictures:
+    """pbr, irradiance, the strongest baselines, the neural renderer, the truth and the error of the neural
+    one.
+    """
+    pictures = []
+    where = f"scene {shown.meta.scene} under light {shown.meta.light}"
+    for name, title in METHOD_TITLES.items():
+        if name in shown.methods:
+            figure = f"{shown.psnr[name]:.1f} dB" if name in shown.psnr else ""
+            alt = f"{METHOD_ALTS[name]}, {where}"
+            pictures.append(Picture(shown.methods[name], title, alt, figure, strong=name == "neural"))
+    pictures.append(Picture(shown.truth, "path-traced truth", f"path-traced ground truth, {where}"))
+    judged_name = "neural" if "neural" in shown.methods else "pbr"
+    error = np.clip(np.abs(shown.methods[judged_name] - shown.truth) * ERROR_GAIN, 0, 1)
+    title = f"|{METHOD_TITLES[judged_name]} − truth| ×{ERROR_GAIN}"
+    pictures.append(Picture(error, title, f"absolute error of {judged_name} times {ERROR_GAIN}, {where}"))
+    return Pictures(shown.title, pictures)
+
+
+def guidance(shown: Shown) -> Pictures:
+    """Irradiance, its reference and errors; base color and normals of the surfels beside the true ones."""
+    where = f"scene {shown.meta.scene} under light {shown.meta.light}"
+    pictures = [Picture(image, name, f"{name}, {where}") for name, image in shown.guidance.items()]
+    note = (
+        f"Shadow errors: orange where a shadow leaks (more than {LEAK_OVER_MEAN:.0%} of the mean light too "
+        f"bright), blue where a lit pixel keeps less than {DARKENED_BELOW:.0%} of its light."
+    )
+    return Pictures(shown.title, pictures, note)
+
+
+def write_strips(groups: Sequence[Pictures], names: Sequence[str], folder: Path) -> None:
+    """Write each group of equally large pictures as one PNG, in the page's order and number of columns."""
+    for group, name in zip(groups, names):
+        images = [picture.image for picture in group.pictures]
+        blank = np.zeros_like(images[0])
+        images += [blank] * (-len(images) % group.columns)
+        rows = [
+            np.concatenate(images[i : i + group.columns], 1) for i in range(0, len(images), group.columns)
+        ]
+        write_image(folder / f"{name}.png", np.concatenate(rows, 0))

@@ -1,0 +1,47 @@
+"""What the command prints at its end: figures on the foreground and the full frame, then the path."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from eval.report.figures import bound, verdict, written
+from eval.results import Results, Target
+
+
+def print_results(results: Results, targets: Sequence[Target], report: Path) -> None:
+    """Print tables of the results and the absolute path of the report, to stdout.
+
+    Metrics with a ``_full`` twin share a line; rows of one light family stay in results.json and the report.
+    """
+    console = Console(width=None if Console().is_terminal else 110, highlight=False)
+    pairs = Table("figure", "foreground", "full frame", box=None, pad_edge=False)
+    others = Table("figure", "measured", "target", "", box=None, pad_edge=False)
+    by_metric = {target.metric: target for target in targets}
+    for row in results.rows:
+        full = results.find(f"{row.metric}_full")
+        signed = ".gain" in row.metric
+        if full is not None:
+            values = [written(each.value, each.unit, signed) for each in (row, full)]
+            pairs.add_row(row.metric, *values)
+        target = by_metric.get(row.metric)
+        if target is not None:
+            words, tone = verdict(target, row.value, row.unit)
+            style = "green" if tone == "good" else "red"
+            value = written(row.value, row.unit, signed)
+            others.add_row(row.metric, value, bound(target, row.unit), f"[{style}]{words}[/]")
+        elif full is None and re.match(r"(demo|surfels|guidance)\.[a-z_]+$", row.metric):
+            others.add_row(row.metric, written(row.value, row.unit), "", "")
+    for target in targets:
+        if results.find(target.metric) is None:
+            others.add_row(target.metric, "—", f"{target.bound} {target.value:g}", "[red]not measured[/]")
+    for table in (pairs, others):
+        if table.row_count:
+            console.print(table)
+            console.print()
+    # print, not the console: a path must come out whole, on one line
+    print(f"report: {report.absolute()}", flush=True)

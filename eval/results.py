@@ -1,0 +1,118 @@
+"""results.json: the figures of one benchmark on one machine, and the targets they are held to.
+
+The file is ``{"benchmark", "environment", "rows": [{"metric", "value", "unit", "reference", "ratio",
+"n"}]}``. Metric names are unique; a figure that was not measured has no row, and a row never holds NaN or
+infinity (JSON has no way to write them).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Literal
+
+import pydantic
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt
+
+from tron.errors import TronError
+from tron.storage import write_atomic
+
+METRIC_PATTERN = r"^[a-z][a-z0-9_]*(\.[a-z0-9][a-z0-9_]*)+$"
+
+
+class Row(BaseModel):
+    """One figure. ``n`` counts what it was averaged over; ``ratio`` is ``value`` over the reference's
+    number.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    metric: str = Field(pattern=METRIC_PATTERN, description="what was measured, e.g. neural.psnr_full.sun")
+    value: FiniteFloat
+    unit: str = Field(min_length=1)
+    reference: str | None = Field(default=None, description="what the value is held against, in words")
+    ratio: FiniteFloat | None = None
+    n: PositiveInt
+
+
+class Target(BaseModel):
+    """A bound on one metric: a row of the small table of targets in ``conf/eval``."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    metric: str = Field(pattern=METRIC_PATTERN)
+    bound: Literal["at least", "at most"]
+    value: FiniteFloat
+    what: str = Field(default="", description="the metric in words, for the report")
+
+    def margin(self, measured: float) -> float:
+        """How far ``measured`` is on the good side of the bound, in its unit; negative when missed."""
+        return measured - self.value if self.bound == "at least" else self.value - measured
+
+    def reached(self, measured: float) -> bool:
+        """Whether the unrounded figure keeps to the bound."""
+        return self.margin(measured) >= 0
+
+
+class Results(BaseModel):
+    """Everything in results.json; validated when read and when written."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    benchmark: str = Field(min_length=1)
+    environment: dict[str, Any]
+    rows: list[Row]
+
+    @pydantic.model_validator(mode="after")
+    def _unique(self) -> Results:
+        seen: set[str] = set()
+        for row in self.rows:
+            if row.metric in seen:
+                raise ValueError(f"metric {row.metric} appears twice")
+            seen.add(row.metric)
+        return self
+
+    def find(self, metric: str) -> Row | None:
+        """The row of that name, or None if it was not measured."""
+        return next((row for row in self.rows if row.metric == metric), None)
+
+    def value(self, metric: str) -> float | None:
+        """The value of that name, or None if it was not measured."""
+        row = self.find(metric)
+        return None if row is None else row.value
+
+    def held_to(self, targets: Iterable[Target]) -> Results:
+        """A copy whose rows name their target as ``reference``, with ``ratio`` = value / target."""
+        by_metric = {target.metric: target for target in targets}
+
+        def annotated(row: Row) -> Row:
+            target = by_metric.get(row.metric)
+            if target is None:
+                return row
+            ratio = row.value / target.value if target.value else None
+            reference = f"target: {target.bound} {target.value:g} {row.unit}"
+            return row.model_copy(update={"reference": reference, "ratio": ratio})
+
+        return self.model_copy(update={"rows": [annotated(row) for row in self.rows]})
+
+    def save(self, path: str | Path) -> None:
+        """Write the file whole or not at all; TronError if the folder cannot be written.
+
+        Raises:
+            ValueError: two rows share a name, or a value is not finite (a defect of the benchmark).
+        """
+        checked = Results.model_validate(self.model_dump())
+        write_atomic(path, json.dumps(checked.model_dump(), indent=2, allow_nan=False) + "\n")
+
+    @staticmethod
+    def load(path: str | Path) -> Results:
+        """Read and validate a file; TronError if it is missing or is not a results.json."""
+        try:
+            return Results.model_validate_json(Path(path).read_bytes())
+        except OSError as error:
+            raise TronError(f"cannot read: {error.strerror or error}", path) from error
+        except pydantic.ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(str(part) for part in first["loc"]) or "file"
+            raise TronError(f"not a results.json: {place}: {first['msg']}", path) from error

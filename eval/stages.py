@@ -1,0 +1,211 @@
+"""Long work done by other console commands: run, streamed, timed, and not done twice.
+
+A stage is one or more commands that run at the same time. Its seconds are kept in ``stages.json`` and add up
+over interrupted attempts, so that a resumed demo still tells how long the whole of it took.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pydantic
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat
+
+from tron.errors import TronError
+from tron.storage import write_atomic
+
+MESSAGE_LINES = 12
+"""Last lines of a failed child that are kept for its error message."""
+PATIENCE = 20.0
+"""Seconds that a child has to end by itself after it was asked to."""
+
+
+class StageFailed(Exception):
+    """A child ended with an exit code other than 0; str() names the command, its code and its last words."""
+
+    def __init__(self, command: str, exit_code: int, words: str):
+        super().__init__(f"{command} failed with exit code {exit_code}: {words or 'it said nothing'}")
+        self.exit_code = exit_code if exit_code > 0 else 1  # killed by a signal: -9 is no exit code of ours
+
+
+class StageRecord(BaseModel):
+    """What stages.json knows of a stage: its commands as typed, seconds over all attempts, whether it is
+    done.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    commands: list[list[str]]
+    seconds: NonNegativeFloat = 0.0
+    attempts: int = Field(default=0, ge=0)
+    finished: bool = False
+
+
+class StageFile(BaseModel):
+    """The whole of stages.json: stage name -> record, in the order in which they first ran."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    stages: dict[str, StageRecord] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Child:
+    """One command: its label in the log, a script, its arguments, additions to its environment."""
+
+    label: str
+    script: str
+    arguments: Sequence[str]
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def typed(self) -> list[str]:
+        """The command as one would type it."""
+        return [self.script, *self.arguments]
+
+
+class Stages:
+    """Runs stages and remembers them in ``folder/stages.json``."""
+
+    def __init__(self, folder: Path):
+        self.path = folder / "stages.json"
+        self.file = StageFile()
+        if self.path.is_file():
+            try:
+                self.file = StageFile.model_validate_json(self.path.read_bytes())
+            except pydantic.ValidationError as error:
+                raise TronError("not a record of stages", self.path, "delete it to start afresh") from error
+
+    @property
+    def records(self) -> dict[str, StageRecord]:
+        """Stage name -> record."""
+        return self.file.stages
+
+    def run(self, name: str, children: Sequence[Child]) -> float:
+        """Run the children at the same time unless the stage is finished; return its seconds in all attempts.
+
+        Raises:
+            TronError: a console script is missing, or the stage was done or begun by other commands.
+            StageFailed: a child failed; the others are ended, and the time spent is kept.
+        """
+        commands = [child.typed for child in children]
+        record = self.records.setdefault(name, StageRecord(commands=commands))
+        if record.commands != commands:
+            raise TronError(
+                f"stage '{name}' was begun with other settings",
+                self.path.parent,
+                "choose another output_dir, or delete this one to start afresh",
+            )
+        if record.finished:
+            _say(name, f"done before, {record.seconds:.0f} s")
+            return record.seconds
+        with self.timed(name, commands):
+            run_together(children)
+        return record.seconds
+
+    @contextmanager
+    def timed(self, name: str, commands: list[list[str]]) -> Iterator[StageRecord]:
+        """Add the seconds of the block to the stage's record, and mark it finished if the block succeeds."""
+        record = self.records.setdefault(name, StageRecord(commands=commands))
+        record.attempts += 1
+        start = time.perf_counter()
+        try:
+            yield record
+            record.finished = True
+        finally:
+            record.seconds += time.perf_counter() - start
+            write_atomic(self.path, self.file.model_dump_json(indent=2) + "\n")
+
+    def restart(self, name: str) -> None:
+        """Forget a stage: one that is cheap, and is measured anew every time."""
+        self.records.pop(name, None)
+
+
+def script_path(name: str) -> str:
+    """The console script beside this Python; TronError if it is not installed there."""
+    folder = Path(sys.executable).parent
+    found = shutil.which(name, path=str(folder))
+    if found is None:
+        raise TronError(f"command {name} not found", folder, "install TRON with `pip install -e .`")
+    return found
+
+
+def run_together(children: Sequence[Child]) -> None:
+    """Run commands at the same time, their output line by line behind their labels, until all have ended.
+
+    When one fails, or this process is interrupted, the others are asked to end and, after PATIENCE, killed.
+
+    Raises:
+        TronError: a console script is missing; nothing was started.
+        StageFailed: the first child, in the order given, that failed by itself.
+    """
+    paths = [script_path(child.script) for child in children]
+    running = [_Running(child, path) for child, path in zip(children, paths)]
+    try:
+        while any(each.process.poll() is None for each in running):
+            if any(each.process.poll() not in (None, 0) for each in running):
+                break
+            time.sleep(0.05)
+        failed = next((each for each in running if each.process.poll() not in (None, 0)), None)
+    finally:
+        for each in running:
+            each.end()
+    if failed is not None:
+        raise StageFailed(" ".join(failed.child.typed), failed.process.returncode, failed.words())
+
+
+class _Running:
+    """A child process and the thread that prints its lines (stdout and stderr in one stream)."""
+
+    def __init__(self, child: Child, path: str):
+        self.child = child
+        self.last: deque[str] = deque(maxlen=MESSAGE_LINES)
+        _say(child.label, "$ " + " ".join(child.typed))
+        self.process = subprocess.Popen(
+            [path, *child.arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **child.environment},
+        )
+        self._thread = threading.Thread(target=self._stream, daemon=True)
+        self._thread.start()
+
+    def _stream(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if text := line.rstrip():
+                self.last.append(text)
+                _say(self.child.label, text)
+
+    def end(self) -> None:
+        """Wait for the process if it has ended, else make it end; then for its last lines."""
+        if self.process.poll() is None:
+            self.process.terminate()
+            try:
+                self.process.wait(PATIENCE)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+        self._thread.join(PATIENCE)
+
+    def words(self) -> str:
+        """What the child said was wrong: the last line that its command speaks in, else its last line."""
+        spoken = [line for line in self.last if line.startswith(f"{self.child.script}: ")]
+        return (spoken or list(self.last) or [""])[-1]
+
+
+def _say(label: str, text: str) -> None:
+    print(f"[{label}] {text}", flush=True)

@@ -1,0 +1,147 @@
+"""A drawn world for the benchmarks: a ball on a floor under one light, every buffer a closed formula."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tron.cameras import Camera
+from tron.seeds import generator
+from tron.shards.manifest import Manifest
+from tron.shards.schema import Clip, ClipMeta
+from tron.shards.writer import ShardWriter
+
+LIGHTS = {"noon": "sun", "softbox": "studio", "grey": "overcast", "dusk": "sun", "window": "studio"}
+
+
+def draw_frame(size: int, seed: int, light: str, frame: int = 0) -> dict[str, np.ndarray]:
+    """Members of one frame, (size, size, C) float32: linear colours, an elliptic shadow, a sky behind."""
+    rng = generator(seed, "drawn", light)
+    y, x = (np.mgrid[:size, :size] + 0.5) / size * 2 - 1
+    azimuth = rng.uniform(-1, 1) + 0.1 * frame
+    sun, sky = {"sun": (2.0, 0.25), "studio": (1.2, 0.4), "overcast": (0.25, 0.8)}[LIGHTS[light]]
+    centre = np.array([0.3 * np.sin(seed), 0.05])
+    u, v = (x - centre[0]) / 0.42, (y - centre[1]) / 0.42
+    ball = u**2 + v**2 < 1
+    floor = (y > 0.1) & ~ball
+    normal = np.stack([u, np.sqrt(np.clip(1 - u**2 - v**2, 0, 1)), -v], -1)  # x right, y near, z up
+    normal[floor] = (0, 0.3, 0.954)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    to_light = np.array([np.sin(azimuth), 0.5, 0.8])
+    cosine = np.clip(normal @ (to_light / np.linalg.norm(to_light)), 0, 1)[..., None]
+    shadow = ((x - centre[0] + 0.5 * np.sin(azimuth)) / 0.5) ** 2 + ((y - 0.52) / 0.16) ** 2 < 1
+    visible = np.where(floor & shadow, 0.0, 1.0)[..., None]
+    colours = rng.uniform(0.1, 0.9, (3, 3))
+    checks = ((np.floor(x * 4) + np.floor(y * 4)) % 2)[..., None]
+    base = np.where(ball[..., None], colours[0], colours[1] * checks + colours[2] * (1 - checks))
+    tint = np.array([1.0, 0.93, 0.85])
+    unshadowed = (sky + sun * cosine) * tint
+    irradiance = (sky * (0.5 + 0.5 * visible) + sun * cosine * visible) * tint
+    gloss = 0.6 * np.clip(cosine, 0, 1) ** 40 * sun
+    backdrop = np.broadcast_to(sky * np.array([0.8, 0.9, 1.1]) * (1.2 - 0.4 * y)[..., None], base.shape)
+    solid = (ball | floor)[..., None]
+
+    def over(image: np.ndarray) -> np.ndarray:
+        return np.where(solid, image, backdrop).astype(np.float32)
+
+    noise = generator(seed, "noise", light, frame)
+    return {
+        "pbr": over(base * unshadowed + gloss),
+        "irr": over(irradiance),
+        "rgb": over(base * irradiance * (1 + 0.25 * base) + gloss * visible),
+        "unshadowed": over(unshadowed),
+        "shadowed": over(base * irradiance + gloss),
+        "mask": solid.astype(np.float32),
+        "foreground": solid.astype(np.float32),
+        "irr_ref": over(irradiance * (1 + 0.05 * noise.standard_normal(irradiance.shape))),
+        "base_color_ref": np.where(solid, base, 0).astype(np.float32),
+        "normal_ref": np.where(solid, normal, 0).astype(np.float32),
+        "base_color": np.where(solid, np.clip(base + 0.02, 0, 1), 0).astype(np.float32),
+        "normal": np.where(solid, normal, 0).astype(np.float32),
+    }
+
+
+def describe_clip(key: str, split: str, scene: str, light: str, frames: int, size: int) -> ClipMeta:
+    cameras = [
+        Camera.look_at((np.sin(0.1 * k), -4, 1), (0, 0, 0), fov_deg=35, width=size, height=size)
+        for k in range(frames)
+    ]
+    return ClipMeta(
+        key=key,
+        scene=scene,
+        light=light,
+        light_family=LIGHTS[light],  # type: ignore[arg-type]
+        split=split,
+        frames=frames,
+        width=size,
+        height=size,
+        cameras=[camera.to_dict() for camera in cameras],
+        exposure=0.4,
+        color_space=dict.fromkeys(("pbr", "irr", "rgb", "unshadowed", "shadowed"), "linear"),
+    )
+
+
+@pytest.fixture(scope="session")
+def drawn_clip() -> Callable[..., Clip]:
+    """A clip in memory: drawn_clip(light="noon", seed=0, frames=2, size=32)."""
+
+    def make(light: str = "noon", seed: int = 0, frames: int = 2, size: int = 32) -> Clip:
+        drawn = [draw_frame(size, seed, light, k) for k in range(frames)]
+        meta = describe_clip(f"s{seed:06d}-{light}", "test", f"s{seed:06d}", light, frames, size)
+        members = {name: np.stack([frame[name] for frame in drawn]) for name in drawn[0]}
+        return Clip(meta, {n: m[..., None] if m.ndim == 3 else m for n, m in members.items()})
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def write_dataset() -> Callable[..., Path]:
+    """Write a data set: write_dataset(folder, size=32, frames=2); train, train_b and test splits."""
+
+    def write(folder: Path, size: int = 32, frames: int = 2, scenes: int = 2) -> Path:
+        entries = []
+        for split, first, lights, count in (
+            ("train", 0, ("noon", "softbox", "grey"), 1),
+            ("train_b", 20, ("noon",), 1),
+            ("test", 10, ("dusk", "window", "grey"), frames),
+        ):
+            with ShardWriter(folder, split, samples_per_shard=4) as writer:
+                for seed in range(first, first + scenes):
+                    for light in lights:
+                        meta = describe_clip(
+                            f"s{seed:06d}-{light}", split, f"s{seed:06d}", light, count, size
+                        )
+                        members = [draw_frame(size, seed, light, k) for k in range(count)]
+                        if split != "test":
+                            members = [_without_references(frame) for frame in members]
+                        writer.write(meta, members)
+            entries += writer.entries
+        Manifest(config_sha256="0" * 64, shards=entries).save(folder)
+        return folder
+
+    return write
+
+
+def _without_references(frame: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    references = ("irr_ref", "base_color_ref", "normal_ref", "base_color", "normal")
+    return {name: image for name, image in frame.items() if name not in references}
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory: pytest.TempPathFactory, write_dataset: Callable[..., Path]) -> Path:
+    """A small data set on disk, shared by the tests that only read it."""
+    return write_dataset(tmp_path_factory.mktemp("dataset"))
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with tiny.safetensors and pixel_mlp.safetensors, both untrained: both return pbr unchanged."""
+    from tron.neural.pixel_mlp import PixelMLP
+    from tron.neural.renderer import NeuralRenderer
+    from tron.neural.weights import save_renderer
+
+    folder = tmp_path_factory.mktemp("weights")
+    save_renderer(folder / "tiny.safetensors", NeuralRenderer())
+    save_renderer(folder / "pixel_mlp.safetensors", PixelMLP())
+    return folder

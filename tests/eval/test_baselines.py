@@ -1,0 +1,111 @@
+"""Each baseline's law, on images whose answer is known."""
+
+import numpy as np
+import pytest
+
+from eval.baselines import RATIO_FLOOR, AffineFit, ProductTerms, ScaleFit, product_terms, shadow_ratio
+from tron.color import agx
+from tron.seeds import generator
+
+
+def images(*names: str, n: int = 4000, low: float = 0.01, high: float = 2.0) -> list[np.ndarray]:
+    return [generator(1, "images", name).uniform(low, high, (n, 3)).astype(np.float32) for name in names]
+
+
+def test_shadow_ratio_is_pbr_where_nothing_is_shadowed():
+    pbr, light = images("pbr", "light")
+    np.testing.assert_array_equal(shadow_ratio(pbr, light, light, exposure=0.4), pbr)
+
+
+def test_shadow_ratio_is_the_share_of_light_per_channel():
+    pbr, light = images("pbr", "light")
+    share = np.array([0.25, 0.5, 0.0], np.float32)
+    np.testing.assert_allclose(shadow_ratio(pbr, light * share, light, 0.4), pbr * share, rtol=1e-6)
+
+
+def test_shadow_ratio_never_brightens_nor_divides_by_darkness():
+    pbr, light = images("pbr", "light")
+    np.testing.assert_array_equal(shadow_ratio(pbr, 3 * light, light, 0.4), pbr)
+    dark = np.full_like(light, 0.5 * RATIO_FLOOR)
+    np.testing.assert_array_equal(shadow_ratio(pbr, np.zeros_like(light), dark, 1.0), pbr)
+
+
+def test_shadow_ratio_does_not_depend_on_the_unit_of_light():
+    pbr, light, share = images("pbr", "light", "share", high=1.0)
+    small = shadow_ratio(pbr, light * share, light, 0.4)
+    large = shadow_ratio(1000 * pbr, 1000 * light * share, 1000 * light, 0.4 / 1000)
+    np.testing.assert_allclose(large, 1000 * small, rtol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [0.03, 0.9, 7.5])
+def test_the_fitted_scale_is_exact_on_data_made_with_it(scale: float):
+    pbr, irradiance = images("pbr", "irradiance")
+    opacity = np.linspace(0, 1, len(pbr))[:, None]
+    terms = product_terms(pbr, irradiance, opacity, exposure=0.4)
+    fit = ScaleFit()
+    fit.add(terms, terms.displayed(scale))
+    assert fit.solve() == pytest.approx(scale, rel=1e-3)
+
+
+def test_the_fitted_scale_is_no_worse_than_any_other():
+    pbr, irradiance, truth = images("pbr", "irradiance", "truth")
+    terms = ProductTerms(pbr * irradiance, np.zeros_like(pbr))
+    fit = ScaleFit()
+    fit.add(terms, agx(truth))
+    error = [
+        np.mean((terms.displayed(s) - agx(truth)) ** 2) for s in (fit.solve(), *np.geomspace(1e-3, 1e3, 200))
+    ]
+    assert error[0] <= min(error[1:]) * (1 + 1e-6)
+
+
+def test_where_no_surfel_is_the_product_keeps_the_environment():
+    pbr, irradiance = images("pbr", "irradiance")
+    terms = product_terms(pbr, irradiance, np.zeros((len(pbr), 1)), exposure=0.4)
+    np.testing.assert_allclose(terms.displayed(123.0), agx(0.4 * pbr), rtol=1e-6)
+
+
+def test_affine_recovers_a_known_affine_map_of_each_channel():
+    first, second = images("first", "second", low=0.2, high=0.8)
+    weights = np.array([[0.5, 0.3, 0.05], [0.7, -0.2, 0.2], [0.1, 0.6, 0.0]])
+    truth = weights[:, 0] * first + weights[:, 1] * second + weights[:, 2]
+    fit = AffineFit(2)
+    for part in range(4):  # as clips come, one after another
+        rows = slice(part * 1000, (part + 1) * 1000)
+        fit.add([first[rows], second[rows]], truth[rows])
+    blend = fit.solve()
+    np.testing.assert_allclose(blend.weights, weights, atol=1e-6)
+    np.testing.assert_allclose(blend.displayed([first, second]), truth, atol=1e-6)
+
+
+def test_affine_agrees_with_numpy_least_squares():
+    first, second, truth = images("first", "second", "truth", high=1.0)
+    fit = AffineFit(2)
+    fit.add([first, second], truth)
+    for channel in range(3):
+        columns = np.stack([first[:, channel], second[:, channel], np.ones(len(first))], 1).astype(float)
+        expected = np.linalg.lstsq(columns, truth[:, channel].astype(float), rcond=None)[0]
+        np.testing.assert_allclose(fit.solve().weights[channel], expected, atol=1e-7)
+
+
+def test_affine_of_equal_inputs_still_has_a_solution():
+    (image,) = images("first", high=1.0)
+    fit = AffineFit(2)
+    fit.add([image, image], image)
+    np.testing.assert_allclose(fit.solve().displayed([image, image]), image, atol=1e-5)
+
+
+def test_a_third_input_never_hurts_on_the_data_it_was_fitted_on():
+    first, second, third, truth = images("a", "b", "c", "d", high=1.0)
+    two, three = AffineFit(2), AffineFit(3)
+    two.add([first, second], truth)
+    three.add([first, second, third], truth)
+    error_two = np.mean((two.solve().displayed([first, second]) - truth) ** 2)
+    error_three = np.mean((three.solve().displayed([first, second, third]) - truth) ** 2)
+    assert error_three <= error_two
+
+
+def test_nothing_to_fit_on_is_said():
+    with pytest.raises(ValueError, match="no training pixels"):
+        AffineFit(2).solve()
+    with pytest.raises(ValueError, match="no training pixels"):
+        ScaleFit().solve()

@@ -1,0 +1,106 @@
+"""Quality of the guidance on drawn errors whose measure is known."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from eval.guidance import GuidanceScores, ShadowCounts, count_shadow_errors
+from tron.color import agx
+from tron.shards.schema import Clip
+
+MakeClip = Callable[..., Clip]
+
+
+def grey(values: list[float]) -> np.ndarray:
+    return np.repeat(np.array([values])[..., None], 3, axis=-1)
+
+
+def test_leaks_and_darkening_follow_their_definitions():
+    unshadowed = grey([1, 1, 1, 1, 1, 1, 1])
+    reference = grey([0.1, 0.1, 0.4, 0.7, 1.0, 1.0, 0.95])  # shadow, shadow, shadow, between, lit, lit, lit
+    leak = 0.15 * reference.mean()
+    ours = grey([0.1 + 1.01 * leak, 0.1 + 0.99 * leak, 0.0, 0.0, 0.74, 0.76, 2.0])
+    counts = count_shadow_errors(ours, unshadowed, reference, np.ones((1, 7), bool))
+    assert counts == ShadowCounts(shadowed=3, leaking=1, lit=3, darkened=1)
+
+
+def test_only_judged_pixels_count():
+    unshadowed, reference, ours = grey([1, 1]), grey([0.1, 1]), grey([1, 0.1])
+    assert count_shadow_errors(ours, unshadowed, reference, np.array([[True, False]])).leaking == 1
+    assert count_shadow_errors(ours, unshadowed, reference, np.array([[True, False]])).lit == 0
+    assert count_shadow_errors(ours, unshadowed, reference, np.zeros((1, 2), bool)) == ShadowCounts(
+        0, 0, 0, 0
+    )
+
+
+def test_perfect_guidance_leaks_nowhere_and_its_psnr_is_capped(drawn_clip: MakeClip):
+    clip = drawn_clip()
+    clip.frames["irr_ref"] = clip.frames["irr"].copy()
+    scores = GuidanceScores()
+    scores.add(clip)
+    rows = {row.metric: row.value for row in scores.rows()}
+    assert rows["guidance.irradiance_psnr"] == 100
+    assert rows["guidance.shadow_leak"] == 0
+    assert rows["guidance.lit_darkened"] == 0
+    assert rows["surfels.normal_mae_deg"] == pytest.approx(0, abs=1e-4)
+
+
+def test_unshadowed_irradiance_leaks_in_every_shadow_of_the_sun(drawn_clip: MakeClip):
+    clip = drawn_clip("noon")
+    clip.frames["irr_ref"] = clip.frames["irr"].copy()
+    clip.frames["irr"] = clip.frames["unshadowed"].copy()
+    scores = GuidanceScores()
+    scores.add(clip)
+    assert {row.metric: row.value for row in scores.rows()}["guidance.shadow_leak.sun"] == 1
+
+
+def test_the_headline_irradiance_is_that_of_the_worst_light(drawn_clip: MakeClip):
+    scores = GuidanceScores()
+    for light, error in (("noon", 0.05), ("softbox", 0.2), ("grey", 0.1)):
+        clip = drawn_clip(light, frames=2)
+        clip.frames["irr"] = np.full_like(clip.frames["irr"], 0.5)
+        clip.frames["irr_ref"] = np.full_like(clip.frames["irr"], 0.5 * (1 + error))
+        scores.add(clip)
+    rows = {row.metric: row for row in scores.rows()}
+    expected = -20 * np.log10(abs(agx(np.full(3, 0.4 * 0.5 * 1.2)) - agx(np.full(3, 0.4 * 0.5)))[0])
+    assert rows["guidance.irradiance_psnr"].value == pytest.approx(expected, abs=1e-3)
+    assert rows["guidance.irradiance_psnr"].value == rows["guidance.irradiance_psnr.studio"].value
+    assert rows["guidance.irradiance_psnr.studio"].value < rows["guidance.irradiance_psnr.overcast"].value
+    assert rows["guidance.irradiance_psnr.studio"].n == 2
+
+
+def test_a_view_seen_under_two_lights_counts_once_for_the_surfels(drawn_clip: MakeClip):
+    scores = GuidanceScores()
+    for light in ("noon", "softbox"):
+        scores.add(drawn_clip(light, frames=3))
+    rows = {row.metric: row for row in scores.rows()}
+    assert rows["surfels.base_color_psnr"].n == 3
+    assert rows["surfels.base_color_psnr"].value == pytest.approx(-20 * np.log10(0.02), abs=0.2)
+    assert rows["guidance.irradiance_psnr.sun"].n == 3
+
+
+def test_normals_are_compared_where_both_exist(drawn_clip: MakeClip):
+    clip = drawn_clip()
+    foreground = clip.frames["foreground"][..., 0] > 0.5
+    turned = clip.frames["normal_ref"].copy()
+    turned[foreground] = turned[foreground] @ np.diag([1, -1, -1]).astype(np.float32)  # half a turn about x
+    turned[:, :, :20] = 0  # holes of the surfels
+    clip.frames["normal"] = turned
+    scores = GuidanceScores()
+    scores.add(clip)
+    both = foreground.copy()
+    both[:, :, :20] = False
+    x = clip.frames["normal_ref"][both][:, 0]
+    expected = np.degrees(np.arccos(np.clip(2 * x**2 - 1, -1, 1))).mean()  # n.n' = x^2 - y^2 - z^2
+    value = {row.metric: row.value for row in scores.rows()}["surfels.normal_mae_deg"]
+    assert value == pytest.approx(expected, abs=2.0)
+
+
+def test_without_references_nothing_is_claimed(drawn_clip: MakeClip):
+    clip = drawn_clip()
+    for name in ("irr_ref", "base_color_ref", "normal_ref", "base_color", "normal"):
+        del clip.frames[name]
+    scores = GuidanceScores()
+    scores.add(clip)
+    assert scores.rows() == []

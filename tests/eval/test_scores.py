@@ -1,0 +1,161 @@
+"""Scores of predictions with known errors, and the rows made of them."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from eval.predictions import Predictor, displayed_truth, fit_baselines, region_mask
+from eval.scores import PSNR_CAP, Scores
+from tron.color import to_display
+from tron.errors import TronError
+from tron.shards.schema import Clip
+
+MakeClip = Callable[..., Clip]
+
+
+def both(images: dict[str, np.ndarray]) -> dict:
+    return {"foreground": images, "frame": images}
+
+
+def rows_of(scores: Scores) -> dict[str, tuple[float, int]]:
+    return {row.metric: (row.value, row.n) for row in scores.rows()}
+
+
+def test_a_known_error_has_its_known_psnr(drawn_clip: MakeClip):
+    clip = drawn_clip(frames=3)
+    truth = displayed_truth(clip) * 0.5 + 0.2
+    scores = Scores()
+    scores.add(clip, both({"pbr": truth + 0.1, "neural": truth - 0.01}), truth)
+    rows = rows_of(scores)
+    assert rows["pbr.psnr"] == (pytest.approx(20.0, abs=1e-3), 3)
+    assert rows["pbr.psnr_full"] == (pytest.approx(20.0, abs=1e-3), 3)
+    assert rows["neural.psnr.sun"] == (pytest.approx(40.0, abs=1e-2), 3)
+
+
+def test_psnr_is_averaged_over_frames_not_taken_of_the_mean_error(drawn_clip: MakeClip):
+    clip = drawn_clip(frames=2)
+    truth = np.full_like(displayed_truth(clip), 0.5)
+    shown = truth.copy()
+    shown[0] += 0.1
+    shown[1] += 0.001
+    scores = Scores()
+    scores.add(clip, both({"pbr": shown}), truth)
+    assert rows_of(scores)["pbr.psnr"][0] == pytest.approx((20 + 60) / 2, abs=1e-2)
+
+
+def test_a_perfect_prediction_is_capped_and_never_infinite(drawn_clip: MakeClip):
+    clip = drawn_clip()
+    truth = displayed_truth(clip)
+    scores = Scores()
+    scores.add(clip, both({"neural": truth}), truth)
+    assert rows_of(scores)["neural.psnr"][0] == PSNR_CAP
+    assert rows_of(scores)["neural.ssim"][0] == pytest.approx(1.0)
+
+
+def test_errors_outside_the_foreground_count_in_the_full_frame_only(drawn_clip: MakeClip):
+    clip = drawn_clip()
+    truth = displayed_truth(clip)
+    outside = ~region_mask(clip, "foreground")[..., None]
+    scores = Scores()
+    scores.add(clip, both({"pbr": truth + 0.2 * outside}), truth)
+    rows = rows_of(scores)
+    assert rows["pbr.psnr"][0] == PSNR_CAP
+    share = outside.mean()
+    assert rows["pbr.psnr_full"][0] == pytest.approx(-10 * np.log10(0.04 * share), abs=1e-2)
+
+
+def test_gains_are_over_the_best_of_their_group_and_absent_without_all_of_it(drawn_clip: MakeClip):
+    clip = drawn_clip()
+    truth = np.full_like(displayed_truth(clip), 0.5)
+
+    def off(error: float) -> np.ndarray:
+        return truth + np.float32(error)
+
+    three = {"neural": off(0.01), "pbr": off(0.1), "shadow_ratio": off(0.05), "affine": off(0.02)}
+    scores = Scores()
+    scores.add(clip, both(three), truth)
+    rows = rows_of(scores)
+    assert rows["neural.gain_over_best_of_three"][0] == pytest.approx(20 * np.log10(2), abs=1e-2)
+    assert not [name for name in rows if "best_of_seven" in name]
+    four = {
+        "pbr_x_irradiance": off(0.2),
+        "shadowed": off(0.2),
+        "affine_ratio": off(0.015),
+        "pixel_mlp": off(1),
+    }
+    scores = Scores()
+    scores.add(clip, both({**three, **four}), truth)
+    expected = 20 * np.log10(1.5)
+    assert rows_of(scores)["neural.gain_over_best_of_seven_full.sun"][0] == pytest.approx(expected, abs=1e-2)
+
+
+def test_what_was_not_given_has_no_row(drawn_clip: MakeClip):
+    clip = drawn_clip()
+    scores = Scores()
+    scores.add(clip, Predictor(fit_baselines([clip], seed=0)).shown(clip), displayed_truth(clip))
+    names = set(rows_of(scores))
+    assert "affine_ratio.psnr" in names
+    assert not [name for name in names if name.startswith(("neural", "pixel_mlp"))]
+
+
+def test_a_frame_without_foreground_has_no_foreground_score(drawn_clip: MakeClip):
+    clip = drawn_clip(frames=3)
+    clip.frames["foreground"][1] = 0
+    truth = displayed_truth(clip)
+    scores = Scores()
+    scores.add(clip, both({"pbr": truth}), truth)
+    assert rows_of(scores)["pbr.psnr"][1] == 2
+    assert rows_of(scores)["pbr.psnr_full"][1] == 3
+
+
+def test_without_shadows_and_bounces_every_product_is_the_truth(drawn_clip: MakeClip):
+    clip = drawn_clip()
+    clip.frames["irr"] = clip.frames["unshadowed"].copy()
+    clip.frames["rgb"] = clip.frames["shadowed"] = clip.frames["pbr"].copy()
+    shown = Predictor(fit_baselines([clip], seed=0)).shown(clip)
+    truth = displayed_truth(clip)
+    for region, images in shown.items():
+        for method in ("pbr", "shadow_ratio", "shadowed", "affine", "affine_ratio"):
+            np.testing.assert_allclose(images[method], truth, atol=1e-4, err_msg=f"{region} {method}")
+
+
+def test_fits_of_a_region_are_the_better_ones_there(drawn_clip: MakeClip):
+    clips = [drawn_clip(light, seed) for light in ("noon", "softbox") for seed in (0, 1)]
+    fits = fit_baselines(clips, seed=0)
+    for method in ("affine", "affine_ratio", "pbr_x_irradiance"):
+        errors = {}
+        for fitted in ("foreground", "frame"):
+            predictor = Predictor({"foreground": fits[fitted]})
+            errors[fitted] = np.mean(
+                [
+                    np.mean(
+                        (predictor.shown(clip)["foreground"][method] - displayed_truth(clip))[inside] ** 2
+                    )
+                    for clip in clips
+                    for inside in [region_mask(clip, "foreground")]
+                ]
+            )
+        assert errors["foreground"] <= errors["frame"] * (1 + 1e-3), method
+
+
+def test_the_network_is_given_linear_buffers_and_the_exposure(drawn_clip: MakeClip):
+    clip = drawn_clip()
+
+    def network(pbr: np.ndarray, irradiance: np.ndarray, exposure: float) -> np.ndarray:
+        np.testing.assert_array_equal(irradiance, clip.frames["irr"])
+        return to_display(pbr, exposure)
+
+    shown = Predictor(fit_baselines([clip], seed=0), {"neural": network}).shown(clip)
+    np.testing.assert_array_equal(shown["frame"]["neural"], shown["frame"]["pbr"])
+
+
+def test_no_training_clips_is_one_line():
+    with pytest.raises(TronError, match="no training clips"):
+        fit_baselines([], seed=0)
+
+
+def test_a_captured_photo_is_shown_as_it_is(drawn_clip: MakeClip):
+    clip = drawn_clip()
+    clip.meta.color_space["rgb"] = "display"
+    np.testing.assert_array_equal(displayed_truth(clip), clip.frames["rgb"])
