@@ -1,0 +1,202 @@
+"""SceneSpec -> Mitsuba scene.
+
+All procedural objects and the floor are one mesh under one ``principled`` material whose parameters are mesh
+attributes. Every synthetic scene then has the same kernel: Dr.Jit compiles it once and finds it in its cache for
+all others. Parts of the user's models bring a mesh and a material each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from datagen.materials import MaterialSpec, evaluate
+from datagen.models import Part
+from datagen.scene import SceneSpec
+from datagen.shapes import make_mesh, split_creases
+from tron.errors import TronError
+from tron.shading.environment import EnvironmentMap
+
+FLOOR_ID = 1
+"""Object id of the floor; objects count on from it, 0 is nothing."""
+
+Arrays = dict[str, np.ndarray]
+
+
+@dataclass
+class Surface:
+    """One Mitsuba mesh and what is needed to read its true materials at a hit.
+
+    Attributes:
+        shape: the mesh, with its material.
+        principled: the innermost material, which knows base color, roughness and metallic.
+        normal_map: texture of tangent-space normals as (n + 1) / 2, or None.
+        object_id: (F,) uint32 object of each triangle.
+    """
+
+    shape: mi.Mesh
+    principled: mi.BSDF
+    normal_map: mi.Texture | None
+    object_id: np.ndarray
+
+
+@dataclass
+class Geometry:
+    """A scene without its light."""
+
+    surfaces: list[Surface]
+
+    def lit(self, environment: EnvironmentMap | None = None) -> mi.Scene:
+        """The Mitsuba scene under a light; without one it still answers rays."""
+        scene: dict[str, Any] = {"type": "scene"}
+        scene |= {f"surface{i}": surface.shape for i, surface in enumerate(self.surfaces)}
+        if environment is not None:
+            scene["environment"] = environment.to_mitsuba()
+        return mi.load_dict(scene)
+
+
+def build(spec: SceneSpec, models: Mapping[str, list[Part]] | None = None, edge: float = 0.05) -> Geometry:
+    """Build a scene's meshes and materials.
+
+    Args:
+        spec: the scene.
+        models: asset id -> its parts (unit ball, z up), for the assets that the scene names.
+        edge: longest edge of the procedural meshes, world units; patterns are as sharp as the mesh is fine.
+
+    Raises:
+        TronError: the scene names an asset that is not among the models.
+    """
+    solids = [_floor(spec, edge / 2)]
+    surfaces = []
+    for number, item in enumerate(spec.objects, start=FLOOR_ID + 1):
+        matrix = item.placement.matrix()
+        if item.shape is not None and item.material is not None:
+            solids.append(_solid(make_mesh(item.shape, edge), item.material, matrix, number))
+            continue
+        parts = (models or {}).get(str(item.asset))
+        if parts is None:
+            raise TronError(f"the scene needs the asset {item.asset!r}", spec.name, "give its folder as assets=...")
+        surfaces += [_textured(part.moved(matrix, item.size), number, i) for i, part in enumerate(parts)]
+    return Geometry([_merge(solids), *surfaces])
+
+
+def _solid(mesh: trimesh.Trimesh, material: MaterialSpec, matrix: np.ndarray, object_id: int) -> Arrays:
+    """Arrays of one solid in the world; the pattern is the object's own and moves with it."""
+    vertices, normals, faces = split_creases(mesh)
+    base_color, roughness, metallic = evaluate(material, vertices)
+    return {
+        "vertices": vertices @ matrix[:3, :3].T + matrix[:3, 3],
+        "normals": normals @ matrix[:3, :3].T,
+        "faces": faces,
+        "base_color": base_color,
+        "roughness": roughness,
+        "metallic": metallic,
+        "object_id": np.full(len(faces), object_id, np.uint32),
+    }
+
+
+def _floor(spec: SceneSpec, edge: float) -> Arrays:
+    half = spec.floor.half_size
+    n = int(np.ceil(2 * half / edge)) + 1
+    line = np.linspace(-half, half, n)
+    x, y = np.meshgrid(line, line, indexing="ij")
+    vertices = np.stack([x.ravel(), y.ravel(), np.zeros(n * n)], axis=1)
+    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    faces = np.concatenate(
+        [np.stack([corner, corner + n, corner + n + 1], 1), np.stack([corner, corner + n + 1, corner + 1], 1)]
+    )
+    base_color, roughness, metallic = evaluate(spec.floor.material, vertices)
+    return {
+        "vertices": vertices,
+        "normals": np.broadcast_to((0.0, 0.0, 1.0), vertices.shape),
+        "faces": faces,
+        "base_color": base_color,
+        "roughness": roughness,
+        "metallic": metallic,
+        "object_id": np.full(len(faces), FLOOR_ID, np.uint32),
+    }
+
+
+def _merge(solids: list[Arrays]) -> Surface:
+    offsets = np.cumsum([0, *(len(solid["vertices"]) for solid in solids)])
+    faces = np.concatenate([solid["faces"] + offset for solid, offset in zip(solids, offsets)])
+    joined = {name: np.concatenate([solid[name] for solid in solids]) for name in solids[0] if name != "faces"}
+    principled = mi.load_dict(
+        {
+            "type": "principled",
+            "base_color": {"type": "mesh_attribute", "name": "vertex_base_color"},
+            "roughness": {"type": "mesh_attribute", "name": "vertex_roughness"},
+            "metallic": {"type": "mesh_attribute", "name": "vertex_metallic"},
+            "specular": 0.5,
+        }
+    )
+    mesh = _mesh("solids", principled, joined["vertices"], joined["normals"], faces, None)
+    for name, width in (("base_color", 3), ("roughness", 1), ("metallic", 1)):
+        mesh.add_attribute(f"vertex_{name}", width, np.ascontiguousarray(joined[name], np.float32).ravel())
+    return Surface(mesh, principled, None, joined["object_id"])
+
+
+def _textured(part: Part, object_id: int, index: int) -> Surface:
+    per_vertex = part.base_color.ndim == 2
+    base_color = (
+        {"type": "mesh_attribute", "name": "vertex_base_color"} if per_vertex else _texture(part.base_color)
+    )
+    principled = mi.load_dict(
+        {
+            "type": "principled",
+            "base_color": base_color,
+            "roughness": _texture(part.roughness),
+            "metallic": _texture(part.metallic),
+            "specular": 0.5,
+        }
+    )
+    bsdf: Any = principled
+    normal_map = None
+    if part.normal_map is not None:
+        normal_map = mi.load_dict(_texture(part.normal_map))
+        bsdf = mi.load_dict({"type": "normalmap", "normalmap": normal_map, "bsdf": principled})
+    # Models are often open shells; a back face that renders black would not match its surfels.
+    bsdf = mi.load_dict({"type": "twosided", "bsdf": bsdf})
+    mesh = _mesh(f"object{object_id}-{index}", bsdf, part.vertices, part.normals, part.faces, part.uv)
+    if per_vertex:
+        mesh.add_attribute("vertex_base_color", 3, np.ascontiguousarray(part.base_color, np.float32).ravel())
+    return Surface(mesh, principled, normal_map, np.full(len(part.faces), object_id, np.uint32))
+
+
+def _texture(value: np.ndarray | float) -> Any:
+    """A constant or an image as Mitsuba texture; values are linear already."""
+    image = np.asarray(value, np.float32)
+    if image.ndim == 0:
+        return float(image)
+    if image.ndim == 1:
+        return {"type": "rgb", "value": image.tolist()}
+    pixels = np.ascontiguousarray(image if image.ndim == 3 else image[..., None])
+    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
+
+
+def _mesh(
+    name: str, bsdf: mi.BSDF, vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, uv: np.ndarray | None
+) -> mi.Mesh:
+    properties = mi.Properties()
+    properties["bsdf"] = bsdf
+    mesh = mi.Mesh(
+        name,
+        len(vertices),
+        len(faces),
+        props=properties,
+        has_vertex_normals=True,
+        has_vertex_texcoords=uv is not None,
+    )
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = np.ascontiguousarray(vertices, np.float32).ravel()
+    parameters["vertex_normals"] = np.ascontiguousarray(normals, np.float32).ravel()
+    parameters["faces"] = np.ascontiguousarray(faces, np.uint32).ravel()
+    if uv is not None:
+        parameters["vertex_texcoords"] = np.ascontiguousarray(uv, np.float32).ravel()
+    parameters.update()
+    return mesh

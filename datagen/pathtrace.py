@@ -1,0 +1,203 @@
+"""Mitsuba scene -> path-traced frames, true G-buffers, and the direct irradiance that guidance is judged by.
+
+Frames are anti-aliased (box filter). G-buffers and irradiance are taken along rays through the pixel centres: the
+mean of two surfaces is a point on neither.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from datagen.build import Geometry
+from tron.cameras import Camera, mitsuba_sensor
+from tron.gaussians.initialize import GBufferView
+
+MAX_DEPTH = 6
+LANES = 2**22
+"""Most paths or rays in flight at once: bounds memory, not quality."""
+
+
+def render_frames(
+    scene: mi.Scene, cameras: Sequence[Camera], spp: int, seeds: Sequence[int], max_depth: int = MAX_DEPTH
+) -> np.ndarray:
+    """Path-trace one frame a camera.
+
+    Args:
+        scene: a lit scene; its light is seen directly behind it.
+        cameras: all of one size.
+        spp: paths a pixel.
+        seeds: one a frame, in [0, 2**32); frames depend on nothing else.
+        max_depth: longest path in segments; 6 is five bounces.
+
+    Returns:
+        (K, H, W, 3) float32 linear radiance.
+    """
+    integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": max_depth})
+    frames = []
+    for camera, seed in zip(cameras, seeds):
+        sensor = mi.load_dict(mitsuba_sensor(camera, spp))
+        total = np.zeros((camera.height, camera.width, 3))
+        done = 0
+        while done < spp:
+            part = min(spp - done, max(LANES // (camera.width * camera.height), 1))
+            # Passes of one frame need streams of their own; the odd constant keeps them apart from other frames.
+            image = mi.render(scene, sensor=sensor, integrator=integrator, spp=part, seed=_pass_seed(seed, done))
+            total += part * np.array(image, np.float64)[..., :3]
+            done += part
+        frames.append((total / spp).astype(np.float32))
+    return np.stack(frames)
+
+
+def _pass_seed(seed: int, done: int) -> int:
+    return (seed + done * 0x9E3779B1) % 2**32
+
+
+def gbuffers(geometry: Geometry, cameras: Sequence[Camera]) -> list[GBufferView]:
+    """True G-buffers, one view a camera, along pixel-centre rays.
+
+    Base color is the material's own, of metals too; normals are shading normals (normal maps included) on the
+    camera's side. ``rgb`` is None.
+    """
+    scene = geometry.lit()
+    views: list[GBufferView] = []
+    waiting: list[Camera] = []
+    for camera in cameras:
+        waiting.append(camera)
+        if sum(c.width * c.height for c in waiting) >= LANES // 2:
+            views += _views(geometry, scene, waiting)
+            waiting = []
+    return views + (_views(geometry, scene, waiting) if waiting else [])
+
+
+def _views(geometry: Geometry, scene: mi.Scene, cameras: Sequence[Camera]) -> list[GBufferView]:
+    rays = [_pixel_rays(camera) for camera in cameras]
+    origins, directions = (np.concatenate(part) for part in zip(*rays))
+    si, normal = _surface_points(geometry, scene, origins, directions)
+    valid = si.is_valid()
+    base_color, roughness, metallic = mi.Color3f(0.0), mi.Float(0.0), mi.Float(0.0)
+    object_id = dr.zeros(mi.UInt32, len(origins))
+    for surface in geometry.surfaces:
+        here = valid & (si.shape == mi.ShapePtr(surface.shape))
+        base_color = dr.select(here, surface.principled.eval_attribute_3("base_color", si, here), base_color)
+        roughness = dr.select(here, surface.principled.eval_attribute_1("roughness", si, here), roughness)
+        metallic = dr.select(here, surface.principled.eval_attribute_1("metallic", si, here), metallic)
+        ids = dr.gather(mi.UInt32, mi.UInt32(surface.object_id), si.prim_index, here)
+        object_id = dr.select(here, ids, object_id)
+    dr.eval(si.p, normal, base_color, roughness, metallic, object_id, valid)
+    columns = {
+        "position": np.array(si.p).T,
+        "normal": np.array(normal).T,
+        "base_color": np.clip(np.array(base_color).T, 0.0, 1.0),
+        "roughness": np.clip(np.array(roughness), 0.0, 1.0),
+        "metallic": np.clip(np.array(metallic), 0.0, 1.0),
+        "valid": np.array(valid),
+        "object_id": np.array(object_id).astype(np.int32),
+    }
+    views, start = [], 0
+    for camera in cameras:
+        part = slice(start, start + camera.width * camera.height)
+        start = part.stop
+        images = {
+            name: np.ascontiguousarray(values[part].reshape(camera.height, camera.width, *values.shape[1:]))
+            for name, values in columns.items()
+        }
+        views.append(GBufferView(camera=camera, rgb=None, **images))
+    return views
+
+
+class DirectIrradiance(NamedTuple):
+    """E / pi, linear, (H, W, 3) float32, of the surfaces at the pixel centres; 0 where there is none."""
+
+    shadowed: np.ndarray
+    unshadowed: np.ndarray
+
+
+def direct_irradiance(
+    geometry: Geometry, scene: mi.Scene, camera: Camera, spp: int, seed: int
+) -> DirectIrradiance:
+    """Direct irradiance by Mitsuba's own light sampling and its rays against the meshes.
+
+    Shares no code with TRON's tracer: this is what the surfels' irradiance is measured against. Half of the rays
+    are drawn from the cosine lobe around the shading normal, half from Mitsuba's emitter, weighted by the balance
+    heuristic (Veach 1997), which for one ray of each kind sums L cos / (pdf_cosine + pdf_light).
+
+    Args:
+        geometry, scene: the scene and its lit form.
+        camera: where from.
+        spp: shadow rays a pixel, rounded up to an even number.
+        seed: of the sampler, in [0, 2**32).
+    """
+    pairs = max((spp + 1) // 2, 1)
+    origins, directions = _pixel_rays(camera)
+    block = max(LANES // (2 * pairs), 1)
+    parts = [
+        _irradiance_block(geometry, scene, origins[i : i + block], directions[i : i + block], pairs, seed + i)
+        for i in range(0, len(origins), block)
+    ]
+    shadowed, unshadowed = (np.concatenate(part) for part in zip(*parts))
+    shape = (camera.height, camera.width, 3)
+    return DirectIrradiance(shadowed.reshape(shape), unshadowed.reshape(shape))
+
+
+def _irradiance_block(
+    geometry: Geometry, scene: mi.Scene, origins: np.ndarray, directions: np.ndarray, pairs: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    repeated = np.repeat(np.arange(len(origins)), pairs)
+    si, normal = _surface_points(geometry, scene, origins[repeated], directions[repeated])
+    valid = si.is_valid()
+    sampler = mi.PCG32(size=len(repeated), initstate=seed % 2**32)
+    uniform = [sampler.next_float32() for _ in range(4)]
+    emitter = scene.environment()
+
+    light, _ = scene.sample_emitter_direction(si, mi.Point2f(uniform[0], uniform[1]), False, valid)
+    frame = mi.Frame3f(normal)
+    cosine = frame.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(uniform[2], uniform[3])))
+
+    shadowed, unshadowed = mi.Color3f(0.0), mi.Color3f(0.0)
+    for direction in (light.d, cosine):
+        seen = dr.zeros(mi.SurfaceInteraction3f, len(repeated))
+        seen.wi = -direction
+        radiance = emitter.eval(seen, valid)
+        sample = dr.zeros(mi.DirectionSample3f, len(repeated))
+        sample.d = direction
+        sample.emitter = mi.EmitterPtr(emitter)
+        pdf_light = scene.pdf_emitter_direction(si, sample, valid)
+        cos = dr.maximum(dr.dot(normal, direction), 0.0)
+        pdf_cosine = cos * dr.inv_pi
+        counts = valid & (cos > 0.0)
+        value = dr.select(counts, radiance * pdf_cosine / (pdf_light + pdf_cosine), 0.0)
+        blocked = scene.ray_test(si.spawn_ray(direction), counts)
+        unshadowed += value
+        shadowed += dr.select(blocked, 0.0, value)
+    mean = [np.array(dr.block_sum(mi.Color3f(x), pairs)).T / np.float32(pairs) for x in (shadowed, unshadowed)]
+    return mean[0], mean[1]
+
+
+def _pixel_rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and unit directions, (H W, 3) float32 each, row-major."""
+    directions = camera.rays().reshape(-1, 3)
+    origins = np.broadcast_to(camera.position.astype(np.float32), directions.shape)
+    return np.ascontiguousarray(origins), directions
+
+
+def _surface_points(
+    geometry: Geometry, scene: mi.Scene, origins: np.ndarray, directions: np.ndarray
+) -> tuple[mi.SurfaceInteraction3f, mi.Normal3f]:
+    """First hits and their unit shading normals on the side of the ray's origin."""
+    ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T))
+    si = scene.ray_intersect(ray)
+    normal = mi.Normal3f(si.sh_frame.n)
+    for surface in geometry.surfaces:
+        if surface.normal_map is None:
+            continue
+        here = si.is_valid() & (si.shape == mi.ShapePtr(surface.shape))
+        bent = dr.normalize(2.0 * mi.Vector3f(surface.normal_map.eval_3(si, here)) - 1.0)
+        normal = dr.select(here, mi.Normal3f(si.sh_frame.to_world(bent)), normal)
+    # Which side is seen is the triangle's affair: near silhouettes shading normals may well look away.
+    normal = dr.select(dr.dot(si.n, ray.d) > 0.0, -normal, normal)
+    return si, dr.normalize(normal)

@@ -1,0 +1,199 @@
+"""Procedural shapes: a kind, a size and a few numbers become a closed triangle mesh.
+
+Every mesh fits a ball of radius ``size`` around the origin and is dense enough to carry a material in its vertices.
+Styles A and B draw from disjoint kinds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+import trimesh
+from trimesh import Trimesh
+
+from datagen.materials import Style
+from datagen.spec import Number, Spec
+
+ShapeKind = Literal[
+    "sphere", "box", "cylinder", "cone", "torus", "blob", "capsule", "gem", "star", "vase", "knot", "superquadric"
+]
+KINDS_OF_STYLE: dict[Style, tuple[ShapeKind, ...]] = {
+    "A": ("sphere", "box", "cylinder", "cone", "torus", "blob"),
+    "B": ("capsule", "gem", "star", "vase", "knot", "superquadric"),
+}
+CREASE_DEG = 35.0
+
+
+class ShapeSpec(Spec):
+    """A procedural shape.
+
+    Attributes:
+        kind: which family.
+        size: radius in world units of the ball around the origin that the shape just fits.
+        parameters: proportions in (0, 1), whose meaning is the kind's own.
+    """
+
+    kind: ShapeKind
+    size: Number
+    parameters: tuple[Number, Number, Number, Number]
+
+
+def draw_shape(rng: np.random.Generator, style: Style, size: tuple[float, float]) -> ShapeSpec:
+    """Draw a shape of a style with a radius between the two numbers of ``size``."""
+    kinds = KINDS_OF_STYLE[style]
+    kind = kinds[int(rng.integers(len(kinds)))]
+    return ShapeSpec(kind=kind, size=rng.uniform(*size), parameters=tuple(rng.random(4)))
+
+
+def make_mesh(shape: ShapeSpec, edge: float = 0.05) -> Trimesh:
+    """Build the mesh of a shape: closed, outward normals, centred at the origin, edges at most ``edge`` world units.
+
+    Vertices are shared; :func:`split_creases` gives the mesh its shading normals.
+    """
+    mesh = _BUILDERS[shape.kind](np.asarray(shape.parameters))
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    vertices = vertices - 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    mesh.vertices = vertices * (shape.size / np.linalg.norm(vertices, axis=1).max())
+    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge, max_iter=16)
+    return Trimesh(vertices, faces, process=True)
+
+
+def split_creases(mesh: Trimesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Shading normals that are smooth over curved parts and break at creases sharper than CREASE_DEG.
+
+    Returns:
+        vertices (V, 3), unit normals (V, 3) float64 and faces (F, 3) int; vertices on creases are repeated.
+    """
+    shaded = trimesh.graph.smooth_shade(mesh, angle=np.radians(CREASE_DEG))
+    return np.asarray(shaded.vertices), np.asarray(shaded.vertex_normals), np.asarray(shaded.faces)
+
+
+def _between(fraction: float, low: float, high: float) -> float:
+    return float(low + fraction * (high - low))
+
+
+def _sphere(p: np.ndarray) -> Trimesh:
+    return trimesh.creation.icosphere(4)
+
+
+def _box(p: np.ndarray) -> Trimesh:
+    return trimesh.creation.box((1.0, _between(p[0], 0.6, 1.0), _between(p[1], 0.4, 1.6)))
+
+
+def _cylinder(p: np.ndarray) -> Trimesh:
+    return trimesh.creation.cylinder(1.0, _between(p[0], 0.7, 3.0), sections=48)
+
+
+def _cone(p: np.ndarray) -> Trimesh:
+    return trimesh.creation.cone(1.0, _between(p[0], 1.4, 2.6), sections=48)
+
+
+def _torus(p: np.ndarray) -> Trimesh:
+    return trimesh.creation.torus(1.0, _between(p[0], 0.3, 0.5), major_sections=72, minor_sections=36)
+
+
+def _blob(p: np.ndarray) -> Trimesh:
+    mesh = trimesh.creation.icosphere(4)
+    waves = 2.0 + 3.0 * p[:3]
+    vertices = np.asarray(mesh.vertices)
+    mesh.vertices = vertices * (1.0 + 0.1 * np.sin(vertices * waves + 6.28 * p[3]).sum(axis=1, keepdims=True))
+    return mesh
+
+
+def _capsule(p: np.ndarray) -> Trimesh:
+    return trimesh.creation.capsule(height=_between(p[0], 0.5, 2.5), radius=1.0, count=(48, 48))
+
+
+def _gem(p: np.ndarray) -> Trimesh:
+    mesh = trimesh.creation.icosphere(1 if p[1] < 0.5 else 0)
+    mesh.vertices = np.asarray(mesh.vertices) * (1.0, 1.0, _between(p[0], 0.8, 1.5))
+    return mesh
+
+
+def _star(p: np.ndarray) -> Trimesh:
+    """A prism over a star of 4 to 8 points."""
+    points = 4 + int(p[0] * 4.999)
+    n = 2 * points
+    angle = np.arange(n) * 2 * np.pi / n
+    radius = np.where(np.arange(n) % 2, _between(p[1], 0.5, 0.75), 1.0)
+    half = 0.5 * _between(p[2], 0.4, 1.8)
+    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    vertices = np.concatenate(
+        [
+            np.column_stack([ring, np.full(n, -half)]),
+            np.column_stack([ring, np.full(n, half)]),
+            [[0.0, 0.0, -half], [0.0, 0.0, half]],
+        ]
+    )
+    i, j = np.arange(n), (np.arange(n) + 1) % n
+    faces = np.concatenate(
+        [
+            np.column_stack([i, j, j + n]),
+            np.column_stack([i, j + n, i + n]),
+            np.column_stack([j, i, np.full(n, 2 * n)]),
+            np.column_stack([i + n, j + n, np.full(n, 2 * n + 1)]),
+        ]
+    )
+    return Trimesh(vertices, faces)
+
+
+def _vase(p: np.ndarray) -> Trimesh:
+    """A solid of revolution whose profile swells, narrows and opens."""
+    t = np.linspace(0.0, 1.0, 40)
+    swell, neck = _between(p[0], 0.5, 0.9), _between(p[1], 0.1, 0.3)
+    radius = 0.35 + swell * np.sin(np.pi * t**0.8) ** 2 * (1.0 - t) + neck * t**3
+    profile = np.column_stack([radius, t * _between(p[2], 1.6, 2.4)])
+    profile = np.concatenate([[[0.0, 0.0]], profile, [[0.0, profile[-1, 1]]]])
+    return trimesh.creation.revolve(profile, sections=48)
+
+
+def _knot(p: np.ndarray) -> Trimesh:
+    """A tube around a (2, 3) torus knot, swept with the frame of the torus normal."""
+    n, m, tube = 240, 24, _between(p[0], 0.22, 0.36)
+    t = np.arange(n) * 2 * np.pi / n
+    centre = np.column_stack(
+        [(1.6 + 0.7 * np.cos(3 * t)) * np.cos(2 * t), (1.6 + 0.7 * np.cos(3 * t)) * np.sin(2 * t), 0.7 * np.sin(3 * t)]
+    )
+    tangent = np.roll(centre, -1, axis=0) - np.roll(centre, 1, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    away = np.column_stack([np.cos(2 * t), np.sin(2 * t), np.zeros(n)]) * 1.6 - centre
+    first = away - tangent * (away * tangent).sum(axis=1, keepdims=True)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(tangent, first)
+    angle = (np.arange(m) * 2 * np.pi / m)[None, :, None]
+    rings = centre[:, None] + tube * (np.cos(angle) * first[:, None] + np.sin(angle) * second[:, None])
+    i, j = np.meshgrid(np.arange(n), np.arange(m), indexing="ij")
+    a, b = (i * m + j).ravel(), (i * m + (j + 1) % m).ravel()
+    c, d = (((i + 1) % n) * m + (j + 1) % m).ravel(), (((i + 1) % n) * m + j).ravel()
+    mesh = Trimesh(rings.reshape(-1, 3), np.concatenate([np.column_stack([a, d, c]), np.column_stack([a, c, b])]))
+    mesh.fix_normals()
+    return mesh
+
+
+def _superquadric(p: np.ndarray) -> Trimesh:
+    """|x|^e + |y|^e + |z|^f = 1 by projecting a sphere: from pillows to rounded boxes."""
+    mesh = trimesh.creation.icosphere(4)
+    v = np.asarray(mesh.vertices)
+    e, f = _between(p[0], 2.5, 6.0), _between(p[1], 2.5, 6.0)
+    flat = (np.abs(v[:, 0]) ** e + np.abs(v[:, 1]) ** e) ** (1.0 / e)
+    radius = (flat**f + np.abs(v[:, 2]) ** f) ** (-1.0 / f)
+    mesh.vertices = v * radius[:, None] * (1.0, 1.0, _between(p[2], 0.6, 1.4))
+    return mesh
+
+
+_BUILDERS: dict[ShapeKind, Callable[[np.ndarray], Trimesh]] = {
+    "sphere": _sphere,
+    "box": _box,
+    "cylinder": _cylinder,
+    "cone": _cone,
+    "torus": _torus,
+    "blob": _blob,
+    "capsule": _capsule,
+    "gem": _gem,
+    "star": _star,
+    "vase": _vase,
+    "knot": _knot,
+    "superquadric": _superquadric,
+}
