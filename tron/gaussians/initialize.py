@@ -18,7 +18,7 @@ from tron.cameras import Camera
 from tron.color import linear_to_srgb
 from tron.errors import TronError
 from tron.gaussians.harmonics import SH_COUNT, rgb_to_dc
-from tron.gaussians.scene import GaussianScene, neighbour_distances, quats_from_matrices
+from tron.gaussians.scene import GaussianScene, neighbour_distances, quats_from_normals
 
 # Fractions of a cell by which the grid is moved: with a cell boundary at 0, a flat floor at z = 0 would fall
 # into two layers of cells by rounding alone.
@@ -97,7 +97,7 @@ def surfels_from_gbuffers(
     sh[:, 0] = rgb_to_dc(samples.values["rgb"] if has_rgb else linear_to_srgb(base_color))
     return GaussianScene(
         means=means,
-        quats=quats_from_matrices(_frames(normals)),
+        quats=quats_from_normals(normals),
         log_scales=np.repeat(np.log(sigma)[:, None], 2, axis=1),
         opacity_logits=np.full(len(means), logit(opacity)),
         sh=sh,
@@ -219,17 +219,3 @@ def _cell_size(samples: _Samples, count: int) -> float:
 
 def _extent(points: np.ndarray) -> float:
     return float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-
-
-def _frames(normals: np.ndarray) -> np.ndarray:
-    """(M, 3) unit normals -> (M, 3, 3) rotations with the normal as third column; the tangents are arbitrary.
-
-    Branchless basis of Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
-    """
-    x, y, z = normals.T
-    sign = np.copysign(1.0, z)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    u = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=-1)
-    v = np.stack([b, sign + y * y * a, -y], axis=-1)
-    return np.stack([u, v, normals], axis=-1)

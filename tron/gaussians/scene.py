@@ -216,6 +216,20 @@ def quats_from_matrices(rotations: np.ndarray) -> np.ndarray:
     return xyzw[:, [3, 0, 1, 2]].astype(np.float32)
 
 
+def quats_from_normals(normals: np.ndarray) -> np.ndarray:
+    """(M, 3) unit normals -> (M, 4) float32 unit quaternions (w, x, y, z) with any tangents.
+
+    The tangents are the branchless basis of Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
+    """
+    x, y, z = np.asarray(normals, dtype=np.float64).T
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    u = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=-1)
+    v = np.stack([b, sign + y * y * a, -y], axis=-1)
+    return quats_from_matrices(np.stack([u, v, np.stack([x, y, z], axis=-1)], axis=-1))
+
+
 def neighbour_distances(
     means: np.ndarray, queries: np.ndarray | None = None, neighbours: int = 3
 ) -> np.ndarray:

@@ -156,17 +156,6 @@ def test_thin_walls_keep_their_two_sides():
     assert (scene.base_color[up < 0] == 0).all()
 
 
-def test_frames_hold_for_every_normal():
-    normals = np.concatenate([np.eye(3), -np.eye(3), [[0.6, 0.0, -0.8], [0.0, 1e-9, -1.0]]])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    frames = initialize._frames(normals)
-    np.testing.assert_allclose(
-        np.einsum("mij,mik->mjk", frames, frames), [np.eye(3)] * len(normals), atol=1e-8
-    )
-    np.testing.assert_allclose(np.linalg.det(frames), 1, atol=1e-8)
-    np.testing.assert_array_equal(frames[:, :, 2], normals)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [

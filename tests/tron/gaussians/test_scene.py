@@ -8,7 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from tron.errors import TronError
 from tron.gaussians.harmonics import eval_sh
-from tron.gaussians.scene import GaussianScene, measure_spacing, quats_from_matrices
+from tron.gaussians.scene import (
+    GaussianScene,
+    measure_spacing,
+    quats_from_matrices,
+    quats_from_normals,
+    rotation_matrices,
+)
 from tron.seeds import generator
 
 
@@ -41,6 +47,13 @@ def test_a_known_quaternion_gives_a_known_normal():
     half = np.sqrt(0.5)
     scene.quats = np.array([[half, half, 0, 0]], np.float32)  # a quarter turn about +x takes +z to -y
     np.testing.assert_allclose(scene.normals(), [[0, -1, 0]], atol=1e-6)
+
+
+def test_every_normal_has_a_frame():
+    normals = np.concatenate([np.eye(3), -np.eye(3), [[0.6, 0.0, -0.8], [0.0, 1e-9, -1.0]]])
+    rotations = rotation_matrices(quats_from_normals(normals))
+    np.testing.assert_allclose(rotations[:, :, 2], normals, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-6)
 
 
 def test_facing_turns_normals_to_the_point_and_keeps_the_disk():

@@ -1,0 +1,46 @@
+"""A small scene with everything that relighting shows: a metal ball and its shadow on a floor."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from tron.gaussians.harmonics import rgb_to_dc
+from tron.gaussians.scene import GaussianScene, quats_from_normals
+
+CENTRE, RADIUS = np.array([0.0, 0.0, 0.5]), 0.5
+
+
+def make_ball_on_floor(spacing: float = 0.06, half: float = 1.5) -> GaussianScene:
+    """Surfels of a sphere (Fibonacci spiral) on a square floor at z = 0 (grid), each about `spacing` apart."""
+    count = int(4 * np.pi * RADIUS**2 / spacing**2)
+    z = 1 - (2 * np.arange(count) + 1) / count
+    azimuth = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    level = np.sqrt(1 - z**2)
+    ball = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), z], axis=1)
+    side = np.arange(-half, half + spacing / 2, spacing)
+    floor = np.stack([*np.meshgrid(side, side), np.zeros((len(side), len(side)))], axis=-1).reshape(-1, 3)
+    normals = np.concatenate([ball, np.tile([0.0, 0.0, 1.0], (len(floor), 1))])
+    on_ball = np.arange(len(normals)) < count
+    color = np.where(on_ball[:, None], [0.8, 0.3, 0.2], [0.5, 0.5, 0.5])
+    sh = np.zeros((len(normals), 16, 3))
+    sh[:, 0] = rgb_to_dc(color)
+    return GaussianScene(
+        means=np.concatenate([CENTRE + RADIUS * ball, floor]),
+        quats=quats_from_normals(normals),
+        log_scales=np.full((len(normals), 2), np.log(0.4 * spacing)),
+        opacity_logits=np.full(len(normals), 4.6),
+        sh=sh,
+        base_color=color,
+        roughness=np.where(on_ball, 0.3, 0.8),
+        metallic=np.where(on_ball, 0.6, 0.0),
+        object_id=on_ball,
+        kernel_degree=4,
+        spacing=spacing,
+    ).validate()
+
+
+@pytest.fixture(scope="session")
+def ball_on_floor() -> Callable[..., GaussianScene]:
+    """Makes a fresh scene at each call."""
+    return make_ball_on_floor

@@ -1,0 +1,125 @@
+"""Automatic framing: what is looked at, that it fits into the image, and cameras from files."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tron.apps.framing import find_subject, plan_cameras, read_cameras, turn_cameras, upright
+from tron.errors import TronError
+from tron.seeds import generator
+
+VIEW = {"width": 64, "height": 48, "fov_deg": 50.0}
+
+
+def test_the_subject_is_what_stands_on_the_floor(ball_on_floor):
+    subject = find_subject(ball_on_floor(half=4.0))
+    np.testing.assert_allclose(subject.centre, [0, 0, 0.55], atol=0.08)
+    assert subject.radius == pytest.approx(0.5, abs=0.08)
+
+
+def test_strays_do_not_move_the_subject(ball_on_floor):
+    scene = ball_on_floor()
+    before = find_subject(scene)
+    scene.means[:5] = generator(0, "test", "strays").uniform(50, 900, (5, 3))
+    np.testing.assert_allclose(find_subject(scene).centre, before.centre, atol=0.05)
+
+
+def test_without_a_floor_everything_is_the_subject(ball_on_floor):
+    scene = ball_on_floor()
+    keep = scene.object_id == 1
+    for name in ("means", "quats"):
+        setattr(scene, name, getattr(scene, name)[keep])
+    subject = find_subject(scene)
+    np.testing.assert_allclose(subject.centre, [0, 0, 0.5], atol=0.02)
+    assert subject.radius == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_floor_alone_is_the_subject(ball_on_floor):
+    scene = ball_on_floor()
+    for name in ("means", "quats"):
+        setattr(scene, name, getattr(scene, name)[scene.object_id == 0])
+    assert find_subject(scene).radius > 1.5
+
+
+@pytest.mark.parametrize("trajectory", ["orbit", "spiral", "oscillating"])
+@pytest.mark.parametrize("size", [(64, 48), (48, 64)])
+def test_every_camera_sees_the_whole_subject(ball_on_floor, trajectory, size):
+    scene = ball_on_floor()
+    width, height = size
+    cameras = plan_cameras(scene, trajectory, 9, width=width, height=height, fov_deg=50)
+    assert len(cameras) == 9
+    ball = scene.means[scene.object_id == 1]
+    for camera in cameras:
+        pixels, depth = camera.project(ball)
+        assert (depth > 0).all()
+        assert ((pixels > 0) & (pixels < [width, height])).all()
+        extent = np.ptp(pixels, axis=0).max()
+        assert extent > 0.5 * min(width, height)  # and not as a dot
+
+
+def test_framing_does_not_depend_on_where_and_how_large_the_scene_is(ball_on_floor):
+    scene, moved = ball_on_floor(), ball_on_floor()
+    moved.means = moved.means * 7 + np.array([100, -40, 12], np.float32)
+    moved.spacing *= 7
+    for a, b in zip(plan_cameras(scene, "orbit", 3, **VIEW), plan_cameras(moved, "orbit", 3, **VIEW)):
+        np.testing.assert_allclose(a.world_to_camera[:3, :3], b.world_to_camera[:3, :3], atol=1e-6)
+        np.testing.assert_allclose(b.position, a.position * 7 + [100, -40, 12], atol=0.01)
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1), (0, -1, 0), (0.6, 0, -0.8), (1e-9, 0, -1)])
+def test_upright_takes_up_to_z_by_a_rotation(up):
+    up = np.array(up) / np.linalg.norm(up)
+    turn = upright(up)
+    np.testing.assert_allclose(turn @ up, [0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-6)
+    assert np.linalg.det(turn) == pytest.approx(1)
+
+
+def test_turned_cameras_see_the_turned_world_as_before(ball_on_floor):
+    scene = ball_on_floor()
+    cameras = plan_cameras(scene, "orbit", 2, **VIEW)
+    rotation = Rotation.from_euler("xyz", [0.4, 2.0, -1.0]).as_matrix()
+    turned = turn_cameras(cameras, rotation)
+    for before, after in zip(cameras, turned):
+        np.testing.assert_allclose(
+            after.project(scene.means @ rotation.T)[0], before.project(scene.means)[0], atol=1e-3
+        )
+
+
+def test_cameras_come_back_from_a_file_at_any_size(ball_on_floor, tmp_path):
+    cameras = plan_cameras(ball_on_floor(), "spiral", 3, **VIEW)
+    entries = [camera.to_dict() for camera in cameras]
+    for name, content in (("list.json", entries), ("object.json", {"cameras": entries, "frames": 3})):
+        (tmp_path / name).write_text(json.dumps(content))
+        back = read_cameras(tmp_path / name, 128, 96)
+        assert [camera.width for camera in back] == [128] * 3
+        np.testing.assert_allclose(back[1].world_to_camera, cameras[1].world_to_camera)
+        assert back[1].fx == pytest.approx(2 * cameras[1].fx)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("not json", "not JSON"),
+        ("[]", "no cameras"),
+        ('{"cameras": 3}', "no cameras"),
+        ('[{"fx": 1}]', "camera lacks"),
+        ("[1, 2]", "no cameras"),
+    ],
+)
+def test_broken_camera_files_are_refused(tmp_path, content, words):
+    path = tmp_path / "cameras.json"
+    path.write_text(content)
+    with pytest.raises(TronError, match=words):
+        read_cameras(path, 64, 48)
+
+
+def test_another_aspect_ratio_and_a_missing_file_are_refused(ball_on_floor, tmp_path):
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps([c.to_dict() for c in plan_cameras(ball_on_floor(), "orbit", 1, **VIEW)]))
+    with pytest.raises(TronError, match="64 x 48"):
+        read_cameras(path, 64, 64)
+    with pytest.raises(TronError, match="cannot read"):
+        read_cameras(tmp_path / "absent.json", 64, 48)

@@ -1,0 +1,128 @@
+"""The frames of a run on disk: linear buffers that are rendered once, and pictures that are developed from
+them.
+
+A file appears under its name only when it is whole, so a frame is finished exactly if its files are there.
+What the frames were made with stands beside them; frames of other settings are never mixed in silently.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from tron.errors import TronError
+from tron.images import read_image, write_image
+from tron.storage import write_atomic
+from tron.video import VideoWriter
+
+SETTINGS_NAME = "settings.json"
+# Lengths need more digits than half floats have.
+_FULL_PRECISION = ("depth", "position")
+_SHEET_COLUMNS = 6
+_SHEET_WIDTH = 320
+
+
+class FrameFolder:
+    """Files NNNN.NAME.exr (linear or plain values) and NNNN.NAME.png (display) in one folder.
+
+    Args:
+        folder: where they are; made by `claim`.
+        buffers: names of the buffers that a finished frame has.
+    """
+
+    def __init__(self, folder: Path, buffers: Sequence[str]) -> None:
+        self.folder = folder
+        self.buffers = tuple(buffers)
+
+    def claim(self, made_with: Mapping[str, Any], overwrite: bool) -> None:
+        """Take the folder for frames made with these settings (JSON values), keeping those that already are.
+
+        Raises TronError if it holds frames made with others, unless `overwrite` deletes them.
+        """
+        record = self.folder / SETTINGS_NAME
+        if record.exists():
+            different = _first_difference(_read_json(record), made_with)
+            if different and not overwrite:
+                raise TronError(
+                    f"there are frames made with {different}",
+                    self.folder,
+                    "choose another output_dir, or replace them with overwrite=true",
+                )
+            if different:
+                for path in (*self.folder.glob("*.exr"), *self.folder.glob("*.png")):
+                    path.unlink()
+        write_atomic(record, json.dumps(made_with, indent=1) + "\n")
+
+    def path(self, index: int, name: str, suffix: str) -> Path:
+        """Where frame `index`'s buffer or picture `name` is; suffix "exr" or "png"."""
+        return self.folder / f"{index:04d}.{name}.{suffix}"
+
+    def finished(self, index: int) -> bool:
+        """Whether every buffer of the frame is there, and hence whole."""
+        return all(self.path(index, name, "exr").exists() for name in self.buffers)
+
+    def write(self, index: int, images: Mapping[str, np.ndarray]) -> None:
+        """Write a frame's buffers. Raises TronError, and writes nothing, if one of them is not finite."""
+        for name in self.buffers:
+            if not np.isfinite(images[name]).all():
+                raise TronError(f"buffer {name} of frame {index} is not finite", self.folder)
+        for name in self.buffers:
+            path = self.path(index, name, "exr")
+            write_image(path, images[name], half=name not in _FULL_PRECISION)
+
+    def read(self, index: int, name: str) -> np.ndarray:
+        """A frame's buffer as (H, W, 3) float32."""
+        return read_image(self.path(index, name, "exr"))
+
+    def write_picture(self, index: int, name: str, display: np.ndarray) -> None:
+        """Write (H, W, 3) display values in [0, 1] as NNNN.NAME.png."""
+        write_image(self.path(index, name, "png"), display)
+
+    def row(self, index: int, names: Sequence[str]) -> np.ndarray:
+        """A frame's pictures side by side, (H, W * len(names), 3) display values."""
+        return np.concatenate([read_image(self.path(index, name, "png")) for name in names], axis=1)
+
+    def write_video(self, path: Path, frames: int, names: Sequence[str], fps: float) -> None:
+        """Write the pictures of all frames, side by side, as a video."""
+        height, width = self.row(0, names).shape[:2]
+        with VideoWriter(path, fps, (width, height)) as video:
+            for index in range(frames):
+                video.write(self.row(index, names))
+
+    def write_sheet(self, path: Path, frames: int, names: Sequence[str]) -> None:
+        """Write a contact sheet: a column for each of a few frames evenly spread, a row for each picture."""
+        columns = np.linspace(0, frames, min(frames, _SHEET_COLUMNS), endpoint=False).astype(int)
+        rows = [[_thumbnail(self.row(index, [name])) for index in columns] for name in names]
+        write_image(path, np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0))
+
+
+def _thumbnail(display: np.ndarray) -> np.ndarray:
+    height, width = display.shape[:2]
+    if width <= _SHEET_WIDTH:
+        return display
+    size = (_SHEET_WIDTH, max(1, round(height * _SHEET_WIDTH / width)))
+    picture = Image.fromarray(np.round(np.clip(display, 0, 1) * 255).astype(np.uint8))
+    return np.asarray(picture.resize(size, Image.Resampling.LANCZOS), dtype=np.float32) / 255
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise TronError(f"cannot read: {error}", path, "delete the folder of frames") from error
+    if not isinstance(content, dict):
+        raise TronError("holds no settings", path, "delete the folder of frames")
+    return content
+
+
+def _first_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
+    """The first setting that differs, in words; None if all agree."""
+    for key in {**now, **before}:
+        if before.get(key) != now.get(key):
+            return f"{key}={before.get(key)}, not {now.get(key)}"
+    return None

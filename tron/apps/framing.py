@@ -1,0 +1,151 @@
+"""Cameras for a scene that nobody has framed: what to look at, and from how far.
+
+The subject is what stands on the floor, where there is one: a floor often holds most of the surfels, and a
+view that shows all of it shows little else. Strays are left out by quantiles.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from tron import trajectories
+from tron.cameras import Camera
+from tron.errors import TronError
+from tron.gaussians.scene import GaussianScene
+
+TrajectoryName = Literal["orbit", "spiral", "oscillating"]
+
+# Fraction of the subject's surfels that may lie outside the sphere that is framed.
+STRAYS = 0.01
+# Room around that sphere: a sphere that touches the edges of the image looks cramped.
+MARGIN = 1.25
+# A floor is flat: its surfels look up within this cosine and lie within this many spacings of one height.
+_LEVEL_COSINE = 0.95
+_FLOOR_SPACINGS = 3.0
+_FLOOR_SHARE = 0.2
+_SUBJECT_SHARE = 0.005
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A sphere worth looking at: centre (3,) and radius, world units."""
+
+    centre: np.ndarray
+    radius: float
+
+    def distance(self, fov_deg: float, width: int, height: int) -> float:
+        """How far a camera with this horizontal field of view stands off to see the whole sphere."""
+        half = math.tan(math.radians(fov_deg) / 2)
+        narrow = math.atan(half * min(1.0, height / width))
+        return MARGIN * self.radius / math.sin(narrow)
+
+
+def find_subject(scene: GaussianScene) -> Subject:
+    """The sphere around the surfels that matter: those off the floor if the scene has a floor, else all."""
+    shown = scene.means[_off_floor(scene)].astype(np.float64)
+    low, high = np.quantile(shown, [STRAYS, 1 - STRAYS], axis=0)
+    centre = (low + high) / 2
+    radius = float(np.quantile(np.linalg.norm(shown - centre, axis=1), 1 - STRAYS))
+    return Subject(centre, max(radius, scene.spacing))
+
+
+def _off_floor(scene: GaussianScene) -> np.ndarray:
+    """(M,) bool: surfels that stand on or above the floor; all of them where no floor is found."""
+    everything = np.ones(len(scene), dtype=bool)
+    height = scene.means @ scene.up
+    level = np.abs(scene.normals() @ scene.up) > _LEVEL_COSINE
+    if level.sum() < _FLOOR_SHARE * len(scene):
+        return everything
+    # The floor is the fullest of thin slabs of level surfels; slabs overlap by half so that none is cut in
+    # two.
+    slab = _FLOOR_SPACINGS * scene.spacing
+    heights = np.sort(height[level])
+    held = np.searchsorted(heights, heights + slab, side="right") - np.arange(len(heights))
+    floor = heights[held.argmax()]
+    above = height > floor + slab
+    if held.max() < _FLOOR_SHARE * len(scene) or above.sum() < _SUBJECT_SHARE * len(scene):
+        return everything
+    return above
+
+
+def plan_cameras(
+    scene: GaussianScene,
+    trajectory: TrajectoryName,
+    frames: int,
+    *,
+    width: int,
+    height: int,
+    fov_deg: float,
+    distance: float = 1.0,
+) -> list[Camera]:
+    """A camera path around the scene's subject.
+
+    width, height: pixels; fov_deg: horizontal, degrees; distance: a factor on the automatic stand-off.
+    """
+    subject = find_subject(scene)
+    path = {
+        "orbit": trajectories.orbit,
+        "spiral": trajectories.spiral,
+        "oscillating": trajectories.oscillating,
+    }[trajectory]
+    return path(
+        frames,
+        target=subject.centre,
+        radius=distance * subject.distance(fov_deg, width, height),
+        width=width,
+        height=height,
+        fov_deg=fov_deg,
+        up=scene.up,
+    )
+
+
+def read_cameras(path: Path, width: int, height: int) -> list[Camera]:
+    """Cameras of a JSON file, resized: a list of cameras (Camera.to_dict), or an object with such a list as
+    "cameras", as relight.json and the metadata of shards have it.
+
+    Raises TronError if the file is missing, is no such JSON, holds no camera, or has another aspect ratio.
+    """
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise TronError(f"cannot read: {error.strerror or error}", path) from error
+    except ValueError as error:
+        raise TronError(f"not JSON: {error}", path) from error
+    entries = content.get("cameras") if isinstance(content, dict) else content
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+        raise TronError("no cameras found", path, 'give a list of cameras, or {"cameras": [...]}')
+    try:
+        cameras = [Camera.from_dict(entry) for entry in entries]
+    except TronError as error:
+        raise TronError(error.what, path, error.mend) from error
+    for camera in cameras:
+        if abs(camera.width * height - camera.height * width) > max(width, height):
+            raise TronError(
+                f"cameras are {camera.width} x {camera.height}, frames {width} x {height}",
+                path,
+                "choose width and height of the same aspect ratio",
+            )
+    return [camera.resized(width, height) for camera in cameras]
+
+
+def turn_cameras(cameras: list[Camera], rotation: np.ndarray) -> list[Camera]:
+    """The same views of a world turned about its origin by a (3, 3) rotation."""
+    turn = np.eye(4)
+    turn[:3, :3] = rotation.T
+    return [replace(camera, world_to_camera=camera.world_to_camera @ turn) for camera in cameras]
+
+
+def upright(up: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation, the shortest, that takes the unit direction `up` to +z, up in environment maps."""
+    x, y, z = up
+    if z < -1 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    # Rodrigues' formula about up x z, with cos = z: R = I + [v]x + [v]x^2 / (1 + cos).
+    cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    return np.eye(3) + cross + cross @ cross / (1 + z)
