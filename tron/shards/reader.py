@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tarfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,20 +20,23 @@ MOST_FILES = 200_000  # of one shard: 64 clips of 93 frames x 12 members are 71,
 _DECODERS: dict[str, Callable[[bytes], np.ndarray]] = {"exr": decode_exr, "png": decode_png}
 
 
-def tar_files(path: str | Path) -> Iterator[tuple[str, str, bytes]]:
+def tar_files(path: str | Path, members: Collection[str] | None = None) -> Iterator[tuple[str, str, bytes]]:
     """Files of one shard in order: (key, name within the clip such as "f00.pbr.exr", bytes).
 
-    Refuses with TronError links, devices, folders, names outside the schema (so also absolute paths and
-    `..`), compressed or damaged tars and files beyond the size limit; such a file's bytes are not read.
+    members: only these members and the metadata; the bytes of others are skipped (default: all). Refuses
+    with TronError links, devices, folders, names outside the schema (so also absolute paths and `..`),
+    compressed or damaged tars and files beyond the size limit; such a file's bytes are not read.
     """
     try:
         with tarfile.open(path, "r:") as tar:  # "r:" reads plain tars only: no decompression bombs
             for count, info in enumerate(tar):
-                if not info.isreg():
+                if not info.isreg() or info.issparse():
                     raise TronError(f"member {info.name[:80]!r} is not a plain file", str(path))
                 if info.size > LARGEST_MEMBER or count >= MOST_FILES:
                     raise TronError(f"member {info.name[:80]!r} goes beyond the size limits", str(path))
-                key, _, _ = parse_name(info.name)
+                key, _, member = parse_name(info.name)
+                if members is not None and member != "meta" and member not in members:
+                    continue
                 file = tar.extractfile(info)
                 data = file.read() if file else b""
                 if len(data) != info.size:
@@ -123,7 +126,7 @@ def read_clips(folder: str | Path, split: str, members: Iterable[str] | None = N
     wanted = None if members is None else list(members)
     for entry in Manifest.load(folder).of_split(split):
         seen: list[str] = []
-        for key, files in group_clips(tar_files(Path(folder) / entry.name)):
+        for key, files in group_clips(tar_files(Path(folder) / entry.name, wanted)):
             seen.append(key)
             yield decode_clip(files, wanted)
         if seen != entry.keys:

@@ -29,8 +29,6 @@ from tron.shards.schema import (
 )
 from tron.storage import atomic_path
 
-LARGEST_HALF = 65504.0
-
 
 class ShardWriter:
     """Context manager that fills `folder/{split}-00000.tar`, `-00001.tar`, ... with clips.
@@ -81,7 +79,7 @@ class ShardWriter:
             raise TronError(f"clip {meta.key} says split {meta.split!r}, the shard is {self.split!r}")
         if len(frames) != meta.frames or len(meta.cameras) != meta.frames:
             raise TronError(
-                f"clip {meta.key} says {meta.frames} frames, has {len(frames)} and {len(meta.cameras)} cameras"
+                f"clip {meta.key} says {meta.frames} frames: {len(frames)} with {len(meta.cameras)} cameras"
             )
         if meta.key in self._keys or any(meta.key in entry.keys for entry in self.entries):
             raise TronError(f"clip {meta.key} is written twice")
@@ -103,7 +101,7 @@ class ShardWriter:
     def _open_shard(self) -> tarfile.TarFile:
         if self._tar is None:
             path = self._stack.enter_context(atomic_path(self.folder / shard_name(self.split, self._index)))
-            self._file = _HashingFile(self._stack.enter_context(open(path, "wb")))
+            self._file = _HashingFile(self._stack.enter_context(path.open("wb")))
             self._tar = tarfile.TarFile(fileobj=self._file, mode="w", format=tarfile.USTAR_FORMAT)
         return self._tar
 
@@ -164,5 +162,5 @@ def _encode(meta: ClipMeta, index: int, member: str, image: np.ndarray) -> bytes
     if not np.isfinite(image).all():
         raise TronError(f"{where} holds {int((~np.isfinite(image)).sum())} values that are not finite")
     if kind.extension == "png":
-        return encode_png(np.clip(image, 0.0, 1.0))
-    return encode_exr(np.clip(image, -LARGEST_HALF, LARGEST_HALF) if kind.half else image, half=kind.half)
+        return encode_png(image)
+    return encode_exr(image, half=kind.half)

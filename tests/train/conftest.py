@@ -1,0 +1,94 @@
+"""A dataset folder small enough to train on in a second, and the settings to do so."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tron import seeds
+from tron.shards.manifest import Manifest
+from tron.shards.schema import ClipMeta
+from tron.shards.writer import ShardWriter
+
+
+def write_dataset(
+    folder: Path, splits: dict[str, int], frames: int = 6, size: int = 24, shard: int = 2
+) -> Path:
+    """Clips of smooth colours whose picture is the product of the two buffers, frames x size x size."""
+    entries = []
+    for split, count in splits.items():
+        with ShardWriter(folder, split, shard) as writer:
+            for number in range(count):
+                random = seeds.generator(0, "dataset", split, number)
+                meta = ClipMeta(
+                    key=f"{split}{number:03d}-l0",
+                    scene=f"{split}{number:03d}",
+                    light="l0",
+                    light_family="studio",
+                    split=split,
+                    frames=frames,
+                    width=size,
+                    height=size,
+                    cameras=[{}] * frames,
+                    exposure=1.0,
+                    color_space={"pbr": "linear", "irr": "linear", "rgb": "linear"},
+                )
+                writer.write(meta, [_frame(random, size) for _ in range(frames)])
+        entries += writer.entries
+    Manifest(config_sha256="0" * 64, shards=entries).save(folder)
+    return folder
+
+
+def _frame(random: np.random.Generator, size: int) -> dict[str, np.ndarray]:
+    ramp = np.linspace(0, 1, size, dtype=np.float32)
+    pbr = 0.1 + random.random(3) * ramp[:, None, None] + np.zeros((size, size, 3))
+    irr = 0.2 + random.random(3) * ramp[None, :, None] + np.zeros((size, size, 3))
+    one = np.ones((size, size, 1))
+    return {
+        "pbr": pbr,
+        "irr": irr,
+        "rgb": pbr * irr,
+        "unshadowed": irr,
+        "shadowed": pbr,
+        "mask": one,
+        "foreground": one,
+    }
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory) -> Path:
+    return write_dataset(tmp_path_factory.mktemp("dataset"), {"train": 5, "train_b": 3, "test": 2})
+
+
+def small_settings(dataset: Path, output_dir: Path, **changes: Any) -> dict[str, Any]:
+    """Settings, as a plain dict, of a run of a few seconds."""
+    settings = {
+        "dataset": dataset,
+        "output_dir": output_dir,
+        "renderer": {
+            "_target_": "tron.neural.renderer.NeuralRenderer",
+            "config": {
+                "_target_": "tron.neural.renderer.RendererConfig",
+                "backbone": {"heads": 1, "head_dim": 12, "layers": 1, "adaln_lora_dim": 4},
+            },
+        },
+        "stages": [
+            {"name": "one", "split": "train", "steps": 6, "batch_size": 2, "crop": 16},
+            {
+                "name": "two",
+                "split": "train_b",
+                "frames": 5,
+                "steps": 4,
+                "batch_size": 2,
+                "crop": 16,
+                "rehearsal_split": "train",
+                "rehearsal_ratio": 0.5,
+            },
+        ],
+        "optimizer": {"warmup_steps": 2},
+        "validation": {"every": 5, "clips": 2},
+        "checkpoint_every": 2,
+        "accelerator": "cpu",
+    }
+    return settings | changes

@@ -1,0 +1,200 @@
+"""What happens around the steps: the clock, the progress bar and metrics.csv."""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import Callback
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from train.curriculum import Pace, Stage
+from tron.storage import write_atomic
+
+log = logging.getLogger(__name__)
+
+LINE_SECONDS = 20.0  # between lines of progress where there is no terminal
+SMOOTHING = 0.98
+
+
+class Clock(Callback):
+    """Runs the stage's pace, and ends the stage when its time is up."""
+
+    def __init__(self, pace: Pace):
+        self.pace = pace
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Start the clock: setting up and loading do not count."""
+        del trainer, pl_module
+        self.pace.start()
+
+    def on_train_batch_end(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, *_args: Any, **_kwargs: Any
+    ) -> None:
+        """Stop the stage where its limit of seconds is reached."""
+        del pl_module
+        if self.pace.seconds_limit is not None and self.pace.progress(trainer.global_step) >= 1:
+            trainer.should_stop = True
+
+    def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Stop the clock."""
+        del trainer, pl_module
+        self.pace.stop()
+
+
+class TrainingLog(Callback):
+    """Shows loss and validation PSNR on a bar (plain lines where there is no terminal) and in metrics.csv.
+
+    metrics.csv has one row every `every` steps: stage, step, seconds of this stage, smoothed loss (as
+    trained: squared error of values in [-1, 1], plus LPIPS if on), learning rate, and the latest
+    validation's PSNR in dB. A resumed run goes on behind the rows it had reached.
+    """
+
+    columns: tuple[str, ...] = (
+        "stage",
+        "step",
+        "seconds",
+        "loss",
+        "learning_rate",
+        "val_psnr",
+        "val_psnr_full",
+    )
+
+    def __init__(self, path: Path, stage: Stage, pace: Pace, every: int = 50, first_step: int = 0):
+        self.path, self.stage, self.pace, self.every = path, stage, pace, every
+        self.loss = float("nan")
+        self.validated: dict[str, float] = {}
+        self._last_line = time.monotonic()
+        self._rows = earlier_rows(path, stage.name, first_step)
+        self._bar: Progress | None = None
+        self._task: Any = None
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Open the bar on a terminal."""
+        del pl_module
+        if trainer.is_global_zero and sys.stderr.isatty():
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TextColumn("{task.fields[text]}"),
+                TimeElapsedColumn(),
+                TimeRemainingColumn(),
+                console=Console(stderr=True),
+                refresh_per_second=2,
+            )
+            self._task = self._bar.add_task(self.stage.name, total=1.0, text="")
+            self._bar.start()
+
+    def on_train_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """Note the loss of a step."""
+        del pl_module, batch, batch_idx
+        step = trainer.global_step
+        loss = outputs["loss"].item() if torch.device(outputs["loss"].device).type == "cpu" else None
+        if loss is None and step % 10 == 0:  # reading a number from a GPU waits for it: not at every step
+            loss = outputs["loss"].item()
+        if loss is not None:
+            self.loss = loss if self.loss != self.loss else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
+        if not trainer.is_global_zero:
+            return
+        if step % self.every == 0:
+            self._rows.append(self._row(trainer))
+        self._show(trainer)
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Note the PSNR of a validation."""
+        del pl_module
+        named = trainer.callback_metrics
+        self.validated = {name: named[name].item() for name in ("val_psnr", "val_psnr_full") if name in named}
+
+    def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Write the last row and close the bar."""
+        del pl_module
+        if not trainer.is_global_zero:
+            return
+        if trainer.global_step % self.every:
+            self._rows.append(self._row(trainer))
+        self._write()
+        self._show(trainer, last=True)
+        self._close()
+
+    def on_exception(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, exception: BaseException
+    ) -> None:
+        """Leave the terminal in order."""
+        del trainer, pl_module, exception
+        self._close()
+
+    def on_save_checkpoint(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Write metrics.csv as often as checkpoints."""
+        del pl_module, checkpoint
+        if trainer.is_global_zero:
+            self._write()
+
+    def _row(self, trainer: lightning.Trainer) -> dict[str, Any]:
+        rate = trainer.optimizers[0].param_groups[0]["lr"]
+        return {
+            "stage": self.stage.name,
+            "step": trainer.global_step,
+            "seconds": f"{self.pace.seconds():.1f}",
+            "loss": f"{self.loss:.6g}",
+            "learning_rate": f"{rate:.4g}",
+            **{name: f"{value:.3f}" for name, value in self.validated.items()},
+        }
+
+    def _write(self) -> None:
+        table = io.StringIO()
+        writer = csv.DictWriter(table, self.columns, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self._rows)
+        write_atomic(self.path, table.getvalue())
+
+    def _show(self, trainer: lightning.Trainer, last: bool = False) -> None:
+        progress = self.pace.progress(trainer.global_step)
+        validated = self.validated.get("val_psnr")
+        text = f"step {trainer.global_step} loss {self.loss:.5f}"
+        if validated is not None:
+            text += f" validation {validated:.2f} dB"
+        if self._bar is not None:
+            self._bar.update(self._task, completed=progress, text=text)
+        elif last or time.monotonic() - self._last_line > LINE_SECONDS:
+            self._last_line = time.monotonic()
+            seconds = self.pace.seconds()
+            left = seconds / progress - seconds if progress > 0 else 0.0
+            log.info(
+                "%s %3.0f%% %s, %.0f s, %.0f s to go", self.stage.name, 100 * progress, text, seconds, left
+            )
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+def earlier_rows(path: Path, stage: str, first_step: int) -> list[dict[str, Any]]:
+    """Rows of metrics.csv up to a step of a stage: those of earlier stages, and of this one up to there."""
+    if not path.is_file():
+        return []
+    kept: list[dict[str, Any]] = []
+    with path.open(newline="") as file:
+        for row in csv.DictReader(file):
+            if row["stage"] == stage and int(row["step"]) > first_step:
+                break
+            kept.append(row)
+    return kept

@@ -1,0 +1,90 @@
+"""Checkpoints that survive a kill at any moment, and how a run finds where it was.
+
+`checkpoints/2-adapt-00001500.ckpt` holds everything to go on with stage 2 from step 1500; a whole stage
+leaves `checkpoints/2-adapt.safetensors`, the renderer at its end, and its `.ckpt` is removed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+
+from train.curriculum import Stage
+from tron.errors import TronError
+from tron.storage import atomic_path
+
+
+class AtomicCheckpoints(TorchCheckpointIO):
+    """Lightning's checkpoints, written by fsync and rename and read without unpickling."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Write a checkpoint that is whole or not there."""
+        if storage_options is not None:
+            raise TypeError("storage options are not used")
+        with atomic_path(path) as temporary:
+            torch.save(checkpoint, temporary)
+
+    def load_checkpoint(
+        self, path: Any, map_location: Any = "cpu", weights_only: bool | None = True
+    ) -> dict[str, Any]:
+        """Read a checkpoint; always with weights_only, so that nothing in the file is executed."""
+        del weights_only
+        try:
+            return torch.load(path, map_location=map_location, weights_only=True)
+        except Exception as error:  # torch raises a dozen types for damaged files
+            raise TronError(
+                "checkpoint is damaged", str(path), "remove it to start from the one before"
+            ) from error
+
+
+def periodic_checkpoint(folder: Path, number: int, stage: Stage, every: int) -> ModelCheckpoint:
+    """Write the run's whole state every `every` steps, keeping the newest."""
+    return ModelCheckpoint(
+        dirpath=folder,
+        filename=f"{number}-{stage.name}-{{step:08d}}",
+        auto_insert_metric_name=False,
+        every_n_train_steps=every,
+        save_top_k=1,
+        save_on_train_epoch_end=False,
+        enable_version_counter=False,
+    )
+
+
+def stage_end(folder: Path, number: int, stage: Stage) -> Path:
+    """Where the renderer at a stage's end is kept."""
+    return folder / f"{number}-{stage.name}.safetensors"
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where a run stands: the stage to run next (from 0), its first step, and the checkpoint to read."""
+
+    stage: int
+    step: int = 0
+    checkpoint: Path | None = None
+
+
+def find_position(folder: Path, stages: Sequence[Stage]) -> Position:
+    """Find where a run in this folder of checkpoints was left; stage == len(stages) means it is finished."""
+    for index, stage in enumerate(stages):
+        if stage_end(folder, index + 1, stage).is_file():
+            continue
+        name = re.compile(rf"{index + 1}-{stage.name}-(\d+)\.ckpt")
+        steps = {int(found[1]): p for p in folder.glob("*.ckpt") if (found := name.fullmatch(p.name))}
+        if not steps:
+            return Position(index)
+        return Position(index, max(steps), steps[max(steps)])
+    return Position(len(stages))
+
+
+def remove_checkpoints(folder: Path, number: int, stage: Stage) -> None:
+    """Remove a stage's `.ckpt` files, once its end is kept."""
+    for path in folder.glob(f"{number}-{stage.name}-*.ckpt"):
+        path.unlink()

@@ -1,0 +1,88 @@
+"""The stages of training as plain data, and the learning rate within a stage."""
+
+from __future__ import annotations
+
+import math
+import time
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from tron.neural.codecs import TIME
+
+
+class Stage(BaseModel):
+    """One stage of the curriculum: what it trains on and for how long."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,40}$", description="Name in logs and checkpoint files.")
+    split: str = Field(description="Split of the dataset to train on.")
+    frames: int = Field(default=1, ge=1, description="Frames K of a sample, 1 + 4n, consecutive in a clip.")
+    steps: int = Field(
+        ge=0,
+        description="Optimiser steps; with max_seconds, this stage's share of the time. 0 leaves it out.",
+    )
+    batch_size: int = Field(default=8, ge=1, description="Samples of a step, on each device.")
+    crop: int | None = Field(
+        default=None, ge=8, description="Side of the random square crop, pixels; null trains on whole frames."
+    )
+    learning_rate: float = Field(
+        default=1.0, gt=0, description="Factor on optimizer.learning_rate, the stage's peak."
+    )
+    rehearsal_split: str | None = Field(
+        default=None, description="Earlier split to mix in, against forgetting."
+    )
+    rehearsal_ratio: float = Field(
+        default=0.0, ge=0, le=1, description="Fraction of samples that come from rehearsal_split."
+    )
+
+    @field_validator("frames")
+    @classmethod
+    def _codec_frames(cls, value: int) -> int:
+        if (value - 1) % TIME:
+            raise ValueError("frames must be 1 + 4n: 1, 5, 9, ...")
+        return value
+
+    def splits(self) -> list[str]:
+        """Splits that this stage draws from."""
+        return [self.split] + (
+            [self.rehearsal_split] if self.rehearsal_split and self.rehearsal_ratio else []
+        )
+
+
+class Pace:
+    """How far a stage has come, from 0 to 1: by its steps, or by its share of a time limit.
+
+    By steps a run is reproducible; by time the schedule anneals to its end within the limit on any machine,
+    and the number of steps depends on the machine. Time counts only while the stage runs: `seconds` is what
+    earlier sessions of a resumed run have spent.
+    """
+
+    def __init__(self, steps: int, seconds_limit: float | None = None):
+        self.steps = steps
+        self.seconds_limit = seconds_limit
+        self.spent = 0.0
+        self._since: float | None = None
+
+    def start(self) -> None:
+        """Let the clock run."""
+        self._since = time.monotonic()
+
+    def stop(self) -> None:
+        """Halt the clock."""
+        self.spent, self._since = self.seconds(), None
+
+    def seconds(self) -> float:
+        """Seconds of training in this stage, earlier sessions included."""
+        return self.spent + (0.0 if self._since is None else time.monotonic() - self._since)
+
+    def progress(self, step: int) -> float:
+        """Fraction of the stage that is done after `step` steps."""
+        done = step / self.steps if self.seconds_limit is None else self.seconds() / self.seconds_limit
+        return min(1.0, done)
+
+
+def learning_rate_factor(progress: float, step: int, warmup_steps: int, floor: float) -> float:
+    """Linear warm-up over the first steps times a half cosine from 1 at progress 0 down to `floor` at 1."""
+    warmup = min(1.0, (step + 1) / (warmup_steps + 1))
+    return warmup * (floor + (1 - floor) * 0.5 * (1 + math.cos(math.pi * progress)))

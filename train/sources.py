@@ -1,0 +1,194 @@
+"""Where samples come from: a split decoded into memory, or streamed from its tar files by webdataset.
+
+Exposure and AgX are applied when a clip is loaded; what the network sees is display-encoded in [-1, 1].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor
+from webdataset.filters import detshuffle
+from webdataset.pipeline import DataPipeline
+from webdataset.shardlists import ResampledShards
+
+from tron import seeds
+from tron.color import to_display
+from tron.errors import TronError
+from tron.shards.manifest import Manifest
+from tron.shards.reader import decode_clip, decode_meta, group_clips, read_clips, tar_files
+from tron.shards.schema import META_SUFFIX, Clip, ClipMeta
+
+BUFFERS = ("pbr", "irr", "rgb")
+
+
+class DataSettings(BaseModel):
+    """How samples are read and varied."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    cache_gb: float = Field(
+        default=4.0,
+        ge=0,
+        description="Keep decoded splits in memory up to this size; larger ones are streamed.",
+    )
+    workers: int = Field(
+        default=0, ge=0, description="Loader processes of streamed splits; cached ones use none."
+    )
+    shuffle_buffer: int = Field(default=64, ge=1, description="Samples in a stream's shuffle buffer.")
+    samples_per_clip: int = Field(
+        default=1, ge=1, description="Random windows taken from a streamed clip each time it is read."
+    )
+    flip: float = Field(default=0.5, ge=0, le=1, description="Probability of mirroring left and right.")
+    permute_colors: float = Field(
+        default=0.0, ge=0, le=1, description="Probability of shuffling R, G and B, alike in all buffers."
+    )
+    crop_alignment: int = Field(
+        default=4, ge=1, description="Crops start at multiples of this; 4 keeps the codec's blocks."
+    )
+
+
+def display_video(clip: Clip, member: str) -> np.ndarray:
+    """A clip's buffer as the network sees it: (K, H, W, C) linear -> display in [-1, 1], (3, K, H, W)
+    float32.
+
+    Members whose color_space is "display" (captured photos) are taken as they are; exposure and AgX are for
+    linear.
+    """
+    image = clip.frames[member]
+    if clip.meta.color_space.get(member, "linear") == "linear":
+        image = to_display(image, clip.meta.exposure)
+    return np.ascontiguousarray(np.moveaxis(image * 2 - 1, -1, 0), np.float32)
+
+
+class Source(Protocol):
+    """Clips of a split that samples are drawn from by number."""
+
+    def sample(self, draw: Draw) -> dict[str, Tensor]:
+        """The drawn sample's buffers, (3, K, H, W) in [-1, 1]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Draw:
+    """The how-manieth sample of a stage this is, and the random stream that is its own."""
+
+    number: int
+    random: np.random.Generator
+    frames: int
+
+
+class CachedSplit:
+    """A split decoded into memory; sample number n is clip n of an endless series of shuffled passes."""
+
+    def __init__(self, folder: Path, split: str, seed: int):
+        self.seed, self.split = seed, split
+        self.clips: list[dict[str, Tensor]] = []
+        for clip in read_clips(folder, split, BUFFERS):
+            self.clips.append({name: torch.from_numpy(display_video(clip, name)) for name in BUFFERS})
+        self._pass = -1
+        self._order = np.zeros(0, np.int64)
+
+    def sample(self, draw: Draw) -> dict[str, Tensor]:
+        """Clip `draw.number` of the shuffled passes, at a random start."""
+        which, place = divmod(draw.number, len(self.clips))
+        if which != self._pass:
+            order = seeds.generator(self.seed, "train", "pass", self.split, which)
+            self._pass, self._order = which, order.permutation(len(self.clips))
+        clip = self.clips[int(self._order[place])]
+        start = int(draw.random.integers(clip["rgb"].shape[1] - draw.frames + 1))
+        return {name: clip[name][:, start : start + draw.frames] for name in BUFFERS}
+
+
+class StreamedSplit:
+    """A split read from its tar files as it goes, by webdataset: shards resampled, clips shuffled in a
+    buffer.
+
+    Only the members and frames that a sample needs are decoded, by the reader's table of decoders. The
+    stream is a function of (seed, stream name); `skip` samples at its start are not decoded.
+    """
+
+    def __init__(
+        self, folder: Path, split: str, frames: int, settings: DataSettings, seed: int, skip: int = 0
+    ):
+        self.frames, self.per_clip, self.seed, self.skip = frames, settings.samples_per_clip, seed, skip
+        names = [str(folder / e.name) for e in Manifest.load(folder).of_split(split) if e.samples]
+        self._pipeline: Any = DataPipeline(
+            ResampledShards(
+                names, seed=seeds.integer(seed, "shards", bits=31), worker_seed=_zero, deterministic=True
+            ),
+            self._undecoded,
+            detshuffle(
+                settings.shuffle_buffer, settings.shuffle_buffer, seed=seeds.integer(seed, "shuffle", bits=31)
+            ),
+        )
+        self._samples: Iterator[dict[str, bytes]] | None = None
+
+    def _undecoded(self, shards: Iterator[dict[str, str]]) -> Iterator[dict[str, Any]]:
+        """Bytes of the windows drawn from each clip of each shard, the first stages of a sample."""
+        for number, shard in enumerate(shards):
+            for key, files in group_clips(tar_files(shard["url"], BUFFERS)):
+                random = seeds.generator(self.seed, "window", number, key)
+                count = decode_meta(files[META_SUFFIX]).frames if META_SUFFIX in files else 0
+                if count < self.frames:
+                    raise TronError(
+                        f"clip {key} has {count} frames, the stage needs {self.frames}", shard["url"]
+                    )
+                for _ in range(self.per_clip):
+                    start = int(random.integers(count - self.frames + 1))
+                    wanted = {f"f{i:02d}" for i in range(start, start + self.frames)}
+                    kept = {n: data for n, data in files.items() if n[: n.index(".")] in {*wanted, "meta"}}
+                    yield {"files": kept, "start": start}
+
+    def sample(self, draw: Draw) -> dict[str, Tensor]:
+        """The stream's next sample; its number is the order of calls."""
+        if self._samples is None:
+            self._samples = iter(self._pipeline)
+            for _ in range(self.skip):
+                next(self._samples)
+        drawn: Any = next(self._samples)
+        indices = range(drawn["start"], drawn["start"] + draw.frames)
+        clip = decode_clip(drawn["files"], BUFFERS, indices)
+        return {name: torch.from_numpy(display_video(clip, name)) for name in BUFFERS}
+
+
+def _zero() -> int:
+    return 0  # the seed already names rank and worker; webdataset's own would differ between launchers
+
+
+def first_meta(folder: Path, manifest: Manifest, split: str) -> ClipMeta:
+    """Metadata of a split's first clip; TronError where the split or its first shard is empty or missing."""
+    entry = next(entry for entry in manifest.of_split(split) if entry.samples)
+    for _, name, data in tar_files(folder / entry.name, ()):
+        if name == META_SUFFIX:
+            return decode_meta(data)
+    raise TronError("shard holds no clip", str(folder / entry.name), "make it again with tron-datagen")
+
+
+def decoded_bytes(meta: ClipMeta) -> int:
+    """Memory that a clip's three buffers take as float32."""
+    return meta.frames * meta.height * meta.width * len(BUFFERS) * 3 * 4
+
+
+def spread_clips(
+    folder: Path, manifest: Manifest, split: str, count: int, members: Sequence[str]
+) -> Iterator[Clip]:
+    """Up to `count` clips spread evenly over a split; the others are skipped without decoding."""
+    entries = manifest.of_split(split)
+    total = sum(entry.samples for entry in entries)
+    chosen = set(np.linspace(0, total - 1, min(count, total)).round().astype(int).tolist())
+    number = 0
+    for entry in entries:
+        if chosen.isdisjoint(range(number, number + entry.samples)):
+            number += entry.samples
+            continue
+        for _, files in group_clips(tar_files(folder / entry.name, members)):
+            if number in chosen:
+                yield decode_clip(files, members)
+            number += 1

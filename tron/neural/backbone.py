@@ -1,0 +1,127 @@
+"""The transformer between the latents: diffusers' Cosmos-Predict2 DiT, tiny or with its published weights."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import torch
+from diffusers.models.transformers.transformer_cosmos import CosmosTransformer3DModel
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+
+
+class BackboneConfig(BaseModel):
+    """Shape of a CosmosTransformer3DModel; the defaults are the tiny one that trains in minutes on a CPU.
+
+    padding_channel: the published weights expect a padding mask as one more input channel; it is always zero.
+    cross_attention: "frozen" keeps the text branch as loaded; "none" leaves it out. With the null text
+    embedding its output is exactly zero either way, so what differs is only memory and time.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    heads: int = Field(default=3, ge=1)
+    head_dim: int = Field(default=32, ge=6)
+    layers: int = Field(default=4, ge=1)
+    mlp_ratio: float = Field(default=4.0, gt=0)
+    text_embed_dim: int = Field(default=16, ge=1)
+    adaln_lora_dim: int = Field(default=32, ge=1)
+    patch: tuple[int, int, int] = (1, 1, 1)
+    max_size: tuple[int, int, int] = (64, 512, 512)
+    rope_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    padding_channel: bool = False
+    cross_attention: Literal["frozen", "none"] = "none"
+
+
+COSMOS_0_6B = BackboneConfig(
+    heads=20,
+    head_dim=64,
+    layers=20,
+    mlp_ratio=4.0,
+    text_embed_dim=1024,
+    adaln_lora_dim=256,
+    patch=(1, 2, 2),
+    max_size=(128, 240, 240),
+    rope_scale=(1.0, 4.0, 4.0),
+    padding_channel=True,
+    cross_attention="frozen",
+)
+"""Cosmos-Predict2 0.6B, 597.5 M parameters with 16 latent channels."""
+
+
+class NoCrossAttention(nn.Module):
+    """What cross-attention over a zero token without biases computes: zero."""
+
+    def forward(self, hidden_states: Tensor, *_args: Any, **_kwargs: Any) -> Tensor:
+        """Return zeros of the hidden states' shape."""
+        return torch.zeros_like(hidden_states)
+
+
+class _NoModulation(nn.Module):
+    """Stands for the norm in front of an absent cross-attention: hands on its input and a gate of one."""
+
+    def forward(self, hidden_states: Tensor, *_args: Any, **_kwargs: Any) -> tuple[Tensor, Tensor]:
+        return hidden_states, hidden_states.new_ones(())
+
+
+def transformer(config: BackboneConfig, in_channels: int, out_channels: int) -> CosmosTransformer3DModel:
+    """Build the transformer with diffusers' own initialisation; channels are those of the latents."""
+    return CosmosTransformer3DModel(
+        in_channels=in_channels + int(config.padding_channel),
+        out_channels=out_channels,
+        num_attention_heads=config.heads,
+        attention_head_dim=config.head_dim,
+        num_layers=config.layers,
+        mlp_ratio=config.mlp_ratio,
+        text_embed_dim=config.text_embed_dim,
+        adaln_lora_dim=config.adaln_lora_dim,
+        max_size=config.max_size,
+        patch_size=config.patch,
+        rope_scale=config.rope_scale,
+        # diffusers concatenates the mask with torchvision, which need not be there; ours is a zero channel.
+        concat_padding_mask=False,
+        extra_pos_embed_type=None,
+    )
+
+
+class Backbone(nn.Module):
+    """Latents and a fixed time step in, the transformer's raw output out; the text is always null."""
+
+    def __init__(self, config: BackboneConfig, in_channels: int, out_channels: int):
+        super().__init__()
+        self.config = config
+        self.transformer = transformer(config, in_channels, out_channels)
+        self._initialise()
+        self.leave_out_text()
+
+    def _initialise(self) -> None:
+        """Start from the identity: a zero output layer, and modulations small enough not to disturb it."""
+        nn.init.zeros_(self.transformer.proj_out.weight)
+        for name, parameter in self.transformer.transformer_blocks.named_parameters():
+            if name.endswith("linear_2.weight"):
+                nn.init.normal_(parameter, std=0.02)
+
+    def leave_out_text(self) -> None:
+        """Freeze the text branch (24% of the weights), or leave it out if the config says so.
+
+        Keys and values of a zero token without biases are zero, so the branch adds exactly nothing and gets
+        no gradient; freezing it also lets DDP run with find_unused_parameters=False.
+        """
+        for block in self.transformer.transformer_blocks:
+            if self.config.cross_attention == "none":
+                block.attn2, block.norm2 = NoCrossAttention(), _NoModulation()
+            else:
+                block.attn2.requires_grad_(False)
+                block.norm2.requires_grad_(False)
+
+    def forward(self, latent: Tensor, timestep: float) -> Tensor:
+        """(B, in_channels, T, h, w) -> (B, out_channels, T, h, w), any h and w that the patch divides."""
+        batch = latent.shape[0]
+        if self.config.padding_channel:
+            latent = torch.cat([latent, torch.zeros_like(latent[:, :1])], 1)
+        return self.transformer(
+            latent,
+            timestep=latent.new_full((batch,), timestep),
+            encoder_hidden_states=latent.new_zeros(batch, 1, self.config.text_embed_dim),
+            return_dict=False,
+        )[0]
