@@ -189,6 +189,8 @@ def _load_renderer(settings: Settings) -> Any:
     """The network, before any frame is traced, so that a wrong file is found at once; None without one."""
     if settings.checkpoint is None:
         return None
+    if not settings.checkpoint.is_file():  # said before torch is loaded, which takes seconds
+        raise TronError("file not found", settings.checkpoint)
     from tron.neural.weights import load_renderer
 
     if settings.threads is not None:

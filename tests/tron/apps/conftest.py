@@ -12,7 +12,7 @@ CENTRE, RADIUS = np.array([0.0, 0.0, 0.5]), 0.5
 
 
 def make_ball_on_floor(spacing: float = 0.06, half: float = 1.5) -> GaussianScene:
-    """Surfels of a sphere (Fibonacci spiral) on a square floor at z = 0 (grid), each about `spacing` apart."""
+    """Surfels of a sphere (Fibonacci spiral) on a floor at z = 0 (square grid), about `spacing` apart."""
     count = int(4 * np.pi * RADIUS**2 / spacing**2)
     z = 1 - (2 * np.arange(count) + 1) / count
     azimuth = np.pi * (3 - np.sqrt(5)) * np.arange(count)

@@ -120,7 +120,7 @@ def test_a_2dgs_file_with_two_scales_loads(scene, tmp_path):
 
 
 def test_dropping_the_thin_axis_keeps_the_gaussian(scene, tmp_path):
-    # Independent witness: the covariance R diag(s^2) R^T of the file, with its smallest eigenvalue set to zero.
+    # Independent witness: the covariance R diag(s^2) R^T of the file, its smallest eigenvalue set to zero.
     path = tmp_path / "a.ply"
     scene.save(path)
     scales = generator(0, "test", "scales").uniform(-4, -2, (len(scene), 3)).astype(np.float32)

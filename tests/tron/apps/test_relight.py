@@ -1,0 +1,183 @@
+"""tron-relight from end to end on a tiny scene: files, laws of light, resuming, and mistakes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+
+from tron.apps.relight import cli
+from tron.gaussians.ply import MATERIALS
+from tron.images import read_image
+from tron.shading.environment import EnvironmentMap
+from tron.video import read_video
+
+SIZE = 32
+
+
+@pytest.fixture(scope="module")
+def scene_path(ball_on_floor, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "surfels.ply"
+    ball_on_floor().save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def light_path(tmp_path_factory) -> Path:
+    """A dim sky with a bright patch low in the +x direction."""
+    image = np.full((32, 64, 3), 0.3, np.float32)
+    row, column = 9, 16  # u = atan2(x, y) / 2 pi = 1/4
+    image[row - 1 : row + 2, column - 2 : column + 2] = 60.0
+    path = tmp_path_factory.mktemp("light") / "lamp.exr"
+    EnvironmentMap(image).save(path)
+    return path
+
+
+def relight(*overrides: str) -> int:
+    with pytest.raises(SystemExit) as exit_info:
+        cli([*overrides, f"width={SIZE}", f"height={SIZE}"])
+    return int(exit_info.value.code or 0)
+
+
+def test_writes_frames_videos_sheet_and_report(variant, scene_path, light_path, tmp_path):
+    out = tmp_path / "out"
+    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=2"]
+    assert relight(*base, "buffers=[normal,depth,mask]") == 0
+    frames = sorted(path.name for path in (out / "frames").iterdir())
+    buffers = ("depth", "irradiance", "mask", "normal", "pbr")
+    expected = [f"{i:04d}.{name}.exr" for i in range(2) for name in buffers]
+    expected += [f"{i:04d}.{name}.png" for i in range(2) for name in ("irradiance", "pbr")]
+    assert frames == sorted([*expected, "settings.json"])
+    assert read_video(out / "guidance.mp4").shape == (2, SIZE, 2 * SIZE, 3)
+    assert read_image(out / "contact_sheet.png").shape == (2 * SIZE, 2 * SIZE, 3)
+    assert not (out / "neural.mp4").exists()
+    report = json.loads((out / "relight.json").read_text())
+    assert report["frames"] == report["frames_rendered"] == 2
+    assert report["exposure"] == pytest.approx(EnvironmentMap.load(light_path).exposure())
+    assert report["scene"]["materials_guessed"] is False
+
+    normal, mask = (read_image(out / "frames" / f"0000.{name}.exr") for name in ("normal", "mask"))
+    middle = normal[SIZE // 2, SIZE // 2]
+    assert np.linalg.norm(middle) == pytest.approx(1, abs=0.01)
+    assert middle[0] > 0.8  # the first camera of an orbit stands on +x and sees the ball's front
+    assert mask[SIZE // 2, SIZE // 2, 0] > 0.95
+
+
+def test_rotating_light_and_camera_together_changes_nothing_else(variant, scene_path, light_path, tmp_path):
+    """Frame 1 of four in an orbit is 90 degrees on: under light turned by 90 it is frame 0 again."""
+    shots = {}
+    for rotation in (0, 90):
+        out = tmp_path / str(rotation)
+        base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=4"]
+        assert relight(*base, f"rotation={rotation}", "quality=final") == 0
+        shots[rotation] = [read_image(out / "frames" / f"{i:04d}.irradiance.exr") for i in range(4)]
+    # The ball is a surface of revolution about +z up to its surfels; the square floor has this symmetry
+    # exactly.
+    same = np.abs(shots[90][1] - shots[0][0]).mean()
+    other = np.abs(shots[90][0] - shots[0][0]).mean()
+    assert same < 0.3 * other
+
+
+def test_the_side_towards_the_lamp_is_bright_and_a_shadow_falls_behind(
+    variant, scene_path, light_path, tmp_path
+):
+    out = tmp_path / "out"
+    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=4"]
+    assert relight(*base, "quality=final") == 0
+    toward, left, away, _ = (
+        read_image(out / "frames" / f"{i:04d}.irradiance.exr").mean(axis=2) for i in range(4)
+    )
+    ball = slice(SIZE // 2 - 2, SIZE // 2 + 2)
+    assert toward[ball, ball].mean() > 3 * away[ball, ball].mean()
+    # From +y the lamp at +x is on the left (x axis points left), so the left half of the ball is brighter.
+    assert left[ball, : SIZE // 2].mean() > 1.2 * left[ball, SIZE // 2 :].mean()
+
+
+def test_a_second_run_renders_nothing_and_only_lost_frames_come_back(
+    variant, scene_path, light_path, tmp_path
+):
+    out = tmp_path / "out"
+    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=2"]
+    assert relight(*base) == 0
+    files = sorted((out / "frames").glob("*.exr"))
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
+    assert relight(*base, "exposure=0.1") == 0
+    assert json.loads((out / "relight.json").read_text())["frames_rendered"] == 0
+    assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files} == before
+    lost = out / "frames" / "0001.pbr.exr"
+    lost.unlink()
+    assert relight(*base) == 0
+    assert json.loads((out / "relight.json").read_text())["frames_rendered"] == 1
+    assert lost.read_bytes() == before[lost][1]
+
+
+def test_other_settings_in_the_same_folder_are_refused(variant, scene_path, light_path, tmp_path, capsys):
+    out = tmp_path / "out"
+    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=1"]
+    assert relight(*base) == 0
+    assert relight(*base, "rotation=45") == 2
+    assert "rotation=0.0, not 45.0" in capsys.readouterr().err
+    assert relight(*base, "rotation=45", "overwrite=true") == 0
+
+
+def test_a_plain_3dgs_file_is_relit_with_a_warning(variant, scene_path, light_path, tmp_path, caplog):
+    """Without materials, and with normals of random sign, as 3DGS writes them."""
+    rows = plyfile.PlyData.read(str(scene_path))["vertex"].data
+    names = [name for name in rows.dtype.names if name not in (*MATERIALS, "object_id")]
+    plain = np.empty(len(rows), [(name, "<f4") for name in names])
+    for name in names:
+        plain[name] = rows[name]
+    w, x, y, z = (plain[f"rot_{k}"][::2].copy() for k in range(4))  # half of the surfels turned over
+    for k, turned in enumerate((-x, w, z, -y)):
+        plain[f"rot_{k}"][::2] = turned
+    path = tmp_path / "plain.ply"
+    plyfile.PlyData([plyfile.PlyElement.describe(plain, "vertex")], byte_order="<").write(str(path))
+    masks = []
+    for scene, out in ((scene_path, tmp_path / "ours"), (path, tmp_path / "plain")):
+        assert relight(f"scene={scene}", f"environment={light_path}", f"output_dir={out}", "frames=1") == 0
+        masks.append(read_image(out / "frames" / "0000.mask.exr")[..., 0])
+    assert "materials" in caplog.text
+    assert "guessed" in caplog.text
+    assert json.loads((tmp_path / "plain" / "relight.json").read_text())["scene"]["materials_guessed"] is True
+    # Whichever way its normals point, the surface is there; kernel degree 2 is softer than the scene's 4.
+    assert np.abs(masks[0] - masks[1]).mean() < 0.1
+
+
+def test_a_scene_lying_on_its_side_is_stood_up(variant, ball_on_floor, light_path, tmp_path):
+    upright = ball_on_floor()
+    lying = upright.rotated(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))  # up is now -y
+    shots = []
+    for name, scene in (("upright", upright), ("lying", lying)):
+        path = tmp_path / f"{name}.ply"
+        scene.save(path)
+        base = [f"scene={path}", f"environment={light_path}", f"output_dir={tmp_path / name}", "frames=1"]
+        assert relight(*base, "quality=final") == 0
+        shots.append(read_image(tmp_path / name / "frames" / "0000.irradiance.exr"))
+    assert np.abs(shots[0] - shots[1]).mean() < 0.05 * shots[0].mean()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"scene": "absent.ply"}, "cannot read"),
+        ({"environment": "absent.hdr"}, "absent.hdr"),
+        ({"checkpoint": "absent.safetensors"}, "absent.safetensors"),
+        ({"cameras": "absent.json"}, "absent.json"),
+        ({"quality": "best"}, "'quality'"),
+        ({"up": "[0,0,0]"}, "'up'"),
+        ({"exposure": "-1"}, "'exposure'"),
+        ({"buffers": "[pbr,nonsense]"}, "'buffers"),
+        ({"framse": "3"}, "framse"),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_nothing(
+    variant, scene_path, light_path, tmp_path, capsys, change, words
+):
+    options = {"scene": scene_path, "environment": light_path, "output_dir": tmp_path / "out"} | change
+    assert relight(*(f"{key}={value}" for key, value in options.items())) == 2
+    error = capsys.readouterr().err.strip()
+    assert words in error
+    assert error.startswith("tron-relight: ")
+    assert "\n" not in error
+    assert not (tmp_path / "out").exists()
