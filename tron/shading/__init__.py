@@ -1,7 +1,7 @@
 """Light on a G-buffer: environment maps, split-sum, shadowed irradiance, guidance buffers.
 
-Light is an :class:`EnvironmentMap` (NumPy, data at rest); :class:`Lighting` prepares what rendering needs of it
-once, and :func:`render_guidance` turns a camera into the buffers the neural renderer is conditioned on.
+Light is an :class:`EnvironmentMap` (NumPy, data at rest); :class:`Lighting` prepares what rendering needs of
+it once, and :func:`render_guidance` turns a camera into the buffers the neural renderer is conditioned on.
 Everything here is linear and scene-referred; exposure and AgX come at the very end, elsewhere.
 """
 

@@ -5,15 +5,14 @@ direction d, before the map's own rotation about +z:
 
     u = atan2(d.x, d.y) / (2 pi)  (mod 1),      v = acos(d.z) / pi
 
-so the top row is the zenith, the left edge looks along +y and the middle column along -y. Columns are centred on
-half texels (column j at u = (j + 1/2) / W, periodic); rows stand *on* the poles (row i at v = i / (H - 1)).
-Between those samples radiance is bilinear in (u, v). Every integral below is of that bilinear function.
+so the top row is the zenith, the left edge looks along +y and the middle column along -y. Columns are centred
+on half texels (column j at u = (j + 1/2) / W, periodic), rows stand *on* the poles (row i at v = i/(H - 1)).
+Between those samples radiance is bilinear in (u, v), and every integral below is of that bilinear function.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,7 @@ PDF_WIDTH = 512
 """Widest grid, in cells, that directions are drawn from: finer maps are averaged down to it."""
 
 PDF_FLOOR = 0.01
-"""Least density of a cell, relative to the mean: no direction is ever impossible, so lookups stay unbiased."""
+"""Least density of a cell, relative to the mean: no direction is impossible, so lookups stay unbiased."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +52,9 @@ class EnvironmentMap:
         object.__setattr__(self, "image", image)
         _check(image, None)
         if not np.isfinite(self.rotation_deg):
-            raise TronError(f"environment rotation is {self.rotation_deg}", mend="give a finite number of degrees")
+            raise TronError(
+                f"environment rotation is {self.rotation_deg}", mend="give a finite number of degrees"
+            )
 
     @classmethod
     def load(cls, path: str | Path, rotation_deg: float = 0.0) -> EnvironmentMap:
@@ -104,8 +105,8 @@ class EnvironmentMap:
     def resized(self, height: int, width: int | None = None) -> EnvironmentMap:
         """Area average over the new texels' solid angles; ``width`` is 2 ``height`` if not given.
 
-        The average is that of the bilinear function, rows standing on the poles on both sides, so lights do not
-        move and a constant stays constant.
+        The average is that of the bilinear function, with rows standing on the poles before and after, so
+        lights do not move and a constant stays constant.
         """
         width = 2 * height if width is None else width
         if (height, width) == self.image.shape[:2]:
@@ -118,7 +119,7 @@ class EnvironmentMap:
         return replace(self, image=np.maximum(image.transpose(1, 0, 2), 0).astype(np.float32))
 
     def lookup(self, directions: np.ndarray) -> np.ndarray:
-        """Radiance (..., 3) float32 from unit world ``directions`` (..., 3), as Mitsuba's envmap plugin gives it."""
+        """Radiance (..., 3) float32 from unit world ``directions`` (..., 3), as Mitsuba's plugin gives it."""
         d = np.asarray(directions, np.float64)
         height, width = self.image.shape[:2]
         u = np.arctan2(d[..., 0], d[..., 1]) / (2 * np.pi) + self.rotation_deg / 360
@@ -138,7 +139,7 @@ class EnvironmentMap:
         return {"type": "envmap", "bitmap": mi.Bitmap(self.image), "to_world": to_world}
 
     def solid_angles(self) -> np.ndarray:
-        """(H,) float64: integral over the sphere of one texel's bilinear weight, by row; W times their sum is 4 pi."""
+        """(H,) float64: integral over the sphere of one texel's bilinear weight; W times the sum is 4 pi."""
         return _row_integrals(self.image.shape[0], np.sin) * (2 * np.pi / self.image.shape[1])
 
     def mean(self) -> np.ndarray:
@@ -147,9 +148,9 @@ class EnvironmentMap:
         return np.einsum("i,ijc->c", weights, self.image, dtype=np.float64)
 
     def contrast(self) -> float:
-        """Share of all light that comes from the brightest hundredth of the sphere: 0.01 if constant, near 1 for a sun.
+        """Share of all light that comes from the brightest hundredth of the sphere.
 
-        Energies are luminance times solid angle; 0 for a black map.
+        0.01 for a constant, near 1 for a sun, 0 for a black map; light is luminance times solid angle.
         """
         energy = np.asarray(luminance(self.image), np.float64)
         area = np.repeat(self.solid_angles(), self.image.shape[1]) / (4 * np.pi)
@@ -160,55 +161,59 @@ class EnvironmentMap:
         return float((energy * share).sum() / max(energy.sum(), 1e-300)) if energy.sum() > 0 else 0.0
 
     def unoccluded_upward(self) -> np.ndarray:
-        """(3,) float64: radiance of a white diffuse plane facing +z with nothing in the way, E / pi, by quadrature."""
+        """(3,) float64: radiance of a white diffuse plane facing +z with nothing in the way, E / pi."""
         weights = _row_integrals(self.image.shape[0], lambda t: np.maximum(np.cos(t), 0) * np.sin(t))
         weights *= 2 / self.image.shape[1]
         return np.einsum("i,ijc->c", weights, self.image, dtype=np.float64)
 
     def exposure(self) -> float:
-        """The one scalar of this light that every buffer is multiplied by before AgX: 0.4 over the luminance above.
+        """The one scalar that every buffer under this light is multiplied by before AgX.
+
+        0.4 over the luminance of :meth:`unoccluded_upward`, in inverse radiance.
 
         Raises:
             TronError: no light falls on an upward plane, so no exposure shows anything.
         """
         light = float(luminance(self.unoccluded_upward()))
         if light <= 0:
-            raise TronError("the environment map lights nothing from above", mend="give a map that is not black")
+            raise TronError(
+                "the environment map lights nothing from above", mend="give a map that is not black"
+            )
         return 0.4 / light
 
 
 class EnvironmentLight:
     """An :class:`EnvironmentMap` on the device: radiance, importance sampling, and its density.
 
-    Directions are drawn from a grid of cells whose corners are texel centres. A cell's probability is proportional
-    to its mean bilinear luminance times its solid angle, floored at ``PDF_FLOOR`` of the mean; inside a cell the
-    density is uniform in solid angle. Maps wider than ``pdf_width`` are averaged for the grid, never for radiance.
+    Directions are drawn from a grid of cells whose corners are texel centres. A cell's probability is
+    proportional to its mean bilinear luminance times its solid angle, floored at ``PDF_FLOOR`` of the mean;
+    inside a cell the density is uniform in solid angle. Maps wider than ``pdf_width`` are averaged for the
+    grid, never for radiance.
     """
 
     def __init__(self, environment: EnvironmentMap, pdf_width: int = PDF_WIDTH) -> None:
         self.environment = environment
         image = environment.image
-        self.height, self.width = image.shape[:2]
+        height, width = image.shape[:2]
+        # Opaque numbers: lights of other sizes and rotations must share one compiled kernel.
+        self._width, self._last_row = dr.opaque(mi.Int, width), dr.opaque(mi.Int, height - 1)
         rgba = np.concatenate([image, np.zeros_like(image[..., :1])], axis=-1)
         self._texels = mi.Float(rgba.ravel())
         self._rotation = dr.opaque(mi.Float, environment.rotation_deg / 360)
 
-        coarse = environment if self.width <= pdf_width else environment.resized(pdf_width // 2, pdf_width)
+        coarse = environment if width <= pdf_width else environment.resized(pdf_width // 2, pdf_width)
         y = np.asarray(luminance(coarse.image), np.float64)
         y = 0.5 * (y + np.roll(y, -1, axis=1))
         y = 0.5 * (y[1:] + y[:-1])
-        self.rows, self.columns = y.shape
-        angle = np.linspace(0, np.pi, self.rows + 1)
-        area = -np.diff(np.cos(angle))[:, None] * (2 * np.pi / self.columns)
+        rows, columns = y.shape
+        self._rows, self._columns = dr.opaque(mi.Int, rows), dr.opaque(mi.Int, columns)
+        angle = np.linspace(0, np.pi, rows + 1)
+        area = -np.diff(np.cos(angle))[:, None] * (2 * np.pi / columns)
         mean = (y * area).sum() / (4 * np.pi)
         mass = np.maximum(y, PDF_FLOOR * mean if mean > 0 else 1.0) * area
         mass /= mass.sum()
         self._density = mi.Float((mass / area).astype(np.float32).ravel())
         self._distribution = mi.DiscreteDistribution2D(mass.astype(np.float32))
-
-    @cached_property
-    def _row_step(self) -> float:
-        return float(np.pi / self.rows)
 
     def _longitude(self, d: mi.Vector3f) -> mi.Float:
         u = dr.atan2(d.x, d.y) * float(0.5 / np.pi) + self._rotation
@@ -216,47 +221,50 @@ class EnvironmentLight:
 
     def radiance(self, d: mi.Vector3f) -> mi.Color3f:
         """Bilinear lookup: linear radiance arriving from unit world directions ``d``."""
-        x = self._longitude(d) * self.width - 0.5
-        y = _polar_angle(d) * float((self.height - 1) / np.pi)
-        column, row = dr.floor(x), dr.minimum(dr.floor(y), float(self.height - 2))
-        fx, fy = x - column, y - row
-        left = mi.Int(column)
-        left = dr.select(left < 0, left + self.width, left)
-        right = dr.select(left + 1 >= self.width, 0, left + 1)
-        top = mi.Int(row) * self.width
+        width = self._width
+        x = self._longitude(d) * mi.Float(width) - 0.5
+        y = _polar_angle(d) * (mi.Float(self._last_row) * float(1 / np.pi))
+        left, top = mi.Int(dr.floor(x)), mi.Int(y)
+        top = dr.select(top < self._last_row, top, self._last_row - 1)
+        fx, fy = x - mi.Float(left), y - mi.Float(top)
+        left = dr.select(left < 0, left + width, left)
+        right = dr.select(left + 1 >= width, 0, left + 1)
+        top *= width
 
         def texel(index: mi.Int) -> mi.Vector4f:
             return dr.gather(mi.Vector4f, self._texels, mi.UInt32(index))
 
         upper = dr.lerp(texel(top + left), texel(top + right), fx)
-        lower = dr.lerp(texel(top + self.width + left), texel(top + self.width + right), fx)
+        lower = dr.lerp(texel(top + width + left), texel(top + width + right), fx)
         value = dr.lerp(upper, lower, fy)
         return mi.Color3f(value.x, value.y, value.z)
 
-    def sample(self, u: mi.Point2f, active: mi.Bool | bool = True) -> tuple[mi.Vector3f, mi.Float]:
-        """Unit world directions and their densities (per steradian) from uniform numbers ``u`` in [0, 1)^2."""
+    def sample(self, u: mi.Point2f, active: Any = True) -> tuple[mi.Vector3f, mi.Float]:
+        """Unit world directions and their densities (per steradian) from uniform ``u`` in [0, 1)^2."""
         cell, _, inside = self._distribution.sample(u, active)
         column, row = mi.Float(cell.x), mi.Float(cell.y)
-        upper, lower = dr.cos(row * self._row_step), dr.cos((row + 1) * self._row_step)
+        step = float(np.pi) / mi.Float(self._rows)
+        upper, lower = dr.cos(row * step), dr.cos((row + 1) * step)
         z = dr.clip(dr.lerp(upper, lower, inside.y), -1, 1)
         # Cells begin at texel centres, half a texel into the image.
-        longitude = (column + 0.5 + inside.x) / self.columns - self._rotation
+        longitude = (column + 0.5 + inside.x) / mi.Float(self._columns) - self._rotation
         sin, cos = dr.sincos(float(2 * np.pi) * longitude)
         radius = dr.safe_sqrt(1 - z * z)
-        density = dr.gather(mi.Float, self._density, cell.y * self.columns + cell.x, active)
+        density = dr.gather(mi.Float, self._density, cell.y * mi.UInt32(self._columns) + cell.x, active)
         return mi.Vector3f(radius * sin, radius * cos, z), density
 
     def pdf(self, d: mi.Vector3f) -> mi.Float:
         """Density (per steradian) with which :meth:`sample` draws unit world directions ``d``."""
-        column = mi.Int(dr.floor(self._longitude(d) * self.columns - 0.5))
-        column = dr.select(column < 0, column + self.columns, column)
-        row = dr.minimum(mi.Int(_polar_angle(d) / self._row_step), self.rows - 1)
-        return dr.gather(mi.Float, self._density, mi.UInt32(row * self.columns + column))
+        column = mi.Int(dr.floor(self._longitude(d) * mi.Float(self._columns) - 0.5))
+        column = dr.select(column < 0, column + self._columns, column)
+        row = mi.Int(_polar_angle(d) * (mi.Float(self._rows) * float(1 / np.pi)))
+        row = dr.select(row < self._rows, row, self._rows - 1)
+        return dr.gather(mi.Float, self._density, mi.UInt32(row * self._columns + column))
 
 
 def _polar_angle(d: mi.Vector3f) -> mi.Float:
     # acos(d.z) loses half its digits at the poles; atan2 does not.
-    return dr.atan2(dr.sqrt(d.x * d.x + d.y * d.y), d.z)
+    return mi.Float(dr.atan2(dr.sqrt(d.x * d.x + d.y * d.y), d.z))
 
 
 def _check(image: np.ndarray, where: str | None) -> None:
@@ -265,18 +273,24 @@ def _check(image: np.ndarray, where: str | None) -> None:
     height, width = image.shape[:2]
     if width != 2 * height or height < 4:
         raise TronError(
-            f"environment map is {width} x {height} pixels, not 2:1", where, "give a lat-long image, twice as wide as high"
+            f"environment map is {width} x {height} pixels, not 2:1",
+            where,
+            "give a lat-long image, twice as wide as high",
         )
     if not np.isfinite(image).all():
-        raise TronError("environment map holds NaN or infinity", where, "repair the file: radiance must be finite")
+        raise TronError(
+            "environment map holds NaN or infinity", where, "repair the file: radiance must be finite"
+        )
     if image.min() < 0:
         raise TronError(
-            f"environment map holds negative radiance (down to {image.min():.3g})", where, "clamp it to zero or above"
+            f"environment map holds negative radiance (down to {image.min():.3g})",
+            where,
+            "clamp it to zero or above",
         )
 
 
 def _row_integrals(height: int, density: Any) -> np.ndarray:
-    """(H,) integral over theta in [0, pi] of each row's hat function times ``density(theta)``, Gauss-Legendre."""
+    """(H,) integral over theta in [0, pi] of each row's hat times ``density(theta)``, by Gauss-Legendre."""
     node, weight = np.polynomial.legendre.leggauss(8)
     node, weight = 0.5 * (node + 1), 0.5 * weight
     step = np.pi / (height - 1)
@@ -294,8 +308,8 @@ def _row_integrals(height: int, density: Any) -> np.ndarray:
 def _average(edges: np.ndarray, size: int, offset: float, density: Any) -> sparse.csr_matrix:
     """Rows are the averages of a hat basis over [edges[i], edges[i + 1]], weighted by ``density``.
 
-    Basis function j has its peak at ``offset`` + j, in source texels; ``edges`` are in source texels too. Indices
-    wrap around modulo ``size``.
+    Basis function j has its peak at ``offset`` + j, in source texels; ``edges`` are in source texels too.
+    Indices wrap around modulo ``size``.
     """
     lower, upper = edges[:-1], edges[1:]
     pieces = int(np.ceil((upper - lower).max())) + 1
@@ -314,7 +328,8 @@ def _average(edges: np.ndarray, size: int, offset: float, density: Any) -> spars
             column.append((left + shift) % size)
             value.append(share)
     shape = (len(lower), size)
-    matrix = sparse.coo_matrix((np.concatenate(value), (np.concatenate(row), np.concatenate(column))), shape).tocsr()
+    entries = np.concatenate(value), (np.concatenate(row), np.concatenate(column))
+    matrix = sparse.coo_matrix(entries, shape).tocsr()
     return sparse.diags(1 / np.asarray(matrix.sum(1)).ravel()) @ matrix
 
 

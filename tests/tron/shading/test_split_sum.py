@@ -1,0 +1,253 @@
+"""Laws of split-sum: what is filtered is the integral, what is reflected is at most what arrives."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tron.errors import TronError
+from tron.seeds import generator
+from tron.shading.environment import EnvironmentLight, EnvironmentMap
+from tron.shading.prefilter import LightTree, direction_face, face_direction, ggx_prefilter
+from tron.shading.split_sum import SplitSum, brdf_table
+
+
+def unit(n: int, seed: int = 0) -> np.ndarray:
+    d = generator(seed, "directions").normal(size=(n, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def vector(a: np.ndarray) -> "mi.Vector3f":
+    return mi.Vector3f(np.ascontiguousarray(a.T, dtype=np.float32))
+
+
+def rows(a: object) -> np.ndarray:
+    return np.array(a).T.astype(np.float64)
+
+
+def random_map(height: int = 16) -> EnvironmentMap:
+    image = generator(1, "map").random((height, 2 * height, 3)) ** 4 * 5
+    return EnvironmentMap(image.astype(np.float32), 30.0)
+
+
+def sun_map(height: int = 96) -> EnvironmentMap:
+    image = np.full((height, 2 * height, 3), 0.3, np.float32)
+    image[22:24, 130:132] = (3000.0, 2700.0, 2000.0)
+    return EnvironmentMap(image)
+
+
+def towards_sun() -> np.ndarray:
+    theta, u = 22.5 / 95 * np.pi, 131.0 / 192 * 2 * np.pi
+    sun = np.array([np.sin(theta) * np.sin(u), np.sin(theta) * np.cos(u), np.cos(theta)])
+    axes = np.concatenate([sun + s * unit(4, seed=5) for s in (0.05, 0.15, 0.4, 1.0)] + [unit(8)])
+    return axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
+def lobe_integral(
+    environment: EnvironmentMap, axes: np.ndarray, alpha: float, height: int = 384
+) -> np.ndarray:
+    """GGX filter of the lat-long bilinear function by brute force, float64: the oracle of prefiltering."""
+    theta = (np.arange(height) + 0.5) / height * np.pi
+    phi = (np.arange(2 * height) + 0.5) / height * np.pi
+    t, p = np.meshgrid(theta, phi, indexing="ij")
+    d = np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], -1).reshape(-1, 3)
+    radiance = environment.lookup(d).astype(np.float64) * np.sin(t).reshape(-1, 1)
+    result = []
+    for n in axes:
+        cosine = d @ n
+        half2 = 0.5 * (1 + cosine)  # (n.h)^2, h halfway between n and the light
+        weight = np.where(cosine > 0, cosine, 0) * alpha**2 / (np.pi * (half2 * (alpha**2 - 1) + 1) ** 2)
+        result.append(weight @ radiance / (weight @ np.sin(t).ravel()))
+    return np.array(result)
+
+
+def test_faces_and_directions_are_inverse_and_cover_the_sphere(variant: str) -> None:
+    d = unit(5000)
+    face, u, v = direction_face(vector(d))
+    assert set(np.array(face)) == set(range(6))
+    assert max(np.abs(np.array(u)).max(), np.abs(np.array(v)).max()) <= 1
+    np.testing.assert_allclose(rows(face_direction(face, u, v)), d, atol=1e-6)
+
+
+def test_tree_holds_all_the_light_and_all_the_sphere(variant: str) -> None:
+    environment = sun_map()
+    tree = LightTree.build(EnvironmentLight(environment), 64)
+    record = np.array(tree.records, dtype=np.float64).reshape(-1, 8)
+    leaf = record[:, 7] == np.arange(len(record)) + 1
+    assert leaf.sum() == 6 * 64 * 64
+    np.testing.assert_allclose((record[leaf, 3] ** 2).sum(), 4 * np.pi, rtol=1e-4)
+    np.testing.assert_allclose(record[leaf, 4:7].sum(0), environment.mean() * 4 * np.pi, rtol=5e-3)
+
+
+@pytest.mark.parametrize("make", [random_map, sun_map])
+@pytest.mark.parametrize("alpha", [0.05, 0.25, 1.0])
+def test_prefilter_is_the_lobe_integral(variant: str, make, alpha: float) -> None:
+    environment, axes = make(), towards_sun()
+    tree = LightTree.build(EnvironmentLight(environment), 128)
+    ours = rows(ggx_prefilter(tree, vector(axes), dr.opaque(mi.Float, alpha)))
+    truth = lobe_integral(environment, axes, alpha)
+    np.testing.assert_allclose(ours, truth, rtol=0.03, atol=1e-3 * truth.max())
+
+
+@pytest.mark.parametrize("make", [random_map, sun_map])
+def test_diffuse_is_the_cosine_integral(variant: str, make) -> None:
+    environment, normals = make(), towards_sun()
+    truth = lobe_integral(environment, normals, 1.0)
+    ours = rows(SplitSum(environment, 64).diffuse(vector(normals)))
+    np.testing.assert_allclose(ours, truth, rtol=0.01, atol=4e-3 * truth.max())
+    np.testing.assert_allclose(
+        rows(SplitSum(environment, 64).diffuse(mi.Vector3f(0, 0, 1)))[0],
+        environment.unoccluded_upward(),
+        rtol=4e-3,
+    )
+
+
+@pytest.mark.parametrize("resolution", [64, 128])
+def test_a_constant_environment_is_returned_exactly(variant: str, resolution: int) -> None:
+    light = SplitSum(EnvironmentMap.constant((0.5, 1.0, 2.0)), resolution)
+    d = vector(unit(2000))
+    np.testing.assert_allclose(rows(light.diffuse(d)), np.tile((0.5, 1, 2), (2000, 1)), rtol=1e-5)
+    roughness = mi.Float(generator(2, "roughness").random(2000).astype(np.float32))
+    np.testing.assert_allclose(
+        rows(light.prefiltered(d, roughness)), np.tile((0.5, 1, 2), (2000, 1)), rtol=1e-5
+    )
+
+
+def test_white_metal_in_a_white_furnace_reflects_at_most_all_and_smooth_metal_nearly_all(
+    variant: str,
+) -> None:
+    light = SplitSum(EnvironmentMap.constant(1.0), 64)
+    n, v = unit(20000), unit(20000, seed=3)
+    v *= np.sign((n * v).sum(1))[:, None]
+    roughness = generator(4, "roughness").random(20000).astype(np.float32)
+    out = rows(light.specular(vector(n), vector(v), mi.Float(roughness), mi.Color3f(1.0)))
+    assert out.max() <= 1 + 1e-4
+    assert out[roughness < 0.2].mean() > 0.99
+    assert out[roughness < 0.5].mean() > 0.95
+    assert out.min() > 0.3  # what a single bounce between rough facets keeps
+
+
+def test_reflection_looks_where_a_mirror_would(variant: str) -> None:
+    environment = EnvironmentMap(random_map().resized(8).image).resized(64)
+    light = SplitSum(environment, 128)
+    n, v = unit(500), unit(500, seed=3)
+    n *= np.sign((n * v).sum(1))[:, None]
+    mirrored = 2 * (n * v).sum(1, keepdims=True) * n - v
+    seen = rows(light.specular(vector(n), vector(v), mi.Float(0.02), mi.Color3f(1.0)))
+    error = np.abs(seen - environment.lookup(mirrored))
+    assert error.mean() < 0.01 * seen.mean()
+    assert np.quantile(error, 0.99) < 0.1 * seen.mean()  # a mirror looking into the kink at a pole
+
+
+def test_a_smooth_map_survives_the_cubemap_within_a_hundredth(variant: str) -> None:
+    environment = random_map().resized(4).resized(64)
+    d = unit(5000)
+    seen, truth = (
+        rows(SplitSum(environment, 128).prefiltered(vector(d), mi.Float(0.08))),
+        environment.lookup(d),
+    )
+    assert np.abs(seen - truth).mean() < 0.01 * truth.mean()
+
+
+@pytest.mark.parametrize("roughness,level", [(0, 0), (0.08, 0), (0.29, 1), (0.5, 2), (0.75, 2.5), (1, 3)])
+def test_level_lookup(variant: str, roughness: float, level: float) -> None:
+    light = SplitSum(EnvironmentMap.constant(1.0), 128)  # levels 128, 64, 32, 16
+    assert np.array(light._level_of(mi.Float(roughness)))[0] == pytest.approx(level, abs=1e-5)
+
+
+def test_roughness_of_a_level_is_filtered_by_its_own_lobe(variant: str) -> None:
+    environment, axes = random_map(), unit(40)
+    light = SplitSum(environment, 128)
+    for roughness, tolerance in ((0.29, 0.03), (0.5, 0.03), (1.0, 0.03)):
+        truth = lobe_integral(environment, axes, roughness**2)
+        seen = rows(light.prefiltered(vector(axes), mi.Float(roughness)))
+        assert np.abs(seen - truth).max() < tolerance * truth.max()
+
+
+@pytest.mark.parametrize("roughness", [0.08, 0.5, 1.0])
+def test_no_seam_between_faces(variant: str, roughness: float) -> None:
+    light = SplitSum(random_map(), 64)
+    along = np.linspace(-1, 1, 200)
+    step = 1e-4
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            edge = np.roll(np.stack([np.ones(200), np.full(200, sign), along], 1), axis, axis=1)
+            across = np.roll(np.array([step, -sign * step, 0]), axis)
+            one = rows(light.prefiltered(mi.Vector3f(*_columns(edge + across)), mi.Float(roughness)))
+            other = rows(light.prefiltered(mi.Vector3f(*_columns(edge - across)), mi.Float(roughness)))
+            assert np.abs(one - other).max() < 0.02 * one.mean()
+
+
+def _columns(a: np.ndarray) -> list:
+    return [mi.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in a.T]
+
+
+def test_turning_the_light_turns_its_filters(variant: str) -> None:
+    environment, d = random_map(), unit(500)
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    for roughness in (0.2, 0.7):
+        still = rows(SplitSum(environment, 64).prefiltered(vector(d), mi.Float(roughness)))
+        turned = rows(
+            SplitSum(environment.rotated(90), 64).prefiltered(vector(d @ turn.T), mi.Float(roughness))
+        )
+        np.testing.assert_allclose(turned, still, rtol=0.01, atol=0.01)
+
+
+def monte_carlo_albedo(cosine: float, alpha: float, n: int = 400_000) -> tuple[float, float]:
+    """A and B by sampling half vectors from D n.h, float64; independent of visible normals."""
+    random = generator(6, "brdf")
+    u, phi = random.random(n), random.random(n) * 2 * np.pi
+    cos_h = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))
+    sin_h = np.sqrt(1 - cos_h**2)
+    view = np.array([np.sqrt(1 - cosine**2), 0, cosine])
+    facing = view[0] * sin_h * np.cos(phi) + view[2] * cos_h
+    out = 2 * facing * cos_h - cosine
+
+    def smith(c: np.ndarray | float) -> np.ndarray:
+        return 2 * c / (c + np.sqrt(alpha**2 + (1 - alpha**2) * np.square(c)))
+
+    valid = (out > 0) & (facing > 0)
+    weight = np.where(valid, smith(np.maximum(out, 1e-9)) * smith(cosine) * facing / (cosine * cos_h), 0)
+    fresnel = (1 - np.clip(facing, 0, 1)) ** 5
+    return float((weight * (1 - fresnel)).mean()), float((weight * fresnel).mean())
+
+
+@pytest.mark.parametrize("row", [20, 64, 128, 200, 255])
+@pytest.mark.parametrize("column", [12, 60, 128, 250])
+def test_table_is_the_albedo_by_monte_carlo(variant: str, row: int, column: int) -> None:
+    expected = monte_carlo_albedo((column + 0.5) / 256, ((row + 0.5) / 256) ** 2)
+    np.testing.assert_allclose(brdf_table()[row, column], expected, atol=5e-3)
+
+
+@pytest.mark.parametrize("row,column", [(30, 40), (100, 128), (180, 30), (250, 200)])
+def test_table_is_the_albedo_of_mitsubas_rough_conductor(variant: str, row: int, column: int) -> None:
+    alpha, cosine = ((row + 0.5) / 256) ** 2, (column + 0.5) / 256
+    mirror = mi.load_dict(
+        {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": alpha}
+    )
+    n = 1 << 18
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.wi = mi.Vector3f(float(np.sqrt(1 - cosine**2)), 0, cosine)
+    u = mi.Point2f(generator(7, "u").random((2, n)).astype(np.float32))
+    _, weight = mirror.sample(mi.BSDFContext(), si, mi.Float(0), u)
+    assert brdf_table()[row, column].sum() == pytest.approx(np.array(weight[0]).mean(), abs=3e-3)
+
+
+def test_another_light_of_another_size_compiles_nothing_new(variant: str) -> None:
+    def shade(environment: EnvironmentMap) -> None:
+        light = SplitSum(environment, 64)
+        dr.eval(light.diffuse(vector(unit(64))), light.prefiltered(vector(unit(64)), mi.Float(0.3)))
+
+    shade(random_map(16))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        shade(random_map(24).rotated(10))
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    assert kernels
+    assert all(k["cache_hit"] for k in kernels)
+
+
+@pytest.mark.parametrize("resolution", [0, 100, 32, 4096])
+def test_an_odd_resolution_is_refused(variant: str, resolution: int) -> None:
+    with pytest.raises(TronError, match=str(resolution)):
+        SplitSum(EnvironmentMap.constant(1.0), resolution)

@@ -1,0 +1,217 @@
+"""Split-sum lighting: prefiltered environment times BRDF table (Karis 2013), in nvdiffrec's convention.
+
+The prefiltered cubemap has one level for each of a few roughnesses, from 0.08 at full resolution to 0.5 at
+32 texels a face, then roughness 1 at 16: level i of 0..L-2 is roughness 0.08 + 0.42 i / (L - 2), level L-1
+is 1. Between levels, texels and faces the lookup is linear. Diffuse light is the roughness-1 filter once
+more, at 32 texels a face: its kink at the terminator shows at 16 (4 % off at worst, against 0.4 %).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from tron.errors import TronError
+from tron.shading.environment import EnvironmentLight, EnvironmentMap
+from tron.shading.prefilter import LightTree, direction_face, face_direction, ggx_prefilter
+
+CUBEMAP_RESOLUTION = 128
+"""Texels along a face edge of the sharpest level."""
+SMALLEST_LEVEL, DIFFUSE_LEVEL = 16, 32
+SHARPEST_ROUGHNESS, MIDDLE_ROUGHNESS = 0.08, 0.5
+TABLE_SIZE = 256
+TABLE_SAMPLES = 32
+"""Quadrature points along each of the two dimensions of the visible normals."""
+
+
+class SplitSum:
+    """An environment prepared for unshadowed shading of any surface.
+
+    Args:
+        environment: the light.
+        resolution: texels along a face edge of the sharpest level, a power of two in [64, 1024]. Preparing a
+            light takes about 0.3, 1.2 and 5 seconds on one core at 128, 256 and 512.
+        light: the same environment on the device, if the caller has it already.
+
+    Raises:
+        TronError: another resolution.
+    """
+
+    def __init__(
+        self,
+        environment: EnvironmentMap,
+        resolution: int = CUBEMAP_RESOLUTION,
+        light: EnvironmentLight | None = None,
+    ) -> None:
+        if resolution not in (64, 128, 256, 512, 1024):
+            raise TronError(f"cubemap resolution is {resolution}", mend="use 64, 128, 256, 512 or 1024")
+        widest = 8 * resolution
+        if environment.image.shape[1] > widest:
+            environment, light = environment.resized(widest // 2), None
+        tree = LightTree.build(light or EnvironmentLight(environment), resolution)
+        resolutions = _level_resolutions(resolution)
+        roughnesses = _level_roughnesses(len(resolutions))
+        self._last = dr.opaque(mi.UInt32, len(resolutions) - 1)
+        resolutions, roughnesses = [*resolutions, DIFFUSE_LEVEL], [*roughnesses, 1.0]
+        levels = [
+            _prefiltered_level(tree, r, alpha=roughness**2)
+            for r, roughness in zip(resolutions, roughnesses, strict=True)
+        ]
+        offsets = np.cumsum([0] + [len(level) for level in levels[:-1]])
+        self._texels = mi.Float(np.concatenate(levels).ravel())
+        self._offsets = mi.UInt32(offsets.astype(np.uint32))
+        self._resolutions = mi.UInt32(np.array(resolutions, np.uint32))
+        self._table = mi.Float(brdf_table().ravel())
+
+    def diffuse(self, normal: mi.Vector3f) -> mi.Color3f:
+        """Unoccluded irradiance / pi: linear radiance of a white diffuse surface of unit ``normal``."""
+        return self._level(mi.Vector3f(normal), self._last + 1)
+
+    def specular(
+        self, normal: mi.Vector3f, to_camera: mi.Vector3f, roughness: mi.Float, f0: mi.Color3f
+    ) -> mi.Color3f:
+        """Unoccluded specular reflection: prefiltered(R, roughness) (f0 A + B).
+
+        Args:
+            normal, to_camera: unit, world.
+            roughness: in [0, 1]; alpha is its square.
+            f0: linear reflectance at normal incidence.
+
+        Returns:
+            linear radiance towards the camera.
+        """
+        normal, to_camera = mi.Vector3f(normal), mi.Vector3f(to_camera)
+        cosine = dr.dot(normal, to_camera)
+        scale, bias = self._brdf(cosine, roughness)
+        return self.prefiltered(2 * cosine * normal - to_camera, roughness) * (f0 * scale + bias)
+
+    def prefiltered(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
+        """Environment filtered by the lobe of ``roughness``, trilinear, in unit world ``direction``."""
+        level = self._level_of(roughness)
+        lower = mi.UInt32(level)
+        lower = dr.select(lower < self._last, lower, self._last - 1)
+        return dr.lerp(
+            self._level(direction, lower), self._level(direction, lower + 1), level - mi.Float(lower)
+        )
+
+    def _level_of(self, roughness: mi.Float) -> mi.Float:
+        before_last = mi.Float(self._last) - 1
+        sharp = dr.clip(roughness, SHARPEST_ROUGHNESS, MIDDLE_ROUGHNESS) - SHARPEST_ROUGHNESS
+        rough = dr.clip(roughness, MIDDLE_ROUGHNESS, 1) - MIDDLE_ROUGHNESS
+        return sharp / (MIDDLE_ROUGHNESS - SHARPEST_ROUGHNESS) * before_last + rough / (1 - MIDDLE_ROUGHNESS)
+
+    def _level(self, direction: mi.Vector3f, level: mi.UInt32) -> mi.Color3f:
+        """Bilinear lookup in one level; faces carry a border of one texel, so edges are filtered too."""
+        face, u, v = direction_face(direction)
+        resolution = dr.gather(mi.UInt32, self._resolutions, level)
+        half = 0.5 * mi.Float(resolution)
+        x, y = u * half + half + 0.5, v * half + half + 0.5
+        column, row = mi.UInt32(x), mi.UInt32(y)
+        column = dr.select(column > resolution, resolution, column)
+        row = dr.select(row > resolution, resolution, row)
+        width = resolution + 2
+        first = dr.gather(mi.UInt32, self._offsets, level) + (face * width + row) * width + column
+
+        def texel(index: mi.UInt32) -> mi.Vector4f:
+            return dr.gather(mi.Vector4f, self._texels, index)
+
+        fx, fy = x - mi.Float(column), y - mi.Float(row)
+        upper = dr.lerp(texel(first), texel(first + 1), fx)
+        lower = dr.lerp(texel(first + width), texel(first + width + 1), fx)
+        value = dr.lerp(upper, lower, fy)
+        return mi.Color3f(value.x, value.y, value.z)
+
+    def _brdf(self, cosine: mi.Float, roughness: mi.Float) -> tuple[mi.Float, mi.Float]:
+        x = dr.clip(cosine * TABLE_SIZE - 0.5, 0, TABLE_SIZE - 1)
+        y = dr.clip(roughness * TABLE_SIZE - 0.5, 0, TABLE_SIZE - 1)
+        column, row = mi.UInt32(x), mi.UInt32(y)
+        column = dr.select(column < TABLE_SIZE - 1, column, TABLE_SIZE - 2)
+        row = dr.select(row < TABLE_SIZE - 1, row, TABLE_SIZE - 2)
+        first = row * TABLE_SIZE + column
+
+        def texel(index: mi.UInt32) -> mi.Vector2f:
+            return dr.gather(mi.Vector2f, self._table, index)
+
+        fx, fy = x - mi.Float(column), y - mi.Float(row)
+        upper = dr.lerp(texel(first), texel(first + 1), fx)
+        lower = dr.lerp(texel(first + TABLE_SIZE), texel(first + TABLE_SIZE + 1), fx)
+        value = dr.lerp(upper, lower, fy)
+        return value.x, value.y
+
+
+def _level_resolutions(resolution: int) -> list[int]:
+    levels = [resolution]
+    while levels[-1] > SMALLEST_LEVEL:
+        levels.append(levels[-1] // 2)
+    return levels
+
+
+def _level_roughnesses(count: int) -> list[float]:
+    step = (MIDDLE_ROUGHNESS - SHARPEST_ROUGHNESS) / (count - 2)
+    return [SHARPEST_ROUGHNESS + step * i for i in range(count - 1)] + [1.0]
+
+
+def _prefiltered_level(tree: LightTree, resolution: int, alpha: float) -> np.ndarray:
+    """(6 (resolution + 2)^2, 4) float32: r, g, b, 0; the border lies on the face's extended plane."""
+    width = dr.opaque(mi.UInt32, resolution + 2)
+    texel = dr.arange(mi.UInt32, 6 * (resolution + 2) ** 2)
+    face, inside = texel // (width * width), texel % (width * width)
+    scale = dr.opaque(mi.Float, 2 / resolution)
+    u, v = (mi.Float(inside % width) - 0.5) * scale - 1, (mi.Float(inside // width) - 0.5) * scale - 1
+    # The small levels have few texels, wide lobes and the closely watched diffuse light: they can be exact.
+    opening = dr.opaque(mi.Float, 0.35 if resolution > DIFFUSE_LEVEL else 0.1)
+    colour = ggx_prefilter(tree, face_direction(face, u, v), dr.opaque(mi.Float, alpha), opening)
+    return np.concatenate([np.array(colour).T, np.zeros((len(texel), 1), np.float32)], axis=1)
+
+
+@cache
+def brdf_table() -> np.ndarray:
+    """(roughness, n.v, 2) float32: A and B of f0 A + B, the albedo of a GGX mirror with Schlick's Fresnel.
+
+    Rows and columns are centred: entry (i, j) is roughness (i + 1/2) / 256 and n.v = (j + 1/2) / 256. Smith's
+    masking in its separable form, as Mitsuba's microfacet materials have it. By midpoint quadrature over the
+    visible normals (Heitz 2018, "Sampling the GGX Distribution of Visible Normals"). Computed once a process.
+    """
+    lane = dr.arange(mi.UInt32, TABLE_SIZE * TABLE_SIZE)
+    cosine = (mi.Float(lane % TABLE_SIZE) + 0.5) / TABLE_SIZE
+    roughness = (mi.Float(lane // TABLE_SIZE) + 0.5) / TABLE_SIZE
+    scale, bias = _directional_albedo(cosine, dr.square(roughness))
+    return np.stack([np.array(scale), np.array(bias)], -1).reshape(TABLE_SIZE, TABLE_SIZE, 2)
+
+
+@dr.syntax
+def _directional_albedo(cosine: mi.Float, alpha: mi.Float) -> tuple[mi.Float, mi.Float]:
+    view = mi.Vector3f(dr.safe_sqrt(1 - cosine * cosine), 0, cosine)
+    # Heitz: stretch the view, sample the projected half disk, map back.
+    stretched = dr.normalize(mi.Vector3f(alpha * view.x, 0, view.z))
+    across = mi.Vector3f(0, 1, 0)
+    along = dr.cross(stretched, across)
+    squeeze = 0.5 * (1 + stretched.z)
+    scale, bias, total = mi.Float(0), mi.Float(0), mi.Float(0)
+    i = mi.UInt32(0)
+    while i < TABLE_SAMPLES * TABLE_SAMPLES:
+        # The rim of the disk is the lobe's long tail: points crowd there, by radius^2 = 1 - x^3.
+        x = (mi.Float(i % TABLE_SAMPLES) + 0.5) / TABLE_SAMPLES
+        radius, share = dr.sqrt(1 - x * x * x), 3 * x * x
+        # Mirror symmetry about the plane of incidence: half a turn is enough.
+        angle = (mi.Float(i // TABLE_SAMPLES) + 0.5) * float(np.pi / TABLE_SAMPLES)
+        sin, cos = dr.sincos(angle - float(np.pi / 2))
+        t1, t2 = radius * cos, radius * sin
+        t2 = (1 - squeeze) * dr.safe_sqrt(1 - t1 * t1) + squeeze * t2
+        t3 = dr.safe_sqrt(1 - t1 * t1 - t2 * t2)
+        h = t1 * across + t2 * along + t3 * stretched
+        h = dr.normalize(mi.Vector3f(alpha * h.x, alpha * h.y, dr.maximum(h.z, 1e-7)))
+        facing = dr.dot(view, h)
+        cosine_out = 2 * facing * h.z - view.z
+        tangent2 = alpha * alpha * (1 - cosine_out * cosine_out)
+        masking = 2 * cosine_out / (cosine_out + dr.safe_sqrt(tangent2 + cosine_out * cosine_out))
+        masking = dr.select((cosine_out > 0) & (facing > 0), masking * share, 0)
+        fresnel = (1 - facing) ** 5
+        scale += masking * (1 - fresnel)
+        bias += masking * fresnel
+        total += share
+        i += 1
+    return scale / total, bias / total
