@@ -8,9 +8,18 @@ from typing import Any
 import pytest
 from hydra.utils import get_object
 from omegaconf import OmegaConf
+from pydantic import BaseModel
 
 from tron.apps.command_line import Command
-from tron.apps.recipes import check, compose_recipe, field_keys, group_options, nested_items, resolve
+from tron.apps.recipes import (
+    check,
+    compose_recipe,
+    field_keys,
+    group_options,
+    nested_items,
+    nested_model,
+    resolve,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
@@ -73,8 +82,19 @@ def test_every_setting_can_be_set_from_the_command_line(folder: str):
 @pytest.mark.parametrize("folder", sorted(COMMANDS))
 def test_every_setting_is_described(folder: str):
     command = load_command(folder)
-    assert [name for name, field in command.settings.model_fields.items() if not field.description] == []
+    assert undescribed(command.settings) == []
     assert len(command.examples) >= 2
+
+
+def undescribed(model: type[BaseModel], prefix: str = "") -> list[str]:
+    names = []
+    for name, field in model.model_fields.items():
+        inner = nested_model(field.annotation)
+        if inner is not None:
+            names += undescribed(inner, f"{prefix}{name}.")
+        elif not field.description:
+            names.append(prefix + name)
+    return names
 
 
 @pytest.mark.parametrize("folder", sorted(COMMANDS))

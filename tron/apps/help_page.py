@@ -11,7 +11,7 @@ import pydantic
 import yaml
 from pydantic.fields import FieldInfo
 
-from tron.apps.recipes import nested_items, nested_model
+from tron.apps.recipes import nested_model
 
 OPTIONS = {
     "-h, --help": "print this page",
@@ -27,6 +27,9 @@ TYPE_NAMES = {
     bool: "true | false",
     type(None): "null",
 }
+
+
+NO_DEFAULT = object()  # of a field of a list's items: each item has its own value
 
 
 def render_help(
@@ -58,16 +61,7 @@ def render_help(
         "keys (default)",
     ]
     for key, field, default in _fields(settings, defaults):
-        if isinstance(default, Mapping) and default:
-            page.append(f"  {key}.*")
-        else:
-            page.append(_shorten(f"  {key}={_yaml(default)}   [{describe_type(field.annotation)}]", width))
-        page += textwrap.wrap(
-            field.description or "", width, initial_indent=" " * 6, subsequent_indent=" " * 6
-        )
-        for inner, value in nested_items(default, f"{key}."):
-            if not isinstance(value, Mapping) and not inner.endswith("_target_"):
-                page.append(_shorten(f"    {inner}={_yaml(value)}", width))
+        page += _entry(key, field, default, width)
     for group, options in groups.items():
         page += ["", f"{group}=NAME"]
         page += _table(options, width)
@@ -108,10 +102,35 @@ def _fields(
         else:
             default = "???" if field.is_required() else field.get_default(call_default_factory=True)
         inner = nested_model(field.annotation)
-        if inner is None:
-            yield prefix + name, field, default
-        else:
+        if inner is not None:
             yield from _fields(inner, default, f"{prefix}{name}.")
+            continue
+        yield prefix + name, field, default
+        for item in get_args(field.annotation):  # list[Model]: its fields, under N for the index
+            if isinstance(item, type) and issubclass(item, pydantic.BaseModel):
+                for key, part, _ in _fields(item, {}, f"{prefix}{name}.N."):
+                    yield key, part, NO_DEFAULT
+
+
+def _entry(key: str, field: FieldInfo, default: Any, width: int) -> list[str]:
+    if isinstance(default, Mapping) and default:
+        lines = [f"  {key}.*"]
+    else:
+        shown = "" if default is NO_DEFAULT else f"={_yaml(default)}"
+        lines = [_shorten(f"  {key}{shown}   [{describe_type(field.annotation)}]", width)]
+    indent = " " * 6
+    lines += textwrap.wrap(field.description or "", width, initial_indent=indent, subsequent_indent=indent)
+    lines += [_shorten(f"    {key}.{inner}={_yaml(value)}", width) for inner, value in _leaves(default)]
+    return lines
+
+
+def _leaves(values: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Values of a free-form mapping that a user may want to set."""
+    for name, value in values.items() if isinstance(values, Mapping) else ():
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, f"{prefix}{name}.")
+        elif name != "_target_":
+            yield prefix + name, value
 
 
 def _yaml(value: Any) -> str:

@@ -5,11 +5,12 @@ that can be wrong with it is found here, before any long work starts, and raised
 """
 
 import difflib
+import types
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, Union, get_args, get_origin
 
 import pydantic
 from hydra import compose, initialize_config_module
@@ -93,11 +94,16 @@ def resolve(recipe: DictConfig) -> Any:
 
 
 def nested_items(values: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every dotted key of a nested mapping with its value, parents before children."""
+    """Every dotted key of nested mappings and lists (`stages.0.steps`) with its value, parents first."""
     if isinstance(values, Mapping):
-        for name, value in values.items():
-            yield f"{prefix}{name}", value
-            yield from nested_items(value, f"{prefix}{name}.")
+        pairs = values.items()
+    elif isinstance(values, list):
+        pairs = enumerate(values)
+    else:
+        return
+    for name, value in pairs:
+        yield f"{prefix}{name}", value
+        yield from nested_items(value, f"{prefix}{name}.")
 
 
 def group_options(config_module: str) -> dict[str, dict[str, str]]:
@@ -191,7 +197,8 @@ def field_keys(model: type[pydantic.BaseModel], prefix: str = "") -> Iterator[st
 
 def nested_model(annotation: Any) -> type[pydantic.BaseModel] | None:
     """The settings model that an annotation holds, `Model` or `Model | None`; None for anything else."""
-    for each in (annotation, *getattr(annotation, "__args__", ())):
+    union = get_origin(annotation) in (Union, types.UnionType)
+    for each in get_args(annotation) if union else (annotation,):
         if isinstance(each, type) and issubclass(each, pydantic.BaseModel):
             return each
     return None

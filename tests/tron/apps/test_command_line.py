@@ -24,6 +24,8 @@ quality: preview
 note: null
 trajectory:
   turns: 2
+stages:
+  - {name: first, steps: 5}
 cluster:
   _target_: some.Cluster
   workers: 4
@@ -41,6 +43,12 @@ class Lens(BaseModel):
     fov_deg: float = Field(gt=0, description="Horizontal field of view, degrees.")
 
 
+class Stage(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    name: str = Field(description="What it is called.")
+    steps: int = Field(description="How long it lasts.")
+
+
 class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     output_dir: Path = Field(description="Folder of the results.")
@@ -48,6 +56,7 @@ class Settings(BaseModel):
     quality: Literal["preview", "final"] = Field(description="How many rays are spent.")
     trajectory: Trajectory
     lens: Lens
+    stages: list[Stage] = Field(description="One after the other.")
     cluster: dict[str, Any] = Field(description="Where it runs.")
     note: str | None = Field(default=None, description="Free text.")
 
@@ -112,6 +121,9 @@ def run(toy_conf: str, capsys: pytest.CaptureFixture[str], monkeypatch, tmp_path
         (["lens=fisheye"], ["lens 'fisheye'", "tele, wide"]),
         (["output_dir=o", "frames=three"], ["'frames'", "'three'", "integer"]),
         (["output_dir=o", "frames=0"], ["'frames'", "greater than or equal to 1"]),
+        (["output_dir=o", "stages.0.stepz=1"], ["'stages.0.stepz'", "did you mean 'stages.0.steps'?"]),
+        (["output_dir=o", "stages.0.steps=x"], ["'stages.0.steps'", "'x'", "integer"]),
+        (["output_dir=o", "stages=[{name: a}]"], ["'stages.0.steps' has no value"]),
         (["output_dir=o", "frames=null"], ["'frames' has no value"]),
         (["output_dir=o", "~frames"], ["'frames' has no value"]),
         (["output_dir=o", "lens.fov_deg=-1"], ["'lens.fov_deg'", "greater than 0"]),
@@ -140,9 +152,20 @@ def test_a_mistake_is_one_line_that_names_it_and_nothing_runs(run: Run, tmp_path
 
 
 def test_overrides_groups_and_experiments_reach_the_settings(run: Run):
-    assert run("output_dir=o", "experiment=demo", "lens=tele", "trajectory.turns=5", "note=a b")[0] == 0
+    assert (
+        run(
+            "output_dir=o",
+            "experiment=demo",
+            "lens=tele",
+            "trajectory.turns=5",
+            "note=a b",
+            "stages.0.steps=8",
+        )[0]
+        == 0
+    )
     (settings,) = run.seen  # type: ignore[attr-defined]
     assert (settings.frames, settings.lens.fov_deg, settings.trajectory.turns) == (2, 20, 5)
+    assert settings.stages == [Stage(name="first", steps=8)]
     assert (settings.output_dir, settings.note) == (Path("o"), "a b")
     assert run("output_dir=o", "experiment=demo", "frames=7")[0] == 0
     assert run.seen[0].frames == 7, "the command line wins over the experiment"  # type: ignore[attr-defined]
@@ -177,6 +200,7 @@ def test_cfg_prints_yaml_that_holds_every_override(run: Run):
         "quality": "preview",
         "note": None,
         "trajectory": {"turns": 2},
+        "stages": [{"name": "first", "steps": 5}],
         "cluster": {"_target_": "some.Cluster", "workers": 4, "names": ["averylongname"] * 5},
         "lens": {"fov_deg": 90},
     }
@@ -195,6 +219,9 @@ def test_help_teaches_purpose_keys_defaults_recipes_and_examples(run: Run, monke
         "quality=preview   [preview | final]",
         "trajectory.turns=2",
         "lens.fov_deg=90",
+        "stages=[{name: first, steps: 5}]   [list of Stage]",
+        "stages.N.steps   [integer]",
+        "How long it lasts.",
         "cluster.*",
         "cluster.workers=4",
         "cluster.names=[averylongname, ",
