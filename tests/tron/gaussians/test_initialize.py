@@ -154,6 +154,10 @@ def test_thin_walls_keep_their_two_sides():
     np.testing.assert_allclose(np.abs(up), 1, atol=1e-5)
     assert (up > 0).sum() == pytest.approx((up < 0).sum(), rel=0.02)
     assert (scene.base_color[up < 0] == 0).all()
+    # Neither side's surfels shrink because the other side is near.
+    assert np.median(scene.scales()) == pytest.approx(
+        np.median(surfels_from_gbuffers([above], count=500).scales()), rel=0.1
+    )
 
 
 @pytest.mark.parametrize(
