@@ -114,8 +114,10 @@ def decode_exr(data: bytes) -> np.ndarray:
     try:
         parts = OpenEXR.File(io.BytesIO(data), header_only=True).parts
         _check_exr_header(parts, len(data))
-        channels = OpenEXR.File(io.BytesIO(data)).channels()
-        pixels = {name: channel.pixels for name, channel in channels.items()}
+        decoded = OpenEXR.File(io.BytesIO(data))
+        if not decoded.parts:  # the binding drops a part that it cannot decode
+            raise TronError("OpenEXR image is damaged or cut short")
+        pixels = {name: channel.pixels for name, channel in decoded.channels().items()}
     except TronError:
         raise
     except Exception as error:  # the binding raises RuntimeError, ValueError and others for damaged files

@@ -11,7 +11,6 @@ import importlib.metadata
 import os
 import platform
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -73,10 +72,11 @@ def llvm_version(path: Path) -> tuple[int, ...] | None:
     """Version of an LLVM library, read from its name or else asked of the library; None if it has none."""
     if not path.is_file():
         return None
-    for name in (path.name, path.resolve().name, *reversed(path.resolve().parts)):
-        match = re.search(r"llvm(?:[-@/]|\.so\.)?(\d+(?:\.\d+)*)", name, re.IGNORECASE)
-        if match:
-            return tuple(int(part) for part in match[1].split("."))
+    # libLLVM-17.so, libLLVM.so.19.1, llvm@19/lib/libLLVM.dylib, Cellar/llvm/18.1.8/lib/libLLVM.dylib
+    for name in (path.name, path.resolve().name, str(path.resolve().parent)):
+        found = re.findall(r"llvm(?:[-@/]|\.so\.)(\d+(?:\.\d+)*)", name, re.IGNORECASE)
+        if found:
+            return tuple(int(part) for part in found[-1].split("."))
     try:
         numbers = [ctypes.c_uint() for _ in range(3)]
         ctypes.CDLL(str(path)).LLVMGetVersion(*map(ctypes.byref, numbers))  # exists since LLVM 16
@@ -90,9 +90,10 @@ def _llvm_candidates() -> list[Path]:
         os.path.join(sys.prefix, "lib"),
         os.path.join(os.environ.get("CONDA_PREFIX", sys.prefix), "lib"),
     ]
-    if shutil.which("ldconfig", path=f"{os.environ.get('PATH', '')}:/sbin:/usr/sbin"):
-        cache = _output(["ldconfig", "-p"]) or _output(["/sbin/ldconfig", "-p"]) or ""
-        folders += sorted({os.path.dirname(path) for path in re.findall(r"=> (\S*libLLVM\S*)", cache)})
+    cache = (
+        _output(["ldconfig", "-p"]) or _output(["/sbin/ldconfig", "-p"]) or ""
+    )  # users' PATH may lack /sbin
+    folders += sorted({os.path.dirname(path) for path in re.findall(r"=> (\S*libLLVM\S*)", cache)})
     folders += _LLVM_FOLDERS
     names = ("libLLVM.dylib", "libLLVM-[0-9]*.dylib") if sys.platform == "darwin" else ("libLLVM*.so*",)
     found = (glob.glob(os.path.join(folder, name)) for folder in folders for name in names)

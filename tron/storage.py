@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,34 +23,41 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     The temporary file keeps the suffix (writers choose their format by it) and is flushed to disk before it
     is renamed, so that neither a crash nor a power cut leaves half a file under the final name. On any
-    exception it is removed. Parent folders are made.
+    exception it is removed; what a killed process leaves is overwritten by the next one, since its name is
+    always the same. Parent folders are made.
 
     Raises:
-        TronError: the folder cannot be made or written to, or the disk is full.
+        TronError: the folder cannot be made or written to, the disk is full, or another run is writing this
+            file.
     """
     final = Path(path)
-    temporary: Path | None = None
+    temporary = final.with_name(f".{final.stem}.part{final.suffix}")
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{final.stem[:80]}.", suffix=final.suffix, dir=final.parent)
-        os.close(handle)
-        temporary = Path(name)
-        yield temporary
-        temporary.chmod(0o666 & ~_umask())  # mkstemp makes private files; data sets are shared
-        _flush(temporary)
-        os.replace(temporary, final)
-        _flush(final.parent)
+        with _claimed(temporary):
+            try:
+                yield temporary
+                _flush(temporary)
+                os.replace(temporary, final)
+                _flush(final.parent)
+            finally:
+                temporary.unlink(missing_ok=True)
+    except BlockingIOError as error:
+        raise TronError("file is being written by another run", final, "wait for it") from error
     except OSError as error:
         raise TronError(f"cannot write: {error.strerror or error}", final) from error
+
+
+@contextmanager
+def _claimed(path: Path) -> Iterator[None]:
+    """Make an empty file, or empty one that was left behind, and lock it; BlockingIOError if it is locked."""
+    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.ftruncate(handle, 0)
+        yield
     finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+        os.close(handle)
 
 
 def _flush(path: Path) -> None:

@@ -78,10 +78,11 @@ class VideoWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         with self._exits:
-            if kind is None:
-                if self._frames == 0:
-                    raise TronError("video has no frames", self._path)
-                self._container.mux(self._stream.encode())
+            if error is not None:
+                raise error  # once more, where it also discards the temporary file
+            if self._frames == 0:
+                raise TronError("video has no frames", self._path)
+            self._container.mux(self._stream.encode())
 
 
 def read_video(path: str | os.PathLike[str]) -> np.ndarray:

@@ -119,11 +119,11 @@ def test_a_world_point_renders_on_the_pixel_it_projects_to(variant: str, seed: i
         scene: Any = mi.load_dict(
             {"type": "scene", "integrator": {"type": "direct"}, "lamp": lamp, "sensor": sensor}
         )
-        image = np.array(mi.render(scene, seed=seed))[..., 0]
+        image = np.array(mi.render(scene, seed=mi.UInt32(seed)))[..., 0]
         weights = image / image.sum()
         rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
         centroid = (weights * columns).sum(), (weights * rows).sum()
-        # A sphere off the axis is seen as an ellipse whose middle lies a little outwards of its centre's image.
+        # Off the axis a sphere is seen as an ellipse whose middle lies slightly outwards.
         np.testing.assert_allclose(centroid, pixel[0], atol=0.1)
 
 

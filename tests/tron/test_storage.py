@@ -13,7 +13,26 @@ import pytest
 from tron import storage
 from tron.errors import TronError
 
-HOLD = "import sys, time\nfrom tron.storage import locked\nwith locked(sys.argv[1]):\n    print('held', flush=True)\n    time.sleep(60)\n"
+HOLD = """
+import sys, time
+from tron.storage import locked
+with locked(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+WRITE = """
+import sys, time
+from tron.storage import atomic_path
+with atomic_path(sys.argv[1]) as path:
+    path.write_bytes(b"half")
+    print("writing", flush=True)
+    time.sleep(60)
+"""
+
+
+def write_half_and_fail(path: Path) -> None:
+    path.write_text("half")
+    raise RuntimeError
 
 
 def test_success_leaves_exactly_the_file(tmp_path: Path):
@@ -29,23 +48,23 @@ def test_success_leaves_exactly_the_file(tmp_path: Path):
 def test_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path):
     storage.write_atomic(tmp_path / "a.txt", "old")
     with pytest.raises(RuntimeError), storage.atomic_path(tmp_path / "a.txt") as temporary:
-        temporary.write_text("half")
-        raise RuntimeError
+        write_half_and_fail(temporary)
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "old"
 
 
-def test_killed_writer_leaves_nothing_under_the_final_name(tmp_path: Path):
-    code = (
-        "import sys, time\nfrom tron.storage import atomic_path\n"
-        "with atomic_path(sys.argv[1]) as p:\n    p.write_bytes(b'half'); print('on', flush=True); time.sleep(60)"
-    )
-    child = subprocess.Popen([sys.executable, "-c", code, tmp_path / "a.bin"], stdout=subprocess.PIPE)
+def test_killed_writer_leaves_nothing_that_the_next_one_does_not_clear(tmp_path: Path):
+    child = subprocess.Popen([sys.executable, "-c", WRITE, tmp_path / "a.bin"], stdout=subprocess.PIPE)
     assert child.stdout is not None
     child.stdout.readline()
+    with pytest.raises(TronError, match="being written by another run"):
+        storage.write_atomic(tmp_path / "a.bin", b"mine")
     child.kill()
     child.communicate()
     assert not (tmp_path / "a.bin").exists()
+    storage.write_atomic(tmp_path / "a.bin", b"new")
+    assert (tmp_path / "a.bin").read_bytes() == b"new"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.bin"]
 
 
 def test_new_files_follow_the_umask(tmp_path: Path):
@@ -70,8 +89,7 @@ def test_unwritable_target_is_one_line(tmp_path: Path):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
 def test_full_disk_is_one_line(tmp_path: Path):
     with pytest.raises(TronError, match="No space left"), storage.atomic_path(tmp_path / "a"):
-        with open("/dev/full", "wb", buffering=0) as file:
-            file.write(b"x")
+        Path("/dev/full").write_bytes(b"x")
     assert not list(tmp_path.iterdir())
 
 

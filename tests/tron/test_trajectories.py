@@ -1,5 +1,7 @@
 """Camera paths: distance, aim and coverage hold for any target and any up direction."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -79,7 +81,7 @@ def test_keyframes_are_met_and_the_way_between_is_shortest():
         np.testing.assert_allclose(path[frame].world_to_camera, key.world_to_camera, atol=1e-9)
     turned = [
         np.degrees(np.arccos((np.trace(p.world_to_camera[:3, :3] @ q.camera_to_world[:3, :3]) - 1) / 2))
-        for p, q in zip(path[:4], path[1:5])
+        for p, q in pairwise(path[:5])
     ]
     whole = np.degrees(np.arccos((np.trace(a.world_to_camera[:3, :3] @ b.camera_to_world[:3, :3]) - 1) / 2))
     assert turned == pytest.approx([whole / 4] * 4)  # constant speed along one great arc
