@@ -142,7 +142,11 @@ def _yaml(value: Any) -> str:
         value = list(value)
     if value == "???":
         return "VALUE (required)"
-    return yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
+    return (
+        yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10_000)
+        .removesuffix("...\n")
+        .strip()
+    )
 
 
 def _shorten(line: str, width: int) -> str:

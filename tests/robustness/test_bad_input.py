@@ -1,0 +1,138 @@
+"""What a user gets wrong costs one line that says what, where and how to mend it, and leaves nothing behind.
+
+Each command is run in this process, from its real entry point: starting Python with torch costs seconds.
+"""
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra.utils import get_object
+
+from tron.gaussians.scene import GaussianScene
+from tron.shading.environment import EnvironmentMap
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+
+# Enough to get past the checks of keys; {inputs} is the folder that the fixture below fills.
+COMPLETE = {
+    "tron-datagen": ["experiment=demo"],
+    "tron-train": ["dataset={inputs}/empty"],
+    "tron-eval": ["dataset={inputs}/empty", "renderer={inputs}/text.safetensors"],
+    "tron-relight": ["scene={inputs}/good.ply", "environment={inputs}/text.hdr"],
+}
+
+BAD_FILES = [
+    ("tron-relight", ["scene={inputs}/absent.ply"], ["absent.ply"]),
+    ("tron-relight", ["scene={inputs}/empty"], ["empty"]),
+    ("tron-relight", ["scene={inputs}/text.ply"], ["text.ply"]),
+    ("tron-relight", ["scene={inputs}/points.ply"], ["points.ply"]),
+    ("tron-relight", ["environment={inputs}/absent.hdr"], ["absent.hdr"]),
+    ("tron-relight", ["environment={inputs}/text.hdr"], ["text.hdr"]),
+    ("tron-relight", ["environment={inputs}/text.xyz"], ["text.xyz"]),
+    (
+        "tron-relight",
+        ["environment={inputs}/good.exr", "checkpoint={inputs}/absent.safetensors"],
+        ["absent.safe"],
+    ),
+    (
+        "tron-relight",
+        ["environment={inputs}/good.exr", "checkpoint={inputs}/text.safetensors"],
+        ["text.safe"],
+    ),
+    ("tron-relight", ["environment={inputs}/good.exr", "cameras={inputs}/absent.json"], ["absent.json"]),
+    ("tron-train", ["dataset={inputs}/absent"], ["absent"]),
+    ("tron-train", ["dataset={inputs}/empty"], ["empty"]),
+    ("tron-train", ["dataset={inputs}/text.ply"], ["text.ply"]),
+    ("tron-eval", ["dataset={inputs}/absent"], ["absent"]),
+    ("tron-eval", ["dataset={inputs}/empty"], ["empty"]),
+    ("tron-datagen", ["assets={inputs}/absent"], ["absent"]),
+    ("tron-datagen", ["environments={inputs}/absent"], ["absent"]),
+    ("tron-datagen", ["mode=validate"], ["out"]),
+]
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Files that are fine, hostile in the simplest way, or absent."""
+    folder = tmp_path_factory.mktemp("inputs")
+    (folder / "empty").mkdir()
+    for name in ("text.ply", "text.hdr", "text.xyz", "text.safetensors"):
+        (folder / name).write_text("not what the name says\n")
+    header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    (folder / "points.ply").write_text(header + "end_header\n0 0 0\n")
+    one_surfel().save(folder / "good.ply")
+    EnvironmentMap.constant(1.0).save(folder / "good.exr")
+    return folder
+
+
+def one_surfel() -> GaussianScene:
+    return GaussianScene(
+        means=np.zeros((1, 3), np.float32),
+        quats=np.array([[1, 0, 0, 0]], np.float32),
+        log_scales=np.full((1, 2), -3, np.float32),
+        opacity_logits=np.full(1, 4, np.float32),
+        sh=np.zeros((1, 16, 3), np.float32),
+        base_color=np.full((1, 3), 0.5, np.float32),
+        roughness=np.full(1, 0.5, np.float32),
+        metallic=np.zeros(1, np.float32),
+        object_id=np.zeros(1, np.int32),
+        spacing=0.1,
+    )
+
+
+@pytest.fixture
+def run(inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch):
+    """Runs a command in an empty folder with output_dir=out; returns the one line it must have printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(name: str, *arguments: str) -> str:
+        cli = get_object(SCRIPTS[name].replace(":", "."))
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as stop:
+            cli([*(each.format(inputs=inputs) for each in arguments), "output_dir=out"])
+        out, err = capsys.readouterr()
+        assert stop.value.code == 2, err
+        assert out == ""
+        assert len(err.splitlines()) == 1, err
+        assert err.startswith(f"{name}: ")
+        left = {path.name for path in tmp_path.rglob("*") if not path.is_dir()}
+        assert left <= {".tron.lock"}  # a lock cannot be removed without a race; it holds no result
+        return err
+
+    return run
+
+
+@pytest.mark.parametrize("name", sorted(SCRIPTS))
+def test_an_unknown_key_is_named_with_its_nearest_neighbour(run, name):
+    assert "'outptu_dir': did you mean 'output_dir'?" in run(name, *COMPLETE[name], "outptu_dir=x")
+
+
+@pytest.mark.parametrize("name", sorted(SCRIPTS))
+def test_an_added_unknown_key_is_refused_too(run, name):
+    assert "'extra'" in run(name, *COMPLETE[name], "+extra=1")
+
+
+@pytest.mark.parametrize("name", sorted(SCRIPTS))
+def test_a_value_of_the_wrong_type_is_named_with_what_is_wanted(run, name):
+    line = run(name, *COMPLETE[name], "seed=tomorrow")
+    assert "'seed'" in line
+    assert "'tomorrow'" in line
+    assert "integer" in line
+
+
+@pytest.mark.parametrize("name", sorted(SCRIPTS))
+def test_a_word_that_is_no_setting_is_explained(run, name):
+    assert "write key=value" in run(name, *COMPLETE[name], "please")
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "named"),
+    BAD_FILES,
+    ids=lambda value: "-".join(value) if isinstance(value, list) else value,
+)
+def test_a_bad_file_is_named(run, variant, name, arguments, named):
+    line = run(name, *COMPLETE[name], *arguments)
+    assert [each for each in named if each not in line] == [], line
