@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, UnidentifiedImageError
 
 from tron.errors import TronError
 from tron.storage import write_atomic
@@ -29,6 +30,10 @@ MAX_DECODED_BYTES = 2**31
 _SMALL_DECODED_BYTES = 2**27
 _MAX_EXPANSION = 1000
 
+# Pillow warns of large images; ours are held to the limits above before anything is decoded.
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
+
+_EXR_MAGIC = b"\x76\x2f\x31\x01"
 _HALF_MAX = 65504.0
 _JPEG_QUALITY = 95
 
@@ -111,6 +116,8 @@ def decode_exr(data: bytes) -> np.ndarray:
     """
     import OpenEXR
 
+    if not data.startswith(_EXR_MAGIC):
+        raise TronError("not an OpenEXR image")
     try:
         parts = OpenEXR.File(io.BytesIO(data), header_only=True).parts
         _check_exr_header(parts, len(data))
@@ -157,29 +164,25 @@ def decode_png(data: bytes) -> np.ndarray:
     Raises:
         TronError: not such an image, damaged or too large.
     """
-    from PIL import Image
-
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # Pillow warns of likely decompression bombs
-            with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as picture:
-                _check_size(*picture.size, len(picture.getbands()), len(data))
-                if picture.mode.startswith("I"):  # 16 bits of grey
-                    return np.asarray(picture, dtype=np.float32)[..., None] / 65535
-                if picture.mode not in ("L", "RGB", "RGBA"):
-                    transparent = "A" in picture.getbands() or "transparency" in picture.info
-                    picture = picture.convert("RGBA" if transparent else "RGB")
-                pixels = np.asarray(picture, dtype=np.float32) / 255
+        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as picture:
+            _check_size(*picture.size, len(picture.getbands()), len(data))
+            if picture.mode.startswith("I"):  # 16 bits of grey
+                return np.asarray(picture, dtype=np.float32)[..., None] / 65535
+            if picture.mode not in ("L", "RGB", "RGBA"):
+                transparent = "A" in picture.getbands() or "transparency" in picture.info
+                picture = picture.convert("RGBA" if transparent else "RGB")
+            pixels = np.asarray(picture, dtype=np.float32) / 255
     except TronError:
         raise
+    except UnidentifiedImageError as error:
+        raise TronError("not a PNG or JPEG image") from error
     except Exception as error:  # damaged files raise almost anything: OSError, SyntaxError, struct.error, ...
         raise TronError(f"not a readable PNG or JPEG image: {error}") from error
     return pixels.reshape(*pixels.shape[:2], -1)
 
 
 def _encode_display(image: np.ndarray, file_format: str) -> bytes:
-    from PIL import Image
-
     image = _shaped(image, (1, 3, 4) if file_format == "PNG" else (1, 3))
     if image.dtype != np.uint8:
         image = np.round(np.clip(np.nan_to_num(image, nan=0.0), 0, 1) * 255).astype(np.uint8)
@@ -200,6 +203,7 @@ def _decode_hdr(data: bytes) -> np.ndarray:
         )
     height, width = int(header[1]), int(header[2])
     _check_size(width, height, 3, len(data))
+    cv2.setLogLevel(0)  # OpenCV would report a damaged file on stderr as well
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
