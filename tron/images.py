@@ -203,7 +203,7 @@ def _decode_hdr(data: bytes) -> np.ndarray:
         )
     height, width = int(header[1]), int(header[2])
     _check_size(width, height, 3, len(data))
-    cv2.setLogLevel(0)  # OpenCV would report a damaged file on stderr as well
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # damage is ours to report
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
