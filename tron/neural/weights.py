@@ -31,6 +31,7 @@ from tron.neural.renderer import NeuralRenderer, RendererConfig
 from tron.storage import write_atomic
 
 FORMAT = "tron-renderer 1"
+METADATA_KEY = "tron"
 COSMOS_FILE = "model.pt of nvidia/Cosmos-Predict2-0.6B-Text2Image (or its diffusers folder `transformer`)"
 WAN_FILE = "tokenizer/tokenizer.pth of the same repository (or a diffusers folder `vae` of WAN 2.1)"
 
@@ -40,13 +41,11 @@ def save_renderer(path: str | Path, renderer: nn.Module) -> None:
     kinds = {NeuralRenderer: "neural", PixelMLP: "pixel_mlp"}
     if type(renderer) not in kinds:
         raise TypeError(f"no file format for a {type(renderer).__name__}")
-    metadata = {
-        "format": FORMAT,
-        "kind": kinds[type(renderer)],
-        "config": renderer.config.model_dump_json(),  # type: ignore[union-attr]
-    }
+    config: Any = renderer.config
+    header = {"format": FORMAT, "kind": kinds[type(renderer)], "config": config.model_dump(mode="json")}
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in renderer.state_dict().items()}
-    write_atomic(path, serialize(state, metadata))
+    # One key, since safetensors writes several in the order of a hash that changes from run to run.
+    write_atomic(path, serialize(state, {METADATA_KEY: json.dumps(header)}))
 
 
 def load_renderer(path: str | Path, vae: str | Path | None = None) -> nn.Module:
@@ -62,25 +61,27 @@ def load_renderer(path: str | Path, vae: str | Path | None = None) -> nn.Module:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+            # Cloned, since memory at odd addresses makes the last bit of matrix products differ.
+            state = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (no mapping)
     except (SafetensorError, OSError) as error:
         raise TronError(f"not a readable safetensors file: {error}", str(path), mend) from error
-    if metadata.get("format") != FORMAT:
-        raise TronError("safetensors file holds no TRON renderer", str(path), mend)
     try:
-        renderer = _build(metadata.get("kind", ""), metadata.get("config", ""), vae)
-    except (ValidationError, ValueError) as error:
+        header = json.loads(metadata.get(METADATA_KEY, "{}"))
+        if header.get("format") != FORMAT:
+            raise TronError("safetensors file holds no TRON renderer", str(path), mend)
+        renderer = _build(header["kind"], header["config"], vae)
+    except (ValidationError, ValueError, KeyError, AttributeError) as error:
         raise TronError("the renderer's configuration is damaged", str(path), mend) from error
     _load_strictly(renderer, state, path)
     return renderer.eval()
 
 
-def _build(kind: str, config: str, vae: str | Path | None) -> nn.Module:
+def _build(kind: str, config: dict[str, Any], vae: str | Path | None) -> nn.Module:
     # The file chooses among these two and nothing else: a name to import would be code in a data file.
     if kind == "pixel_mlp":
-        return PixelMLP(PixelMLPConfig.model_validate_json(config))
+        return PixelMLP(PixelMLPConfig.model_validate(config))
     if kind == "neural":
-        parsed = RendererConfig.model_validate_json(config)
+        parsed = RendererConfig.model_validate(config)
         return NeuralRenderer(parsed, load_wan(vae) if parsed.codec == "wan" else None)
     raise ValueError(kind)
 

@@ -1,0 +1,62 @@
+"""Losses: the formulas written out, and PSNR as tron.metrics has it."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+
+from tron import metrics
+from tron.errors import TronError
+from tron.neural.losses import RendererLoss, psnr_per_frame
+
+
+def pair(frames: int = 2, size: int = 16):
+    generator = torch.Generator().manual_seed(0)
+    return [torch.rand(2, 3, frames, size, size, generator=generator) * 2 - 1 for _ in range(2)]
+
+
+def test_without_vgg_the_loss_is_the_squared_error_and_the_log_says_so(caplog):
+    a, b = pair()
+    with caplog.at_level(logging.INFO):
+        loss = RendererLoss(l2=2.0, lpips=1.0)
+    assert "LPIPS is absent" in caplog.text
+    np.testing.assert_allclose(loss(a, b).item(), 2 * np.mean((a.numpy() - b.numpy()) ** 2), rtol=1e-6)
+
+
+def test_lpips_is_the_mean_over_frames_of_the_metric(tmp_path):
+    torch.manual_seed(0)
+    widths = [64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512]
+    places = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
+    state = {}
+    for place, inputs, outputs in zip(places, [3, *widths], widths):
+        state[f"features.{place}.weight"] = torch.randn(outputs, inputs, 3, 3) * (2 / (9 * inputs)) ** 0.5
+        state[f"features.{place}.bias"] = torch.zeros(outputs)
+    torch.save(state, tmp_path / "vgg16.pth")
+    a, b = pair()
+    together = RendererLoss(1.0, 0.5, tmp_path / "vgg16.pth")(a, b)
+    lpips = metrics.LPIPS.load(tmp_path / "vgg16.pth")
+    each = torch.stack([lpips(a[:, :, k], b[:, :, k]) for k in range(2)])
+    torch.testing.assert_close(together, (a - b).square().mean() + 0.5 * each.mean(), atol=1e-5, rtol=1e-4)
+
+
+def test_a_vgg_path_that_is_wrong_is_an_error_not_a_silent_absence(tmp_path):
+    with pytest.raises(TronError, match="missing"):
+        RendererLoss(vgg_weights=tmp_path / "vgg16.pth")
+
+
+def test_psnr_of_a_video_is_that_of_its_frames():
+    a, b = pair()
+    mask = torch.rand(2, 1, 2, 16, 16) > 0.3
+    shown = psnr_per_frame(a * 1.2, b, mask.float())
+    for i in range(2):
+        for k in range(2):
+            images = [(v[i, :, k].clamp(-1, 1).movedim(0, -1).numpy() + 1) / 2 for v in (a * 1.2, b)]
+            expected = metrics.psnr(images[0], images[1], mask[i, 0, k].numpy())
+            np.testing.assert_allclose(shown[i, k].item(), expected, rtol=1e-4)
+
+
+def test_a_frame_without_foreground_has_no_psnr():
+    a, b = pair()
+    mask = torch.zeros(2, 1, 2, 16, 16)
+    assert torch.isnan(psnr_per_frame(a, b, mask)).all()
