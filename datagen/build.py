@@ -1,8 +1,8 @@
 """SceneSpec -> Mitsuba scene.
 
 All procedural objects and the floor are one mesh under one ``principled`` material whose parameters are mesh
-attributes. Every synthetic scene then has the same kernel: Dr.Jit compiles it once and finds it in its cache for
-all others. Parts of the user's models bring a mesh and a material each.
+attributes. Every synthetic scene then has the same kernel: Dr.Jit compiles it once and finds it in its cache
+for all others. Parts of the user's models bring a mesh and a material each.
 """
 
 from __future__ import annotations
@@ -80,7 +80,9 @@ def build(spec: SceneSpec, models: Mapping[str, list[Part]] | None = None, edge:
             continue
         parts = (models or {}).get(str(item.asset))
         if parts is None:
-            raise TronError(f"the scene needs the asset {item.asset!r}", spec.name, "give its folder as assets=...")
+            raise TronError(
+                f"the scene needs the asset {item.asset!r}", spec.name, "give its folder as assets=..."
+            )
         surfaces += [_textured(part.moved(matrix, item.size), number, i) for i, part in enumerate(parts)]
     return Geometry([_merge(solids), *surfaces])
 
@@ -125,7 +127,9 @@ def _floor(spec: SceneSpec, edge: float) -> Arrays:
 def _merge(solids: list[Arrays]) -> Surface:
     offsets = np.cumsum([0, *(len(solid["vertices"]) for solid in solids)])
     faces = np.concatenate([solid["faces"] + offset for solid, offset in zip(solids, offsets)])
-    joined = {name: np.concatenate([solid[name] for solid in solids]) for name in solids[0] if name != "faces"}
+    joined = {
+        name: np.concatenate([solid[name] for solid in solids]) for name in solids[0] if name != "faces"
+    }
     principled = mi.load_dict(
         {
             "type": "principled",
@@ -137,7 +141,7 @@ def _merge(solids: list[Arrays]) -> Surface:
     )
     mesh = _mesh("solids", principled, joined["vertices"], joined["normals"], faces, None)
     for name, width in (("base_color", 3), ("roughness", 1), ("metallic", 1)):
-        mesh.add_attribute(f"vertex_{name}", width, np.ascontiguousarray(joined[name], np.float32).ravel())
+        mesh.add_attribute(f"vertex_{name}", width, _flat(joined[name]))
     return Surface(mesh, principled, None, joined["object_id"])
 
 
@@ -164,7 +168,7 @@ def _textured(part: Part, object_id: int, index: int) -> Surface:
     bsdf = mi.load_dict({"type": "twosided", "bsdf": bsdf})
     mesh = _mesh(f"object{object_id}-{index}", bsdf, part.vertices, part.normals, part.faces, part.uv)
     if per_vertex:
-        mesh.add_attribute("vertex_base_color", 3, np.ascontiguousarray(part.base_color, np.float32).ravel())
+        mesh.add_attribute("vertex_base_color", 3, _flat(part.base_color))
     return Surface(mesh, principled, normal_map, np.full(len(part.faces), object_id, np.uint32))
 
 
@@ -179,8 +183,17 @@ def _texture(value: np.ndarray | float) -> Any:
     return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
 
 
+def _flat(values: np.ndarray) -> Any:
+    return np.ascontiguousarray(values, np.float32).ravel()
+
+
 def _mesh(
-    name: str, bsdf: mi.BSDF, vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, uv: np.ndarray | None
+    name: str,
+    bsdf: mi.BSDF,
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray | None,
 ) -> mi.Mesh:
     properties = mi.Properties()
     properties["bsdf"] = bsdf
@@ -193,10 +206,10 @@ def _mesh(
         has_vertex_texcoords=uv is not None,
     )
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = np.ascontiguousarray(vertices, np.float32).ravel()
-    parameters["vertex_normals"] = np.ascontiguousarray(normals, np.float32).ravel()
+    parameters["vertex_positions"] = _flat(vertices)
+    parameters["vertex_normals"] = _flat(normals)
     parameters["faces"] = np.ascontiguousarray(faces, np.uint32).ravel()
     if uv is not None:
-        parameters["vertex_texcoords"] = np.ascontiguousarray(uv, np.float32).ravel()
+        parameters["vertex_texcoords"] = _flat(uv)
     parameters.update()
     return mesh

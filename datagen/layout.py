@@ -1,7 +1,7 @@
 """Where objects stand: at rest on the floor z = 0, apart from each other, or not at all.
 
-Objects are settled one by one and moved about until nothing touches; collisions are exact tests of convex hulls
-(FCL). Tries are bounded: an object that finds no place is left out and named.
+Objects are settled one by one and moved about until nothing touches; collisions are exact tests of convex
+hulls (FCL). Tries are bounded: an object that finds no place is left out and named.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from datagen.spec import Number, Spec, Triple
 
 TRIES = 60
 GAP = 0.03
-"""Least distance in world units between two objects' hulls: below it, surfels of one would touch the other."""
+"""Least distance in world units between two objects' hulls: below it, surfels of one would touch the other.
+"""
 
 
 class Placement(Spec):
@@ -41,7 +42,11 @@ class Placement(Spec):
 
 
 def place(
-    rng: np.random.Generator, meshes: Sequence[Trimesh], radius: float, *, upright: Sequence[bool] | None = None
+    rng: np.random.Generator,
+    meshes: Sequence[Trimesh],
+    radius: float,
+    *,
+    upright: Sequence[bool] | None = None,
 ) -> list[Placement | None]:
     """Put meshes on the floor within ``radius`` of the origin, none nearer than GAP to another.
 
@@ -67,7 +72,7 @@ def place(
         for _ in range(TRIES):
             x, y = _in_disk(rng, radius)
             candidate = _placement(turn, (x, y, floor))
-            if not placements or manager.min_distance_single(hull, candidate.matrix()) > GAP:
+            if not placements or _distance(manager, hull, candidate) > GAP:
                 found = candidate
                 break
         if found is not None:
@@ -79,8 +84,8 @@ def place(
 def settle(hull: Trimesh, rotation: np.ndarray) -> np.ndarray:
     """Roll a convex body from an orientation to the stable face it comes to rest on.
 
-    The body tips over the face under its centre of mass until that face is the one below: each roll lowers the
-    centre of mass, so this ends. Returns the (3, 3) rotation at rest.
+    The body tips over the face under its centre of mass until that face is the one below: each roll lowers
+    the centre of mass, so this ends. Returns the (3, 3) rotation at rest.
     """
     normals = np.asarray(hull.face_normals, dtype=np.float64)
     centre = np.asarray(hull.center_mass)
@@ -96,8 +101,12 @@ def settle(hull: Trimesh, rotation: np.ndarray) -> np.ndarray:
             break
         lowest = float(heights[face])
         down = normals[face]
-    turn, _ = Rotation.align_vectors([[0.0, 0.0, -1.0]], [rotation @ down])
+    turn = Rotation.align_vectors([[0.0, 0.0, -1.0]], [rotation @ down])[0]
     return turn.as_matrix() @ rotation
+
+
+def _distance(manager: CollisionManager, hull: Trimesh, placement: Placement) -> float:
+    return float(manager.min_distance_single(hull, placement.matrix()))  # type: ignore[arg-type]
 
 
 def _in_disk(rng: np.random.Generator, radius: float) -> tuple[float, float]:

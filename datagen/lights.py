@@ -5,7 +5,8 @@ studio    soft boxes on a dark surround, some tinted
 overcast  a soft dome, brighter above or to one side, over a dim ground
 hdri      a file of the user's, turned about z
 
-The same image lights Mitsuba's path tracer and the surfels, so whatever the bake rounds off is rounded off in both.
+The same image lights Mitsuba's path tracer and the surfels, so whatever the bake rounds off is rounded off in
+both.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ HIGH_CONTRAST = 0.3
 class SunSpec(Spec):
     """Sun and sky. Angles in degrees, azimuth from +x towards +y; ``aperture_deg`` is the sun's diameter.
 
-    The sun keeps its power when it grows: wider than the true 0.53 degrees, it fits the texels of a small map.
-    ``ground`` is the linear albedo of the plain seen below the horizon.
+    The sun keeps its power when it grows: wider than the true 0.53 degrees, it fits the texels of a small
+    map. ``ground`` is the linear albedo of the plain seen below the horizon.
     """
 
     family: Literal["sun"] = "sun"
@@ -81,7 +82,7 @@ class OvercastSpec(Spec):
 
 
 class HdriSpec(Spec):
-    """A file: its name within the environments folder, its hash, a rotation about z, its measured contrast."""
+    """A file: its path within the environments folder, its hash, a rotation about z, its contrast."""
 
     family: Literal["hdri"] = "hdri"
     path: str
@@ -95,7 +96,9 @@ Family = Literal["sun", "studio", "overcast", "hdri"]
 
 
 def draw_light(rng: np.random.Generator, family: Family, files: Sequence[HdriSpec] = ()) -> LightSpec:
-    """Draw a light of a family; ``files`` are the maps that family ``hdri`` chooses from (rotation drawn here)."""
+    """Draw a light of a family; ``files`` are the maps that family ``hdri`` chooses from (rotation drawn
+    here).
+    """
     if family == "sun":
         return _draw_sun(rng)
     if family == "studio":
@@ -225,7 +228,10 @@ def _studio(light: StudioSpec, directions: np.ndarray) -> np.ndarray:
         right /= np.linalg.norm(right)
         roll = np.radians(panel.roll_deg)
         above = np.cross(centre, right)
-        right, above = np.cos(roll) * right + np.sin(roll) * above, np.cos(roll) * above - np.sin(roll) * right
+        right, above = (
+            np.cos(roll) * right + np.sin(roll) * above,
+            np.cos(roll) * above - np.sin(roll) * right,
+        )
         depth = directions @ centre
         x = np.degrees(np.arctan2(np.abs(directions @ right), depth))
         y = np.degrees(np.arctan2(np.abs(directions @ above), depth))

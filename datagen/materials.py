@@ -1,8 +1,8 @@
 """Principled materials with solid patterns: the colour of a point depends on its place alone, so no seams.
 
-A material blends two sets of parameters, a and b, by a pattern m(p) in [0, 1]: base color (linear), roughness and
-metallic. Patterns are closed formulas of the point in the object's own frame, so a mesh of any density samples the
-same material. Styles A and B draw from disjoint pattern families (plain belongs to both).
+A material blends two sets of parameters, a and b, by a pattern m(p) in [0, 1]: base color (linear), roughness
+and metallic. Patterns are closed formulas of the point in the object's own frame, so a mesh of any density
+samples the same material. Styles A and B draw from disjoint pattern families (plain belongs to both).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class MaterialSpec(Spec):
 
 
 def draw_material(rng: np.random.Generator, style: Style, *, floor: bool = False) -> MaterialSpec:
-    """Draw a material of a style; floors are dielectric and coarser, since they are seen at grazing angles."""
+    """Draw a material of a style; floors are dielectric and coarser: they are seen at grazing angles."""
     names = PATTERNS_OF_STYLE[style]
     # A plain floor hides what the guidance does wrong with texture; objects may well be plain.
     pattern = names[int(rng.integers(1, len(names)) if floor else rng.integers(len(names)))]
@@ -95,7 +95,7 @@ def pattern(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
     return _PATTERNS[material.pattern](material, np.asarray(points, dtype=np.float64))
 
 
-def _plain(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def _plain(_material: MaterialSpec, points: np.ndarray) -> np.ndarray:
     return np.ones(len(points))
 
 

@@ -1,9 +1,9 @@
 """The user's glTF, GLB and OBJ models as textured parts that surfels can represent.
 
 Textures become linear float32 images; the glTF metallic-roughness model maps one to one onto Mitsuba's
-``principled``. Surfels and shadow rays know opaque surfaces only, so transparency is decided once, here: triangles
-whose alpha is below the cut-off (one half where the material blends) are left out, the others become opaque. Path
-tracer, G-buffers and reference then agree on what is there.
+``principled``. Surfels and shadow rays know opaque surfaces only, so transparency is decided once, here:
+triangles whose alpha is below the cut-off (one half where the material blends) are left out, the others
+become opaque. Path tracer, G-buffers and reference then agree on what is there.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 from trimesh import Trimesh
+from trimesh.visual.color import ColorVisuals
 from trimesh.visual.material import PBRMaterial
 
 from tron.color import srgb_to_linear
@@ -53,7 +54,9 @@ class Part:
         """The part scaled about its origin, then moved by a rigid (4, 4) ``matrix``."""
         rotation = matrix[:3, :3]
         return replace(
-            self, vertices=self.vertices * scale @ rotation.T + matrix[:3, 3], normals=self.normals @ rotation.T
+            self,
+            vertices=self.vertices * scale @ rotation.T + matrix[:3, 3],
+            normals=self.normals @ rotation.T,
         )
 
 
@@ -95,8 +98,10 @@ def load_model(path: str | Path, up: str = "y") -> list[Part]:
 
 def outline(parts: list[Part]) -> Trimesh:
     """All parts as one mesh without materials, for placement."""
-    meshes = [Trimesh(part.vertices, part.faces, process=False) for part in parts]
-    return trimesh.util.concatenate(meshes) if len(meshes) > 1 else meshes[0]
+    offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets)])
+    return Trimesh(vertices, faces, process=False)
 
 
 def _node_parts(scene: trimesh.Scene, node: str) -> list[Part]:
@@ -120,7 +125,7 @@ def _node_parts(scene: trimesh.Scene, node: str) -> list[Part]:
         normal_map=normal_map,
     )
     if alpha is not None:
-        part.faces = part.faces[_face_alpha(part, alpha) >= _cutoff(mesh.visual.material)]
+        part.faces = part.faces[_face_alpha(part, alpha) >= _cutoff(getattr(mesh.visual, "material", None))]
     linear = np.asarray(transform)[:3, :3]
     part.vertices = part.vertices @ linear.T + np.asarray(transform)[:3, 3]
     part.normals = part.normals @ np.linalg.inv(linear)
@@ -136,13 +141,16 @@ def _unit_normals(mesh: Trimesh) -> np.ndarray:
     bad = ~(length > 1e-6)
     if bad.any():
         own = trimesh.geometry.mean_vertex_normals(len(mesh.vertices), mesh.faces, mesh.face_normals)
-        normals[bad], length[bad] = np.where(np.linalg.norm(own[bad], axis=1)[:, None] > 0, own[bad], (0, 0, 1)), 1.0
+        normals[bad], length[bad] = (
+            np.where(np.linalg.norm(own[bad], axis=1)[:, None] > 0, own[bad], (0, 0, 1)),
+            1.0,
+        )
     return normals / length[:, None]
 
 
 def _textures(mesh: Trimesh, has_uv: bool) -> tuple[np.ndarray, Any, Any, Any, np.ndarray | None]:
     """base color, alpha image or None, roughness, metallic, normal map of a mesh's material."""
-    if mesh.visual.kind == "vertex":
+    if isinstance(mesh.visual, ColorVisuals) and mesh.visual.kind == "vertex":
         colors = np.asarray(mesh.visual.vertex_colors)[:, :3] / 255.0
         return np.asarray(srgb_to_linear(colors), np.float32), None, 0.7, 0.0, None
     material = getattr(mesh.visual, "material", None)

@@ -1,11 +1,15 @@
 """Mitsuba scene -> path-traced frames, true G-buffers, and the direct irradiance that guidance is judged by.
 
-Frames are anti-aliased (box filter). G-buffers and irradiance are taken along rays through the pixel centres: the
-mean of two surfaces is a point on neither.
+Frames are anti-aliased (box filter). G-buffers and irradiance are taken along rays through the pixel centres:
+the mean of two surfaces is a point on neither.
 """
+
+# pyright: reportArgumentType=false, reportCallIssue=false
+# (Mitsuba's type stubs do not know its own aliases of Dr.Jit's array types.)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -45,8 +49,11 @@ def render_frames(
         done = 0
         while done < spp:
             part = min(spp - done, max(LANES // (camera.width * camera.height), 1))
-            # Passes of one frame need streams of their own; the odd constant keeps them apart from other frames.
-            image = mi.render(scene, sensor=sensor, integrator=integrator, spp=part, seed=_pass_seed(seed, done))
+            # Passes of one frame need streams of their own; the odd constant keeps them apart from other
+            # frames.
+            image = mi.render(
+                scene, sensor=sensor, integrator=integrator, spp=part, seed=_pass_seed(seed, done)
+            )
             total += part * np.array(image, np.float64)[..., :3]
             done += part
         frames.append((total / spp).astype(np.float32))
@@ -122,9 +129,9 @@ def direct_irradiance(
 ) -> DirectIrradiance:
     """Direct irradiance by Mitsuba's own light sampling and its rays against the meshes.
 
-    Shares no code with TRON's tracer: this is what the surfels' irradiance is measured against. Half of the rays
-    are drawn from the cosine lobe around the shading normal, half from Mitsuba's emitter, weighted by the balance
-    heuristic (Veach 1997), which for one ray of each kind sums L cos / (pdf_cosine + pdf_light).
+    Shares no code with TRON's tracer: this is what the surfels' irradiance is measured against. Half of the
+    rays are drawn from the cosine lobe around the shading normal, half from Mitsuba's emitter, weighted by
+    the balance heuristic (Veach 1997), which for one ray of each kind sums L cos / (pdf_cosine + pdf_light).
 
     Args:
         geometry, scene: the scene and its lit form.
@@ -150,13 +157,12 @@ def _irradiance_block(
     repeated = np.repeat(np.arange(len(origins)), pairs)
     si, normal = _surface_points(geometry, scene, origins[repeated], directions[repeated])
     valid = si.is_valid()
-    sampler = mi.PCG32(size=len(repeated), initstate=seed % 2**32)
-    uniform = [sampler.next_float32() for _ in range(4)]
+    u = [_stratified(len(repeated), pairs, seed + 2 * kind) for kind in range(2)]
     emitter = scene.environment()
 
-    light, _ = scene.sample_emitter_direction(si, mi.Point2f(uniform[0], uniform[1]), False, valid)
+    light, _ = scene.sample_emitter_direction(si, u[0], False, valid)
     frame = mi.Frame3f(normal)
-    cosine = frame.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(uniform[2], uniform[3])))
+    cosine = frame.to_world(mi.warp.square_to_cosine_hemisphere(u[1]))
 
     shadowed, unshadowed = mi.Color3f(0.0), mi.Color3f(0.0)
     for direction in (light.d, cosine):
@@ -174,8 +180,22 @@ def _irradiance_block(
         blocked = scene.ray_test(si.spawn_ray(direction), counts)
         unshadowed += value
         shadowed += dr.select(blocked, 0.0, value)
-    mean = [np.array(dr.block_sum(mi.Color3f(x), pairs)).T / np.float32(pairs) for x in (shadowed, unshadowed)]
+    mean = [
+        np.array(dr.block_sum(mi.Color3f(x), pairs)).T / np.float32(pairs) for x in (shadowed, unshadowed)
+    ]
     return mean[0], mean[1]
+
+
+def _stratified(lanes: int, count: int, seed: int) -> mi.Point2f:
+    """Jittered points in the unit square, ``count`` in a row sharing one grid: a pixel's samples cover it
+    evenly.
+    """
+    sampler = mi.PCG32(size=lanes, initstate=seed % 2**32)
+    columns = max(d for d in range(1, math.isqrt(count) + 1) if count % d == 0)
+    cell = dr.arange(mi.UInt32, lanes) % count
+    x = (mi.Float(cell % columns) + sampler.next_float32()) / columns
+    y = (mi.Float(cell // columns) + sampler.next_float32()) / (count // columns)
+    return mi.Point2f(x, y)
 
 
 def _pixel_rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:

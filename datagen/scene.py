@@ -1,7 +1,7 @@
 """SceneSpec: everything a synthetic scene is, as pure data drawn from a seed.
 
-A scene is named by its split and index; its specification depends on (root seed, split, index) and the recipe of
-the split alone. What it is rendered with (resolution, samples) is the run's business and not part of it.
+A scene is named by its split and index; its specification depends on (root seed, split, index) and the recipe
+of the split alone. What it is rendered with (resolution, samples) is the run's business and not part of it.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
+from pydantic import Field
+from trimesh import Trimesh
+
 from datagen.layout import Placement, place
 from datagen.lights import Family, HdriSpec, LightSpec, draw_light
 from datagen.materials import MaterialSpec, Style, draw_material
 from datagen.shapes import ShapeSpec, draw_shape, make_mesh
 from datagen.spec import Number, Spec, Triple
-from pydantic import Field
-from trimesh import Trimesh
-
 from tron.cameras import Camera
 from tron.errors import TronError
 from tron.seeds import generator
@@ -27,12 +27,16 @@ LAYOUT_EDGE = 0.5
 """Edge length of the meshes that objects are placed with: only their convex hulls matter there."""
 
 FEWEST_OBJECTS = 2
-SCENE_RADIUS = 1.6
+SCENE_RADIUS = 1.45
+"""World units from the origin within which objects stand: all of them in view from every camera."""
+
 DEFAULT_FAMILIES: tuple[Family, ...] = ("sun", "studio", "overcast")
 
 
 class ObjectSpec(Spec):
-    """One object: a procedural shape with its material, or an asset of the user's scaled to a ball of ``size``."""
+    """One object: a procedural shape with its material, or an asset of the user's scaled to a ball of
+    ``size``.
+    """
 
     shape: ShapeSpec | None = None
     material: MaterialSpec | None = None
@@ -51,8 +55,8 @@ class FloorSpec(Spec):
 class CameraSpec(Spec):
     """Where the cameras go; angles in degrees, lengths in world units.
 
-    The spiral is what surfels are made from; the oscillating path is what is path-traced. ``first_frame`` says,
-    for each light, where on the path its clip begins.
+    The spiral is what surfels are made from; the oscillating path is what is path-traced. ``first_frame``
+    says, for each light, where on the path its clip begins.
     """
 
     target: Triple
@@ -86,17 +90,29 @@ class SceneSpec(Spec):
         """The ``count`` cameras that surfels are made from."""
         c = self.cameras
         return spiral(
-            count, target=c.target, radius=c.spiral_radius, width=width, height=height, fov_deg=c.fov_deg,
+            count,
+            target=c.target,
+            radius=c.spiral_radius,
+            width=width,
+            height=height,
+            fov_deg=c.fov_deg,
             phase=c.spiral_phase,
-        )  # fmt: skip
+        )
 
     def clip(self, light: int, frames: int, width: int, height: int) -> list[Camera]:
         """The consecutive cameras of the clip under light number ``light``."""
         c = self.cameras
         path = oscillating(
-            c.path_frames, target=c.target, radius=c.path_radius, width=width, height=height, fov_deg=c.fov_deg,
-            elevation_deg=c.path_elevation_deg, amplitude_deg=c.path_amplitude_deg, azimuth_deg=c.path_azimuth_deg,
-        )  # fmt: skip
+            c.path_frames,
+            target=c.target,
+            radius=c.path_radius,
+            width=width,
+            height=height,
+            fov_deg=c.fov_deg,
+            elevation_deg=c.path_elevation_deg,
+            amplitude_deg=c.path_amplitude_deg,
+            azimuth_deg=c.path_azimuth_deg,
+        )
         first = c.first_frame[light]
         return path[first : first + frames]
 
@@ -139,7 +155,9 @@ def draw_scene(
         TronError: fewer objects found a place than make a scene, or a clip is longer than its path.
     """
     if frames > path_frames:
-        raise TronError(f"a clip of {frames} frames does not fit a path of {path_frames}", mend="raise path_frames")
+        raise TronError(
+            f"a clip of {frames} frames does not fit a path of {path_frames}", mend="raise path_frames"
+        )
     counts, sizes = {"A": ((3, 7), (0.4, 0.85)), "B": ((2, 4), (0.55, 1.0))}[style]
     low, high = objects or counts
     rng = generator(seed, split, index, "objects")
@@ -175,7 +193,9 @@ def draw_scene(
         style=style,
         objects=placed,
         left_out=len(drawn) - len(placed),
-        floor=FloorSpec(half_size=3.0 if style == "A" else 2.6, material=draw_material(floor, style, floor=True)),
+        floor=FloorSpec(
+            half_size=3.0 if style == "A" else 2.6, material=draw_material(floor, style, floor=True)
+        ),
         lights=tuple(_draw_lights(seed, split, index, lights, families, environments)),
         cameras=_draw_cameras(seed, split, index, len(lights), frames, path_frames),
     )
@@ -197,15 +217,17 @@ def _draw_lights(
     return drawn
 
 
-def _draw_cameras(seed: int, split: str, index: int, lights: int, frames: int, path_frames: int) -> CameraSpec:
+def _draw_cameras(
+    seed: int, split: str, index: int, lights: int, frames: int, path_frames: int
+) -> CameraSpec:
     rng = generator(seed, split, index, "cameras")
     start = rng.uniform(0.0, 360.0)
     return CameraSpec(
         target=(0.0, 0.0, 0.3),
         fov_deg=34.0,
-        spiral_radius=6.2,
+        spiral_radius=6.4,
         spiral_phase=rng.uniform(0.0, 360.0),
-        path_radius=rng.uniform(5.4, 6.2),
+        path_radius=rng.uniform(5.8, 6.6),
         path_elevation_deg=rng.uniform(24.0, 34.0),
         path_amplitude_deg=rng.uniform(8.0, 15.0),
         path_azimuth_deg=(start, start + 321.0),

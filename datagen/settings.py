@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
 from datagen.lights import Family
 from datagen.materials import Style
-from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 LightChoice = Literal["any", "sun", "studio", "overcast", "hdri"]
 Split = Literal["train", "train_b", "test"]
@@ -24,7 +25,9 @@ class SplitSettings(_Model):
     scenes: int = Field(ge=0, le=1_000_000, description="Number of scenes.")
     style: Style = Field(description="Distribution of shapes, patterns, object counts and floor.")
     lights: list[LightChoice] = Field(
-        min_length=1, max_length=64, description="Light family of each clip of a scene; any draws one of families."
+        min_length=1,
+        max_length=64,
+        description="Light family of each clip of a scene; any draws one of families.",
     )
     frames: int = Field(ge=1, le=1000, description="Consecutive frames of a clip.")
     width: int = Field(ge=8, le=8192, description="Frame width in pixels.")
@@ -44,40 +47,58 @@ class Settings(_Model):
     mode: Literal["make", "validate"] = Field(
         "make", description="make the dataset, or validate the one in output_dir and list every problem."
     )
-    seed: int = Field(0, description="Root of all randomness; a scene depends on it, its split and its index alone.")
+    seed: int = Field(
+        0, description="Root of all randomness; a scene depends on it, its split and its index alone."
+    )
     train: SplitSettings = Field(description="First training split.")
     train_b: SplitSettings = Field(description="Second training split, of another distribution.")
     test: SplitSettings = Field(description="Held-out scenes under held-out lights.")
-    path_frames: int = Field(93, ge=1, le=100_000, description="Frames of the whole path that clips are cut from.")
+    path_frames: int = Field(
+        93, ge=1, le=100_000, description="Frames of the whole path that clips are cut from."
+    )
     objects: tuple[int, int] | None = Field(
         None, description="Least and greatest number of objects of a scene; null takes the style's own."
     )
     families: list[Family] | None = Field(
-        None, description="What light 'any' chooses from; null: hdri with environments, else the procedural ones."
+        None,
+        description="What light 'any' chooses from; null: hdri with environments, else the procedural ones.",
     )
     views: int = Field(290, ge=1, description="Spiral views whose G-buffers the surfels are made from.")
     view_width: int = Field(800, ge=8, le=8192, description="Width of those views in pixels.")
     view_height: int = Field(800, ge=8, le=8192, description="Height of those views in pixels.")
     surfels: int = Field(200_000, ge=100, description="Number of surfels of a scene, about.")
     mesh_edge: float = Field(
-        0.03, gt=0, le=1, description="Longest edge of procedural meshes in world units; patterns are that sharp."
+        0.03,
+        gt=0,
+        le=1,
+        description="Longest edge of procedural meshes in world units; patterns are that sharp.",
     )
     environment_height: int = Field(
         256, ge=8, le=8192, description="Rows of the lat-long maps that lights are baked to."
     )
     assets: Path | None = Field(None, description="Folder of .gltf, .glb and .obj models to use as objects.")
-    asset_share: float = Field(1.0, ge=0, le=1, description="Share of objects drawn from assets, where given.")
+    asset_share: float = Field(
+        1.0, ge=0, le=1, description="Share of objects drawn from assets, where given."
+    )
     environments: Path | None = Field(None, description="Folder of .hdr and .exr maps to use as lights.")
     catalogue: Path | None = Field(
-        None, description="JSON list of path, licence, author, source; null looks for catalogue.json in each folder."
+        None,
+        description="JSON list of path, licence, author, source; null: catalogue.json in each folder.",
     )
     allow_unlicensed: list[str] = Field(
-        default_factory=list, description="Names of assets and maps to use although the catalogue has no licence."
+        default_factory=list,
+        description="Names of assets and maps to use although the catalogue has no licence.",
     )
     only: list[str] = Field(default_factory=list, description="Make these scenes only, such as train-000012.")
-    clips_per_shard: int = Field(64, ge=1, description="Most clips of a shard; a shard never spans two scenes.")
-    variant: str = Field("llvm_ad_rgb", description="Mitsuba variant; on cuda_ad_rgb bytes are not repeatable.")
-    workers: int | None = Field(None, ge=1, description="Worker processes of a local cluster; null: one a core.")
+    clips_per_shard: int = Field(
+        64, ge=1, description="Most clips of a shard; a shard never spans two scenes."
+    )
+    variant: str = Field(
+        "llvm_ad_rgb", description="Mitsuba variant; on cuda_ad_rgb bytes are not repeatable."
+    )
+    workers: int | None = Field(
+        None, ge=1, description="Worker processes of a local cluster; null: one a core."
+    )
     recycle_after: int = Field(50, ge=1, description="Scenes a worker makes before it is replaced.")
     cluster: dict[str, Any] | None = Field(
         None, description="Dask cluster by _target_; null makes scenes one by one in this process."
@@ -88,8 +109,14 @@ class Settings(_Model):
         for name in SPLITS:
             split = self.split(name)
             if split.frames > self.path_frames:
-                raise ValueError(f"{name}.frames is {split.frames}, longer than path_frames, {self.path_frames}")
-            if split.scenes and "hdri" in {*split.lights, *self.light_families()} and self.environments is None:
+                raise ValueError(
+                    f"{name}.frames is {split.frames}, longer than path_frames, {self.path_frames}"
+                )
+            if (
+                split.scenes
+                and "hdri" in {*split.lights, *self.light_families()}
+                and self.environments is None
+            ):
                 raise ValueError(f"{name}.lights or families ask for hdri: give environments=FOLDER")
         if self.objects is not None and not 1 <= self.objects[0] <= self.objects[1]:
             raise ValueError("objects must be [least, greatest] with 1 <= least <= greatest")
@@ -106,7 +133,7 @@ class Settings(_Model):
         return ["hdri"] if self.environments is not None else ["sun", "studio", "overcast"]
 
     def recipe(self) -> dict[str, Any]:
-        """What decides the content of a scene, as plain values: not where it goes, who makes it or how many."""
+        """What decides a scene's content, as plain values: not where it goes, who makes it or how many."""
         outside = {"output_dir", "mode", "only", "workers", "recycle_after", "cluster"}
         values = self.model_dump(mode="json", exclude=outside)
         for name in SPLITS:

@@ -1,7 +1,7 @@
 """Procedural shapes: a kind, a size and a few numbers become a closed triangle mesh.
 
-Every mesh fits a ball of radius ``size`` around the origin and is dense enough to carry a material in its vertices.
-Styles A and B draw from disjoint kinds.
+Every mesh fits a ball of radius ``size`` around the origin and is dense enough to carry a material in its
+vertices. Styles A and B draw from disjoint kinds.
 """
 
 from __future__ import annotations
@@ -17,7 +17,18 @@ from datagen.materials import Style
 from datagen.spec import Number, Spec
 
 ShapeKind = Literal[
-    "sphere", "box", "cylinder", "cone", "torus", "blob", "capsule", "gem", "star", "vase", "knot", "superquadric"
+    "sphere",
+    "box",
+    "cylinder",
+    "cone",
+    "torus",
+    "blob",
+    "capsule",
+    "gem",
+    "star",
+    "vase",
+    "knot",
+    "superquadric",
 ]
 KINDS_OF_STYLE: dict[Style, tuple[ShapeKind, ...]] = {
     "A": ("sphere", "box", "cylinder", "cone", "torus", "blob"),
@@ -48,7 +59,8 @@ def draw_shape(rng: np.random.Generator, style: Style, size: tuple[float, float]
 
 
 def make_mesh(shape: ShapeSpec, edge: float = 0.05) -> Trimesh:
-    """Build the mesh of a shape: closed, outward normals, centred at the origin, edges at most ``edge`` world units.
+    """Build the mesh of a shape: closed, outward normals, centred at the origin, edges at most ``edge`` world
+    units.
 
     Vertices are shared; :func:`split_creases` gives the mesh its shading normals.
     """
@@ -56,8 +68,8 @@ def make_mesh(shape: ShapeSpec, edge: float = 0.05) -> Trimesh:
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     vertices = vertices - 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     mesh.vertices = vertices * (shape.size / np.linalg.norm(vertices, axis=1).max())
-    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge, max_iter=16)
-    return Trimesh(vertices, faces, process=True)
+    fine = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge, max_iter=16)
+    return Trimesh(fine[0], fine[1], process=True)
 
 
 def split_creases(mesh: Trimesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -74,7 +86,7 @@ def _between(fraction: float, low: float, high: float) -> float:
     return float(low + fraction * (high - low))
 
 
-def _sphere(p: np.ndarray) -> Trimesh:
+def _sphere(_p: np.ndarray) -> Trimesh:
     return trimesh.creation.icosphere(4)
 
 
@@ -154,7 +166,11 @@ def _knot(p: np.ndarray) -> Trimesh:
     n, m, tube = 240, 24, _between(p[0], 0.22, 0.36)
     t = np.arange(n) * 2 * np.pi / n
     centre = np.column_stack(
-        [(1.6 + 0.7 * np.cos(3 * t)) * np.cos(2 * t), (1.6 + 0.7 * np.cos(3 * t)) * np.sin(2 * t), 0.7 * np.sin(3 * t)]
+        [
+            (1.6 + 0.7 * np.cos(3 * t)) * np.cos(2 * t),
+            (1.6 + 0.7 * np.cos(3 * t)) * np.sin(2 * t),
+            0.7 * np.sin(3 * t),
+        ]
     )
     tangent = np.roll(centre, -1, axis=0) - np.roll(centre, 1, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -167,7 +183,9 @@ def _knot(p: np.ndarray) -> Trimesh:
     i, j = np.meshgrid(np.arange(n), np.arange(m), indexing="ij")
     a, b = (i * m + j).ravel(), (i * m + (j + 1) % m).ravel()
     c, d = (((i + 1) % n) * m + (j + 1) % m).ravel(), (((i + 1) % n) * m + j).ravel()
-    mesh = Trimesh(rings.reshape(-1, 3), np.concatenate([np.column_stack([a, d, c]), np.column_stack([a, c, b])]))
+    mesh = Trimesh(
+        rings.reshape(-1, 3), np.concatenate([np.column_stack([a, d, c]), np.column_stack([a, c, b])])
+    )
     mesh.fix_normals()
     return mesh
 

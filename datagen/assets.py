@@ -1,0 +1,166 @@
+"""The catalogue of the user's assets: what each file is, where it comes from, and whether it may be used.
+
+A catalogue is a JSON list beside the files (``catalogue.json``) or elsewhere:
+
+    [{"path": "FlightHelmet/FlightHelmet.gltf", "licence": "CC0-1.0", "author": "...", "source":
+    "https://..."}]
+
+``path`` is relative to the folder; ``licence`` is required for use, the rest is for the dataset card. ``up``
+may be ``"z"`` for models that do not stand on y. A file without a licence is used only if its name is allowed
+explicitly.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Collection, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+
+from datagen.lights import HdriSpec, classify
+from datagen.models import SUFFIXES, Part, load_model
+from tron.errors import TronError
+from tron.shading.environment import EnvironmentMap
+from tron.storage import sha256
+
+CATALOGUE_NAME = "catalogue.json"
+LARGEST_CATALOGUE = 64 * 2**20
+HELD_OUT = 4
+"""Every fourth map of a folder lights the test split only, where there are at least as many."""
+
+
+class Asset(BaseModel):
+    """One file that scenes may use.
+
+    Attributes:
+        id: name by which specifications call it: the file's stem, or its path where stems collide.
+        path: relative to the folder, with forward slashes.
+        sha256: of the file itself (a .gltf's textures are files of their own).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    id: str
+    path: str
+    sha256: str
+    licence: str | None = None
+    author: str | None = None
+    source: str | None = None
+    up: Literal["y", "z"] = "y"
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    path: str
+    licence: str | None = None
+    author: str | None = None
+    source: str | None = None
+    up: Literal["y", "z"] = "y"
+
+
+def find_assets(
+    folder: Path,
+    suffixes: Sequence[str] = SUFFIXES,
+    catalogue: Path | None = None,
+    allow_unlicensed: Collection[str] = (),
+) -> list[Asset]:
+    """List the usable files of a folder in order of path.
+
+    Args:
+        folder: searched with its subfolders.
+        suffixes: what counts as an asset.
+        catalogue: JSON file; None looks for catalogue.json in the folder.
+        allow_unlicensed: ids to accept without a licence.
+
+    Raises:
+        TronError: the folder or catalogue is missing or unreadable, nothing was found, or a file has no
+            licence and its id is not allowed.
+    """
+    if not folder.is_dir():
+        raise TronError("folder of assets not found", folder)
+    paths = sorted(
+        p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.suffix.lower() in suffixes
+    )
+    if not paths:
+        raise TronError(f"no {', '.join(suffixes)} in the folder", folder)
+    entries = _read_catalogue(
+        catalogue if catalogue is not None else folder / CATALOGUE_NAME, catalogue is not None
+    )
+    stems = Counter(Path(path).stem for path in paths)
+    assets = []
+    for path in paths:
+        entry = entries.get(path, _Entry(path=path))
+        name = Path(path).stem if stems[Path(path).stem] == 1 else str(Path(path).with_suffix(""))
+        if not entry.licence and name not in allow_unlicensed:
+            raise TronError(
+                f"asset '{name}' has no licence",
+                folder / path,
+                f"state it in {CATALOGUE_NAME}, or use it nevertheless with allow_unlicensed=[{name}]",
+            )
+        assets.append(Asset(id=name, sha256=sha256(folder / path), **entry.model_dump()))
+    return assets
+
+
+def find_environments(
+    folder: Path, catalogue: Path | None = None, allow_unlicensed: Collection[str] = ()
+) -> tuple[list[Asset], list[HdriSpec]]:
+    """List the maps of a folder with their measured contrast; raises as :func:`find_assets` does."""
+    assets = find_assets(folder, (".hdr", ".exr"), catalogue, allow_unlicensed)
+    specs = [
+        HdriSpec(
+            path=a.path, sha256=a.sha256, rotation_deg=0.0, contrast=_contrast(str(folder / a.path), a.sha256)
+        )
+        for a in assets
+    ]
+    return assets, specs
+
+
+@lru_cache(maxsize=4096)
+def _contrast(path: str, _sha256: str) -> Literal["high", "low"]:
+    environment = EnvironmentMap.load(path)
+    return classify(environment.resized(min(128, environment.image.shape[0])))
+
+
+def for_split(maps: Sequence[HdriSpec], split: str) -> list[HdriSpec]:
+    """The maps that light a split: every HELD_OUT-th is the test split's own; a few maps are shared."""
+    if len(maps) < HELD_OUT:
+        return list(maps)
+    return [m for i, m in enumerate(maps) if (i % HELD_OUT == HELD_OUT - 1) == (split == "test")]
+
+
+def load_models(folder: Path, assets: Sequence[Asset]) -> dict[str, list[Part]]:
+    """Asset id -> its parts in the unit ball, z up; read once a process."""
+    return {asset.id: _load(str(folder / asset.path), asset.up, asset.sha256) for asset in assets}
+
+
+@lru_cache(maxsize=64)
+def _load(path: str, up: str, _sha256: str) -> list[Part]:
+    return load_model(path, up)
+
+
+def _read_catalogue(path: Path, required: bool) -> dict[str, _Entry]:
+    if not path.is_file():
+        if required:
+            raise TronError("catalogue not found", path)
+        return {}
+    try:
+        if path.stat().st_size > LARGEST_CATALOGUE:
+            raise ValueError("file is too large to be a catalogue")
+        entries = TypeAdapter(list[_Entry]).validate_python(json.loads(path.read_text("utf-8")))
+    except (OSError, ValueError, RecursionError, ValidationError) as error:
+        raise TronError(
+            f"catalogue cannot be read: {_reason(error)}", path, 'write [{"path": ..., "licence": ...}, ...]'
+        ) from error
+    return {entry.path: entry for entry in entries}
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        return f"entry {'.'.join(map(str, first['loc']))}: {first['msg']}"
+    return str(error)

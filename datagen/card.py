@@ -1,0 +1,130 @@
+"""The dataset card: what is in the folder, under which licences, made by what, and by which exact command."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from omegaconf import OmegaConf
+
+import tron
+from datagen.assets import Asset
+from datagen.plan import Sources, config_sha256
+from datagen.settings import SPLITS, Settings
+from tron.apps.recipes import compose_recipe
+from tron.runtime import describe_machine
+from tron.shards.manifest import Manifest
+from tron.shards.schema import SCHEMA_VERSION
+
+PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "OpenEXR")
+
+
+def command_line(settings: Settings, output_dir: str, only: Sequence[str] = ()) -> str:
+    """The command that makes this dataset: every key that differs from the shipped configuration, spelt out.
+
+    It does not lean on recipes, whose content may change; ``output_dir`` and ``only`` are the caller's.
+    """
+    shipped = OmegaConf.to_container(compose_recipe("conf.datagen", []), resolve=False)
+    defaults = dict(_leaves(shipped))
+    values = settings.model_dump(mode="json") | {"output_dir": output_dir, "only": list(only)}
+    words = ["tron-datagen"]
+    for key, value in _leaves(values):
+        if key not in defaults:
+            words.append(f"+{key}={_hydra(value)}")
+        elif defaults[key] != value:
+            words.append(f"{key}={_hydra(value)}")
+    return " ".join(shlex.quote(word) for word in words)
+
+
+def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping) and value:
+        for name, inner in value.items():
+            yield from _leaves(inner, f"{prefix}.{name}" if prefix else str(name))
+    else:
+        yield prefix, value
+
+
+def _hydra(value: Any) -> str:
+    """A value in the grammar of Hydra's overrides."""
+    if isinstance(value, str):
+        plain = value != "" and all(c.isalnum() or c in "_-./" for c in value)
+        return value if plain else json.dumps(value)
+    if isinstance(value, list):
+        return "[" + ",".join(_hydra(item) for item in value) + "]"
+    return json.dumps(value)
+
+
+def card_text(
+    settings: Settings, manifest: Manifest, sources: Sources, lights: Mapping[str, Counter[str]]
+) -> str:
+    """card.md, the same bytes for the same dataset.
+
+    Args:
+        settings: what it was made with.
+        manifest: what it holds.
+        sources: the user's files it drew from.
+        lights: split -> light family -> clips.
+    """
+    lines = [
+        "# Dataset card",
+        "",
+        f"Clips of synthetic scenes for TRON's neural renderer, made by `tron-datagen` {tron.__version__} "
+        f"(shard schema {SCHEMA_VERSION}, configuration {config_sha256(settings)[:12]}).",
+        "",
+        "| split | scenes | clips | frames | size | lights | style |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for split in SPLITS:
+        entries = [entry for entry in manifest.shards if entry.split == split]
+        clips = sum(entry.samples for entry in entries)
+        if not clips:
+            continue
+        recipe = settings.split(split)
+        scenes = len({key.rsplit("-l", 1)[0] for entry in entries for key in entry.keys})
+        families = ", ".join(f"{count} {family}" for family, count in sorted(lights[split].items()))
+        lines.append(
+            f"| {split} | {scenes} | {clips} | {clips * recipe.frames} | {recipe.width} x {recipe.height} "
+            f"| {families} | {recipe.style} |"
+        )
+    lines += [
+        "",
+        f"Scenes that could not be made: {manifest.failures}"
+        + (" (see failures.jsonl)." if manifest.failures else "."),
+        "",
+        "## How it was made",
+        "",
+        "    " + command_line(settings, "DIR"),
+        "",
+        f"Root seed {settings.seed}. Frames by Mitsuba's path tracer, guidance by TRON's surfel tracer on "
+        f"about {settings.surfels:,} surfels a scene, from {settings.views} views. Buffers are linear; "
+        "`exposure` in a clip's metadata is the scalar to apply before AgX.",
+        "",
+        "| software | version |",
+        "|---|---|",
+    ]
+    packages = describe_machine()["packages"]
+    lines += [f"| {name} | {packages[name]} |" for name in PACKAGES if name in packages]
+    lines += ["", "## What it was made from", ""]
+    if sources.assets or sources.maps:
+        lines += ["| asset | licence | author | source | sha256 |", "|---|---|---|---|---|"]
+        lines += [_asset_row(asset) for asset in (*sources.assets, *sources.maps)]
+        lines += [""]
+    if not sources.assets:
+        lines.append("Shapes and materials are procedural: no asset of anybody's is in it.")
+    if not sources.maps:
+        lines.append("Lights are procedural; skies follow Mitsuba's `sunsky`.")
+    return "\n".join(lines) + "\n"
+
+
+def _asset_row(asset: Asset) -> str:
+    cells = (
+        asset.id,
+        asset.licence or "none stated",
+        asset.author or "",
+        asset.source or "",
+        asset.sha256[:16],
+    )
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

@@ -1,0 +1,33 @@
+"""The command ``tron-datagen``."""
+
+from __future__ import annotations
+
+from datagen.run import make
+from datagen.settings import Settings
+from datagen.validate import validate
+from tron.apps.command_line import command
+
+
+def main(settings: Settings) -> int:
+    """Make a dataset for the neural renderer, or validate one.
+
+    Scenes are drawn from seeds, path-traced by Mitsuba, turned into surfels and rendered again by TRON's
+    tracer; the pairs land in tar shards with a manifest. An interrupted run goes on where it stopped. The
+    exit code is 1 if a scene could not be made (failures.jsonl says why) or if validation found a problem.
+    """
+    if settings.mode == "validate":
+        return 1 if validate(settings.output_dir) else 0
+    return 1 if make(settings) else 0
+
+
+cli = command(
+    "tron-datagen",
+    "conf.datagen",
+    Settings,
+    main,
+    examples=(
+        "tron-datagen experiment=demo output_dir=outputs/dataset",
+        "tron-datagen experiment=demo output_dir=outputs/mine assets=models environments=hdris workers=8",
+        "tron-datagen output_dir=outputs/dataset mode=validate",
+    ),
+)

@@ -1,0 +1,213 @@
+"""What has to be made: the work list, what it takes, and what of it is there already.
+
+One scene is one piece of work. Its shards are its own and numbered by its index, so where a clip lands
+depends on the plan alone: not on who makes it, in which order, or what failed. A scene is finished when its
+record exists, which is written last.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from datagen.assets import Asset, find_assets, find_environments
+from datagen.lights import HdriSpec
+from datagen.scene import scene_name
+from datagen.settings import SPLITS, Settings
+from tron.errors import TronError
+from tron.shards.manifest import ShardEntry
+from tron.storage import write_atomic
+
+RECORD_NAME = "record.json"
+CONFIG_NAME = "config.yaml"
+SURFEL_BYTES = 320
+
+
+@dataclass(frozen=True)
+class Work:
+    """One scene to make: its split, index and name, and the number of its first shard."""
+
+    split: str
+    index: int
+    name: str
+    first_shard: int
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The user's files that scenes draw from; empty where everything is procedural."""
+
+    assets: tuple[Asset, ...] = ()
+    maps: tuple[Asset, ...] = ()
+    environments: tuple[HdriSpec, ...] = ()
+
+
+class Quarantined(BaseModel):
+    """A clip that was made and is not fit for a shard."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    key: str
+    reason: str
+
+
+class Record(BaseModel):
+    """scenes/NAME/record.json: the scene is finished, and this is what it gave."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    shards: list[ShardEntry]
+    quarantined: list[Quarantined]
+
+
+def plan(settings: Settings) -> list[Work]:
+    """Every scene of the dataset, in order of split and index."""
+    items = []
+    for split in SPLITS:
+        recipe = settings.split(split)
+        shards = -(-len(recipe.lights) // settings.clips_per_shard)
+        items += [Work(split, i, scene_name(split, i), i * shards) for i in range(recipe.scenes)]
+    if not items:
+        raise TronError("the dataset would have no scenes", "train.scenes, train_b.scenes, test.scenes")
+    return items
+
+
+def chosen(items: list[Work], only: Iterable[str]) -> list[Work]:
+    """The scenes named by ``only``, all if it is empty; TronError names one that the plan lacks."""
+    names = list(only)
+    known = {item.name for item in items}
+    for name in names:
+        if name not in known:
+            raise TronError(
+                "no such scene in this dataset", name, f"scenes are {items[0].name} to {items[-1].name}"
+            )
+    return [item for item in items if not names or item.name in names]
+
+
+def find_sources(settings: Settings) -> Sources:
+    """Catalogue the user's assets and environments; raises as ``datagen.assets`` does, before any render."""
+    allowed = settings.allow_unlicensed
+    assets = (
+        find_assets(settings.assets, catalogue=settings.catalogue, allow_unlicensed=allowed)
+        if settings.assets
+        else []
+    )
+    maps, environments = (
+        find_environments(settings.environments, settings.catalogue, allowed)
+        if settings.environments
+        else ([], [])
+    )
+    return Sources(tuple(assets), tuple(maps), tuple(environments))
+
+
+def scene_folder(output: Path, name: str) -> Path:
+    """Where a scene's specification, surfels and record lie."""
+    return output / "scenes" / name
+
+
+def read_record(output: Path, item: Work) -> Record | None:
+    """The record of a finished scene; None if it has to be made (again)."""
+    try:
+        record = Record.model_validate_json((scene_folder(output, item.name) / RECORD_NAME).read_bytes())
+    except (OSError, ValidationError):
+        return None
+    whole = all(_size(output / entry.name) == entry.bytes for entry in record.shards)
+    return record if whole else None
+
+
+def _size(path: Path) -> int | None:
+    return path.stat().st_size if path.is_file() else None
+
+
+def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
+    """Bytes that scenes may take on disk: half-precision EXR hardly compresses noise."""
+    total = 0
+    for item in items:
+        recipe = settings.split(item.split)
+        pixel = 5 * 3 * 2 + 2 + 1 + (3 * 3 * 2 + 2 * 3 * 4 if recipe.reference_buffers else 0)
+        frame = recipe.width * recipe.height * pixel + 16_384
+        total += len(recipe.lights) * recipe.frames * frame + settings.surfels * SURFEL_BYTES
+    return total
+
+
+def config_text(settings: Settings) -> str:
+    """config.yaml of the dataset: the recipe and the numbers of scenes, without where and by whom."""
+    counts = {split: settings.split(split).scenes for split in SPLITS}
+    return yaml.safe_dump({"scenes": counts, "recipe": settings.recipe()}, sort_keys=True, allow_unicode=True)
+
+
+def config_sha256(settings: Settings) -> str:
+    """Hash of the resolved configuration, 64 hexadecimal digits."""
+    return hashlib.sha256(config_text(settings).encode()).hexdigest()
+
+
+def adopt(settings: Settings) -> None:
+    """Make output_dir this recipe's, or make sure that it is already.
+
+    More scenes may be added to a dataset; any other change would mix two datasets in one folder.
+
+    Raises:
+        TronError: the folder holds a dataset of another recipe, or more scenes than are asked for; names the
+        key.
+    """
+    path, text = settings.output_dir / CONFIG_NAME, config_text(settings)
+    if path.is_file():
+        try:
+            old = yaml.safe_load(path.read_text("utf-8"))
+            before, scenes = _leaves(old["recipe"]), old["scenes"]
+        except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+            raise TronError(
+                "config.yaml of the dataset is damaged", path, "choose another output_dir"
+            ) from error
+        now = _leaves(settings.recipe())
+        for key in sorted(before.keys() | now.keys()):
+            if before.get(key) != now.get(key):
+                raise TronError(
+                    f"output_dir holds a dataset made with {key}={before.get(key)}, not {now.get(key)}",
+                    settings.output_dir,
+                    "choose another output_dir, or delete that one",
+                )
+        for split in SPLITS:
+            if scenes.get(split, 0) > settings.split(split).scenes:
+                raise TronError(
+                    f"output_dir holds {scenes[split]} scenes of {split}, more than {split}.scenes asks for",
+                    settings.output_dir,
+                    "choose another output_dir, or delete that one",
+                )
+    elif any(settings.output_dir.glob("*.tar")):
+        raise TronError(
+            "output_dir holds shards of something else", settings.output_dir, "choose an empty folder"
+        )
+    write_if_changed(path, text)
+
+
+def _leaves(value: object, prefix: str = "") -> dict[str, object]:
+    if isinstance(value, dict):
+        return {
+            k: v
+            for name, inner in value.items()
+            for k, v in _leaves(inner, f"{prefix}.{name}".strip(".")).items()
+        }
+    return {prefix: value}
+
+
+def write_if_changed(path: Path, text: str) -> None:
+    """Write a text file atomically unless it says that already: a finished dataset is not touched."""
+    if not path.is_file() or path.read_bytes() != text.encode():
+        write_atomic(path, text)
+
+
+def clear_temporaries(output: Path) -> None:
+    """Remove what a killed run left half-written; only under the folder's lock.
+
+    Atomic writes go to hidden files beside their targets, in folders that are all ours.
+    """
+    for folder in (output, output / "previews", output / "quarantine", *output.glob("scenes/*")):
+        for path in folder.glob(".*.*.*") if folder.is_dir() else ():
+            path.unlink(missing_ok=True)

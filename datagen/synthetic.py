@@ -1,0 +1,152 @@
+"""The synthetic source: a scene's specification becomes surfels and, light by light, a clip of training
+pairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
+import numpy as np
+from tron.shading.guidance import Guidance, Lighting, render_guidance
+
+from datagen.build import Geometry
+from datagen.lights import LightSpec, bake, classify
+from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
+from datagen.scene import SceneSpec
+from datagen.settings import Settings
+from tron.cameras import Camera
+from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
+from tron.gaussians.scene import GaussianScene
+from tron.seeds import integer
+from tron.shading.environment import EnvironmentMap
+from tron.shards.schema import ClipMeta
+from tron.tracing import SurfelTracer
+
+Frame = dict[str, np.ndarray]
+ColorSpace = Literal["linear", "display"]
+
+COLOR_SPACE: dict[str, ColorSpace] = dict.fromkeys(("pbr", "irr", "rgb", "unshadowed", "shadowed"), "linear")
+REFERENCE_COLOR_SPACE: dict[str, ColorSpace] = dict.fromkeys(
+    ("irr_ref", "base_color_ref", "base_color"), "linear"
+)
+
+
+def make_surfels(spec: SceneSpec, geometry: Geometry, settings: Settings) -> GaussianScene:
+    """Surfels through what the spiral views see of a scene."""
+    cameras = spec.spiral(settings.views, settings.view_width, settings.view_height)
+    return surfels_from_gbuffers(gbuffers(geometry, cameras), count=settings.surfels)
+
+
+def make_clips(
+    spec: SceneSpec, geometry: Geometry, surfels: GaussianScene, settings: Settings
+) -> Iterator[tuple[ClipMeta, list[Frame]]]:
+    """Render one clip a light, in the order of the specification.
+
+    Each frame holds the schema's members, linear: guidance from the surfels, rgb path-traced from the meshes,
+    both under the same baked map; with reference buffers also what Mitsuba says of the pixel centres.
+    """
+    tracer = SurfelTracer(surfels)
+    for number, light in enumerate(spec.lights):
+        environment = bake(
+            light,
+            settings.environment_height,
+            None if settings.environments is None else str(settings.environments),
+        )
+        yield make_clip(spec, geometry, tracer, light, number, environment, settings)
+
+
+def make_clip(
+    spec: SceneSpec,
+    geometry: Geometry,
+    tracer: SurfelTracer,
+    light: LightSpec,
+    number: int,
+    environment: EnvironmentMap,
+    settings: Settings,
+) -> tuple[ClipMeta, list[Frame]]:
+    """Render the clip of one light; ``number`` is its place in the scene's list and names its seeds."""
+    recipe = settings.split(spec.split)
+    cameras = spec.clip(number, recipe.frames, recipe.width, recipe.height)
+    scene = geometry.lit(environment)
+    path = ("light", number, "frame")
+    seeds = {what: _seeds(spec, len(cameras), what, *path) for what in ("path", "guidance", "reference")}
+
+    rgb = render_frames(scene, cameras, recipe.path_spp, seeds["path"])
+    lighting = Lighting(environment)
+    frames: list[Frame] = []
+    for i, (camera, truth) in enumerate(zip(cameras, gbuffers(geometry, cameras))):
+        guidance = render_guidance(
+            tracer, camera, lighting, spp=recipe.guidance_spp, seed=seeds["guidance"][i]
+        )
+        frame = {
+            "pbr": guidance.pbr,
+            "irr": guidance.irradiance,
+            "rgb": rgb[i],
+            "unshadowed": guidance.unshadowed,
+            "shadowed": guidance.shadowed,
+            "mask": guidance.mask,
+            "foreground": truth.valid.astype(np.float32),
+        }
+        if recipe.reference_buffers:
+            direct = direct_irradiance(geometry, scene, camera, recipe.reference_spp, seeds["reference"][i])
+            frame |= _reference(camera, truth, guidance, direct.shadowed, environment)
+        frames.append(frame)
+    spp = {"path": recipe.path_spp, "guidance": recipe.guidance_spp}
+    if recipe.reference_buffers:
+        spp["reference"] = recipe.reference_spp
+    meta = ClipMeta(
+        key=f"{spec.name}-l{number}",
+        scene=spec.name,
+        light=f"{spec.name}-{light.family}{number}",
+        light_family=light.family,
+        split=spec.split,
+        frames=len(frames),
+        width=recipe.width,
+        height=recipe.height,
+        cameras=[camera.to_dict() for camera in cameras],
+        exposure=environment.exposure(),
+        color_space=COLOR_SPACE | (REFERENCE_COLOR_SPACE if recipe.reference_buffers else {}),
+        seeds={"root": spec.seed, **{f"{what}0": values[0] for what, values in seeds.items()}},
+        spp=spp,
+        extra={
+            "style": spec.style,
+            "contrast": classify(environment),
+            "light_spec": light.model_dump(mode="json"),
+        },
+    )
+    return meta, frames
+
+
+def first_bad_value(frames: Sequence[Frame]) -> str | None:
+    """Where a clip is not finite, in words, or None: such a clip must not reach a shard."""
+    for i, frame in enumerate(frames):
+        for member, image in frame.items():
+            bad = int((~np.isfinite(image)).sum())
+            if bad:
+                return f"frame {i}: {member} has {bad} values that are not finite"
+    return None
+
+
+def _seeds(spec: SceneSpec, frames: int, what: str, *path: str | int) -> list[int]:
+    return [integer(spec.seed, spec.split, spec.index, *path, i, what) for i in range(frames)]
+
+
+def _reference(
+    camera: Camera,
+    truth: GBufferView,
+    guidance: Guidance,
+    irradiance: np.ndarray,
+    environment: EnvironmentMap,
+) -> Frame:
+    """The reference members of one frame; behind the scene irradiance shows the environment, as guidance
+    does.
+    """
+    seen = truth.valid[..., None]
+    return {
+        "irr_ref": np.where(seen, irradiance, environment.lookup(camera.rays())),
+        "base_color_ref": np.where(seen, truth.base_color, 0.0),
+        "normal_ref": np.where(seen, truth.normal, 0.0),
+        "base_color": guidance.gbuffer["base_color"],
+        "normal": guidance.gbuffer["normal"],
+    }
