@@ -6,8 +6,16 @@ Everything here is linear and scene-referred; exposure and AgX come at the very 
 """
 
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
+from tron.shading.guidance import Guidance, Lighting, render_guidance
+from tron.shading.irradiance import irradiance
+from tron.shading.split_sum import SplitSum
 
 __all__ = [
     "EnvironmentLight",
     "EnvironmentMap",
+    "Guidance",
+    "Lighting",
+    "SplitSum",
+    "irradiance",
+    "render_guidance",
 ]

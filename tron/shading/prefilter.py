@@ -8,6 +8,9 @@ distance from the lobe's axis. Placing the light at its own centroid makes the e
 one texel is filtered where it stands. One compiled kernel serves every lobe and every light.
 """
 
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
+
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -1,0 +1,129 @@
+"""G-buffer + environment -> guidance: the buffers that the neural renderer is conditioned on.
+
+    pbr         base (1 - m) U + S             unshadowed split-sum
+    irradiance  U shadowed_n / unshadowed_n    a white diffuse surface, shadows included
+    shadowed    base (1 - m) irradiance + S    the strongest picture that needs no network
+
+U is the unshadowed irradiance / pi, S the split-sum specular, F0 = 0.04 (1 - m) + m base. The n-ray
+estimates of shadowed and unshadowed irradiance share their rays, so their ratio keeps the shadows and sheds
+the noise of the light, and U, which has none, puts the light back (Heitz et al. 2018). At 64 rays under a
+sun this takes the relative error from 0.13 to 0.04, and irradiance over unshadowed is exactly 1 where
+nothing is in the way; the price, a bias of the ratio, is 0.2 % there.
+
+Every buffer shows the environment where surfels are absent: opacity x shaded + (1 - opacity) x radiance seen.
+All of it is linear; exposure and AgX are applied when a buffer is looked at or loaded.
+"""
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from tron.shading.denoise import atrous
+from tron.shading.environment import EnvironmentLight, EnvironmentMap
+from tron.shading.irradiance import irradiance
+from tron.shading.split_sum import CUBEMAP_RESOLUTION, SplitSum
+
+if TYPE_CHECKING:
+    from tron.cameras import Camera
+    from tron.tracing import GBuffer, SurfelTracer
+
+DIELECTRIC_F0 = 0.04
+
+
+class Lighting:
+    """An environment prepared once for every frame that it lights.
+
+    Args:
+        environment: the light.
+        cubemap_resolution: see :class:`SplitSum`.
+    """
+
+    def __init__(self, environment: EnvironmentMap, cubemap_resolution: int = CUBEMAP_RESOLUTION) -> None:
+        self.environment = environment
+        self.light = EnvironmentLight(environment)
+        self.split_sum = SplitSum(environment, cubemap_resolution, self.light)
+
+
+@dataclass
+class Guidance:
+    """Buffers of one frame, NumPy float32, linear, blended with the environment by opacity.
+
+    Attributes:
+        pbr: (H, W, 3) unshadowed split-sum radiance.
+        irradiance: (H, W, 3) shadowed irradiance / pi.
+        unshadowed: (H, W, 3) the same with nothing in the way.
+        shadowed: (H, W, 3) radiance: shadowed diffuse plus split-sum specular.
+        mask: (H, W) opacity of the surfels in [0, 1].
+        gbuffer: ``GBuffer.numpy()``.
+    """
+
+    pbr: np.ndarray
+    irradiance: np.ndarray
+    unshadowed: np.ndarray
+    shadowed: np.ndarray
+    mask: np.ndarray
+    gbuffer: dict[str, np.ndarray]
+
+
+def render_guidance(
+    tracer: SurfelTracer,
+    camera: Camera,
+    lighting: Lighting,
+    spp: int = 64,
+    seed: int = 0,
+    denoise: bool = False,
+) -> Guidance:
+    """Trace ``camera``'s view of the surfels and shade it under ``lighting``.
+
+    Args:
+        tracer: the scene.
+        camera: the view.
+        lighting: the prepared environment.
+        spp: shadow rays a pixel, even; 64 for final frames, 2 for previews.
+        seed: root of the shadow rays' random numbers.
+        denoise: filter the visibility over the image; for previews.
+
+    Raises:
+        TronError: ``spp`` is odd or not positive.
+    """
+    gbuffer = tracer.gbuffer(camera)
+    shadowed, unshadowed = irradiance(tracer, gbuffer, lighting.light, spp, seed)
+    if denoise:
+        shadowed, unshadowed = atrous(shadowed, unshadowed, gbuffer, tracer.scene.spacing)
+    visibility = dr.select(unshadowed > 0, shadowed / unshadowed, 1)
+    return shade(gbuffer, visibility, lighting)
+
+
+def shade(gbuffer: GBuffer, visibility: mi.Color3f, lighting: Lighting) -> Guidance:
+    """Guidance from a G-buffer and the share of the unshadowed irradiance that reaches each pixel."""
+    surface = gbuffer.opacity > 0
+    # An empty pixel has no normal, and 0 / 0 must not reach a lookup.
+    normal = dr.select(surface, mi.Vector3f(gbuffer.normal), mi.Vector3f(0, 0, 1))
+    diffuse_color = gbuffer.base_color * (1 - gbuffer.metallic)
+    f0 = DIELECTRIC_F0 * (1 - gbuffer.metallic) + gbuffer.metallic * gbuffer.base_color
+    unshadowed = lighting.split_sum.diffuse(normal)
+    specular = lighting.split_sum.specular(normal, -gbuffer.direction, gbuffer.roughness, f0)
+    shadowed = unshadowed * visibility
+    behind = lighting.light.radiance(gbuffer.direction)
+
+    def image(shaded: mi.Color3f) -> np.ndarray:
+        shown = dr.select(surface, dr.lerp(behind, shaded, gbuffer.opacity), behind)
+        return np.ascontiguousarray(np.array(shown).T.reshape(gbuffer.height, gbuffer.width, 3))
+
+    buffers = gbuffer.numpy()
+    return Guidance(
+        pbr=image(diffuse_color * unshadowed + specular),
+        irradiance=image(shadowed),
+        unshadowed=image(unshadowed),
+        shadowed=image(diffuse_color * shadowed + specular),
+        mask=buffers["opacity"],
+        gbuffer=buffers,
+    )
