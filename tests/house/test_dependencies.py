@@ -30,11 +30,12 @@ def imported(*folders: str) -> set[str]:
                 modules |= {alias.name.partition(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 modules.add((node.module or "").partition(".")[0])
-            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(
-                ("import_module", "importorskip")
+            elif (
+                isinstance(node, ast.Call)
+                and ast.unparse(node.func).endswith(("import_module", "importorskip"))
+                and isinstance(node.args[0], ast.Constant)
             ):
-                if isinstance(node.args[0], ast.Constant):
-                    modules.add(str(node.args[0].value).partition(".")[0])
+                modules.add(str(node.args[0].value).partition(".")[0])
     known = packages_distributions()
     foreign = modules - set(sys.stdlib_module_names) - set(PACKAGES)
     return {canonical(known.get(module, [module])[0]) for module in foreign}
