@@ -53,9 +53,9 @@ class Clock(Callback):
 class TrainingLog(Callback):
     """Shows loss and validation PSNR on a bar (plain lines where there is no terminal) and in metrics.csv.
 
-    metrics.csv has one row every `every` steps: stage, step, seconds of this stage, smoothed loss (as
-    trained: squared error of values in [-1, 1], plus LPIPS if on), learning rate, and the latest
-    validation's PSNR in dB. A resumed run goes on behind the rows it had reached.
+    metrics.csv has one row every `every` steps and at every checkpoint: stage, step, seconds of this stage,
+    smoothed loss (as trained: squared error of values in [-1, 1], plus LPIPS if on), learning rate, and the
+    latest validation's PSNR in dB. A resumed run goes on behind the rows it had reached.
     """
 
     columns: tuple[str, ...] = (
@@ -112,7 +112,7 @@ class TrainingLog(Callback):
         if not trainer.is_global_zero:
             return
         if step % self.every == 0:
-            self._rows.append(self._row(trainer))
+            self._note(trainer)
         self._show(trainer)
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
@@ -126,8 +126,7 @@ class TrainingLog(Callback):
         del pl_module
         if not trainer.is_global_zero:
             return
-        if trainer.global_step % self.every:
-            self._rows.append(self._row(trainer))
+        self._note(trainer)
         self._write()
         self._show(trainer, last=True)
         self._close()
@@ -142,10 +141,26 @@ class TrainingLog(Callback):
     def on_save_checkpoint(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Write metrics.csv as often as checkpoints."""
+        """Write metrics.csv with each checkpoint, so that a resumed run finds the rows up to it."""
         del pl_module, checkpoint
         if trainer.is_global_zero:
+            self._note(trainer)
             self._write()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The running mean goes into checkpoints."""
+        return {"loss": self.loss}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """The running mean goes on from a checkpoint."""
+        self.loss = state_dict["loss"]
+
+    def _note(self, trainer: lightning.Trainer) -> None:
+        """Add the row of this step, once."""
+        row = self._row(trainer)
+        place = (row["stage"], str(row["step"]))
+        if not self._rows or (self._rows[-1]["stage"], str(self._rows[-1]["step"])) != place:
+            self._rows.append(row)
 
     def _row(self, trainer: lightning.Trainer) -> dict[str, Any]:
         rate = trainer.optimizers[0].param_groups[0]["lr"]

@@ -166,6 +166,11 @@ def _run_stage(
     share = stage.steps / sum(each.steps for each in stages)
     pace = Pace(stage.steps, settings.max_seconds * share if settings.max_seconds else None)
     _announce(number, stages, settings.max_seconds, position.step)
+    if position.checkpoint and pace.seconds_limit is None and position.step >= stage.steps:
+        # Interrupted between its last step and its end: Lightning would not even start, nor average weights.
+        module.load_state_dict(AtomicCheckpoints().load_checkpoint(position.checkpoint)["state_dict"])
+        _end_stage(folder, number, stage, module)
+        return
     module.begin(stage, pace)
     data.begin(stage, position.step)
     callbacks: list[Callback] = [
@@ -184,7 +189,7 @@ def _run_stage(
         num_nodes=settings.nodes,
         precision=settings.precision,  # type: ignore[arg-type]
         gradient_clip_val=settings.optimizer.gradient_clip,
-        val_check_interval=settings.validation.every,
+        val_check_interval=min(settings.validation.every, stage.steps),
         check_val_every_n_epoch=None,
         num_sanity_val_steps=0,
         limit_val_batches=0 if settings.validation.split is None else 1.0,
@@ -202,9 +207,13 @@ def _run_stage(
     if trainer.interrupted:
         raise KeyboardInterrupt
     if trainer.is_global_zero:
-        save_renderer(stage_end(folder, number, stage), module.renderer)
-        remove_checkpoints(folder, number, stage)
+        _end_stage(folder, number, stage, module)
     trainer.strategy.barrier()
+
+
+def _end_stage(folder: Path, number: int, stage: Stage, module: RendererModule) -> None:
+    save_renderer(stage_end(folder, number, stage), module.renderer)
+    remove_checkpoints(folder, number, stage)
 
 
 def _announce(number: int, stages: list[Stage], max_seconds: float | None, first_step: int) -> None:

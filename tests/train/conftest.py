@@ -1,5 +1,6 @@
 """A dataset folder small enough to train on in a second, and the settings to do so."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,16 @@ def _frame(random: np.random.Generator, size: int) -> dict[str, np.ndarray]:
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory) -> Path:
     return write_dataset(tmp_path_factory.mktemp("dataset"), {"train": 5, "train_b": 3, "test": 2})
+
+
+@pytest.fixture(scope="session")
+def make_dataset() -> Callable[..., Path]:
+    return write_dataset
+
+
+@pytest.fixture(scope="session")
+def make_settings() -> Callable[..., dict[str, Any]]:
+    return small_settings
 
 
 def small_settings(dataset: Path, output_dir: Path, **changes: Any) -> dict[str, Any]:

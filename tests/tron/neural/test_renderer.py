@@ -42,7 +42,7 @@ def test_skip_mean_starts_from_the_mean_of_the_buffers():
 def test_averaging_keeps_the_pretrained_input_width_and_concatenation_doubles_it():
     padded = SMALL.model_copy(update={"padding_channel": True})
     for fusion, channels in (("average", 192 + 1), ("concat", 2 * 192 + 1)):
-        renderer = NeuralRenderer(RendererConfig(fusion=fusion, backbone=padded))
+        renderer = NeuralRenderer(RendererConfig.model_validate({"fusion": fusion, "backbone": padded}))
         assert renderer.backbone.transformer.patch_embed.proj.in_features == channels
 
 
@@ -113,7 +113,7 @@ def test_every_parameter_that_is_not_frozen_gets_a_gradient():
 def test_one_batch_can_be_learnt_by_heart(fusion):
     torch.manual_seed(0)
     pbr, irradiance, target = buffers(1, 8, 8, batch=1)
-    renderer = NeuralRenderer(RendererConfig(fusion=fusion, backbone=SMALL))
+    renderer = NeuralRenderer(RendererConfig.model_validate({"fusion": fusion, "backbone": SMALL}))
     optimizer = torch.optim.AdamW(renderer.parameters(), lr=5e-3)
     first = last = (pbr - target).square().mean().item()
     for _ in range(150):
@@ -128,7 +128,7 @@ def test_one_batch_can_be_learnt_by_heart(fusion):
 def test_a_pixel_mlp_sees_single_pixels():
     torch.manual_seed(0)
     mlp = PixelMLP(PixelMLPConfig(width=16))
-    torch.nn.init.normal_(mlp.layers[-1].weight)
+    torch.nn.init.normal_(list(mlp.parameters())[-2])
     pbr, irradiance, _ = buffers(5, 8, 8)
     order = torch.randperm(8 * 8 * 5)
     shuffled = [b.flatten(2)[..., order].view_as(b) for b in (pbr, irradiance)]

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from typing import Any
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from tron.neural.renderer import NeuralRenderer, RendererConfig
 from tron.neural.weights import load_cosmos, load_renderer, load_wan, save_renderer
 
 SMALL = BackboneConfig(heads=2, head_dim=12, layers=2, adaln_lora_dim=8)
-WAN = {"base_dim": 8, "num_res_blocks": 1}
+WAN: dict[str, Any] = {"base_dim": 8, "num_res_blocks": 1}
 COSMOS = BackboneConfig(
     heads=2,
     head_dim=12,
@@ -169,7 +170,7 @@ def test_a_trained_cosmos_renderer_is_saved_without_the_frozen_vae(published, tm
     assert all(name.startswith("backbone.") for name in load_file(tmp_path / "r.safetensors"))
     again = load_renderer(tmp_path / "r.safetensors", vae=folder / "vae")
     with torch.no_grad():
-        torch.testing.assert_close(again(*inputs()), renderer(*inputs()), atol=0, rtol=0)
+        torch.testing.assert_close(again(*inputs()), renderer(*inputs()), atol=1e-5, rtol=0)
     with pytest.raises(TronError, match=r"tokenizer\.pth"):
         load_renderer(tmp_path / "r.safetensors")
 

@@ -1,0 +1,57 @@
+"""Stages and their pace: what the schedule promises at its ends and in between."""
+
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from train.curriculum import Pace, Stage, learning_rate_factor
+
+
+def test_the_rate_rises_to_its_peak_falls_like_a_cosine_and_ends_at_the_floor():
+    rates = [learning_rate_factor(step / 1000, step, 100, 0.01) for step in range(1001)]
+    assert rates[0] == pytest.approx(1 / 101)
+    assert int(np.argmax(rates)) in range(90, 111)
+    assert rates[-1] == pytest.approx(0.01)
+    assert all(b < a for a, b in pairwise(rates[101:]))
+    assert rates[500] == pytest.approx(0.505)  # half way between 1 and 0.01
+
+
+def test_without_warm_up_the_first_step_is_the_peak():
+    assert learning_rate_factor(0.0, 0, 0, 0.0) == 1.0
+
+
+def test_a_pace_by_steps_ignores_the_clock():
+    pace = Pace(200)
+    pace.start()
+    assert [pace.progress(step) for step in (0, 50, 200, 300)] == [0.0, 0.25, 1.0, 1.0]
+
+
+def test_a_pace_by_time_ignores_the_steps_and_stands_still_while_stopped():
+    pace = Pace(200, seconds_limit=10.0)
+    pace.spent = 2.5  # an earlier session's
+    assert pace.progress(10**9) == 0.25
+    pace.start()
+    time.sleep(0.02)
+    pace.stop()
+    reached = pace.progress(0)
+    assert 0.252 <= reached < 0.6
+    time.sleep(0.01)
+    assert pace.progress(0) == reached
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"frames": 2}, {"frames": 4}, {"name": "Stage 1"}, {"crop": 4}, {"rehearsal_ratio": 1.5}, {"x": 1}],
+)
+def test_stages_that_cannot_run_are_refused(wrong):
+    with pytest.raises(ValidationError):
+        Stage.model_validate({"name": "one", "split": "train", "steps": 10} | wrong)
+
+
+def test_a_stage_draws_from_its_rehearsal_split_only_if_it_takes_any():
+    stage = Stage(name="two", split="train_b", steps=1, rehearsal_split="train")
+    assert stage.splits() == ["train_b"]
+    assert stage.model_copy(update={"rehearsal_ratio": 0.1}).splits() == ["train_b", "train"]

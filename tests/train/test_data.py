@@ -1,0 +1,175 @@
+"""Batches: a function of seed, stage, rank and step; buffers stay aligned; streams resume where they were."""
+
+import itertools
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from train import data as training_data
+from train.curriculum import Stage
+from train.data import Batches, TrainingData, ValidationSettings, varied
+from train.sources import BUFFERS, CachedSplit, DataSettings, display_video
+from tron import seeds
+from tron.color import to_display
+from tron.errors import TronError
+from tron.shards import read_clips
+
+STAGE = Stage(name="one", split="train", steps=10, batch_size=3, crop=16)
+MIXED = Stage(
+    name="two",
+    split="train_b",
+    frames=5,
+    steps=10,
+    batch_size=2,
+    crop=16,
+    rehearsal_split="train",
+    rehearsal_ratio=0.25,
+)
+
+
+def batches(dataset: Path, stage: Stage = STAGE, cache: bool = True, **options) -> Batches:
+    settings = DataSettings(shuffle_buffer=4)
+    cached = {split: CachedSplit(dataset, split, 0) for split in stage.splits()} if cache else {}
+    return Batches(stage, cached, dataset, settings, options.pop("seed", 0), **options)
+
+
+def take(stream, count: int) -> list[torch.Tensor]:
+    return [torch.stack([b[name] for name in BUFFERS]) for b in itertools.islice(iter(stream), count)]
+
+
+def same(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
+    return len(a) == len(b) and all(torch.equal(x, y) for x, y in zip(a, b))
+
+
+@pytest.mark.parametrize("stage", [STAGE, MIXED])
+@pytest.mark.parametrize("cache", [True, False])
+def test_batches_repeat_and_a_resumed_run_sees_the_same_ones(dataset, monkeypatch, stage, cache):
+    monkeypatch.setattr(training_data, "SEGMENT", 4)
+    whole = take(batches(dataset, stage, cache), 10)
+    assert whole[0].shape == (3, stage.batch_size, 3, stage.frames, 16, 16)
+    assert same(whole, take(batches(dataset, stage, cache), 10))
+    for first in (1, 3, 4, 7):
+        assert same(whole[first:], take(batches(dataset, stage, cache, first_step=first), 10 - first))
+    assert not same(whole, take(batches(dataset, stage, cache, seed=1), 10))
+    assert not torch.equal(whole[0], whole[1])
+
+
+def test_streams_resume_with_several_loader_processes(dataset, monkeypatch):
+    monkeypatch.setattr(training_data, "SEGMENT", 4)
+
+    def loaded(first: int, count: int) -> list[torch.Tensor]:
+        stream = batches(dataset, STAGE, cache=False, first_step=first)
+        return take(DataLoader(stream, batch_size=None, num_workers=2), count)
+
+    whole = loaded(0, 9)
+    assert same(whole[3:], loaded(3, 6))
+
+
+def test_ranks_share_each_pass_over_the_clips(dataset):
+    stage = STAGE.model_copy(update={"batch_size": 1, "crop": None})
+    ranks = [batches(dataset, stage, rank=rank, ranks=2)._plan(step) for step in range(5) for rank in (0, 1)]
+    assert sorted(number for ((_, number, _),) in ranks) == list(range(10))
+
+
+def test_every_clip_is_seen_once_a_pass(dataset):
+    source = CachedSplit(dataset, "train", 0)
+    for number in range(10):
+        source.sample(training_data.Draw(number, seeds.generator(0, "x"), 1))
+        if number % 5 == 0:
+            assert sorted(source._order.tolist()) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.25, 0.5, 1.0])
+def test_rehearsal_takes_its_share_of_any_run_of_samples(dataset, ratio):
+    stage = MIXED.model_copy(update={"rehearsal_ratio": ratio})
+    stream = batches(dataset, stage)
+    plan = [entry for step in range(40) for entry in stream._plan(step)]
+    rehearsed = [split == "train" for split, _, _ in plan]
+    for start, length in ((0, 80), (3, 8), (17, 40)):
+        assert abs(sum(rehearsed[start : start + length]) - ratio * length) <= 1
+    for split in ("train", "train_b"):  # each split's own samples are counted without gaps
+        assert [n for s, n, _ in plan if s == split] == list(range(sum(s == split for s, _, _ in plan)))
+
+
+def test_crops_flips_and_colours_are_the_same_in_all_buffers():
+    grid = torch.arange(3 * 2 * 20 * 24, dtype=torch.float32).view(3, 2, 20, 24)
+    sample: dict[str, torch.Tensor] = {name: grid for name in BUFFERS}  # noqa: C420
+    settings = DataSettings(permute_colors=1.0)
+    seen = set()
+    for number in range(20):
+        out = varied(sample, seeds.generator(0, "varied", number), 8, settings)
+        assert all(torch.equal(out[name], out["pbr"]) for name in BUFFERS)
+        assert out["pbr"].shape == (3, 2, 8, 8)
+        corner = int(out["pbr"][0, 0, 0].min())
+        assert corner % 4 == 0
+        assert (corner % (20 * 24) // 24) % 4 == 0
+        seen.add(corner)
+    assert len(seen) > 10
+
+
+def test_without_options_a_sample_is_left_as_it_is():
+    sample = {name: torch.rand(3, 1, 8, 8) for name in BUFFERS}
+    out = varied(sample, seeds.generator(0, "x"), None, DataSettings(flip=0.0))
+    assert all(torch.equal(out[name], sample[name]) for name in BUFFERS)
+
+
+def test_exposure_and_agx_are_applied_at_load_and_display_members_are_left_alone(dataset):
+    clip = next(iter(read_clips(dataset, "test")))
+    clip.meta = clip.meta.model_copy(
+        update={"exposure": 0.3, "color_space": {"rgb": "display", "pbr": "linear"}}
+    )
+    shown = display_video(clip, "pbr")
+    np.testing.assert_allclose(
+        (np.moveaxis(shown, 0, -1) + 1) / 2, to_display(clip.frames["pbr"], 0.3), atol=1e-6
+    )
+    np.testing.assert_allclose(
+        (np.moveaxis(display_video(clip, "rgb"), 0, -1) + 1) / 2, clip.frames["rgb"], atol=1e-6
+    )
+
+
+def test_what_does_not_fit_the_budget_is_streamed(dataset):
+    for budget, cached in ((4.0, {"train"}), (1e-6, set())):
+        data = TrainingData(dataset, DataSettings(cache_gb=budget), 0, ValidationSettings())
+        data.open([STAGE])
+        assert set(data.cached) == cached
+        data.begin(STAGE, 0)
+        batch = next(iter(data.train_dataloader()))
+        assert batch["rgb"].shape == (3, 3, 1, 16, 16)
+
+
+def test_validation_shows_whole_frames_with_their_foreground(dataset):
+    data = TrainingData(dataset, DataSettings(), 0, ValidationSettings(clips=1))
+    data.begin(MIXED, 0)
+    (window,) = list(data.val_dataloader())
+    assert window["rgb"].shape == (1, 3, 5, 24, 24)  # six frames hold one window of five
+    assert window["mask"].shape == (1, 1, 5, 24, 24)
+    data.begin(STAGE, 0)
+    (window,) = list(data.val_dataloader())
+    assert window["rgb"].shape == (6, 3, 1, 24, 24)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"frames": 9}, "clips of 9 frames"),
+        ({"crop": 32}, "crops 32 pixels"),
+        ({"split": "nothing"}, "no split 'nothing'"),
+    ],
+)
+def test_stages_that_the_dataset_cannot_serve_fail_before_training(dataset, change, message):
+    data = TrainingData(dataset, DataSettings(), 0, ValidationSettings())
+    with pytest.raises(TronError, match=message):
+        data.open([STAGE.model_copy(update=change)])
+
+
+def test_a_stream_reports_a_damaged_shard(dataset, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(dataset, folder)
+    for path in folder.glob("train-*.tar"):
+        path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(TronError, match="shard"):
+        take(batches(folder, STAGE, cache=False), 1)
