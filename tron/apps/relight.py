@@ -91,6 +91,7 @@ class Settings(BaseModel):
         None, description="up direction of the scene; null: the file's own, or +z (COLMAP captures: [0,-1,0])"
     )
     checkpoint: Path | None = Field(None, description="renderer.safetensors, for neural pictures as well")
+    vae: Path | None = Field(None, description="WAN 2.1 VAE, for checkpoints that were trained with it")
     buffers: tuple[BufferName, ...] = Field(
         ("pbr", "irradiance", "unshadowed", "shadowed", "mask"), description="buffers written as EXR"
     )
@@ -195,10 +196,10 @@ def _load_renderer(settings: Settings) -> Any:
 
     if settings.threads is not None:
         set_torch_threads(settings.threads)
-    renderer = load_renderer(settings.checkpoint)
+    renderer = load_renderer(settings.checkpoint, settings.vae)
     if settings.variant.startswith("cuda"):
         renderer = renderer.to("cuda")
-    return renderer.eval()
+    return renderer
 
 
 def _cameras(scene: GaussianScene, turn: np.ndarray, settings: Settings) -> list[Camera]:
@@ -290,8 +291,9 @@ def _neural_pass(renderer: Any, folder: FrameFolder, frames: int, exposure: floa
 
     # A window that starts this many frames before a part makes the part's own frames independent of the cut.
     before = getattr(getattr(renderer, "config", None), "window", 1) - 1
-    for start in track(range(0, frames, CLIP_FRAMES), "neural"):
-        first, end = max(start - before, 0), min(start + CLIP_FRAMES, frames)
+    step = max(CLIP_FRAMES, before + 1)
+    for start in track(range(0, frames, step), "neural"):
+        first, end = max(start - before, 0), min(start + step, frames)
         pbr, irradiance = (np.stack([folder.read(i, name) for i in range(first, end)]) for name in GUIDANCE)
         display = render_clip(renderer, pbr, irradiance, exposure)
         for index in range(start, end):

@@ -1,15 +1,20 @@
 """tron-relight from end to end on a tiny scene: files, laws of light, resuming, and mistakes."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import plyfile
 import pytest
 
+from tron.apps import relight as app
+from tron.apps.frame_folder import FrameFolder
 from tron.apps.relight import cli
+from tron.cameras import Camera
 from tron.gaussians.ply import MATERIALS
 from tron.images import read_image
+from tron.seeds import generator
 from tron.shading.environment import EnvironmentMap
 from tron.video import read_video
 
@@ -34,13 +39,19 @@ def light_path(tmp_path_factory) -> Path:
     return path
 
 
-def relight(*overrides: str) -> int:
-    with pytest.raises(SystemExit) as exit_info:
-        cli([*overrides, f"width={SIZE}", f"height={SIZE}"])
-    return int(exit_info.value.code or 0)
+@pytest.fixture
+def relight(variant) -> Callable[..., int]:
+    """Runs the command in this process; gives its exit code."""
+
+    def run(*overrides: str) -> int:
+        with pytest.raises(SystemExit) as exit_info:
+            cli([*overrides, f"width={SIZE}", f"height={SIZE}", f"variant={variant}"])
+        return int(exit_info.value.code or 0)
+
+    return run
 
 
-def test_writes_frames_videos_sheet_and_report(variant, scene_path, light_path, tmp_path):
+def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, tmp_path):
     out = tmp_path / "out"
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=2"]
     assert relight(*base, "buffers=[normal,depth,mask]") == 0
@@ -64,7 +75,7 @@ def test_writes_frames_videos_sheet_and_report(variant, scene_path, light_path, 
     assert mask[SIZE // 2, SIZE // 2, 0] > 0.95
 
 
-def test_rotating_light_and_camera_together_changes_nothing_else(variant, scene_path, light_path, tmp_path):
+def test_rotating_light_and_camera_together_changes_nothing_else(relight, scene_path, light_path, tmp_path):
     """Frame 1 of four in an orbit is 90 degrees on: under light turned by 90 it is frame 0 again."""
     shots = {}
     for rotation in (0, 90):
@@ -80,7 +91,7 @@ def test_rotating_light_and_camera_together_changes_nothing_else(variant, scene_
 
 
 def test_the_side_towards_the_lamp_is_bright_and_a_shadow_falls_behind(
-    variant, scene_path, light_path, tmp_path
+    relight, scene_path, light_path, tmp_path
 ):
     out = tmp_path / "out"
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=4"]
@@ -92,10 +103,15 @@ def test_the_side_towards_the_lamp_is_bright_and_a_shadow_falls_behind(
     assert toward[ball, ball].mean() > 3 * away[ball, ball].mean()
     # From +y the lamp at +x is on the left (x axis points left), so the left half of the ball is brighter.
     assert left[ball, : SIZE // 2].mean() > 1.2 * left[ball, SIZE // 2 :].mean()
+    # The lamp stands 38 degrees high on +x: the ball's shadow lies on the floor towards -x.
+    camera = Camera.from_dict(json.loads((out / "relight.json").read_text())["cameras"][1])
+    pixels, _ = camera.project(np.array([[0.7, 0, 0], [-0.7, 0, 0]]))
+    lit, shaded = (left[int(y), int(x)] for x, y in pixels)
+    assert lit > 2 * shaded
 
 
 def test_a_second_run_renders_nothing_and_only_lost_frames_come_back(
-    variant, scene_path, light_path, tmp_path
+    relight, scene_path, light_path, tmp_path
 ):
     out = tmp_path / "out"
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=2"]
@@ -112,7 +128,7 @@ def test_a_second_run_renders_nothing_and_only_lost_frames_come_back(
     assert lost.read_bytes() == before[lost][1]
 
 
-def test_other_settings_in_the_same_folder_are_refused(variant, scene_path, light_path, tmp_path, capsys):
+def test_other_settings_in_the_same_folder_are_refused(relight, scene_path, light_path, tmp_path, capsys):
     out = tmp_path / "out"
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=1"]
     assert relight(*base) == 0
@@ -121,7 +137,7 @@ def test_other_settings_in_the_same_folder_are_refused(variant, scene_path, ligh
     assert relight(*base, "rotation=45", "overwrite=true") == 0
 
 
-def test_a_plain_3dgs_file_is_relit_with_a_warning(variant, scene_path, light_path, tmp_path, caplog):
+def test_a_plain_3dgs_file_is_relit_with_a_warning(relight, scene_path, light_path, tmp_path, caplog):
     """Without materials, and with normals of random sign, as 3DGS writes them."""
     rows = plyfile.PlyData.read(str(scene_path))["vertex"].data
     names = [name for name in rows.dtype.names if name not in (*MATERIALS, "object_id")]
@@ -144,7 +160,54 @@ def test_a_plain_3dgs_file_is_relit_with_a_warning(variant, scene_path, light_pa
     assert np.abs(masks[0] - masks[1]).mean() < 0.1
 
 
-def test_a_scene_lying_on_its_side_is_stood_up(variant, ball_on_floor, light_path, tmp_path):
+def test_a_new_renderer_shows_the_pbr_buffer(relight, scene_path, light_path, tmp_path):
+    """Untrained, a renderer gives its PBR input back; what is tested is the way there and back."""
+    from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
+    from tron.neural.weights import save_renderer
+
+    checkpoint, out = tmp_path / "renderer.safetensors", tmp_path / "out"
+    save_renderer(checkpoint, PixelMLP(PixelMLPConfig(width=4)))
+    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=2"]
+    assert relight(*base, f"checkpoint={checkpoint}") == 0
+    for index in range(2):
+        neural, pbr = (read_image(out / "frames" / f"{index:04d}.{name}.png") for name in ("neural", "pbr"))
+        np.testing.assert_allclose(neural, pbr, atol=1.01 / 255)
+    assert read_video(out / "guidance.mp4").shape == (2, SIZE, 3 * SIZE, 3)
+    assert read_video(out / "neural.mp4").shape == (2, SIZE, SIZE, 3)
+
+
+def test_a_clip_in_parts_is_the_clip_in_one(tmp_path, monkeypatch):
+    import torch
+
+    from tron.neural.backbone import BackboneConfig
+    from tron.neural.renderer import NeuralRenderer, RendererConfig, render_clip
+
+    small = BackboneConfig(heads=2, head_dim=12, layers=1, adaln_lora_dim=8)
+    renderer = NeuralRenderer(RendererConfig(window=5, backbone=small)).eval()
+    torch.manual_seed(1)
+    torch.nn.init.normal_(renderer.backbone.transformer.proj_out.weight, std=0.1)
+    folder = FrameFolder(tmp_path, app.GUIDANCE)
+    rng = generator(0, "test", "clip")
+    for index in range(13):
+        folder.write(index, {name: rng.uniform(0, 2, (16, 16, 3)) for name in app.GUIDANCE})
+    monkeypatch.setattr(app, "CLIP_FRAMES", 6)
+    app._neural_pass(renderer, folder, 13, exposure=0.7)
+    clip = (np.stack([folder.read(i, name) for i in range(13)]) for name in app.GUIDANCE)
+    whole = render_clip(renderer, *clip, exposure=0.7)
+    for index in range(13):
+        np.testing.assert_allclose(folder.row(index, ["neural"]), whole[index], atol=1.01 / 255)
+
+
+def test_cameras_of_a_report_repeat_its_frames(relight, scene_path, light_path, tmp_path):
+    base = [f"scene={scene_path}", f"environment={light_path}", "up=[0,1,1]", "frames=2"]
+    assert relight(*base, f"output_dir={tmp_path / 'a'}") == 0
+    assert relight(*base, f"output_dir={tmp_path / 'b'}", f"cameras={tmp_path / 'a' / 'relight.json'}") == 0
+    for index in range(2):
+        a, b = (read_image(tmp_path / run / "frames" / f"{index:04d}.mask.exr") for run in "ab")
+        assert np.abs(a - b).mean() < 1e-3
+
+
+def test_a_scene_lying_on_its_side_is_stood_up(relight, ball_on_floor, light_path, tmp_path):
     upright = ball_on_floor()
     lying = upright.rotated(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))  # up is now -y
     shots = []
@@ -172,7 +235,7 @@ def test_a_scene_lying_on_its_side_is_stood_up(variant, ball_on_floor, light_pat
     ],
 )
 def test_mistakes_are_one_line_and_leave_nothing(
-    variant, scene_path, light_path, tmp_path, capsys, change, words
+    relight, scene_path, light_path, tmp_path, capsys, change, words
 ):
     options = {"scene": scene_path, "environment": light_path, "output_dir": tmp_path / "out"} | change
     assert relight(*(f"{key}={value}" for key, value in options.items())) == 2
