@@ -41,6 +41,7 @@ def main(settings: Settings) -> int:
     from tron.runtime import describe_machine
 
     benchmark = make_benchmark(settings.benchmark)
+    benchmark.check()
     with locked(settings.output_dir):
         try:
             outcome = benchmark.run(settings.output_dir)

@@ -51,6 +51,13 @@ class Benchmark(BaseModel, abc.ABC):
     name: ClassVar[str]
     targets: list[Target] = Field(default_factory=list)
 
+    def check(self) -> None:
+        """Look at the inputs before anything is written.
+
+        Raises:
+            TronError: an input is missing or is not what it should be.
+        """
+
     @abc.abstractmethod
     def run(self, output_dir: Path) -> Outcome:
         """Measure. Pictures and other files go below ``output_dir``, which exists.

@@ -13,7 +13,7 @@ from eval.benchmarks.relighting import Relighting
 from eval.report.figures import written
 from eval.report.page import Cell, Section, Table
 from eval.results import Row
-from eval.stages import Child, Stages
+from eval.stages import Child, Stages, script_path
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 WORDS = {
@@ -37,6 +37,11 @@ class Demo(Benchmark):
         default=None, description="wall time of each training; null leaves it to the training recipe"
     )
     train_threads: PositiveInt = Field(default=1, description="threads of each of the two trainings")
+
+    def check(self) -> None:
+        """Find the commands that the stages call."""
+        for name in ("tron-datagen", "tron-train"):
+            script_path(name)
 
     def run(self, output_dir: Path) -> Outcome:
         """Run the stages that are not finished, evaluate, and add the ``demo.*`` rows.
@@ -89,7 +94,7 @@ class Demo(Benchmark):
         section = Section(
             "stages",
             "Where the time went",
-            [Table(caption, ["Stage", "Time", "What", "Command"], table, True)],
+            [Table(caption, ["Stage", "Time", "What", "Command"], table, words=[2, 3])],
         )
         return dataclasses.replace(
             outcome,

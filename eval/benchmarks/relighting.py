@@ -45,20 +45,26 @@ class Relighting(Benchmark):
     threads: PositiveInt = 1
     seed: int = 0
 
+    def check(self) -> None:
+        """Find the data set, its splits and the weights; TronError names what is missing."""
+        manifest = Manifest.load(self._dataset())
+        for split in (self.test_split, *self.train_splits):
+            manifest.of_split(split)
+        for path in (self.renderer, self.pixel_mlp, self.vae):
+            if path is not None and not path.exists():
+                raise TronError("weights not found", path, "give what tron-train wrote")
+
     def run(self, output_dir: Path) -> Outcome:
         """Fit on the training splits, score the test split, choose and make the pictures."""
-        if self.dataset is None:
-            raise TronError(
-                "no data set to evaluate on", mend="give dataset=DIR, a folder tron-datagen wrote"
-            )
-        manifest = Manifest.load(self.dataset)
-        manifest.of_split(self.test_split)
+        self.check()
+        dataset = self._dataset()
+        manifest = Manifest.load(dataset)
         set_torch_threads(self.threads)
         networks = self._networks()
         log.info("fitting the baselines on %s", ", ".join(self.train_splits))
         predictor = Predictor(fit_baselines(self._training_clips(), self.seed), networks)
         scores, guidance, clips = Scores(), GuidanceScores(), []
-        for clip in read_clips(self.dataset, self.test_split):
+        for clip in read_clips(dataset, self.test_split):
             scores.add(clip, predictor.shown(clip), displayed_truth(clip))
             guidance.add(clip)
             clips.append(clip.meta)
@@ -76,10 +82,14 @@ class Relighting(Benchmark):
             scores, guidance, clips, shown, self._curves(), inputs, output_dir, self._typed(output_dir)
         )
 
+    def _dataset(self) -> Path:
+        if self.dataset is None:
+            raise TronError("no data set to evaluate on", mend="give dataset=DIR, made by tron-datagen")
+        return self.dataset
+
     def _training_clips(self) -> Iterator[Clip]:
-        assert self.dataset is not None
         for split in self.train_splits:
-            yield from read_clips(self.dataset, split, MEMBERS)
+            yield from read_clips(self._dataset(), split, MEMBERS)
 
     def _networks(self) -> dict[str, Render]:
         given = {"neural": self.renderer, "pixel_mlp": self.pixel_mlp}
@@ -96,15 +106,15 @@ class Relighting(Benchmark):
     def _typed(self, output_dir: Path) -> list[str]:
         inputs = {"dataset": self.dataset, "renderer": self.renderer, "pixel_mlp": self.pixel_mlp}
         given = [f"{name}={path}" for name, path in inputs.items() if path is not None]
-        return [" ".join(["tron-eval benchmark=relighting", *given, f"output_dir={output_dir}"])]
+        return [" \\\n    ".join(["tron-eval benchmark=relighting", *given, f"output_dir={output_dir}"])]
 
     def _shown(self, predictor: Predictor, keys: list[str]) -> list[Shown]:
         """The middle frames of the chosen clips by every method, in that order: a second pass."""
-        if not keys or self.dataset is None:
+        if not keys:
             return []
         shown = {
             clip.meta.key: middle_frame(clip, predictor.shown(clip)["frame"], displayed_truth(clip))
-            for clip in read_clips(self.dataset, self.test_split)
+            for clip in read_clips(self._dataset(), self.test_split)
             if clip.meta.key in keys
         }
         return [shown[key] for key in keys]

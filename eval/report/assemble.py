@@ -74,20 +74,20 @@ def _targets(results: Results, targets: Sequence[Target]) -> Section:
             ]
         )
     caption = "Bounds set before the measurement; verdicts are on the unrounded figures."
-    table = Table(caption, ["Figure", "Measured", "Target", "Verdict"], rows)
+    table = Table(caption, ["Figure", "Measured", "Target", "Verdict"], rows, words=[3])
     return Section("targets", "Targets", [table])
 
 
 def _provenance(environment: dict[str, Any], commit: str, reproduce: Sequence[str]) -> Section:
     described: dict[str, str] = {"commit": commit}
-    for key, value in environment.items():
-        if key not in ("commit", "dirty") and value not in (None, "", {}):
+    for key, value in {**environment, **environment.get("inputs", {})}.items():
+        if key not in ("commit", "dirty", "inputs") and value not in (None, "", {}):
             described[key.replace("_", " ")] = _plain(value)
     table = Table(
         "Where and with what this was measured.",
         ["Property", "Value"],
         [[Cell(key), Cell(value)] for key, value in described.items()],
-        prose=True,
+        words=[1],
     )
     blocks = [table]
     if reproduce:

@@ -5,6 +5,10 @@ from __future__ import annotations
 from eval.report.page import Tone
 from eval.results import Target
 
+MINUS = "\N{MINUS SIGN}"
+_STYLES = {"fraction": (100, 2, "%"), "s": (1, 0, " s"), "deg": (1, 2, "°"), "1": (1, 3, "")}
+"""Unit -> factor, decimals, what is written behind the number."""
+
 
 def written(value: float, unit: str, signed: bool = False) -> str:
     """A figure with its unit: fractions as percent, seconds beyond a minute as minutes too.
@@ -12,19 +16,12 @@ def written(value: float, unit: str, signed: bool = False) -> str:
     >>> written(0.0123, "fraction"), written(31.456, "dB"), written(754, "s")
     ('1.23%', '31.46 dB', '12 min 34 s')
     """
-    sign = "+" if signed else ""
-    if unit == "fraction":
-        return f"{100 * value:{sign}.2f}%"
-    if unit == "s":
-        if signed or abs(value) < 60:
-            return f"{value:{sign}.0f} s"
+    if unit == "s" and not signed and abs(value) >= 60:
         minutes, seconds = divmod(round(value), 60)
         return f"{minutes} min {seconds} s"
-    if unit == "deg":
-        return f"{value:{sign}.2f}°"
-    if unit == "1":
-        return f"{value:{sign}.3f}"
-    return f"{value:{sign}.2f} {unit}"
+    scale, digits, suffix = _STYLES.get(unit, (1, 2, f" {unit}"))
+    value = round(scale * value, digits) + 0.0  # adding zero turns a negative zero into zero
+    return f"{value:{'+' if signed and value else ''}.{digits}f}{suffix}".replace("-", MINUS)
 
 
 def verdict(target: Target, measured: float | None, unit: str) -> tuple[str, Tone]:

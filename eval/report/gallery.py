@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eval.guidance import DARKENED_BELOW, LEAK_OVER_MEAN, shadow_errors, surface_mask
+from eval.guidance import shadow_errors, surface_mask
 from eval.report.page import Picture, Pictures
 from eval.scores import PSNR_CAP
 from tron import metrics
@@ -82,7 +82,7 @@ def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
         np.where(foreground, to_display(frames[name], clip.meta.exposure), 0) for name in ("irr", "irr_ref")
     )
     pictures = {
-        "irradiance": ours,
+        "irradiance, surfels": ours,
         "irradiance, path-traced": truth,
         f"difference ×{ERROR_GAIN}": np.clip(np.abs(ours - truth) * ERROR_GAIN, 0, 1),
         "shadow errors": _shadow_error_picture(frames, truth),
@@ -132,11 +132,7 @@ def guidance(shown: Shown) -> Pictures:
     """Irradiance, its reference and errors; base color and normals of the surfels beside the true ones."""
     where = f"scene {shown.meta.scene} under light {shown.meta.light}"
     pictures = [Picture(image, name, f"{name}, {where}") for name, image in shown.guidance.items()]
-    note = (
-        f"Shadow errors: orange where a shadow leaks (more than {LEAK_OVER_MEAN:.0%} of the mean light too "
-        f"bright), blue where a lit pixel keeps less than {DARKENED_BELOW:.0%} of its light."
-    )
-    return Pictures(shown.title, pictures, note)
+    return Pictures(shown.title, pictures)
 
 
 def write_strips(groups: Sequence[Pictures], names: Sequence[str], folder: Path) -> None:

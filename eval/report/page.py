@@ -37,15 +37,18 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells under headings; the first column names the row, the others hold figures unless
-    ``prose``.
+    """Rows of cells under headings; the first column names the row, the others hold figures.
+
+    ``groups`` are headings over several columns: (text, number of columns), from the left. Columns in
+    ``words`` hold text instead of figures, and may break into lines.
     """
 
     kind: ClassVar[str] = "table"
     caption: str
     headings: Sequence[str]
     rows: Sequence[Sequence[Cell]]
-    prose: bool = False
+    groups: Sequence[tuple[str, int]] = ()
+    words: Sequence[int] = ()
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from eval.baselines import SEVEN, THREE
 from eval.benchmarks import Outcome
 from eval.guidance import DARKENED_BELOW, LEAK_OVER_MEAN, LIT_ABOVE, SHADOWED_BELOW, GuidanceScores
 from eval.predictions import Region
-from eval.report.figures import written
+from eval.report.figures import MINUS, written
 from eval.report.gallery import Shown, comparison, guidance, write_strips
 from eval.report.page import Block, Cell, Chart, Section, Table, Text
 from eval.results import Row
@@ -34,7 +34,9 @@ HEADLINE = {
     "neural.gain_over_best_of_seven": "Gain over the best of all seven baselines",
     "neural.psnr_full": "Neural renderer, full-frame PSNR",
     "guidance.irradiance_psnr": "Irradiance against path tracing, worst kind of light",
+    "guidance.shadow_leak": "Shadow pixels of the surfels that leak light",
     "surfels.base_color_psnr": "Base color of the surfels",
+    "surfels.normal_mae_deg": "Normals of the surfels, mean error",
 }
 LEAD = (
     "TRON relights captured 3D worlds. A scene becomes a cloud of small flat disks (surfels) with "
@@ -111,9 +113,8 @@ def _more(gain: float) -> str:
 
 
 def _methods(scores: Scores) -> list[Block]:
-    headings = ["Method", "What it is"]
-    for region in REGIONS:
-        headings += [f"PSNR, {REGION_WORDS[region]}", "SSIM", "neural gains"]
+    headings = ["Method", "What it is", *(["PSNR", "SSIM", "neural gains"] * len(REGIONS))]
+    groups = [("", 2), *((REGION_WORDS[region], 3) for region in REGIONS)]
     rows = []
     for method in scores.methods:
         tone = "strong" if method == "neural" else "plain"
@@ -122,7 +123,7 @@ def _methods(scores: Scores) -> list[Block]:
             psnr, ssim = scores.mean(method, region), scores.mean(method, region, metric="ssim")
             gain = None if method == "neural" else scores.gain((method,), region)
             row += [
-                Cell(written(psnr[0], "dB") if psnr else "—", tone),
+                Cell(f"{psnr[0]:.2f}" if psnr else "—", tone),
                 Cell(written(ssim[0], "1") if ssim else "—", tone),
                 _gain_cell(gain),
             ]
@@ -132,12 +133,14 @@ def _methods(scores: Scores) -> list[Block]:
         for region in REGIONS:
             best = scores.best(methods, region)
             row += [
-                Cell(f"{written(best[1], 'dB')}" if best else "—", "strong"),
+                Cell(f"{best[1]:.2f}" if best else "—", "strong"),
                 Cell(best[0] if best else "—", "faint"),
                 _gain_cell(scores.gain(methods, region)),
             ]
         rows.append(row)
     notes = (
+        "PSNR says how close a picture is to the truth, in decibels: 20 dB is a typical error of 10% of full "
+        "brightness, 30 dB of 3%, and 6 dB more halve it. SSIM compares structure; 1 is identical. "
         "PSNR is taken of each displayed frame (exposure, then the AgX tone curve; peak 1) and averaged "
         "over frames; SSIM likewise. “Neural gains” is the neural renderer's mean PSNR minus the method's. "
         "Foreground is where a ray through the pixel's centre meets true geometry. Best of three: "
@@ -145,18 +148,21 @@ def _methods(scores: Scores) -> list[Block]:
         "are fitted on the training split in float64, once for the foreground and once for full frames: each "
         "is judged where it is strongest."
     )
-    return [Table("Higher is better everywhere.", headings, rows), Text(notes)]
+    caption = "PSNR and gains in dB; higher is better everywhere."
+    return [Table(caption, headings, rows, groups, words=[1]), Text(notes)]
 
 
 def _gain_cell(gain: tuple[float, int] | None) -> Cell:
     if gain is None:
         return Cell("")
-    return Cell(written(gain[0], "dB", signed=True), "good" if gain[0] >= 0 else "bad")
+    text = written(gain[0], "dB", signed=True).removesuffix(" dB")
+    return Cell(text, "good" if text[0] == "+" else "bad" if text[0] == MINUS else "plain")
 
 
 def _families(scores: Scores) -> Table:
     families = scores.families
-    headings = ["Method", *(f"{family}, {REGION_WORDS[region]}" for region in REGIONS for family in families)]
+    headings = ["Method", *families, *families]
+    groups = [("", 1), *((REGION_WORDS[region], len(families)) for region in REGIONS)]
     places: list[tuple[Region, str]] = [(region, family) for region in REGIONS for family in families]
     rows = []
     for method in scores.methods:
@@ -169,7 +175,7 @@ def _families(scores: Scores) -> Table:
     counts = [
         f"{family}: {mean[1]} frames" for family in families if (mean := scores.mean("pbr", "frame", family))
     ]
-    return Table(f"PSNR in dB by kind of light ({', '.join(counts)}).", headings, rows)
+    return Table(f"PSNR in dB by kind of light ({', '.join(counts)}).", headings, rows, groups)
 
 
 def _guidance_section(scores: GuidanceScores, shown: Sequence[Shown], output_dir: Path) -> list[Section]:
@@ -183,7 +189,8 @@ def _guidance_section(scores: GuidanceScores, shown: Sequence[Shown], output_dir
         f"foreground. A pixel is in shadow where under {SHADOWED_BELOW:.0%} of the unshadowed light arrives "
         f"in the reference, and leaks if it is brighter than the reference by more than {LEAK_OVER_MEAN:.0%}"
         f" of the frame's mean; it is lit where over {LIT_ABOVE:.0%} arrives, and darkened if it keeps less "
-        f"than {DARKENED_BELOW:.0%} of it."
+        f"than {DARKENED_BELOW:.0%} of it. Pictures called shadow errors show leaking pixels in orange and "
+        "darkened ones in blue, over the reference."
     )
     blocks: list[Block] = [intro]
     families = sorted(scores.irradiance_psnr)
@@ -211,8 +218,8 @@ def _guidance_section(scores: GuidanceScores, shown: Sequence[Shown], output_dir
         if metric in rows
     ]
     if surfels:
-        blocks.append(Table("Surfels at held-out views.", ["Figure", "Measured", "How"], surfels))
-    drawn = [each for each in shown if each.guidance]
+        blocks.append(Table("Surfels at held-out views.", ["Figure", "Measured", "How"], surfels, words=[2]))
+    drawn = list({each.meta.light_family: each for each in reversed(shown) if each.guidance}.values())
     groups = [guidance(each) for each in drawn]
     write_strips(groups, [f"{each.meta.key}-guidance" for each in drawn], output_dir / "pictures")
     return [Section("guidance", "The guidance itself", [*blocks, *groups])]

@@ -1,0 +1,100 @@
+"""The demo's orchestration; stand-ins for the two long commands copy what those would make."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from eval import stages as stages_module
+from eval.cli import cli
+from eval.results import Results
+
+STAND_IN = """#!{python}
+import pathlib, shutil, sys
+given = dict(argument.split("=", 1) for argument in sys.argv[1:])
+out = pathlib.Path(given["output_dir"])
+with open({log!r}, "a") as log:
+    log.write(" ".join(["{name}", *sys.argv[1:]]) + "\\n")
+{body}
+"""
+MAKE = "shutil.copytree({dataset!r}, out)\nprint('12 clips')"
+TRAIN = """
+out.mkdir(parents=True)
+shutil.copy(pathlib.Path({weights!r}) / (given["renderer"] + ".safetensors"), out / "renderer.safetensors")
+"""
+
+
+@pytest.fixture
+def stand_ins(tmp_path: Path, dataset: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Puts the stand-ins in place; returns the file that lists the commands that ran."""
+    log = tmp_path / "commands.txt"
+    for name, body in (
+        ("tron-datagen", MAKE.format(dataset=str(dataset))),
+        ("tron-train", TRAIN.format(weights=str(weights))),
+    ):
+        path = tmp_path / name
+        path.write_text(STAND_IN.format(python=sys.executable, log=str(log), name=name, body=body))
+        path.chmod(0o755)
+    monkeypatch.setattr(stages_module, "script_path", lambda name: str(tmp_path / name))
+    return log
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as end:
+        cli(["benchmark=demo", "benchmark.relighting.pictures=1", *arguments])
+    return end.value.code  # type: ignore[return-value]
+
+
+def test_the_demo_goes_from_nothing_to_a_report_and_a_second_run_only_evaluates(
+    stand_ins: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "demo"
+    assert run(f"output_dir={out}") == 0
+    commands = stand_ins.read_text().splitlines()
+    assert commands[0] == f"tron-datagen experiment=demo output_dir={out / 'dataset'}"
+    assert sorted(command.split()[2] for command in commands[1:]) == ["renderer=pixel_mlp", "renderer=tiny"]
+    limits = {word for command in commands[1:] for word in command.split() if word.startswith("max_seconds=")}
+    assert len(limits) == 1, "both networks train for the same time"
+    results = Results.load(out / "results.json")
+    assert results.benchmark == "demo"
+    parts = [results.value(f"demo.{stage}_seconds") for stage in ("datagen", "train", "eval")]
+    assert all(parts)
+    assert results.value("demo.seconds") == pytest.approx(sum(parts))  # type: ignore[arg-type]
+    said = capfd.readouterr().out
+    assert "[datagen] 12 clips" in said
+    assert f"report: {out / 'report.html'}" in said
+    assert "demo.seconds" in said
+    html = (out / "report.html").read_text()
+    assert "Where the time went" in html
+
+    assert run(f"output_dir={out}") == 0
+    assert stand_ins.read_text().splitlines() == commands
+    again = Results.load(out / "results.json")
+    for stage in ("datagen", "train"):
+        assert again.value(f"demo.{stage}_seconds") == results.value(f"demo.{stage}_seconds")
+    stages = json.loads((out / "stages.json").read_text())["stages"]
+    assert list(stages) == ["datagen", "train", "eval"]
+    assert all(stage["finished"] for stage in stages.values())
+
+
+def test_a_stage_that_fails_ends_the_demo_with_its_words_and_code(
+    stand_ins: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
+    (tmp_path / "tron-train").write_text(
+        f"#!{sys.executable}\nimport sys\nsys.exit(print('tron-train: out of luck', file=sys.stderr) or 7)\n"
+    )
+    out = tmp_path / "demo"
+    assert run(f"output_dir={out}") == 7
+    assert "failed with exit code 7: tron-train: out of luck" in capfd.readouterr().err
+    assert not (out / "results.json").exists()
+    assert len(stand_ins.read_text().splitlines()) == 1  # the data set is made, and is kept
+
+
+def test_other_settings_do_not_mix_with_a_finished_data_set(
+    stand_ins: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "demo"
+    assert run(f"output_dir={out}") == 0
+    assert run(f"output_dir={out}", 'benchmark.datagen=["experiment=paper"]') == 2
+    assert "begun with other settings" in capfd.readouterr().err

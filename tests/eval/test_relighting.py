@@ -1,0 +1,172 @@
+"""The benchmark `relighting` on a drawn data set, end to end, with untrained networks: both return pbr."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eval.benchmarks import Outcome
+from eval.benchmarks.relighting import Relighting, choose_clips
+from eval.cli import cli
+from eval.report.page import Pictures
+from eval.results import Results
+from eval.scores import Score, Scores
+from tron.images import read_image
+
+REQUIRED = [
+    *(
+        f"{method}.{metric}{region}"
+        for method in (
+            "neural",
+            "pbr",
+            "pbr_x_irradiance",
+            "shadow_ratio",
+            "shadowed",
+            "affine",
+            "affine_ratio",
+            "pixel_mlp",
+        )
+        for metric in ("psnr", "ssim")
+        for region in ("", "_full")
+    ),
+    *(
+        f"neural.gain_over_best_of_{n}{region}{family}"
+        for n in ("three", "seven")
+        for region in ("", "_full")
+        for family in ("", ".sun", ".studio", ".overcast")
+    ),
+    *("guidance.irradiance_psnr", "guidance.irradiance_psnr.sun", "guidance.shadow_leak"),
+    *("guidance.lit_darkened", "surfels.base_color_psnr", "surfels.normal_mae_deg"),
+]
+
+
+@pytest.fixture(scope="module")
+def outcome(dataset: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    benchmark = Relighting(
+        dataset=dataset,
+        renderer=weights / "tiny.safetensors",
+        pixel_mlp=weights / "pixel_mlp.safetensors",
+        pictures=3,
+    )
+    return benchmark.run(tmp_path_factory.mktemp("output"))
+
+
+def values(outcome: Outcome) -> dict[str, float]:
+    return {row.metric: row.value for row in outcome.rows}
+
+
+def test_every_row_of_the_issue_is_there(outcome: Outcome):
+    rows = {row.metric: row for row in outcome.rows}
+    assert [metric for metric in REQUIRED if metric not in rows] == []
+    assert len(rows) == len(outcome.rows)
+    assert rows["neural.psnr"].n == 2 * 3 * 2  # scenes, lights, frames
+    assert rows["neural.psnr.sun"].n == 2 * 2
+
+
+def test_networks_that_return_pbr_score_as_pbr(outcome: Outcome):
+    found = values(outcome)
+    for region in ("", "_full"):
+        assert found[f"neural.psnr{region}"] == pytest.approx(found[f"pbr.psnr{region}"], abs=1e-3)
+        assert found[f"pixel_mlp.psnr{region}"] == pytest.approx(found[f"pbr.psnr{region}"], abs=1e-3)
+        best = max(found[f"{name}.psnr{region}"] for name in ("pbr", "shadow_ratio", "affine"))
+        gain = found[f"neural.gain_over_best_of_three{region}"]
+        assert gain == pytest.approx(found[f"neural.psnr{region}"] - best, abs=1e-9)
+
+
+def test_baselines_rank_as_they_must_in_a_world_of_shadows(outcome: Outcome):
+    found = values(outcome)
+    assert found["pbr.psnr"] < found["shadow_ratio.psnr"] < found["affine_ratio.psnr"]
+    assert found["affine.psnr"] < found["affine_ratio.psnr"]
+
+
+def test_every_shown_clip_has_its_pictures(outcome: Outcome):
+    groups = {
+        section.name: [block for block in section.blocks if isinstance(block, Pictures)]
+        for section in outcome.sections
+    }
+    assert len(groups["pictures"]) == 3
+    titles = [picture.title for picture in groups["pictures"][0].pictures]
+    assert titles[:2] == ["pbr", "irradiance"]
+    assert titles[-3:] == ["neural renderer", "path-traced truth", "|neural renderer − truth| ×3"]
+    assert all(picture.alt for group in groups["pictures"] for picture in group.pictures)
+    assert {"irradiance, surfels", "shadow errors", "normals, true"} <= {
+        picture.title for picture in groups["guidance"][0].pictures
+    }
+
+
+def test_the_command_writes_results_report_and_pictures(
+    dataset: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    with pytest.raises(SystemExit) as end:
+        cli(
+            [
+                "benchmark=relighting",
+                f"dataset={dataset}",
+                f"renderer={weights / 'tiny.safetensors'}",
+                f"output_dir={tmp_path}",
+                "benchmark.pictures=1",
+            ]
+        )
+    assert end.value.code == 0
+    results = Results.load(tmp_path / "results.json")
+    assert results.benchmark == "relighting"
+    assert {"cpu", "commit", "packages"} <= set(results.environment)
+    metrics = {row.metric for row in results.rows}
+    assert not [name for name in metrics if name.startswith("pixel_mlp") or "best_of_seven" in name]
+    assert results.find("neural.gain_over_best_of_three").reference == "target: at least 3 dB"  # type: ignore[union-attr]
+    assert "null" not in json.dumps([row.value for row in results.rows])
+    picture = read_image(next(path for path in (tmp_path / "pictures").glob("*-guidance.png")))
+    assert picture.shape == (2 * 32, 4 * 32, 3)
+    out = capsys.readouterr().out
+    assert f"report: {tmp_path / 'report.html'}" in out
+    assert "neural.psnr" in out
+    assert "not measured" in out
+    assert (tmp_path / "report.html").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    "arguments, said",
+    [
+        (["benchmark=relighting"], "no data set to evaluate on"),
+        (["dataset=/nowhere"], "manifest.json"),
+        (["dataset={dataset}", "renderer=/nowhere/x.safetensors"], "/nowhere/x.safetensors"),
+        (["dataset={dataset}", "benchmark.test_split=elsewhere"], "no split 'elsewhere'"),
+        (["dataset={dataset}", "benchmark.train_splits=[elsewhere]"], "no split 'elsewhere'"),
+        (["benchmark=nonsense"], "unknown benchmark 'nonsense'"),
+        (["benchmark.picture=3"], "did you mean 'benchmark.pictures'?"),
+        (["benchmark.pictures=-1"], "benchmark.pictures"),
+        (["threads=none"], "threads"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(
+    arguments: list[str], said: str, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    arguments = [argument.format(dataset=dataset) for argument in arguments]
+    with pytest.raises(SystemExit) as end:
+        cli([*arguments, f"output_dir={tmp_path / 'out'}"])
+    assert end.value.code == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_shown_clips_span_the_ranking_from_the_worst_to_the_best():
+    scores = Scores()
+    for clip, gain in (("c", 3.0), ("a", 1.0), ("e", 5.0), ("b", 2.0), ("d", 4.0)):
+        for method, psnr in (("neural", 20 + gain), ("pbr", 20.0)):
+            score = Score(method, "foreground", "sun", clip, 0, psnr, 0.9)
+            scores._kept.setdefault((method, "foreground"), []).append(score)
+    assert choose_clips(scores, 3) == ["a", "c", "e"]
+    assert choose_clips(scores, 1) == ["a"]
+    assert choose_clips(scores, 9) == ["a", "b", "c", "d", "e"]
+    assert choose_clips(scores, 0) == []
+
+
+def test_evaluation_is_the_same_twice(dataset: Path, tmp_path: Path, write_dataset: Callable[..., Path]):
+    del write_dataset
+    first, second = (values(Relighting(dataset=dataset, pictures=0).run(tmp_path)) for _ in range(2))
+    assert first == second
+    assert all(np.isfinite(list(first.values())))

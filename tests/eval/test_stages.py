@@ -1,0 +1,108 @@
+"""Stages run once, side by side, keep their seconds, and fail with the child's own words."""
+
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from eval import stages as stages_module
+from eval.stages import Child, StageFailed, StageFile, Stages
+from tron.errors import TronError
+
+
+@pytest.fixture
+def scripts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of console scripts in place of the one beside this Python; fill it with `script`."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    monkeypatch.setattr(stages_module, "script_path", lambda name: str(folder / name))
+    return folder
+
+
+def script(folder: Path, name: str, body: str) -> None:
+    (folder / name).write_text(f"#!{sys.executable}\nimport os, sys, time\n{body}\n")
+    (folder / name).chmod(0o755)
+
+
+def test_a_finished_stage_is_not_redone_and_keeps_its_seconds(tmp_path: Path, scripts: Path):
+    script(scripts, "tron-x", f"open({str(tmp_path / 'runs')!r}, 'a').write('x'); time.sleep(0.2)")
+    first = Stages(tmp_path).run("make", [Child("x", "tron-x", ["a=1"])])
+    second = Stages(tmp_path).run("make", [Child("x", "tron-x", ["a=1"])])
+    assert (tmp_path / "runs").read_text() == "x"
+    assert 0.2 <= first == pytest.approx(second)
+
+
+def test_a_stage_of_other_settings_is_not_taken_for_this_one(tmp_path: Path, scripts: Path):
+    script(scripts, "tron-x", "")
+    Stages(tmp_path).run("make", [Child("x", "tron-x", ["a=1"])])
+    with pytest.raises(TronError, match="begun with other settings"):
+        Stages(tmp_path).run("make", [Child("x", "tron-x", ["a=2"])])
+
+
+def test_children_run_at_the_same_time_and_speak_behind_their_labels(
+    tmp_path: Path, scripts: Path, capfd: pytest.CaptureFixture[str]
+):
+    body = f"""
+mine, other = sys.argv[1:3]
+open(os.path.join({str(tmp_path)!r}, mine), "w").close()
+end = time.time() + 20
+while not os.path.exists(os.path.join({str(tmp_path)!r}, other)):
+    assert time.time() < end, "the other never started"
+    time.sleep(0.01)
+print("met", os.environ["GREETING"])
+"""
+    script(scripts, "tron-x", body)
+    children = [
+        Child("one", "tron-x", ["a", "b"], {"GREETING": "hello"}),
+        Child("two", "tron-x", ["b", "a"], {"GREETING": "hallo"}),
+    ]
+    Stages(tmp_path).run("make", children)
+    out = capfd.readouterr().out
+    assert "[one] met hello" in out
+    assert "[two] met hallo" in out
+
+
+def test_a_failure_ends_with_the_childs_words_and_code_and_stops_the_other(tmp_path: Path, scripts: Path):
+    script(
+        scripts,
+        "tron-bad",
+        "print('warming up'); print('tron-bad: no such file (x.ply)', file=sys.stderr); sys.exit(2)",
+    )
+    script(scripts, "tron-slow", "time.sleep(60)")
+    begin = time.monotonic()
+    with pytest.raises(StageFailed) as failure:
+        Stages(tmp_path).run("make", [Child("slow", "tron-slow", []), Child("bad", "tron-bad", ["a=1"])])
+    assert time.monotonic() - begin < 20
+    assert failure.value.exit_code == 2
+    assert str(failure.value) == "tron-bad a=1 failed with exit code 2: tron-bad: no such file (x.ply)"
+    record = StageFile.model_validate_json((tmp_path / "stages.json").read_bytes()).stages["make"]
+    assert not record.finished
+    assert record.seconds > 0
+
+
+def test_the_seconds_of_failed_attempts_count(tmp_path: Path, scripts: Path):
+    body = f"time.sleep(0.3); sys.exit(not os.path.exists({str(tmp_path / 'ready')!r}))"
+    script(scripts, "tron-x", body)
+    with pytest.raises(StageFailed):
+        Stages(tmp_path).run("make", [Child("x", "tron-x", [])])
+    (tmp_path / "ready").touch()
+    assert Stages(tmp_path).run("make", [Child("x", "tron-x", [])]) >= 0.6
+
+
+def test_a_child_killed_by_a_signal_fails_too(tmp_path: Path, scripts: Path):
+    script(scripts, "tron-x", "print('about to go', flush=True); os.kill(os.getpid(), 9)")
+    with pytest.raises(StageFailed, match="about to go") as failure:
+        Stages(tmp_path).run("make", [Child("x", "tron-x", [])])
+    assert failure.value.exit_code > 0
+
+
+def test_a_missing_command_is_one_line(tmp_path: Path):
+    with pytest.raises(TronError, match="command tron-nonsense not found"):
+        Stages(tmp_path).run("make", [Child("x", "tron-nonsense", [])])
+
+
+def test_a_damaged_record_is_one_line(tmp_path: Path):
+    (tmp_path / "stages.json").write_text("{]")
+    with pytest.raises(TronError, match="not a record of stages"):
+        Stages(tmp_path)
