@@ -21,38 +21,38 @@ from tron.gaussians.scene import GaussianScene
 
 TrajectoryName = Literal["orbit", "spiral", "oscillating"]
 
-# Fraction of the subject's surfels that may lie outside the sphere that is framed.
+# Fraction of the subject's surfels that may lie outside the frame.
 STRAYS = 0.01
-# Room around that sphere: a sphere that touches the edges of the image looks cramped.
-MARGIN = 1.25
+# Empty border around the subject, as a fraction of the image's sides.
+BORDER = 0.06
 # A floor is flat: its surfels look up within this cosine and lie within this many spacings of one height.
 _LEVEL_COSINE = 0.95
 _FLOOR_SPACINGS = 3.0
 _FLOOR_SHARE = 0.2
 _SUBJECT_SHARE = 0.005
+# Enough points and cameras to find a distance by; a camera comes no nearer than this many radii.
+_PROBES = 2000
+_PROBE_CAMERAS = 24
+_NEAREST = 1.2
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A sphere worth looking at: centre (3,) and radius, world units."""
+    """What is worth looking at: surfel centres (N, 3), centre (3,) and radius of their sphere, world units."""
 
+    points: np.ndarray
     centre: np.ndarray
     radius: float
 
-    def distance(self, fov_deg: float, width: int, height: int) -> float:
-        """How far a camera with this horizontal field of view stands off to see the whole sphere."""
-        half = math.tan(math.radians(fov_deg) / 2)
-        narrow = math.atan(half * min(1.0, height / width))
-        return MARGIN * self.radius / math.sin(narrow)
-
 
 def find_subject(scene: GaussianScene) -> Subject:
-    """The sphere around the surfels that matter: those off the floor if the scene has a floor, else all."""
+    """The surfels that matter, strays apart: those off the floor if the scene has a floor, else all."""
     shown = scene.means[_off_floor(scene)].astype(np.float64)
     low, high = np.quantile(shown, [STRAYS, 1 - STRAYS], axis=0)
     centre = (low + high) / 2
-    radius = float(np.quantile(np.linalg.norm(shown - centre, axis=1), 1 - STRAYS))
-    return Subject(centre, max(radius, scene.spacing))
+    from_centre = np.linalg.norm(shown - centre, axis=1)
+    radius = float(np.quantile(from_centre, 1 - STRAYS))
+    return Subject(shown[from_centre <= radius], centre, max(radius, scene.spacing))
 
 
 def _off_floor(scene: GaussianScene) -> np.ndarray:
@@ -94,15 +94,37 @@ def plan_cameras(
         "spiral": trajectories.spiral,
         "oscillating": trajectories.oscillating,
     }[trajectory]
-    return path(
-        frames,
-        target=subject.centre,
-        radius=distance * subject.distance(fov_deg, width, height),
-        width=width,
-        height=height,
-        fov_deg=fov_deg,
-        up=scene.up,
-    )
+
+    def at(radius: float) -> list[Camera]:
+        return path(
+            frames,
+            target=subject.centre,
+            radius=radius,
+            width=width,
+            height=height,
+            fov_deg=fov_deg,
+            up=scene.up,
+        )
+
+    probes = subject.points[:: max(1, len(subject.points) // _PROBES)]
+    # From the far end a sphere around the subject fits into any frame; bisection of the logarithm from there.
+    half = math.atan(math.tan(math.radians(fov_deg) / 2) * min(1.0, height / width) * (1 - 2 * BORDER))
+    near, far = _NEAREST * subject.radius, max(_NEAREST, 1.1 / math.sin(half)) * subject.radius
+    for _ in range(12):
+        middle = math.sqrt(near * far)
+        near, far = (near, middle) if _hold(at(middle), probes) else (middle, far)
+    return at(distance * far)
+
+
+def _hold(cameras: list[Camera], points: np.ndarray) -> bool:
+    """Whether the images hold all but the strays of the points (N, 3), world, with a border to spare."""
+    for camera in cameras[:: max(1, len(cameras) // _PROBE_CAMERAS)]:
+        pixels, depth = camera.project(points)
+        place = pixels / (camera.width, camera.height)
+        inside = (depth > 0) & (np.abs(place - 0.5) < 0.5 - BORDER).all(axis=1)
+        if inside.mean() < 1 - STRAYS:
+            return False
+    return True
 
 
 def read_cameras(path: Path, width: int, height: int) -> list[Camera]:
