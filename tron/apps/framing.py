@@ -38,7 +38,7 @@ _NEAREST = 1.2
 
 @dataclass(frozen=True)
 class Subject:
-    """What is worth looking at: surfel centres (N, 3), centre (3,) and radius of their sphere, world units."""
+    """What is worth looking at: surfel centres (N, 3), and centre (3,) and radius of their sphere, world."""
 
     points: np.ndarray
     centre: np.ndarray
