@@ -149,10 +149,10 @@ def test_a_smooth_map_survives_the_cubemap_within_a_hundredth(variant: str) -> N
     assert np.abs(seen - truth).mean() < 0.01 * truth.mean()
 
 
-@pytest.mark.parametrize("roughness,level", [(0, 0), (0.08, 0), (0.29, 1), (0.5, 2), (0.75, 2.5), (1, 3)])
-def test_level_lookup(variant: str, roughness: float, level: float) -> None:
+def test_level_lookup(variant: str) -> None:
     light = SplitSum(EnvironmentMap.constant(1.0), 128)  # levels 128, 64, 32, 16
-    assert np.array(light._level_of(mi.Float(roughness)))[0] == pytest.approx(level, abs=1e-5)
+    level = light._level_of(mi.Float([0, 0.08, 0.29, 0.5, 0.75, 1]))
+    np.testing.assert_allclose(np.array(level), (0, 0, 1, 2, 2.5, 3), atol=1e-5)
 
 
 def test_roughness_of_a_level_is_filtered_by_its_own_lobe(variant: str) -> None:
@@ -212,8 +212,8 @@ def monte_carlo_albedo(cosine: float, alpha: float, n: int = 400_000) -> tuple[f
     return float((weight * (1 - fresnel)).mean()), float((weight * fresnel).mean())
 
 
-@pytest.mark.parametrize("row", [20, 64, 128, 200, 255])
-@pytest.mark.parametrize("column", [12, 60, 128, 250])
+@pytest.mark.parametrize("row", [20, 64, 200])
+@pytest.mark.parametrize("column", [12, 128, 250])
 def test_table_is_the_albedo_by_monte_carlo(variant: str, row: int, column: int) -> None:
     expected = monte_carlo_albedo((column + 0.5) / 256, ((row + 0.5) / 256) ** 2)
     np.testing.assert_allclose(brdf_table()[row, column], expected, atol=5e-3)
