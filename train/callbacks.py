@@ -156,11 +156,11 @@ class TrainingLog(Callback):
         self.loss = state_dict["loss"]
 
     def _note(self, trainer: lightning.Trainer) -> None:
-        """Add the row of this step, once."""
+        """Add the row of this step, or bring it up to date."""
         row = self._row(trainer)
-        place = (row["stage"], str(row["step"]))
-        if not self._rows or (self._rows[-1]["stage"], str(self._rows[-1]["step"])) != place:
-            self._rows.append(row)
+        if self._rows and all(str(self._rows[-1][name]) == str(row[name]) for name in ("stage", "step")):
+            self._rows.pop()
+        self._rows.append(row)
 
     def _row(self, trainer: lightning.Trainer) -> dict[str, Any]:
         rate = trainer.optimizers[0].param_groups[0]["lr"]
