@@ -13,75 +13,13 @@ import numpy as np
 
 from eval.results import Row
 from eval.scores import PSNR_CAP
+from eval.shadows import ShadowCounts, both_have_surface, count_shadow_errors, same_surface
 from tron import metrics
-from tron.color import luminance, to_display
+from tron.color import to_display
 from tron.shards.schema import Clip
 
-SHADOWED_BELOW = 0.5
-"""A pixel is in shadow where less than this share of the unshadowed irradiance arrives, in the reference."""
-LIT_ABOVE = 0.9
-"""A pixel is lit where more than this share arrives, in the reference."""
-LEAK_OVER_MEAN = 0.15
-"""A shadowed pixel leaks if it exceeds the reference by more than this share of the frame's mean reference.
-"""
-DARKENED_BELOW = 0.75
-"""A lit pixel is darkened if it keeps less than this share of the reference."""
 MEMBERS = ("irr_ref", "base_color_ref", "normal_ref", "base_color", "normal")
 """Optional members of test clips that these measurements need."""
-
-
-@dataclass(frozen=True)
-class ShadowCounts:
-    """Pixels of one frame: in shadow, leaking among them, lit, darkened among them."""
-
-    shadowed: int
-    leaking: int
-    lit: int
-    darkened: int
-
-
-def shadow_classes(
-    unshadowed: np.ndarray, reference: np.ndarray, judged: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Which pixels the reference has in shadow, and which it has lit: two (H, W) bool; see
-    :func:`shadow_errors`.
-    """
-    truth, open_sky = luminance(reference), luminance(unshadowed)
-    share = np.divide(truth, open_sky, out=np.ones_like(truth), where=open_sky > 0)
-    return judged & (share < SHADOWED_BELOW), judged & (share > LIT_ABOVE)
-
-
-def shadow_errors(
-    irradiance: np.ndarray, unshadowed: np.ndarray, reference: np.ndarray, judged: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Which pixels leak and which are darkened, by luminance, as the constants of this file define.
-
-    Args:
-        irradiance, unshadowed: (H, W, 3) linear E / pi of the surfels, with and without shadows.
-        reference: (H, W, 3) linear E / pi of the path tracer's direct light.
-        judged: (H, W) bool, the pixels where both see a surface; the mean reference is taken over them.
-
-    Returns:
-        leaking, darkened: (H, W) bool.
-    """
-    shadowed, lit = shadow_classes(unshadowed, reference, judged)
-    ours, truth = luminance(irradiance), luminance(reference)
-    mean = truth[judged].mean() if judged.any() else 0.0
-    return shadowed & (ours > truth + LEAK_OVER_MEAN * mean), lit & (ours < DARKENED_BELOW * truth)
-
-
-def count_shadow_errors(
-    irradiance: np.ndarray, unshadowed: np.ndarray, reference: np.ndarray, judged: np.ndarray
-) -> ShadowCounts:
-    """Count the pixels of :func:`shadow_classes` and :func:`shadow_errors`; arguments as there."""
-    shadowed, lit = shadow_classes(unshadowed, reference, judged)
-    leaking, darkened = shadow_errors(irradiance, unshadowed, reference, judged)
-    return ShadowCounts(*(int(pixels.sum()) for pixels in (shadowed, leaking, lit, darkened)))
-
-
-def surface_mask(frames: dict[str, np.ndarray]) -> np.ndarray:
-    """Pixels where truth and surfels both have a surface: (..., H, W) bool from members of (..., H, W, 1)."""
-    return (frames["foreground"][..., 0] > 0.5) & (frames["mask"][..., 0] > 0.5)
 
 
 @dataclass
@@ -90,6 +28,7 @@ class GuidanceScores:
 
     irradiance_psnr: dict[str, list[float]] = field(default_factory=dict)
     shadows: dict[str, list[ShadowCounts]] = field(default_factory=dict)
+    everywhere: list[ShadowCounts] = field(default_factory=list)
     base_color_psnr: list[float] = field(default_factory=list)
     normal_error: list[float] = field(default_factory=list)
     _views: set[str] = field(default_factory=set)
@@ -101,7 +40,6 @@ class GuidanceScores:
         once for base color and normals.
         """
         frames, meta = clip.frames, clip.meta
-        surface = surface_mask(frames)
         for k, foreground in enumerate(frames["foreground"][..., 0] > 0.5):
             if not foreground.any():
                 continue
@@ -109,10 +47,7 @@ class GuidanceScores:
                 shown, truth = (to_display(frames[name][k], meta.exposure) for name in ("irr", "irr_ref"))
                 psnr = min(metrics.psnr(shown, truth, foreground), PSNR_CAP)
                 self.irradiance_psnr.setdefault(meta.light_family, []).append(psnr)
-                counts = count_shadow_errors(
-                    frames["irr"][k], frames["unshadowed"][k], frames["irr_ref"][k], surface[k]
-                )
-                self.shadows.setdefault(meta.light_family, []).append(counts)
+                self._count_shadows({name: images[k] for name, images in frames.items()}, meta.light_family)
             view = f"{meta.scene} {sorted(meta.cameras[k].items())}"
             if view in self._views:
                 continue
@@ -127,11 +62,17 @@ class GuidanceScores:
                 if both.any():
                     self.normal_error.append(float(metrics.angular_error_deg(ours, truth, both)))
 
+    def _count_shadows(self, frame: dict[str, np.ndarray], family: str) -> None:
+        buffers = frame["irr"], frame["unshadowed"], frame["irr_ref"]
+        self.everywhere.append(count_shadow_errors(*buffers, both_have_surface(frame)))
+        self.shadows.setdefault(family, []).append(count_shadow_errors(*buffers, same_surface(frame)))
+
     def rows(self) -> list[Row]:
         """``guidance.*`` (all lights, and ``.FAMILY``) and ``surfels.*``; what was not measured has no row.
 
         ``guidance.irradiance_psnr`` is the lowest of the light families' means over frames; the two
-        fractions are taken over the pixels of all frames together, for a frame may hold hardly any shadow.
+        fractions are taken over the pixels of all frames together, for a frame may hold hardly any shadow;
+        ``_with_silhouettes`` also judges pixels where surfels and truth show different surfaces.
         """
         rows: list[Row] = []
         if self.irradiance_psnr:
@@ -147,6 +88,7 @@ class GuidanceScores:
             everything = [counts for of_family in self.shadows.values() for counts in of_family]
             for name, counts in (
                 ("", everything),
+                ("_with_silhouettes", self.everywhere),
                 *((f".{family}", self.shadows[family]) for family in means),
             ):
                 rows += _fractions(name, counts)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -150,18 +151,38 @@ def run_together(children: Sequence[Child]) -> None:
         StageFailed: the first child, in the order given, that failed by itself.
     """
     paths = [script_path(child.script) for child in children]
-    running = [_Running(child, path) for child, path in zip(children, paths)]
-    try:
-        while any(each.process.poll() is None for each in running):
-            if any(each.process.poll() not in (None, 0) for each in running):
-                break
-            time.sleep(0.05)
-        failed = next((each for each in running if each.process.poll() not in (None, 0)), None)
-    finally:
-        for each in running:
-            each.end()
+    running: list[_Running] = []
+    with _termination_unwinds():
+        try:
+            for child, path in zip(children, paths):
+                running.append(_Running(child, path))
+            while any(each.process.poll() is None for each in running):
+                if any(each.process.poll() not in (None, 0) for each in running):
+                    break
+                time.sleep(0.05)
+            failed = next((each for each in running if each.process.poll() not in (None, 0)), None)
+        finally:
+            for each in running:
+                each.end()
     if failed is not None:
         raise StageFailed(" ".join(failed.child.typed), failed.process.returncode, failed.words())
+
+
+@contextmanager
+def _termination_unwinds() -> Iterator[None]:
+    """Let SIGTERM end this process by an exception, so that it does not leave its children running."""
+
+    def end(signum: int, _frame: object) -> None:
+        raise SystemExit(128 + signum)
+
+    if threading.current_thread() is not threading.main_thread():  # only there may handlers be set
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 class _Running:

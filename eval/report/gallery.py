@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from eval.guidance import shadow_errors, surface_mask
 from eval.report.page import Picture, Pictures
 from eval.scores import PSNR_CAP
+from eval.shadows import same_surface, shadow_errors
 from tron import metrics
 from tron.color import linear_to_srgb, luminance, to_display
 from tron.images import write_image
@@ -101,7 +101,7 @@ def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
 def _shadow_error_picture(frames: dict[str, np.ndarray], truth: np.ndarray) -> np.ndarray:
     """The true irradiance in faint grey, leaking pixels orange, darkened pixels blue."""
     leaking, darkened = shadow_errors(
-        frames["irr"], frames["unshadowed"], frames["irr_ref"], surface_mask(frames)
+        frames["irr"], frames["unshadowed"], frames["irr_ref"], same_surface(frames)
     )
     picture = np.repeat(luminance(truth)[..., None] * 0.6, 3, axis=-1)
     picture[leaking] = (1.0, 0.5, 0.05)

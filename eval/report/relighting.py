@@ -8,13 +8,14 @@ from typing import Any
 
 from eval.baselines import SEVEN, THREE
 from eval.benchmarks import Outcome
-from eval.guidance import DARKENED_BELOW, LEAK_OVER_MEAN, LIT_ABOVE, SHADOWED_BELOW, GuidanceScores
+from eval.guidance import GuidanceScores
 from eval.predictions import Region
 from eval.report.figures import MINUS, written
 from eval.report.gallery import Shown, comparison, guidance, write_strips
 from eval.report.page import Block, Cell, Chart, Section, Table, Text
 from eval.results import Row
 from eval.scores import GROUPS, REGIONS, Scores
+from eval.shadows import DARKENED_BELOW, LEAK_OVER_MEAN, LIT_ABOVE, SAME_SURFACE_DEG, SHADOWED_BELOW
 from tron.shards.schema import ClipMeta
 
 WHAT = {
@@ -189,8 +190,9 @@ def _guidance_section(scores: GuidanceScores, shown: Sequence[Shown], output_dir
         f"foreground. A pixel is in shadow where under {SHADOWED_BELOW:.0%} of the unshadowed light arrives "
         f"in the reference, and leaks if it is brighter than the reference by more than {LEAK_OVER_MEAN:.0%}"
         f" of the frame's mean; it is lit where over {LIT_ABOVE:.0%} arrives, and darkened if it keeps less "
-        f"than {DARKENED_BELOW:.0%} of it. Pictures called shadow errors show leaking pixels in orange and "
-        "darkened ones in blue, over the reference."
+        f"than {DARKENED_BELOW:.0%} of it. Both are judged where surfels and truth show the same surface "
+        f"(normals within {SAME_SURFACE_DEG:.0f}°): at silhouettes surfels overhang by a pixel and show "
+        "another one. Pictures called shadow errors show leaking pixels in orange, darkened ones in blue."
     )
     blocks: list[Block] = [intro]
     families = sorted(scores.irradiance_psnr)
@@ -198,7 +200,9 @@ def _guidance_section(scores: GuidanceScores, shown: Sequence[Shown], output_dir
         metrics = {
             "irradiance PSNR": "guidance.irradiance_psnr",
             "shadow pixels leaking": "guidance.shadow_leak",
+            "shadow pixels leaking, silhouettes included": "guidance.shadow_leak_with_silhouettes",
             "lit pixels darkened": "guidance.lit_darkened",
+            "lit pixels darkened, silhouettes included": "guidance.lit_darkened_with_silhouettes",
         }
         table_rows = [
             [Cell(name), _value(rows.get(metric), "strong")]

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from eval.guidance import GuidanceScores, ShadowCounts, count_shadow_errors
+from eval.guidance import GuidanceScores
+from eval.shadows import ShadowCounts, count_shadow_errors, same_surface
 from tron.color import agx
 from tron.shards.schema import Clip
 
@@ -32,6 +33,20 @@ def test_only_judged_pixels_count():
     assert count_shadow_errors(ours, unshadowed, reference, np.zeros((1, 2), bool)) == ShadowCounts(
         0, 0, 0, 0
     )
+
+
+def test_a_pixel_that_shows_another_surface_is_judged_only_with_silhouettes(drawn_clip: MakeClip):
+    clip = drawn_clip("noon")
+    clip.frames["irr_ref"] = clip.frames["irr"].copy()
+    frame = {name: images[0] for name, images in clip.frames.items()}
+    assert same_surface(frame)[frame["foreground"][..., 0] > 0.5].all()
+    clip.frames["irr"] = clip.frames["unshadowed"].copy()
+    clip.frames["normal"] = clip.frames["normal_ref"][..., ::-1].copy()  # x and z change places
+    scores = GuidanceScores()
+    scores.add(clip)
+    rows = {row.metric: row.value for row in scores.rows()}
+    assert rows["guidance.shadow_leak_with_silhouettes"] == 1
+    assert "guidance.shadow_leak" not in rows  # the floor's shadow is on another surface now
 
 
 def test_perfect_guidance_leaks_nowhere_and_its_psnr_is_capped(drawn_clip: MakeClip):

@@ -1,5 +1,8 @@
 """Stages run once, side by side, keep their seconds, and fail with the child's own words."""
 
+import os
+import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -9,6 +12,8 @@ import pytest
 from eval import stages as stages_module
 from eval.stages import Child, StageFailed, StageFile, Stages
 from tron.errors import TronError
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -95,6 +100,29 @@ def test_a_child_killed_by_a_signal_fails_too(tmp_path: Path, scripts: Path):
     with pytest.raises(StageFailed, match="about to go") as failure:
         Stages(tmp_path).run("make", [Child("x", "tron-x", [])])
     assert failure.value.exit_code > 0
+
+
+def test_ending_the_demo_ends_its_children_and_keeps_the_seconds(tmp_path: Path, scripts: Path):
+    body = f"open({str(tmp_path / 'child')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
+    script(scripts, "tron-x", body)
+    program = f"""
+from pathlib import Path
+from eval import stages
+stages.script_path = lambda name: str(Path({str(scripts)!r}) / name)
+stages.Stages(Path({str(tmp_path)!r})).run("make", [stages.Child("x", "tron-x", [])])
+"""
+    demo = subprocess.Popen([sys.executable, "-c", program], cwd=ROOT, stdout=subprocess.DEVNULL)
+    end = time.monotonic() + 60
+    while not (tmp_path / "child").exists() or not (tmp_path / "child").read_text():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    demo.send_signal(signal.SIGTERM)
+    assert demo.wait(60) == 128 + signal.SIGTERM
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "child").read_text()), 0)
+    record = StageFile.model_validate_json((tmp_path / "stages.json").read_bytes()).stages["make"]
+    assert record.seconds > 0
+    assert not record.finished
 
 
 def test_a_missing_command_is_one_line(tmp_path: Path):
