@@ -8,11 +8,10 @@ from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import numpy as np
-from tron.shading.guidance import Guidance, Lighting, render_guidance
 
 from datagen.build import Geometry
 from datagen.lights import LightSpec, bake, classify
-from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
+from datagen.pathtrace import DirectIrradiance, direct_irradiance, gbuffers, render_frames
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from tron.cameras import Camera
@@ -20,7 +19,8 @@ from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.gaussians.scene import GaussianScene
 from tron.seeds import integer
 from tron.shading.environment import EnvironmentMap
-from tron.shards.schema import ClipMeta
+from tron.shading.guidance import Guidance, Lighting, render_guidance
+from tron.shards.schema import REFERENCE_MEMBERS, ClipMeta
 from tron.tracing import SurfelTracer
 
 Frame = dict[str, np.ndarray]
@@ -90,7 +90,7 @@ def make_clip(
         }
         if recipe.reference_buffers:
             direct = direct_irradiance(geometry, scene, camera, recipe.reference_spp, seeds["reference"][i])
-            frame |= _reference(camera, truth, guidance, direct.shadowed, environment)
+            frame |= _reference(camera, truth, guidance, direct, environment)
         frames.append(frame)
     spp = {"path": recipe.path_spp, "guidance": recipe.guidance_spp}
     if recipe.reference_buffers:
@@ -136,17 +136,22 @@ def _reference(
     camera: Camera,
     truth: GBufferView,
     guidance: Guidance,
-    irradiance: np.ndarray,
+    direct: DirectIrradiance,
     environment: EnvironmentMap,
 ) -> Frame:
     """The reference members of one frame; behind the scene irradiance shows the environment, as guidance
     does.
     """
     seen = truth.valid[..., None]
-    return {
-        "irr_ref": np.where(seen, irradiance, environment.lookup(camera.rays())),
+    behind = environment.lookup(camera.rays())
+    members = {
+        "irr_ref": np.where(seen, direct.shadowed, behind),
+        "unshadowed_ref": np.where(seen, direct.unshadowed, behind),
+        "depth_ref": np.where(truth.valid, np.linalg.norm(truth.position - camera.position, axis=-1), 0.0),
         "base_color_ref": np.where(seen, truth.base_color, 0.0),
         "normal_ref": np.where(seen, truth.normal, 0.0),
         "base_color": guidance.gbuffer["base_color"],
         "normal": guidance.gbuffer["normal"],
+        "depth": guidance.gbuffer["depth"],
     }
+    return {name: image for name, image in members.items() if name in REFERENCE_MEMBERS}
