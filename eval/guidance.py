@@ -28,7 +28,7 @@ class GuidanceScores:
 
     irradiance_psnr: dict[str, list[float]] = field(default_factory=dict)
     shadows: dict[str, list[ShadowCounts]] = field(default_factory=dict)
-    everywhere: list[ShadowCounts] = field(default_factory=list)
+    everywhere: dict[str, list[ShadowCounts]] = field(default_factory=dict)
     base_color_psnr: list[float] = field(default_factory=list)
     normal_error: list[float] = field(default_factory=list)
     _views: set[str] = field(default_factory=set)
@@ -64,7 +64,7 @@ class GuidanceScores:
 
     def _count_shadows(self, frame: dict[str, np.ndarray], family: str) -> None:
         buffers = frame["irr"], frame["unshadowed"], frame["irr_ref"]
-        self.everywhere.append(count_shadow_errors(*buffers, both_have_surface(frame)))
+        self.everywhere.setdefault(family, []).append(count_shadow_errors(*buffers, both_have_surface(frame)))
         self.shadows.setdefault(family, []).append(count_shadow_errors(*buffers, same_surface(frame)))
 
     def rows(self) -> list[Row]:
@@ -85,13 +85,10 @@ class GuidanceScores:
                 rows.append(
                     Row(metric=f"guidance.irradiance_psnr{name}", value=means[family], unit="dB", n=n)
                 )
-            everything = [counts for of_family in self.shadows.values() for counts in of_family]
-            for name, counts in (
-                ("", everything),
-                ("_with_silhouettes", self.everywhere),
-                *((f".{family}", self.shadows[family]) for family in means),
-            ):
-                rows += _fractions(name, counts)
+            for name, by_family in (("", self.shadows), ("_with_silhouettes", self.everywhere)):
+                rows += _fractions(name, [counts for family in by_family.values() for counts in family])
+                for family in means:
+                    rows += _fractions(f"{name}.{family}", by_family[family])
         for metric, values, unit in (
             ("surfels.base_color_psnr", self.base_color_psnr, "dB"),
             ("surfels.normal_mae_deg", self.normal_error, "deg"),

@@ -53,7 +53,8 @@ class Shown:
     @property
     def title(self) -> str:
         """Scene, light and frame in words."""
-        light = f"{self.meta.light} ({self.meta.light_family})"
+        name = self.meta.light.removeprefix(f"{self.meta.scene}-")
+        light = name if name.startswith(self.meta.light_family) else f"{name} ({self.meta.light_family})"
         return f"Scene {self.meta.scene} · light {light} · frame {self.frame + 1} of {self.meta.frames}"
 
 
