@@ -7,7 +7,7 @@ import time
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from tron.neural.codecs import TIME
+from tron.neural.windows import TIME
 
 
 class Stage(BaseModel):
@@ -27,7 +27,7 @@ class Stage(BaseModel):
         default=None, ge=8, description="Side of the random square crop, pixels; null trains on whole frames."
     )
     learning_rate: float = Field(
-        default=1.0, gt=0, description="Factor on optimizer.learning_rate, the stage's peak."
+        default=1.0, gt=0, description="Factor on the optimizer's learning rates in this stage."
     )
     rehearsal_split: str | None = Field(
         default=None, description="Earlier split to mix in, against forgetting."

@@ -16,15 +16,14 @@ from typing import Any
 import lightning
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from train.curriculum import Stage
+from train.settings import DataSettings, ValidationSettings
 from train.sources import (
     BUFFERS,
     CachedSplit,
-    DataSettings,
     Draw,
     Source,
     StreamedSplit,
@@ -35,23 +34,13 @@ from train.sources import (
 )
 from tron import seeds
 from tron.errors import TronError
-from tron.neural.codecs import TIME
+from tron.neural.windows import TIME
 from tron.shards.manifest import Manifest
 from tron.shards.schema import Clip
 
 log = logging.getLogger(__name__)
 
 SEGMENT = 500  # batches after which a stream starts anew, so that resuming skips fewer than this
-
-
-class ValidationSettings(BaseModel):
-    """Clips whose PSNR is shown while training; nothing is selected or stopped by it."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    split: str | None = Field(default="test", description="Split to validate on; null validates nothing.")
-    clips: int = Field(default=8, ge=1, description="How many of its clips, spread evenly over it.")
-    every: int = Field(default=250, ge=1, description="Steps between validations.")
 
 
 class Batches(IterableDataset):

@@ -6,32 +6,12 @@ from typing import Any
 
 import lightning
 import torch
-from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
 from train.curriculum import Pace, Stage, learning_rate_factor
+from train.optimizers import make_optimizer
+from train.settings import OptimizerSettings
 from tron.neural.losses import RendererLoss, psnr_per_frame
-
-
-class OptimizerSettings(BaseModel):
-    """AdamW and its schedule, the same in every stage."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    learning_rate: float = Field(default=1e-3, gt=0, description="Peak learning rate.")
-    betas: tuple[float, float] = Field(default=(0.9, 0.99), description="AdamW's averaging rates.")
-    weight_decay: float = Field(default=1e-2, ge=0, description="AdamW's decoupled weight decay.")
-    warmup_steps: int = Field(default=50, ge=0, description="Steps of linear warm-up in each stage.")
-    final_factor: float = Field(
-        default=0.01, ge=0, le=1, description="Learning rate at a stage's end, as a fraction of its peak."
-    )
-    gradient_clip: float = Field(default=1.0, gt=0, description="Largest norm of the gradient.")
-    ema_decay: float | None = Field(
-        default=None,
-        gt=0,
-        lt=1,
-        description="Decay of an exponential moving average of the weights; null: none.",
-    )
 
 
 class RendererModule(lightning.LightningModule):
@@ -63,16 +43,11 @@ class RendererModule(lightning.LightningModule):
         self.log("val_psnr_full", full.mean(), batch_size=size, sync_dist=True)
 
     def configure_optimizers(self) -> Any:
-        """AdamW over what is not frozen, with warm-up and a cosine over the stage."""
+        """The stage's optimiser, with warm-up and a cosine over the stage."""
         if self.stage is None:
             raise RuntimeError("begin() chooses the stage first")
         settings = self.settings
-        optimizer = torch.optim.AdamW(
-            [parameter for parameter in self.renderer.parameters() if parameter.requires_grad],
-            lr=settings.learning_rate * self.stage.learning_rate,
-            betas=settings.betas,
-            weight_decay=settings.weight_decay,
-        )
+        optimizer = make_optimizer(self.renderer, settings, self.stage.learning_rate)
 
         def factor(step: int) -> float:
             progress = self.pace.progress(step)

@@ -12,12 +12,12 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 from webdataset.filters import detshuffle
 from webdataset.pipeline import DataPipeline
 from webdataset.shardlists import ResampledShards
 
+from train.settings import DataSettings
 from tron import seeds
 from tron.color import to_display
 from tron.errors import TronError
@@ -26,32 +26,6 @@ from tron.shards.reader import decode_clip, decode_meta, group_clips, read_clips
 from tron.shards.schema import META_SUFFIX, Clip, ClipMeta
 
 BUFFERS = ("pbr", "irr", "rgb")
-
-
-class DataSettings(BaseModel):
-    """How samples are read and varied."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    cache_gb: float = Field(
-        default=4.0,
-        ge=0,
-        description="Keep decoded splits in memory up to this size; larger ones are streamed.",
-    )
-    workers: int = Field(
-        default=0, ge=0, description="Loader processes of streamed splits; cached ones use none."
-    )
-    shuffle_buffer: int = Field(default=64, ge=1, description="Samples in a stream's shuffle buffer.")
-    samples_per_clip: int = Field(
-        default=1, ge=1, description="Random windows taken from a streamed clip each time it is read."
-    )
-    flip: float = Field(default=0.5, ge=0, le=1, description="Probability of mirroring left and right.")
-    permute_colors: float = Field(
-        default=0.0, ge=0, le=1, description="Probability of shuffling R, G and B, alike in all buffers."
-    )
-    crop_alignment: int = Field(
-        default=4, ge=1, description="Crops start at multiples of this; 4 keeps the codec's blocks."
-    )
 
 
 def display_video(clip: Clip, member: str) -> np.ndarray:

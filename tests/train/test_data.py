@@ -11,8 +11,9 @@ from torch.utils.data import DataLoader
 
 from train import data as training_data
 from train.curriculum import Stage
-from train.data import Batches, TrainingData, ValidationSettings, varied
-from train.sources import BUFFERS, CachedSplit, DataSettings, display_video
+from train.data import Batches, TrainingData, varied
+from train.settings import DataSettings, ValidationSettings
+from train.sources import BUFFERS, CachedSplit, display_video
 from tron import seeds
 from tron.color import to_display
 from tron.errors import TronError

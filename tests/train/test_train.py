@@ -15,10 +15,11 @@ import yaml
 from lightning.pytorch.callbacks import ModelCheckpoint
 from safetensors.torch import load_file
 
-from train import cli
+from train import run as training_run
 from train.checkpoints import find_position
-from train.cli import Settings, main
+from train.cli import main
 from train.curriculum import Stage
+from train.settings import Settings
 from tron.errors import TronError
 from tron.neural.pixel_mlp import PixelMLP
 from tron.neural.weights import load_renderer
@@ -80,11 +81,11 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_by_bit(
 
 
 @pytest.mark.parametrize("saves", [2, 3, 4])
-def test_resuming_holds_with_an_averaged_model_and_streamed_data(
+def test_resuming_holds_with_muon_an_averaged_model_and_streamed_data(
     train, monkeypatch, dataset, tmp_path, saves
 ):
     changes = {
-        "optimizer": {"warmup_steps": 2, "ema_decay": 0.5},
+        "optimizer": {"warmup_steps": 2, "ema_decay": 0.5, "muon_learning_rate": 0.02},
         "data": {"cache_gb": 0.0, "shuffle_buffer": 2},
         "validation": {"split": None},
     }
@@ -226,7 +227,7 @@ def test_a_killed_process_leaves_what_the_next_one_goes_on_from(
     settings = make_settings(dataset, tmp_path)
     overrides = {**settings, "dataset": str(dataset), "output_dir": str(tmp_path)}
     program = (
-        f"from train.cli import Settings, main; import time, train.module as m\n"
+        f"from train.cli import main; from train.settings import Settings; import time, train.module as m\n"
         f"step = m.RendererModule.training_step\n"
         f"def slow(self, *a): time.sleep(0.3); return step(self, *a)\n"
         f"m.RendererModule.training_step = slow\n"
@@ -249,6 +250,13 @@ def test_an_interrupt_ends_the_command_as_interrupts_do(train, monkeypatch, data
     def interrupt(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli.RendererModule, "training_step", interrupt)
+    monkeypatch.setattr(training_run.RendererModule, "training_step", interrupt)
     with pytest.raises(KeyboardInterrupt):
         train(dataset, tmp_path)
+
+
+def test_help_and_mistyped_keys_wait_for_no_torch():
+    program = (
+        "import sys, train.cli; sys.exit(any(m in sys.modules for m in ('torch', 'lightning', 'diffusers')))"
+    )
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

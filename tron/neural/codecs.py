@@ -15,14 +15,9 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from tron.errors import TronError
+from tron.neural.windows import TIME, check_frames
 
-SPACE, TIME, COLORS = 4, 4, 3
-
-
-def check_frames(frames: int) -> None:
-    """TronError unless a clip has 1 + 4n frames: the codecs would silently drop the rest."""
-    if frames < 1 or (frames - 1) % TIME:
-        raise TronError(f"a window has {frames} frames", mend="give 1, 5, 9, ... frames (1 + 4n)")
+SPACE, COLORS = 4, 3
 
 
 def dct_matrix(n: int) -> Tensor:

@@ -47,3 +47,7 @@ class PixelMLP(nn.Module):
         # A linear layer over the last axis is a 1 x 1 convolution, and much faster on a CPU.
         pixels = torch.cat([pbr, irradiance], 1).movedim(1, -1)
         return pbr + self.layers(pixels).movedim(-1, 1)
+
+    def hidden_matrices(self) -> list[nn.Parameter]:
+        """Weights between hidden layers, 2-D."""
+        return [parameter for parameter in self.layers.parameters() if parameter.ndim == 2][1:-1]

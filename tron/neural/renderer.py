@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -14,7 +13,8 @@ from torch.nn.functional import pad
 from tron.color import to_display
 from tron.errors import TronError
 from tron.neural.backbone import Backbone, BackboneConfig
-from tron.neural.codecs import BlockDCT, check_frames
+from tron.neural.codecs import BlockDCT
+from tron.neural.windows import check_frames, windows
 
 
 class Codec(Protocol):
@@ -90,6 +90,11 @@ class NeuralRenderer(nn.Module):
         start = z_pbr if self.config.skip == "pbr" else mean
         return self.codec.decode(self._denoise(fused, start))[..., :height, :width]
 
+    def hidden_matrices(self) -> list[nn.Parameter]:
+        """Weights between hidden layers, 2-D: attention and feed-forward of every block."""
+        blocks = self.backbone.transformer.transformer_blocks
+        return [p for name, p in blocks.named_parameters() if ".attn1.to_" in name or ".ff." in name]
+
     def _denoise(self, fused: Tensor, start: Tensor) -> Tensor:
         if self.config.sigma is None:
             return start + self.backbone(fused, PLAIN_TIMESTEP)
@@ -113,15 +118,6 @@ def to_display_array(video: Tensor) -> np.ndarray:
     """Network output (1, 3, K, H, W) -> display values (K, H, W, 3) in [0, 1], clipped, NumPy float32."""
     image = (video[0].float().clamp(-1, 1) + 1) / 2
     return np.ascontiguousarray(image.permute(1, 2, 3, 0).cpu().numpy())
-
-
-def windows(frames: int, size: int) -> list[Sequence[int]]:
-    """Frame indices of each pass over a clip: the first `size` frames, then a window for each new frame.
-
-    Stride 1, as the paper has it; a clip shorter than the window is cut into the largest windows that fit.
-    """
-    size = min(size, frames - (frames - 1) % 4)
-    return [range(start, start + size) for start in range(frames - size + 1)]
 
 
 @torch.no_grad()

@@ -9,7 +9,8 @@ from tron.color import to_display
 from tron.errors import TronError
 from tron.neural.backbone import Backbone, BackboneConfig
 from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
-from tron.neural.renderer import NeuralRenderer, RendererConfig, render_clip, windows
+from tron.neural.renderer import NeuralRenderer, RendererConfig, render_clip
+from tron.neural.windows import windows
 
 SMALL = BackboneConfig(heads=2, head_dim=12, layers=2, adaln_lora_dim=8)
 

@@ -1,0 +1,77 @@
+"""The optimiser: AdamW, and Muon for the matrices between hidden layers where a recipe asks for it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from train.settings import OptimizerSettings
+
+
+def make_optimizer(renderer: nn.Module, settings: OptimizerSettings, factor: float) -> torch.optim.Optimizer:
+    """Optimise what is not frozen; learning rates are the settings' times `factor`.
+
+    With muon_learning_rate, the matrices that the renderer names as `hidden_matrices` follow Muon
+    (orthogonalised momentum, K. Jordan 2024, as in torch.optim.Muon) and everything else AdamW.
+    """
+    trained = [parameter for parameter in renderer.parameters() if parameter.requires_grad]
+    if settings.muon_learning_rate is None:
+        return _adamw(trained, settings, factor)
+    hidden: Sequence[Tensor] = renderer.hidden_matrices()  # type: ignore[operator]
+    chosen = {id(matrix) for matrix in hidden}
+    muon = torch.optim.Muon(
+        list(hidden),
+        lr=settings.muon_learning_rate * factor,
+        weight_decay=settings.weight_decay,
+        adjust_lr_fn="original",
+    )
+    return Together([muon, _adamw([p for p in trained if id(p) not in chosen], settings, factor)])
+
+
+def _adamw(parameters: list[nn.Parameter], settings: OptimizerSettings, factor: float) -> torch.optim.AdamW:
+    return torch.optim.AdamW(
+        parameters,
+        lr=settings.learning_rate * factor,
+        betas=settings.betas,
+        weight_decay=settings.weight_decay,
+    )
+
+
+class Together(torch.optim.Optimizer):
+    """Several optimisers that step as one: schedules, clipping and checkpoints see a single optimiser."""
+
+    def __init__(self, parts: Sequence[torch.optim.Optimizer]):
+        self.parts = list(parts)
+        super().__init__(
+            [{"params": [p for part in parts for g in part.param_groups for p in g["params"]]}], {}
+        )
+        self._share_groups()
+
+    def _share_groups(self) -> None:
+        # The parts' own dicts: what a schedule writes into a group is what its optimiser reads.
+        self.param_groups = [group for part in self.parts for group in part.param_groups]
+        self.state = defaultdict(dict)  # each part keeps its own
+
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
+        """Evaluate the closure once, then step every part."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for part in self.parts:
+            part.step()
+        return loss
+
+    def state_dict(self) -> dict[str, Any]:
+        """The parts' states, in order."""
+        return {"parts": [part.state_dict() for part in self.parts]}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the parts' states."""
+        for part, state in zip(self.parts, state_dict["parts"], strict=True):
+            part.load_state_dict(state)
+        self._share_groups()

@@ -1,0 +1,217 @@
+"""One training run: stage after stage, from wherever it was left."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+import yaml
+from hydra.errors import HydraException
+from hydra.utils import instantiate
+from lightning.pytorch.callbacks import Callback, EMAWeightAveraging
+from pydantic import ValidationError
+from torch import nn
+
+from train.callbacks import Clock, TrainingLog
+from train.checkpoints import (
+    AtomicCheckpoints,
+    Position,
+    find_position,
+    periodic_checkpoint,
+    remove_checkpoints,
+    stage_end,
+)
+from train.curriculum import Pace, Stage
+from train.data import TrainingData
+from train.module import RendererModule
+from train.settings import Settings
+from tron import seeds
+from tron.errors import TronError
+from tron.neural.codecs import BlockDCT
+from tron.neural.losses import RendererLoss
+from tron.neural.weights import load_renderer, save_renderer
+from tron.runtime import set_torch_threads
+from tron.shards.manifest import MANIFEST_NAME
+from tron.storage import locked, sha256, write_atomic
+
+log = logging.getLogger(__name__)
+
+RENDERER_NAME = "renderer.safetensors"
+
+
+def run(settings: Settings) -> None:
+    """Train a neural renderer on a dataset through the stages of a curriculum.
+
+    Ends with output_dir/renderer.safetensors. A run that was interrupted goes on from its last checkpoint
+    when the same command is given again; a finished one is left as it is.
+    """
+    _quiet_lightning()
+    if settings.threads is not None:
+        set_torch_threads(settings.threads)
+    stages = [stage for stage in settings.stages if stage.steps > 0]
+    data = TrainingData(settings.dataset, settings.data, settings.seed, settings.validation)
+    with locked(settings.output_dir):
+        _claim(settings)
+        folder = settings.output_dir / "checkpoints"
+        position = find_position(folder, stages)
+        if position.stage == len(stages) and (settings.output_dir / RENDERER_NAME).is_file():
+            log.info("%s is trained already", settings.output_dir / RENDERER_NAME)
+            return
+        torch.manual_seed(seeds.integer(settings.seed, "train", "weights", bits=63))
+        renderer = build_renderer(settings.renderer)
+        module = RendererModule(renderer, RendererLoss(**settings.loss.model_dump()), settings.optimizer)
+        data.open(stages)
+        if position.stage > 0:
+            _take_weights(renderer, stage_end(folder, position.stage, stages[position.stage - 1]))
+        elif isinstance(codec := getattr(renderer, "codec", None), BlockDCT) and position.checkpoint is None:
+            codec.fit(data.calibration(stages))
+        for index in range(position.stage, len(stages)):
+            here = position if index == position.stage else Position(index)
+            _run_stage(settings, stages, here, module, data)
+        save_renderer(settings.output_dir / RENDERER_NAME, renderer)
+        log.info("Renderer: %s", settings.output_dir / RENDERER_NAME)
+
+
+def build_renderer(recipe: dict[str, Any]) -> nn.Module:
+    """Make the renderer that a recipe's `_target_` names; TronError where the recipe does not fit it."""
+    try:
+        renderer = instantiate(recipe, _convert_="all")
+    except HydraException as error:
+        cause = error.__cause__ or error
+        if isinstance(cause, TronError):
+            raise cause from error
+        if isinstance(cause, ValidationError):
+            first = cause.errors()[0]
+            key = ".".join(str(part) for part in ("renderer", "config", *first["loc"]))
+            raise TronError(f"wrong value for '{key}'", repr(first["input"])[:80], first["msg"]) from error
+        raise TronError(
+            f"the renderer's recipe does not fit: {cause}", mend="see conf/train/renderer"
+        ) from error
+    if not isinstance(renderer, nn.Module):
+        raise TronError(f"renderer._target_ makes a {type(renderer).__name__}, not a torch module")
+    return renderer
+
+
+def _run_stage(
+    settings: Settings, stages: list[Stage], position: Position, module: RendererModule, data: TrainingData
+) -> None:
+    number, stage = position.stage + 1, stages[position.stage]
+    folder = settings.output_dir / "checkpoints"
+    share = stage.steps / sum(each.steps for each in stages)
+    pace = Pace(stage.steps, settings.max_seconds * share if settings.max_seconds else None)
+    _announce(number, stages, settings.max_seconds, position.step)
+    if position.checkpoint and pace.seconds_limit is None and position.step >= stage.steps:
+        # Interrupted between its last step and its end: Lightning would not even start, nor average weights.
+        module.load_state_dict(AtomicCheckpoints().load_checkpoint(position.checkpoint)["state_dict"])
+        _end_stage(folder, number, stage, module)
+        return
+    module.begin(stage, pace)
+    data.begin(stage, position.step)
+    callbacks: list[Callback] = [
+        Clock(pace),
+        TrainingLog(settings.output_dir / "metrics.csv", stage, pace, first_step=position.step),
+        periodic_checkpoint(folder, number, stage, settings.checkpoint_every),
+    ]
+    if settings.optimizer.ema_decay is not None:
+        # The codec's normalisation is a buffer: averaging it would mix it with itself, so only weights are.
+        callbacks.insert(0, EMAWeightAveraging(decay=settings.optimizer.ema_decay, use_buffers=False))
+    trainer = lightning.Trainer(
+        max_steps=stage.steps if pace.seconds_limit is None else -1,
+        max_epochs=-1,
+        accelerator=settings.accelerator,
+        devices=settings.devices,
+        num_nodes=settings.nodes,
+        precision=settings.precision,  # type: ignore[arg-type]
+        gradient_clip_val=settings.optimizer.gradient_clip,
+        val_check_interval=min(settings.validation.every, stage.steps),
+        check_val_every_n_epoch=None,
+        num_sanity_val_steps=0,
+        limit_val_batches=0 if settings.validation.split is None else 1.0,
+        callbacks=callbacks,
+        plugins=[AtomicCheckpoints()],
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=settings.output_dir,
+    )
+    try:
+        trainer.fit(module, datamodule=data, ckpt_path=position.checkpoint, weights_only=True)
+    except SystemExit as error:  # Lightning turns an interrupt into exit(1)
+        raise KeyboardInterrupt from error
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    if trainer.is_global_zero:
+        _end_stage(folder, number, stage, module)
+    trainer.strategy.barrier()
+
+
+def _end_stage(folder: Path, number: int, stage: Stage, module: RendererModule) -> None:
+    save_renderer(stage_end(folder, number, stage), module.renderer)
+    remove_checkpoints(folder, number, stage)
+
+
+def _announce(number: int, stages: list[Stage], max_seconds: float | None, first_step: int) -> None:
+    stage = stages[number - 1]
+    length = f"{stage.steps} steps"
+    if max_seconds is not None:
+        length = f"{max_seconds * stage.steps / sum(each.steps for each in stages):.0f} s"
+    mixed = f", {stage.rehearsal_ratio:.0%} from '{stage.rehearsal_split}'" if len(stage.splits()) > 1 else ""
+    log.info(
+        "Stage %d of %d, %s: split '%s'%s, K = %d, %s%s",
+        number,
+        len(stages),
+        stage.name,
+        stage.split,
+        mixed,
+        stage.frames,
+        length,
+        f", from step {first_step}" if first_step else "",
+    )
+    if number > 1:
+        log.info("(Captures do not exist yet: split '%s', path-traced too, stands in for them.)", stage.split)
+
+
+def _claim(settings: Settings) -> None:
+    """Write config.yaml, or find that this folder holds a run of other settings or data."""
+    path = settings.output_dir / "config.yaml"
+    described = yaml.safe_load(yaml.safe_dump(settings.model_dump(mode="json")))
+    described["dataset_sha256"] = sha256(settings.dataset / MANIFEST_NAME)
+    if path.is_file():
+        try:
+            earlier = yaml.safe_load(path.read_text())
+        except yaml.YAMLError:
+            earlier = None
+        if not isinstance(earlier, dict):
+            raise TronError("config.yaml of an earlier run is damaged", str(path), "remove the folder")
+        free = {"output_dir", "dataset"}  # a run may move; its data are known by their hash
+        changed = [key for key in described if key not in free and described[key] != earlier.get(key)]
+        if changed:
+            raise TronError(
+                f"output_dir holds a run with another '{changed[0]}'",
+                str(settings.output_dir),
+                "give another output_dir, or remove this one",
+            )
+        return
+    write_atomic(path, yaml.safe_dump(described, sort_keys=False))
+
+
+def _take_weights(renderer: nn.Module, path: Path) -> None:
+    vae = getattr(getattr(renderer, "codec", None), "vae", None)
+    if vae is None:
+        renderer.load_state_dict(load_renderer(path).state_dict())
+        return
+    from safetensors.torch import load_file
+
+    renderer.load_state_dict(load_file(path))
+
+
+def _quiet_lightning() -> None:
+    """Lightning's start-up lines and advice on loaders say nothing about this run."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
+    for message in (".*does not have many workers.*", ".*Checkpoint directory.*", ".*IterableDataset.*"):
+        warnings.filterwarnings("ignore", message)

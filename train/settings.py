@@ -1,0 +1,134 @@
+"""Everything tron-train can be told, checked before anything heavy is loaded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from train.curriculum import Stage
+
+
+class OptimizerSettings(BaseModel):
+    """The optimiser and its schedule, the same in every stage."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    learning_rate: float = Field(default=1e-3, gt=0, description="Peak learning rate of AdamW.")
+    muon_learning_rate: float | None = Field(
+        default=None,
+        gt=0,
+        description="Peak rate of Muon (0.02 is usual) for the matrices between hidden layers, AdamW for the "
+        "rest; null: AdamW alone.",
+    )
+    betas: tuple[float, float] = Field(default=(0.9, 0.99), description="AdamW's averaging rates.")
+    weight_decay: float = Field(default=1e-2, ge=0, description="AdamW's decoupled weight decay.")
+    warmup_steps: int = Field(default=50, ge=0, description="Steps of linear warm-up in each stage.")
+    final_factor: float = Field(
+        default=0.01, ge=0, le=1, description="Learning rate at a stage's end, as a fraction of its peak."
+    )
+    gradient_clip: float = Field(default=1.0, gt=0, description="Largest norm of the gradient.")
+    ema_decay: float | None = Field(
+        default=None,
+        gt=0,
+        lt=1,
+        description="Decay of an exponential moving average of the weights; null: none.",
+    )
+
+
+class LossSettings(BaseModel):
+    """Weights of the loss's terms."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    l2: float = Field(
+        default=1.0, ge=0, description="Weight of the squared error of display values in [-1, 1]."
+    )
+    lpips: float = Field(default=1.0, ge=0, description="Weight of LPIPS (VGG); needs vgg_weights.")
+    vgg_weights: Path | None = Field(
+        default=None, description="Local vgg16-397923af.pth; without it LPIPS is absent and the log says so."
+    )
+
+
+class DataSettings(BaseModel):
+    """How samples are read and varied."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    cache_gb: float = Field(
+        default=4.0,
+        ge=0,
+        description="Keep decoded splits in memory up to this size; larger ones are streamed.",
+    )
+    workers: int = Field(
+        default=0, ge=0, description="Loader processes of streamed splits; cached ones use none."
+    )
+    shuffle_buffer: int = Field(default=64, ge=1, description="Samples in a stream's shuffle buffer.")
+    samples_per_clip: int = Field(
+        default=1, ge=1, description="Random windows taken from a streamed clip each time it is read."
+    )
+    flip: float = Field(default=0.5, ge=0, le=1, description="Probability of mirroring left and right.")
+    permute_colors: float = Field(
+        default=0.0, ge=0, le=1, description="Probability of shuffling R, G and B, alike in all buffers."
+    )
+    crop_alignment: int = Field(
+        default=4, ge=1, description="Crops start at multiples of this; 4 keeps the codec's blocks."
+    )
+
+
+class ValidationSettings(BaseModel):
+    """Clips whose PSNR is shown while training; nothing is selected or stopped by it."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    split: str | None = Field(default="test", description="Split to validate on; null validates nothing.")
+    clips: int = Field(default=8, ge=1, description="How many of its clips, spread evenly over it.")
+    every: int = Field(default=250, ge=1, description="Steps between validations.")
+
+
+class Settings(BaseModel):
+    """Everything tron-train can be told."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    dataset: Path = Field(description="Dataset folder that tron-datagen wrote.")
+    output_dir: Path = Field(
+        description="Folder for renderer.safetensors, checkpoints, metrics.csv, config.yaml."
+    )
+    renderer: dict[str, Any] = Field(
+        description="What is trained, a `_target_` (group: tiny, pixel_mlp, cosmos)."
+    )
+    stages: list[Stage] = Field(min_length=1, description="The curriculum, in order.")
+    optimizer: OptimizerSettings = OptimizerSettings()
+    loss: LossSettings = LossSettings()
+    data: DataSettings = DataSettings()
+    validation: ValidationSettings = ValidationSettings()
+    seed: int = Field(
+        default=0, description="Root of all randomness: initial weights, batches, augmentation."
+    )
+    max_seconds: float | None = Field(
+        default=None,
+        gt=0,
+        description="Anneal all stages within this training time, each by its share of the steps; "
+        "null trains the given steps, reproducibly.",
+    )
+    checkpoint_every: int = Field(default=500, ge=1, description="Steps between checkpoints.")
+    threads: int | None = Field(
+        default=1,
+        ge=1,
+        description="CPU threads of torch; 1 makes runs reproducible bit by bit, null leaves torch's.",
+    )
+    accelerator: str = Field(default="auto", description="Lightning accelerator: auto, cpu, gpu.")
+    devices: int | str = Field(default="auto", description="Lightning devices, a number or auto.")
+    nodes: int = Field(default=1, ge=1, description="Machines, under torchrun or Slurm.")
+    precision: str = Field(default="32-true", description="Lightning precision, e.g. 32-true or bf16-mixed.")
+
+    @field_validator("stages")
+    @classmethod
+    def _distinct_names(cls, stages: list[Stage]) -> list[Stage]:
+        if len({stage.name for stage in stages}) < len(stages):
+            raise ValueError("two stages have one name")
+        if not any(stage.steps for stage in stages):
+            raise ValueError("no stage has any steps")
+        return stages
