@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 import tron
 from datagen.assets import Asset
 from datagen.plan import Sources, config_sha256
-from datagen.settings import SPLITS, Settings
+from datagen.settings import OUTSIDE, SPLITS, Settings
 from tron.apps.recipes import compose_recipe
 from tron.runtime import describe_machine
 from tron.shards.manifest import Manifest
@@ -22,20 +22,28 @@ from tron.shards.schema import SCHEMA_VERSION
 PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "OpenEXR")
 
 
-def command_line(settings: Settings, output_dir: str, only: Sequence[str] = ()) -> str:
-    """The command that makes this dataset: every key that differs from the shipped configuration, spelt out.
+def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), machine: bool = True) -> str:
+    """The command that makes a dataset: every key that differs from the shipped configuration, spelt out.
 
-    It does not lean on recipes, whose content may change; ``output_dir`` and ``only`` are the caller's.
+    It does not lean on recipes, whose content may change. ``output_dir`` and ``only`` are the caller's; without
+    ``machine`` it leaves out what decides nothing of the content: cluster and workers.
     """
     shipped = OmegaConf.to_container(compose_recipe("conf.datagen", []), resolve=False)
-    defaults = dict(_leaves(shipped))
     values = settings.model_dump(mode="json") | {"output_dir": output_dir, "only": list(only)}
+    if not machine:
+        values = {key: value for key, value in values.items() if key not in OUTSIDE}
+        values |= {"output_dir": output_dir}
+    defaults, wanted = dict(_leaves(shipped)), dict(_leaves(values))
+    parents = {key.rsplit(".", 1)[0] for key in defaults if "." in key}
     words = ["tron-datagen"]
-    for key, value in _leaves(values):
-        if key not in defaults:
+    for key, value in wanted.items():
+        if key not in defaults and key not in parents:
             words.append(f"+{key}={_hydra(value)}")
-        elif defaults[key] != value:
+        elif defaults.get(key, ...) != value:
             words.append(f"{key}={_hydra(value)}")
+    # A cluster of another kind has other options: those of the shipped one must go.
+    inside = {key.rsplit(".", 1)[0] for key in wanted if "." in key}
+    words += [f"~{key}" for key in defaults if key not in wanted and key.rsplit(".", 1)[0] in inside]
     return " ".join(shlex.quote(word) for word in words)
 
 
@@ -96,7 +104,7 @@ def card_text(
         "",
         "## How it was made",
         "",
-        "    " + command_line(settings, "DIR"),
+        "    " + command_line(settings, "DIR", machine=False),
         "",
         f"Root seed {settings.seed}. Frames by Mitsuba's path tracer, guidance by TRON's surfel tracer on "
         f"about {settings.surfels:,} surfels a scene, from {settings.views} views. Buffers are linear; "

@@ -12,6 +12,9 @@ from datagen.materials import Style
 
 LightChoice = Literal["any", "sun", "studio", "overcast", "hdri"]
 Split = Literal["train", "train_b", "test"]
+OUTSIDE = {"output_dir", "mode", "only", "workers", "recycle_after", "cluster"}
+"""Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
+
 SPLITS: tuple[Split, ...] = ("train", "train_b", "test")
 
 
@@ -134,8 +137,7 @@ class Settings(_Model):
 
     def recipe(self) -> dict[str, Any]:
         """What decides a scene's content, as plain values: not where it goes, who makes it or how many."""
-        outside = {"output_dir", "mode", "only", "workers", "recycle_after", "cluster"}
-        values = self.model_dump(mode="json", exclude=outside)
+        values = self.model_dump(mode="json", exclude=OUTSIDE)
         for name in SPLITS:
             del values[name]["scenes"]
         return values

@@ -96,8 +96,8 @@ def test_a_panel_shines_with_its_solid_angle():
 def test_an_overcast_zenith_outshines_the_horizon_as_the_cie_says():
     light = OvercastSpec(
         zenith=(1, 1, 1),
-        horizon=(1 / 3,) * 3,
-        ground=(0.1,) * 3,
+        horizon=(1 / 3, 1 / 3, 1 / 3),
+        ground=(0.1, 0.1, 0.1),
         patch_azimuth_deg=0,
         patch_elevation_deg=45,
         patch_width_deg=30,

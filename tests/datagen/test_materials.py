@@ -61,7 +61,7 @@ def test_parameters_blend_by_the_pattern(points):
 
 
 def test_drawn_materials_are_physical():
-    for style in "AB":
+    for style in PATTERNS_OF_STYLE:
         for i in range(50):
             drawn = draw_material(generator(i, "m"), style)
             assert drawn.pattern in PATTERNS_OF_STYLE[style]

@@ -30,7 +30,7 @@ def spec():
         }
     )
     ball = ObjectSpec(
-        shape=ShapeSpec(kind="sphere", size=RADIUS, parameters=(0.5,) * 4),
+        shape=ShapeSpec(kind="sphere", size=RADIUS, parameters=(0.5, 0.5, 0.5, 0.5)),
         material=material,
         size=RADIUS,
         placement=Placement(quaternion=(0.9, 0.1, 0.3, 0.2), position=(0.2, -0.1, RADIUS)),

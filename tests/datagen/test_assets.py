@@ -1,0 +1,86 @@
+"""The catalogue: nothing without a licence unless it is allowed by name."""
+
+import json
+
+import numpy as np
+import pytest
+
+from datagen.assets import find_assets, find_environments, for_split
+from datagen.lights import HdriSpec
+from tron.errors import TronError
+from tron.shading.environment import EnvironmentMap
+from tron.storage import sha256
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "sub").mkdir()
+    for name in ("a.obj", "sub/b.obj", "sub/a.obj"):
+        (tmp_path / name).write_text(TRIANGLE)
+    return tmp_path
+
+
+def catalogue(folder, *paths, name="catalogue.json"):
+    entries = [{"path": p, "licence": "CC0-1.0", "author": "me", "source": "here"} for p in paths]
+    (folder / name).write_text(json.dumps(entries))
+    return folder / name
+
+
+def test_licensed_files_are_listed_in_order_with_their_hash(folder):
+    catalogue(folder, "a.obj", "sub/b.obj", "sub/a.obj")
+    assets = find_assets(folder)
+    assert [asset.path for asset in assets] == ["a.obj", "sub/a.obj", "sub/b.obj"]
+    assert [asset.id for asset in assets] == ["a", "sub/a", "b"], "colliding stems go by their path"
+    assert assets[0].sha256 == sha256(folder / "a.obj")
+    assert assets[0].licence == "CC0-1.0"
+
+
+def test_a_file_without_licence_is_refused_by_name(folder):
+    catalogue(folder, "a.obj", "sub/a.obj")
+    with pytest.raises(TronError, match=r"'b' has no licence.*allow_unlicensed=\[b\]"):
+        find_assets(folder)
+    allowed = find_assets(folder, allow_unlicensed=["b"])
+    assert {asset.id: asset.licence for asset in allowed}["b"] is None
+
+
+def test_a_catalogue_may_lie_elsewhere(folder, tmp_path_factory):
+    elsewhere = catalogue(tmp_path_factory.mktemp("c"), "a.obj", "sub/a.obj", "sub/b.obj", name="mine.json")
+    assert len(find_assets(folder, catalogue=elsewhere)) == 3
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{}", "[1]", '[{"licence": "x"}]', '[{"path": "a", "wrong": 1}]', "[" * 100_000, "\x00"]
+)
+def test_damaged_catalogues_are_one_line_errors(folder, text):
+    (folder / "catalogue.json").write_text(text)
+    with pytest.raises(TronError, match="catalogue cannot be read") as caught:
+        find_assets(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_empty_folders_are_errors(tmp_path):
+    with pytest.raises(TronError, match="not found"):
+        find_assets(tmp_path / "none")
+    with pytest.raises(TronError, match=r"no \.gltf"):
+        find_assets(tmp_path)
+
+
+def test_environment_maps_are_classified_by_what_they_hold(tmp_path, variant):
+    flat = np.full((16, 32, 3), 0.5, np.float32)
+    lamp = flat.copy()
+    lamp[5, 7] = 500.0
+    EnvironmentMap(flat).save(tmp_path / "flat.exr")
+    EnvironmentMap(lamp).save(tmp_path / "lamp.hdr")
+    catalogue(tmp_path, "flat.exr", "lamp.hdr")
+    _, specs = find_environments(tmp_path)
+    assert [(spec.path, spec.contrast) for spec in specs] == [("flat.exr", "low"), ("lamp.hdr", "high")]
+
+
+def test_test_lights_are_held_out_where_there_are_enough():
+    maps = [HdriSpec(path=str(i), sha256="", rotation_deg=0.0, contrast="low") for i in range(9)]
+    train, test = ({m.path for m in for_split(maps, split)} for split in ("train", "test"))
+    assert not train & test
+    assert len(train | test) == 9
+    assert for_split(maps[:3], "train") == for_split(maps[:3], "test")

@@ -1,0 +1,310 @@
+"""The engine's promises: resumable, repeatable, accounted for, finite, never two datasets in one folder."""
+
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+
+import datagen.run
+from datagen.card import command_line
+from datagen.plan import Sources, Work, plan
+from datagen.run import make, make_scene
+from datagen.settings import Settings
+from datagen.synthetic import make_clips
+from datagen.validate import validate
+from tron.apps.recipes import check, compose_recipe
+from tron.errors import TronError
+from tron.gaussians.scene import GaussianScene
+from tron.images import read_image
+from tron.shards.manifest import Manifest, verify
+from tron.shards.reader import read_clips
+from tron.shards.schema import MEMBERS, REFERENCE_MEMBERS
+from tron.storage import locked
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+TINY = [
+    "train.scenes=2",
+    "train_b.scenes=1",
+    "test.scenes=1",
+    "views=6",
+    "view_width=32",
+    "view_height=32",
+    "surfels=1500",
+    "mesh_edge=0.2",
+    "environment_height=16",
+    "path_frames=8",
+    "objects=[2,2]",
+    "cluster=null",
+]
+for _split in ("train", "train_b", "test"):
+    TINY += [
+        f"{_split}.lights=[overcast,any]",
+        f"{_split}.frames=2",
+        f"{_split}.width=16",
+        f"{_split}.height=12",
+        f"{_split}.path_spp=2",
+        f"{_split}.guidance_spp=2",
+        f"{_split}.reference_spp=2",
+    ]
+
+
+def tiny(output: Path, *overrides: str) -> Settings:
+    return check(compose_recipe("conf.datagen", [*TINY, f"output_dir={output}", *overrides]), Settings)
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """Every file but the lock, with its bytes."""
+    files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != ".tron.lock")
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in files}
+
+
+@pytest.fixture(scope="module")
+def dataset(variant, tmp_path_factory) -> Path:
+    output = tmp_path_factory.mktemp("dataset")
+    assert make(tiny(output)) == 0
+    return output
+
+
+def test_a_dataset_is_whole_and_has_everything_beside_its_shards(dataset):
+    assert verify(dataset) == []
+    assert validate(dataset) == 0
+    manifest = Manifest.load(dataset)
+    assert manifest.splits() == ["test", "train", "train_b"]
+    assert sum(entry.samples for entry in manifest.shards) == 8
+    for name in (
+        "config.yaml",
+        "index.html",
+        "card.md",
+        "scenes/train-000001/spec.json",
+        "previews/test-00000.png",
+    ):
+        assert (dataset / name).is_file()
+    GaussianScene.load(dataset / "scenes/train_b-000000/surfels.ply").validate()
+    assert not (dataset / "failures.jsonl").exists()
+    card = (dataset / "card.md").read_text()
+    assert "| train | 2 | 4 | 8 | 16 x 12 |" in card
+    assert "mitsuba" in card
+    page = (dataset / "index.html").read_text()
+    assert "previews/train-00001.png" in page
+    assert "http" not in page
+
+
+def test_clips_hold_consecutive_frames_with_true_metadata(dataset):
+    clips = list(read_clips(dataset, "test"))
+    assert clips[0].meta.light_family == "overcast"
+    for clip in clips:
+        assert set(clip.frames) == {*MEMBERS, *REFERENCE_MEMBERS}
+        assert len(clip.meta.cameras) == clip.meta.frames == 2
+        assert clip.meta.exposure > 0
+        foreground = clip.frames["foreground"]
+        assert set(np.unique(foreground)) <= {0.0, 1.0}
+        # Where the truth has a surface, so have the surfels, but for their rims.
+        assert clip.frames["mask"][foreground > 0].mean() > 0.9
+        normal = clip.frames["normal_ref"][foreground[..., 0] > 0]
+        np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1.0, atol=1e-3)
+    for clip in read_clips(dataset, "train"):
+        assert set(clip.frames) == set(MEMBERS)
+
+
+def test_guidance_and_frames_see_the_same_light(dataset):
+    """Means over the foreground agree within a factor: another exposure, rotation or unit would show."""
+    for clip in read_clips(dataset, "train"):
+        seen = clip.frames["foreground"][..., 0] > 0
+        ratio = clip.frames["rgb"][seen].mean() / clip.frames["shadowed"][seen].mean()
+        assert 0.5 < ratio < 2.0
+
+
+def test_a_finished_dataset_is_not_touched(dataset, monkeypatch):
+    def never(*_):
+        raise AssertionError("nothing is left to make")
+
+    monkeypatch.setattr(datagen.run, "make_scene", never)
+    before = {path: os.stat(dataset / path).st_mtime_ns for path in tree(dataset)}
+    assert make(tiny(dataset)) == 0
+    assert {path: os.stat(dataset / path).st_mtime_ns for path in tree(dataset)} == before
+
+
+def test_an_interrupted_run_ends_with_the_same_bytes(dataset, tmp_path, monkeypatch):
+    """Killed twice, once between a scene's shards and its record, with debris of half-written files."""
+    made = []
+
+    def stops_after_one(item: Work, settings: Settings, sources: Sources):
+        if made:
+            raise KeyboardInterrupt
+        made.append(item.name)
+        return make_scene(item, settings, sources)
+
+    monkeypatch.setattr(datagen.run, "make_scene", stops_after_one)
+    with pytest.raises(KeyboardInterrupt):
+        make(tiny(tmp_path))
+    monkeypatch.undo()
+    (tmp_path / "scenes" / made[0] / "record.json").unlink()
+    (tmp_path / ".train-00000.abcd.tar").write_bytes(b"half a shard")
+    assert make(tiny(tmp_path)) == 0
+    assert tree(tmp_path) == tree(dataset)
+
+
+def test_a_scene_depends_on_nothing_else_that_is_made(dataset, tmp_path):
+    settings = tiny(tmp_path, "only=[train-000001]")
+    assert make(settings) == 0
+    alone = tree(tmp_path)
+    whole = tree(dataset)
+    for path in ("train-00001.tar", "scenes/train-000001/surfels.ply", "scenes/train-000001/spec.json"):
+        assert alone[path] == whole[path]
+    assert [entry.name for entry in Manifest.load(tmp_path).shards] == ["train-00001.tar"]
+
+
+def test_a_dataset_grows_without_making_the_old_scenes_again(tmp_path, monkeypatch):
+    small = ["train.scenes=1", "train_b.scenes=0", "test.scenes=0"]
+    assert make(tiny(tmp_path, *small)) == 0
+    names = []
+    real = make_scene
+    monkeypatch.setattr(
+        datagen.run, "make_scene", lambda item, *rest: (names.append(item.name), real(item, *rest))[1]
+    )
+    assert make(tiny(tmp_path, *small, "train.scenes=2")) == 0
+    assert names == ["train-000001"]
+    with pytest.raises(TronError, match="holds 2 scenes"):
+        make(tiny(tmp_path, *small))
+
+
+def test_another_recipe_is_refused_before_anything_is_written(dataset):
+    before = tree(dataset)
+    with pytest.raises(TronError, match=r"path_spp=2, not 3"):
+        make(tiny(dataset, "test.path_spp=3"))
+    assert tree(dataset) == before
+
+
+def test_failures_are_listed_and_retried_by_their_command(tmp_path, monkeypatch):
+    real = datagen.run.build
+
+    def fails(spec, *rest):
+        if spec.name == "train-000001":
+            raise RuntimeError("no memory\nfor this")
+        return real(spec, *rest)
+
+    monkeypatch.setattr(datagen.run, "build", fails)
+    settings = tiny(tmp_path)
+    assert make(settings) == 1
+    failure = json.loads((tmp_path / "failures.jsonl").read_text())
+    assert failure["scene"] == "train-000001"
+    assert failure["reason"] == "RuntimeError: no memory for this"
+    assert Manifest.load(tmp_path).failures == 1
+    assert verify(tmp_path) == []
+
+    monkeypatch.undo()
+    words = shlex.split(failure["command"])
+    assert words[0] == "tron-datagen"
+    again = check(compose_recipe("conf.datagen", words[1:]), Settings)
+    assert again.only == ["train-000001"]
+    assert again.recipe() == settings.recipe()
+    assert make(again) == 0
+    assert not (tmp_path / "failures.jsonl").exists()
+    assert Manifest.load(tmp_path).failures == 0
+
+
+def test_values_that_are_not_finite_never_reach_a_shard(tmp_path, monkeypatch):
+    def spoilt(*arguments):
+        for meta, frames in make_clips(*arguments):
+            if meta.key == "test-000000-l1":
+                frames[1]["pbr"][3, 4] = np.nan
+            yield meta, frames
+
+    monkeypatch.setattr(datagen.run, "make_clips", spoilt)
+    settings = tiny(tmp_path, "train.scenes=0", "train_b.scenes=0")
+    assert make(settings) == 1
+    failure = json.loads((tmp_path / "failures.jsonl").read_text())
+    assert failure["clip"] == "test-000000-l1"
+    assert "frame 1: pbr has 3 values" in failure["reason"]
+    assert [clip.meta.key for clip in read_clips(tmp_path, "test")] == ["test-000000-l0"]
+    with np.load(tmp_path / "quarantine" / "test-000000-l1.npz") as aside:
+        assert np.isnan(aside["pbr"]).sum() == 3
+    assert make(settings) == 1, "made again it would be the same; it stays accounted for"
+
+
+def test_a_folder_in_use_is_refused(tmp_path):
+    with locked(tmp_path), pytest.raises(TronError, match="in use"):
+        make(tiny(tmp_path))
+
+
+def test_a_full_disk_is_found_before_the_first_scene(tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
+    with pytest.raises(TronError, match="disk space"):
+        make(tiny(tmp_path))
+    assert not list(tmp_path.glob("*.tar"))
+
+
+def test_unknown_scenes_and_empty_datasets_are_refused(tmp_path):
+    with pytest.raises(TronError, match="no such scene"):
+        make(tiny(tmp_path, "only=[train-000009]"))
+    with pytest.raises(TronError, match="no scenes"):
+        plan(tiny(tmp_path, "train.scenes=0", "train_b.scenes=0", "test.scenes=0"))
+
+
+@pytest.mark.parametrize("cluster", [None, {"_target_": "dask_jobqueue.SLURMCluster", "cores": 8}])
+def test_the_command_of_the_card_makes_the_same_settings(dataset, cluster):
+    settings = tiny(dataset, "allow_unlicensed=['a b','c']", "only=[train-000001]")
+    settings = settings.model_copy(update={"cluster": cluster})
+    words = shlex.split(command_line(settings, str(dataset), settings.only))
+    assert check(compose_recipe("conf.datagen", words[1:]), Settings) == settings
+
+
+def test_previews_are_the_clips_first_frames_side_by_side(dataset):
+    sheet = read_image(dataset / "previews" / "train-00000.png")
+    assert sheet.shape == (2 * (12 + 2), 6 * (16 + 2), 3)
+    assert sheet.std() > 0.05
+
+
+def test_validation_finds_what_is_missing(dataset, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(dataset, copy)
+    (copy / "scenes/test-000000/surfels.ply").unlink()
+    tar = copy / "train-00000.tar"
+    tar.write_bytes(tar.read_bytes()[:-20_000])
+    assert validate(copy) >= 2
+
+
+def test_config_says_how_it_was_made_and_not_where(dataset):
+    config = yaml.safe_load((dataset / "config.yaml").read_text())
+    assert config["scenes"] == {"train": 2, "train_b": 1, "test": 1}
+    assert str(dataset) not in (dataset / "config.yaml").read_text()
+    assert str(dataset) not in (dataset / "card.md").read_text()
+
+
+CLUSTER = "cluster={_target_:dask.distributed.LocalCluster,threads_per_worker:1,dashboard_address:":0"}"
+
+
+@pytest.mark.long
+def test_two_workers_make_the_bytes_of_one_process(dataset, tmp_path):
+    assert make(tiny(tmp_path, CLUSTER, "workers=2", "recycle_after=1")) == 0
+    assert tree(tmp_path) == tree(dataset)
+
+
+@pytest.mark.long
+def test_kill_9_at_any_moment_and_again_gives_the_same_bytes(dataset, tmp_path):
+    command = [sys.executable, "-m", "tests_run_tiny"]
+    script = tmp_path / "tests_run_tiny.py"
+    output = tmp_path / "out"
+    arguments = [*TINY, f"output_dir={output}", CLUSTER, "workers=2"]
+    script.write_text(f"from datagen.cli import cli\nif __name__ == '__main__':\n    cli({arguments!r})\n")
+    for seconds in (6.0, 14.0):
+        process = subprocess.Popen(
+            command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": f"{Path.cwd()}:{tmp_path}"}
+        )
+        time.sleep(seconds)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        time.sleep(2.0)  # orphaned workers notice and go
+    assert make(tiny(output)) == 0
+    assert tree(output) == tree(dataset)
