@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -42,3 +43,18 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"no real data: {SHARED_DATA} is absent")
     return SHARED_DATA
+
+
+@pytest.fixture(autouse=True)
+def drjit_threads() -> None:
+    """Give Dr.Jit two threads or more before each test, whatever the last one set.
+
+    Commands run with one thread to be reproducible; Mitsuba 3.9 reads and writes OpenEXR on Dr.Jit's worker
+    threads, and where there are none it waits for ever.
+    """
+    if "drjit" in sys.modules:
+        import drjit as dr
+
+        threads = max(2, os.cpu_count() or 1)
+        if dr.thread_count() != threads:
+            dr.set_thread_count(threads)
