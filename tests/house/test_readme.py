@@ -1,0 +1,62 @@
+"""What the README shows has to run."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
+from tron.images import read_image, write_image
+
+README = Path(__file__).resolve().parents[2] / "README.md"
+
+
+def plane_view() -> GBufferView:
+    """A camera four units above a grey floor of 4 x 4."""
+    from tron.cameras import Camera
+
+    camera = Camera.look_at((0, 0, 4), (0, 0, 0), up=(0, 1, 0), fov_deg=50, width=48, height=48)
+    rays = camera.rays()
+    position = camera.position + rays * (-4 / rays[..., 2:])
+    full = np.ones(rays.shape[:2])
+    return GBufferView(
+        camera=camera,
+        position=position,
+        normal=np.broadcast_to((0.0, 0.0, 1.0), rays.shape).copy(),
+        base_color=np.full(rays.shape, 0.5),
+        roughness=0.5 * full,
+        metallic=0 * full,
+        rgb=None,
+        valid=full > 0,
+        object_id=full.astype(np.int32),
+    )
+
+
+@pytest.mark.usefixtures("variant")
+def test_the_python_example_relights_a_scene(tmp_path, monkeypatch):
+    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    assert "width=512, height=512" in code
+    surfels_from_gbuffers([plane_view()], count=500).save(tmp_path / "scene.ply")
+    write_image(tmp_path / "studio.hdr", np.full((16, 32, 3), 0.7, np.float32))
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code.replace("512", "24"), str(README), "exec"), {})  # noqa: S102 - it is our own README
+    pbr = read_image(tmp_path / "pbr.exr")
+    assert pbr.shape == (24, 24, 3)
+    # A grey floor under a constant light of 0.7: half of it comes back, and a little gloss.
+    assert 0.3 < pbr[12, 12, 0] < 0.45
+    assert read_image(tmp_path / "irradiance.png")[12, 12, 0] > 0.5
+
+
+def test_commands_that_the_readme_names_exist():
+    import tomllib
+
+    scripts = tomllib.loads((README.parent / "pyproject.toml").read_text())["project"]["scripts"]
+    named = set(re.findall(r"tron-[a-z]+", README.read_text()))
+    assert named == set(scripts)
+
+
+def test_files_that_the_readme_links_exist():
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", README.read_text()) if "://" not in link]
+    assert links
+    assert [link for link in links if not (README.parent / link).is_file()] == []
