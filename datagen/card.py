@@ -23,10 +23,10 @@ PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "OpenEXR")
 
 
 def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), machine: bool = True) -> str:
-    """The command that makes a dataset: every key that differs from the shipped configuration, spelt out.
+    """The command that makes a dataset: every key that differs from the shipped configuration, in full.
 
-    It does not lean on recipes, whose content may change. ``output_dir`` and ``only`` are the caller's; without
-    ``machine`` it leaves out what decides nothing of the content: cluster and workers.
+    It does not lean on recipes, whose content may change. ``output_dir`` and ``only`` are the caller's;
+    without ``machine`` it leaves out what decides nothing of the content: cluster and workers.
     """
     shipped = OmegaConf.to_container(compose_recipe("conf.datagen", []), resolve=False)
     values = settings.model_dump(mode="json") | {"output_dir": output_dir, "only": list(only)}

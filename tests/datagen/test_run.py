@@ -282,7 +282,7 @@ def test_config_says_how_it_was_made_and_not_where(dataset):
     assert str(dataset) not in (dataset / "card.md").read_text()
 
 
-CLUSTER = "cluster={_target_:dask.distributed.LocalCluster,threads_per_worker:1,dashboard_address:":0"}"
+CLUSTER = "cluster={_target_:dask.distributed.LocalCluster,threads_per_worker:1}"
 
 
 @pytest.mark.long
