@@ -50,11 +50,11 @@ def main(settings: Settings) -> int:
             return failure.exit_code
         environment = {**describe_machine(), "inputs": outcome.inputs}
         results = Results(benchmark=benchmark.name, environment=environment, rows=list(outcome.rows))
-        results = results.held_to(benchmark.targets)
+        results = results.held_to(benchmark.bounds())
         results.save(settings.output_dir / "results.json")
         report = settings.output_dir / "report.html"
-        write_report(assemble(outcome, results, benchmark.targets), report)
-        print_results(results, benchmark.targets, report)
+        write_report(assemble(outcome, results, benchmark.bounds()), report)
+        print_results(results, benchmark.bounds(), report)
     return 0
 
 

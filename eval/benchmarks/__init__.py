@@ -51,6 +51,10 @@ class Benchmark(BaseModel, abc.ABC):
     name: ClassVar[str]
     targets: list[Target] = Field(default_factory=list)
 
+    def bounds(self) -> list[Target]:
+        """The targets that the rows are held to, those of a benchmark inside this one included."""
+        return self.targets
+
     def check(self) -> None:
         """Look at the inputs before anything is written.
 

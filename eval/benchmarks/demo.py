@@ -12,7 +12,7 @@ from eval.benchmarks import Benchmark, Outcome
 from eval.benchmarks.relighting import Relighting
 from eval.report.figures import written
 from eval.report.page import Cell, Section, Table
-from eval.results import Row
+from eval.results import Row, Target
 from eval.stages import Child, Stages, script_path
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -37,6 +37,10 @@ class Demo(Benchmark):
         default=None, description="wall time of each training; null leaves it to the training recipe"
     )
     train_threads: PositiveInt = Field(default=1, description="threads of each of the two trainings")
+
+    def bounds(self) -> list[Target]:
+        """The evaluation's targets, then the demo's own."""
+        return [*self.relighting.targets, *self.targets]
 
     def check(self) -> None:
         """Find the commands that the stages call."""

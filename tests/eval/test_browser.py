@@ -45,7 +45,7 @@ def test_the_report_opens_in_chromium(dataset: Path, weights: Path, tmp_path: Pa
     benchmark = Relighting(dataset=dataset, renderer=weights / "tiny.safetensors", pictures=2)
     outcome = benchmark.run(tmp_path)
     results = Results(benchmark="relighting", environment={"cpu": "here"}, rows=list(outcome.rows))
-    write_report(assemble(outcome, results, benchmark.targets), tmp_path / "report.html")
+    write_report(assemble(outcome, results, benchmark.bounds()), tmp_path / "report.html")
     html = (tmp_path / "report.html").read_text().replace("</body>", PROBE + "</body>")
     (tmp_path / "probe.html").write_text(html)
     browser = [CHROMIUM, *FLAGS, f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},1200"]

@@ -65,8 +65,11 @@ def test_the_demo_goes_from_nothing_to_a_report_and_a_second_run_only_evaluates(
     assert "[datagen] 12 clips" in said
     assert f"report: {out / 'report.html'}" in said
     assert "demo.seconds" in said
+    assert results.find("demo.seconds").reference == "target: at most 900 s"  # type: ignore[union-attr]
+    assert results.find("surfels.normal_mae_deg").reference == "target: at most 5 deg"  # type: ignore[union-attr]
     html = (out / "report.html").read_text()
     assert "Where the time went" in html
+    assert "the whole demo, after set-up" in html
 
     assert run(f"output_dir={out}") == 0
     assert stand_ins.read_text().splitlines() == commands
