@@ -46,7 +46,8 @@ def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     import torch
     from torchmetrics.functional.image import structural_similarity_index_measure
 
-    first, second = (torch.from_numpy(np.asarray(x, np.float64)).movedim(-1, 0)[None] for x in (a, b))
+    # In float64 the same convolutions take 25 times as long, and the mean differs by less than 1e-6.
+    first, second = (torch.from_numpy(np.asarray(x, np.float32)).movedim(-1, 0)[None] for x in (a, b))
     _, image = structural_similarity_index_measure(first, second, data_range=1.0, return_full_image=True)
     similarity = image[0].movedim(0, -1).numpy()
     return float(_selected(similarity, mask).mean())
