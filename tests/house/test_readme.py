@@ -1,6 +1,8 @@
 """What the README shows has to run."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +48,15 @@ def test_the_python_example_relights_a_scene(tmp_path, monkeypatch):
     # A grey floor under a constant light of 0.7: half of it comes back, and a little gloss.
     assert 0.3 < pbr[12, 12, 0] < 0.45
     assert read_image(tmp_path / "irradiance.png")[12, 12, 0] > 0.5
+
+
+def test_the_line_for_cuda_users_names_the_gpu_or_says_in_one_line_why_not():
+    (line,) = re.findall(r"^\.venv/bin/python -c \"(.*)\"$", README.read_text(), re.MULTILINE)
+    done = subprocess.run([sys.executable, "-c", line], capture_output=True, text=True, timeout=120)
+    if done.returncode == 0:
+        assert done.stdout.strip()
+    else:
+        assert "TronError: " in done.stderr.strip().splitlines()[-1]
 
 
 def test_commands_that_the_readme_names_exist():
