@@ -42,7 +42,7 @@ def test_the_python_example_relights_a_scene(tmp_path, monkeypatch):
     surfels_from_gbuffers([plane_view()], count=500).save(tmp_path / "scene.ply")
     write_image(tmp_path / "studio.hdr", np.full((16, 32, 3), 0.7, np.float32))
     monkeypatch.chdir(tmp_path)
-    exec(compile(code.replace("512", "24"), str(README), "exec"), {})  # noqa: S102 - it is our own README
+    exec(compile(code.replace("512", "24"), str(README), "exec"), {})
     pbr = read_image(tmp_path / "pbr.exr")
     assert pbr.shape == (24, 24, 3)
     # A grey floor under a constant light of 0.7: half of it comes back, and a little gloss.
