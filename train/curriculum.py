@@ -27,7 +27,13 @@ class Stage(BaseModel):
         default=None, ge=8, description="Side of the random square crop, pixels; null trains on whole frames."
     )
     learning_rate: float = Field(
-        default=1.0, gt=0, description="Factor on the optimizer's learning rates in this stage."
+        default=1.0, gt=0, description="Factor on the optimizer's learning rates at the stage's peak."
+    )
+    final_learning_rate: float = Field(
+        default=0.01, gt=0, description="The same factor at the stage's end, after a cosine."
+    )
+    still_ratio: float = Field(
+        default=0.0, ge=0, le=1, description="Share of a video stage's batches that hold single frames."
     )
     rehearsal_split: str | None = Field(
         default=None, description="Earlier split to mix in, against forgetting."
@@ -42,6 +48,11 @@ class Stage(BaseModel):
         if (value - 1) % TIME:
             raise ValueError("frames must be 1 + 4n: 1, 5, 9, ...")
         return value
+
+    def frames_of(self, step: int) -> int:
+        """Frames K of the batch at a step: single frames are spread evenly among a video stage's batches."""
+        stills = math.floor((step + 1) * self.still_ratio) - math.floor(step * self.still_ratio)
+        return 1 if stills else self.frames
 
     def splits(self) -> list[str]:
         """Splits that this stage draws from."""
@@ -82,7 +93,8 @@ class Pace:
         return min(1.0, done)
 
 
-def learning_rate_factor(progress: float, step: int, warmup_steps: int, floor: float) -> float:
-    """Linear warm-up over the first steps times a half cosine from 1 at progress 0 down to `floor` at 1."""
+def learning_rate_factor(stage: Stage, progress: float, step: int, warmup_steps: int) -> float:
+    """Linear warm-up over the first steps times a half cosine from the stage's peak to its final rate."""
     warmup = min(1.0, (step + 1) / (warmup_steps + 1))
-    return warmup * (floor + (1 - floor) * 0.5 * (1 + math.cos(math.pi * progress)))
+    peak, final = stage.learning_rate, stage.final_learning_rate
+    return warmup * (final + (peak - final) * 0.5 * (1 + math.cos(math.pi * progress)))

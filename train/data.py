@@ -25,6 +25,7 @@ from train.sources import (
     BUFFERS,
     CachedSplit,
     Draw,
+    Sample,
     Source,
     StreamedSplit,
     decoded_bytes,
@@ -33,6 +34,7 @@ from train.sources import (
     spread_clips,
 )
 from tron import seeds
+from tron.color import luminance, to_display
 from tron.errors import TronError
 from tron.neural.windows import TIME
 from tron.shards.manifest import Manifest
@@ -114,19 +116,34 @@ class Batches(IterableDataset):
         samples = []
         for split, number, sample in self._plan(step):
             random = seeds.generator(self.seed, "train", "sample", self.stage.name, sample)
-            drawn = sources[split].sample(Draw(number, random, self.stage.frames))
+            drawn = sources[split].sample(Draw(number, random, self.stage.frames_of(step)))
             samples.append(varied(drawn, random, self.stage.crop, self.settings))
-        shapes = {tuple(sample["rgb"].shape) for sample in samples}
+        shapes = {tuple(sample.buffers["rgb"].shape) for sample in samples}
         if len(shapes) > 1:
             raise TronError(f"stage {self.stage.name} meets frames of several sizes", mend="give it a crop")
-        return {name: torch.stack([sample[name] for sample in samples]) for name in BUFFERS}
+        return {name: developed(samples, name) for name in BUFFERS}
 
 
-def varied(
-    sample: Mapping[str, Tensor], random: np.random.Generator, crop: int | None, settings: DataSettings
-) -> dict[str, Tensor]:
-    """Crop, mirror and recolour a sample, its buffers (3, K, H, W) all alike."""
-    height, width = sample["rgb"].shape[-2:]
+def developed(samples: Sequence[Sample], name: str) -> Tensor:
+    """One buffer of a batch as the network sees it: AgX where it is linear, then [-1, 1], (B, 3, K, h, w)."""
+    batch = torch.stack([sample.buffers[name] for sample in samples])
+    linear = torch.tensor([name not in sample.display for sample in samples])
+    if linear.all():
+        batch = to_display(batch, 1.0, axis=1)
+    elif linear.any():
+        batch[linear] = to_display(batch[linear], 1.0, axis=1)
+    return batch * 2 - 1
+
+
+def varied(sample: Sample, random: np.random.Generator, crop: int | None, settings: DataSettings) -> Sample:
+    """Crop, mirror and recolour a sample, its buffers all alike.
+
+    Colours are changed in linear light, where permuting and scaling channels of the light gives exactly the
+    permuted and scaled buffers: transport is linear and no channel knows another. A tint keeps the
+    luminance of white, so that the exposure rule still holds. Samples with display members keep their
+    colours.
+    """
+    height, width = sample.buffers["rgb"].shape[-2:]
     rows, columns = slice(None), slice(None)
     if crop is not None:
         if crop > min(height, width):
@@ -139,13 +156,15 @@ def varied(
         )
         rows, columns = slice(top, top + crop), slice(left, left + crop)
     mirrored = random.random() < settings.flip
-    colors = random.permutation(3).tolist() if random.random() < settings.permute_colors else None
-    result = {}
-    for name, video in sample.items():
+    order = random.permutation(3) if random.random() < settings.permute_colors else np.arange(3)
+    tint = np.exp(settings.tint * random.standard_normal(3))
+    gains = torch.tensor(tint / luminance(tint), dtype=torch.float32).view(3, 1, 1, 1)
+    buffers = {}
+    for name, video in sample.buffers.items():
         video = video[..., rows, columns]
         video = video.flip(-1) if mirrored else video
-        result[name] = video[colors] if colors else video
-    return result
+        buffers[name] = video if sample.display else video[order.tolist()] * gains
+    return Sample(buffers, sample.display)
 
 
 class TrainingData(lightning.LightningDataModule):

@@ -46,12 +46,11 @@ class RendererModule(lightning.LightningModule):
         """The stage's optimiser, with warm-up and a cosine over the stage."""
         if self.stage is None:
             raise RuntimeError("begin() chooses the stage first")
-        settings = self.settings
-        optimizer = make_optimizer(self.renderer, settings, self.stage.learning_rate)
+        settings, stage = self.settings, self.stage
+        optimizer = make_optimizer(self.renderer, settings)
 
         def factor(step: int) -> float:
-            progress = self.pace.progress(step)
-            return learning_rate_factor(progress, step, settings.warmup_steps, settings.final_factor)
+            return learning_rate_factor(stage, self.pace.progress(step), step, settings.warmup_steps)
 
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

@@ -12,30 +12,30 @@ from torch import Tensor, nn
 from train.settings import OptimizerSettings
 
 
-def make_optimizer(renderer: nn.Module, settings: OptimizerSettings, factor: float) -> torch.optim.Optimizer:
-    """Optimise what is not frozen; learning rates are the settings' times `factor`.
+def make_optimizer(renderer: nn.Module, settings: OptimizerSettings) -> torch.optim.Optimizer:
+    """Optimise what is not frozen, at the settings' rates.
 
     With muon_learning_rate, the matrices that the renderer names as `hidden_matrices` follow Muon
     (orthogonalised momentum, K. Jordan 2024, as in torch.optim.Muon) and everything else AdamW.
     """
     trained = [parameter for parameter in renderer.parameters() if parameter.requires_grad]
     if settings.muon_learning_rate is None:
-        return _adamw(trained, settings, factor)
+        return _adamw(trained, settings)
     hidden: Sequence[Tensor] = renderer.hidden_matrices()  # type: ignore[operator]
     chosen = {id(matrix) for matrix in hidden}
     muon = torch.optim.Muon(
         list(hidden),
-        lr=settings.muon_learning_rate * factor,
+        lr=settings.muon_learning_rate,
         weight_decay=settings.weight_decay,
         adjust_lr_fn="original",
     )
-    return Together([muon, _adamw([p for p in trained if id(p) not in chosen], settings, factor)])
+    return Together([muon, _adamw([p for p in trained if id(p) not in chosen], settings)])
 
 
-def _adamw(parameters: list[nn.Parameter], settings: OptimizerSettings, factor: float) -> torch.optim.AdamW:
+def _adamw(parameters: list[nn.Parameter], settings: OptimizerSettings) -> torch.optim.AdamW:
     return torch.optim.AdamW(
         parameters,
-        lr=settings.learning_rate * factor,
+        lr=settings.learning_rate,
         betas=settings.betas,
         weight_decay=settings.weight_decay,
     )

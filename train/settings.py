@@ -25,9 +25,6 @@ class OptimizerSettings(BaseModel):
     betas: tuple[float, float] = Field(default=(0.9, 0.99), description="AdamW's averaging rates.")
     weight_decay: float = Field(default=1e-2, ge=0, description="AdamW's decoupled weight decay.")
     warmup_steps: int = Field(default=50, ge=0, description="Steps of linear warm-up in each stage.")
-    final_factor: float = Field(
-        default=0.01, ge=0, le=1, description="Learning rate at a stage's end, as a fraction of its peak."
-    )
     gradient_clip: float = Field(default=1.0, gt=0, description="Largest norm of the gradient.")
     ema_decay: float | None = Field(
         default=None,
@@ -71,6 +68,9 @@ class DataSettings(BaseModel):
     flip: float = Field(default=0.5, ge=0, le=1, description="Probability of mirroring left and right.")
     permute_colors: float = Field(
         default=0.0, ge=0, le=1, description="Probability of shuffling R, G and B, alike in all buffers."
+    )
+    tint: float = Field(
+        default=0.0, ge=0, description="Deviation of the logarithm of random gains on the light's R, G and B."
     )
     crop_alignment: int = Field(
         default=4, ge=1, description="Crops start at multiples of this; 4 keeps the codec's blocks."

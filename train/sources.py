@@ -28,25 +28,43 @@ from tron.shards.schema import META_SUFFIX, Clip, ClipMeta
 BUFFERS = ("pbr", "irr", "rgb")
 
 
-def display_video(clip: Clip, member: str) -> np.ndarray:
-    """A clip's buffer as the network sees it: (K, H, W, C) linear -> display in [-1, 1], (3, K, H, W)
-    float32.
+def exposed_video(clip: Clip, member: str) -> np.ndarray:
+    """A clip's buffer (K, H, W, C) as (C, K, H, W) float32: linear under the clip's exposure, or display as
+    it is.
 
-    Members whose color_space is "display" (captured photos) are taken as they are; exposure and AgX are for
-    linear.
+    Members whose color_space is "display" (captured photos) are left alone: exposure is for linear values.
     """
     image = clip.frames[member]
-    if clip.meta.color_space.get(member, "linear") == "linear":
-        image = to_display(image, clip.meta.exposure)
-    return np.ascontiguousarray(np.moveaxis(image * 2 - 1, -1, 0), np.float32)
+    if not is_display(clip.meta, member):
+        image = image * np.float32(clip.meta.exposure)
+    return np.ascontiguousarray(np.moveaxis(image, -1, 0), np.float32)
 
 
-class Source(Protocol):
-    """Clips of a split that samples are drawn from by number."""
+def is_display(meta: ClipMeta, member: str) -> bool:
+    """Whether a member holds display values, to which neither exposure nor AgX is applied."""
+    return meta.color_space.get(member, "linear") == "display"
 
-    def sample(self, draw: Draw) -> dict[str, Tensor]:
-        """The drawn sample's buffers, (3, K, H, W) in [-1, 1]."""
-        ...
+
+def display_video(clip: Clip, member: str) -> np.ndarray:
+    """A clip's buffer as the network sees it: display-encoded in [-1, 1], (3, K, H, W) float32."""
+    video = exposed_video(clip, member)
+    if not is_display(clip.meta, member):
+        video = to_display(video, 1.0, axis=0)
+    return (video * 2 - 1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Frames of one clip: buffers (3, K, H, W), exposed linear, or display in [0, 1] where `display` says."""
+
+    buffers: dict[str, Tensor]
+    display: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(cls, clip: Clip) -> Sample:
+        """All frames of a clip."""
+        buffers = {name: torch.from_numpy(exposed_video(clip, name)) for name in BUFFERS}
+        return cls(buffers, frozenset(name for name in BUFFERS if is_display(clip.meta, name)))
 
 
 @dataclass(frozen=True)
@@ -58,26 +76,38 @@ class Draw:
     frames: int
 
 
+class Source(Protocol):
+    """Clips of a split that samples are drawn from by number."""
+
+    def sample(self, draw: Draw) -> Sample:
+        """The drawn sample, K = draw.frames frames."""
+        ...
+
+
 class CachedSplit:
     """A split decoded into memory; sample number n is clip n of an endless series of shuffled passes."""
 
     def __init__(self, folder: Path, split: str, seed: int):
         self.seed, self.split = seed, split
-        self.clips: list[dict[str, Tensor]] = []
-        for clip in read_clips(folder, split, BUFFERS):
-            self.clips.append({name: torch.from_numpy(display_video(clip, name)) for name in BUFFERS})
+        self.clips = [Sample.of(clip) for clip in read_clips(folder, split, BUFFERS)]
         self._pass = -1
         self._order = np.zeros(0, np.int64)
 
-    def sample(self, draw: Draw) -> dict[str, Tensor]:
+    def sample(self, draw: Draw) -> Sample:
         """Clip `draw.number` of the shuffled passes, at a random start."""
         which, place = divmod(draw.number, len(self.clips))
         if which != self._pass:
             order = seeds.generator(self.seed, "train", "pass", self.split, which)
             self._pass, self._order = which, order.permutation(len(self.clips))
         clip = self.clips[int(self._order[place])]
-        start = int(draw.random.integers(clip["rgb"].shape[1] - draw.frames + 1))
-        return {name: clip[name][:, start : start + draw.frames] for name in BUFFERS}
+        count = clip.buffers["rgb"].shape[1]
+        if count < draw.frames:
+            raise TronError(
+                f"split '{self.split}' has a clip of {count} frames", mend=f"{draw.frames} are needed"
+            )
+        start = int(draw.random.integers(count - draw.frames + 1))
+        frames = {name: video[:, start : start + draw.frames] for name, video in clip.buffers.items()}
+        return Sample(frames, clip.display)
 
 
 class StreamedSplit:
@@ -120,7 +150,7 @@ class StreamedSplit:
                     kept = {n: data for n, data in files.items() if n[: n.index(".")] in {*wanted, "meta"}}
                     yield {"files": kept, "start": start}
 
-    def sample(self, draw: Draw) -> dict[str, Tensor]:
+    def sample(self, draw: Draw) -> Sample:
         """The stream's next sample; its number is the order of calls."""
         if self._samples is None:
             self._samples = iter(self._pipeline)
@@ -128,8 +158,7 @@ class StreamedSplit:
                 next(self._samples)
         drawn: Any = next(self._samples)
         indices = range(drawn["start"], drawn["start"] + draw.frames)
-        clip = decode_clip(drawn["files"], BUFFERS, indices)
-        return {name: torch.from_numpy(display_video(clip, name)) for name in BUFFERS}
+        return Sample.of(decode_clip(drawn["files"], BUFFERS, indices))
 
 
 def _zero() -> int:

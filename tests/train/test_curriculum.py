@@ -9,18 +9,29 @@ from pydantic import ValidationError
 
 from train.curriculum import Pace, Stage, learning_rate_factor
 
+STAGE = Stage(name="one", split="train", steps=1000, learning_rate=0.5, final_learning_rate=0.01)
 
-def test_the_rate_rises_to_its_peak_falls_like_a_cosine_and_ends_at_the_floor():
-    rates = [learning_rate_factor(step / 1000, step, 100, 0.01) for step in range(1001)]
-    assert rates[0] == pytest.approx(1 / 101)
+
+def test_the_rate_rises_to_its_peak_falls_like_a_cosine_and_ends_where_it_should():
+    rates = [learning_rate_factor(STAGE, step / 1000, step, 100) for step in range(1001)]
+    assert rates[0] == pytest.approx(0.5 / 101)
     assert int(np.argmax(rates)) in range(90, 111)
     assert rates[-1] == pytest.approx(0.01)
     assert all(b < a for a, b in pairwise(rates[101:]))
-    assert rates[500] == pytest.approx(0.505)  # half way between 1 and 0.01
+    assert rates[500] == pytest.approx(0.255)  # half way between the two
 
 
 def test_without_warm_up_the_first_step_is_the_peak():
-    assert learning_rate_factor(0.0, 0, 0, 0.0) == 1.0
+    assert learning_rate_factor(STAGE, 0.0, 0, 0) == 0.5
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.3, 0.5, 1.0])
+def test_single_frames_take_their_share_of_any_run_of_batches(ratio):
+    stage = STAGE.model_copy(update={"frames": 5, "still_ratio": ratio})
+    stills = [stage.frames_of(step) == 1 for step in range(100)]
+    for start, length in ((0, 100), (7, 10), (31, 40)):
+        assert abs(sum(stills[start : start + length]) - ratio * length) <= 1
+    assert {stage.frames_of(step) for step in range(100)} <= {1, 5}
 
 
 def test_a_pace_by_steps_ignores_the_clock():

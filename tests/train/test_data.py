@@ -11,11 +11,11 @@ from torch.utils.data import DataLoader
 
 from train import data as training_data
 from train.curriculum import Stage
-from train.data import Batches, TrainingData, varied
+from train.data import Batches, TrainingData, developed, varied
 from train.settings import DataSettings, ValidationSettings
-from train.sources import BUFFERS, CachedSplit, display_video
+from train.sources import BUFFERS, CachedSplit, Sample, display_video
 from tron import seeds
-from tron.color import to_display
+from tron.color import luminance, to_display
 from tron.errors import TronError
 from tron.shards import read_clips
 
@@ -29,6 +29,7 @@ MIXED = Stage(
     crop=16,
     rehearsal_split="train",
     rehearsal_ratio=0.25,
+    still_ratio=0.3,
 )
 
 
@@ -51,12 +52,13 @@ def same(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
 def test_batches_repeat_and_a_resumed_run_sees_the_same_ones(dataset, monkeypatch, stage, cache):
     monkeypatch.setattr(training_data, "SEGMENT", 4)
     whole = take(batches(dataset, stage, cache), 10)
-    assert whole[0].shape == (3, stage.batch_size, 3, stage.frames, 16, 16)
+    for step, batch in enumerate(whole):
+        assert batch.shape == (3, stage.batch_size, 3, stage.frames_of(step), 16, 16)
     assert same(whole, take(batches(dataset, stage, cache), 10))
     for first in (1, 3, 4, 7):
         assert same(whole[first:], take(batches(dataset, stage, cache, first_step=first), 10 - first))
     assert not same(whole, take(batches(dataset, stage, cache, seed=1), 10))
-    assert not torch.equal(whole[0], whole[1])
+    assert not torch.equal(whole[1], whole[2])
 
 
 def test_streams_resume_with_several_loader_processes(dataset, monkeypatch):
@@ -96,13 +98,16 @@ def test_rehearsal_takes_its_share_of_any_run_of_samples(dataset, ratio):
         assert [n for s, n, _ in plan if s == split] == list(range(sum(s == split for s, _, _ in plan)))
 
 
+def sample_of(video: torch.Tensor, display: frozenset[str] = frozenset()) -> Sample:
+    return Sample({name: video.clone() for name in BUFFERS}, display)
+
+
 def test_crops_flips_and_colours_are_the_same_in_all_buffers():
     grid = torch.arange(3 * 2 * 20 * 24, dtype=torch.float32).view(3, 2, 20, 24)
-    sample: dict[str, torch.Tensor] = {name: grid for name in BUFFERS}  # noqa: C420
     settings = DataSettings(permute_colors=1.0)
     seen = set()
     for number in range(20):
-        out = varied(sample, seeds.generator(0, "varied", number), 8, settings)
+        out = varied(sample_of(grid), seeds.generator(0, "varied", number), 8, settings).buffers
         assert all(torch.equal(out[name], out["pbr"]) for name in BUFFERS)
         assert out["pbr"].shape == (3, 2, 8, 8)
         corner = int(out["pbr"][0, 0, 0].min())
@@ -113,23 +118,48 @@ def test_crops_flips_and_colours_are_the_same_in_all_buffers():
 
 
 def test_without_options_a_sample_is_left_as_it_is():
-    sample = {name: torch.rand(3, 1, 8, 8) for name in BUFFERS}
-    out = varied(sample, seeds.generator(0, "x"), None, DataSettings(flip=0.0))
-    assert all(torch.equal(out[name], sample[name]) for name in BUFFERS)
+    video = torch.rand(3, 1, 8, 8)
+    out = varied(sample_of(video), seeds.generator(0, "x"), None, DataSettings(flip=0.0))
+    assert all(torch.equal(out.buffers[name], video) for name in BUFFERS)
 
 
-def test_exposure_and_agx_are_applied_at_load_and_display_members_are_left_alone(dataset):
+def test_a_tint_scales_the_light_and_keeps_the_luminance_of_white():
+    settings = DataSettings(flip=0.0, tint=0.3)
+    white = torch.ones(3, 1, 4, 4)
+    gains = [
+        varied(sample_of(white), seeds.generator(0, n), None, settings).buffers["rgb"] for n in range(50)
+    ]
+    for tinted in gains:
+        np.testing.assert_allclose(luminance(tinted.numpy(), axis=0), 1.0, rtol=1e-5)
+        assert torch.equal(tinted, tinted[:, :1, :1, :1].expand_as(tinted))
+    assert 0.2 < torch.stack(gains).log().std() < 0.4
+    picture = torch.rand(3, 1, 4, 4)
+    out = varied(sample_of(picture), seeds.generator(0, 7), None, settings).buffers
+    torch.testing.assert_close(out["irr"], picture * gains[7])
+
+
+def test_colours_of_photos_are_left_alone():
+    video = torch.rand(3, 1, 8, 8)
+    photo = sample_of(video, frozenset({"rgb"}))
+    settings = DataSettings(flip=0.0, tint=0.5, permute_colors=1.0)
+    out = varied(photo, seeds.generator(0, 3), None, settings)
+    assert all(torch.equal(out.buffers[name], video) for name in BUFFERS)
+
+
+def test_exposure_and_agx_are_applied_to_linear_members_and_not_to_photos(dataset):
     clip = next(iter(read_clips(dataset, "test")))
-    clip.meta = clip.meta.model_copy(
-        update={"exposure": 0.3, "color_space": {"rgb": "display", "pbr": "linear"}}
-    )
-    shown = display_video(clip, "pbr")
-    np.testing.assert_allclose(
-        (np.moveaxis(shown, 0, -1) + 1) / 2, to_display(clip.frames["pbr"], 0.3), atol=1e-6
-    )
-    np.testing.assert_allclose(
-        (np.moveaxis(display_video(clip, "rgb"), 0, -1) + 1) / 2, clip.frames["rgb"], atol=1e-6
-    )
+    spaces = {"rgb": "display", "pbr": "linear", "irr": "linear"}
+    clip.meta = clip.meta.model_copy(update={"exposure": 0.3, "color_space": spaces})
+    as_stored = clip.frames["rgb"]
+    for name, expected in (("pbr", to_display(clip.frames["pbr"], 0.3)), ("rgb", as_stored)):
+        shown = (np.moveaxis(display_video(clip, name), 0, -1) + 1) / 2
+        np.testing.assert_allclose(shown, expected, atol=1e-6)
+        other = next(iter(read_clips(dataset, "train")))
+        batch = developed(
+            [Sample.of(clip), Sample.of(other)], name
+        )  # a photo and a path-traced clip in one batch
+        np.testing.assert_allclose(batch[0].numpy(), display_video(clip, name), atol=1e-5)
+        np.testing.assert_allclose(batch[1].numpy(), display_video(other, name), atol=1e-5)
 
 
 def test_what_does_not_fit_the_budget_is_streamed(dataset):

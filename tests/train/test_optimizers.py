@@ -37,15 +37,15 @@ def run(optimizer: torch.optim.Optimizer, model: torch.nn.Module, steps: int, fi
 @pytest.mark.parametrize("renderer", RENDERERS)
 @pytest.mark.parametrize("settings", [MUON, OptimizerSettings()])
 def test_every_trained_weight_is_optimised_once(renderer, settings):
-    optimizer = make_optimizer(renderer, settings, 0.5)
+    optimizer = make_optimizer(renderer, settings)
     optimised = [id(p) for group in optimizer.param_groups for p in group["params"]]
     assert sorted(optimised) == sorted(id(p) for p in renderer.parameters() if p.requires_grad)
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
 def test_muon_takes_the_hidden_matrices_at_its_own_rate(renderer):
-    optimizer = make_optimizer(renderer, MUON, 0.5)
-    assert [group["lr"] for group in optimizer.param_groups] == [0.01, 0.0005]
+    optimizer = make_optimizer(renderer, MUON)
+    assert [group["lr"] for group in optimizer.param_groups] == [0.02, 0.001]
     hidden = optimizer.param_groups[0]["params"]
     assert hidden
     assert all(p.ndim == 2 and p.requires_grad for p in hidden)
