@@ -68,7 +68,7 @@ class StudioSpec(Spec):
 class OvercastSpec(Spec):
     """A cloudy dome: zenith and horizon radiance, a broad brighter patch, and the ground below (all linear).
 
-    The dome follows the CIE overcast sky's (1 + 2 sin(elevation)) / 3 between horizon and zenith.
+    The dome is linear in sin(elevation): the CIE overcast sky where the horizon is a third of the zenith.
     """
 
     family: Literal["overcast"] = "overcast"
@@ -244,7 +244,7 @@ def _studio(light: StudioSpec, directions: np.ndarray) -> np.ndarray:
 
 def _overcast(light: OvercastSpec, directions: np.ndarray) -> np.ndarray:
     z = directions[:, 2:]
-    share = np.clip((1.0 + 2.0 * np.maximum(z, 0.0)) / 3.0, 0.0, 1.0) * 1.5 - 0.5
+    share = np.maximum(z, 0.0)
     dome = np.asarray(light.horizon) * (1.0 - share) + np.asarray(light.zenith) * share
     centre = _direction(light.patch_azimuth_deg, light.patch_elevation_deg)
     angle = np.degrees(np.arccos(np.clip(directions @ centre, -1.0, 1.0)))

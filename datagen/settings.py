@@ -35,8 +35,13 @@ class SplitSettings(_Model):
     frames: int = Field(ge=1, le=1000, description="Consecutive frames of a clip.")
     width: int = Field(ge=8, le=8192, description="Frame width in pixels.")
     height: int = Field(ge=8, le=8192, description="Frame height in pixels.")
-    path_spp: int = Field(ge=1, description="Paths a pixel of the path-traced frames.")
-    guidance_spp: int = Field(ge=2, description="Shadow rays a pixel of the surfels' irradiance.")
+    path_spp: int = Field(
+        ge=1,
+        description="Paths a pixel of path-traced frames; rounded up to a product of near numbers.",
+    )
+    guidance_spp: int = Field(
+        ge=2, multiple_of=2, description="Shadow rays a pixel of the surfels' irradiance, even."
+    )
     reference_buffers: bool = Field(
         description="Also store Mitsuba's direct irradiance, base color and normals, and the surfels' own."
     )
@@ -96,7 +101,7 @@ class Settings(_Model):
     clips_per_shard: int = Field(
         64, ge=1, description="Most clips of a shard; a shard never spans two scenes."
     )
-    variant: str = Field(
+    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = Field(
         "llvm_ad_rgb", description="Mitsuba variant; on cuda_ad_rgb bytes are not repeatable."
     )
     workers: int | None = Field(

@@ -23,12 +23,20 @@ import pydantic
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat
 
 from tron.errors import TronError
+from tron.runtime import describe_machine
 from tron.storage import write_atomic
 
 MESSAGE_LINES = 12
 """Last lines of a failed child that are kept for its error message."""
 PATIENCE = 20.0
 """Seconds that a child has to end by itself after it was asked to."""
+
+
+def checkout() -> str:
+    """The short commit of the code that runs, with a + where the checkout has changes; empty outside one."""
+    machine = describe_machine()
+    commit = str(machine.get("commit") or "")[:10]
+    return commit + "+" if commit and machine.get("dirty") else commit
 
 
 class StageFailed(Exception):
@@ -50,6 +58,8 @@ class StageRecord(BaseModel):
     seconds: NonNegativeFloat = 0.0
     attempts: int = Field(default=0, ge=0)
     finished: bool = False
+    commit: str = ""
+    """Of the checkout that finished it, with a + where that had changes; empty outside a checkout."""
 
 
 class StageFile(BaseModel):
@@ -109,6 +119,11 @@ class Stages:
             )
         if record.finished:
             _say(name, f"done before, {record.seconds:.0f} s")
+            if record.commit != checkout():
+                _say(
+                    name,
+                    f"made by commit {record.commit or 'unknown'}, not by this one: delete {self.path.parent} to redo",
+                )
             return record.seconds
         with self.timed(name, commands):
             run_together(children)
@@ -122,7 +137,7 @@ class Stages:
         start = time.perf_counter()
         try:
             yield record
-            record.finished = True
+            record.finished, record.commit = True, checkout()
         finally:
             record.seconds += time.perf_counter() - start
             write_atomic(self.path, self.file.model_dump_json(indent=2) + "\n")

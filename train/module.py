@@ -1,4 +1,4 @@
-"""The Lightning module: one renderer, its loss, AdamW and the schedule of the stage that is running."""
+"""The Lightning module: a renderer, its loss, its optimiser and the schedule of the running stage."""
 
 from __future__ import annotations
 

@@ -88,6 +88,7 @@ class Demo(Benchmark):
                 Cell(name),
                 Cell(written(record.seconds, "s"), "strong"),
                 Cell(WORDS.get(name, "")),
+                Cell(record.commit or "unknown"),
                 Cell("; ".join(" ".join(command) for command in record.commands), "faint"),
             ]
             for name, record in stages.records.items()
@@ -98,7 +99,7 @@ class Demo(Benchmark):
         section = Section(
             "stages",
             "Where the time went",
-            [Table(caption, ["Stage", "Time", "What", "Command"], table, words=[2, 3])],
+            [Table(caption, ["Stage", "Time", "What", "Commit", "Command"], table, words=[2, 4])],
         )
         return dataclasses.replace(
             outcome,
