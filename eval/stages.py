@@ -120,10 +120,8 @@ class Stages:
         if record.finished:
             _say(name, f"done before, {record.seconds:.0f} s")
             if record.commit != checkout():
-                _say(
-                    name,
-                    f"made by commit {record.commit or 'unknown'}, not by this one: delete {self.path.parent} to redo",
-                )
+                made_by = record.commit or "unknown"
+                _say(name, f"made by another commit ({made_by}): delete {self.path.parent} to redo it")
             return record.seconds
         with self.timed(name, commands):
             run_together(children)
