@@ -179,6 +179,7 @@ def _outcomes(items: Sequence[Work], settings: Settings, sources: Sources) -> It
     from dask.distributed import Client, as_completed
     from hydra.utils import instantiate
 
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # it reports every connection otherwise
     options = dict(settings.cluster)
     if str(options.get("_target_", "")).endswith("LocalCluster"):
         options.setdefault("n_workers", min(settings.workers or _cores(), len(items)))
