@@ -4,19 +4,28 @@ A tile's 16 pixels fill one 16-lane packet, so every lane of a packet walks the 
 candidate for a tile where the exact screen-space bounds of its (cut) ellipse overlap the tile's pixel
 centres. Lists are sorted by ``near = |c - o| - r``, a lower bound of the distance to any point of the
 surfel, which lets traversal stop early without being wrong.
+
+Surfels are ordered by ``near`` first and written out tile by tile, so one stable sort by tile orders both.
+All of it runs in Dr.Jit; only the number of entries comes back to Python, because arrays need a size.
 """
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from tron.cameras import Camera
+from tron.tracing.kernel import GEOMETRY_PACKETS, SurfelRecords
 
 TILE = 4
 LANES = TILE * TILE
+MARGIN = 1e-2
+"""Pixels added around a surfel's bounds: candidates may be too many by rounding, never too few."""
 
 
 @dataclass(frozen=True)
@@ -36,81 +45,121 @@ class TileLists:
     tiles_y: int
 
 
-def _screen_bounds(
-    centre: np.ndarray, axis_a: np.ndarray, axis_b: np.ndarray, k: int, focal: float, principal: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel range of the ellipses ``c + a cos + b sin`` along image axis k; unbounded where z = 0 is crossed.
+@dataclass
+class _Axis:
+    """One image axis: focal length, principal point and size, in pixels; opaque."""
 
-    The bounds of x/z over the ellipse are the roots m at which the plane x = m z is tangent to it:
-    ``(c_x - m c_z)^2 = (a_x - m a_z)^2 + (b_x - m b_z)^2``.
-    """
-    in_front = centre[:, 2] ** 2 - axis_a[:, 2] ** 2 - axis_b[:, 2] ** 2
-    cross = centre[:, k] * centre[:, 2] - axis_a[:, k] * axis_a[:, 2] - axis_b[:, k] * axis_b[:, 2]
-    constant = centre[:, k] ** 2 - axis_a[:, k] ** 2 - axis_b[:, k] ** 2
-    clear = (in_front > 0) & (centre[:, 2] > 0)
-    root = np.sqrt(np.maximum(cross**2 - in_front * constant, 0.0))
-    divisor = np.where(clear, in_front, 1.0)
-    low, high = (cross - root) / divisor, (cross + root) / divisor
-    return (
-        np.where(clear, focal * low + principal, -np.inf),
-        np.where(clear, focal * high + principal, np.inf),
-    )
+    focal: mi.Float
+    principal: mi.Float
+    pixels: mi.Float
 
 
-def _tile_range(low: np.ndarray, high: np.ndarray, pixels: int, tiles: int) -> tuple[np.ndarray, np.ndarray]:
-    """First and last tile with pixel centres (i + 0.5) in [low, high]; first > last where there are none."""
-    margin = 1e-2  # pixels; candidates may be too many, never too few
-    first = np.ceil(np.clip(low - 0.5 - margin, -1.0, pixels + 1.0))
-    last = np.floor(np.clip(high - 0.5 + margin, -2.0, pixels))
-    first, last = np.maximum(first, 0.0), np.minimum(last, pixels - 1.0)
-    empty = first > last
-    first_tile = np.minimum(first // TILE, tiles - 1).astype(np.int64)
-    last_tile = (last // TILE).astype(np.int64)
-    return first_tile, np.where(empty, first_tile - 1, last_tile)
-
-
-def build_tiles(geometry: np.ndarray, camera: Camera) -> TileLists:
-    """Make the lists of one camera.
-
-    Args:
-        geometry: (M, 12) float32 records of :func:`tron.tracing.kernel.pack_geometry`.
-        camera: pinhole camera.
-    """
+def build_tiles(records: SurfelRecords, camera: Camera) -> TileLists:
+    """Make the lists of one camera."""
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    rotation = camera.world_to_camera[:3, :3]
-    # float32 records, float64 projection: the bounds must not round inwards.
-    to_centre = geometry[:, 0:3].astype(np.float64) - camera.position
-    axis_u, axis_v = geometry[:, 4:7].astype(np.float64), geometry[:, 8:11].astype(np.float64)
-    q_cut = geometry[:, 11].astype(np.float64)
-    facing = (np.cross(axis_u, axis_v) * to_centre).sum(1) < 0  # a flat disk shows one side to a point
-    reach = np.sqrt(np.maximum(q_cut, 0.0))
-    # t_u / s_u has length 1 / s_u: dividing by its squared length gives s_u t_u.
-    half_u = axis_u * (reach / np.maximum((axis_u**2).sum(1), 1e-30))[:, None] @ rotation.T
-    half_v = axis_v * (reach / np.maximum((axis_v**2).sum(1), 1e-30))[:, None] @ rotation.T
-    centre = to_centre @ rotation.T
-    ahead = centre[:, 2] + np.sqrt(half_u[:, 2] ** 2 + half_v[:, 2] ** 2) > 0
-    x0, x1 = _tile_range(
-        *_screen_bounds(centre, half_u, half_v, 0, camera.fx, camera.cx), camera.width, tiles_x
-    )
-    y0, y1 = _tile_range(
-        *_screen_bounds(centre, half_u, half_v, 1, camera.fy, camera.cy), camera.height, tiles_y
-    )
-    across, down = np.maximum(x1 - x0 + 1, 0), np.maximum(y1 - y0 + 1, 0)
-    touched = np.where(facing & ahead & (q_cut >= 0), across * down, 0)
+    first_x, across, first_y, touched, near = _touched_tiles(records, camera)
+    order = dr.argsort(near)
+    touched = dr.gather(mi.UInt32, touched, order)
+    offset = dr.prefix_sum(touched)  # exclusive
+    total = int(dr.sum(touched)[0])
+    if total == 0:
+        empty = dr.zeros(mi.UInt32, tiles_x * tiles_y)
+        return TileLists(empty, empty, dr.zeros(mi.UInt32, 1), tiles_x, tiles_y)
 
-    near = np.linalg.norm(to_centre, axis=1) - geometry[:, 7]
-    order = np.argsort(
-        near, kind="stable"
-    )  # emit surfels nearest first: one stable sort by tile then orders both
-    surfel = np.repeat(order, touched[order])
-    within = np.arange(len(surfel)) - np.repeat(np.cumsum(touched[order]) - touched[order], touched[order])
-    tile = (y0[surfel] + within // across[surfel]) * tiles_x + x0[surfel] + within % across[surfel]
-    sort = np.argsort(tile.astype(np.uint32), kind="stable")
-    count = np.bincount(tile, minlength=tiles_x * tiles_y)
-    return TileLists(
-        start=mi.UInt32((np.cumsum(count) - count).astype(np.uint32)),
-        count=mi.UInt32(count.astype(np.uint32)),
-        entries=mi.UInt32(surfel[sort].astype(np.uint32) if len(surfel) else np.zeros(1, np.uint32)),
-        tiles_x=tiles_x,
-        tiles_y=tiles_y,
+    # Each surfel marks its first entry with its rank; a running maximum gives every entry its surfel.
+    rank = dr.zeros(mi.UInt32, total)
+    dr.scatter(rank, dr.arange(mi.UInt32, records.count), offset, touched > 0)
+    rank = dr.prefix_reduce(dr.ReduceOp.Max, rank, exclusive=False)
+    surfel = dr.gather(mi.UInt32, order, rank)
+    within = dr.arange(mi.UInt32, total) - dr.gather(mi.UInt32, offset, rank)
+    width = dr.gather(mi.UInt32, across, surfel)
+    width = dr.select(width > 0, width, 1)  # idle lanes of the last packet: LLVM divides there too
+    tile = (dr.gather(mi.UInt32, first_y, surfel) + within // width) * dr.opaque(mi.UInt32, tiles_x)
+    tile += dr.gather(mi.UInt32, first_x, surfel) + within % width
+    dr.eval(tile, surfel)
+    position = dr.argsort(tile)
+    start, count = _runs(dr.gather(mi.UInt32, tile, position), tiles_x * tiles_y)
+    entries = dr.gather(mi.UInt32, surfel, position)
+    dr.eval(start, count, entries)
+    return TileLists(start, count, entries, tiles_x, tiles_y)
+
+
+def _touched_tiles(
+    records: SurfelRecords, camera: Camera
+) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32, mi.UInt32, mi.Float]:
+    """Per surfel: first tile and number of tiles across, first tile down, tiles in all, and ``near``."""
+    position = mi.Point3f([float(v) for v in camera.position])
+    right, down, forward = (mi.Vector3f([float(v) for v in row]) for row in camera.world_to_camera[:3, :3])
+    horizontal = _Axis(*_opaque(camera.fx, camera.cx, camera.width))
+    vertical = _Axis(*_opaque(camera.fy, camera.cy, camera.height))
+    dr.make_opaque(position, right, down, forward)
+
+    record = dr.arange(mi.UInt32, records.count) * GEOMETRY_PACKETS
+    centre, axis_u, axis_v = (dr.gather(mi.Vector4f, records.geometry, record + k) for k in range(3))
+    to_centre = mi.Vector3f(centre.x, centre.y, centre.z) - position
+    u, v = mi.Vector3f(axis_u.x, axis_u.y, axis_u.z), mi.Vector3f(axis_v.x, axis_v.y, axis_v.z)
+    q_cut = axis_v.w
+    facing = dr.dot(dr.cross(u, v), to_centre) < 0  # a flat disk shows one side to a point
+    # t_u / s_u has length 1 / s_u: divided by its squared length it is s_u t_u.
+    reach = dr.safe_sqrt(q_cut)
+    u, v = u * (reach / dr.squared_norm(u)), v * (reach / dr.squared_norm(v))
+
+    def seen(vector: mi.Vector3f) -> mi.Vector3f:
+        return mi.Vector3f(dr.dot(right, vector), dr.dot(down, vector), dr.dot(forward, vector))
+
+    c, a, b = seen(to_centre), seen(u), seen(v)
+    ahead = c.z + dr.sqrt(a.z * a.z + b.z * b.z) > 0
+    first_x, across = _tile_range(*_screen_bounds(c, a, b, 0, horizontal), horizontal)
+    first_y, down_count = _tile_range(*_screen_bounds(c, a, b, 1, vertical), vertical)
+    touched = dr.select(facing & ahead & (q_cut >= 0), across * down_count, 0)
+    near = dr.norm(to_centre) - axis_u.w
+    dr.eval(first_x, across, first_y, touched, near)
+    return first_x, across, first_y, touched, near
+
+
+def _opaque(*numbers: float) -> tuple[mi.Float, ...]:
+    """The camera's numbers as variables: literals would compile a kernel for each view."""
+    return tuple(dr.opaque(mi.Float, float(number)) for number in numbers)
+
+
+def _screen_bounds(
+    c: mi.Vector3f, a: mi.Vector3f, b: mi.Vector3f, k: int, axis: _Axis
+) -> tuple[mi.Float, mi.Float]:
+    """Pixel range of the ellipse ``c + a cos + b sin`` along image axis k; unbounded where z = 0 is crossed.
+
+    The bounds of x/z are the roots m at which the plane x = m z is tangent to the ellipse,
+    ``(c_x - m c_z)^2 = (a_x - m a_z)^2 + (b_x - m b_z)^2``. They are sought as offsets from the centre's own
+    c_x / c_z: then both terms under the root are positive, and float32 is enough.
+    """
+    depth = c.z
+    m = c[k] / depth
+    a_off, b_off = a[k] - m * a.z, b[k] - m * b.z
+    in_front = depth * depth - a.z * a.z - b.z * b.z
+    clear = (in_front > 0) & (depth > 0)
+    cross = -(a_off * a.z + b_off * b.z)
+    root = dr.sqrt(dr.maximum(cross * cross + in_front * (a_off * a_off + b_off * b_off), 0))
+    low, high = m + (cross - root) / in_front, m + (cross + root) / in_front
+    return (
+        dr.select(clear, axis.focal * low + axis.principal, -dr.inf),
+        dr.select(clear, axis.focal * high + axis.principal, dr.inf),
     )
+
+
+def _tile_range(low: mi.Float, high: mi.Float, axis: _Axis) -> tuple[mi.UInt32, mi.UInt32]:
+    """First tile with pixel centres (i + 0.5) in [low, high], and the number of such tiles; 0 for none."""
+    first = dr.maximum(dr.ceil(dr.minimum(low - 0.5 - MARGIN, axis.pixels)), 0)
+    last = dr.floor(dr.minimum(dr.maximum(high - 0.5 + MARGIN, -1), axis.pixels - 1))
+    first_tile = mi.Int(first) // TILE
+    tiles = mi.Int(dr.maximum(last, 0)) // TILE - first_tile + 1
+    return mi.UInt32(first_tile), mi.UInt32(dr.select(first > last, 0, tiles))
+
+
+def _runs(keys: mi.UInt32, size: int) -> tuple[mi.UInt32, mi.UInt32]:
+    """Where each of 0..size-1 begins in sorted ``keys``, and how often it occurs there."""
+    i, end = dr.arange(mi.UInt32, dr.width(keys)), dr.opaque(mi.UInt32, dr.width(keys) - 1)
+    before = dr.gather(mi.UInt32, keys, dr.select(i > 0, i - 1, 0))
+    after = dr.gather(mi.UInt32, keys, dr.select(i < end, i + 1, end))
+    first, past = dr.zeros(mi.UInt32, size), dr.zeros(mi.UInt32, size)
+    dr.scatter(first, i, keys, (i == 0) | (before != keys))
+    dr.scatter(past, i + 1, keys, (i == end) | (after != keys))
+    return first, past - first

@@ -41,7 +41,7 @@ class SurfelTracer:
 
     def gbuffer(self, camera: Camera) -> GBuffer:
         """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it."""
-        return trace_gbuffer(self._records, build_tiles(self._geometry, camera), camera)
+        return trace_gbuffer(self._records, build_tiles(self._records, camera), camera)
 
     def transmittance(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
