@@ -26,7 +26,6 @@ import mitsuba as mi
 
 from tron.errors import TronError
 from tron.seeds import integer
-from tron.shading.environment import EnvironmentLight
 
 if TYPE_CHECKING:
     from tron.gaussians.scene import GaussianScene
@@ -48,10 +47,20 @@ class Occluder(Protocol):
     def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float: ...
 
 
+class Light(Protocol):
+    """Radiance from afar that can be drawn from: :class:`tron.shading.EnvironmentLight`, or a cubemap."""
+
+    def radiance(self, d: mi.Vector3f) -> mi.Color3f: ...
+
+    def sample(self, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]: ...
+
+    def pdf(self, d: mi.Vector3f) -> mi.Float: ...
+
+
 def irradiance(
     tracer: Occluder,
     gbuffer: GBuffer,
-    light: EnvironmentLight,
+    light: Light,
     spp: int,
     seed: int,
     strategy: Strategy = "mis",
@@ -76,20 +85,7 @@ def irradiance(
     Raises:
         TronError: ``spp`` is odd or not positive.
     """
-    if bool(spp < 2 or spp % 2):  # dr.syntax takes booleans, not the truth of a number
-        raise TronError(f"spp is {spp}", mend="give an even number of shadow rays, 2 or more")
-    n = spp // 2 if strategy == "mis" else spp
-    rows = max(r for r in range(1, math.isqrt(n) + 1) if n % r == 0)
-    # Opaque numbers, so that seeds, ray counts and scenes share one compiled kernel.
-    plan = _RayPlan(
-        rays=dr.opaque(mi.UInt32, 2 * n if strategy == "mis" else n),
-        count=dr.opaque(mi.UInt32, n),
-        columns=dr.opaque(mi.UInt32, n // rows),
-        rows=dr.opaque(mi.UInt32, rows),
-        by_cosine=dr.opaque(mi.Float, float(strategy != "light")),
-        by_light=dr.opaque(mi.Float, float(strategy != "cosine")),
-        stream=dr.opaque(mi.UInt32, integer(seed, "irradiance")),
-    )
+    plan = RayPlan.make(spp, seed, strategy)
     offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
     shadowed, unshadowed = _accumulate(tracer, gbuffer, light, plan, offset)
     dr.eval(shadowed, unshadowed)
@@ -97,7 +93,7 @@ def irradiance(
 
 
 @dataclass
-class _RayPlan:
+class RayPlan:
     """How many rays of which kind a pixel sends; ``count`` of each kind, in ``columns`` x ``rows`` strata."""
 
     rays: mi.UInt32
@@ -107,6 +103,28 @@ class _RayPlan:
     by_cosine: mi.Float
     by_light: mi.Float
     stream: mi.UInt32
+
+    @classmethod
+    def make(cls, spp: int, seed: int, strategy: Strategy = "mis") -> RayPlan:
+        """The plan for arguments as :func:`irradiance` has them.
+
+        Raises:
+            TronError: ``spp`` is odd or not positive.
+        """
+        if spp < 2 or spp % 2:
+            raise TronError(f"spp is {spp}", mend="give an even number of shadow rays, 2 or more")
+        n = spp // 2 if strategy == "mis" else spp
+        rows = max(r for r in range(1, math.isqrt(n) + 1) if n % r == 0)
+        # Opaque numbers, so that seeds, ray counts and scenes share one compiled kernel.
+        return cls(
+            rays=dr.opaque(mi.UInt32, 2 * n if strategy == "mis" else n),
+            count=dr.opaque(mi.UInt32, n),
+            columns=dr.opaque(mi.UInt32, n // rows),
+            rows=dr.opaque(mi.UInt32, rows),
+            by_cosine=dr.opaque(mi.Float, float(strategy != "light")),
+            by_light=dr.opaque(mi.Float, float(strategy != "cosine")),
+            stream=dr.opaque(mi.UInt32, integer(seed, "irradiance")),
+        )
 
     def point(self, pixel: mi.UInt32, ray: mi.UInt32) -> mi.Point2f:
         """Jittered point of a ray's stratum in [0, 1)^2."""
@@ -120,9 +138,29 @@ class _RayPlan:
         return dr.minimum(u, BELOW_ONE)
 
 
+def shadow_ray(
+    light: Light, frame: mi.Frame3f, plan: RayPlan, pixel: mi.UInt32, ray: mi.UInt32
+) -> tuple[mi.Vector3f, mi.Float]:
+    """The estimator of one ray: its unit world direction and the weight of the radiance that it finds.
+
+    The weighted radiances of all rays of a plan, over ``plan.count``, sum to irradiance / pi. The weight is 0
+    below the horizon.
+    """
+    u = plan.point(pixel, ray)
+    towards_light, _ = light.sample(u)
+    direction = dr.select(
+        (ray >= plan.count) | (plan.by_cosine == 0),
+        towards_light,
+        frame.to_world(mi.warp.square_to_cosine_hemisphere(u)),
+    )
+    cosine_pdf = dr.dot(frame.n, direction) * dr.inv_pi
+    density = plan.by_cosine * cosine_pdf + plan.by_light * light.pdf(direction)
+    return direction, dr.select(cosine_pdf > 0, cosine_pdf / density, 0)
+
+
 @dr.syntax
 def _accumulate(
-    tracer: Occluder, gbuffer: GBuffer, light: EnvironmentLight, plan: _RayPlan, offset: mi.Float
+    tracer: Occluder, gbuffer: GBuffer, light: Light, plan: RayPlan, offset: mi.Float
 ) -> tuple[mi.Color3f, mi.Color3f]:
     normal = mi.Normal3f(gbuffer.normal)
     frame = mi.Frame3f(normal)
@@ -132,18 +170,10 @@ def _accumulate(
     shadowed, unshadowed = mi.Color3f(0), mi.Color3f(0)
     ray = mi.UInt32(0)
     while ray < plan.rays:
-        u = plan.point(pixel, ray)
-        towards_light, _ = light.sample(u)
-        direction = dr.select(
-            (ray >= plan.count) | (plan.by_cosine == 0),
-            towards_light,
-            frame.to_world(mi.warp.square_to_cosine_hemisphere(u)),
-        )
-        cosine_pdf = dr.dot(normal, direction) * dr.inv_pi
-        density = plan.by_cosine * cosine_pdf + plan.by_light * light.pdf(direction)
+        direction, weight = shadow_ray(light, frame, plan, pixel, ray)
         radiance = light.radiance(direction)
-        counts = surface & (cosine_pdf > 0) & (dr.max(radiance) > 0)
-        value = dr.select(counts, radiance * (cosine_pdf / density), 0)
+        counts = surface & (weight > 0) & (dr.max(radiance) > 0)
+        value = dr.select(counts, radiance * weight, 0)
         unshadowed += value
         shadowed += value * tracer.transmittance(origin, direction, counts)
         ray += 1
