@@ -1,11 +1,20 @@
 """A bounding volume hierarchy for arbitrary rays: perfectly balanced, threaded with skip links, no stack.
 
-Built by median splits of the longest axis, level by level, all nodes of a level at once. The tree is
-perfect, so nodes in depth-first order follow from arithmetic: a node's left child is the next one, and
-its skip link (where to go when the box is missed, or after a leaf) is itself plus the size of its
-subtree. A node is four 32-bit words: six 16-bit bounds on a grid over the scene, rounded outwards, and
-the skip link or leaf word. Four words are one packet; float bounds took 2.7 times as long (tracer.md).
+Built by median splits of the longest axis, level by level, all nodes of a level at once: the surfels of a
+node are neighbours in the order, a power of two of them, and one sort by (node, coordinate along the node's
+longest axis) splits them all. What is missing to a power of two stands at the end as empty places. Then the
+shape of the tree is arithmetic: node i of level l of a tree with L levels below the root has the depth-first
+index l + i 2^(L - l + 1) - popcount(i), its left child is the next node, and its skip link (where to go when
+the box is missed, or after a leaf) is itself plus the size of its subtree.
+
+When surfels move, the order stays good for a while and the boxes alone are made anew (:func:`refit`).
+
+A node is four 32-bit words: six 16-bit bounds on a grid over the scene, rounded outwards, and the skip link
+or leaf word. Four words are one packet; float bounds took 2.7 times as long (tracer.md).
 """
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations
 
@@ -13,133 +22,207 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
+
+from tron.tracing.kernel import GEOMETRY_PACKETS, SurfelRecords
 
 LEAF_SIZE = 2
 LEAF_BIT = 1 << 31
-_GRID = 65533
+_GRID = 65533.0
+_KEY_BITS = 32
+_COORDINATE_BITS = 24
 
 
 @dataclass
 class Bvh:
-    """The hierarchy and its surfels, uploaded.
+    """The hierarchy and its surfels.
 
     Attributes:
         nodes: mi.UInt32, 4 words a node in depth-first order: (low | high << 16) for x, y, z, and the link.
             The link of an inner node is the node to skip to; of a leaf, ``LEAF_BIT | first << 4 | count``.
         node_count: opaque mi.UInt32 of one lane, so that scenes of any size share one kernel.
         geometry: mi.Float, geometry records in leaf order.
-        order: (M,) int64, leaf order -> scene order.
-        grid_origin, grid_scale: opaque; world -> grid coordinates.
+        order: mi.UInt32 (M,), leaf order -> scene order.
+        grid_origin, grid_scale: one lane each; world -> grid coordinates.
+        area: mi.Float of one lane, summed half surface of all boxes over the root's: how many boxes a random
+            ray that meets the root's is expected to meet (Goldsmith and Salmon 1987).
+        levels: levels below the root.
         degree: kernel degree.
     """
 
     nodes: mi.UInt32
     node_count: mi.UInt32
     geometry: mi.Float
-    order: np.ndarray
+    order: mi.UInt32
     grid_origin: mi.Point3f
     grid_scale: mi.Vector3f
+    area: mi.Float
+    levels: int
     degree: int
 
 
-def surfel_bounds(geometry: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tight axis-aligned boxes of the cut disks of (M, 12) geometry records, two (M, 3) float64 arrays."""
-    axis_u, axis_v = geometry[:, 4:7].astype(np.float64), geometry[:, 8:11].astype(np.float64)
-    reach = np.sqrt(np.maximum(geometry[:, 11:12].astype(np.float64), 0.0))
-    half_u = axis_u / np.maximum((axis_u**2).sum(1, keepdims=True), 1e-30) * reach
-    half_v = axis_v / np.maximum((axis_v**2).sum(1, keepdims=True), 1e-30) * reach
-    extent = np.sqrt(half_u**2 + half_v**2)
-    centre = geometry[:, 0:3].astype(np.float64)
-    return centre - extent, centre + extent
+def build_bvh(records: SurfelRecords) -> Bvh:
+    """Build the hierarchy of a scene's surfels, none included."""
+    levels = max(0, (max(records.count, 1) - 1).bit_length() - (LEAF_SIZE.bit_length() - 1))
+    return refit(_median_order(records, levels), levels, records)
 
 
-def median_order(centres: np.ndarray, levels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Order points by ``levels`` rounds of median splits of the longest axis.
+def refit(order: mi.UInt32, levels: int, records: SurfelRecords) -> Bvh:
+    """Boxes for surfels that keep their ``order``; quick, exact, and tight while neighbours stay neighbours.
 
-    Returns:
-        (M,) int64 order and (2^levels,) int64 count of points in each leaf.
+    Args:
+        order: (M,) leaf order -> scene order, of an earlier hierarchy of M surfels.
+        levels: that hierarchy's levels.
+        records: the surfels where they are now.
     """
-    order = np.arange(len(centres))
-    counts = np.array([len(centres)])
-    for _ in range(levels):
-        starts = np.cumsum(counts) - counts
-        sorted_centres = centres[order]
-        low = np.minimum.reduceat(sorted_centres, starts)
-        high = np.maximum.reduceat(sorted_centres, starts)
-        segment = np.repeat(np.arange(len(counts)), counts)
-        key = sorted_centres[np.arange(len(order)), np.argmax(high - low, 1)[segment]]
-        order = order[np.lexsort((key, segment))]
-        left = (counts + 1) // 2
-        counts = np.stack([left, counts - left], 1).ravel()
-    return order, counts
+    places = LEAF_SIZE << levels
+    geometry = _in_leaf_order(records, order)
+    low, high = _bounds(geometry, records.count, places)
+    boxes = [(low, high)]
+    for _ in range(levels + 1):
+        # The first reduction makes leaves out of surfels, the last one the root.
+        low, high = (_pairs(low, dr.minimum), _pairs(high, dr.maximum))
+        boxes.append((low, high))
+    dr.eval(boxes)
+    boxes = boxes[:0:-1]
 
+    root_low, root_high = boxes[0]
+    size = root_high - root_low
+    # A scene without surfels, or with one seen edge-on, still needs a grid with cells.
+    pad = 1e-4 * dr.maximum(dr.max(size), 1e-6)
+    origin = mi.Point3f(dr.select(size >= 0, root_low - pad, 0))
+    scale = dr.select(size >= 0, _GRID / (size + 2 * pad), 1)
+    dr.eval(origin, scale)
 
-def _depth_first(levels: int) -> list[np.ndarray]:
-    """Depth-first index of each node of a perfect tree, level by level from the root."""
-    indices = [np.zeros(1, np.int64)]
-    for level in range(levels):
-        parent = indices[-1]
-        right = parent + (1 << (levels - level))  # past the left subtree of 2^(levels - level) - 1 nodes
-        indices.append(np.stack([parent + 1, right], 1).ravel())
-    return indices
-
-
-def build_bvh(geometry: np.ndarray, degree: int) -> Bvh:
-    """Build and upload the hierarchy of (M, 12) float32 geometry records (M may be 0)."""
-    geometry = geometry[geometry[:, 11] >= 0]  # surfels too faint to count anywhere
-    count = len(geometry)
-    if count == 0:
-        empty = np.array([0, 0, 0, LEAF_BIT], np.uint32)
-        return _upload(
-            empty, np.zeros(12, np.float32), np.zeros(0, np.int64), np.zeros(3), np.ones(3), degree
-        )
-    low, high = surfel_bounds(geometry)
-    levels = max(0, int(np.ceil(np.log2(count / LEAF_SIZE))))
-    order, counts = median_order((low + high) / 2, levels)
-    starts = np.cumsum(counts) - counts
-
-    grid_low, grid_high = low.min(0), high.max(0)
-    pad = 1e-4 * max(float((grid_high - grid_low).max()), 1e-6)
-    grid_low, grid_high = grid_low - pad, grid_high + pad
-    scale = _GRID / (grid_high - grid_low)
-
-    box_low, box_high = np.minimum.reduceat(low[order], starts), np.maximum.reduceat(high[order], starts)
-    words = np.zeros(((2 << levels) - 1, 4), np.uint32)
-    indices = _depth_first(levels)
-    for level in range(levels, -1, -1):
-        index = indices[level]
-        # One cell of slack on each side covers the float32 rounding of the rays' grid coordinates.
-        q_low = np.clip(np.floor((box_low - grid_low) * scale) - 1, 0, 65535).astype(np.uint32)
-        q_high = np.clip(np.ceil((box_high - grid_low) * scale) + 1, 0, 65535).astype(np.uint32)
-        words[index, :3] = q_low | (q_high << 16)
-        if level == levels:
-            words[index, 3] = (LEAF_BIT | (starts << 4) | counts).astype(np.uint32)
-        else:
-            words[index, 3] = (index + (2 << (levels - level)) - 1).astype(np.uint32)
-        box_low = np.minimum(box_low[0::2], box_low[1::2]) if level else box_low
-        box_high = np.maximum(box_high[0::2], box_high[1::2]) if level else box_high
-    return _upload(words.ravel(), geometry[order].ravel(), order, grid_low, scale, degree)
-
-
-def _upload(
-    words: np.ndarray,
-    geometry: np.ndarray,
-    order: np.ndarray,
-    origin: np.ndarray,
-    scale: np.ndarray,
-    degree: int,
-) -> Bvh:
-    grid_origin, grid_scale = mi.Point3f([float(v) for v in origin]), mi.Vector3f([float(v) for v in scale])
-    dr.make_opaque(grid_origin, grid_scale)
-    bvh = Bvh(
-        mi.UInt32(words),
-        dr.opaque(mi.UInt32, len(words) // 4),
-        mi.Float(geometry),
+    words = dr.empty(mi.UInt32, 4 * ((2 << levels) - 1))
+    area = mi.Float(0)
+    for level, (low, high) in enumerate(boxes):
+        _write_level(words, level, levels, records.count, low, high, origin, scale)
+        area += dr.sum(_half_area(low, high))
+    area /= dr.maximum(_half_area(root_low, root_high), 1e-30)
+    dr.eval(words, area)
+    return Bvh(
+        words,
+        dr.opaque(mi.UInt32, (2 << levels) - 1),
+        geometry,
         order,
-        grid_origin,
-        grid_scale,
-        degree,
+        origin,
+        scale,
+        area,
+        levels,
+        records.degree,
     )
-    dr.eval(bvh.nodes, bvh.geometry)
-    return bvh
+
+
+def _in_leaf_order(records: SurfelRecords, order: mi.UInt32) -> mi.Float:
+    geometry = dr.empty(mi.Float, max(dr.width(records.geometry), 4 * GEOMETRY_PACKETS))
+    place = dr.arange(mi.UInt32, records.count)
+    for packet in range(GEOMETRY_PACKETS):
+        value = dr.gather(mi.Vector4f, dr.detach(records.geometry), order * GEOMETRY_PACKETS + packet)
+        dr.scatter(geometry, value, place * GEOMETRY_PACKETS + packet)
+    dr.eval(geometry)
+    return geometry
+
+
+def _bounds(geometry: mi.Float, count: int, places: int) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """Tight boxes of the cut disks; empty (low > high) for surfels that count nowhere and empty places."""
+    place = dr.arange(mi.UInt32, places)
+    real = place < dr.opaque(mi.UInt32, count)
+    centre, u, v = (
+        dr.gather(mi.Vector4f, geometry, place * GEOMETRY_PACKETS + k, real) for k in range(GEOMETRY_PACKETS)
+    )
+    real &= v.w >= 0
+    reach2 = dr.maximum(v.w, 0)
+    axis_u, axis_v = mi.Vector3f(u.x, u.y, u.z), mi.Vector3f(v.x, v.y, v.z)
+    # t_u / s_u has length 1 / s_u: divided by its squared length it is s_u t_u.
+    half_u, half_v = axis_u / dr.squared_norm(axis_u), axis_v / dr.squared_norm(axis_v)
+    extent = dr.sqrt((half_u * half_u + half_v * half_v) * reach2)
+    middle = mi.Vector3f(centre.x, centre.y, centre.z)
+    low, high = dr.select(real, middle - extent, dr.inf), dr.select(real, middle + extent, -dr.inf)
+    dr.eval(low, high)
+    return low, high
+
+
+def _pairs(values: mi.Vector3f, reduce: object) -> mi.Vector3f:
+    """Reduce neighbours two by two."""
+    even = 2 * dr.arange(mi.UInt32, dr.width(values) // 2)
+    left, right = (mi.Vector3f(*[dr.gather(mi.Float, v, even + side) for v in values]) for side in (0, 1))
+    result = reduce(left, right)
+    dr.eval(result)
+    return result
+
+
+def _half_area(low: mi.Vector3f, high: mi.Vector3f) -> mi.Float:
+    size = dr.maximum(high - low, 0)
+    return size.x * size.y + size.y * size.z + size.z * size.x
+
+
+def _write_level(
+    words: mi.UInt32,
+    level: int,
+    levels: int,
+    count: int,
+    low: mi.Vector3f,
+    high: mi.Vector3f,
+    origin: mi.Point3f,
+    scale: mi.Vector3f,
+) -> None:
+    """Quantise the boxes of one level outwards and write its nodes."""
+    node = dr.arange(mi.UInt32, 1 << level)
+    depth, below = dr.opaque(mi.UInt32, level), dr.opaque(mi.UInt32, levels - level)
+    index = depth + (node << (below + 1)) - mi.UInt32(dr.popcnt(node))
+    # One cell of slack on each side covers the float32 rounding of the rays' grid coordinates.
+    first = mi.Vector3u(dr.clip(dr.floor((low - origin) * scale) - 1, 0, 65535))
+    last = mi.Vector3u(dr.clip(dr.ceil((high - origin) * scale) + 1, 0, 65535))
+    surfel = node * LEAF_SIZE
+    total = dr.opaque(mi.UInt32, count)
+    held = dr.select(surfel < total, dr.minimum(total - surfel, LEAF_SIZE), 0)
+    # An empty box has low > high on its grid; 65535 | 0 << 16 says so whatever the infinities rounded to.
+    empty = ~(low.x <= high.x)
+    bounds = [dr.select(empty, mi.UInt32(65535), a | (b << 16)) for a, b in zip(first, last)]
+    link = dr.select(below == 0, mi.UInt32(LEAF_BIT) | (surfel << 4) | held, index + (2 << below) - 1)
+    dr.scatter(words, mi.Vector4u(*bounds, link), index)
+
+
+def _median_order(records: SurfelRecords, levels: int) -> mi.UInt32:
+    """Leaf order -> scene order: ``levels`` rounds of median splits, all nodes of a level in one sort."""
+    places = LEAF_SIZE << levels
+    order = dr.arange(mi.UInt32, places)
+    for level in range(levels):
+        dr.eval(order)
+        real = order < dr.opaque(mi.UInt32, records.count)
+        centre = dr.gather(mi.Vector4f, dr.detach(records.geometry), order * GEOMETRY_PACKETS, real)
+        centre = mi.Vector3f(centre.x, centre.y, centre.z)
+        low, high = dr.select(real, centre, dr.inf), dr.select(real, centre, -dr.inf)
+        dr.eval(centre, real, low, high)
+        size = places >> level
+        low, high = _reduce(dr.ReduceOp.Min, low, size), _reduce(dr.ReduceOp.Max, high, size)
+        shift = dr.opaque(mi.UInt32, (places >> level).bit_length() - 1)
+        bits = min(_KEY_BITS - level, _COORDINATE_BITS)
+        order = dr.gather(
+            mi.UInt32, order, dr.argsort(_keys(centre, real, low, high, shift, dr.opaque(mi.UInt32, bits)))
+        )
+    return dr.gather(mi.UInt32, order, dr.arange(mi.UInt32, records.count))
+
+
+def _reduce(op: dr.ReduceOp, values: mi.Vector3f, size: int) -> mi.Vector3f:
+    return mi.Vector3f(*[dr.block_reduce(op, value, size) for value in values])
+
+
+def _keys(
+    centre: mi.Vector3f, real: mi.Bool, low: mi.Vector3f, high: mi.Vector3f, shift: mi.UInt32, bits: mi.UInt32
+) -> mi.UInt32:
+    """Sort keys: the node in the high bits, the coordinate on its longest axis in the ``bits`` low ones."""
+    node = dr.arange(mi.UInt32, dr.width(centre)) >> shift
+    low, high = (mi.Vector3f(*[dr.gather(mi.Float, v, node) for v in bound]) for bound in (low, high))
+    size = high - low
+    on_x = (size.x >= size.y) & (size.x >= size.z)
+    on_y = ~on_x & (size.y >= size.z)
+
+    def pick(v: mi.Vector3f) -> mi.Float:
+        return dr.select(on_x, v.x, dr.select(on_y, v.y, v.z))
+
+    steps = mi.Float((mi.UInt32(1) << bits) - 2)
+    part = dr.clip((pick(centre) - pick(low)) / dr.maximum(pick(size), 1e-30), 0, 1)
+    coordinate = dr.minimum(mi.UInt32(part * steps), mi.UInt32(steps))
+    # Empty places come last in their node.
+    return (node << bits) | dr.select(real, coordinate, (mi.UInt32(1) << bits) - 1)

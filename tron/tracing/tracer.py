@@ -37,7 +37,7 @@ class SurfelTracer:
     @cached_property
     def bvh(self) -> Bvh:
         """The hierarchy for shadow rays."""
-        return build_bvh(self._geometry, self.scene.kernel_degree)
+        return build_bvh(self._records)
 
     def gbuffer(self, camera: Camera) -> GBuffer:
         """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it."""
