@@ -1,0 +1,103 @@
+"""The peer for camera rays: Mitsuba's ``volprim_rf_basic`` on its ellipsoids, with the same surfels.
+
+The shipped integrator stops where transmittance falls below 0.01, with that number written in its loop. For
+equal work :func:`load_integrator` can run the shipped source with that one number replaced; nothing else of
+it changes. What cannot be made equal: its primitives are 3D Gaussians, here very flat ones, met in the order
+in which rays enter their hulls; they have no front side, so both sides are composited; it gathers radiance
+alone, no normals, materials or depths; and it starts again 1e-4 behind each hit, which skips primitives that
+nearly coincide.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from tron.cameras import Camera, mitsuba_sensor
+from tron.errors import TronError
+from tron.gaussians.scene import GaussianScene
+
+SHAPES = ("ellipsoids", "ellipsoidsmesh")
+SHIPPED_STOP = 0.01
+THINNESS = 0.02
+"""Third scale over the smaller of the surfel's two: as flat as the peer's own arithmetic bears."""
+MAX_DEPTH = 128
+_STOP_LINE = "dr.max(β) > 0.01"
+
+
+def load_integrator(stop: float = SHIPPED_STOP) -> Any:
+    """The shipped integrator, or the same source with another stop; it takes colours as they are.
+
+    Raises:
+        TronError: this Mitsuba's source no longer holds the line to be replaced.
+    """
+    from mitsuba.ad.integrators import volprim_rf_basic as shipped
+
+    name = "volprim_rf_basic"
+    if stop != SHIPPED_STOP:
+        name = f"volprim_rf_basic_{stop:g}"
+        source = inspect.getsource(shipped)
+        if source.count(_STOP_LINE) != 1:
+            raise TronError("this Mitsuba's volprim_rf_basic ends rays in another way", shipped.__file__)
+        source = source.replace(_STOP_LINE, f"dr.max(β) > {stop:g}")
+        source = source.replace('register_integrator("volprim_rf_basic"', f'register_integrator("{name}"')
+        _import_beside(shipped, source, name.replace(".", "_").replace("-", "_"))
+    return mi.load_dict({"type": name, "max_depth": MAX_DEPTH, "srgb_primitives": False})
+
+
+def _import_beside(shipped: Any, source: str, name: str) -> None:
+    """Run changed source as a sibling of a module; Dr.Jit reads it again, so it must stand in a file."""
+    package = shipped.__name__.rpartition(".")[0]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name}.py"
+        path.write_text(source, encoding="utf-8")
+        spec = importlib.util.spec_from_file_location(f"{package}.{name}", path)
+        assert spec is not None
+        assert spec.loader is not None
+        spec.loader.exec_module(importlib.util.module_from_spec(spec))
+
+
+def primitives(scene: GaussianScene, sh_degree: int, shape: str = "ellipsoids") -> mi.Scene:
+    """The surfels as flat ellipsoids in a Mitsuba scene, harmonics up to ``sh_degree``."""
+    scales = scene.scales()
+    flat = np.concatenate([scales, THINNESS * scales.min(1, keepdims=True)], 1)
+    coefficients = scene.sh[:, : (sh_degree + 1) ** 2].reshape(len(scene), -1)
+    tensors = {
+        "centers": scene.means,
+        "scales": flat,
+        "quaternions": scene.quats[:, [1, 2, 3, 0]],
+        "opacities": scene.opacities()[:, None],
+        "sh_coeffs": coefficients,
+    }
+    columns = {name: mi.TensorXf(np.ascontiguousarray(v, np.float32)) for name, v in tensors.items()}
+    return mi.load_dict({"type": "scene", "surfels": {"type": shape, "extent": 3.0, **columns}})
+
+
+def sensor(camera: Camera) -> mi.Sensor:
+    """The camera with a box filter and one sample a pixel."""
+    return mi.load_dict(mitsuba_sensor(camera, spp=1))
+
+
+def render(scene: mi.Scene, view: mi.Sensor, integrator: Any) -> mi.TensorXf:
+    """One frame as a user renders it: one ray a pixel, somewhere in the pixel."""
+    return mi.render(scene, sensor=view, integrator=integrator, spp=1)
+
+
+def through_centres(scene: mi.Scene, integrator: Any, camera: Camera) -> np.ndarray:
+    """(H, W, 3) float32 radiance along the rays through the pixel centres: for comparing, not for timing."""
+    import drjit as dr
+
+    rays = np.ascontiguousarray(camera.rays().reshape(-1, 3).T, np.float32)
+    origin = mi.Point3f(*[float(x) for x in camera.position]) + dr.zeros(mi.Vector3f, rays.shape[1])
+    sampler = mi.load_dict({"type": "independent", "sample_count": 1})
+    sampler.seed(0, rays.shape[1])
+    color, *_ = integrator.sample(
+        dr.ADMode.Primal, scene, sampler, mi.Ray3f(origin, mi.Vector3f(rays)), None, None, mi.Bool(True)
+    )
+    return np.array(color).T.reshape(camera.height, camera.width, 3)
