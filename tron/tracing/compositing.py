@@ -59,18 +59,16 @@ class Composite:
     count: mi.UInt32
 
 
-def _radiance(records: SurfelRecords, index: mi.UInt32, basis: list[mi.Float]) -> mi.Color3f:
+def radiance(records: SurfelRecords, index: mi.UInt32, basis: list[mi.Float]) -> mi.Color3f:
     """Display-space radiance ``max(0, SH(d) + 0.5)`` of one surfel; gathers only the degrees in use."""
-    coefficients = (records.sh_degree + 1) ** 2
-    color = []
-    for channel in range(3):
-        total = mi.Float(0.5)
-        for packet in range(-(-coefficients // 4)):
-            values = dr.gather(mi.Vector4f, records.harmonics, index * SH_PACKETS + channel * 4 + packet)
-            for lane in range(min(4, coefficients - 4 * packet)):
-                total = dr.fma(values[lane], basis[4 * packet + lane], total)
-        color.append(dr.select(total > 0, total, 0))
-    return mi.Color3f(*color)
+    total = [mi.Float(0.5), mi.Float(0.5), mi.Float(0.5)]
+    numbers = 3 * (records.sh_degree + 1) ** 2
+    for packet in range(-(-numbers // 4)):
+        values = dr.gather(mi.Vector4f, records.harmonics, index * SH_PACKETS + packet)
+        for lane in range(min(4, numbers - 4 * packet)):
+            coefficient, channel = divmod(4 * packet + lane, 3)
+            total[channel] = dr.fma(values[lane], basis[coefficient], total[channel])
+    return mi.Color3f(*[dr.select(value > 0, value, 0) for value in total])
 
 
 @dr.syntax
@@ -98,7 +96,7 @@ def composite(records: SurfelRecords, hits: LocalHits, direction: mi.Vector3f, o
             for k in range(4):
                 channels[4 * packet + k] = dr.fma(weight, feature[k], channels[4 * packet + k])
         if dr.hint(records.sh_degree > 0, mode="scalar"):
-            extra = _radiance(records, index, basis)
+            extra = radiance(records, index, basis)
             base = dr.gather(mi.Vector4f, records.features, index * FEATURE_PACKETS + 2)
             for k in range(3):
                 channels[8 + k] = dr.fma(weight, extra[k] - base[k], channels[8 + k])

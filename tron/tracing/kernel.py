@@ -16,19 +16,13 @@ sigma. Nothing else evaluates this formula, except the float64 oracle in :mod:`t
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from tron.errors import TronError
-from tron.gaussians.harmonics import dc_to_rgb
-
-if TYPE_CHECKING:
-    from tron.gaussians.scene import GaussianScene
 
 MIN_RESPONSE = 0.0113
 MIN_ALPHA = 1.0 / 255.0
@@ -41,28 +35,23 @@ GEOMETRY_PACKETS = 3
 FEATURE_PACKETS = 3
 """A feature record is 12 floats: normal, roughness | base color, metallic | radiance of SH degree 0, 0."""
 SH_PACKETS = 12
-"""An SH record is 48 floats: 16 coefficients of red, of green, of blue."""
+"""An SH record is 48 floats, as scenes store them: red, green and blue of the first coefficient, and so on."""
 
 
-def cut_radius_squared(opacities: np.ndarray, degree: int) -> np.ndarray:
+def cut_radius_squared(opacity: mi.Float, degree: int) -> mi.Float:
     """Largest squared Mahalanobis distance at which a surfel still counts; negative where it never does.
 
     Args:
-        opacities: (M,) float, after the sigmoid.
+        opacity: after the sigmoid; not differentiated through, because visibility is not.
         degree: kernel degree, 2 or 4.
-
-    Returns:
-        (M,) float64.
     """
-    threshold = np.maximum(MIN_RESPONSE, MIN_ALPHA / np.maximum(opacities.astype(np.float64), 1e-12))
-    log_response = np.log(threshold)
-    if degree == 2:
-        q = -2.0 * log_response
-    elif degree == 4:
-        q = np.sqrt(np.maximum(-18.0 * log_response, 0.0))
-    else:
+    if degree not in (2, 4):
         raise TronError(f"kernel degree {degree} is not known", mend="use 2 or 4")
-    return np.where(threshold <= 1.0, q, -1.0)
+    faintest = MIN_ALPHA / dr.select(opacity > 1e-12, opacity, 1e-12)
+    threshold = dr.select(faintest > MIN_RESPONSE, faintest, MIN_RESPONSE)
+    log_response = dr.log(threshold)
+    q = -2 * log_response if degree == 2 else dr.safe_sqrt(-18 * log_response)
+    return dr.select(threshold <= 1, q, -1)
 
 
 def response(q: Any, degree: int) -> Any:
@@ -70,17 +59,22 @@ def response(q: Any, degree: int) -> Any:
     return dr.exp(-0.5 * q) if degree == 2 else dr.exp((-1.0 / 18.0) * q * q)
 
 
+def log_response_slope(q: Any, degree: int) -> Any:
+    """Derivative of ``log(response(q))`` by ``q``."""
+    return -0.5 if degree == 2 else (-1.0 / 9.0) * q
+
+
 @dataclass
 class SurfelRecords:
-    """A scene's surfels as packed Dr.Jit buffers, in the scene's order.
+    """A scene's surfels as packed Dr.Jit buffers, in the scene's order (:func:`tron.tracing.parameters.pack`).
 
     Attributes:
         geometry: mi.Float, M records of ``4 * GEOMETRY_PACKETS``.
         features: mi.Float, M records of ``4 * FEATURE_PACKETS``.
         harmonics: mi.Float, M records of ``4 * SH_PACKETS``; one unused zero where ``sh_degree`` is 0.
-        count: M.
+        count: M; 1 where the scene has no surfel: a record that no ray meets.
         degree: kernel degree, 2 or 4.
-        sh_degree: highest SH degree with a coefficient that is not zero.
+        sh_degree: highest SH degree that is evaluated.
     """
 
     geometry: mi.Float
@@ -90,54 +84,14 @@ class SurfelRecords:
     degree: int
     sh_degree: int
 
-
-def pack_geometry(scene: GaussianScene) -> np.ndarray:
-    """(M, 12) float32 geometry records of a scene (layout: :data:`GEOMETRY_PACKETS`)."""
-    tangent_u, tangent_v = scene.tangents()
-    scales, opacities = scene.scales(), scene.opacities()
-    q_cut = cut_radius_squared(opacities, scene.kernel_degree)
-    records = np.empty((len(scene), 12), np.float32)
-    records[:, 0:3] = scene.means
-    records[:, 3] = opacities
-    records[:, 4:7] = tangent_u / scales[:, :1]
-    records[:, 7] = scales.max(1) * np.sqrt(np.maximum(q_cut, 0.0))
-    records[:, 8:11] = tangent_v / scales[:, 1:]
-    records[:, 11] = q_cut
-    return records
-
-
-def pack_features(scene: GaussianScene) -> np.ndarray:
-    """(M, 12) float32 feature records of a scene (layout: :data:`FEATURE_PACKETS`)."""
-    records = np.zeros((len(scene), 12), np.float32)
-    records[:, 0:3] = scene.normals()
-    records[:, 3] = scene.roughness
-    records[:, 4:7] = scene.base_color
-    records[:, 7] = scene.metallic
-    records[:, 8:11] = np.maximum(dc_to_rgb(scene.sh[:, 0]), 0.0)
-    return records
-
-
-def sh_degree(scene: GaussianScene) -> int:
-    """Highest spherical-harmonics degree of the scene with a coefficient that is not zero."""
-    used = np.any(scene.sh != 0.0, axis=(0, 2)) if len(scene) else np.zeros(16, bool)
-    return math.isqrt(int(np.flatnonzero(used).max())) if used.any() else 0
-
-
-def upload(scene: GaussianScene, geometry: np.ndarray) -> SurfelRecords:
-    """Upload a scene's surfels and their ``pack_geometry`` records, in the scene's own order."""
-    degree = sh_degree(scene)
-    # Dr.Jit refuses empty arrays as loop state: an unused scalar stands in.
-    harmonics = scene.sh.transpose(0, 2, 1).ravel() if degree > 0 else np.zeros(1, np.float32)
-    records = SurfelRecords(
-        geometry=mi.Float(geometry.ravel()),
-        features=mi.Float(pack_features(scene).ravel()),
-        harmonics=mi.Float(harmonics),
-        count=len(scene),
-        degree=scene.kernel_degree,
-        sh_degree=degree,
-    )
-    dr.eval(records.geometry, records.features, records.harmonics)
-    return records
+    def detached(self) -> SurfelRecords:
+        """The same buffers, cut off from automatic differentiation."""
+        return replace(
+            self,
+            geometry=dr.detach(self.geometry),
+            features=dr.detach(self.features),
+            harmonics=dr.detach(self.harmonics),
+        )
 
 
 @dataclass

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from tron.tracing.bvh import Bvh, build_bvh
 from tron.tracing.gbuffer import GBuffer, trace_gbuffer
-from tron.tracing.kernel import pack_geometry, upload
+from tron.tracing.parameters import SurfelParameters, pack
 from tron.tracing.tiles import build_tiles
 from tron.tracing.transmittance import BACK_FACE_SPACINGS, transmittance
 
@@ -29,8 +29,7 @@ class SurfelTracer:
 
     def __init__(self, scene: GaussianScene, *, two_sided: bool = True) -> None:
         self.scene = scene
-        self._geometry = pack_geometry(scene)
-        self._records = upload(scene, self._geometry)
+        self._records = pack(SurfelParameters.from_scene(scene))
         reach = BACK_FACE_SPACINGS * scene.spacing if two_sided else float("inf")
         self._back_faces_from = dr.opaque(mi.Float, reach)
 
