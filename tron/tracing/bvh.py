@@ -176,9 +176,10 @@ def _write_level(
     surfel = node * LEAF_SIZE
     total = dr.opaque(mi.UInt32, count)
     held = dr.select(surfel < total, dr.minimum(total - surfel, LEAF_SIZE), 0)
-    # An empty box has low > high on its grid; 65535 | 0 << 16 says so whatever the infinities rounded to.
+    # An empty box is the grid's far corner, a point. One with low > high would be met by every ray: the slab
+    # test sorts the two bounds.
     empty = ~(low.x <= high.x)
-    bounds = [dr.select(empty, mi.UInt32(65535), a | (b << 16)) for a, b in zip(first, last)]
+    bounds = [dr.select(empty, mi.UInt32(0xFFFFFFFF), a | (b << 16)) for a, b in zip(first, last)]
     link = dr.select(below == 0, mi.UInt32(LEAF_BIT) | (surfel << 4) | held, index + (2 << below) - 1)
     dr.scatter(words, mi.Vector4u(*bounds, link), index)
 
