@@ -5,12 +5,14 @@ it once, and :func:`render_guidance` turns a camera into the buffers the neural 
 Everything here is linear and scene-referred; exposure and AgX come at the very end, elsewhere.
 """
 
+from tron.shading.cubemap import CubemapLight
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
 from tron.shading.irradiance import irradiance
 from tron.shading.split_sum import SplitSum
 
 __all__ = [
+    "CubemapLight",
     "EnvironmentLight",
     "EnvironmentMap",
     "Guidance",

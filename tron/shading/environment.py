@@ -218,6 +218,11 @@ class EnvironmentLight:
         self._density = mi.Float((mass / area).astype(np.float32).ravel())
         self._distribution = mi.DiscreteDistribution2D(mass.astype(np.float32))
 
+    @property
+    def face_resolution(self) -> int:
+        """Texels along a quarter of the horizon."""
+        return self.environment.image.shape[1] // 4
+
     def _longitude(self, d: mi.Vector3f) -> mi.Float:
         u = dr.atan2(d.x, d.y) * float(0.5 / np.pi) + self._rotation
         return u - dr.floor(u)

@@ -6,6 +6,9 @@ is a quadtree whose nodes know their energy (radiance times solid angle), solid 
 weighted direction their light comes from; a node is opened while it looks large beside the lobe or beside its
 distance from the lobe's axis. Placing the light at its own centroid makes the error second order, so a sun of
 one texel is filtered where it stands. One compiled kernel serves every lobe and every light.
+
+The filter is differentiable with respect to the light's texels, centroids included. Its loops are declared to
+be sums (``max_iterations=-1``): Dr.Jit then differentiates them by walking once more, with nothing stored.
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
@@ -14,40 +17,15 @@ one texel is filtered where it stands. One compiled kernel serves every lobe and
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from tron.color import LUMINANCE
+from tron.shading.cubemap import CubemapLight, face_direction
 from tron.shading.environment import EnvironmentLight
-
-
-def face_direction(face: mi.UInt32, u: mi.Float, v: mi.Float) -> mi.Vector3f:
-    """Unit world direction of a point on a cube face.
-
-    Faces are +x, -x, +y, -y, +z, -z; ``u`` and ``v`` in [-1, 1] run along the next two axes in cyclic order
-    (for +-x: y and z; +-y: z and x; +-z: x and y). Values a little outside [-1, 1] extend the face's plane.
-    """
-    axis = face >> 1
-    major = dr.select((face & 1) == 0, mi.Float(1), mi.Float(-1))
-    x = dr.select(axis == 0, major, dr.select(axis == 1, v, u))
-    y = dr.select(axis == 0, u, dr.select(axis == 1, major, v))
-    z = dr.select(axis == 0, v, dr.select(axis == 1, u, major))
-    return dr.normalize(mi.Vector3f(x, y, z))
-
-
-def direction_face(d: mi.Vector3f) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-    """The inverse of :func:`face_direction`: face and (u, v) in [-1, 1] of directions ``d`` (any length)."""
-    a = dr.abs(d)
-    on_x = (a.x >= a.y) & (a.x >= a.z)
-    on_y = ~on_x & (a.y >= a.z)
-    major = dr.select(on_x, d.x, dr.select(on_y, d.y, d.z))
-    u = dr.select(on_x, d.y, dr.select(on_y, d.z, d.x))
-    v = dr.select(on_x, d.z, dr.select(on_y, d.x, d.y))
-    face = dr.select(on_x, mi.UInt32(0), dr.select(on_y, mi.UInt32(2), mi.UInt32(4)))
-    scale = dr.rcp(dr.abs(major))
-    return face + dr.select(major < 0, mi.UInt32(1), 0), u * scale, v * scale
 
 
 @dataclass
@@ -64,32 +42,39 @@ class LightTree:
     count: mi.UInt32
 
     @classmethod
-    def build(cls, light: EnvironmentLight, resolution: int) -> LightTree:
+    def build(cls, light: EnvironmentLight | CubemapLight, resolution: int) -> LightTree:
         """Tree of ``light`` with ``resolution`` (a power of two) leaves along each face edge."""
-        source = light.environment.image.shape[1] / 4
-        samples = int(np.clip(np.ceil(1.5 * source / resolution), 2, 8))
+        samples = int(np.clip(np.ceil(1.5 * light.face_resolution / resolution), 2, 8))
         depth = resolution.bit_length() - 1
-        energy, moment, area = _leaves(light, depth, samples)
-        levels = [(energy, moment, area)]
+        levels = [_leaves(light, depth, samples)]
         for _ in range(depth):
-            levels.append(tuple(a.reshape(len(a) // 4, 4, *a.shape[1:]).sum(1) for a in levels[-1]))
-        levels.reverse()
-        sizes = [(4 ** (depth - level + 1) - 1) // 3 for level in range(depth + 1)]
-        records = np.empty((6 * sizes[0], 8), np.float32)
-        index = np.arange(6) * sizes[0]
-        for level, (energy, moment, area) in enumerate(levels):
-            if level:
-                index = ((index + 1)[:, None] + np.arange(4) * sizes[level]).ravel()
-            records[index, 0:3] = moment / np.linalg.norm(moment, axis=1, keepdims=True)
-            records[index, 3] = np.sqrt(area)
-            records[index, 4:7] = energy
-            records[index, 7] = index + sizes[level]
-        return cls(mi.Float(records.ravel()), dr.opaque(mi.UInt32, len(records)))
+            levels.append([dr.block_sum(value, 4) for value in levels[-1]])
+        r, g, b, x, y, z, area = (dr.concat(list(column)) for column in zip(*levels[::-1]))
+        centroid = dr.normalize(mi.Vector3f(x, y, z))
+        index, after = (mi.UInt32(np.concatenate(part)) for part in zip(*_preorder(depth)))
+        records = dr.zeros(mi.Float, 8 * dr.width(index))
+        dr.scatter(records, mi.Vector4f(*centroid, dr.sqrt(area)), 2 * index)
+        dr.scatter(records, mi.Vector4f(r, g, b, mi.Float(after)), 2 * index + 1)
+        dr.eval(records)
+        return cls(records, dr.opaque(mi.UInt32, dr.width(index)))
+
+
+@cache
+def _preorder(depth: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For each level of six quadtrees, the nodes' places in preorder and those of the nodes after them."""
+    sizes = [(4 ** (depth - level + 1) - 1) // 3 for level in range(depth + 1)]
+    index = np.arange(6) * sizes[0]
+    levels = []
+    for level, size in enumerate(sizes):
+        if level:
+            index = ((index + 1)[:, None] + np.arange(4) * size).ravel()
+        levels.append((index.astype(np.uint32), (index + size).astype(np.uint32)))
+    return levels
 
 
 @dr.syntax
-def _leaves(light: EnvironmentLight, depth: int, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Energy (N, 3), luminance-weighted moment (N, 3) and solid angle (N,), float64, of the leaves.
+def _leaves(light: EnvironmentLight | CubemapLight, depth: int, samples: int) -> list[mi.Float]:
+    """Energy r, g, b, luminance-weighted moment x, y, z and solid angle of the leaves.
 
     Leaves are in Morton order within each face; each is sampled on a grid of ``samples`` squared points.
     """
@@ -103,7 +88,7 @@ def _leaves(light: EnvironmentLight, depth: int, samples: int) -> tuple[np.ndarr
     step, per_edge = 2 / (resolution * samples), dr.opaque(mi.UInt32, samples)
     energy, moment, area = mi.Color3f(0), mi.Vector3f(0), mi.Float(0)
     i = mi.UInt32(0)
-    while i < per_edge * per_edge:
+    while dr.hint(i < per_edge * per_edge, max_iterations=-1):
         u = (mi.Float(x * per_edge + i % per_edge) + 0.5) * step - 1
         v = (mi.Float(y * per_edge + i // per_edge) + 0.5) * step - 1
         d = face_direction(face, u, v)
@@ -115,7 +100,7 @@ def _leaves(light: EnvironmentLight, depth: int, samples: int) -> tuple[np.ndarr
         area += solid
         i += 1
     dr.eval(energy, moment, area)
-    return np.array(energy, np.float64).T, np.array(moment, np.float64).T, np.array(area, np.float64)
+    return [*energy, *moment, area]
 
 
 @dr.syntax
@@ -140,7 +125,7 @@ def ggx_prefilter(
     alpha2, opening2 = alpha * alpha, opening * opening
     total, weight = mi.Color3f(0), mi.Float(0)
     node = mi.UInt32(0)
-    while node < tree.count:
+    while dr.hint(node < tree.count, max_iterations=-1):
         low = dr.gather(mi.Vector4f, tree.records, 2 * node)
         high = dr.gather(mi.Vector4f, tree.records, 2 * node + 1)
         # |n - l|^2 keeps its digits where 1 - n.l would lose them.

@@ -18,8 +18,9 @@ import mitsuba as mi
 import numpy as np
 
 from tron.errors import TronError
+from tron.shading.cubemap import CubemapLight, bilinear, face_direction
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
-from tron.shading.prefilter import LightTree, direction_face, face_direction, ggx_prefilter
+from tron.shading.prefilter import LightTree, ggx_prefilter
 
 CUBEMAP_RESOLUTION = 128
 """Texels along a face edge of the sharpest level."""
@@ -33,11 +34,14 @@ TABLE_SAMPLES = 32
 class SplitSum:
     """An environment prepared for unshadowed shading of any surface.
 
+    Everything it returns is differentiable with respect to the texels of a :class:`CubemapLight`, through the
+    levels; make a new one after each change of the light.
+
     Args:
-        environment: the light.
+        environment: the light, a map or a cubemap on the device.
         resolution: texels along a face edge of the sharpest level, a power of two in [64, 1024]. Preparing a
             light takes about 0.3, 1.2 and 5 seconds on one core at 128, 256 and 512.
-        light: the same environment on the device, if the caller has it already.
+        light: the same map on the device, if the caller has it already.
 
     Raises:
         TronError: another resolution.
@@ -45,16 +49,13 @@ class SplitSum:
 
     def __init__(
         self,
-        environment: EnvironmentMap,
+        environment: EnvironmentMap | CubemapLight,
         resolution: int = CUBEMAP_RESOLUTION,
         light: EnvironmentLight | None = None,
     ) -> None:
         if resolution not in (64, 128, 256, 512, 1024):
             raise TronError(f"cubemap resolution is {resolution}", mend="use 64, 128, 256, 512 or 1024")
-        widest = 8 * resolution
-        if environment.image.shape[1] > widest:
-            environment, light = environment.resized(widest // 2), None
-        tree = LightTree.build(light or EnvironmentLight(environment), resolution)
+        tree = LightTree.build(_on_device(environment, 8 * resolution, light), resolution)
         resolutions = _level_resolutions(resolution)
         roughnesses = _level_roughnesses(len(resolutions))
         self._last = dr.opaque(mi.UInt32, len(resolutions) - 1)
@@ -63,11 +64,12 @@ class SplitSum:
             _prefiltered_level(tree, r, alpha=roughness**2)
             for r, roughness in zip(resolutions, roughnesses, strict=True)
         ]
-        offsets = np.cumsum([0] + [len(level) for level in levels[:-1]])
-        self._texels = mi.Float(np.concatenate(levels).ravel())
+        offsets = np.cumsum([0] + [6 * (r + 2) ** 2 for r in resolutions[:-1]])
+        self._texels = dr.concat(levels)
         self._offsets = mi.UInt32(offsets.astype(np.uint32))
         self._resolutions = mi.UInt32(np.array(resolutions, np.uint32))
         self._table = mi.Float(brdf_table().ravel())
+        dr.eval(self._texels)
 
     def diffuse(self, normal: mi.Vector3f) -> mi.Color3f:
         """Unoccluded irradiance / pi: linear radiance of a white diffuse surface of unit ``normal``."""
@@ -107,25 +109,8 @@ class SplitSum:
         return sharp / (MIDDLE_ROUGHNESS - SHARPEST_ROUGHNESS) * before_last + rough / (1 - MIDDLE_ROUGHNESS)
 
     def _level(self, direction: mi.Vector3f, level: mi.UInt32) -> mi.Color3f:
-        """Bilinear lookup in one level; faces carry a border of one texel, so edges are filtered too."""
-        face, u, v = direction_face(direction)
         resolution = dr.gather(mi.UInt32, self._resolutions, level)
-        half = 0.5 * mi.Float(resolution)
-        x, y = u * half + half + 0.5, v * half + half + 0.5
-        column, row = mi.UInt32(x), mi.UInt32(y)
-        column = dr.select(column > resolution, resolution, column)
-        row = dr.select(row > resolution, resolution, row)
-        width = resolution + 2
-        first = dr.gather(mi.UInt32, self._offsets, level) + (face * width + row) * width + column
-
-        def texel(index: mi.UInt32) -> mi.Vector4f:
-            return dr.gather(mi.Vector4f, self._texels, index)
-
-        fx, fy = x - mi.Float(column), y - mi.Float(row)
-        upper = dr.lerp(texel(first), texel(first + 1), fx)
-        lower = dr.lerp(texel(first + width), texel(first + width + 1), fx)
-        value = dr.lerp(upper, lower, fy)
-        return mi.Color3f(value.x, value.y, value.z)
+        return bilinear(self._texels, dr.gather(mi.UInt32, self._offsets, level), resolution, direction)
 
     def _brdf(self, cosine: mi.Float, roughness: mi.Float) -> tuple[mi.Float, mi.Float]:
         x = dr.clip(cosine * TABLE_SIZE - 0.5, 0, TABLE_SIZE - 1)
@@ -145,6 +130,17 @@ class SplitSum:
         return value.x, value.y
 
 
+def _on_device(
+    environment: EnvironmentMap | CubemapLight, widest: int, light: EnvironmentLight | None
+) -> EnvironmentLight | CubemapLight:
+    """The light to filter; a map with far more columns than the levels can show is averaged down first."""
+    if isinstance(environment, CubemapLight):
+        return environment
+    if environment.image.shape[1] > widest:
+        return EnvironmentLight(environment.resized(widest // 2))
+    return light or EnvironmentLight(environment)
+
+
 def _level_resolutions(resolution: int) -> list[int]:
     levels = [resolution]
     while levels[-1] > SMALLEST_LEVEL:
@@ -157,8 +153,8 @@ def _level_roughnesses(count: int) -> list[float]:
     return [SHARPEST_ROUGHNESS + step * i for i in range(count - 1)] + [1.0]
 
 
-def _prefiltered_level(tree: LightTree, resolution: int, alpha: float) -> np.ndarray:
-    """(6 (resolution + 2)^2, 4) float32: r, g, b, 0; the border lies on the face's extended plane."""
+def _prefiltered_level(tree: LightTree, resolution: int, alpha: float) -> mi.Float:
+    """r, g, b, 0 of 6 (resolution + 2)^2 texels; the border is filtered on the face's extended plane."""
     width = dr.opaque(mi.UInt32, resolution + 2)
     texel = dr.arange(mi.UInt32, 6 * (resolution + 2) ** 2)
     face, inside = texel // (width * width), texel % (width * width)
@@ -167,7 +163,7 @@ def _prefiltered_level(tree: LightTree, resolution: int, alpha: float) -> np.nda
     # The small levels have few texels, wide lobes and the closely watched diffuse light: they can be exact.
     opening = dr.opaque(mi.Float, 0.35 if resolution > DIFFUSE_LEVEL else 0.1)
     colour = ggx_prefilter(tree, face_direction(face, u, v), dr.opaque(mi.Float, alpha), opening)
-    return np.concatenate([np.array(colour).T, np.zeros((len(texel), 1), np.float32)], axis=1)
+    return dr.ravel(mi.Vector4f(*colour, dr.zeros(mi.Float, dr.width(texel))))
 
 
 @cache

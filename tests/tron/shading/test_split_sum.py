@@ -7,8 +7,9 @@ import pytest
 
 from tron.errors import TronError
 from tron.seeds import generator
+from tron.shading.cubemap import direction_face, face_direction
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
-from tron.shading.prefilter import LightTree, direction_face, face_direction, ggx_prefilter
+from tron.shading.prefilter import LightTree, ggx_prefilter
 from tron.shading.split_sum import SplitSum, brdf_table
 
 
