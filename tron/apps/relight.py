@@ -251,14 +251,12 @@ def _render(
 ) -> list[float]:
     """Trace the frames that are missing, develop all of them; returns the seconds of each traced one."""
     from tron.shading.guidance import Lighting, render_guidance
-    from tron.tracing.hits import MAX_HITS
 
     spp, denoise = QUALITY[settings.quality]
     missing = [index for index in range(len(cameras)) if not folder.finished(index)]
     lighting: Lighting | None = Lighting(environment) if missing else None
     tracer_for = _tracers(scene)
     seconds: list[float] = []
-    left_out = 0
     for index, camera in enumerate(track(cameras, "guidance")):
         if index in missing:
             assert lighting is not None
@@ -267,16 +265,9 @@ def _render(
             tracer = tracer_for(camera)
             guidance = render_guidance(tracer, camera, lighting, spp=spp, seed=seed, denoise=denoise)
             seconds.append(time.perf_counter() - started)
-            left_out += int(guidance.gbuffer["overflow"].sum())
             folder.write(index, {name: _buffer(guidance, name) for name in folder.buffers})
         for name in GUIDANCE:
             folder.write_picture(index, name, to_display(folder.read(index, name), exposure))
-    if left_out:
-        log.warning(
-            "%d hits were left out: some rays met more than %d surfels, what lies behind may miss",
-            left_out,
-            MAX_HITS,
-        )
     return seconds
 
 

@@ -87,8 +87,8 @@ def refit(order: mi.UInt32, levels: int, records: SurfelRecords) -> Bvh:
 
     root_low, root_high = boxes[0]
     size = root_high - root_low
-    # A scene without surfels, or with one seen edge-on, still needs a grid with cells.
-    pad = 1e-4 * dr.maximum(dr.max(size), 1e-6)
+    # A flat scene needs cells wider than the rounding of its rays, a scene without surfels any cells at all.
+    pad = 0.03 * dr.maximum(dr.max(size), 1e-6)
     origin = mi.Point3f(dr.select(size >= 0, root_low - pad, 0))
     scale = dr.select(size >= 0, _GRID / (size + 2 * pad), 1)
     dr.eval(origin, scale)

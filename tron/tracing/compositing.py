@@ -1,8 +1,12 @@
 """Front-to-back compositing of sorted hits: ``sum_i T_i alpha_i f_i``, ``T_i = prod_{j<i} (1 - alpha_j)``.
 
 (Equation 3 of the TRON paper.)  Compositing ends at the first hit after which T < 0.001.  The ids of the
-composited hits are written out in order, so that an adjoint can replay exactly this list.
+composited hits are written out in order, so that the adjoint can replay exactly this list.
 """
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportReturnType=false
+# pyright: reportOptionalMemberAccess=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations
 
@@ -11,33 +15,35 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from tron.gaussians.harmonics import sh_basis
-from tron.tracing.hits import MAX_HITS, LocalHits
+from tron.tracing.hits import LocalHits
 from tron.tracing.kernel import FEATURE_PACKETS, SH_PACKETS, SurfelRecords
 
 STOP_TRANSMITTANCE = 1e-3
 MEDIAN_TRANSMITTANCE = 0.5
-CHANNELS = 4 * FEATURE_PACKETS
+CHANNELS = 11
+MATERIAL_PACKETS = 2
+"""Packets of a feature record that are composited as they are: normal, roughness | base color, metallic."""
 
 
 @dataclass
 class HitList:
-    """The composited hits of P rays, as the adjoint will replay them.
+    """The composited hits of some rays, as the adjoint replays them.
 
     Attributes:
-        ids: mi.UInt32, slot-major: hit ``s`` of ray ``r`` lies at ``s * rays + r``.
-        count: mi.UInt32 (P,), composited hits a ray.
-        rays: P.
+        ids: mi.UInt32, surfels, slot-major: slot ``s`` of list ``r`` lies at ``s * width(ray) + r``.
+        count: mi.UInt32, composited hits of each list.
+        ray: mi.UInt32, the ray that each list belongs to.
     """
 
     ids: mi.UInt32
     count: mi.UInt32
-    rays: int
+    ray: mi.UInt32
 
     @staticmethod
-    def empty(rays: int) -> HitList:
-        """Room for ``rays`` lists."""
-        return HitList(dr.zeros(mi.UInt32, MAX_HITS * rays), dr.zeros(mi.UInt32, rays), rays)
+    def empty(ray: mi.UInt32, room: int) -> HitList:
+        """Lists of up to ``room`` hits for the rays ``ray``."""
+        rays = dr.width(ray)
+        return HitList(dr.zeros(mi.UInt32, room * rays), dr.zeros(mi.UInt32, rays), ray)
 
 
 @dataclass
@@ -45,7 +51,7 @@ class Composite:
     """Sums over the hits of each ray, unnormalised (Dr.Jit).
 
     Attributes:
-        channels: 12 floats: normal, roughness | base color, metallic | rgb of SH radiance, unused.
+        channels: 11 floats: normal, roughness, base color, metallic, rgb of SH radiance.
         mean_depth: sum of ``w t``.
         transmittance: T after the last composited hit.
         median_depth: t of the first hit after which T < 0.5; 0 where T stays above.
@@ -58,53 +64,80 @@ class Composite:
     median_depth: mi.Float
     count: mi.UInt32
 
+    @staticmethod
+    def start() -> Composite:
+        """Nothing met yet."""
+        return Composite(
+            [mi.Float(0) for _ in range(CHANNELS)], mi.Float(0), mi.Float(1), mi.Float(0), mi.UInt32(0)
+        )
 
-def radiance(records: SurfelRecords, index: mi.UInt32, basis: list[mi.Float]) -> mi.Color3f:
-    """Display-space radiance ``max(0, SH(d) + 0.5)`` of one surfel; gathers only the degrees in use."""
-    total = [mi.Float(0.5), mi.Float(0.5), mi.Float(0.5)]
+
+def harmonic_sums(
+    records: SurfelRecords, index: mi.UInt32, basis: list[mi.Float], active: mi.Bool
+) -> tuple[list[mi.Vector4f], list[mi.Float]]:
+    """An SH record's packets in use, and ``SH(d) + 0.5`` for red, green and blue.
+
+    ``basis`` is :func:`tron.gaussians.harmonics.sh_basis` of d.
+    """
+    packets, total = [], [mi.Float(0.5), mi.Float(0.5), mi.Float(0.5)]
     numbers = 3 * (records.sh_degree + 1) ** 2
     for packet in range(-(-numbers // 4)):
-        values = dr.gather(mi.Vector4f, records.harmonics, index * SH_PACKETS + packet)
+        values = dr.gather(mi.Vector4f, records.harmonics, index * SH_PACKETS + packet, active)
+        packets.append(values)
         for lane in range(min(4, numbers - 4 * packet)):
             coefficient, channel = divmod(4 * packet + lane, 3)
             total[channel] = dr.fma(values[lane], basis[coefficient], total[channel])
-    return mi.Color3f(*[dr.select(value > 0, value, 0) for value in total])
+    return packets, total
+
+
+def radiance(
+    records: SurfelRecords, index: mi.UInt32, basis: list[mi.Float], active: mi.Bool
+) -> list[mi.Float]:
+    """Display-space radiance ``max(0, SH(d) + 0.5)`` of one surfel: red, green, blue."""
+    if records.sh_degree == 0:  # the same from everywhere: packing has evaluated it
+        packed = dr.gather(mi.Vector4f, records.features, index * FEATURE_PACKETS + MATERIAL_PACKETS, active)
+        return [packed[0], packed[1], packed[2]]
+    _, total = harmonic_sums(records, index, basis, active)
+    return [dr.select(value > 0, value, 0) for value in total]
 
 
 @dr.syntax
-def composite(records: SurfelRecords, hits: LocalHits, direction: mi.Vector3f, out: HitList) -> Composite:
-    """Composite the sorted ``hits`` of each lane and write their ids to ``out`` (the caller evaluates both).
+def composite(
+    records: SurfelRecords, hits: LocalHits, basis: list[mi.Float], sums: Composite, out: HitList | None
+) -> Composite:
+    """Composite the sorted ``hits`` of each lane behind what ``sums`` holds already.
 
     Args:
         records: the surfels.
-        hits: sorted local hits, in the same kernel.
-        direction: unit ray direction, at which SH radiance is evaluated (3DGRT's choice).
-        out: receives the ids; lane r writes list r.
+        hits: sorted local hits, in the same kernel; all of them lie behind those in ``sums``.
+        basis: spherical harmonics at the unit ray direction (3DGRT evaluates SH there).
+        sums: what was composited before; :meth:`Composite.start` at first.
+        out: receives the ids, list r from lane r; the caller evaluates it.
     """
-    channels = [mi.Float(0) for _ in range(CHANNELS)]
-    mean_depth, median_depth, remaining = mi.Float(0), mi.Float(0), mi.Float(1)
-    lane, slot = dr.arange(mi.UInt32, out.rays), mi.UInt32(0)
-    stride = dr.opaque(mi.UInt32, out.rays)  # a literal would compile a kernel for each image size
-    basis = sh_basis(direction.x, direction.y, direction.z)
-    active = slot < hits.count
+    slot = mi.UInt32(0)
+    lane, lists = mi.UInt32(0), mi.UInt32(0)
+    if dr.hint(out is not None, mode="scalar"):
+        lane = dr.arange(mi.UInt32, dr.width(out.ray))
+        lists = dr.opaque(mi.UInt32, dr.width(out.ray))  # a literal would compile a kernel per image size
+    active = (slot < hits.count) & (sums.transmittance >= STOP_TRANSMITTANCE)
     while active:
         alpha, index, t = hits.alpha[slot], hits.index[slot], hits.t[slot]
-        dr.scatter(out.ids, index, slot * stride + lane, active)
-        weight = remaining * alpha
-        for packet in range(FEATURE_PACKETS):
-            feature = dr.gather(mi.Vector4f, records.features, index * FEATURE_PACKETS + packet)
-            for k in range(4):
-                channels[4 * packet + k] = dr.fma(weight, feature[k], channels[4 * packet + k])
-        if dr.hint(records.sh_degree > 0, mode="scalar"):
-            extra = radiance(records, index, basis)
-            base = dr.gather(mi.Vector4f, records.features, index * FEATURE_PACKETS + 2)
-            for k in range(3):
-                channels[8 + k] = dr.fma(weight, extra[k] - base[k], channels[8 + k])
-        mean_depth = dr.fma(weight, t, mean_depth)
-        after = remaining * (1 - alpha)
-        crossed = (remaining >= MEDIAN_TRANSMITTANCE) & (after < MEDIAN_TRANSMITTANCE)
-        median_depth = dr.select(crossed, t, median_depth)
-        remaining = after
+        if dr.hint(out is not None, mode="scalar"):
+            dr.scatter(out.ids, index, sums.count * lists + lane, active)
+        weight = sums.transmittance * alpha
+        channels = []
+        for packet in range(MATERIAL_PACKETS):
+            feature = dr.gather(mi.Vector4f, records.features, index * FEATURE_PACKETS + packet, active)
+            channels += [feature[k] for k in range(4)]
+        channels += radiance(records, index, basis, active)
+        for k in range(CHANNELS):
+            sums.channels[k] = dr.fma(weight, channels[k], sums.channels[k])
+        sums.mean_depth = dr.fma(weight, t, sums.mean_depth)
+        after = sums.transmittance * (1 - alpha)
+        crossed = (sums.transmittance >= MEDIAN_TRANSMITTANCE) & (after < MEDIAN_TRANSMITTANCE)
+        sums.median_depth = dr.select(crossed, t, sums.median_depth)
+        sums.transmittance = after
+        sums.count += 1
         slot += 1
-        active &= (slot < hits.count) & (remaining >= STOP_TRANSMITTANCE)
-    return Composite(channels, mean_depth, remaining, median_depth, slot)
+        active &= (slot < hits.count) & (after >= STOP_TRANSMITTANCE)
+    return sums

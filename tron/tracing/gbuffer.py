@@ -1,16 +1,11 @@
-"""Camera + scene -> GBuffer: one traced, composited and normalised surface point a pixel.
-
-Normalising (facts.md 4b): composited channels are alpha-weighted sums, so materials are divided by
-opacity and the normal is brought back to unit length. The surface point is at the median depth; where
-transmittance never falls below one half there is no median, and the alpha-weighted mean depth stands in
-where opacity is not zero.
-"""
+"""Camera + scene -> GBuffer: one traced, composited and normalised surface point a pixel."""
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false
 # (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import drjit as dr
@@ -18,57 +13,40 @@ import mitsuba as mi
 import numpy as np
 
 from tron.cameras import Camera
+from tron.gaussians.harmonics import sh_basis
+from tron.tracing.adjoint import attach
+from tron.tracing.bvh import Bvh
 from tron.tracing.compositing import STOP_TRANSMITTANCE, Composite, HitList, composite
 from tron.tracing.hits import MAX_HITS, collect, sort
+from tron.tracing.kbuffer import composite_rays
 from tron.tracing.kernel import SurfelRecords
+from tron.tracing.surface import Surface, surface
 from tron.tracing.tiles import LANES, TILE, TileLists
 
 
 @dataclass
-class GBuffer:
-    """What a camera sees, per pixel, as Dr.Jit arrays of ``width * height`` lanes in row-major order.
+class GBuffer(Surface):
+    """What a camera sees, per pixel: a :class:`Surface` of ``width * height`` lanes in row-major order.
 
     Attributes:
-        position: mi.Point3f, world; meaningless where opacity is 0.
-        depth: mi.Float, distance along the unit ray to the median hit, world units; 0 where there is none.
-        normal: mi.Normal3f, unit, world, geometric; zero where opacity is 0.
-        base_color: mi.Color3f, linear.
-        roughness, metallic: mi.Float.
-        rgb: mi.Color3f, composited SH radiance in display space, premultiplied by opacity.
-        opacity: mi.Float, 1 - T.
-        direction: mi.Vector3f, unit ray from the camera into the scene, world.
-        overflow: mi.UInt32, hits left out because the ray met more than ``MAX_HITS``.
-        hits: the composited ids in tile order (see :class:`HitList`), for the adjoint.
         width, height: pixels.
     """
 
-    position: mi.Point3f
-    depth: mi.Float
-    normal: mi.Normal3f
-    base_color: mi.Color3f
-    roughness: mi.Float
-    metallic: mi.Float
-    rgb: mi.Color3f
-    opacity: mi.Float
-    direction: mi.Vector3f
-    overflow: mi.UInt32
-    hits: HitList
     width: int
     height: int
 
     def numpy(self) -> dict[str, np.ndarray]:
-        """Every per-pixel field as (H, W) or (H, W, 3) float32 (overflow: uint32)."""
-        skipped = ("hits", "width", "height")
-        return {f.name: self._image(getattr(self, f.name)) for f in fields(self) if f.name not in skipped}
+        """Every field as (H, W) or (H, W, 3) float32."""
+        return {f.name: self._image(getattr(self, f.name)) for f in fields(Surface)}
 
     def _image(self, value: mi.Float) -> np.ndarray:
-        array = np.array(value)
+        array = np.array(dr.detach(value))
         shape = (self.height, self.width) if array.ndim == 1 else (self.height, self.width, -1)
         return np.ascontiguousarray(array.T.reshape(shape))
 
 
 @dataclass
-class _TileRays:
+class TileRays:
     """Rays of all pixels in tile order: lane = tile * 16 + pixel within the tile."""
 
     origin: mi.Point3f
@@ -77,7 +55,7 @@ class _TileRays:
     inside: mi.Bool
 
 
-def _tile_rays(camera: Camera, tiles_x: int, tiles_y: int) -> _TileRays:
+def tile_rays(camera: Camera, tiles_x: int, tiles_y: int) -> TileRays:
     """Pixel-centre rays. The camera's numbers are opaque, or every view would compile its own kernel."""
     lane = dr.arange(mi.UInt32, tiles_x * tiles_y * LANES)
     tile, pixel = lane // LANES, lane % LANES
@@ -92,7 +70,7 @@ def _tile_rays(camera: Camera, tiles_x: int, tiles_y: int) -> _TileRays:
     direction = dr.normalize(
         ((mi.Float(x) + 0.5 - cx) / fx) * right + ((mi.Float(y) + 0.5 - cy) / fy) * down + forward
     )
-    return _TileRays(origin, direction, tile, (x < width) & (y < height))
+    return TileRays(origin, direction, tile, (x < width) & (y < height))
 
 
 def _row_major_lanes(width: int, height: int, tiles_x: int) -> mi.UInt32:
@@ -104,55 +82,77 @@ def _row_major_lanes(width: int, height: int, tiles_x: int) -> mi.UInt32:
 
 
 def trace_tiles(
-    records: SurfelRecords, lists: TileLists, rays: _TileRays
-) -> tuple[Composite, HitList, mi.UInt32]:
-    """Collect, sort and composite in one kernel: the sums, the hit list and the hits met, in tile order."""
+    records: SurfelRecords, lists: TileLists, rays: TileRays, bvh: Callable[[], Bvh]
+) -> tuple[Composite, list[HitList]]:
+    """Sums of every ray in tile order, and the hits that they are made of.
+
+    Collecting, sorting and compositing are one kernel, with room for ``MAX_HITS`` hits a ray. Rays that met
+    more are traced once more through the hierarchy, where there is no limit.
+
+    Args:
+        records: the surfels, detached.
+        lists: tile lists. rays: the rays of their pixels.
+        bvh: makes the hierarchy; called only if some ray needs it.
+    """
     start = dr.gather(mi.UInt32, lists.start, rays.tile)
     count = dr.select(rays.inside, dr.gather(mi.UInt32, lists.count, rays.tile), 0)
-    out = HitList.empty(dr.width(rays.tile))
+    out = HitList.empty(dr.arange(mi.UInt32, dr.width(rays.tile)), MAX_HITS)
     hits = collect(records, lists.entries, start, count, rays.origin, rays.direction, STOP_TRANSMITTANCE)
     sort(hits)
-    sums = composite(records, hits, rays.direction, out)
-    out.count = sums.count
-    dr.eval(
-        sums.channels, sums.mean_depth, sums.transmittance, sums.median_depth, out.ids, out.count, hits.met
-    )
-    return sums, out, hits.met
+    basis = sh_basis(rays.direction.x, rays.direction.y, rays.direction.z)
+    sums = composite(records, hits, basis, Composite.start(), out)
+    out.count = dr.select(hits.met > MAX_HITS, 0, sums.count)
+    dr.eval(sums, out.ids, out.count, hits.met)
+    crowded = dr.compress(hits.met > MAX_HITS)
+    if dr.width(crowded) == 0:
+        return sums, [out]
+    met = dr.gather(mi.UInt32, hits.met, crowded)
+    more = HitList.empty(crowded, int(dr.max(met)[0]))  # met counts every hit that can be composited
+    direction = dr.gather(mi.Vector3f, rays.direction, crowded)
+    again = composite_rays(records, bvh(), rays.origin, direction, mi.Bool(True), more)
+    more.count = again.count
+    dr.eval(again, more.ids, more.count)
+    scatter_rays(sums, again, crowded)
+    return sums, [out, more]
 
 
-def trace_gbuffer(records: SurfelRecords, lists: TileLists, camera: Camera) -> GBuffer:
-    """Render a camera's G-buffer from its tile lists (see :class:`GBuffer`)."""
-    rays = _tile_rays(camera, lists.tiles_x, lists.tiles_y)
-    sums, hits, met = trace_tiles(records, lists, rays)
+def scatter_rays(sums: Composite, some: Composite, ray: mi.UInt32) -> None:
+    """Overwrite the sums of the rays ``ray``."""
+    for target, source in zip(sums.channels, some.channels, strict=True):
+        dr.scatter(target, source, ray)
+    for name in ("mean_depth", "transmittance", "median_depth", "count"):
+        dr.scatter(getattr(sums, name), getattr(some, name), ray)
+    dr.eval(sums)
+
+
+def trace_gbuffer(
+    records: SurfelRecords, lists: TileLists, camera: Camera, bvh: Callable[[], Bvh]
+) -> GBuffer:
+    """Render a camera's G-buffer from its tile lists; differentiable in the records.
+
+    Args:
+        records: the surfels. lists: tile lists of them for ``camera``.
+        bvh: makes their hierarchy; called only if a ray meets more than ``MAX_HITS`` surfels.
+    """
+    rays = tile_rays(camera, lists.tiles_x, lists.tiles_y)
+    sums, hits = trace_tiles(records.detached(), lists, rays, bvh)
+    sums = attach(sums, records, rays.origin, rays.direction, hits)
     lane = _row_major_lanes(camera.width, camera.height, lists.tiles_x)
 
     def gather(value: mi.Float) -> mi.Float:
-        return dr.gather(type(value), value, lane)
+        return dr.gather(type(value), value, lane, mode=dr.ReduceMode.Permute)
 
-    opacity = 1 - gather(sums.transmittance)
-    seen = opacity > 0
-    inverse = dr.select(seen, dr.rcp(opacity), 0)
-    channels = [gather(channel) for channel in sums.channels]
-    normal = mi.Normal3f(*channels[0:3])
-    length = dr.norm(normal)
-    depth = gather(sums.median_depth)
-    distance = dr.select(depth > 0, depth, gather(sums.mean_depth) * inverse)
-    direction = gather(rays.direction)
-    met = gather(met)
-    buffer = GBuffer(
-        position=rays.origin + distance * direction,
-        depth=depth,
-        normal=dr.select(length > 0, normal / length, 0),
-        base_color=mi.Color3f(*channels[4:7]) * inverse,
-        roughness=channels[3] * inverse,
-        metallic=channels[7] * inverse,
-        rgb=mi.Color3f(*channels[8:11]),
-        opacity=opacity,
-        direction=direction,
-        overflow=dr.select(met > MAX_HITS, met - MAX_HITS, 0),
-        hits=hits,
-        width=camera.width,
-        height=camera.height,
+    in_rows = Composite(
+        channels=[gather(channel) for channel in sums.channels],
+        mean_depth=gather(sums.mean_depth),
+        transmittance=gather(sums.transmittance),
+        median_depth=gather(sums.median_depth),
+        count=gather(sums.count),
     )
-    dr.eval(*(getattr(buffer, f.name) for f in fields(buffer) if f.name not in ("hits", "width", "height")))
+    direction = mi.Vector3f(*[gather(v) for v in rays.direction])
+    seen = surface(in_rows, rays.origin, direction)
+    buffer = GBuffer(
+        **{f.name: getattr(seen, f.name) for f in fields(Surface)}, width=camera.width, height=camera.height
+    )
+    dr.eval(*(getattr(buffer, f.name) for f in fields(Surface)))
     return buffer

@@ -15,7 +15,7 @@ import mitsuba as mi
 from tron.tracing.kernel import T_MIN, SurfelRecords, intersect
 
 MAX_HITS = 64
-"""Hits kept a ray. Of more, those of the nearest surfels are kept; GBuffer.overflow counts the rest."""
+"""Hits kept a ray; rays that meet more are traced by :mod:`tron.tracing.kbuffer` instead."""
 
 
 @dataclass

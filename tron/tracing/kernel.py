@@ -35,7 +35,7 @@ GEOMETRY_PACKETS = 3
 FEATURE_PACKETS = 3
 """A feature record is 12 floats: normal, roughness | base color, metallic | radiance of SH degree 0, 0."""
 SH_PACKETS = 12
-"""An SH record is 48 floats, as scenes store them: red, green and blue of the first coefficient, and so on."""
+"""An SH record is 48 floats as scenes store them: (red, green, blue) of one coefficient after the other."""
 
 
 def cut_radius_squared(opacity: mi.Float, degree: int) -> mi.Float:
@@ -66,7 +66,7 @@ def log_response_slope(q: Any, degree: int) -> Any:
 
 @dataclass
 class SurfelRecords:
-    """A scene's surfels as packed Dr.Jit buffers, in the scene's order (:func:`tron.tracing.parameters.pack`).
+    """Surfels as packed Dr.Jit buffers, in the scene's order (made by :func:`tron.tracing.parameters.pack`).
 
     Attributes:
         geometry: mi.Float, M records of ``4 * GEOMETRY_PACKETS``.
@@ -96,7 +96,7 @@ class SurfelRecords:
 
 @dataclass
 class SurfelHit:
-    """One ray against one surfel. All fields are Dr.Jit variables.
+    """One ray against one surfel. All fields are Dr.Jit variables; those that nobody reads are not computed.
 
     Attributes:
         t: distance along the unit ray to the surfel's plane, world units.
@@ -104,6 +104,9 @@ class SurfelHit:
         within: the hit lies where the kernel counts (alpha >= 1/255, response >= 0.0113).
         front: the ray meets the side that the normal points to.
         near: lower bound of the distance from the ray's origin to any counted point of the surfel.
+        unclipped: opacity before clipping. response: the kernel's value.
+        u_axis, v_axis: t_u / s_u and t_v / s_v. normal: their cross product. facing: normal . direction.
+        offset: p - c. u, v: its coordinates in standard deviations.
     """
 
     t: mi.Float
@@ -111,6 +114,15 @@ class SurfelHit:
     within: mi.Bool
     front: mi.Bool
     near: mi.Float
+    unclipped: mi.Float
+    response: mi.Float
+    u_axis: mi.Vector3f
+    v_axis: mi.Vector3f
+    normal: mi.Vector3f
+    facing: mi.Float
+    offset: mi.Vector3f
+    u: mi.Float
+    v: mi.Float
 
 
 def intersect(
@@ -135,9 +147,22 @@ def intersect(
     offset = dr.fma(t, direction, -to_centre)
     u, v = dr.dot(offset, u_axis), dr.dot(offset, v_axis)
     q = dr.fma(u, u, v * v)
-    raw = centre[3] * response(q, degree)
-    # dr.select is a quarter of the cost of dr.minimum on LLVM (measured in tracer.md).
-    alpha = dr.select(raw < MAX_ALPHA, raw, MAX_ALPHA)
+    value = response(q, degree)
+    unclipped = centre[3] * value
     return SurfelHit(
-        t=t, alpha=alpha, within=q <= axis_v[3], front=facing < 0.0, near=dr.norm(to_centre) - axis_u[3]
+        t=t,
+        # dr.select is a quarter of the cost of dr.minimum on LLVM (measured in tracer.md).
+        alpha=dr.select(unclipped < MAX_ALPHA, unclipped, MAX_ALPHA),
+        within=q <= axis_v[3],
+        front=facing < 0.0,
+        near=dr.norm(to_centre) - axis_u[3],
+        unclipped=unclipped,
+        response=value,
+        u_axis=u_axis,
+        v_axis=v_axis,
+        normal=normal,
+        facing=facing,
+        offset=offset,
+        u=u,
+        v=v,
     )

@@ -1,8 +1,8 @@
 """What can be optimised about a scene, and how it becomes the records that the tracer reads.
 
-Packing is Dr.Jit code, so gradients of the records flow back to means, quaternions, log-scales, logits, harmonics
-and materials by ordinary automatic differentiation. The kernel's cut (``q_cut``, ``radius``) decides what is
-visible and is not differentiated.
+Packing is Dr.Jit code, so gradients of the records flow back to means, quaternions, log-scales, logits,
+harmonics and materials by ordinary automatic differentiation. The kernel's cut (``q_cut``, ``radius``)
+decides what is visible and is not differentiated.
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false

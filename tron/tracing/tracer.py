@@ -10,7 +10,9 @@ import mitsuba as mi
 
 from tron.tracing.bvh import Bvh, build_bvh
 from tron.tracing.gbuffer import GBuffer, trace_gbuffer
+from tron.tracing.kbuffer import composite_rays
 from tron.tracing.parameters import SurfelParameters, pack
+from tron.tracing.surface import Surface, surface
 from tron.tracing.tiles import build_tiles
 from tron.tracing.transmittance import BACK_FACE_SPACINGS, transmittance
 
@@ -40,7 +42,18 @@ class SurfelTracer:
 
     def gbuffer(self, camera: Camera) -> GBuffer:
         """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it."""
-        return trace_gbuffer(self._records, build_tiles(self._records, camera), camera)
+        lists = build_tiles(self._records, camera)
+        return trace_gbuffer(self._records, lists, camera, lambda: self.bvh)
+
+    def trace(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True) -> Surface:
+        """What any rays see, from ``origin`` along unit ``direction``; inactive lanes see nothing.
+
+        The same surfels composited in the same order as by :meth:`gbuffer`, without the coherence that makes
+        camera rays fast.
+        """
+        return surface(
+            composite_rays(self._records, self.bvh, origin, direction, mi.Bool(active)), origin, direction
+        )
 
     def transmittance(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True

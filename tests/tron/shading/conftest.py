@@ -62,8 +62,6 @@ class SphereOverPlane:
             rgb=mi.Color3f(0) * one,
             opacity=one,
             direction=direction,
-            overflow=dr.zeros(mi.UInt32, n),
-            hits=None,  # type: ignore[arg-type]
             width=camera.width,
             height=camera.height,
         )

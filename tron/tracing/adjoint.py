@@ -1,0 +1,228 @@
+"""The gradient of compositing: the stored hits of each ray are replayed, with one running scalar.
+
+With ``g`` the gradient of the sums ``F = sum_i w_i f_i`` and ``g_T`` that of the final transmittance T, let
+
+    rest_i = sum_{j > i} w_j (g . f_j) + g_T T
+
+Then, for hit i with ``w_i = T_i alpha_i``:
+
+    d/df_i = w_i g,    d/dalpha_i = T_i (g . f_i) - rest_i / (1 - alpha_i)
+
+Front to back, ``rest`` starts as ``g . F + g_T T`` and loses ``w_i (g . f_i)`` at each hit, so neither a
+second list nor a backward walk is needed. Which surfels are met, and the median, are not differentiated;
+where alpha is clipped its derivative is zero.
+"""
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportReturnType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.gaussians.harmonics import sh_basis
+from tron.tracing.compositing import MATERIAL_PACKETS, Composite, HitList, harmonic_sums
+from tron.tracing.kernel import (
+    FEATURE_PACKETS,
+    GEOMETRY_PACKETS,
+    MAX_ALPHA,
+    SH_PACKETS,
+    SurfelHit,
+    SurfelRecords,
+    intersect,
+    log_response_slope,
+)
+
+
+@dataclass
+class _Gradients:
+    """Where gradients are added up, laid out as the records are."""
+
+    geometry: mi.Float
+    features: mi.Float
+    harmonics: mi.Float
+
+
+@dataclass
+class _Replay:
+    """What the adjoint needs to know of the forward pass, all of it detached."""
+
+    records: SurfelRecords
+    origin: mi.Point3f
+    direction: mi.Vector3f
+    hits: list[HitList]
+    sums: Composite
+    differentiate_basis: bool
+
+
+def attach(
+    sums: Composite, records: SurfelRecords, origin: mi.Point3f, direction: mi.Vector3f, hits: list[HitList]
+) -> Composite:
+    """Give sums traced without gradients their derivatives by the records and by SH's view direction.
+
+    Nothing happens, and nothing is paid, where neither ``records`` nor ``direction`` have gradients. The
+    direction is differentiated in the radiance only: the rays themselves stand still.
+
+    Args:
+        sums: of each ray, evaluated. records: what they were traced from.
+        origin, direction: the rays. hits: what they met.
+    """
+    view = records.sh_degree > 0 and dr.grad_enabled(direction)
+    if not (view or dr.grad_enabled(records.geometry, records.features, records.harmonics)):
+        return sums
+    basis = sh_basis(direction.x, direction.y, direction.z)[1:] if records.sh_degree > 0 else []
+    replay = _Replay(records.detached(), dr.detach(origin), dr.detach(direction), hits, sums, view)
+    channels, mean_depth, transmittance = dr.custom(
+        _Compositing, records.geometry, records.features, records.harmonics, basis, replay
+    )
+    return replace(sums, channels=channels, mean_depth=mean_depth, transmittance=transmittance)
+
+
+class _Compositing(dr.CustomOp):
+    """(geometry, features, harmonics, SH basis but its constant) -> (channels, mean depth, transmittance)."""
+
+    def eval(self, *inputs: Any) -> Any:
+        *_, self.basis, self.replay = inputs
+        sums = self.replay.sums
+        return [mi.Float(channel) for channel in sums.channels], sums.mean_depth, sums.transmittance
+
+    def backward(self) -> None:
+        replay, records = self.replay, self.replay.records
+        channels, mean_depth, transmittance = cast("tuple[Any, Any, Any]", self.grad_out())
+        rest = transmittance * replay.sums.transmittance + mean_depth * replay.sums.mean_depth
+        for gradient, value in zip(channels, replay.sums.channels, strict=True):
+            rest = dr.fma(gradient, value, rest)
+        dr.eval(channels, mean_depth, rest)
+        out = _Gradients(
+            *[
+                dr.zeros(mi.Float, dr.width(a))
+                for a in (records.geometry, records.features, records.harmonics)
+            ]
+        )
+        by_basis = (
+            [dr.zeros(mi.Float, dr.width(rest)) for _ in self.basis] if replay.differentiate_basis else []
+        )
+        for hits in replay.hits:
+            outer = [dr.gather(mi.Float, channel, hits.ray) for channel in channels]
+            depth = dr.gather(mi.Float, mean_depth, hits.ray)
+            direction = dr.gather(mi.Vector3f, replay.direction, hits.ray)
+            basis = sh_basis(direction.x, direction.y, direction.z)
+            added = _replay(
+                records, hits, replay.origin, direction, basis, outer, depth,
+                dr.gather(mi.Float, rest, hits.ray), out, len(by_basis),
+            )  # fmt: skip
+            for target, value in zip(by_basis, added, strict=True):
+                dr.scatter(target, value, hits.ray, hits.count > 0)
+        dr.eval(out, by_basis)
+        self.set_grad_in("geometry", out.geometry)
+        self.set_grad_in("features", out.features)
+        self.set_grad_in("harmonics", out.harmonics)
+        if by_basis:
+            self.set_grad_in("basis", by_basis)
+
+
+def _add(target: mi.Float, packet: mi.UInt32, values: list[mi.Float], active: mi.Bool) -> None:
+    dr.scatter_reduce(dr.ReduceOp.Add, target, mi.Vector4f(*values), packet, active)
+
+
+@dr.syntax
+def _replay(
+    records: SurfelRecords, hits: HitList, origin: mi.Point3f, direction: mi.Vector3f, basis: list[mi.Float],
+    outer: list[mi.Float], outer_depth: mi.Float, rest: mi.Float, out: _Gradients, functions: int,
+) -> list[mi.Float]:  # fmt: skip
+    """Walk each list front to back and add its gradients to ``out``.
+
+    Args:
+        records, origin, direction, basis: as in the forward pass, one lane a list.
+        hits: the lists.
+        outer, outer_depth: gradients of the channels and of the mean depth.
+        rest: sum of outer gradients times what they belong to (module docstring).
+        out: receives the gradients of the records.
+        functions: how many basis functions, from the second on, to differentiate by.
+
+    Returns:
+        Gradients of the basis functions.
+    """
+    by_basis = [mi.Float(0) for _ in range(functions)]
+    lane, lists = dr.arange(mi.UInt32, dr.width(hits.ray)), dr.opaque(mi.UInt32, dr.width(hits.ray))
+    remaining, slot = mi.Float(1), mi.UInt32(0)
+    active = slot < hits.count
+    while active:
+        index = dr.gather(mi.UInt32, hits.ids, slot * lists + lane, active)
+        met = intersect(records.geometry, index, origin, direction, records.degree)
+        weight = remaining * met.alpha
+        projected = outer_depth * met.t
+        for packet in range(MATERIAL_PACKETS):
+            at = index * FEATURE_PACKETS + packet
+            feature = dr.gather(mi.Vector4f, records.features, at, active)
+            gradient = outer[4 * packet : 4 * packet + 4]
+            for k in range(4):
+                projected = dr.fma(gradient[k], feature[k], projected)
+            _add(out.features, at, [weight * value for value in gradient], active)
+        color, by_basis = _replay_radiance(records, index, basis, weight, outer[8:11], by_basis, out, active)
+        for k in range(3):
+            projected = dr.fma(outer[8 + k], color[k], projected)
+        rest = dr.fma(-weight, projected, rest)
+        by_alpha = remaining * projected - rest / (1 - met.alpha)
+        _replay_hit(records, index, met, direction, by_alpha, weight * outer_depth, out, active)
+        remaining *= 1 - met.alpha
+        slot += 1
+        active &= slot < hits.count
+    return by_basis
+
+
+def _replay_radiance(
+    records: SurfelRecords, index: mi.UInt32, basis: list[mi.Float], weight: mi.Float, outer: list[mi.Float],
+    by_basis: list[mi.Float], out: _Gradients, active: mi.Bool,
+) -> tuple[list[mi.Float], list[mi.Float]]:  # fmt: skip
+    """Radiance of one surfel and the basis gradients so far; its own gradients go to ``out``."""
+    if records.sh_degree == 0:  # clipping is differentiated where packing evaluates it
+        at = index * FEATURE_PACKETS + MATERIAL_PACKETS
+        packed = dr.gather(mi.Vector4f, records.features, at, active)
+        _add(out.features, at, [*[weight * value for value in outer], mi.Float(0)], active)
+        return [packed[0], packed[1], packed[2]], by_basis
+    packets, total = harmonic_sums(records, index, basis, active)
+    numbers = 3 * (records.sh_degree + 1) ** 2
+    by_total = [dr.select(total[k] > 0, weight * outer[k], 0) for k in range(3)]
+    for packet in range(len(packets)):
+        values = []
+        for number in range(4 * packet, 4 * packet + 4):
+            coefficient, channel = divmod(number, 3)
+            values.append(by_total[channel] * basis[coefficient] if number < numbers else mi.Float(0))
+        _add(out.harmonics, index * SH_PACKETS + packet, values, active)
+    if by_basis:
+        by_basis = list(by_basis)
+        for number in range(3, numbers):
+            coefficient, channel = divmod(number, 3)
+            by_basis[coefficient - 1] = dr.fma(
+                by_total[channel], packets[number // 4][number % 4], by_basis[coefficient - 1]
+            )
+    return [dr.select(value > 0, value, 0) for value in total], by_basis
+
+
+def _replay_hit(
+    records: SurfelRecords, index: mi.UInt32, met: SurfelHit, direction: mi.Vector3f,
+    by_alpha: mi.Float, by_t: mi.Float, out: _Gradients, active: mi.Bool,
+) -> None:  # fmt: skip
+    """Gradients of a geometry record from those of alpha and t: ``kernel.intersect`` in reverse.
+
+    t = n . c / (n . d) with n = a x b and c from the origin to the centre; the offset is t d - c.
+    """
+    by_alpha = dr.select(met.unclipped < MAX_ALPHA, by_alpha, 0)
+    q = dr.fma(met.u, met.u, met.v * met.v)
+    by_q = by_alpha * met.unclipped * log_response_slope(q, records.degree)
+    by_u, by_v = 2 * met.u * by_q, 2 * met.v * by_q
+    by_offset = by_u * met.u_axis + by_v * met.v_axis
+    along = (by_t + dr.dot(by_offset, direction)) / met.facing
+    by_normal = -along * met.offset
+    by_centre = along * met.normal - by_offset
+    by_a = by_u * met.offset + dr.cross(met.v_axis, by_normal)
+    by_b = by_v * met.offset + dr.cross(by_normal, met.u_axis)
+    base = index * GEOMETRY_PACKETS
+    _add(out.geometry, base, [*by_centre, by_alpha * met.response], active)
+    _add(out.geometry, base + 1, [*by_a, mi.Float(0)], active)
+    _add(out.geometry, base + 2, [*by_b, mi.Float(0)], active)

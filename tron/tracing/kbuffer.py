@@ -1,0 +1,117 @@
+"""Exact compositing of any number of hits along arbitrary rays, the nearest eight at a time.
+
+Each round walks the hierarchy for the K nearest hits behind the last one composited; (t, id) orders hits, so
+coincident surfels are neither lost nor met twice. Slower than tile lists, but nothing overflows.
+"""
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.gaussians.harmonics import sh_basis
+from tron.tracing.bvh import Bvh
+from tron.tracing.compositing import STOP_TRANSMITTANCE, Composite, HitList, composite
+from tron.tracing.hits import LocalHits
+from tron.tracing.kernel import T_MIN, SurfelRecords, intersect
+from tron.tracing.traversal import walk
+
+K = 8
+_NO_ID = 0xFFFFFFFF
+
+
+@dataclass
+class _Nearest:
+    """The nearest hits behind (nearest, last), ascending by (t, id); t is infinite in slots without a hit.
+
+    Attributes:
+        t, alpha: K of mi.Float; index: K of mi.UInt32, the scene's ids.
+        nearest, last: t and id of the last hit composited.
+        farthest: t of the last slot.
+    """
+
+    t: list[mi.Float]
+    index: list[mi.UInt32]
+    alpha: list[mi.Float]
+    nearest: mi.Float
+    last: mi.UInt32
+    farthest: mi.Float
+
+
+@dr.syntax
+def _insert(
+    bvh: Bvh, origin: mi.Point3f, direction: mi.Vector3f, kept: _Nearest, surfel: mi.UInt32, active: mi.Bool
+) -> _Nearest:
+    """Keep a surfel that is met among the nearest."""
+    met = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
+    index = dr.gather(mi.UInt32, bvh.order, surfel, active)
+    behind = (met.t > kept.nearest) | ((met.t == kept.nearest) & (index > kept.last))
+    if active & met.within & met.front & behind & (met.t <= kept.farthest):
+        t, alpha = met.t, met.alpha
+        for slot in range(K):
+            nearer = (t < kept.t[slot]) | ((t == kept.t[slot]) & (index < kept.index[slot]))
+            t_, index_, alpha_ = kept.t[slot], kept.index[slot], kept.alpha[slot]
+            kept.t[slot] = dr.select(nearer, t, t_)
+            kept.index[slot] = dr.select(nearer, index, index_)
+            kept.alpha[slot] = dr.select(nearer, alpha, alpha_)
+            t, index, alpha = (
+                dr.select(nearer, t_, t),
+                dr.select(nearer, index_, index),
+                dr.select(nearer, alpha_, alpha),
+            )
+        kept.farthest = kept.t[K - 1]
+    return kept
+
+
+@dr.syntax
+def composite_rays(
+    records: SurfelRecords,
+    bvh: Bvh,
+    origin: mi.Point3f,
+    direction: mi.Vector3f,
+    active: mi.Bool,
+    out: HitList | None = None,
+) -> Composite:
+    """Composite the front-facing hits of each ray, however many.
+
+    Args:
+        records: the surfels, in the scene's order.
+        bvh: their hierarchy.
+        origin: world. direction: unit, world.
+        active: lanes to trace; the others meet nothing.
+        out: receives the composited ids of lane r in list r, which must have room.
+    """
+    basis = sh_basis(direction.x, direction.y, direction.z)
+    local_t = dr.alloc_local(mi.Float, K, value=mi.Float(0))
+    local_index = dr.alloc_local(mi.UInt32, K, value=mi.UInt32(0))
+    local_alpha = dr.alloc_local(mi.Float, K, value=mi.Float(0))
+    sums = Composite.start()
+    nearest, last = mi.Float(T_MIN), mi.UInt32(_NO_ID)  # no id is larger: a hit at T_MIN itself is none
+    going = mi.Bool(active)
+    while going:
+        kept = _Nearest(
+            [mi.Float(dr.inf) for _ in range(K)],
+            [mi.UInt32(_NO_ID) for _ in range(K)],
+            [mi.Float(0) for _ in range(K)],
+            mi.Float(nearest),
+            mi.UInt32(last),
+            mi.Float(dr.inf),
+        )
+        kept = walk(bvh, origin, direction, kept, partial(_insert, bvh, origin, direction), going)
+        count = mi.UInt32(0)
+        for slot in range(K):
+            local_t[slot] = kept.t[slot]
+            local_index[slot] = kept.index[slot]
+            local_alpha[slot] = kept.alpha[slot]
+            count += dr.select(kept.t[slot] < dr.inf, mi.UInt32(1), mi.UInt32(0))
+        hits = LocalHits(local_t, local_index, local_alpha, count, count)
+        sums = composite(records, hits, basis, sums, out)
+        nearest, last = kept.t[K - 1], kept.index[K - 1]
+        going &= (count == K) & (sums.transmittance >= STOP_TRANSMITTANCE)
+    return sums

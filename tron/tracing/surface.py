@@ -1,0 +1,70 @@
+"""Sums over hits -> surface points: the normalisation that every ray of the library goes through.
+
+Composited channels are alpha-weighted sums, so materials are divided by opacity and the normal is brought
+back to unit length (facts.md 4b). The surface point is at the median depth; where transmittance never falls
+below one half there is no median, and the alpha-weighted mean depth stands in where opacity is not zero.
+"""
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.tracing.compositing import Composite
+
+
+@dataclass
+class Surface:
+    """What each ray sees, as Dr.Jit arrays of one lane a ray.
+
+    Attributes:
+        position: mi.Point3f, world; meaningless where opacity is 0.
+        depth: mi.Float, distance along the unit ray to the median hit, world units; 0 where there is none.
+            Not differentiated.
+        normal: mi.Normal3f, unit, world, geometric; zero where opacity is 0.
+        base_color: mi.Color3f, linear.
+        roughness, metallic: mi.Float.
+        rgb: mi.Color3f, composited SH radiance in display space, premultiplied by opacity.
+        opacity: mi.Float, 1 - T.
+        direction: mi.Vector3f, the unit ray, world.
+    """
+
+    position: mi.Point3f
+    depth: mi.Float
+    normal: mi.Normal3f
+    base_color: mi.Color3f
+    roughness: mi.Float
+    metallic: mi.Float
+    rgb: mi.Color3f
+    opacity: mi.Float
+    direction: mi.Vector3f
+
+
+def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surface:
+    """Normalise the sums of rays from ``origin`` along unit ``direction``; differentiable in the sums."""
+    opacity = 1 - sums.transmittance
+    seen = opacity > 0
+    # Divisors of empty rays are replaced before dividing: 0 times an infinite derivative would be NaN.
+    inverse = dr.select(seen, dr.rcp(dr.select(seen, opacity, 1)), 0)
+    channels = sums.channels
+    normal = mi.Normal3f(*channels[0:3])
+    squared = dr.squared_norm(normal)
+    oriented = squared > 0
+    depth = dr.detach(sums.median_depth)
+    distance = dr.select(depth > 0, depth, sums.mean_depth * inverse)
+    return Surface(
+        position=origin + distance * direction,
+        depth=depth,
+        normal=dr.select(oriented, normal / dr.sqrt(dr.select(oriented, squared, 1)), 0),
+        base_color=mi.Color3f(*channels[4:7]) * inverse,
+        roughness=channels[3] * inverse,
+        metallic=channels[7] * inverse,
+        rgb=mi.Color3f(*channels[8:11]),
+        opacity=opacity,
+        direction=direction,
+    )
