@@ -15,7 +15,6 @@ from, which is a choice and no result.
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -98,6 +97,8 @@ class CubemapLight:
             )
         self.texels, self.resolution = texels, resolution
         self._bordered = _bordered(texels, resolution)
+        # Not on demand: the demand comes from inside a symbolic loop, where nothing can be evaluated.
+        self._distribution = _RowsAndColumns(dr.detach(self._bordered), resolution)
         self._width, self._first = dr.opaque(mi.UInt32, resolution), dr.opaque(mi.UInt32, 0)
 
     @classmethod
@@ -152,10 +153,6 @@ class CubemapLight:
         rgb = _lat_long_means(self, dr.opaque(mi.UInt32, height), dr.opaque(mi.UInt32, samples), height)
         image = np.array(rgb).T.reshape(height, 2 * height, 3)
         return EnvironmentMap(np.maximum(image, 0))
-
-    @cached_property
-    def _distribution(self) -> _RowsAndColumns:
-        return _RowsAndColumns(dr.detach(self._bordered), self.resolution)
 
 
 class _RowsAndColumns:

@@ -1,4 +1,4 @@
-"""Laws of the cubemap: continuous on the sphere, one with the lat-long map, honest densities and gradients."""
+"""Laws of the cubemap: continuous on the sphere, one with the lat-long map, and its gradients are honest."""
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportReturnType=false
 # (Mitsuba's type stubs know no arithmetic between its own array types.)

@@ -1,0 +1,76 @@
+"""Shadowed irradiance as a linear function of the light, for fixed rays: what fitting a light needs.
+
+The rays of :mod:`tron.shading.irradiance`, the same estimator and the same weights, are traced once and kept
+with their visibility, one lane a ray. Irradiance / pi is then a weighted sum of looked-up radiance: gradients
+reach the light's texels, and stop at directions, densities and visibility. Memory grows with pixels x rays;
+where no gradient is wanted, :func:`tron.shading.irradiance` stores nothing.
+"""
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.shading.irradiance import ORIGIN_OFFSET, Light, Occluder, RayPlan, shadow_ray
+
+if TYPE_CHECKING:
+    from tron.tracing import GBuffer
+
+
+@dataclass
+class Transport:
+    """Shadow rays with their visibility, pixel-major: lane = pixel x ``per_pixel`` + ray.
+
+    Attributes:
+        direction: unit, world.
+        weight: what a ray's radiance is multiplied by on its way into irradiance / pi, visibility included.
+        per_pixel: rays of a pixel.
+    """
+
+    direction: mi.Vector3f
+    weight: mi.Float
+    per_pixel: int
+
+    @classmethod
+    def trace(cls, tracer: Occluder, gbuffer: GBuffer, light: Light, spp: int, seed: int) -> Transport:
+        """Draw and trace rays as :func:`tron.shading.irradiance` does; ``light`` only chooses directions.
+
+        Args:
+            tracer, gbuffer, spp, seed: as there; pixels of opacity 0 get rays of weight 0.
+            light: what half the rays are drawn from.
+
+        Raises:
+            TronError: ``spp`` is odd or not positive.
+        """
+        plan = RayPlan.make(spp, seed)
+        pixels = dr.width(gbuffer.opacity)
+        lane = dr.arange(mi.UInt32, pixels * spp)
+        pixel, ray = lane // plan.rays, lane % plan.rays
+
+        def spread(value: mi.Point3f) -> mi.Point3f:
+            return type(value)(*[dr.gather(mi.Float, channel, pixel) for channel in value])
+
+        with dr.suspend_grad():
+            normal = mi.Normal3f(spread(gbuffer.normal))
+            surface = dr.gather(mi.Float, gbuffer.opacity, pixel) > 0
+            direction, weight = shadow_ray(light, mi.Frame3f(normal), plan, pixel, ray)
+            counts = surface & (weight > 0)
+            offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
+            origin = spread(gbuffer.position) + normal * offset
+            visibility = tracer.transmittance(origin, direction, counts)
+            weight = dr.select(counts, weight * visibility, 0) / mi.Float(plan.count)
+            dr.eval(direction, weight)
+        return cls(direction, weight, spp)
+
+    def irradiance(self, light: Light) -> mi.Color3f:
+        """Shadowed irradiance / pi of each pixel under ``light``, linear in it and differentiable."""
+        radiance = light.radiance(self.direction)
+        # Where nothing arrives the lookup may be anything, but 0 x infinity must not reach a sum.
+        found = [dr.select(self.weight > 0, channel * self.weight, 0) for channel in radiance]
+        return mi.Color3f(*[dr.block_sum(channel, self.per_pixel) for channel in found])
