@@ -85,8 +85,9 @@ def attach(
 class _Compositing(dr.CustomOp):
     """(geometry, features, harmonics, SH basis but its constant) -> (channels, mean depth, transmittance)."""
 
-    def eval(self, *inputs: Any) -> Any:
-        *_, self.basis, self.replay = inputs
+    def eval(self, geometry: Any, features: Any, harmonics: Any, basis: Any, replay: Any) -> Any:
+        del geometry, features, harmonics  # their values are in the sums already
+        self.basis, self.replay = basis, replay
         sums = self.replay.sums
         return [mi.Float(channel) for channel in sums.channels], sums.mean_depth, sums.transmittance
 

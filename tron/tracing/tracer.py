@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
-from tron.tracing.bvh import Bvh, build_bvh
+from tron.tracing.bvh import build_bvh
 from tron.tracing.gbuffer import GBuffer, trace_gbuffer
 from tron.tracing.kbuffer import composite_rays
 from tron.tracing.parameters import SurfelParameters, pack
@@ -22,28 +21,28 @@ if TYPE_CHECKING:
 
 
 class SurfelTracer:
-    """Traces one :class:`GaussianScene`: uploads it at once, builds the hierarchy when first needed.
+    """Traces one :class:`GaussianScene`, uploaded and sorted into a hierarchy at once.
 
     Args:
         scene: the surfels; must be valid (``scene.validate()``), and must not change while the tracer lives.
         two_sided: let back faces block shadow rays beyond two spacings; False is the paper's rule.
+
+    Attributes:
+        records: the surfels as every kernel reads them. bvh: their hierarchy.
     """
 
     def __init__(self, scene: GaussianScene, *, two_sided: bool = True) -> None:
         self.scene = scene
-        self._records = pack(SurfelParameters.from_scene(scene))
+        self.records = pack(SurfelParameters.from_scene(scene))
+        # Not built when first needed: that may be inside a recorded loop, where nothing can be evaluated.
+        self.bvh = build_bvh(self.records)
         reach = BACK_FACE_SPACINGS * scene.spacing if two_sided else float("inf")
         self._back_faces_from = dr.opaque(mi.Float, reach)
 
-    @cached_property
-    def bvh(self) -> Bvh:
-        """The hierarchy for shadow rays."""
-        return build_bvh(self._records)
-
     def gbuffer(self, camera: Camera) -> GBuffer:
         """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it."""
-        lists = build_tiles(self._records, camera)
-        return trace_gbuffer(self._records, lists, camera, lambda: self.bvh)
+        lists = build_tiles(self.records, camera)
+        return trace_gbuffer(self.records, lists, camera, lambda: self.bvh)
 
     def trace(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True) -> Surface:
         """What any rays see, from ``origin`` along unit ``direction``; inactive lanes see nothing.
@@ -52,7 +51,7 @@ class SurfelTracer:
         camera rays fast.
         """
         return surface(
-            composite_rays(self._records, self.bvh, origin, direction, mi.Bool(active)), origin, direction
+            composite_rays(self.records, self.bvh, origin, direction, mi.Bool(active)), origin, direction
         )
 
     def transmittance(
