@@ -1,0 +1,93 @@
+"""A capture says at the door what is wrong with it, and reads no file before it is asked to."""
+
+import numpy as np
+import pytest
+
+from tron.cameras import Camera
+from tron.captures import Capture, View
+from tron.errors import TronError
+
+CAMERA = Camera.look_at((3, 0, 1), (0, 0, 0), fov_deg=50, width=6, height=4)
+
+
+def view(name: str = "a", **maps) -> View:
+    image = maps.pop("image", np.full((4, 6, 3), 0.5))
+    return View(name, CAMERA, image, maps.pop("space", "display"), **maps)
+
+
+def test_maps_are_float32_and_scalar_maps_lose_their_channel() -> None:
+    whole = view(
+        roughness=np.full((4, 6, 1), 0.25), sky_mask=np.ones((4, 6), bool), normal=-np.ones((4, 6, 3))
+    )
+    assert whole.read().dtype == np.float32
+    assert whole.read("roughness").shape == (4, 6)
+    assert whole.read("sky_mask").dtype == np.float32
+    assert not whole.has("irradiance")
+
+
+def test_a_reader_is_called_when_it_is_asked_and_checked_then() -> None:
+    calls = []
+
+    def read() -> np.ndarray:
+        calls.append(1)
+        return np.full((4, 6, 3), np.nan)
+
+    lazy = view(irradiance=read)
+    assert not calls
+    with pytest.raises(TronError, match=r"irradiance holds 72 values.*\(view a\)"):
+        lazy.read("irradiance")
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"image": np.zeros((6, 4, 3))}, "its camera says"),
+        ({"image": np.zeros((4, 6))}, "its camera says"),
+        ({"image": np.full((4, 6, 3), 1.5)}, "between 0 and 1"),
+        ({"space": "srgb"}, "linear or display"),
+        ({"roughness": np.full((4, 6), 2.0)}, "between 0 and 1"),
+        ({"irradiance": np.full((4, 6, 3), -1.0)}, "between 0 and inf"),
+        ({"normal": np.full((4, 6, 3), np.inf)}, "NaN or infinite"),
+        ({"name": ""}, "no name"),
+    ],
+)
+def test_wrong_views_are_refused_in_one_line(change: dict, message: str) -> None:
+    with pytest.raises(TronError, match=message) as caught:
+        view(**change)
+    assert "\n" not in str(caught.value)
+
+
+def test_linear_images_may_exceed_one() -> None:
+    assert view(image=np.full((4, 6, 3), 50.0), space="linear").read().max() == 50
+
+
+def test_a_map_that_is_absent_is_named() -> None:
+    with pytest.raises(TronError, match=r"no irradiance map \(view a\)"):
+        view().read("irradiance")
+
+
+def test_views_are_split_by_name() -> None:
+    capture = Capture((view("a"), view("b"), view("c")), test=frozenset({"b"}))
+    assert [v.name for v in capture.train_views] == ["a", "c"]
+    assert [v.name for v in capture.test_views] == ["b"]
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"views": ()}, "no views"),
+        ({"views": (view("a"), view("a"))}, "2 views of a capture are named 'a'"),
+        ({"test": {"z"}}, "'z' is not among"),
+        ({"test": {"a"}}, "held out"),
+        ({"up": (0, 0, 2)}, "unit vector"),
+        ({"points": np.zeros((3, 2))}, r"\(N, 3\)"),
+        ({"points": np.full((3, 3), np.nan)}, "finite"),
+        ({"points": np.zeros((3, 3)), "point_colors": np.zeros((2, 3))}, "do not match"),
+        ({"exposure": 0.0}, "positive"),
+    ],
+)
+def test_wrong_captures_are_refused_in_one_line(change: dict, message: str) -> None:
+    with pytest.raises(TronError, match=message) as caught:
+        Capture(**{"views": (view("a"),), **change})
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,6 @@
+"""Captures: posed views of a scene, photographed or path-traced; the same type for both."""
+
+from tron.captures.capture import Capture
+from tron.captures.view import View
+
+__all__ = ["Capture", "View"]

@@ -1,0 +1,115 @@
+"""One posed view: a camera, what it saw, and maps that say more about the same pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from tron.cameras import Camera
+from tron.errors import TronError
+
+ColorSpace = Literal["linear", "display"]
+
+Pixels = np.ndarray | Callable[[], np.ndarray]
+"""An array, or what reads one when it is asked for, such as ``partial(read_image, path)``."""
+
+_CHANNELS = {
+    "image": 3,
+    "normal": 3,
+    "base_color": 3,
+    "roughness": 1,
+    "metallic": 1,
+    "irradiance": 3,
+    "mask": 1,
+    "sky_mask": 1,
+}
+_NOT_NEGATIVE = ("image", "base_color", "roughness", "metallic", "irradiance", "mask", "sky_mask")
+_AT_MOST_ONE = ("base_color", "roughness", "metallic", "mask", "sky_mask")
+_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What one camera saw. Arrays are checked at once, readers when they are read.
+
+    Attributes:
+        name: unique within a capture.
+        camera: the view; its size is the size of every map.
+        image: (H, W, 3) float32, in the space named by ``space``.
+        space: "display", photos as stored and AgX pictures, or "linear", scene-referred radiance.
+        normal: (H, W, 3) world, unit, or zero where nothing is known.
+        base_color: (H, W, 3) linear, in [0, 1].
+        roughness, metallic: (H, W) in [0, 1].
+        irradiance: (H, W, 3) linear irradiance / pi, the radiance of a white diffuse surface.
+        mask: (H, W) in [0, 1], 1 on the subject.
+        sky_mask: (H, W) in [0, 1], 1 on the sky.
+
+    Raises:
+        TronError: no name, an unknown colour space, or an array that the camera contradicts, that is not
+            finite or outside its range.
+    """
+
+    name: str
+    camera: Camera
+    image: Pixels
+    space: ColorSpace
+    normal: Pixels | None = None
+    base_color: Pixels | None = None
+    roughness: Pixels | None = None
+    metallic: Pixels | None = None
+    irradiance: Pixels | None = None
+    mask: Pixels | None = None
+    sky_mask: Pixels | None = None
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise TronError("a view has no name", mend="name it after its image file")
+        if self.space not in get_args(ColorSpace):
+            raise TronError(
+                f"colour space of an image is {self.space!r}", f"view {self.name}", "say linear or display"
+            )
+        for field in _CHANNELS:
+            value = getattr(self, field)
+            if value is not None and not callable(value):
+                object.__setattr__(self, field, self._checked(field, np.asarray(value)))
+
+    def has(self, field: str) -> bool:
+        """Whether the view has this map."""
+        return getattr(self, field) is not None
+
+    def read(self, field: str = "image") -> np.ndarray:
+        """The image or a map, float32, read now if it was not yet: (H, W, 3), or (H, W) for scalar maps.
+
+        Raises:
+            TronError: the view lacks this map, or what was read is wrong (see the class).
+        """
+        value = getattr(self, field)
+        if value is None:
+            raise TronError(f"the view has no {field} map", f"view {self.name}")
+        return self._checked(field, np.asarray(value())) if callable(value) else value
+
+    def _checked(self, field: str, value: np.ndarray) -> np.ndarray:
+        where, height, width = f"view {self.name}", self.camera.height, self.camera.width
+        pixels = value
+        channels = _CHANNELS[field]
+        if channels == 1 and pixels.shape == (height, width, 1):
+            pixels = pixels[..., 0]
+        expected = (height, width) if channels == 1 else (height, width, channels)
+        if pixels.shape != expected:
+            raise TronError(f"{field} has shape {pixels.shape}, its camera says {expected}", where)
+        pixels = np.ascontiguousarray(pixels, np.float32)
+        bad = ~np.isfinite(pixels)
+        if bad.any():
+            raise TronError(f"{field} holds {bad.sum()} values that are NaN or infinite", where)
+        low = 0.0 if field in _NOT_NEGATIVE else -np.inf
+        high = 1.0 if field in _AT_MOST_ONE or (field == "image" and self.space == "display") else np.inf
+        if pixels.min() < low - _TOLERANCE or pixels.max() > high + _TOLERANCE:
+            raise TronError(
+                f"{field} ranges from {pixels.min():.4g} to {pixels.max():.4g}",
+                where,
+                f"values must lie between {low:g} and {high:g}",
+            )
+        return pixels
