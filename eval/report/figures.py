@@ -6,12 +6,18 @@ from eval.report.page import Tone
 from eval.results import Target
 
 MINUS = "\N{MINUS SIGN}"
-_STYLES = {"fraction": (100, 2, "%"), "s": (1, 0, " s"), "deg": (1, 2, "°"), "1": (1, 3, "")}
+_STYLES = {
+    "fraction": (100, 2, "%"),
+    "s": (1, 0, " s"),
+    "deg": (1, 2, "°"),
+    "1": (1, 3, ""),
+    "x": (1, 2, "×"),
+}
 """Unit -> factor, decimals, what is written behind the number."""
 
 
 def written(value: float, unit: str, signed: bool = False) -> str:
-    """A figure with its unit: fractions as percent, seconds beyond a minute as minutes too.
+    """A figure with its unit: fractions as percent, seconds beyond a minute as minutes too, factors with ×.
 
     >>> written(0.0123, "fraction"), written(31.456, "dB"), written(754, "s")
     ('1.23%', '31.46 dB', '12 min 34 s')
@@ -19,6 +25,8 @@ def written(value: float, unit: str, signed: bool = False) -> str:
     if unit == "s" and not signed and abs(value) >= 60:
         minutes, seconds = divmod(round(value), 60)
         return f"{minutes} min {seconds} s"
+    if unit == "abs":  # errors of computation, many orders below one
+        return f"{value:.1e}".replace("-", MINUS)
     scale, digits, suffix = _STYLES.get(unit, (1, 2, f" {unit}"))
     value = round(scale * value, digits) + 0.0  # adding zero turns a negative zero into zero
     return f"{value:{'+' if signed and value else ''}.{digits}f}{suffix}".replace("-", MINUS)

@@ -13,7 +13,7 @@ import numpy as np
 
 
 class Surface(abc.ABC):
-    """A surface parametrised by (u, v) in [0, 1]^2; equal areas of the square are equal areas in the world."""
+    """A surface parametrised by (u, v) in [0, 1]^2; equal areas of the square stay equal in the world."""
 
     @property
     @abc.abstractmethod
@@ -40,7 +40,9 @@ class Surface(abc.ABC):
             grid_u, grid_v = (a.ravel() for a in np.meshgrid(u, v, indexing="ij"))
             points, directions = self.at(grid_u, grid_v)
             corner = np.arange(len(u) * len(v)).reshape(len(u), len(v)) + offset
-            a, b, c, d = (q.ravel() for q in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]))
+            a, b, c, d = (
+                q.ravel() for q in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:])
+            )
             faces.append(np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
             vertices.append(points)
             normals.append(directions)

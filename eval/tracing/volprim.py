@@ -22,9 +22,11 @@ import numpy as np
 from tron.cameras import Camera, mitsuba_sensor
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
+from tron.tracing.compositing import STOP_TRANSMITTANCE
 
 SHAPES = ("ellipsoids", "ellipsoidsmesh")
 SHIPPED_STOP = 0.01
+OUR_STOP = STOP_TRANSMITTANCE
 THINNESS = 0.02
 """Third scale over the smaller of the surfel's two: as flat as the peer's own arithmetic bears."""
 MAX_DEPTH = 128

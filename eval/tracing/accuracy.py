@@ -1,0 +1,82 @@
+"""Errors of the tracer against the float64 reference, on random rays of the benchmark's own view.
+
+A ray whose float64 value stands within ``MARGIN`` of a threshold (alpha cut, stop, median, sides) may fall on
+either side of it in float32, and is left out; the share of such rays is a figure of its own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eval.results import Row
+from eval.tracing.contenders import Contenders
+from eval.tracing.scene import camera
+from eval.tracing.shadow_rays import random_rays
+from tron import seeds
+from tron.tracing import reference
+
+MARGIN = 1e-5
+
+
+def camera_errors(contenders: Contenders, size: int, rays: int, seed: int) -> list[Row]:
+    """Largest error of the unnormalised sums and of depth (relative), over ``rays`` random pixels."""
+    view = camera(size)
+    gbuffer = contenders.tracer.gbuffer(view)
+    found = {name: values.reshape(size * size, -1) for name, values in gbuffer.numpy().items()}
+    rng = seeds.generator(seed, "tracing", "error", "camera")
+    chosen = rng.choice(size * size, min(rays, size * size), replace=False)
+    directions = found["direction"][chosen]
+    origins = np.tile(view.position.astype(np.float32), (len(chosen), 1))
+    truth = reference.composite(contenders.scene, origins, directions)
+    steady = truth.margin > MARGIN
+    opacity = (1 - truth.transmittance)[:, None]
+    pairs = {
+        "opacity": (found["opacity"][chosen], opacity),
+        "rgb": (found["rgb"][chosen], truth.rgb),
+        "base_color": (found["base_color"][chosen] * opacity, truth.base_color),
+        "roughness": (found["roughness"][chosen] * opacity, truth.roughness[:, None]),
+        "metallic": (found["metallic"][chosen] * opacity, truth.metallic[:, None]),
+        "depth": _relative(found["depth"][chosen], truth.median_depth[:, None]),
+    }
+    errors = {name: float(np.abs(a - b)[steady].max(initial=0)) for name, (a, b) in pairs.items()}
+    return [
+        Row(metric="primary.max_error", value=max(errors.values()), unit="abs", n=int(steady.sum())),
+        *(
+            Row(metric=f"primary.max_error_{name}", value=value, unit="abs", n=int(steady.sum()))
+            for name, value in errors.items()
+        ),
+        _excluded("primary", steady),
+    ]
+
+
+def shadow_errors(contenders: Contenders, size: int, rays: int, seed: int) -> list[Row]:
+    """Largest error of transmittance over ``rays`` random shadow rays, and of the restarting peer."""
+    from eval.tracing.embree import RestartedShadows
+
+    scene = contenders.scene
+    gbuffer = contenders.tracer.gbuffer(camera(size))
+    origin, direction = random_rays(gbuffer, scene.spacing, rays, seed)
+    ours = np.array(contenders.tracer.transmittance(origin, direction))
+    restarted = np.array(RestartedShadows(scene, contenders.quads).transmittance(origin, direction))
+    truth, margin = reference.transmittance(scene, np.array(origin).T, np.array(direction).T)
+    steady = margin > MARGIN
+    n = int(steady.sum())
+    error, peer = np.abs(ours - truth)[steady], np.abs(restarted - truth)[steady]
+    return [
+        Row(metric="shadow.max_error", value=float(error.max(initial=0)), unit="abs", n=n),
+        Row(metric="shadow.embree_restart_max_error", value=float(peer.max(initial=0)), unit="abs", n=n),
+        Row(
+            metric="shadow.embree_restart_wrong_rays", value=float((peer > 1e-3).mean()), unit="fraction", n=n
+        ),
+        _excluded("shadow", steady),
+    ]
+
+
+def _relative(found: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    scale = np.maximum(truth, 1.0)
+    return found / scale, truth / scale
+
+
+def _excluded(kind: str, steady: np.ndarray) -> Row:
+    share = float((~steady).mean())
+    return Row(metric=f"{kind}.rays_at_a_threshold", value=share, unit="fraction", n=len(steady))

@@ -1,0 +1,124 @@
+"""Camera rays: one frame of TRON against Mitsuba's volprim, against one closest hit, and against gsplat.
+
+TRON's time counts everything a new camera costs: tile lists, tracing, sorting, compositing twelve channels,
+normalising, and the list of hits for the gradient. The peers' hierarchies are built before and not counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from eval.results import Row
+from eval.tracing import embree, gsplat_peer, volprim
+from eval.tracing.contenders import Contenders, spelled
+from eval.tracing.scene import camera
+from eval.tracing.timing import Times, interleaved
+from tron.cameras import Camera
+from tron.tracing.tiles import TILE, build_tiles
+
+TRON, BINNING = "tron", "binning"
+VOLPRIM, SHIPPED = "volprim", "volprim_as_shipped"
+EMBREE, GSPLAT = "embree_closest_hit", "gsplat"
+PEERS = (VOLPRIM, SHIPPED, EMBREE, GSPLAT)
+
+
+@dataclass(frozen=True)
+class CameraRays:
+    """Times of one frame of ``size`` x ``size`` pixels over ``count`` surfels, contestant -> times."""
+
+    count: int
+    size: int
+    times: Mapping[str, Times]
+
+    @property
+    def case(self) -> str:
+        """How metrics spell the case, such as 50k_512."""
+        return f"{spelled(self.count)}_{self.size}"
+
+    def mrays(self, name: str) -> float:
+        """Million rays a second."""
+        return self.size**2 / self.times[name].median / 1e6
+
+    def rows(self, suffix: str = "") -> list[Row]:
+        """Ratios to the peers that ran, rays a second of all, and the time of binning within TRON's."""
+        ours = self.times[TRON]
+        rows = [
+            Row(
+                metric=f"primary.ratio_to_{name}{suffix}.{self.case}",
+                value=self.times[name].over(ours),
+                unit="x",
+                n=len(self.times[name].seconds),
+            )
+            for name in PEERS
+            if name in self.times
+        ]
+        for name in (TRON, *PEERS):
+            if name in self.times:
+                metric = "primary.mrays" if name == TRON else f"primary.{name}_mrays"
+                n = len(self.times[name].seconds)
+                rows.append(
+                    Row(metric=f"{metric}{suffix}.{self.case}", value=self.mrays(name), unit="Mrays/s", n=n)
+                )
+        if BINNING in self.times:
+            binning = self.times[BINNING]
+            metric = f"primary.binning_ms{suffix}.{self.case}"
+            rows.append(Row(metric=metric, value=1e3 * binning.median, unit="ms", n=len(binning.seconds)))
+        return rows
+
+
+def measure_camera_rays(
+    contenders: Contenders,
+    size: int,
+    integrators: Mapping[str, Any],
+    repetitions: int,
+    slow_repetitions: int,
+) -> CameraRays:
+    """Time all contestants on one view, in turns.
+
+    Args:
+        integrators: name (:data:`VOLPRIM`, :data:`SHIPPED`) -> the peer's integrator; one with another stop.
+    """
+    view = camera(size)
+    tracer, records, quads = contenders.tracer, contenders.records, contenders.quads
+    origin, direction = tile_rays(view)
+    contestants: dict[str, Any] = {
+        TRON: lambda: tracer.gbuffer(view),
+        EMBREE: lambda: embree.closest_hit(quads, origin, direction, coherent=True),
+        BINNING: lambda: build_tiles(records, view).entries,
+    }
+    if integrators:
+        sensor, primitives = volprim.sensor(view), contenders.primitives
+        for name, integrator in integrators.items():
+            contestants[name] = lambda i=integrator: volprim.render(primitives, sensor, i)
+    if gsplat_peer.available():
+        contestants[GSPLAT] = gsplat_peer.renderer(contenders.scene, view)
+    times = interleaved(contestants, repetitions, slow_repetitions)
+    return CameraRays(len(contenders.scene), size, times)
+
+
+def tile_rays(view: Camera) -> tuple[mi.Point3f, mi.Vector3f]:
+    """Rays through the pixel centres, a 4 x 4 tile after the other: the order that is best for a packet."""
+    tiles = view.rays().reshape(view.height // TILE, TILE, view.width // TILE, TILE, 3)
+    rays = np.ascontiguousarray(tiles.transpose(0, 2, 1, 3, 4).reshape(-1, 3).T, np.float32)
+    origin = mi.Point3f(*[float(x) for x in view.position]) + dr.zeros(mi.Vector3f, rays.shape[1])
+    direction = mi.Vector3f(rays)
+    dr.eval(origin, direction)
+    return origin, direction
+
+
+def faster_shape(contenders: Contenders, size: int, integrator: Any) -> tuple[str, dict[str, Times]]:
+    """Which of the peer's two plugins for its primitives renders faster here, and both times."""
+    sensor = volprim.sensor(camera(size))
+    scenes = {
+        shape: volprim.primitives(contenders.scene, contenders.sh_degree, shape) for shape in volprim.SHAPES
+    }
+    times = interleaved(
+        {shape: lambda s=scene: volprim.render(s, sensor, integrator) for shape, scene in scenes.items()}, 3
+    )
+    return min(times, key=lambda shape: times[shape].median), times

@@ -1,0 +1,86 @@
+"""Peers for single rays: Mitsuba's ray queries (Embree on a CPU, OptiX on a GPU) on quads around the surfels.
+
+A quad is the square around the part of a surfel's ellipse that counts. One closest hit is what any tracer of
+triangles spends at the least, and it is not what the surfels need: it ignores opacity, and stops at corners
+of quads that the ellipse does not reach. Mitsuba and Dr.Jit offer no any-hit program, so whoever wants all
+hits along a ray starts the query again behind each: :class:`RestartedShadows`.
+"""
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from tron.gaussians.scene import GaussianScene
+from tron.tracing.kernel import GEOMETRY_PACKETS, intersect
+from tron.tracing.parameters import SurfelParameters, pack
+from tron.tracing.transmittance import BACK_FACE_SPACINGS, OPAQUE_TRANSMITTANCE
+
+RESTART_OFFSET = 1e-4
+"""How far behind a hit the next query starts, world units: what Mitsuba's volprim integrators use too."""
+MAX_RESTARTS = 512
+
+
+def quads(scene: GaussianScene) -> mi.Scene:
+    """Two triangles a surfel, 2 k and 2 k + 1 for surfel k, in a Mitsuba scene, its hierarchy built."""
+    records = np.array(_geometry(scene)).reshape(len(scene), 4 * GEOMETRY_PACKETS)
+    reach = np.sqrt(np.maximum(records[:, 11], 0.0))
+    tangent_u, tangent_v = scene.tangents()
+    scales = scene.scales() * reach[:, None]
+    a, b = tangent_u * scales[:, :1], tangent_v * scales[:, 1:]
+    corners = scene.means[:, None] + np.stack([-a - b, a - b, a + b, b - a], 1)
+    first = 4 * np.arange(len(scene))[:, None, None]
+    faces = first + np.array([[0, 1, 2], [0, 2, 3]])
+    mesh = mi.Mesh("quads", 4 * len(scene), 2 * len(scene))
+    values = mi.traverse(mesh)
+    values["vertex_positions"] = np.ascontiguousarray(corners, np.float32).ravel()
+    values["faces"] = faces.astype(np.uint32).ravel()
+    values.update()
+    return mi.load_dict({"type": "scene", "quads": mesh})
+
+
+def _geometry(scene: GaussianScene) -> mi.Float:
+    """Geometry records, of which the twelfth float is the squared radius that counts, in sigmas."""
+    return pack(SurfelParameters.from_scene(scene)).geometry
+
+
+def closest_hit(scene: mi.Scene, origin: mi.Point3f, direction: mi.Vector3f, coherent: bool) -> mi.Float:
+    """Distance of the nearest quad along each ray, infinite where there is none."""
+    return scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=mi.Bool(coherent)).t
+
+
+class RestartedShadows:
+    """Transmittance by restarted closest-hit queries, under TRON's rules as far as restarts can follow them.
+
+    Front faces count from the origin, back faces beyond two spacings, a ray ends below 0.01. Surfels that lie
+    within ``RESTART_OFFSET`` behind another hit are skipped: that is what restarting loses.
+    """
+
+    def __init__(self, scene: GaussianScene, traced: mi.Scene) -> None:
+        self._traced = traced
+        self._geometry = _geometry(scene)
+        self._degree = scene.kernel_degree
+        self._back_faces_from = dr.opaque(mi.Float, BACK_FACE_SPACINGS * scene.spacing)
+        dr.eval(self._geometry)
+
+    @dr.syntax
+    def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f) -> mi.Float:
+        """Product of (1 - alpha) over what blocks each ray; exactly 0 below 0.01."""
+        product, travelled, queries = mi.Float(1), mi.Float(0), mi.UInt32(0)
+        going = mi.Bool(True)
+        while going:
+            ray = mi.Ray3f(origin + travelled * direction, direction)
+            found = self._traced.ray_intersect_preliminary(ray, coherent=mi.Bool(False), active=going)
+            going &= found.is_valid()
+            surfel = dr.select(going, found.prim_index >> 1, 0)
+            met = intersect(self._geometry, surfel, origin, direction, self._degree)
+            blocks = going & met.within & (met.t > dr.select(met.front, 0, self._back_faces_from))
+            product = dr.select(blocks, product * (1 - met.alpha), product)
+            travelled = dr.select(going, travelled + found.t + RESTART_OFFSET, travelled)
+            queries += 1
+            going &= (product >= OPAQUE_TRANSMITTANCE) & (queries < MAX_RESTARTS)
+        return dr.select(product >= OPAQUE_TRANSMITTANCE, product, 0)

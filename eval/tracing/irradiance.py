@@ -1,0 +1,251 @@
+"""The irradiance pass: its time against Mitsuba's ``direct``, and its noise at equal rays and at equal time.
+
+Noise is measured on the buffer that the neural renderer is given, against the same buffer with thousands of
+rays a pixel, as a share of the light on an unshadowed upward plane. Plain independent sampling, the yardstick,
+is written again here: the same estimator with random numbers that know nothing of one another.
+
+Errors may be noise, never blocks. For pairs of pixels at one offset, errors correlate as much within an aligned
+block as across its border, unless pixels of a block share something: the excess of the former is measured.
+"""
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from eval.results import Row
+from eval.tracing.contenders import Contenders
+from eval.tracing.lights import LIGHTS
+from eval.tracing.scene import camera, mitsuba_mesh
+from eval.tracing.timing import Times, interleaved
+from tron import seeds
+from tron.cameras import mitsuba_sensor
+from tron.color import luminance
+from tron.shading import EnvironmentLight, Lighting, irradiance, render_guidance
+from tron.shading.guidance import shade
+from tron.shading.irradiance import ORIGIN_OFFSET
+from tron.tracing import GBuffer, SurfelTracer
+
+FEW, MANY = 2, 64
+REFERENCE_SEED, TRIALS = 1_000_003, 8
+
+
+@dataclass(frozen=True)
+class DirectTimes:
+    """The 64-ray pass and Mitsuba's ``direct`` under one light; ``images`` (H, W, 3) of both, linear."""
+
+    light: str
+    times: Mapping[str, Times]
+    images: Mapping[str, np.ndarray]
+    exposure: float
+
+    @property
+    def ratio(self) -> float:
+        """TRON's time, its hierarchy's build included, over that of Mitsuba's faster setting."""
+        direct = min(t.median for name, t in self.times.items() if name.startswith("direct"))
+        return (self.times["tron"].median + self.times["build"].median) / direct
+
+
+def measure_direct(contenders: Contenders, size: int, light: str, seed: int, repetitions: int) -> DirectTimes:
+    """Time the pass on the surfels and Mitsuba on the mesh: as many shadow rays, the same camera and light.
+
+    Mitsuba's 64 rays are tried in both ways it offers: all from one camera ray, and two from each of 32.
+    """
+    from tron.tracing.bvh import build_bvh
+
+    view, environment = camera(size), LIGHTS[light]()
+    prepared = EnvironmentLight(environment)
+    tracer = contenders.tracer
+    gbuffer = tracer.gbuffer(view)
+    scene = mi.load_dict({"type": "scene", **mitsuba_mesh(), "light": environment.to_mitsuba()})
+    half = MANY // 2
+    ways = {"direct at once": (1, half), "direct by camera rays": (half, 1)}
+    contestants: dict[str, Any] = {
+        "tron": lambda: irradiance(tracer, gbuffer, prepared, MANY, seed),
+        "build": lambda: build_bvh(contenders.records).nodes,
+    }
+    for name, (spp, samples) in ways.items():
+        integrator = mi.load_dict(
+            {"type": "direct", "emitter_samples": samples, "bsdf_samples": samples, "hide_emitters": True}
+        )
+        sensor = mi.load_dict(mitsuba_sensor(view, spp=spp))
+        contestants[name] = lambda i=integrator, s=sensor, n=spp: mi.render(
+            scene, sensor=s, integrator=i, spp=n
+        )
+    times = interleaved(contestants, repetitions, repetitions)
+    shadowed, _ = contestants["tron"]()
+    images = {
+        "tron": np.array(shadowed).T.reshape(size, size, 3),
+        "direct": np.array(contestants["direct by camera rays"]()),
+    }
+    return DirectTimes(light, times, images, environment.exposure())
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Errors under one light; ``images`` are linear irradiance buffers, ``rmse`` shares of a plane's light."""
+
+    light: str
+    rmse: Mapping[str, float]
+    blocks: Mapping[str, float]
+    equal_time_spp: int
+    images: Mapping[str, np.ndarray]
+    exposure: float
+
+
+def measure_noise(contenders: Contenders, size: int, light: str, reference_spp: int, seed: int) -> Noise:
+    """Errors of TRON's and of independent sampling at 2 and 64 rays, and at the time of TRON's 64."""
+    environment = LIGHTS[light]()
+    view, lighting, tracer = camera(size), Lighting(environment), contenders.tracer
+    gbuffer = tracer.gbuffer(view)
+    surface = gbuffer.numpy()["opacity"] > 0
+    plane = float(luminance(environment.unoccluded_upward()))
+    truth = render_guidance(tracer, view, lighting, reference_spp, REFERENCE_SEED).irradiance
+
+    def ours(spp: int, trial: int, denoise: bool = False) -> np.ndarray:
+        return render_guidance(tracer, view, lighting, spp, seed + trial, denoise).irradiance
+
+    def independent(spp: int, trial: int) -> np.ndarray:
+        shadowed, unshadowed = independent_irradiance(tracer, gbuffer, lighting.light, spp, seed + trial)
+        visibility = dr.select(unshadowed > 0, shadowed / unshadowed, 1)
+        return shade(gbuffer, visibility, lighting).irradiance
+
+    times = interleaved(
+        {
+            "tron": lambda: irradiance(tracer, gbuffer, lighting.light, MANY, seed),
+            "independent": lambda: independent_irradiance(tracer, gbuffer, lighting.light, MANY, seed),
+        },
+        3,
+    )
+    equal = max(2, 2 * round(MANY / 2 * times["tron"].over(times["independent"])))
+    few, many = ([ours(spp, k) for k in range(TRIALS)] for spp in (FEW, MANY))
+    alone_few, alone_many = ([independent(spp, k) for k in range(TRIALS)] for spp in (FEW, MANY))
+    estimates = {
+        "rmse_2spp": few,
+        "rmse_64spp": many,
+        "rmse_2spp_denoised": [ours(FEW, k, denoise=True) for k in range(TRIALS)],
+        "independent_rmse_2spp": alone_few,
+        "independent_rmse_64spp": alone_many,
+        "independent_rmse_equal_time": [independent(equal, k) for k in range(TRIALS)],
+    }
+    rmse = {name: relative_rmse(images, truth, surface, plane) for name, images in estimates.items()}
+    blocks = {}
+    for side in (4, 8):
+        for whose, images in (("", many), ("independent_", alone_many)):
+            errors = luminance(np.stack(images) - truth)
+            name = f"{whose}block_correlation_{side}x{side}"
+            blocks[name] = block_correlation(errors, surface, side)
+    images = {
+        "reference": truth,
+        "tron 2": few[0],
+        "independent 2": alone_few[0],
+        "denoised 2": estimates["rmse_2spp_denoised"][0],
+        "tron 64": many[0],
+        "independent 64": alone_many[0],
+    }
+    return Noise(light, rmse, blocks, equal, images, environment.exposure())
+
+
+def relative_rmse(images: list[np.ndarray], truth: np.ndarray, surface: np.ndarray, plane: float) -> float:
+    """Root mean square over trials, pixels with a surface and channels, over an upward plane's light."""
+    squares = [((image - truth)[surface].astype(np.float64) ** 2).mean() for image in images]
+    return float(np.sqrt(np.mean(squares)) / plane)
+
+
+def noise_rows(noises: list[Noise]) -> list[Row]:
+    """Rows of every light, and over the lights: root mean square errors, worst block correlation."""
+    rows = [
+        Row(metric=f"irradiance.{name}.{noise.light}", value=value, unit="fraction", n=TRIALS)
+        for noise in noises
+        for name, value in noise.rmse.items()
+    ]
+    rows += [
+        Row(metric=f"irradiance.{name}.{noise.light}", value=value, unit="correlation", n=TRIALS)
+        for noise in noises
+        for name, value in noise.blocks.items()
+    ]
+    for name in noises[0].rmse:
+        value = float(np.sqrt(np.mean([noise.rmse[name] ** 2 for noise in noises])))
+        rows.append(Row(metric=f"irradiance.{name}", value=value, unit="fraction", n=TRIALS * len(noises)))
+    for name in noises[0].blocks:
+        worst = max((noise.blocks[name] for noise in noises), key=abs)
+        rows.append(Row(metric=f"irradiance.{name}", value=worst, unit="correlation", n=TRIALS * len(noises)))
+    return rows
+
+
+def block_correlation(errors: np.ndarray, surface: np.ndarray, side: int) -> float:
+    """Excess correlation of errors inside aligned ``side`` x ``side`` blocks over that across their borders.
+
+    Errors are brought to unit size in each pixel first, over the trials, so that no bright penumbra decides.
+    Pairs lie one to ``side`` - 1 pixels apart along a row or a column; each offset's mean product within
+    blocks is compared with its mean product across borders, and the offsets are averaged by their pairs.
+    Noise gives 0, blue noise too (it is alike on both sides of a border), a value shared by a block 1.
+
+    Args:
+        errors: (K, H, W) of K trials.
+        surface: (H, W) bool, pixels that count.
+    """
+    size = np.sqrt((errors.astype(np.float64) ** 2).mean(0))
+    counts = surface & (size > 1e-6 * max(float(size.max()), 1e-30))
+    unit = np.where(counts, errors / np.where(counts, size, 1), 0)
+    total = weight = 0.0
+    for values, mask in ((unit, counts), (unit.transpose(0, 2, 1), counts.T)):
+        block = np.arange(mask.shape[1]) // side
+        for offset in range(1, side):
+            product = (values[:, :, :-offset] * values[:, :, offset:]).mean(0)
+            both = mask[:, :-offset] & mask[:, offset:]
+            same = both & (block[:-offset] == block[offset:])[None]
+            across = both & ~same
+            pairs = min(same.sum(), across.sum())
+            if pairs:
+                total += pairs * (product[same].mean() - product[across].mean())
+                weight += pairs
+    return float(total / weight) if weight else 0.0
+
+
+@dr.syntax
+def independent_irradiance(
+    tracer: SurfelTracer, gbuffer: GBuffer, light: EnvironmentLight, spp: int, seed: int
+) -> tuple[mi.Color3f, mi.Color3f]:
+    """Shadowed and unshadowed irradiance / pi by the estimator of :mod:`tron.shading.irradiance`, plainly.
+
+    Every ray has random numbers of its own (PCG32); half are cosine-distributed, half follow the light.
+    """
+    frame = mi.Frame3f(mi.Normal3f(gbuffer.normal))
+    origin = gbuffer.position + frame.n * dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
+    surface = gbuffer.opacity > 0
+    stream = seeds.integer(seed, "independent irradiance", bits=31)
+    random = mi.PCG32(size=dr.width(surface), initstate=dr.opaque(mi.UInt64, stream))
+    half, rays = dr.opaque(mi.UInt32, spp // 2), dr.opaque(mi.UInt32, spp)
+    shadowed, unshadowed = mi.Color3f(0), mi.Color3f(0)
+    ray = mi.UInt32(0)
+    while ray < rays:
+        u = mi.Point2f(random.next_float32(), random.next_float32())
+        towards_light, _ = light.sample(u)
+        around_normal = frame.to_world(mi.warp.square_to_cosine_hemisphere(u))
+        direction = dr.select(ray < half, around_normal, towards_light)
+        cosine_pdf = dr.dot(frame.n, direction) * dr.inv_pi
+        radiance = light.radiance(direction)
+        counts = surface & (cosine_pdf > 0) & (dr.max(radiance) > 0)
+        value = dr.select(counts, radiance * (cosine_pdf / (cosine_pdf + light.pdf(direction))), 0)
+        unshadowed += value
+        shadowed += value * tracer.transmittance(origin, direction, counts)
+        ray += 1
+    scale = dr.rcp(mi.Float(half))
+    dr.eval(shadowed, unshadowed)
+    return shadowed * scale, unshadowed * scale
+
+
+def exposed(image: np.ndarray, exposure: float) -> np.ndarray:
+    """Linear irradiance as the page shows it: through the light's exposure and the display transform."""
+    from tron.color import to_display
+
+    return to_display(np.asarray(image, np.float32), exposure)

@@ -1,0 +1,63 @@
+"""Peak memory of tracing a large scene, in a process of its own: `python -m eval.tracing.memory COUNT SIZE`.
+
+The figure is the largest resident set of the whole process on a CPU: Python, Mitsuba and LLVM included (told
+apart by what stood before the scene was made), buffers of the scene, lists, hierarchy, and kernels' memory.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+from tron.errors import TronError
+
+MEGABYTE = 1e6
+
+
+def measure_memory(count: int, size: int, variant: str, seed: int) -> dict[str, float]:
+    """Peak resident set in MB: ``base`` (libraries), ``scene`` (surfels made), ``peak`` (all traced).
+
+    Raises:
+        TronError: the process failed.
+    """
+    command = [sys.executable, "-m", "eval.tracing.memory", str(count), str(size), variant, str(seed)]
+    root = Path(__file__).resolve().parents[2]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=root)
+    if result.returncode != 0:
+        raise TronError(f"measuring memory failed: {result.stderr.strip()[-500:]}", " ".join(command))
+    return json.loads(result.stdout.splitlines()[-1])
+
+
+def _resident() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / MEGABYTE * (1 if sys.platform == "darwin" else 1024)
+
+
+def main(count: int, size: int, variant: str, seed: int) -> None:
+    """Make the scene, trace a view and shadow rays from it, and print the peaks as JSON."""
+    from tron.runtime import activate
+
+    activate(variant)
+    import drjit as dr
+
+    from eval.tracing.scene import camera, surfels
+    from eval.tracing.shadow_rays import random_rays
+    from tron.tracing import SurfelTracer
+
+    peaks = {"base": _resident()}
+    scene = surfels(count, seed)
+    peaks["scene"] = _resident()
+    tracer = SurfelTracer(scene)
+    gbuffer = tracer.gbuffer(camera(size))
+    origin, direction = random_rays(gbuffer, scene.spacing, size * size, seed)
+    dr.eval(tracer.transmittance(origin, direction))
+    dr.sync_thread()
+    peaks["peak"] = _resident()
+    print(json.dumps(peaks))
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]), sys.argv[3], int(sys.argv[4]))
