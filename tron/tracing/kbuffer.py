@@ -32,16 +32,16 @@ class _Nearest:
 
     Attributes:
         t, alpha: K of mi.Float; index: K of mi.UInt32, the scene's ids.
-        nearest, last: t and id of the last hit composited.
-        farthest: t of the last slot.
+        nearest, last: t and id of the last hit composited; nearest is a list of one, as walks have it.
+        farthest: t of the last slot, a list of one.
     """
 
     t: list[mi.Float]
     index: list[mi.UInt32]
     alpha: list[mi.Float]
-    nearest: mi.Float
+    nearest: list[mi.Float]
     last: mi.UInt32
-    farthest: mi.Float
+    farthest: list[mi.Float]
 
 
 @dr.syntax
@@ -51,8 +51,8 @@ def _insert(
     """Keep a surfel that is met among the nearest."""
     met = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
     index = dr.gather(mi.UInt32, bvh.order, surfel, active)
-    behind = (met.t > kept.nearest) | ((met.t == kept.nearest) & (index > kept.last))
-    if active & met.within & met.front & behind & (met.t <= kept.farthest):
+    behind = (met.t > kept.nearest[0]) | ((met.t == kept.nearest[0]) & (index > kept.last))
+    if active & met.within & met.front & behind & (met.t <= kept.farthest[0]):
         t, alpha = met.t, met.alpha
         for slot in range(K):
             nearer = (t < kept.t[slot]) | ((t == kept.t[slot]) & (index < kept.index[slot]))
@@ -65,7 +65,7 @@ def _insert(
                 dr.select(nearer, index_, index),
                 dr.select(nearer, alpha_, alpha),
             )
-        kept.farthest = kept.t[K - 1]
+        kept.farthest[0] = kept.t[K - 1]
     return kept
 
 
@@ -99,11 +99,11 @@ def composite_rays(
             [mi.Float(dr.inf) for _ in range(K)],
             [mi.UInt32(_NO_ID) for _ in range(K)],
             [mi.Float(0) for _ in range(K)],
-            mi.Float(nearest),
+            [mi.Float(nearest)],
             mi.UInt32(last),
-            mi.Float(dr.inf),
+            [mi.Float(dr.inf)],
         )
-        kept = walk(bvh, origin, direction, kept, partial(_insert, bvh, origin, direction), going)
+        kept = walk(bvh, origin, [direction], kept, partial(_insert, bvh, origin, direction), going)
         count = mi.UInt32(0)
         for slot in range(K):
             local_t[slot] = kept.t[slot]

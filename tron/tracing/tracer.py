@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -58,4 +59,10 @@ class SurfelTracer:
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
     ) -> mi.Float:
         """Transmittance from ``origin`` to infinity along unit ``direction``; exactly 0 below 0.01."""
-        return transmittance(self.bvh, origin, direction, self._back_faces_from, mi.Bool(active))
+        return self.transmittances(origin, [direction], [mi.Bool(active)])[0]
+
+    def transmittances(
+        self, origin: mi.Point3f, directions: Sequence[mi.Vector3f], active: Sequence[mi.Bool]
+    ) -> list[mi.Float]:
+        """The same for a fan of rays from each origin: quicker together, the more so the closer they are."""
+        return transmittance(self.bvh, origin, directions, self._back_faces_from, active)
