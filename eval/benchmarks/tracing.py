@@ -1,4 +1,4 @@
-"""Benchmark `tracing`: the surfel tracer's speed, exactness and noise, beside what a user would pick instead."""
+"""Benchmark `tracing`: the tracer's speed, exactness and noise, beside what a user would pick instead."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ class Tracing(Benchmark):
         for count, size in self.gradient:
             contenders = self._contenders(count)
             contenders.shape = measured.shape
-            step = measure_gradient(contenders, size, self.seed, self.repetitions, self.slow_repetitions)
+            step = measure_gradient(contenders, size, self.repetitions, self.slow_repetitions)
             measured.gradient.append(step)
             log.info("gradient step %s: %.1f times as fast as volprim", step.case, step.ratio)
 
@@ -211,7 +211,7 @@ class Tracing(Benchmark):
         for light in LIGHTS:
             found = measure_noise(contenders, size, light, self.reference_spp, self.seed)
             measured.noise.append(found)
-            told = ", ".join(f"{name} {value:.5f}" for name, value in (found.rmse | found.blocks).items())
+            told = ", ".join(f"{name} {value:.5f}" for name, value in {**found.rmse, **found.blocks}.items())
             log.info("irradiance under %s: %s", light, told)
 
     def _measure_error(self, measured: Measured) -> None:

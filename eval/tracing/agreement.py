@@ -28,7 +28,7 @@ def compare_images(contenders: Contenders, size: int, integrator: Any) -> dict[s
 
 
 def hits_a_ray(scene: GaussianScene, size: int, seed: int) -> tuple[float, float, float]:
-    """Means over random camera rays: surfels met, those met from their front, those composited to the stop."""
+    """Means over random camera rays: surfels met, those met from the front, those composited."""
     view = camera(size)
     chosen = seeds.generator(seed, "tracing", "hits").choice(
         size * size, min(RAYS, size * size), replace=False

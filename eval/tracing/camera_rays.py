@@ -106,7 +106,7 @@ def tile_rays(view: Camera) -> tuple[mi.Point3f, mi.Vector3f]:
     """Rays through the pixel centres, a 4 x 4 tile after the other: the order that is best for a packet."""
     tiles = view.rays().reshape(view.height // TILE, TILE, view.width // TILE, TILE, 3)
     rays = np.ascontiguousarray(tiles.transpose(0, 2, 1, 3, 4).reshape(-1, 3).T, np.float32)
-    origin = mi.Point3f(*[float(x) for x in view.position]) + dr.zeros(mi.Vector3f, rays.shape[1])
+    origin = dr.repeat(mi.Point3f([float(x) for x in view.position]), rays.shape[1])
     direction = mi.Vector3f(rays)
     dr.eval(origin, direction)
     return origin, direction

@@ -11,7 +11,6 @@ from eval.tracing import embree, volprim
 from tron.gaussians.scene import GaussianScene
 from tron.tracing import SurfelTracer
 from tron.tracing.kernel import SurfelRecords
-from tron.tracing.parameters import SurfelParameters, pack
 
 
 @dataclass
@@ -35,13 +34,13 @@ class Contenders:
 
     @cached_property
     def tracer(self) -> SurfelTracer:
-        """TRON's tracer; its hierarchy is built when first used."""
+        """TRON's tracer, its hierarchy built."""
         return SurfelTracer(self.scene)
 
-    @cached_property
+    @property
     def records(self) -> SurfelRecords:
         """The packed surfels, from which tile lists and hierarchies are made."""
-        return pack(SurfelParameters.from_scene(self.scene))
+        return self.tracer.records
 
     @cached_property
     def quads(self) -> mi.Scene:

@@ -19,7 +19,7 @@ from tron.gaussians.scene import GaussianScene
 
 def available() -> bool:
     """Whether gsplat is installed, torch sees a GPU, and the tracer runs on it too."""
-    if not mi.variant().startswith("cuda") or importlib.util.find_spec("gsplat") is None:
+    if not (mi.variant() or "").startswith("cuda") or importlib.util.find_spec("gsplat") is None:
         return False
     import torch
 

@@ -1,11 +1,11 @@
 """The irradiance pass: its time against Mitsuba's ``direct``, and its noise at equal rays and at equal time.
 
 Noise is measured on the buffer that the neural renderer is given, against the same buffer with thousands of
-rays a pixel, as a share of the light on an unshadowed upward plane. Plain independent sampling, the yardstick,
-is written again here: the same estimator with random numbers that know nothing of one another.
+rays a pixel, as a share of the light on an unshadowed upward plane. Plain independent sampling, the
+yardstick, is written again here: the same estimator with random numbers that know nothing of one another.
 
-Errors may be noise, never blocks. For pairs of pixels at one offset, errors correlate as much within an aligned
-block as across its border, unless pixels of a block share something: the excess of the former is measured.
+Errors may be noise, never blocks. For pairs of pixels at one offset, errors correlate as much within an
+aligned block as across its border, unless pixels of a block share something: that excess is measured.
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
@@ -91,7 +91,7 @@ def measure_direct(contenders: Contenders, size: int, light: str, seed: int, rep
 
 @dataclass(frozen=True)
 class Noise:
-    """Errors under one light; ``images`` are linear irradiance buffers, ``rmse`` shares of a plane's light."""
+    """Errors under one light; ``images`` are linear, ``rmse`` shares of an upward plane's light."""
 
     light: str
     rmse: Mapping[str, float]

@@ -57,7 +57,7 @@ class Recipe:
 
 
 STUDY = Recipe()
-"""Surfels as reconstructions give them and the design study measured them: some 33 candidates a camera ray."""
+"""Surfels as reconstructions give them, and as the design study had them: some 33 candidates a ray."""
 FROM_GBUFFERS = Recipe(degree=4, overlap=0.0, anisotropy=0.0, tilt=0.01, lift=0.0, opacity=0.99)
 """As :func:`tron.gaussians.initialize.surfels_from_gbuffers` makes them: sigma is 0.4 neighbour distances."""
 

@@ -39,7 +39,7 @@ def load_integrator(stop: float = SHIPPED_STOP) -> Any:
     Raises:
         TronError: this Mitsuba's source no longer holds the line to be replaced.
     """
-    from mitsuba.ad.integrators import volprim_rf_basic as shipped
+    from mitsuba.ad.integrators import volprim_rf_basic as shipped  # pyright: ignore[reportMissingImports]
 
     name = "volprim_rf_basic"
     if stop != SHIPPED_STOP:
@@ -96,7 +96,7 @@ def through_centres(scene: mi.Scene, integrator: Any, camera: Camera) -> np.ndar
     import drjit as dr
 
     rays = np.ascontiguousarray(camera.rays().reshape(-1, 3).T, np.float32)
-    origin = mi.Point3f(*[float(x) for x in camera.position]) + dr.zeros(mi.Vector3f, rays.shape[1])
+    origin = dr.repeat(mi.Point3f([float(x) for x in camera.position]), rays.shape[1])
     sampler = mi.load_dict({"type": "independent", "sample_count": 1})
     sampler.seed(0, rays.shape[1])
     color, *_ = integrator.sample(
