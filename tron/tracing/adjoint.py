@@ -59,6 +59,12 @@ class _Replay:
     differentiate_basis: bool
 
 
+def has_gradients(records: SurfelRecords, direction: mi.Vector3f) -> bool:
+    """Whether sums over these records, seen along ``direction``, have anything to be differentiated by."""
+    view = records.sh_degree > 0 and dr.grad_enabled(direction)
+    return view or dr.grad_enabled(records.geometry, records.features, records.harmonics)
+
+
 def attach(
     sums: Composite, records: SurfelRecords, origin: mi.Point3f, direction: mi.Vector3f, hits: list[HitList]
 ) -> Composite:
@@ -71,9 +77,9 @@ def attach(
         sums: of each ray, evaluated. records: what they were traced from.
         origin, direction: the rays. hits: what they met.
     """
-    view = records.sh_degree > 0 and dr.grad_enabled(direction)
-    if not (view or dr.grad_enabled(records.geometry, records.features, records.harmonics)):
+    if not has_gradients(records, direction):
         return sums
+    view = dr.grad_enabled(direction)
     basis = sh_basis(direction.x, direction.y, direction.z)[1:] if records.sh_degree > 0 else []
     replay = _Replay(records.detached(), dr.detach(origin), dr.detach(direction), hits, sums, view)
     channels, mean_depth, transmittance = dr.custom(

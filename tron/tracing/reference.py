@@ -6,8 +6,8 @@ obvious way.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, fields
+from typing import Protocol
 
 import numpy as np
 
@@ -16,8 +16,20 @@ from tron.tracing.compositing import STOP_TRANSMITTANCE
 from tron.tracing.kernel import MAX_ALPHA, MIN_ALPHA, MIN_RESPONSE, T_MIN
 from tron.tracing.transmittance import BACK_FACE_SPACINGS, OPAQUE_TRANSMITTANCE
 
-if TYPE_CHECKING:
-    from tron.gaussians.scene import GaussianScene
+
+class Scene(Protocol):
+    """What is read of a ``GaussianScene``; finite differences bring one of float64 arrays."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    base_color: np.ndarray
+    roughness: np.ndarray
+    metallic: np.ndarray
+    kernel_degree: int
+    spacing: float
 
 
 @dataclass(frozen=True)
@@ -30,8 +42,10 @@ class ReferenceHits:
         transmittance: (P,) after the last counted hit.
         median_depth: (P,) distance of the first hit after which T < 0.5, or 0.
         hits: (P,) int, number of composited hits.
-        margin: (P,) smallest distance of any compared value to a threshold (alpha cut, stop, median): pixels
-            with a tiny margin may differ in float32.
+        margin: (P,) smallest distance of any value that the ray compares before it stops to its threshold
+            (alpha cut, stop, median): pixels with a tiny margin may differ in float32.
+        gap: (P,) smallest distance along the ray between two composited hits that are neighbours; where it is
+            tiny, rounding may order them otherwise.
     """
 
     normal: np.ndarray
@@ -44,6 +58,7 @@ class ReferenceHits:
     median_depth: np.ndarray
     hits: np.ndarray
     margin: np.ndarray
+    gap: np.ndarray
 
 
 def rotation_matrices(quats: np.ndarray) -> np.ndarray:
@@ -57,68 +72,106 @@ def rotation_matrices(quats: np.ndarray) -> np.ndarray:
     return np.array(rows).transpose(2, 0, 1)
 
 
-class _Surfels:
-    """A scene in float64, and one ray against all of it."""
+@dataclass(frozen=True)
+class _Meetings:
+    """P rays against all M surfels, each array (P, M).
 
-    def __init__(self, scene: GaussianScene) -> None:
-        rotations = rotation_matrices(scene.quats.astype(np.float64))
-        scales = np.exp(scene.log_scales.astype(np.float64))
-        self.means = scene.means.astype(np.float64)
-        self.normals = rotations[:, :, 2]
-        self.axis_u = rotations[:, :, 0] / scales[:, :1]
-        self.axis_v = rotations[:, :, 1] / scales[:, 1:]
-        self.opacities = 1.0 / (1.0 + np.exp(-scene.opacity_logits.astype(np.float64)))
-        self.degree = scene.kernel_degree
+    Attributes:
+        t: distance to the surfel's plane. alpha: opacity there, clipped.
+        counted: the kernel counts there, on whichever side. front: the ray meets the front.
+        margin: distance of response and opacity to their cuts.
+    """
 
-    def intersect(self, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, ...]:
-        """t, alpha, counted (by the kernel alone), front and margin, each (M,), for one ray."""
-        facing = self.normals @ direction
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            t = ((self.means - origin) * self.normals).sum(1) / facing
-            offset = origin + t[:, None] * direction - self.means
-            q = (offset * self.axis_u).sum(1) ** 2 + (offset * self.axis_v).sum(1) ** 2
-            response = np.exp(-q / 2) if self.degree == 2 else np.exp(-4.5 / 81 * q * q)
-        response = np.nan_to_num(response)
-        alpha = np.minimum(self.opacities * response, MAX_ALPHA)
-        counted = (response >= MIN_RESPONSE) & (self.opacities * response >= MIN_ALPHA)
-        margin = np.minimum(np.abs(response - MIN_RESPONSE), np.abs(self.opacities * response - MIN_ALPHA))
-        return np.nan_to_num(t), alpha, counted & np.isfinite(t), facing < 0, margin
+    t: np.ndarray
+    alpha: np.ndarray
+    counted: np.ndarray
+    front: np.ndarray
+    margin: np.ndarray
 
 
-def composite(scene: GaussianScene, origins: np.ndarray, directions: np.ndarray) -> ReferenceHits:
+def _meet(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> _Meetings:
+    rotations = rotation_matrices(np.asarray(scene.quats, np.float64))
+    scales = np.exp(np.asarray(scene.log_scales, np.float64))
+    means = np.asarray(scene.means, np.float64)
+    opacities = 1.0 / (1.0 + np.exp(-np.asarray(scene.opacity_logits, np.float64)))
+    facing = np.einsum("pk,mk->pm", directions, rotations[:, :, 2])
+    to_centre = means - origins[:, None]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        t = np.einsum("pmk,mk->pm", to_centre, rotations[:, :, 2]) / facing
+        offset = t[:, :, None] * directions[:, None] - to_centre
+        u = np.einsum("pmk,mk->pm", offset, rotations[:, :, 0]) / scales[:, 0]
+        v = np.einsum("pmk,mk->pm", offset, rotations[:, :, 1]) / scales[:, 1]
+        q = u**2 + v**2
+        response = np.exp(-q / 2) if scene.kernel_degree == 2 else np.exp(-4.5 / 81 * q * q)
+    response = np.nan_to_num(response)
+    raw = opacities * response
+    return _Meetings(
+        t=np.nan_to_num(t),
+        alpha=np.minimum(raw, MAX_ALPHA),
+        counted=(response >= MIN_RESPONSE) & (raw >= MIN_ALPHA) & np.isfinite(t),
+        front=facing < 0,
+        # A surfel is cut by whichever threshold it falls below first; the other one decides nothing.
+        margin=np.abs(np.minimum(response - MIN_RESPONSE, raw - MIN_ALPHA)),
+    )
+
+
+def composite(
+    scene: Scene, origins: np.ndarray, directions: np.ndarray, sh_directions: np.ndarray | None = None
+) -> ReferenceHits:
     """Front-to-back compositing of front-facing surfels along each ray, ordered by (t, id).
 
     Args:
         scene: the surfels.
         origins, directions: (P, 3), world; directions of unit length.
+        sh_directions: (P, 3), where radiance is evaluated instead of along the rays.
     """
-    surfels, rays = _Surfels(scene), len(origins)
-    features = np.concatenate(
-        [surfels.normals, scene.base_color, scene.roughness[:, None], scene.metallic[:, None]], 1
+    origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
+    views = directions if sh_directions is None else np.asarray(sh_directions, np.float64)
+    # A block of rays holds arrays of rays x surfels x 3.
+    block = max(1, 1_000_000 // max(1, len(scene.means)))
+    parts = [
+        _composite_block(scene, origins[i : i + block], directions[i : i + block], views[i : i + block])
+        for i in range(0, len(origins), block)
+    ]
+    return ReferenceHits(
+        **{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(ReferenceHits)}
+    )
+
+
+def _composite_block(
+    scene: Scene, origins: np.ndarray, directions: np.ndarray, views: np.ndarray
+) -> ReferenceHits:
+    met, rays = _meet(scene, origins, directions), len(origins)
+    normals = rotation_matrices(np.asarray(scene.quats, np.float64))[:, :, 2]
+    materials = np.concatenate(
+        [normals, scene.base_color, scene.roughness[:, None], scene.metallic[:, None]], 1
     ).astype(np.float64)
+    visible = met.counted & met.front & (met.t > T_MIN)
+    along = np.where(visible, met.t, np.inf)
+    order = np.argsort(along, axis=1, kind="stable")  # stable: coincident surfels stay in the order of ids
+    most = int(visible.sum(1).max(initial=0))
     out = np.zeros((rays, 12))
-    transmittance, median, hits = np.ones(rays), np.zeros(rays), np.zeros(rays, int)
-    margins = np.full(rays, np.inf)
-    for ray in range(rays):
-        origin, direction = origins[ray].astype(np.float64), directions[ray].astype(np.float64)
-        t, alpha, counted, front, margin = surfels.intersect(origin, direction)
-        near_cut = front & (t > 0)
-        margins[ray] = margin[near_cut].min() if near_cut.any() else np.inf
-        ids = np.flatnonzero(counted & front & (t > T_MIN))
-        ids = ids[np.lexsort((ids, t[ids]))]
-        rgb = eval_sh(scene.sh[ids].astype(np.float64), np.tile(direction, (len(ids), 1)))
-        remaining = 1.0
-        for i, color in zip(ids, rgb, strict=True):
-            weight, after = remaining * alpha[i], remaining * (1 - alpha[i])
-            out[ray] += weight * np.concatenate([features[i], color, [t[i]]])
-            if remaining >= 0.5 > after:
-                median[ray] = t[i]
-            remaining = after
-            hits[ray] += 1
-            margins[ray] = min(margins[ray], abs(after - 0.5), abs(after - STOP_TRANSMITTANCE))
-            if remaining < STOP_TRANSMITTANCE:
-                break
-        transmittance[ray] = remaining
+    remaining, median, hits = np.ones(rays), np.zeros(rays), np.zeros(rays, int)
+    last, margin, gap = np.zeros(rays), np.full(rays, np.inf), np.full(rays, np.inf)
+    for slot in range(most):
+        ray = np.flatnonzero((visible.sum(1) > slot) & (remaining >= STOP_TRANSMITTANCE))
+        surfel = order[ray, slot]
+        t, alpha = met.t[ray, surfel], met.alpha[ray, surfel]
+        rgb = eval_sh(np.asarray(scene.sh, np.float64)[surfel], views[ray])
+        before, after = remaining[ray], remaining[ray] * (1 - alpha)
+        values = np.concatenate([materials[surfel], rgb, t[:, None]], 1)
+        out[ray] += (before * alpha)[:, None] * values
+        median[ray] = np.where((before >= 0.5) & (after < 0.5), t, median[ray])
+        if slot > 0:
+            gap[ray] = np.minimum(gap[ray], t - last[ray])
+        thresholds = np.minimum(np.abs(after - 0.5), np.abs(after - STOP_TRANSMITTANCE))
+        margin[ray] = np.minimum(margin[ray], thresholds)
+        remaining[ray], last[ray] = after, t
+        hits[ray] += 1
+    # What lies behind the hit that stopped a ray is never compared with anything.
+    reached = np.where(remaining < STOP_TRANSMITTANCE, last, np.inf)
+    compared = met.front & (met.t > 0) & (met.t <= reached[:, None] + 1e-5)
+    cuts = np.where(compared, met.margin, np.inf).min(1, initial=np.inf)
     return ReferenceHits(
         normal=out[:, 0:3],
         base_color=out[:, 3:6],
@@ -126,30 +179,26 @@ def composite(scene: GaussianScene, origins: np.ndarray, directions: np.ndarray)
         metallic=out[:, 7],
         rgb=out[:, 8:11],
         mean_depth=out[:, 11],
-        transmittance=transmittance,
+        transmittance=remaining,
         median_depth=median,
         hits=hits,
-        margin=margins,
+        margin=np.minimum(margin, cuts),
+        gap=gap,
     )
 
 
 def transmittance(
-    scene: GaussianScene, origins: np.ndarray, directions: np.ndarray, *, two_sided: bool = True
+    scene: Scene, origins: np.ndarray, directions: np.ndarray, *, two_sided: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
     """Transmittance of shadow rays and its margin to a threshold, both (P,) float64.
 
     Front faces count from t = 0, back faces beyond ``BACK_FACE_SPACINGS`` spacings (never, if one-sided).
     """
-    surfels = _Surfels(scene)
-    result, margins = np.ones(len(origins)), np.full(len(origins), np.inf)
-    reach = BACK_FACE_SPACINGS * scene.spacing
-    for ray in range(len(origins)):
-        origin, direction = origins[ray].astype(np.float64), directions[ray].astype(np.float64)
-        t, alpha, counted, front, margin = surfels.intersect(origin, direction)
-        blocks = counted & np.where(front, t > 0, two_sided & (t > reach))
-        product = np.prod(1 - alpha[blocks])
-        result[ray] = product if product >= OPAQUE_TRANSMITTANCE else 0.0
-        near = np.where(front, np.abs(t), np.abs(t - reach))
-        thresholds = np.minimum(margin, np.where(counted, near, np.inf))
-        margins[ray] = min(thresholds.min(initial=np.inf), abs(product - OPAQUE_TRANSMITTANCE))
-    return result, margins
+    origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
+    met, reach = _meet(scene, origins, directions), BACK_FACE_SPACINGS * scene.spacing
+    blocks = met.counted & np.where(met.front, met.t > 0, two_sided & (met.t > reach))
+    product = np.where(blocks, 1 - met.alpha, 1.0).prod(1)
+    starts = np.where(met.front, np.abs(met.t), np.abs(met.t - reach))
+    nearby = np.minimum(met.margin, np.where(met.counted, starts, np.inf)).min(1, initial=np.inf)
+    margin = np.minimum(nearby, np.abs(product - OPAQUE_TRANSMITTANCE))
+    return np.where(product >= OPAQUE_TRANSMITTANCE, product, 0.0), margin

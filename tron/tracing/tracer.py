@@ -10,9 +10,9 @@ import mitsuba as mi
 
 from tron.tracing.bvh import build_bvh
 from tron.tracing.gbuffer import GBuffer, trace_gbuffer
-from tron.tracing.kbuffer import composite_rays
 from tron.tracing.parameters import SurfelParameters, pack
-from tron.tracing.surface import Surface, surface
+from tron.tracing.rays import trace_rays
+from tron.tracing.surface import Surface
 from tron.tracing.tiles import build_tiles
 from tron.tracing.transmittance import BACK_FACE_SPACINGS, transmittance
 
@@ -51,9 +51,7 @@ class SurfelTracer:
         The same surfels composited in the same order as by :meth:`gbuffer`, without the coherence that makes
         camera rays fast.
         """
-        return surface(
-            composite_rays(self.records, self.bvh, origin, direction, mi.Bool(active)), origin, direction
-        )
+        return trace_rays(self.records, self.bvh, origin, direction, mi.Bool(active))
 
     def transmittance(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
