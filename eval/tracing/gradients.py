@@ -25,7 +25,6 @@ from eval.tracing import volprim
 from eval.tracing.contenders import Contenders, spelled
 from eval.tracing.scene import camera
 from eval.tracing.timing import Times, interleaved
-from tron.tracing.bvh import build_bvh
 from tron.tracing.gbuffer import trace_gbuffer
 from tron.tracing.parameters import PARAMETERS, SurfelParameters, pack
 from tron.tracing.tiles import build_tiles
@@ -94,7 +93,7 @@ def surfel_step(contenders: Contenders, size: int) -> Callable[[], dict[str, Any
         records = pack(parameters)
         detached = records.detached()
         lists = build_tiles(detached, view)
-        image = trace_gbuffer(records, lists, view, lambda: build_bvh(detached)).rgb
+        image = trace_gbuffer(records, lists, view).rgb
         dr.backward(dr.mean(dr.squared_norm(image - TARGET)) / 3)
         return {name: dr.grad(getattr(parameters, name)) for name in PARAMETERS}
 

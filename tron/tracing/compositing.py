@@ -43,7 +43,7 @@ class HitList:
     def empty(ray: mi.UInt32, room: int) -> HitList:
         """Lists of up to ``room`` hits for the rays ``ray``."""
         rays = dr.width(ray)
-        return HitList(dr.zeros(mi.UInt32, room * rays), dr.zeros(mi.UInt32, rays), ray)
+        return HitList(dr.empty(mi.UInt32, room * rays), dr.zeros(mi.UInt32, rays), ray)
 
 
 @dataclass

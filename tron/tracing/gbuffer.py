@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -15,13 +15,12 @@ import numpy as np
 from tron.cameras import Camera
 from tron.gaussians.harmonics import sh_basis
 from tron.tracing.adjoint import attach
-from tron.tracing.bvh import Bvh
 from tron.tracing.compositing import STOP_TRANSMITTANCE, Composite, HitList, composite
 from tron.tracing.hits import MAX_HITS, collect, sort
-from tron.tracing.kbuffer import composite_rays
+from tron.tracing.kbuffer import composite_rounds, search_list
 from tron.tracing.kernel import SurfelRecords
 from tron.tracing.surface import Surface, surface
-from tron.tracing.tiles import LANES, TILE, TileLists
+from tron.tracing.tiles import TileLists, lanes_of_pixels, tile_pixels
 
 
 @dataclass
@@ -55,13 +54,9 @@ class TileRays:
     inside: mi.Bool
 
 
-def tile_rays(camera: Camera, tiles_x: int, tiles_y: int) -> TileRays:
+def tile_rays(camera: Camera) -> TileRays:
     """Pixel-centre rays. The camera's numbers are opaque, or every view would compile its own kernel."""
-    lane = dr.arange(mi.UInt32, tiles_x * tiles_y * LANES)
-    tile, pixel = lane // LANES, lane % LANES
-    across, width, height = (dr.opaque(mi.UInt32, n) for n in (tiles_x, camera.width, camera.height))
-    x = (tile % across) * TILE + pixel % TILE
-    y = (tile // across) * TILE + pixel // TILE
+    tile, x, y, inside = tile_pixels(camera.width, camera.height)
     fx, fy, cx, cy = (dr.opaque(mi.Float, float(v)) for v in (camera.fx, camera.fy, camera.cx, camera.cy))
     rotation = camera.camera_to_world[:3, :3]
     right, down, forward = (mi.Vector3f([float(v) for v in rotation[:, k]]) for k in range(3))
@@ -70,29 +65,18 @@ def tile_rays(camera: Camera, tiles_x: int, tiles_y: int) -> TileRays:
     direction = dr.normalize(
         ((mi.Float(x) + 0.5 - cx) / fx) * right + ((mi.Float(y) + 0.5 - cy) / fy) * down + forward
     )
-    return TileRays(origin, direction, tile, (x < width) & (y < height))
+    return TileRays(origin, direction, tile, inside)
 
 
-def _row_major_lanes(width: int, height: int, tiles_x: int) -> mi.UInt32:
-    """For each pixel in row-major order, its lane in tile order."""
-    pixel = dr.arange(mi.UInt32, width * height)
-    across, columns = dr.opaque(mi.UInt32, tiles_x), dr.opaque(mi.UInt32, width)
-    x, y = pixel % columns, pixel // columns
-    return ((y // TILE) * across + x // TILE) * LANES + (y % TILE) * TILE + x % TILE
-
-
-def trace_tiles(
-    records: SurfelRecords, lists: TileLists, rays: TileRays, bvh: Callable[[], Bvh]
-) -> tuple[Composite, list[HitList]]:
+def trace_tiles(records: SurfelRecords, lists: TileLists, rays: TileRays) -> tuple[Composite, list[HitList]]:
     """Sums of every ray in tile order, and the hits that they are made of.
 
     Collecting, sorting and compositing are one kernel, with room for ``MAX_HITS`` hits a ray. Rays that met
-    more are traced once more through the hierarchy, where there is no limit.
+    more are traced once more, some hits at a time, without limit.
 
     Args:
         records: the surfels, detached.
         lists: tile lists. rays: the rays of their pixels.
-        bvh: makes the hierarchy; called only if some ray needs it.
     """
     start = dr.gather(mi.UInt32, lists.start, rays.tile)
     count = dr.select(rays.inside, dr.gather(mi.UInt32, lists.count, rays.tile), 0)
@@ -106,17 +90,19 @@ def trace_tiles(
     crowded = dr.compress(hits.met > MAX_HITS)
     if dr.width(crowded) == 0:
         return sums, [out]
-    met = dr.gather(mi.UInt32, hits.met, crowded)
-    more = HitList.empty(crowded, int(dr.max(met)[0]))  # met counts every hit that can be composited
+    room = int(dr.max(dr.gather(mi.UInt32, hits.met, crowded))[0])  # met counts all that can be composited
+    more = HitList.empty(crowded, room)
+    start, count = (dr.gather(mi.UInt32, values, crowded) for values in (start, count))
     direction = dr.gather(mi.Vector3f, rays.direction, crowded)
-    again = composite_rays(records, bvh(), rays.origin, direction, mi.Bool(True), more)
+    search = partial(search_list, records, lists.entries, start, count, rays.origin, direction)
+    again = composite_rounds(records, search, direction, mi.Bool(True), more)
     more.count = again.count
     dr.eval(again, more.ids, more.count)
-    scatter_rays(sums, again, crowded)
+    _overwrite(sums, again, crowded)
     return sums, [out, more]
 
 
-def scatter_rays(sums: Composite, some: Composite, ray: mi.UInt32) -> None:
+def _overwrite(sums: Composite, some: Composite, ray: mi.UInt32) -> None:
     """Overwrite the sums of the rays ``ray``."""
     for target, source in zip(sums.channels, some.channels, strict=True):
         dr.scatter(target, source, ray)
@@ -125,19 +111,12 @@ def scatter_rays(sums: Composite, some: Composite, ray: mi.UInt32) -> None:
     dr.eval(sums)
 
 
-def trace_gbuffer(
-    records: SurfelRecords, lists: TileLists, camera: Camera, bvh: Callable[[], Bvh]
-) -> GBuffer:
-    """Render a camera's G-buffer from its tile lists; differentiable in the records.
-
-    Args:
-        records: the surfels. lists: tile lists of them for ``camera``.
-        bvh: makes their hierarchy; called only if a ray meets more than ``MAX_HITS`` surfels.
-    """
-    rays = tile_rays(camera, lists.tiles_x, lists.tiles_y)
-    sums, hits = trace_tiles(records.detached(), lists, rays, bvh)
+def trace_gbuffer(records: SurfelRecords, lists: TileLists, camera: Camera) -> GBuffer:
+    """Render a camera's G-buffer from its tile lists; differentiable in the records."""
+    rays = tile_rays(camera)
+    sums, hits = trace_tiles(records.detached(), lists, rays)
     sums = attach(sums, records, rays.origin, rays.direction, hits)
-    lane = _row_major_lanes(camera.width, camera.height, lists.tiles_x)
+    lane = lanes_of_pixels(camera.width, camera.height)
 
     def gather(value: mi.Float) -> mi.Float:
         return dr.gather(type(value), value, lane, mode=dr.ReduceMode.Permute)

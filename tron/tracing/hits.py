@@ -18,6 +18,10 @@ MAX_HITS = 64
 """Hits kept a ray; rays that meet more are traced by :mod:`tron.tracing.kbuffer` instead."""
 
 
+NEAR_SLACK = 0.9999
+"""Lists are sorted by a ``near`` that may differ from the one recomputed at a ray by rounding."""
+
+
 @dataclass
 class LocalHits:
     """The hits of each lane in thread-local memory, slot 0 nearest; alive inside one kernel only.
@@ -88,8 +92,7 @@ def collect(
         farthest = dr.select(valid & (hit.t > farthest), hit.t, farthest)
         t_cut = dr.select((product < stop) & (t_cut == dr.inf), farthest, t_cut)
         cursor += 1
-        # `near` is recomputed in float32 here and sorted in float64: a hair of slack keeps the end exact.
-        active &= (cursor < end) & (0.9999 * hit.near <= t_cut)
+        active &= (cursor < end) & (NEAR_SLACK * hit.near <= t_cut)
     kept = dr.select(met < MAX_HITS, met, mi.UInt32(MAX_HITS))
     return LocalHits(kept_t, kept_index, kept_alpha, kept, met)
 

@@ -1,7 +1,9 @@
-"""Exact compositing of any number of hits along arbitrary rays, the nearest eight at a time.
+"""Exact compositing of any number of hits, the nearest eight at a time.
 
-Each round walks the hierarchy for the K nearest hits behind the last one composited; (t, id) orders hits, so
-coincident surfels are neither lost nor met twice. Slower than tile lists, but nothing overflows.
+Each round looks for the K nearest hits behind the last one composited; (t, id) orders hits, so coincident
+surfels are neither lost nor met twice. Rays that no tile holds look for them in the hierarchy; the few camera
+rays that meet more than a hit list holds look in the list of their tile. Slower than one sorted list, but
+nothing overflows.
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false
@@ -9,8 +11,9 @@ coincident surfels are neither lost nor met twice. Slower than tile lists, but n
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -18,8 +21,8 @@ import mitsuba as mi
 from tron.gaussians.harmonics import sh_basis
 from tron.tracing.bvh import Bvh
 from tron.tracing.compositing import STOP_TRANSMITTANCE, Composite, HitList, composite
-from tron.tracing.hits import LocalHits
-from tron.tracing.kernel import T_MIN, SurfelRecords, intersect
+from tron.tracing.hits import NEAR_SLACK, LocalHits
+from tron.tracing.kernel import T_MIN, SurfelHit, SurfelRecords, intersect
 from tron.tracing.traversal import walk
 
 K = 8
@@ -43,14 +46,26 @@ class _Nearest:
     last: mi.UInt32
     farthest: list[mi.Float]
 
+    @staticmethod
+    def behind(nearest: mi.Float, last: mi.UInt32) -> _Nearest:
+        """Nothing found yet behind the hit (nearest, last)."""
+        return _Nearest(
+            t=[mi.Float(dr.inf) for _ in range(K)],
+            index=[mi.UInt32(_NO_ID) for _ in range(K)],
+            alpha=[mi.Float(0) for _ in range(K)],
+            nearest=[mi.Float(nearest)],
+            last=mi.UInt32(last),
+            farthest=[mi.Float(dr.inf)],
+        )
+
+
+Search: TypeAlias = "Callable[[_Nearest, mi.Bool], _Nearest]"
+"""Fills the slots, in the lanes given, with the nearest hits behind (nearest, last)."""
+
 
 @dr.syntax
-def _insert(
-    bvh: Bvh, origin: mi.Point3f, direction: mi.Vector3f, kept: _Nearest, surfel: mi.UInt32, active: mi.Bool
-) -> _Nearest:
-    """Keep a surfel that is met among the nearest."""
-    met = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
-    index = dr.gather(mi.UInt32, bvh.order, surfel, active)
+def _insert(kept: _Nearest, met: SurfelHit, index: mi.UInt32, active: mi.Bool) -> _Nearest:
+    """Keep a surfel that is met, if it is among the nearest."""
     behind = (met.t > kept.nearest[0]) | ((met.t == kept.nearest[0]) & (index > kept.last))
     if active & met.within & met.front & behind & (met.t <= kept.farthest[0]):
         t, alpha = met.t, met.alpha
@@ -69,11 +84,37 @@ def _insert(
     return kept
 
 
+def search_hierarchy(bvh: Bvh, origin: mi.Point3f, direction: mi.Vector3f) -> Search:
+    """Look for hits of any rays, unit directions, in the hierarchy."""
+
+    def visit(kept: _Nearest, surfel: mi.UInt32, active: mi.Bool) -> _Nearest:
+        met = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
+        return _insert(kept, met, dr.gather(mi.UInt32, bvh.order, surfel, active), active)
+
+    return lambda kept, active: walk(bvh, origin, [direction], kept, visit, active)
+
+
 @dr.syntax
-def composite_rays(
+def search_list(
+    records: SurfelRecords, entries: mi.UInt32, start: mi.UInt32, count: mi.UInt32,
+    origin: mi.Point3f, direction: mi.Vector3f, kept: _Nearest, active: mi.Bool,
+) -> _Nearest:  # fmt: skip
+    """Look for hits of camera rays in their tiles' lists (all but the last two as in ``hits.collect``)."""
+    cursor, end = mi.UInt32(start), start + count
+    going = active & (cursor < end)
+    while going:
+        index = dr.gather(mi.UInt32, entries, cursor, going)
+        met = intersect(records.geometry, index, origin, direction, records.degree)
+        kept = _insert(kept, met, index, going)
+        cursor += 1
+        going &= (cursor < end) & (NEAR_SLACK * met.near <= kept.farthest[0])
+    return kept
+
+
+@dr.syntax
+def composite_rounds(
     records: SurfelRecords,
-    bvh: Bvh,
-    origin: mi.Point3f,
+    search: Search,
     direction: mi.Vector3f,
     active: mi.Bool,
     out: HitList | None = None,
@@ -82,8 +123,8 @@ def composite_rays(
 
     Args:
         records: the surfels, in the scene's order.
-        bvh: their hierarchy.
-        origin: world. direction: unit, world.
+        search: where to look for hits.
+        direction: of the rays, unit, world; SH is evaluated there.
         active: lanes to trace; the others meet nothing.
         out: receives the composited ids of lane r in list r, which must have room.
     """
@@ -95,15 +136,7 @@ def composite_rays(
     nearest, last = mi.Float(T_MIN), mi.UInt32(_NO_ID)  # no id is larger: a hit at T_MIN itself is none
     going = mi.Bool(active)
     while going:
-        kept = _Nearest(
-            [mi.Float(dr.inf) for _ in range(K)],
-            [mi.UInt32(_NO_ID) for _ in range(K)],
-            [mi.Float(0) for _ in range(K)],
-            [mi.Float(nearest)],
-            mi.UInt32(last),
-            [mi.Float(dr.inf)],
-        )
-        kept = walk(bvh, origin, [direction], kept, partial(_insert, bvh, origin, direction), going)
+        kept = search(_Nearest.behind(nearest, last), going)
         count = mi.UInt32(0)
         for slot in range(K):
             local_t[slot] = kept.t[slot]

@@ -8,7 +8,7 @@ import mitsuba as mi
 from tron.tracing.adjoint import attach, has_gradients
 from tron.tracing.bvh import Bvh
 from tron.tracing.compositing import HitList
-from tron.tracing.kbuffer import composite_rays
+from tron.tracing.kbuffer import composite_rounds, search_hierarchy
 from tron.tracing.kernel import SurfelRecords
 from tron.tracing.surface import Surface, surface
 
@@ -25,13 +25,14 @@ def trace_rays(
     """
     still = records.detached()
     at, along = dr.detach(origin), dr.detach(direction)
-    sums = composite_rays(still, bvh, at, along, active)
+    search = search_hierarchy(bvh, at, along)
+    sums = composite_rounds(still, search, along, active)
     if has_gradients(records, direction):
         # The lists that the adjoint replays need room, and how much is known only now.
         dr.eval(sums)
         ray = dr.arange(mi.UInt32, dr.width(sums.count))
         hits = HitList.empty(ray, max(1, int(dr.max(sums.count)[0])))
-        hits.count = composite_rays(still, bvh, at, along, active, hits).count
+        hits.count = composite_rounds(still, search, along, active, hits).count
         dr.eval(hits.ids, hits.count)
         sums = attach(sums, records, at, direction, [hits])
     return surface(sums, at, along)

@@ -45,6 +45,30 @@ class TileLists:
     tiles_y: int
 
 
+def tile_counts(width: int, height: int) -> tuple[int, int]:
+    """Tiles across and down an image; the last ones may hang over its edge."""
+    return -(-width // TILE), -(-height // TILE)
+
+
+def tile_pixels(width: int, height: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32, mi.Bool]:
+    """Tile, x, y, and whether in the image, in tile order: lane = tile * 16 + pixel within the tile."""
+    tiles_x, tiles_y = tile_counts(width, height)
+    lane = dr.arange(mi.UInt32, tiles_x * tiles_y * LANES)
+    tile, pixel = lane // LANES, lane % LANES
+    across, columns, rows = (dr.opaque(mi.UInt32, n) for n in (tiles_x, width, height))
+    x = (tile % across) * TILE + pixel % TILE
+    y = (tile // across) * TILE + pixel // TILE
+    return tile, x, y, (x < columns) & (y < rows)
+
+
+def lanes_of_pixels(width: int, height: int) -> mi.UInt32:
+    """For each pixel in row-major order, its lane in tile order."""
+    pixel = dr.arange(mi.UInt32, width * height)
+    across, columns = dr.opaque(mi.UInt32, tile_counts(width, height)[0]), dr.opaque(mi.UInt32, width)
+    x, y = pixel % columns, pixel // columns
+    return ((y // TILE) * across + x // TILE) * LANES + (y % TILE) * TILE + x % TILE
+
+
 @dataclass
 class _Axis:
     """One image axis: focal length, principal point and size, in pixels; opaque."""
@@ -56,7 +80,7 @@ class _Axis:
 
 def build_tiles(records: SurfelRecords, camera: Camera) -> TileLists:
     """Make the lists of one camera."""
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    tiles_x, tiles_y = tile_counts(camera.width, camera.height)
     first_x, across, first_y, touched, near = _touched_tiles(records, camera)
     order = dr.argsort(near)
     touched = dr.gather(mi.UInt32, touched, order)

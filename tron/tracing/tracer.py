@@ -43,7 +43,7 @@ class SurfelTracer:
     def gbuffer(self, camera: Camera) -> GBuffer:
         """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it."""
         lists = build_tiles(self.records, camera)
-        return trace_gbuffer(self.records, lists, camera, lambda: self.bvh)
+        return trace_gbuffer(self.records, lists, camera)
 
     def trace(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True) -> Surface:
         """What any rays see, from ``origin`` along unit ``direction``; inactive lanes see nothing.

@@ -37,8 +37,7 @@ def differentiable(scene) -> SurfelParameters:
 
 def render(parameters: SurfelParameters, camera: Camera = CAMERA) -> GBuffer:
     records = pack(parameters)
-    lists = build_tiles(records.detached(), camera)
-    return trace_gbuffer(records, lists, camera, lambda: build_bvh(records.detached()))
+    return trace_gbuffer(records, build_tiles(records.detached(), camera), camera)
 
 
 def in_float64(scene) -> SimpleNamespace:
@@ -233,7 +232,7 @@ def test_without_gradients_nothing_more_is_done(random_scene):
         lists = build_tiles(records.detached(), CAMERA)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            trace_gbuffer(records, lists, CAMERA, lambda: build_bvh(records))
+            trace_gbuffer(records, lists, CAMERA)
             return len([entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT])
 
     scene = random_scene(30)

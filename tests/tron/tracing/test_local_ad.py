@@ -18,7 +18,6 @@ from tron import seeds
 from tron.cameras import Camera
 from tron.gaussians.harmonics import sh_basis
 from tron.tracing.adjoint import attach
-from tron.tracing.bvh import build_bvh
 from tron.tracing.compositing import MATERIAL_PACKETS, Composite, HitList, radiance
 from tron.tracing.gbuffer import tile_rays, trace_tiles
 from tron.tracing.kernel import FEATURE_PACKETS, SurfelRecords, intersect
@@ -81,7 +80,7 @@ def test_hand_written_adjoint_is_what_local_differentiation_gives(random_scene, 
     records = pack(SurfelParameters.from_scene(random_scene(120, degree=degree, sh_degree=sh_degree)))
     lists = build_tiles(records, CAMERA)
     rays = tile_rays(CAMERA)
-    sums, hits = trace_tiles(records, lists, rays, lambda: build_bvh(records))
+    sums, hits = trace_tiles(records, lists, rays)
     rng = seeds.generator(0, "tests", "outer")
     outer = [mi.Float(rng.normal(size=dr.width(sums.count)).astype(np.float32)) for _ in range(13)]
     buffers = ("geometry", "features", "harmonics")
