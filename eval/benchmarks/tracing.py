@@ -96,7 +96,7 @@ class Tracing(Benchmark):
         measured = Measured()
         for part in self.parts:
             getattr(self, f"_measure_{part}")(measured)
-        return page.outcome(self, measured, output_dir)
+        return page.outcome(self, measured, list(rows(measured, self)), output_dir)
 
     def _contenders(self, count: int, **recipe: Any) -> Contenders:
         from eval.tracing.contenders import Contenders

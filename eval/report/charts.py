@@ -1,11 +1,12 @@
-"""Training curves as inline SVG that follows the page's colours."""
+"""Line charts as inline SVG that follows the page's colours: training curves, growth of time with size."""
 
 from __future__ import annotations
 
 import csv
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,23 +97,7 @@ def _draw(
     title: str,
     logarithmic: bool,
 ) -> str:
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    settings: dict[Any, Any] = {
-        "svg.fonttype": "none",  # text stays text: selectable, in the page's font
-        "svg.hashsalt": title,  # the same bytes every time, and ids that differ between charts
-        "font.family": "sans-serif",
-        "font.size": 10,
-        **{f"{name}.color": INK for name in ("text", "xtick", "ytick")},
-        "axes.edgecolor": INK,
-        "axes.labelcolor": INK,
-    }
-    with rc_context(settings):
-        figure = Figure(figsize=(9, 3.4), layout="constrained")
-        FigureCanvasSVG(figure)
-        axes = figure.add_subplot()
+    with _canvas(title) as (figure, axes):
         runs = list(dict.fromkeys(label.partition(",")[0] for label, *_ in lines))
         for label, x, y in lines:
             colour = LINE_COLOURS[runs.index(label.partition(",")[0]) % len(LINE_COLOURS)]
@@ -125,11 +110,63 @@ def _draw(
             axes.set_yscale("log")
         axes.set_xlabel("seconds of training")
         axes.set_ylabel(title)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(alpha=0.25, color=INK)
-        axes.legend(frameon=False)
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+        return _finished(figure, axes)
+
+
+def growth_chart(
+    lines: Mapping[str, Sequence[tuple[float, float]]], x_label: str, y_label: str, caption: str
+) -> Chart:
+    """A chart with both axes logarithmic; ``lines`` maps a label to its (x, y) points, ascending in x.
+
+    Straight lines are powers: where x is ten times as large and y is too, growth is linear.
+    """
+    with _canvas(caption) as (figure, axes):
+        for (label, points), colour in zip(lines.items(), LINE_COLOURS):
+            x, y = zip(*points)
+            axes.plot(x, y, "o-", color=colour, label=label, linewidth=1.6, markersize=4)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        ticks = sorted({x for points in lines.values() for x, _ in points})
+        axes.set_xticks(ticks, [f"{x:,.0f}" for x in ticks])
+        axes.minorticks_off()
+        axes.set_xlabel(x_label)
+        axes.set_ylabel(y_label)
+        svg = _finished(figure, axes)
+    ends = "; ".join(
+        f"{label} from {points[0][1]:.3g} to {points[-1][1]:.3g}" for label, points in lines.items()
+    )
+    return Chart(svg, caption, f"Line chart, {y_label} over {x_label}: {ends}.")
+
+
+@contextmanager
+def _canvas(name: str) -> Iterator[tuple[Any, Any]]:
+    """A figure and its axes in the page's style; ``name`` makes the chart's ids its own."""
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    settings: dict[Any, Any] = {
+        "svg.fonttype": "none",  # text stays text: selectable, in the page's font
+        "svg.hashsalt": name,  # the same bytes every time, and ids that differ between charts
+        "font.family": "sans-serif",
+        "font.size": 10,
+        **{f"{part}.color": INK for part in ("text", "xtick", "ytick")},
+        "axes.edgecolor": INK,
+        "axes.labelcolor": INK,
+    }
+    with rc_context(settings):
+        figure = Figure(figsize=(9, 3.4), layout="constrained")
+        FigureCanvasSVG(figure)
+        yield figure, figure.add_subplot()
+
+
+def _finished(figure: Any, axes: Any) -> str:
+    """The figure as SVG whose ink is the page's text colour."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(alpha=0.25, color=INK)
+    axes.legend(frameon=False)
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :].replace(INK, "currentColor")
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)

@@ -2,23 +2,126 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from eval.benchmarks import Outcome
+from eval.report.figures import written
+from eval.report.page import Cell, Section, Table, Text
+from eval.report.tracing_light import irradiance_section, noise_section
+from eval.report.tracing_rays import camera_section, family, gradient_section, growth_section, shadow_section
+from eval.results import Row
 
 if TYPE_CHECKING:
     from eval.benchmarks.tracing import Measured, Tracing
 
+LEAD = (
+    "TRON holds a captured scene as surfels: small flat disks whose opacity falls off like a Gaussian, with "
+    "a normal and a material. To relight it, rays must pass through these half-transparent disks: camera "
+    "rays, which need every disk on the way in order of distance, and shadow rays, which only need the "
+    "product of what each lets through. To fit the disks to photographs, the camera rays must be "
+    "differentiated.",
+    "This page measures TRON's tracer on one scene, a floor with spheres, a torus and a box covered by "
+    "surfels, beside what a user of Mitsuba would pick instead. Everyone runs in turns, in one process, on "
+    "the same machine; every figure is a median over the rounds. TRON's preparations (lists of surfels for "
+    "each tile of the image, the hierarchy for shadow rays) are counted in its times; the peers' hierarchies "
+    "are not in theirs.",
+)
+HEADLINE = {
+    "primary.ratio_to_volprim": "Camera rays: times as fast as Mitsuba's volprim",
+    "shadow.ratio_to_embree_restart": "Shadow rays: times as fast as restarts on Embree",
+    "gradient.ratio_to_volprim": "Gradient step: times as fast as Mitsuba's volprim",
+    "irradiance.seconds_ratio_to_mitsuba_direct": "64-ray irradiance: times as long as Mitsuba's direct",
+    "primary.max_error": "Camera rays: largest error against float64",
+}
 
-def outcome(settings: Tracing, measured: Measured, output_dir: Path) -> Outcome:
-    """Rows and sections of a run."""
-    from eval.benchmarks.tracing import rows
 
+def outcome(settings: Tracing, measured: Measured, rows: Sequence[Row], output_dir: Path) -> Outcome:
+    """Rows and sections of a run; pictures are also written below ``output_dir/pictures``."""
+    found = {row.metric: row for row in rows}
+    sections = [
+        *camera_section(settings, measured, output_dir),
+        *growth_section(settings, measured),
+        *shadow_section(measured, found),
+        *gradient_section(measured),
+        *irradiance_section(measured, output_dir),
+        *noise_section(settings, measured, output_dir),
+        *_exactness(found),
+        *_memory(settings, measured),
+    ]
+    targets = {target.metric for target in settings.targets}
+    tiles = {
+        metric: label
+        for name, label in HEADLINE.items()
+        if (metric := next((m for m in found if m in targets and family(m) == name), None))
+    }
+    overrides = [f"output_dir={output_dir}"]
+    if settings.variant != "llvm_ad_rgb":
+        overrides.insert(0, f"benchmark.variant={settings.variant}")
     return Outcome(
-        rows=list(rows(measured, settings)),
+        rows=rows,
         title="The surfel tracer against what a user would pick instead",
-        verdict="",
-        lead=(),
-        sections=[],
+        verdict=_verdict(found),
+        lead=LEAD,
+        sections=sections,
+        headline=tiles,
+        reproduce=[" ".join(["tron-eval benchmark=tracing", *overrides])],
+        inputs={"settings": settings.model_dump(exclude={"targets"})},
     )
+
+
+def _verdict(found: dict[str, Row]) -> str:
+    parts = []
+    for name, text in (
+        ("primary.ratio_to_volprim", "camera rays {} times"),
+        ("gradient.ratio_to_volprim", "gradient steps {} times"),
+        ("shadow.ratio_to_embree_restart", "shadow rays {} times"),
+    ):
+        values = [row.value for metric, row in found.items() if family(metric) == name]
+        if values:
+            low, high = f"{min(values):.1f}", f"{max(values):.1f}"
+            parts.append(text.format(low if low == high else f"{low} to {high}"))
+    if not parts:
+        return "Only some parts were run."
+    return f"Beside Mitsuba's own tools TRON traces {', '.join(parts)} as fast."
+
+
+def _exactness(found: dict[str, Row]) -> list[Section]:
+    words = {
+        "primary.max_error": "camera rays, the largest of all",
+        "primary.max_error_rgb": "camera rays, radiance",
+        "primary.max_error_opacity": "camera rays, opacity",
+        "primary.max_error_depth": "camera rays, median depth, relative",
+        "primary.rays_at_a_threshold": "camera rays left out: within 1e-5 of a threshold",
+        "shadow.max_error": "shadow rays, transmittance",
+        "shadow.rays_at_a_threshold": "shadow rays left out: within 1e-5 of a threshold",
+    }
+    rows = [
+        [Cell(text), Cell(written(found[name].value, found[name].unit), "strong"), Cell(str(found[name].n))]
+        for name, text in words.items()
+        if name in found
+    ]
+    if not rows:
+        return []
+    intro = Text(
+        "Held against a slow float64 tracer that shares no code with the fast one, on random rays of the "
+        "same view. A ray whose float64 value stands within 0.00001 of a threshold (an opacity that just "
+        "counts, the end of the ray, the median) may fall on either side of it and is left out."
+    )
+    table = Table("Largest absolute errors.", ["What", "Measured", "Rays"], rows)
+    return [Section("exactness", "Exactness", [intro, table])]
+
+
+def _memory(settings: Tracing, measured: Measured) -> list[Section]:
+    if not measured.memory:
+        return []
+    memory = measured.memory
+    text = Text(
+        f"A process of its own that makes {settings.memory_surfels:,} surfels, traces one frame of "
+        f"{settings.pixels[-1]}² pixels and as many shadow rays reaches a resident set of "
+        f"{memory['peak']:.0f} MB. Of it {memory['base']:.0f} MB are Python, Mitsuba and LLVM before "
+        f"anything is made; {memory['scene']:.0f} MB was the peak when the surfels had been made, before "
+        "tracing."
+    )
+    return [Section("memory", "Memory", [text])]

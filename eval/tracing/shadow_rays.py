@@ -11,8 +11,8 @@ and taken off both sides.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -79,22 +79,35 @@ class ShadowRays:
         return [Row(metric=f"{name}.{case}", value=v, unit=unit, n=n) for name, (v, unit) in figures.items()]
 
 
-class Unshadowed:
-    """Nothing in the way: what the irradiance pass costs without its tracing."""
+class _Occluder:
+    """What the irradiance pass asks of a tracer; fans of rays are traced one by one."""
 
     def __init__(self, scene: GaussianScene) -> None:
         self.scene = scene
+
+    def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        raise NotImplementedError
+
+    def transmittances(
+        self, origin: mi.Point3f, directions: Sequence[mi.Vector3f], active: Sequence[mi.Bool]
+    ) -> list[mi.Float]:
+        """One transmittance for each direction."""
+        return [self.transmittance(origin, d, a) for d, a in zip(directions, active, strict=True)]
+
+
+class Unshadowed(_Occluder):
+    """Nothing in the way: what the irradiance pass costs without its tracing."""
 
     def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """1 for all that could be traced; the ray is still used, so that no one optimises it away."""
         return dr.select(active & (origin.x + direction.x > 1e30), mi.Float(0), 1)
 
 
-class ClosestHits:
+class ClosestHits(_Occluder):
     """Quads in the way: one closest-hit query a ray, opaque or not."""
 
     def __init__(self, scene: GaussianScene, traced: mi.Scene) -> None:
-        self.scene = scene
+        super().__init__(scene)
         self._traced = traced
 
     def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
@@ -105,11 +118,11 @@ class ClosestHits:
         return dr.select(active & found.is_valid(), mi.Float(0), 1)
 
 
-class Counted:
+class Counted(_Occluder):
     """Counts the rays that the pass asks for, as an occluder in their way."""
 
     def __init__(self, scene: GaussianScene) -> None:
-        self.scene = scene
+        super().__init__(scene)
         self.total = dr.zeros(mi.UInt32, 1)
 
     def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:  # noqa: ARG002
@@ -192,8 +205,6 @@ def moved_surfels(contenders: Contenders, seed: int) -> Contenders:
 
     The tenth is the surfels nearest to the first sphere's top, moved together by five spacings.
     """
-    from dataclasses import replace
-
     scene = contenders.scene
     top = np.array([0.0, 0.0, 1.6])
     nearest = np.argsort(np.linalg.norm(scene.means - top, axis=1))[: max(1, round(MOVED * len(scene)))]

@@ -1,0 +1,228 @@
+"""The tracing benchmark at toy sizes: its rows, its two scenes, its peers, its yardsticks."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eval.benchmarks.tracing import Tracing
+from eval.cli import cli
+from eval.results import Results
+from eval.tracing import agreement, embree, scene, volprim
+from eval.tracing.contenders import Contenders, spelled
+from eval.tracing.irradiance import block_correlation, independent_irradiance, relative_rmse
+from eval.tracing.timing import Times, interleaved
+from tron import metrics, seeds
+from tron.shading import EnvironmentLight, irradiance
+from tron.tracing import reference
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+TOY = {
+    "surfels": "[300,400]",
+    "pixels": "[32]",
+    "growth_surfels": "[300,400]",
+    "growth_pixels": "[32,64]",
+    "shadow_rays": "500",
+    "shadow_spp": "2",
+    "gradient": "[[300,32]]",
+    "irradiance": "[300,32]",
+    "noise": "[300,32]",
+    "reference_spp": "64",
+    "error_rays": "50",
+    "memory_surfels": "500",
+    "repetitions": "1",
+    "slow_repetitions": "1",
+}
+ROWS = [
+    "primary.ratio_to_volprim.400_32",
+    "primary.ratio_to_volprim_as_shipped.400_32",
+    "primary.mrays.400_32",
+    "primary.ratio_to_embree_closest_hit.400_32",
+    "primary.binning_ms.400_32",
+    "primary.ratio_to_volprim_sh3.400_32",
+    "primary.mrays_from_gbuffers.400_32",
+    "primary.ratio_to_volprim.400_64",
+    "shadow.ratio_to_embree_restart.300",
+    "shadow.ratio_to_embree_closest_hit.300",
+    "bvh.build_ms.300",
+    "bvh.refit_ms.300",
+    "gradient.ratio_to_volprim.300_32",
+    "gradient.cosine_with_volprim.300_32",
+    "irradiance.seconds_ratio_to_mitsuba_direct.300_32",
+    "irradiance.rmse_2spp",
+    "irradiance.rmse_64spp",
+    "irradiance.independent_rmse_2spp",
+    "irradiance.independent_rmse_64spp",
+    "irradiance.independent_rmse_equal_time",
+    "irradiance.block_correlation_8x8",
+    "irradiance.rmse_64spp.sun",
+    "irradiance.rmse_64spp.soft",
+    "primary.max_error",
+    "primary.rays_at_a_threshold",
+    "shadow.max_error",
+    "memory.peak_mb.500",
+]
+
+
+@pytest.mark.long
+def test_the_whole_benchmark_runs_and_every_promised_row_is_there(tmp_path: Path):
+    with pytest.raises(SystemExit) as end:
+        cli(
+            [
+                "benchmark=tracing",
+                f"output_dir={tmp_path}",
+                *(f"benchmark.{key}={value}" for key, value in TOY.items()),
+            ]
+        )
+    assert end.value.code == 0
+    results = Results.load(tmp_path / "results.json")
+    found = {row.metric for row in results.rows}
+    assert set(ROWS) <= found
+    assert results.environment["variant"] != "none"
+    error = results.value("primary.max_error")
+    assert error is not None
+    assert error < 1e-4
+    page = (tmp_path / "report.html").read_text()
+    for anchor in ("camera", "growth", "shadow", "gradient", "irradiance", "noise", "exactness", "memory"):
+        assert f'id="{anchor}"' in page
+    assert (tmp_path / "pictures" / "camera.png").stat().st_size > 0
+
+
+def test_a_part_alone_gives_its_rows_alone(tmp_path: Path):
+    settings = {"surfels": [300], "pixels": [32], "growth_surfels": [], "growth_pixels": []}
+    benchmark = Tracing(
+        **settings, parts=["error"], gradient=[], irradiance=(300, 32), noise=(300, 32), error_rays=20
+    )
+    outcome = benchmark.run(tmp_path)
+    assert {row.metric.split(".")[0] for row in outcome.rows} == {"primary", "shadow"}
+    assert [section.name for section in outcome.sections] == ["exactness"]
+
+
+def test_surfels_lie_on_the_mesh_that_stands_for_them():
+    def off(made):
+        points = made.means.astype(np.float64)
+        return np.min([surface.distance(points) for surface in scene.SURFACES], axis=0)
+
+    assert off(scene.surfels(3000, seed=1, recipe=replace(scene.STUDY, lift=0.0))).max() < 1e-6
+    made = scene.surfels(3000, seed=1)
+    assert 0 < np.median(off(made) / made.scales().mean(1)) < scene.STUDY.lift
+    for surface in scene.SURFACES:
+        points, normals, faces = surface.mesh(64)
+        assert surface.distance(points).max() < 1e-9
+        corners = points[faces]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert np.linalg.norm(cross, axis=1).sum() / 2 == pytest.approx(surface.area, rel=0.01)
+        assert ((cross * normals[faces[:, 0]]).sum(1) > 0).all(), "wound outwards"
+        moved = points + 1e-3 * normals
+        assert surface.distance(moved) == pytest.approx(np.full(len(points), 1e-3), abs=1e-5)
+
+
+def test_surfels_are_even_by_area():
+    # A low-discrepancy set fills the cells of a grid far more evenly than chance, whose variance is the mean.
+    u, v = scene.r2_sequence(6400, np.array([0.3, 0.8]))
+    counts = np.histogram2d(u, v, bins=8)[0]
+    assert counts.var() < 0.1 * counts.mean()
+
+
+def test_a_ray_of_the_study_scene_meets_what_the_study_met():
+    met, front, effective = agreement.hits_a_ray(scene.surfels(10_000, seed=0), 64, seed=0)
+    assert met == pytest.approx(33, rel=0.2)
+    assert front == pytest.approx(23, rel=0.2)
+    assert effective == pytest.approx(18, rel=0.2)
+
+
+def test_the_peer_draws_the_same_picture():
+    contenders = Contenders(scene.surfels(2000, seed=0))
+    found = agreement.compare_images(contenders, 48, volprim.load_integrator(volprim.OUR_STOP))
+    chance = metrics.psnr(found["tron"], np.broadcast_to(found["tron"].mean((0, 1)), found["tron"].shape))
+    assert found["psnr"] > 20 > chance
+
+
+def test_the_peer_with_our_stop_goes_on_where_the_shipped_one_ends():
+    contenders = Contenders(scene.surfels(1000, seed=0))
+    view = scene.camera(32)
+    deep, shipped = (
+        volprim.through_centres(contenders.primitives, volprim.load_integrator(stop), view)
+        for stop in (volprim.OUR_STOP, volprim.SHIPPED_STOP)
+    )
+    assert (deep >= shipped - 1e-6).all()
+    assert 1e-4 < (deep - shipped).max() < 2 * volprim.SHIPPED_STOP
+
+
+def test_restarts_agree_with_the_reference_but_for_coincident_surfels():
+    import mitsuba as mi
+
+    made = scene.surfels(800, seed=2)
+    rng = seeds.generator(0, "tests", "restart rays")
+    origins = rng.uniform(-2, 2, (200, 3)) + np.array([0, 0, 2.0])
+    directions = rng.normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    o, d = (np.ascontiguousarray(a.T, np.float32) for a in (origins, directions))
+    found = np.array(
+        embree.RestartedShadows(made, embree.quads(made)).transmittance(mi.Point3f(o), mi.Vector3f(d))
+    )
+    truth, margin = reference.transmittance(made, o.T, d.T)
+    wrong = np.abs(found - truth)[margin > 1e-5] > 1e-3
+    assert wrong.mean() < 0.03
+    assert (truth < 0.5).sum() > 20, "enough rays meet something"
+
+
+def test_independent_sampling_has_the_same_mean_as_the_pass():
+    contenders = Contenders(scene.surfels(1000, seed=0))
+    from eval.tracing.lights import soft
+
+    light, gbuffer = EnvironmentLight(soft()), contenders.tracer.gbuffer(scene.camera(32))
+    ours = np.array(irradiance(contenders.tracer, gbuffer, light, 256, seed=0)[0])
+    plain = np.array(independent_irradiance(contenders.tracer, gbuffer, light, 256, seed=0)[0])
+    assert ours.mean() == pytest.approx(plain.mean(), rel=0.01)
+    assert np.abs(ours - plain).max() > 1e-3, "different rays"
+
+
+def test_block_correlation_tells_blocks_from_noise_and_from_blue_noise():
+    rng = seeds.generator(0, "tests", "blocks")
+    noise = rng.normal(size=(8, 96, 96))
+    surface = np.ones((96, 96), bool)
+    shared = np.kron(rng.normal(size=(8, 24, 24)), np.ones((4, 4)))
+    blue = noise - (np.roll(noise, 1, 1) + np.roll(noise, 1, 2)) / 2
+    assert abs(block_correlation(noise, surface, 4)) < 0.02
+    assert abs(block_correlation(blue, surface, 4)) < 0.02
+    assert block_correlation(shared, surface, 4) == pytest.approx(1, abs=0.1)
+    assert 0.2 < block_correlation(noise + 0.7 * shared, surface, 4) < 0.5
+
+
+def test_relative_rmse_is_the_deviation_over_the_planes_light():
+    truth = np.ones((16, 16, 3))
+    surface = np.zeros((16, 16), bool)
+    surface[:8] = True
+    off = truth + np.where(surface, 0.3, 100.0)[..., None]
+    assert relative_rmse([off, truth - (off - truth)], truth, surface, plane=2.0) == pytest.approx(0.15)
+
+
+def test_contestants_take_turns_and_slow_ones_sit_out(monkeypatch: pytest.MonkeyPatch):
+    calls: list[str] = []
+    seconds = {"quick": 0.1, "slow": 2.0}
+
+    def timed(work):
+        return seconds[work()]
+
+    def contestant(name):
+        def work():
+            calls.append(name)
+            return name
+
+        return work
+
+    monkeypatch.setattr("eval.tracing.timing.seconds_of", timed)
+    times = interleaved({name: contestant(name) for name in seconds}, repetitions=4, slow_repetitions=2)
+    assert calls == ["quick", "slow"] * 3 + ["quick"] * 2  # the first round warms up
+    assert times["slow"].over(times["quick"]) == pytest.approx(20)
+    assert Times((1.0, 2.0, 6.0)).range_over(Times((1.0, 1.0))) == (1.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("count", "text"), [(10_000, "10k"), (1_000_000, "1m"), (2_500_000, "2500k"), (300, "300")]
+)
+def test_counts_are_spelled_as_metrics_want_them(count: int, text: str):
+    assert spelled(count) == text
