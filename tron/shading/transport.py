@@ -29,12 +29,14 @@ class Transport:
 
     Attributes:
         direction: unit, world.
-        weight: what a ray's radiance is multiplied by on its way into irradiance / pi, visibility included.
+        weight: what a ray's radiance is multiplied by on its way into unshadowed irradiance / pi.
+        visibility: transmittance of what stands in the way.
         per_pixel: rays of a pixel.
     """
 
     direction: mi.Vector3f
     weight: mi.Float
+    visibility: mi.Float
     per_pixel: int
 
     @classmethod
@@ -48,10 +50,11 @@ class Transport:
         Raises:
             TronError: ``spp`` is odd or not positive.
         """
-        plan = RayPlan.make(spp, seed)
+        plan = RayPlan.make(spp, seed, gbuffer.width)
         pixels = dr.width(gbuffer.opacity)
         lane = dr.arange(mi.UInt32, pixels * spp)
-        pixel, ray = lane // plan.rays, lane % plan.rays
+        rays = dr.opaque(mi.UInt32, plan.rays)
+        pixel, ray = lane // rays, lane % rays
 
         def spread(value: mi.Point3f) -> mi.Point3f:
             return type(value)(*[dr.gather(mi.Float, channel, pixel) for channel in value])
@@ -63,14 +66,16 @@ class Transport:
             counts = surface & (weight > 0)
             offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
             origin = spread(gbuffer.position) + normal * offset
-            visibility = tracer.transmittance(origin, direction, counts)
-            weight = dr.select(counts, weight * visibility, 0) / mi.Float(plan.count)
-            dr.eval(direction, weight)
-        return cls(direction, weight, spp)
+            (visibility,) = tracer.transmittances(origin, [direction], [counts])
+            weight = dr.select(counts, weight, 0) / mi.Float(plan.count)
+            dr.eval(direction, weight, visibility)
+        return cls(direction, weight, visibility, spp)
 
-    def irradiance(self, light: Light) -> mi.Color3f:
-        """Shadowed irradiance / pi of each pixel under ``light``, linear in it and differentiable."""
-        radiance = light.radiance(self.direction)
-        # Where nothing arrives the lookup may be anything, but 0 x infinity must not reach a sum.
-        found = [dr.select(self.weight > 0, channel * self.weight, 0) for channel in radiance]
-        return mi.Color3f(*[dr.block_sum(channel, self.per_pixel) for channel in found])
+    def irradiance(self, light: Light) -> tuple[mi.Color3f, mi.Color3f]:
+        """Shadowed and unshadowed irradiance / pi of each pixel, linear in ``light`` and differentiable."""
+        found = light.radiance(self.direction) * self.weight
+
+        def of_pixels(value: mi.Color3f) -> mi.Color3f:
+            return mi.Color3f(*[dr.block_sum(channel, self.per_pixel) for channel in value])
+
+        return of_pixels(found * self.visibility), of_pixels(found)

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 
 import drjit as dr
@@ -35,8 +35,11 @@ class SphereOverPlane:
         t = -b - dr.safe_sqrt(under)
         return dr.select((under > 0) & (t > 0) & self.sphere, t, dr.inf)
 
-    def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        return dr.select(active & dr.isfinite(self._sphere_hit(origin, direction)), mi.Float(0), 1)
+    def transmittances(
+        self, origin: mi.Point3f, directions: Sequence[mi.Vector3f], active: Sequence[mi.Bool]
+    ) -> list[mi.Float]:
+        hits = [lanes & dr.isfinite(self._sphere_hit(origin, d)) for d, lanes in zip(directions, active)]
+        return [dr.select(hit, mi.Float(0), 1) for hit in hits]
 
     def gbuffer(self, camera: Camera) -> GBuffer:
         n = camera.width * camera.height
@@ -96,6 +99,8 @@ def points_gbuffer() -> Callable[[np.ndarray, np.ndarray], SimpleNamespace]:
             position=mi.Point3f(columns[0]),
             normal=mi.Normal3f(columns[1]),
             opacity=dr.ones(mi.Float, len(positions)),
+            width=len(positions),
+            height=1,
         )
 
     return make
