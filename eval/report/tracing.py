@@ -118,10 +118,9 @@ def _memory(settings: Tracing, measured: Measured) -> list[Section]:
         return []
     memory = measured.memory
     text = Text(
-        f"A process of its own that makes {settings.memory_surfels:,} surfels, traces one frame of "
+        f"A process of its own that holds {settings.memory_surfels:,} surfels, traces one frame of "
         f"{settings.pixels[-1]}² pixels and as many shadow rays reaches a resident set of "
-        f"{memory['peak']:.0f} MB. Of it {memory['base']:.0f} MB are Python, Mitsuba and LLVM before "
-        f"anything is made; {memory['scene']:.0f} MB was the peak when the surfels had been made, before "
-        "tracing."
+        f"{memory['peak']:.0f} MB. Python, Mitsuba and LLVM alone hold {memory['base']:.0f} MB, and with the "
+        f"surfels made, in NumPy, before tracing, it is {memory['scene']:.0f} MB."
     )
     return [Section("memory", "Memory", [text])]

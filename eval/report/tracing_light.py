@@ -76,7 +76,8 @@ def noise_section(settings: Tracing, measured: Measured, output_dir: Path) -> li
         "a share of the light on an unshadowed upward plane. Independent sampling is the same estimator with "
         "random numbers that know nothing of one another. Speed must not be bought with structure: for pairs "
         "of pixels at one distance, errors must correlate no more within an aligned block than across its "
-        "border; the excess is 0 for noise and 1 for a value shared by a block."
+        "border; the excess is 0 for noise, 1 for a value shared by a block, and below 0 where the pixels of "
+        "a block make up for one another, which is welcome."
     )
     lights = [noise.light for noise in measured.noise]
     error_rows = [

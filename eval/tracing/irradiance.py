@@ -33,8 +33,10 @@ from tron.shading import EnvironmentLight, Lighting, irradiance, render_guidance
 from tron.shading.guidance import shade
 from tron.shading.irradiance import ORIGIN_OFFSET
 from tron.tracing import GBuffer, SurfelTracer
+from tron.tracing.tiles import lanes_of_pixels, tile_pixels
 
 FEW, MANY = 2, 64
+FAN = 4
 REFERENCE_SEED, TRIALS = 1_000_003, 8
 
 
@@ -187,7 +189,8 @@ def block_correlation(errors: np.ndarray, surface: np.ndarray, side: int) -> flo
     Errors are brought to unit size in each pixel first, over the trials, so that no bright penumbra decides.
     Pairs lie one to ``side`` - 1 pixels apart along a row or a column; each offset's mean product within
     blocks is compared with its mean product across borders, and the offsets are averaged by their pairs.
-    Noise gives 0, blue noise too (it is alike on both sides of a border), a value shared by a block 1.
+    Noise gives 0, blue noise too (it is alike on both sides of a border), a value shared by a block 1. Below
+    0, the pixels of a block make up for one another.
 
     Args:
         errors: (K, H, W) of K trials.
@@ -211,41 +214,47 @@ def block_correlation(errors: np.ndarray, surface: np.ndarray, side: int) -> flo
     return float(total / weight) if weight else 0.0
 
 
-@dr.syntax
 def independent_irradiance(
     tracer: SurfelTracer, gbuffer: GBuffer, light: EnvironmentLight, spp: int, seed: int
 ) -> tuple[mi.Color3f, mi.Color3f]:
     """Shadowed and unshadowed irradiance / pi by the estimator of :mod:`tron.shading.irradiance`, plainly.
 
     Every ray has random numbers of its own (PCG32); half are cosine-distributed, half follow the light.
+    Pixels go in tile order and rays in fans, as in the pass itself, so that only the numbers differ.
     """
-    frame = mi.Frame3f(mi.Normal3f(gbuffer.normal))
-    origin = gbuffer.position + frame.n * dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
-    surface = gbuffer.opacity > 0
-    stream = seeds.integer(seed, "independent irradiance", bits=31)
-    random = mi.PCG32(size=dr.width(surface), initstate=dr.opaque(mi.UInt64, stream))
-    half, rays = dr.opaque(mi.UInt32, spp // 2), dr.opaque(mi.UInt32, spp)
-    shadowed, unshadowed = mi.Color3f(0), mi.Color3f(0)
-    ray = mi.UInt32(0)
-    while ray < rays:
-        u = mi.Point2f(random.next_float32(), random.next_float32())
-        towards_light, _ = light.sample(u)
-        around_normal = frame.to_world(mi.warp.square_to_cosine_hemisphere(u))
-        direction = dr.select(ray < half, around_normal, towards_light)
-        cosine_pdf = dr.dot(frame.n, direction) * dr.inv_pi
-        radiance = light.radiance(direction)
-        counts = surface & (cosine_pdf > 0) & (dr.max(radiance) > 0)
-        value = dr.select(counts, radiance * (cosine_pdf / (cosine_pdf + light.pdf(direction))), 0)
-        unshadowed += value
-        shadowed += value * tracer.transmittance(origin, direction, counts)
-        ray += 1
-    scale = dr.rcp(mi.Float(half))
-    dr.eval(shadowed, unshadowed)
-    return shadowed * scale, unshadowed * scale
-
-
-def exposed(image: np.ndarray, exposure: float) -> np.ndarray:
-    """Linear irradiance as the page shows it: through the light's exposure and the display transform."""
-    from tron.color import to_display
-
-    return to_display(np.asarray(image, np.float32), exposure)
+    _, x, y, inside = tile_pixels(gbuffer.width, gbuffer.height)
+    pixel = y * dr.opaque(mi.UInt32, gbuffer.width) + x
+    frame = mi.Frame3f(mi.Normal3f(*[dr.gather(mi.Float, v, pixel, inside) for v in gbuffer.normal]))
+    origin = mi.Point3f(*[dr.gather(mi.Float, v, pixel, inside) for v in gbuffer.position])
+    origin += frame.n * dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
+    surface = inside & (dr.gather(mi.Float, gbuffer.opacity, pixel, inside) > 0)
+    stream = dr.opaque(mi.UInt64, seeds.integer(seed, "independent irradiance", bits=31))
+    random = mi.PCG32(size=dr.width(pixel), initstate=stream)
+    shadowed, unshadowed = (dr.zeros(mi.Color3f, dr.width(pixel)) for _ in range(2))
+    dr.make_opaque(shadowed, unshadowed)
+    dr.eval(frame, origin, surface, random)
+    half, fan = spp // 2, FAN if spp % (2 * FAN) == 0 else 1
+    for first in range(0, spp, fan):
+        follows_light = dr.opaque(mi.Bool, first >= half)
+        directions, values, active = [], [], []
+        for _ in range(fan):
+            u = mi.Point2f(random.next_float32(), random.next_float32())
+            around_normal = frame.to_world(mi.warp.square_to_cosine_hemisphere(u))
+            direction = dr.select(follows_light, light.sample(u)[0], around_normal)
+            cosine_pdf = dr.dot(frame.n, direction) * dr.inv_pi
+            radiance = light.radiance(direction)
+            counts = surface & (cosine_pdf > 0) & (dr.max(radiance) > 0)
+            weight = cosine_pdf / (cosine_pdf + light.pdf(direction))
+            directions.append(direction)
+            active.append(counts)
+            values.append(dr.select(counts, radiance * weight, 0))
+        visible = tracer.transmittances(origin, directions, active)
+        unshadowed += sum(values)
+        shadowed += sum(value * share for value, share in zip(values, visible, strict=True))
+        dr.eval(shadowed, unshadowed, random)
+    lane, scale = lanes_of_pixels(gbuffer.width, gbuffer.height), dr.opaque(mi.Float, 1 / half)
+    in_rows = [
+        mi.Color3f(*[dr.gather(mi.Float, v, lane) for v in color]) * scale for color in (shadowed, unshadowed)
+    ]
+    dr.eval(in_rows)
+    return in_rows[0], in_rows[1]

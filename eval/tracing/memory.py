@@ -1,11 +1,13 @@
 """Peak memory of tracing a large scene, in a process of its own: `python -m eval.tracing.memory COUNT SIZE`.
 
-The figure is the largest resident set of the whole process on a CPU: Python, Mitsuba and LLVM included (told
-apart by what stood before the scene was made), buffers of the scene, lists, hierarchy, and kernels' memory.
+The figure is the largest resident set of the whole process while it traces: Python, Mitsuba and LLVM, the
+scene in NumPy, its records, lists, hierarchy and whatever the kernels need. On a GPU it is the host's part.
 """
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import json
 import resource
 import subprocess
@@ -18,7 +20,7 @@ MEGABYTE = 1e6
 
 
 def measure_memory(count: int, size: int, variant: str, seed: int) -> dict[str, float]:
-    """Peak resident set in MB: ``base`` (libraries), ``scene`` (surfels made), ``peak`` (all traced).
+    """Resident set in MB: ``base`` (libraries loaded), ``scene`` (surfels made), ``peak`` (while tracing).
 
     Raises:
         TronError: the process failed.
@@ -41,6 +43,12 @@ def _resident() -> float:
     return peak / MEGABYTE * (1 if sys.platform == "darwin" else 1024)
 
 
+def _forget() -> None:
+    """Start the high-water mark again from what is resident now, where the system allows it."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
 def main(count: int, size: int, variant: str, seed: int) -> None:
     """Make the scene, trace a view and shadow rays from it, and print the peaks as JSON."""
     from tron.runtime import activate
@@ -54,6 +62,8 @@ def main(count: int, size: int, variant: str, seed: int) -> None:
 
     peaks = {"base": _resident()}
     scene = surfels(count, seed)
+    gc.collect()
+    _forget()
     peaks["scene"] = _resident()
     tracer = SurfelTracer(scene)
     gbuffer = tracer.gbuffer(camera(size))
