@@ -37,14 +37,16 @@ from tron.tracing.kernel import (
     log_response_slope,
 )
 
+_RECORDS = ("geometry", "features", "harmonics")
+
 
 @dataclass
 class _Gradients:
-    """Where gradients are added up, laid out as the records are."""
+    """Where gradients are added up, laid out as the records are; None for records that need none."""
 
-    geometry: mi.Float
-    features: mi.Float
-    harmonics: mi.Float
+    geometry: mi.Float | None
+    features: mi.Float | None
+    harmonics: mi.Float | None
 
 
 @dataclass
@@ -56,6 +58,7 @@ class _Replay:
     direction: mi.Vector3f
     hits: list[HitList]
     sums: Composite
+    wanted: tuple[str, ...]
     differentiate_basis: bool
 
 
@@ -80,8 +83,9 @@ def attach(
     if not has_gradients(records, direction):
         return sums
     view = dr.grad_enabled(direction)
+    wanted = tuple(name for name in _RECORDS if dr.grad_enabled(getattr(records, name)))
     basis = sh_basis(direction.x, direction.y, direction.z)[1:] if records.sh_degree > 0 else []
-    replay = _Replay(records.detached(), dr.detach(origin), dr.detach(direction), hits, sums, view)
+    replay = _Replay(records.detached(), dr.detach(origin), dr.detach(direction), hits, sums, wanted, view)
     channels, mean_depth, transmittance = dr.custom(
         _Compositing, records.geometry, records.features, records.harmonics, basis, replay
     )
@@ -104,11 +108,12 @@ class _Compositing(dr.CustomOp):
         for gradient, value in zip(channels, replay.sums.channels, strict=True):
             rest = dr.fma(gradient, value, rest)
         dr.eval(channels, mean_depth, rest)
+        # Those that nobody asked for, such as the geometry's once it is frozen, cost nothing.
         out = _Gradients(
-            *[
-                dr.zeros(mi.Float, dr.width(a))
-                for a in (records.geometry, records.features, records.harmonics)
-            ]
+            **{
+                name: dr.zeros(mi.Float, dr.width(getattr(records, name))) if name in replay.wanted else None
+                for name in _RECORDS
+            }
         )
         by_basis = (
             [dr.zeros(mi.Float, dr.width(rest)) for _ in self.basis] if replay.differentiate_basis else []
@@ -125,15 +130,15 @@ class _Compositing(dr.CustomOp):
             for target, value in zip(by_basis, added, strict=True):
                 dr.scatter(target, value, hits.ray, hits.count > 0)
         dr.eval(out, by_basis)
-        self.set_grad_in("geometry", out.geometry)
-        self.set_grad_in("features", out.features)
-        self.set_grad_in("harmonics", out.harmonics)
+        for name in replay.wanted:
+            self.set_grad_in(name, getattr(out, name))
         if by_basis:
             self.set_grad_in("basis", by_basis)
 
 
-def _add(target: mi.Float, packet: mi.UInt32, values: list[mi.Float], active: mi.Bool) -> None:
-    dr.scatter_reduce(dr.ReduceOp.Add, target, mi.Vector4f(*values), packet, active)
+def _add(target: mi.Float | None, packet: mi.UInt32, values: list[mi.Float], active: mi.Bool) -> None:
+    if target is not None:
+        dr.scatter_reduce(dr.ReduceOp.Add, target, mi.Vector4f(*values), packet, active)
 
 
 @dr.syntax

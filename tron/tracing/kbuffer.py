@@ -1,4 +1,4 @@
-"""Exact compositing of any number of hits, the nearest eight at a time.
+"""Exact compositing of any number of hits, some of the nearest at a time.
 
 Each round looks for the K nearest hits behind the last one composited; (t, id) orders hits, so coincident
 surfels are neither lost nor met twice. Rays that no tile holds look for them in the hierarchy; the few camera
@@ -25,7 +25,7 @@ from tron.tracing.hits import NEAR_SLACK, LocalHits
 from tron.tracing.kernel import T_MIN, SurfelHit, SurfelRecords, intersect
 from tron.tracing.traversal import walk
 
-K = 8
+K = 16
 _NO_ID = 0xFFFFFFFF
 
 
