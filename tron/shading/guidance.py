@@ -20,7 +20,7 @@ All of it is linear; exposure and AgX are applied when a buffer is looked at or 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -28,14 +28,20 @@ import numpy as np
 
 from tron.shading.denoise import atrous
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
-from tron.shading.irradiance import irradiance
+from tron.shading.irradiance import Occluder, irradiance
 from tron.shading.split_sum import CUBEMAP_RESOLUTION, SplitSum
 
 if TYPE_CHECKING:
     from tron.cameras import Camera
-    from tron.tracing import GBuffer, SurfelTracer
+    from tron.tracing import GBuffer, Surface
 
 DIELECTRIC_F0 = 0.04
+
+
+class ViewTracer(Occluder, Protocol):
+    """What sees and blocks: :class:`tron.tracing.SurfelTracer`, or a closed form in a test."""
+
+    def gbuffer(self, camera: Camera) -> GBuffer: ...
 
 
 class Lighting:
@@ -74,7 +80,7 @@ class Guidance:
 
 
 def render_guidance(
-    tracer: SurfelTracer,
+    tracer: ViewTracer,
     camera: Camera,
     lighting: Lighting,
     spp: int = 64,
@@ -95,35 +101,67 @@ def render_guidance(
         TronError: ``spp`` is odd or not positive.
     """
     gbuffer = tracer.gbuffer(camera)
+    return shade(gbuffer, visibility(tracer, gbuffer, lighting, spp, seed, denoise), lighting)
+
+
+def visibility(
+    tracer: Occluder, gbuffer: GBuffer, lighting: Lighting, spp: int, seed: int, denoise: bool = False
+) -> mi.Color3f:
+    """Share of the unshadowed irradiance that reaches each pixel; arguments as of :func:`render_guidance`."""
     shadowed, unshadowed = irradiance(tracer, gbuffer, lighting.light, spp, seed)
     if denoise:
         shadowed, unshadowed = atrous(shadowed, unshadowed, gbuffer, tracer.scene.spacing)
-    visibility = dr.select(unshadowed > 0, shadowed / unshadowed, 1)
-    return shade(gbuffer, visibility, lighting)
+    return dr.select(unshadowed > 0, shadowed / unshadowed, 1)
+
+
+@dataclass
+class Shaded:
+    """The buffers of :class:`Guidance` on the device, one lane a ray."""
+
+    pbr: mi.Color3f
+    irradiance: mi.Color3f
+    unshadowed: mi.Color3f
+    shadowed: mi.Color3f
+
+
+def shade_surface(seen: Surface, visibility: mi.Color3f, lighting: Lighting) -> Shaded:
+    """Shade what rays see, given the share of the unshadowed irradiance that reaches each of them."""
+    surface = seen.opacity > 0
+    # An empty pixel has no normal, and 0 / 0 must not reach a lookup.
+    normal = dr.select(surface, mi.Vector3f(seen.normal), mi.Vector3f(0, 0, 1))
+    diffuse_color = seen.base_color * (1 - seen.metallic)
+    f0 = DIELECTRIC_F0 * (1 - seen.metallic) + seen.metallic * seen.base_color
+    unshadowed = lighting.split_sum.diffuse(normal)
+    specular = lighting.split_sum.specular(normal, -seen.direction, seen.roughness, f0)
+    shadowed = unshadowed * visibility
+    behind = lighting.light.radiance(seen.direction)
+
+    def shown(shaded: mi.Color3f) -> mi.Color3f:
+        return dr.select(surface, dr.lerp(behind, shaded, seen.opacity), behind)
+
+    buffers = Shaded(
+        pbr=shown(diffuse_color * unshadowed + specular),
+        irradiance=shown(shadowed),
+        unshadowed=shown(unshadowed),
+        shadowed=shown(diffuse_color * shadowed + specular),
+    )
+    dr.eval(buffers.pbr, buffers.irradiance, buffers.unshadowed, buffers.shadowed)
+    return buffers
 
 
 def shade(gbuffer: GBuffer, visibility: mi.Color3f, lighting: Lighting) -> Guidance:
     """Guidance from a G-buffer and the share of the unshadowed irradiance that reaches each pixel."""
-    surface = gbuffer.opacity > 0
-    # An empty pixel has no normal, and 0 / 0 must not reach a lookup.
-    normal = dr.select(surface, mi.Vector3f(gbuffer.normal), mi.Vector3f(0, 0, 1))
-    diffuse_color = gbuffer.base_color * (1 - gbuffer.metallic)
-    f0 = DIELECTRIC_F0 * (1 - gbuffer.metallic) + gbuffer.metallic * gbuffer.base_color
-    unshadowed = lighting.split_sum.diffuse(normal)
-    specular = lighting.split_sum.specular(normal, -gbuffer.direction, gbuffer.roughness, f0)
-    shadowed = unshadowed * visibility
-    behind = lighting.light.radiance(gbuffer.direction)
+    shaded = shade_surface(gbuffer, visibility, lighting)
 
-    def image(shaded: mi.Color3f) -> np.ndarray:
-        shown = dr.select(surface, dr.lerp(behind, shaded, gbuffer.opacity), behind)
-        return np.ascontiguousarray(np.array(shown).T.reshape(gbuffer.height, gbuffer.width, 3))
+    def image(color: mi.Color3f) -> np.ndarray:
+        return np.ascontiguousarray(np.array(color).T.reshape(gbuffer.height, gbuffer.width, 3))
 
     buffers = gbuffer.numpy()
     return Guidance(
-        pbr=image(diffuse_color * unshadowed + specular),
-        irradiance=image(shadowed),
-        unshadowed=image(unshadowed),
-        shadowed=image(diffuse_color * shadowed + specular),
+        pbr=image(shaded.pbr),
+        irradiance=image(shaded.irradiance),
+        unshadowed=image(shaded.unshadowed),
+        shadowed=image(shaded.shadowed),
         mask=buffers["opacity"],
         gbuffer=buffers,
     )

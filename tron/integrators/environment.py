@@ -1,0 +1,92 @@
+"""The environment emitter of a Mitsuba scene -> EnvironmentMap.
+
+An ``envmap`` that stands upright in a z-up world (a turn about +z after ``rotate([1, 0, 0], 90)``) is taken
+texel by texel. Any other emitter (tilted, mirrored, of another shape, ``constant``, ``sunsky``) is asked for
+its radiance on a grid four times as fine as the map, and averaged.
+"""
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false
+# (Mitsuba's type stubs do not know arithmetic between its own array types.)
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from tron.errors import TronError
+from tron.shading.environment import EnvironmentMap
+
+SAMPLED_HEIGHT = 256
+"""Rows of the map of an emitter that has none of its own."""
+OVERSAMPLING = 4
+"""Rows that are asked for, for each row of a sampled map."""
+
+
+def environment_of(scene: mi.Scene) -> EnvironmentMap:
+    """The light of ``scene`` from infinity, as the scene has it now.
+
+    Raises:
+        TronError: the scene has no environment emitter.
+    """
+    emitter = scene.environment()
+    if emitter is None:
+        raise TronError(
+            "the scene has no environment to light the surfels",
+            mend="add an emitter such as `envmap` or `constant` to it, or give the integrator `environment`",
+        )
+    if emitter.class_name() != "EnvironmentMapEmitter":
+        return _sampled(emitter, SAMPLED_HEIGHT)
+    parameters: Any = mi.traverse(emitter)
+    image = np.array(parameters["data"])[:, 1:-1, :3]  # Mitsuba repeats a column at either side
+    rotation = _turn_about_z(np.array(parameters["to_world"].matrix)[..., 0])
+    if rotation is None or image.shape[1] != 2 * image.shape[0]:
+        return _sampled(emitter, image.shape[0])
+    return EnvironmentMap(image * float(parameters["scale"][0]), rotation)
+
+
+def light_state(scene: mi.Scene) -> list[Any]:
+    """Equal for equal states of the scene's environment; changes when a parameter of it does."""
+    emitter = scene.environment()
+    if emitter is None:
+        return []
+    return [emitter.ptr, *(_Held(value) for _, value in mi.traverse(emitter))]
+
+
+class _Held:
+    """A parameter, equal to itself while its variables are the same; held, so that none takes their place."""
+
+    def __init__(self, value: Any) -> None:
+        self._value = dr.detach(value) if dr.is_array_v(value) else value
+        self._identity = mi.util._jit_id_hash(value)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Held) and self._identity == other._identity
+
+
+def _turn_about_z(to_world: np.ndarray) -> float | None:
+    """Degrees by which an upright map is turned about +z; None if it does not stand upright."""
+    upright = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # rotate([1, 0, 0], 90)
+    turn = to_world[:3, :3] @ upright.T
+    angle = math.atan2(turn[1, 0], turn[0, 0])
+    cos, sin = math.cos(angle), math.sin(angle)
+    if np.abs(turn - [[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]).max() > 1e-5:
+        return None
+    return math.degrees(angle)
+
+
+def _sampled(emitter: mi.Emitter, height: int) -> EnvironmentMap:
+    """The emitter's radiance by directions; rows stand on the poles, columns on half texels."""
+    rows = OVERSAMPLING * height
+    theta, turn = np.meshgrid(
+        np.arange(rows) / (rows - 1) * np.pi, (np.arange(2 * rows) + 0.5) / rows * np.pi, indexing="ij"
+    )
+    theta = theta.clip(1e-4, np.pi - 1e-4)  # at a pole an azimuth is anybody's guess
+    d = np.stack([np.sin(theta) * np.sin(turn), np.sin(theta) * np.cos(turn), np.cos(theta)])
+    si = dr.zeros(mi.SurfaceInteraction3f, d[0].size)
+    si.wi = -mi.Vector3f(d.reshape(3, -1).astype(np.float32))
+    radiance = np.array(mi.Color3f(emitter.eval(si))).T
+    return EnvironmentMap(radiance.reshape(rows, 2 * rows, 3)).resized(height)

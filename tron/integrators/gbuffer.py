@@ -1,0 +1,65 @@
+"""``tron_gbuffer``: what the surfels are along each ray of a sensor.
+
+    property       type      meaning
+    filename       string    the surfels: a PLY of TRON, 2DGS or 3DGS
+    surfels        object    or a scene from memory: tron.integrators.embed(scene)
+
+Main channels: radiance of the surfels' harmonics, display space, premultiplied by opacity, which is alpha.
+Others, named as Mitsuba's ``aov`` integrator names its own, 0 where there is no surfel:
+
+    position.X .Y .Z     world
+    depth.T              distance along the ray from the near plane to the median hit, 0 where there is none
+    normal.X .Y .Z       unit, world
+    base_color.R .G .B   linear
+    roughness.Y  metallic.Y  opacity.Y
+
+A pixel is the film's filtered mean of these over its rays. For rays through pixel centres alone take a box
+filter and the sampler ``{"type": "stratified", "jitter": False, "sample_count": 1}``. A ray begins on the
+near plane of its sensor, and surfels in front of it are not seen; the far plane is ignored.
+
+``mi.traverse(integrator)`` exposes the parameters of the surfels. All of them are differentiable by
+``mi.render``, as :class:`tron.tracing.SurfelTracer` is: visibility is not.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.integrators.plugin import Shown
+from tron.integrators.surfels import Surfels
+from tron.tracing import Surface
+
+CHANNELS = {
+    "position": "XYZ",
+    "depth": "T",
+    "normal": "XYZ",
+    "base_color": "RGB",
+    "roughness": "Y",
+    "metallic": "Y",
+    "opacity": "Y",
+}
+"""Fields of a surface and the names of their components."""
+
+
+class GBufferAppearance:
+    """Shows the fields of the surface that a ray meets."""
+
+    def __init__(self, properties: mi.Properties) -> None:
+        self.surfels = Surfels(properties, "tron_gbuffer")
+        self.channels = [f"{name}.{part}" for name, parts in CHANNELS.items() for part in parts]
+
+    def show(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, width: int, seed: int) -> Shown:
+        """See :class:`tron.integrators.plugin.Appearance`."""
+        del scene, width, seed
+        seen = self.surfels.trace(ray.o, ray.d, active)
+        extra = [part for name in CHANNELS for part in _parts(seen, name)]
+        return Shown(seen.rgb, seen.opacity, extra)
+
+
+def _parts(seen: Surface, name: str) -> list[mi.Float]:
+    value = getattr(seen, name)
+    if len(CHANNELS[name]) == 1:
+        return [value]
+    here = seen.opacity > 0  # without a surfel there is no position, only an origin
+    return [dr.select(here, part, 0) for part in value]

@@ -1,0 +1,86 @@
+"""``tron_guidance``: what the surfels look like under an environment, along each ray of a sensor.
+
+    property            type      meaning
+    filename, surfels             as of tron_gbuffer
+    environment         string    the light: a lat-long .hdr or .exr in TRON's orientation (up is +z)
+                        object    or from memory: tron.integrators.embed(environment_map)
+                                  without either, the Mitsuba scene's own environment emitter
+    buffer              string    main channels: pbr (default), irradiance, unshadowed or shadowed
+    shadow_rays         integer   a camera ray, even; 64 (default) for one sample a pixel, fewer for more
+    two_sided           boolean   whether back faces block shadow rays (default: true)
+    cubemap_resolution  integer   of the prefiltered environment
+
+Buffers are those of :mod:`tron.shading.guidance`: linear, blended with the environment by opacity, which is
+alpha. Those that are not the main channels follow as ``irradiance.R`` and so on, then ``opacity.Y``.
+
+Gradients reach the surfels through what camera rays see, as shading has it; what shadow rays find is a
+constant, and so is the light.
+"""
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false
+# (Mitsuba's type stubs do not know arithmetic between its own array types.)
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.errors import TronError
+from tron.integrators.environment import environment_of, light_state
+from tron.integrators.plugin import Shown
+from tron.integrators.surfels import Surfels, unwrap
+from tron.shading.environment import EnvironmentMap
+from tron.shading.guidance import Lighting, Shaded, shade_surface, visibility
+from tron.shading.split_sum import CUBEMAP_RESOLUTION
+from tron.tracing import GBuffer, Surface
+
+BUFFERS = tuple(f.name for f in fields(Shaded))
+
+
+class GuidanceAppearance:
+    """Shows surfels under a light."""
+
+    def __init__(self, properties: mi.Properties) -> None:
+        self.surfels = Surfels(properties, "tron_guidance")
+        self.buffer = properties.get("buffer", BUFFERS[0])
+        if self.buffer not in BUFFERS:
+            mend = f"choose one of {', '.join(BUFFERS)}"
+            raise TronError(f"tron_guidance has no buffer {self.buffer!r}", mend=mend)
+        self.others = [name for name in BUFFERS if name != self.buffer]
+        self.channels = [f"{name}.{part}" for name in self.others for part in "RGB"] + ["opacity.Y"]
+        self.shadow_rays = int(properties.get("shadow_rays", 64))
+        self._resolution = int(properties.get("cubemap_resolution", CUBEMAP_RESOLUTION))
+        self._environment = _given_environment(properties)
+        self._prepared: tuple[Any, Lighting] | None = None
+
+    def show(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, width: int, seed: int) -> Shown:
+        """See :class:`tron.integrators.plugin.Appearance`."""
+        lighting = self._lighting(scene)
+        seen = self.surfels.trace(ray.o, ray.d, active)
+        with dr.suspend_grad():
+            fixed = {f.name: dr.detach(getattr(seen, f.name)) for f in fields(Surface)}
+            rays = GBuffer(**fixed, width=width, height=dr.width(seen.opacity) // width)
+            dr.eval(*fixed.values())
+            reaching = visibility(self.surfels.tracer, rays, lighting, self.shadow_rays, seed)
+        shaded = shade_surface(seen, reaching, lighting)
+        extra = [part for name in self.others for part in getattr(shaded, name)]
+        return Shown(getattr(shaded, self.buffer), seen.opacity, [*extra, seen.opacity])
+
+    def _lighting(self, scene: mi.Scene) -> Lighting:
+        """Prepared once, and again when the scene's light has changed."""
+        state = None if self._environment else light_state(scene)
+        if self._prepared is None or self._prepared[0] != state:
+            environment = self._environment or environment_of(scene)
+            self._prepared = state, Lighting(environment, self._resolution)
+        return self._prepared[1]
+
+
+def _given_environment(properties: mi.Properties) -> EnvironmentMap | None:
+    if "environment" not in properties:
+        return None
+    if isinstance(properties["environment"], str):
+        return EnvironmentMap.load(properties["environment"])
+    return unwrap(properties, "environment", EnvironmentMap, "tron_guidance")
