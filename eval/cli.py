@@ -83,6 +83,7 @@ cli = command(
         "tron-eval benchmark=demo output_dir=outputs/demo",
         "tron-eval benchmark=relighting dataset=outputs/data renderer=outputs/train/renderer.safetensors "
         "output_dir=outputs/relighting",
+        "tron-eval benchmark=tracing output_dir=outputs/tracing",
     ),
 )
 

@@ -34,7 +34,7 @@ def print_results(results: Results, targets: Sequence[Target], report: Path) -> 
             style = "green" if tone == "good" else "red"
             value = written(row.value, row.unit, signed)
             others.add_row(row.metric, value, bound(target, row.unit), f"[{style}]{words}[/]")
-        elif full is None and re.match(r"(demo|surfels|guidance)\.[a-z_]+$", row.metric):
+        elif full is None and re.match(r"(demo|surfels|guidance|irradiance)\.[a-z0-9_]+$", row.metric):
             others.add_row(row.metric, written(row.value, row.unit), "", "")
     for target in targets:
         if results.find(target.metric) is None:

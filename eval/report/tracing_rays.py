@@ -133,7 +133,7 @@ def _camera_table(frames: Sequence[CameraRays]) -> Table:
                 row += [Cell("—")] * 3
         rows.append(row)
     absent = "" if "gsplat" in peers else " gsplat's 2DGS is absent: it needs a GPU and the package."
-    caption = "Camera rays; higher is better, below 1 the peer is faster. Medians of ratios' parts." + absent
+    caption = "Camera rays. Ratios are of medians; below 1 the peer is faster." + absent
     return Table(caption, headings, rows, groups)
 
 
