@@ -1,0 +1,82 @@
+"""Two spheres of surfels that shade each other, seen from all sides under a known light."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from tron.cameras import Camera
+from tron.captures import Capture, View
+from tron.color import agx
+from tron.gaussians import GaussianScene
+from tron.gaussians.harmonics import SH_COUNT
+from tron.gaussians.scene import quats_from_normals
+from tron.shading import EnvironmentMap, Lighting, irradiance, render_guidance
+from tron.tracing import SurfelTracer
+
+SIZE = 32
+
+
+def spheres(per_sphere: int = 1200) -> GaussianScene:
+    """Radius 0.5 about (-0.6, 0, 0) and 0.4 about (0.5, 0.1, 0.2), on Fibonacci's spirals."""
+    i = np.arange(per_sphere) + 0.5
+    z, angle = 1 - 2 * i / per_sphere, i * np.pi * (3 - np.sqrt(5))
+    r = np.sqrt(1 - z * z)
+    normals = np.stack([r * np.cos(angle), r * np.sin(angle), z], -1)
+    centres = np.array([[-0.6, 0, 0], [0.5, 0.1, 0.2]])
+    radii = np.array([0.5, 0.4])
+    count = 2 * per_sphere
+    spacing = np.repeat(np.sqrt(4 * np.pi / per_sphere) * radii, per_sphere)
+    return GaussianScene(
+        means=(centres[:, None] + radii[:, None, None] * normals).reshape(-1, 3),
+        quats=quats_from_normals(np.tile(normals, (2, 1))),
+        log_scales=np.repeat(np.log(0.6 * spacing)[:, None], 2, 1),
+        opacity_logits=np.full(count, 4.6),
+        sh=np.zeros((count, SH_COUNT, 3)),
+        base_color=np.tile([0.6, 0.5, 0.4], (count, 1)),
+        roughness=np.full(count, 0.4),
+        metallic=np.zeros(count),
+        object_id=np.repeat([1, 2], per_sphere),
+        kernel_degree=2,
+        spacing=float(spacing.mean()),
+    )
+
+
+@pytest.fixture(scope="session")
+def tracer(variant: str) -> SurfelTracer:
+    return SurfelTracer(spheres())
+
+
+@pytest.fixture(scope="session")
+def studio() -> EnvironmentMap:
+    """Two soft lights of different colours, a dim room and a dimmer floor."""
+    image = np.full((32, 64, 3), 0.15, np.float32)
+    image[20:] = 0.05
+    image[8:14, 5:16] = (8.0, 7.0, 6.0)
+    image[6:11, 36:42] = (3.0, 4.0, 7.0)
+    return EnvironmentMap(image)
+
+
+@pytest.fixture(scope="session")
+def captured(tracer: SurfelTracer) -> Callable[..., Capture]:
+    """A capture of the spheres: photos under a light; the prior is its irradiance times ``prior_scale``."""
+
+    def capture(light: EnvironmentMap, views: int = 8, prior_scale: float = 1.0) -> Capture:
+        lighting, exposure = Lighting(light, 64), light.exposure()
+        made = []
+        for i in range(views):
+            turn, height = 2 * np.pi * i / views, (2.5, 0.3, -2.5)[i % 3]
+            eye = np.array([3 * np.cos(turn), 3 * np.sin(turn), height])
+            camera = Camera.look_at(
+                eye / np.linalg.norm(eye) * 4, (0, 0, 0), fov_deg=32, width=SIZE, height=SIZE
+            )
+            gbuffer = tracer.gbuffer(camera)
+            prior = [irradiance(tracer, gbuffer, lighting.light, 64, seed)[0] for seed in range(4)]
+            prior = prior_scale * np.mean([np.array(p).T for p in prior], 0).reshape(SIZE, SIZE, 3)
+            shadowed = render_guidance(tracer, camera, lighting, 64, seed=9).shadowed
+            made.append(View(f"{i}", camera, agx(exposure * shadowed), "display", irradiance=prior))
+        return Capture(tuple(made), exposure=exposure)
+
+    return capture

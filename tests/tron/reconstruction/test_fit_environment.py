@@ -1,0 +1,188 @@
+"""Laws of environment fitting: a known light is found again, and so is the scale of its photos."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from tron.captures import Capture
+from tron.errors import TronError
+from tron.reconstruction import EnvironmentFit, FitSettings, fit_environment
+from tron.reconstruction.light_scale import choose_photos, fit_scale
+from tron.seeds import generator
+from tron.shading import EnvironmentMap, Lighting
+
+QUICK = FitSettings(resolution=16, steps=250, rays=16, pixels=512, scale_steps=100, split_sum_resolution=64)
+
+
+def cosine_integral(light: EnvironmentMap, normals: np.ndarray, height: int = 96) -> np.ndarray:
+    """(N, 3) irradiance / pi by midpoints over directions in float64: the witness."""
+    t, p = np.meshgrid(
+        (np.arange(height) + 0.5) / height * np.pi,
+        (np.arange(2 * height) + 0.5) / height * np.pi,
+        indexing="ij",
+    )
+    d = np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], -1).reshape(-1, 3)
+    weight = np.maximum(normals @ d.T, 0) * np.sin(t).ravel() * (np.pi / height) ** 2 / np.pi
+    return weight @ light.lookup(d).astype(np.float64)
+
+
+def irradiance_error(found: EnvironmentMap, truth: EnvironmentMap) -> float:
+    """Relative error (L2) over all normals of the sphere."""
+    normals = generator(0, "normals").normal(size=(500, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    a, b = cosine_integral(found, normals), cosine_integral(truth, normals)
+    return float(np.linalg.norm(a - b) / np.linalg.norm(b))
+
+
+@pytest.fixture(scope="module")
+def fit(tracer, captured, studio) -> EnvironmentFit:
+    return fit_environment(captured(studio, prior_scale=0.4), tracer, QUICK)
+
+
+def test_a_known_light_is_found_and_its_scale_corrected(fit: EnvironmentFit, studio: EnvironmentMap) -> None:
+    # The prior is 0.4 of the truth: stage 3a finds that light, stage 3b the factor that the photos ask for.
+    assert irradiance_error(EnvironmentMap(fit.environment.image / fit.sigma), studio) > 0.5
+    assert irradiance_error(fit.environment, studio) < 0.05
+    assert fit.sigma == pytest.approx(1 / 0.4, rel=0.02)
+
+
+def test_the_losses_fall(fit: EnvironmentFit) -> None:
+    assert len(fit.irradiance_loss) == QUICK.steps
+    assert len(fit.scale_loss) == len(fit.scale_curve) == QUICK.scale_steps
+    assert fit.irradiance_loss[-25:].mean() < 0.3 * fit.irradiance_loss[:5].mean()
+    assert fit.scale_loss[-25:].mean() < 0.3 * fit.scale_loss[:5].mean()
+    assert fit.scale_curve[0] == 1
+
+
+def test_lights_are_where_they_were(fit: EnvironmentFit, studio: EnvironmentMap) -> None:
+    truth = studio.resized(fit.environment.image.shape[0])
+    found = fit.environment.image
+    brightest = truth.image.sum(-1) > 10
+    assert found[brightest].mean() > 5 * found[~brightest].mean()
+
+
+def test_a_small_sun_is_found(tracer, captured) -> None:
+    image = np.full((32, 64, 3), 0.3, np.float32)
+    image[7:9, 20:22] = (300.0, 280.0, 240.0)
+    sun = EnvironmentMap(image)
+    settings = replace(QUICK, steps=400, scale_steps=0)
+    found = fit_environment(captured(sun), tracer, settings)
+    assert found.sigma == 1
+    assert irradiance_error(found.environment, sun) < 0.05
+
+
+def test_sigma_is_a_known_scale_within_a_hundredth(tracer, captured, studio) -> None:
+    capture = captured(studio)
+    photos = choose_photos(capture.train_views, 6, 10**6, capture.exposure, seed=0)
+    for scale in (0.3, 1.0, 20.0):
+        dimmed = Lighting(EnvironmentMap(studio.image / np.float32(scale)), 64)
+        found = fit_scale(
+            tracer,
+            photos,
+            dimmed,
+            exposure=capture.exposure,
+            steps=150,
+            rays=32,
+            learning_rate=0.1,
+            seed=0,
+            track=lambda items, _: items,
+        )
+        assert found.sigma == pytest.approx(scale, rel=0.01)
+
+
+def test_linear_photos_ask_for_the_same_scale(tracer, captured, studio) -> None:
+    from tron.shading import render_guidance
+
+    capture, lighting = captured(studio, views=3), Lighting(studio, 64)
+    linear = [
+        replace(view, image=render_guidance(tracer, view.camera, lighting, 64, 9).shadowed, space="linear")
+        for view in capture.views
+    ]
+    one, other = (choose_photos(views, 3, 10**6, capture.exposure, 0) for views in (capture.views, linear))
+    for a, b in zip(one, other):
+        np.testing.assert_allclose(a.shown, b.shown, atol=1e-5)
+
+
+def test_the_sky_counts_in_neither_stage(tracer, captured, studio) -> None:
+    capture = captured(studio)
+    settings = replace(QUICK, steps=100, scale_steps=50)
+    spoiled = []
+    for view in capture.views:
+        sky = np.zeros((32, 32), np.float32)
+        sky[:10] = 1
+        image, prior = view.read().copy(), view.read("irradiance").copy()
+        image[:10], prior[:10] = generator(1, view.name).random((10, 32, 3)), 1000
+        spoiled.append(replace(view, image=image, irradiance=prior, sky_mask=sky))
+    masked = [replace(v, sky_mask=s.sky_mask) for v, s in zip(capture.views, spoiled)]
+    one, other = (
+        fit_environment(Capture(tuple(views), exposure=capture.exposure), tracer, settings)
+        for views in (masked, spoiled)
+    )
+    # Threads sum gradients in any order, so the two differ by rounding that the steps amplify.
+    np.testing.assert_allclose(one.irradiance_loss[:20], other.irradiance_loss[:20], rtol=1e-2)
+    assert one.sigma == pytest.approx(other.sigma, rel=1e-2)
+
+
+def test_texels_that_no_ray_met_keep_the_first_light(tracer, captured, studio) -> None:
+    capture = captured(studio, views=1)
+    settings = replace(QUICK, resolution=64, steps=2, rays=2, pixels=16, scale_steps=0)
+    found = fit_environment(capture, tracer, settings)
+    assert 0 < found.seen.mean() < 1
+    assert np.ptp(found.texels[~found.seen], axis=0).max() < 1e-5
+    assert np.ptp(found.texels[found.seen], axis=0).max() > 1e-3
+
+
+def test_one_thread_repeats_bit_by_bit_and_seeds_differ(tracer, captured, studio) -> None:
+    import drjit as dr
+
+    capture, settings = captured(studio, views=2), replace(QUICK, steps=10, scale_steps=0)
+    dr.set_thread_count(1)  # the fixture drjit_threads gives them back
+    one, two = (fit_environment(capture, tracer, settings).texels for _ in range(2))
+    other = fit_environment(capture, tracer, replace(settings, seed=1)).texels
+    np.testing.assert_array_equal(one, two)
+    assert (one != other).any()
+
+
+def test_what_is_wrong_is_said_before_the_work(tracer, captured, studio) -> None:
+    capture = captured(studio, views=1)
+    view = capture.views[0]
+    with pytest.raises(TronError, match="no training view has an irradiance map"):
+        fit_environment(Capture((replace(view, irradiance=None),)), tracer, QUICK)
+    broken = replace(view, irradiance=partial(np.full, (32, 32, 3), np.nan))
+    with pytest.raises(TronError, match="irradiance holds 3072 values that are NaN"):
+        fit_environment(Capture((broken,)), tracer, QUICK)
+    hidden = replace(view, sky_mask=np.ones((32, 32)))
+    with pytest.raises(TronError, match="no view shows a surface"):
+        fit_environment(Capture((hidden,)), tracer, QUICK)
+
+
+def test_a_scene_without_fronts_is_refused(tracer, captured, studio) -> None:
+    with pytest.raises(TronError, match="orientation"):
+        fit_environment(captured(studio, views=1), replace(tracer.scene, oriented=False), QUICK)
+
+
+@pytest.mark.parametrize(
+    "change", [{"rays": 3}, {"steps": 0}, {"resolution": 1}, {"learning_rate": 0.0}, {"estimator": "best"}]
+)
+def test_settings_outside_their_range_are_refused(change: dict) -> None:
+    with pytest.raises(TronError, match=next(iter(change))):
+        FitSettings(**change)
+
+
+def test_the_papers_settings() -> None:
+    paper = FitSettings.paper(seed=3)
+    assert (paper.resolution, paper.steps, paper.seed) == (512, 4000, 3)
+
+
+def test_large_photos_are_reduced_by_averaging(captured, studio) -> None:
+    view = captured(studio, views=1).views[0]
+    (photo,) = choose_photos([view], 1, 300, 1.0, 0)
+    assert photo.factor == 2
+    assert photo.shown.shape == (16, 16, 3)
+    np.testing.assert_allclose(photo.shown[3, 5], view.read()[6:8, 10:12].mean((0, 1)), rtol=1e-5)
+    points = generator(0, "points").normal(size=(5, 3)) * 0.3
+    np.testing.assert_allclose(photo.camera.project(points)[0], view.camera.project(points)[0] / 2, rtol=1e-9)

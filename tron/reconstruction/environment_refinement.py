@@ -1,0 +1,132 @@
+"""Stage 3a: a cubemap such that the shadowed irradiance it gives the frozen scene is that of a prior.
+
+The parameter is the logarithm of radiance, so light is positive and suns are within reach. Each step takes
+one view, draws rays by multiple importance sampling from the cubemap as it stands, traces their visibility
+and moves the texels they met along the gradient of the mean absolute error (paper, Algorithm 2). With a new
+light comes a new density to draw from.
+
+The "plain" estimator, the paper's, sums what the rays bring. Its noise is shared by the sign of the error
+and by the gradient, so the two correlate and the fit is biased, however many the steps. The "ratio"
+estimator, the default, takes from the rays only the share that is visible, and the unshadowed irradiance
+without noise from the texels, as the guidance buffers do. Measured on a sphere over a plane, relative error
+of irradiance over all normals: a studio of soft lights 10 % plain and 0.8 % by the ratio at 16 rays, 2 %
+and 0.6 % at 64 and 32; a sun of six degrees 14 % and 1.6 % at 16 rays.
+"""
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from tron.errors import TronError
+from tron.reconstruction.surface_points import PointBatch, SurfacePoints
+from tron.seeds import generator, integer
+from tron.shading.cubemap import CubemapLight
+from tron.shading.irradiance import Occluder
+from tron.shading.prefilter import unoccluded_irradiance
+from tron.shading.transport import Transport
+
+Estimator = Literal["ratio", "plain"]
+
+DARKEST = 1e-4
+"""The first light is at least this bright, relative to its brightest channel: a logarithm needs light."""
+
+
+@dataclass
+class Refinement:
+    """A fitted cubemap.
+
+    Attributes:
+        texels: (6, R, R, 3) float32 linear radiance.
+        seen: (6, R, R) bool, texels that any ray met; the others keep their initial radiance.
+        loss: (steps,) float64, the mean absolute error of each step's view, in the unit of the prior.
+    """
+
+    texels: np.ndarray
+    seen: np.ndarray
+    loss: np.ndarray
+
+
+def refine(
+    tracer: Occluder,
+    points: SurfacePoints,
+    *,
+    resolution: int,
+    steps: int,
+    rays: int,
+    pixels: int,
+    learning_rate: float,
+    final_learning_rate: float,
+    seed: int,
+    estimator: Estimator = "ratio",
+    track: Callable[[Iterable[int], str], Iterable[int]],
+    initial: np.ndarray | None = None,
+) -> Refinement:
+    """Fit the cubemap.
+
+    Args:
+        tracer: what blocks light.
+        points: surface points with the irradiance / pi that is wanted there.
+        resolution: texels along a face edge.
+        steps: updates.
+        rays: shadow rays a point, even.
+        pixels: points a step.
+        learning_rate, final_learning_rate: Adam's steps in log radiance, which fall exponentially.
+        seed: root of views, points and rays.
+        estimator: see the module.
+        track: wraps the steps, to show progress.
+        initial: (6, R, R, 3) radiance to start from; else the constant whose unshadowed irradiance is the
+            prior's mean.
+
+    Raises:
+        TronError: the loss is not finite; the message names the step.
+    """
+    if initial is None:
+        mean = np.maximum(points.mean_target, DARKEST * points.mean_target.max())
+        initial = np.broadcast_to(mean, (6, resolution, resolution, 3))
+    parameter = mi.Float(np.log(np.asarray(initial, np.float64)).astype(np.float32).ravel())
+    optimizer = mi.ad.Adam(learning_rate, {"log_radiance": parameter}, epsilon=1e-15)
+    decay = (final_learning_rate / learning_rate) ** (1 / max(1, steps - 1))
+    draw = generator(seed, "environment", "steps")
+    loss_curve = np.empty(steps)
+    seen = dr.zeros(mi.Bool, dr.width(parameter))
+    for step in track(range(steps), "Environment"):
+        view = int(draw.integers(points.views))
+        batch = points.batch(view, pixels, draw)
+        light = CubemapLight(dr.exp(optimizer["log_radiance"]), resolution)
+        ray_seed = integer(seed, "environment", "rays", step)
+        transport = Transport.trace(tracer, batch, light, rays, ray_seed)
+        error = dr.abs(_estimate(transport, light, batch, estimator) - batch.target)
+        loss = dr.mean((error.x + error.y + error.z) / 3)
+        dr.backward(loss)
+        seen |= dr.grad(optimizer["log_radiance"]) != 0
+        dr.schedule(seen)
+        optimizer.set_learning_rate(dr.opaque(mi.Float, learning_rate * decay**step))
+        optimizer.step()
+        loss_curve[step] = float(loss[0])
+        if not np.isfinite(loss_curve[step]):
+            raise TronError(
+                f"the loss of the environment is {loss_curve[step]} at step {step}",
+                mend="lower the learning rate, or look at the irradiance prior",
+            )
+    texels = np.array(dr.exp(optimizer["log_radiance"])).reshape(6, resolution, resolution, 3)
+    met = np.array(seen).reshape(6, resolution, resolution, 3).any(-1)
+    return Refinement(texels, met, loss_curve)
+
+
+def _estimate(
+    transport: Transport, light: CubemapLight, batch: PointBatch, estimator: Estimator
+) -> mi.Color3f:
+    shadowed, unshadowed = transport.irradiance(light)
+    if estimator == "plain":
+        return shadowed
+    visible = [dr.select(u > 0, s / u, 1) for s, u in zip(shadowed, unshadowed)]
+    return unoccluded_irradiance(light, batch.normal) * mi.Color3f(*visible)
