@@ -12,6 +12,7 @@ from tron.tracing.bvh import build_bvh
 from tron.tracing.gbuffer import GBuffer, trace_gbuffer
 from tron.tracing.parameters import SurfelParameters, pack
 from tron.tracing.rays import trace_rays
+from tron.tracing.shadow_gradient import transmittance_by_opacity
 from tron.tracing.surface import Surface
 from tron.tracing.tiles import build_tiles
 from tron.tracing.transmittance import BACK_FACE_SPACINGS, transmittance
@@ -27,22 +28,26 @@ class SurfelTracer:
     Args:
         scene: the surfels; must be valid (``scene.validate()``), and must not change while the tracer lives.
         two_sided: let back faces block shadow rays beyond two spacings; False is the paper's rule.
+        parameters: traced instead of the scene's own arrays; results are differentiable by those of them that
+            have gradients enabled.
 
     Attributes:
         records: the surfels as every kernel reads them. bvh: their hierarchy.
     """
 
-    def __init__(self, scene: GaussianScene, *, two_sided: bool = True) -> None:
+    def __init__(
+        self, scene: GaussianScene, *, two_sided: bool = True, parameters: SurfelParameters | None = None
+    ) -> None:
         self.scene = scene
-        self.records = pack(SurfelParameters.from_scene(scene))
+        self.records = pack(parameters or SurfelParameters.from_scene(scene))
         # Not built when first needed: that may be inside a recorded loop, where nothing can be evaluated.
-        self.bvh = build_bvh(self.records)
+        self.bvh = build_bvh(self.records.detached())
         reach = BACK_FACE_SPACINGS * scene.spacing if two_sided else float("inf")
         self._back_faces_from = dr.opaque(mi.Float, reach)
 
     def gbuffer(self, camera: Camera) -> GBuffer:
         """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it."""
-        lists = build_tiles(self.records, camera)
+        lists = build_tiles(self.records.detached(), camera)
         return trace_gbuffer(self.records, lists, camera)
 
     def trace(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True) -> Surface:
@@ -64,3 +69,11 @@ class SurfelTracer:
     ) -> list[mi.Float]:
         """The same for a fan of rays from each origin: quicker together, the more so the closer they are."""
         return transmittance(self.bvh, origin, directions, self._back_faces_from, active)
+
+    def transmittance_by_opacity(
+        self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
+    ) -> mi.Float:
+        """:meth:`transmittance`, differentiable by the opacities; not inside a recorded loop."""
+        return transmittance_by_opacity(
+            self.records, self.bvh, origin, direction, self._back_faces_from, mi.Bool(active)
+        )

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.tracing.bvh import Bvh
-from tron.tracing.kernel import intersect
+from tron.tracing.kernel import SurfelHit, intersect
 from tron.tracing.traversal import walk
 
 OPAQUE_TRANSMITTANCE = 1e-2
@@ -32,6 +32,11 @@ class _Products:
     product: list[mi.Float]
     nearest: list[mi.Float]
     farthest: list[mi.Float]
+
+
+def blocks(met: SurfelHit, back_faces_from: mi.Float) -> mi.Bool:
+    """Whether a surfel stands in the ray's way: the rule of sidedness above."""
+    return met.within & (met.t > dr.select(met.front, 0, back_faces_from))
 
 
 def transmittance(
@@ -56,8 +61,9 @@ def transmittance(
     def visit(state: _Products, surfel: mi.UInt32, _: mi.Bool) -> _Products:
         for ray, direction in enumerate(directions):
             met = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
-            blocks = met.within & (met.t > dr.select(met.front, 0, back_faces_from))
-            product = dr.select(blocks, state.product[ray] * (1 - met.alpha), state.product[ray])
+            product = dr.select(
+                blocks(met, back_faces_from), state.product[ray] * (1 - met.alpha), state.product[ray]
+            )
             state.product[ray] = product
             state.farthest[ray] = dr.select(product >= OPAQUE_TRANSMITTANCE, state.farthest[ray], -1)
         return state
