@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import logging
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from pydantic import Field, PositiveInt
 from eval.benchmarks import Benchmark, Outcome
 from eval.results import Row
 from tron.errors import TronError
+from tron.storage import write_atomic
 
 if TYPE_CHECKING:
     from eval.tracing.camera_rays import CameraRays
@@ -54,9 +56,23 @@ class Measured:
     hits: tuple[float, float, float] | None = None
     pictures: dict[str, Any] = dataclasses.field(default_factory=dict)
 
+    def seconds(self) -> dict[str, dict[str, list[float]]]:
+        """Every time that was taken: case -> contestant -> seconds of its rounds."""
+        cases = {f"camera {case}": frame.times for case, frame in self.camera.items()}
+        for name, frame in (("degree 3", self.harmonics), ("from G-buffers", self.from_gbuffers)):
+            if frame is not None:
+                cases[f"camera {frame.case}, {name}"] = frame.times
+        cases |= {f"shadow {shadow.count}": shadow.times for shadow in self.shadow}
+        cases |= {f"gradient {step.case}": step.times for step in self.gradient}
+        cases |= {f"irradiance {found.light}": found.times for found in self.direct}
+        return {
+            case: {name: [round(s, 6) for s in taken.seconds] for name, taken in times.items()}
+            for case, times in cases.items()
+        }
+
 
 class Tracing(Benchmark):
-    """Settings: which parts, at which sizes."""
+    """Settings: which parts, at which sizes. Beside the page, times.json keeps every round's seconds."""
 
     name: ClassVar[str] = "tracing"
 
@@ -96,6 +112,7 @@ class Tracing(Benchmark):
         measured = Measured()
         for part in self.parts:
             getattr(self, f"_measure_{part}")(measured)
+        write_atomic(output_dir / "times.json", json.dumps(measured.seconds(), indent=1) + "\n")
         return page.outcome(self, measured, list(rows(measured, self)), output_dir)
 
     def _contenders(self, count: int, **recipe: Any) -> Contenders:

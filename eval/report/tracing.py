@@ -24,9 +24,9 @@ LEAD = (
     "differentiated.",
     "This page measures TRON's tracer on one scene, a floor with spheres, a torus and a box covered by "
     "surfels, beside what a user of Mitsuba would pick instead. Everyone runs in turns, in one process, on "
-    "the same machine; every figure is a median over the rounds. TRON's preparations (lists of surfels for "
-    "each tile of the image, the hierarchy for shadow rays) are counted in its times; the peers' hierarchies "
-    "are not in theirs.",
+    "the same machine; every figure is a median over the rounds (times.json beside this page has them all). "
+    "TRON's preparations (lists of surfels for each tile of the image, the hierarchy for shadow rays) are "
+    "counted in its times; the peers' hierarchies are not in theirs.",
 )
 HEADLINE = {
     "primary.ratio_to_volprim": "Camera rays: times as fast as Mitsuba's volprim",

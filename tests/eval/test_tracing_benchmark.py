@@ -1,5 +1,6 @@
 """The tracing benchmark at toy sizes: its rows, its two scenes, its peers, its yardsticks."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,6 +85,7 @@ def test_the_whole_benchmark_runs_and_every_promised_row_is_there(tmp_path: Path
     error = results.value("primary.max_error")
     assert error is not None
     assert error < 1e-4
+    assert len(json.loads((tmp_path / "times.json").read_text())["camera 300_32"]["tron"]) == 1
     page = (tmp_path / "report.html").read_text()
     for anchor in ("camera", "growth", "shadow", "gradient", "irradiance", "noise", "exactness", "memory"):
         assert f'id="{anchor}"' in page
