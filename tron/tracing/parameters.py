@@ -94,7 +94,7 @@ def pack(parameters: SurfelParameters) -> SurfelRecords:
     surfel = dr.arange(mi.UInt32, count)
 
     def rows(kind: type, values: mi.Float) -> mi.Float:
-        width = dr.size_v(kind)  # each number is read once: the adjoint is a plain scatter, without atomics
+        width = dr.size_v(kind)
         return kind(*[_column(values, surfel * width + k) for k in range(width)])
 
     tangent_u, tangent_v, normal = _frame(rows(mi.Vector4f, parameters.quats))
@@ -138,7 +138,9 @@ def _constant_radiance(sh: mi.Float, surfel: mi.UInt32) -> list[mi.Float]:
 
 
 def _column(values: mi.Float, index: mi.UInt32) -> mi.Float:
-    return dr.gather(mi.Float, values, index, mode=dr.ReduceMode.Permute)
+    # Each number is read once, yet the adjoint must not be told so: Dr.Jit 1.5 then overwrites (Permute, and
+    # NoConflicts in part) what other uses of the parameters have added, such as a regulariser of the loss.
+    return dr.gather(mi.Float, values, index)
 
 
 def _interleave(columns: list[mi.Float], count: int) -> mi.Float:
