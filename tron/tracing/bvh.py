@@ -1,11 +1,13 @@
 """A bounding volume hierarchy for arbitrary rays: perfectly balanced, threaded with skip links, no stack.
 
-Built by median splits of the longest axis, level by level, all nodes of a level at once: the surfels of a
-node are neighbours in the order, a power of two of them, and one sort by (node, coordinate along the node's
-longest axis) splits them all. What is missing to a power of two stands at the end as empty places. Then the
-shape of the tree is arithmetic: node i of level l of a tree with L levels below the root has the depth-first
-index l + i 2^(L - l + 1) - popcount(i), its left child is the next node, and its skip link (where to go when
-the box is missed, or after a leaf) is itself plus the size of its subtree.
+Built by median splits of the longest axis, round by round, all parts at once: the surfels of a part are
+neighbours in the order, a power of two of them, and one sort by (part, coordinate along the part's longest
+axis) splits them all. What is missing to a power of two stands at the end as empty places. Two rounds make
+the four children of a node: rays that meet a box meet most of its halves, so testing the quarters at once
+costs less. Then the shape of the tree is arithmetic: node i of level l of a tree with L levels below the root
+has the depth-first index l + (i 4^(L - l + 1) - s) / 3, s the sum of i's digits in base 4; its first child is
+the next node, and its skip link (where to go when the box is missed, or after a leaf) is itself plus the size
+of its subtree, (4^(L - l + 1) - 1) / 3.
 
 When surfels move, the order stays good for a while and the boxes alone are made anew (:func:`refit`).
 
@@ -26,6 +28,9 @@ import mitsuba as mi
 from tron.tracing.kernel import GEOMETRY_PACKETS, SurfelRecords
 
 LEAF_SIZE = 2
+CHILDREN = 4
+ROUNDS = 2
+"""Rounds of splits to a level."""
 LEAF_BIT = 1 << 31
 _GRID = 65533.0
 _KEY_BITS = 32
@@ -62,8 +67,9 @@ class Bvh:
 
 def build_bvh(records: SurfelRecords) -> Bvh:
     """Build the hierarchy of a scene's surfels, none included."""
-    levels = max(0, (max(records.count, 1) - 1).bit_length() - (LEAF_SIZE.bit_length() - 1))
-    return refit(_median_order(records, levels), levels, records)
+    leaves = -(-max(records.count, 1) // LEAF_SIZE)
+    levels = -(-(leaves - 1).bit_length() // ROUNDS)
+    return refit(_median_order(records, ROUNDS * levels), levels, records)
 
 
 def refit(order: mi.UInt32, levels: int, records: SurfelRecords) -> Bvh:
@@ -74,16 +80,14 @@ def refit(order: mi.UInt32, levels: int, records: SurfelRecords) -> Bvh:
         levels: that hierarchy's levels.
         records: the surfels where they are now.
     """
-    places = LEAF_SIZE << levels
+    places = LEAF_SIZE << (ROUNDS * levels)
     geometry = _in_leaf_order(records, order)
     low, high = _bounds(geometry, records.count, places)
-    boxes = [(low, high)]
-    for _ in range(levels + 1):
-        # The first reduction makes leaves out of surfels, the last one the root.
-        low, high = (_pairs(low, dr.minimum), _pairs(high, dr.maximum))
+    boxes = []
+    while dr.width(low) > 1:  # from surfels over leaves to the root
+        low, high = _pairs(low, dr.minimum), _pairs(high, dr.maximum)
         boxes.append((low, high))
-    dr.eval(boxes)
-    boxes = boxes[:0:-1]
+    boxes = boxes[::-ROUNDS][: levels + 1]
 
     root_low, root_high = boxes[0]
     size = root_high - root_low
@@ -93,7 +97,8 @@ def refit(order: mi.UInt32, levels: int, records: SurfelRecords) -> Bvh:
     scale = dr.select(size >= 0, _GRID / (size + 2 * pad), 1)
     dr.eval(origin, scale)
 
-    words = dr.empty(mi.UInt32, 4 * ((2 << levels) - 1))
+    nodes = ((CHILDREN << (ROUNDS * levels)) - 1) // (CHILDREN - 1)
+    words = dr.empty(mi.UInt32, 4 * nodes)
     area = mi.Float(0)
     for level, (low, high) in enumerate(boxes):
         _write_level(words, level, levels, records.count, low, high, origin, scale)
@@ -102,7 +107,7 @@ def refit(order: mi.UInt32, levels: int, records: SurfelRecords) -> Bvh:
     dr.eval(words, area)
     return Bvh(
         words,
-        dr.opaque(mi.UInt32, (2 << levels) - 1),
+        dr.opaque(mi.UInt32, nodes),
         geometry,
         order,
         origin,
@@ -167,9 +172,11 @@ def _write_level(
     scale: mi.Vector3f,
 ) -> None:
     """Quantise the boxes of one level outwards and write its nodes."""
-    node = dr.arange(mi.UInt32, 1 << level)
+    node = dr.arange(mi.UInt32, 1 << (ROUNDS * level))
     depth, below = dr.opaque(mi.UInt32, level), dr.opaque(mi.UInt32, levels - level)
-    index = depth + (node << (below + 1)) - mi.UInt32(dr.popcnt(node))
+    digits = mi.UInt32(dr.popcnt(node & 0x55555555)) + 2 * mi.UInt32(dr.popcnt(node & 0xAAAAAAAA))
+    index = depth + ((node << (ROUNDS * (below + 1))) - digits) // 3
+    size = ((mi.UInt32(CHILDREN) << (ROUNDS * below)) - 1) // 3
     # One cell of slack on each side covers the float32 rounding of the rays' grid coordinates.
     first = mi.Vector3u(dr.clip(dr.floor((low - origin) * scale) - 1, 0, 65535))
     last = mi.Vector3u(dr.clip(dr.ceil((high - origin) * scale) + 1, 0, 65535))
@@ -180,25 +187,25 @@ def _write_level(
     # test sorts the two bounds.
     empty = ~(low.x <= high.x)
     bounds = [dr.select(empty, mi.UInt32(0xFFFFFFFF), a | (b << 16)) for a, b in zip(first, last)]
-    link = dr.select(below == 0, mi.UInt32(LEAF_BIT) | (surfel << 4) | held, index + (2 << below) - 1)
+    link = dr.select(below == 0, mi.UInt32(LEAF_BIT) | (surfel << 4) | held, index + size)
     dr.scatter(words, mi.Vector4u(*bounds, link), index)
 
 
-def _median_order(records: SurfelRecords, levels: int) -> mi.UInt32:
-    """Leaf order -> scene order: ``levels`` rounds of median splits, all nodes of a level in one sort."""
-    places = LEAF_SIZE << levels
+def _median_order(records: SurfelRecords, rounds: int) -> mi.UInt32:
+    """Leaf order -> scene order: ``rounds`` of median splits, all parts in one sort."""
+    places = LEAF_SIZE << rounds
     order = dr.arange(mi.UInt32, places)
-    for level in range(levels):
+    for done in range(rounds):
         dr.eval(order)
         real = order < dr.opaque(mi.UInt32, records.count)
         centre = dr.gather(mi.Vector4f, dr.detach(records.geometry), order * GEOMETRY_PACKETS, real)
         centre = mi.Vector3f(centre.x, centre.y, centre.z)
         low, high = dr.select(real, centre, dr.inf), dr.select(real, centre, -dr.inf)
         dr.eval(centre, real, low, high)
-        size = places >> level
+        size = places >> done
         low, high = _reduce(dr.ReduceOp.Min, low, size), _reduce(dr.ReduceOp.Max, high, size)
-        shift = dr.opaque(mi.UInt32, (places >> level).bit_length() - 1)
-        bits = min(_KEY_BITS - level, _COORDINATE_BITS)
+        shift = dr.opaque(mi.UInt32, (places >> done).bit_length() - 1)
+        bits = min(_KEY_BITS - done, _COORDINATE_BITS)
         order = dr.gather(
             mi.UInt32, order, dr.argsort(_keys(centre, real, low, high, shift, dr.opaque(mi.UInt32, bits)))
         )
@@ -212,9 +219,9 @@ def _reduce(op: dr.ReduceOp, values: mi.Vector3f, size: int) -> mi.Vector3f:
 def _keys(
     centre: mi.Vector3f, real: mi.Bool, low: mi.Vector3f, high: mi.Vector3f, shift: mi.UInt32, bits: mi.UInt32
 ) -> mi.UInt32:
-    """Sort keys: the node in the high bits, the coordinate on its longest axis in the ``bits`` low ones."""
-    node = dr.arange(mi.UInt32, dr.width(centre)) >> shift
-    low, high = (mi.Vector3f(*[dr.gather(mi.Float, v, node) for v in bound]) for bound in (low, high))
+    """Sort keys: the part in the high bits, the coordinate on its longest axis in the ``bits`` low ones."""
+    part = dr.arange(mi.UInt32, dr.width(centre)) >> shift
+    low, high = (mi.Vector3f(*[dr.gather(mi.Float, v, part) for v in bound]) for bound in (low, high))
     size = high - low
     on_x = (size.x >= size.y) & (size.x >= size.z)
     on_y = ~on_x & (size.y >= size.z)
@@ -223,7 +230,7 @@ def _keys(
         return dr.select(on_x, v.x, dr.select(on_y, v.y, v.z))
 
     steps = mi.Float((mi.UInt32(1) << bits) - 2)
-    part = dr.clip((pick(centre) - pick(low)) / dr.maximum(pick(size), 1e-30), 0, 1)
-    coordinate = dr.minimum(mi.UInt32(part * steps), mi.UInt32(steps))
-    # Empty places come last in their node.
-    return (node << bits) | dr.select(real, coordinate, (mi.UInt32(1) << bits) - 1)
+    share = dr.clip((pick(centre) - pick(low)) / dr.maximum(pick(size), 1e-30), 0, 1)
+    coordinate = dr.minimum(mi.UInt32(share * steps), mi.UInt32(steps))
+    # Empty places come last in their part.
+    return (part << bits) | dr.select(real, coordinate, (mi.UInt32(1) << bits) - 1)

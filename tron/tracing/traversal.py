@@ -5,8 +5,8 @@ its time on: four rays of neighbouring directions together take little more than
 
 Lanes look for leaves at their own pace but meet the surfels of leaves together: a few nodes are passed first,
 until a leaf is found, and only then are the surfels of those that found one looked at. One lane in a leaf
-would otherwise keep fifteen waiting at nearly every node (1.4 times as fast with four nodes; Aila and Laine
-2009, "Understanding the Efficiency of Ray Traversal on GPUs").
+would otherwise keep fifteen waiting at nearly every node (1.4 times as fast with some nodes between; Aila and
+Laine 2009, "Understanding the Efficiency of Ray Traversal on GPUs").
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false
@@ -22,7 +22,7 @@ import mitsuba as mi
 
 from tron.tracing.bvh import LEAF_BIT, Bvh
 
-NODES_BETWEEN_LEAVES = 4
+NODES_BETWEEN_LEAVES = 6
 
 
 class Intervals(Protocol):
