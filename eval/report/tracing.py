@@ -94,8 +94,10 @@ def _exactness(found: dict[str, Row]) -> list[Section]:
         "primary.max_error_opacity": "camera rays, opacity",
         "primary.max_error_depth": "camera rays, median depth, relative",
         "primary.rays_at_a_threshold": "camera rays left out: within 1e-5 of a threshold",
+        "primary.rays_off": "camera rays off by more than 1e-4, of all",
         "shadow.max_error": "shadow rays, transmittance",
         "shadow.rays_at_a_threshold": "shadow rays left out: within 1e-5 of a threshold",
+        "shadow.rays_off": "shadow rays off by more than 1e-4, of all",
     }
     rows = [
         [Cell(text), Cell(written(found[name].value, found[name].unit), "strong"), Cell(str(found[name].n))]

@@ -16,6 +16,7 @@ from tron import seeds
 from tron.tracing import reference
 
 MARGIN = 1e-5
+OFF = 1e-4
 
 
 def camera_errors(contenders: Contenders, size: int, rays: int, seed: int) -> list[Row]:
@@ -38,14 +39,15 @@ def camera_errors(contenders: Contenders, size: int, rays: int, seed: int) -> li
         "metallic": (found["metallic"][chosen] * opacity, truth.metallic[:, None]),
         "depth": _relative(found["depth"][chosen], truth.median_depth[:, None]),
     }
-    errors = {name: float(np.abs(a - b)[steady].max(initial=0)) for name, (a, b) in pairs.items()}
+    differences = {name: np.abs(a - b).max(1) for name, (a, b) in pairs.items()}
+    errors = {name: float(each[steady].max(initial=0)) for name, each in differences.items()}
     return [
         Row(metric="primary.max_error", value=max(errors.values()), unit="abs", n=int(steady.sum())),
         *(
             Row(metric=f"primary.max_error_{name}", value=value, unit="abs", n=int(steady.sum()))
             for name, value in errors.items()
         ),
-        _excluded("primary", steady),
+        *_excluded("primary", steady, np.max(list(differences.values()), 0)),
     ]
 
 
@@ -68,7 +70,7 @@ def shadow_errors(contenders: Contenders, size: int, rays: int, seed: int) -> li
         Row(
             metric="shadow.embree_restart_wrong_rays", value=float((peer > 1e-3).mean()), unit="fraction", n=n
         ),
-        _excluded("shadow", steady),
+        *_excluded("shadow", steady, np.abs(ours - truth)),
     ]
 
 
@@ -77,6 +79,10 @@ def _relative(found: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndar
     return found / scale, truth / scale
 
 
-def _excluded(kind: str, steady: np.ndarray) -> Row:
-    share = float((~steady).mean())
-    return Row(metric=f"{kind}.rays_at_a_threshold", value=share, unit="fraction", n=len(steady))
+def _excluded(kind: str, steady: np.ndarray, difference: np.ndarray) -> list[Row]:
+    """Share of all rays that stand at a threshold, and of those that fell on its other side, to be seen."""
+    shares = {"rays_at_a_threshold": ~steady, "rays_off": difference > OFF}
+    return [
+        Row(metric=f"{kind}.{name}", value=float(which.mean()), unit="fraction", n=len(steady))
+        for name, which in shares.items()
+    ]

@@ -33,8 +33,9 @@ class Times:
         return (max(self.seconds) - min(self.seconds)) / self.median
 
     def over(self, other: Times) -> float:
-        """Ratio of the medians: how many times as long this takes as ``other``."""
-        return self.median / other.median
+        """How many times as long this takes as ``other``: ratio of medians over the rounds of both."""
+        rounds = min(len(self.seconds), len(other.seconds))
+        return float(np.median(self.seconds[:rounds]) / np.median(other.seconds[:rounds]))
 
     def range_over(self, other: Times) -> tuple[float, float]:
         """Smallest and largest ratio among the rounds in which both ran."""
