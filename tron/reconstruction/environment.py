@@ -30,7 +30,8 @@ Track = Callable[[Iterable, str], Iterable]
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How an environment is fitted. The defaults suit two CPU cores; ``FitSettings.paper()`` wants a GPU.
+    """How an environment is fitted. The defaults take about half a minute on two CPU cores for a small scene;
+    ``FitSettings.paper()`` wants a GPU.
 
     Attributes:
         resolution: texels along a face edge of the cubemap.
@@ -39,6 +40,8 @@ class FitSettings:
         pixels: surface points a step, all of one view.
         learning_rate, final_learning_rate: Adam's steps in log radiance, which fall exponentially.
         estimator: "ratio", or "plain", the paper's, which needs far more rays (see stage 3a).
+        coarsest: texels along a face edge of the coarsest level that log radiance is a sum of, at least 2;
+            ``resolution`` or more fits each texel by itself, which gives the same irradiance and a noisy map.
         points_per_view: most surface points kept of a view.
         scale_steps: updates of the scale; 0 leaves it at 1.
         scale_learning_rate: first step in log sigma.
@@ -58,6 +61,7 @@ class FitSettings:
     learning_rate: float = 0.1
     final_learning_rate: float = 0.01
     estimator: Estimator = "ratio"
+    coarsest: int = 4
     points_per_view: int = 1 << 16
     scale_steps: int = 200
     scale_learning_rate: float = 0.1
@@ -68,7 +72,7 @@ class FitSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        least = {"resolution": 2, "scale_steps": 0, "seed": None, "rays": 2, "scale_rays": 2}
+        least = {"resolution": 2, "coarsest": 2, "scale_steps": 0, "seed": None, "rays": 2, "scale_rays": 2}
         for field in fields(self):
             value, low = getattr(self, field.name), least.get(field.name, 1)
             if field.type == "int" and low is not None and (value != int(value) or value < low):
@@ -83,7 +87,7 @@ class FitSettings:
 
     @classmethod
     def paper(cls, **changes: Any) -> FitSettings:
-        """The paper's size: 512 texels a face edge, 4000 steps; its other numbers are ours."""
+        """The paper's size: 512 texels a face edge, 4000 steps; the other numbers are ours, it names none."""
         large = {"resolution": 512, "steps": 4000, "rays": 64, "pixels": 1 << 14, "scale_rays": 64}
         return cls(**{**large, "scale_pixels": 1 << 18, **changes})
 
@@ -96,7 +100,8 @@ class EnvironmentFit:
         environment: the light, sigma included, as a lat-long map.
         sigma: the scale of stage 3b, already in ``environment``; 1 if it was not fitted.
         texels: (6, R, R, 3) float32 cubemap of stage 3a, sigma not included.
-        seen: (6, R, R) bool, texels that any ray met; the others keep the initial constant radiance.
+        seen: (6, R, R) bool, texels with a gradient of their own in any step; the others have what coarser
+            levels give them, and without such levels the initial constant radiance.
         irradiance_loss: (steps,) mean absolute error of stage 3a, in the unit of the priors.
         scale_loss, scale_curve: (scale_steps,) photometric loss, and sigma, in stage 3b.
     """
@@ -161,6 +166,7 @@ def fit_environment(
         learning_rate=settings.learning_rate,
         final_learning_rate=settings.final_learning_rate,
         estimator=settings.estimator,
+        coarsest=settings.coarsest,
         seed=settings.seed,
         track=track,
     )

@@ -1,9 +1,9 @@
 """Stage 3a: a cubemap such that the shadowed irradiance it gives the frozen scene is that of a prior.
 
-The parameter is the logarithm of radiance, so light is positive and suns are within reach. Each step takes
-one view, draws rays by multiple importance sampling from the cubemap as it stands, traces their visibility
-and moves the texels they met along the gradient of the mean absolute error (paper, Algorithm 2). With a new
-light comes a new density to draw from.
+The parameter is the logarithm of radiance, so light is positive and suns are within reach; it is a sum of
+levels (:mod:`tron.reconstruction.log_pyramid`). Each step takes one view, draws rays by multiple importance
+sampling from the cubemap as it stands, traces their visibility and moves the texels they met along the
+gradient of the mean absolute error (paper, Algorithm 2). With a new light comes a new density to draw from.
 
 The "plain" estimator, the paper's, sums what the rays bring. Its noise is shared by the sign of the error
 and by the gradient, so the two correlate and the fit is biased, however many the steps. The "ratio"
@@ -27,6 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from tron.errors import TronError
+from tron.reconstruction.log_pyramid import LogPyramid
 from tron.reconstruction.surface_points import PointBatch, SurfacePoints
 from tron.seeds import generator, integer
 from tron.shading.cubemap import CubemapLight
@@ -46,7 +47,8 @@ class Refinement:
 
     Attributes:
         texels: (6, R, R, 3) float32 linear radiance.
-        seen: (6, R, R) bool, texels that any ray met; the others keep their initial radiance.
+        seen: (6, R, R) bool, texels with a gradient of their own in any step; the others have what coarser
+            levels give them, and without such levels their initial radiance.
         loss: (steps,) float64, the mean absolute error of each step's view, in the unit of the prior.
     """
 
@@ -66,7 +68,8 @@ def refine(
     learning_rate: float,
     final_learning_rate: float,
     seed: int,
-    estimator: Estimator = "ratio",
+    estimator: Estimator,
+    coarsest: int,
     track: Callable[[Iterable[int], str], Iterable[int]],
     initial: np.ndarray | None = None,
 ) -> Refinement:
@@ -80,6 +83,7 @@ def refine(
         rays: shadow rays a point, even.
         pixels: points a step.
         learning_rate, final_learning_rate: Adam's steps in log radiance, which fall exponentially.
+        coarsest: of the levels that log radiance is a sum of, see :class:`LogPyramid`.
         seed: root of views, points and rays.
         estimator: see the module.
         track: wraps the steps, to show progress.
@@ -92,24 +96,27 @@ def refine(
     if initial is None:
         mean = np.maximum(points.mean_target, DARKEST * points.mean_target.max())
         initial = np.broadcast_to(mean, (6, resolution, resolution, 3))
-    parameter = mi.Float(np.log(np.asarray(initial, np.float64)).astype(np.float32).ravel())
-    optimizer = mi.ad.Adam(learning_rate, {"log_radiance": parameter}, epsilon=1e-15)
+    pyramid = LogPyramid(np.asarray(initial), coarsest)
+    optimizer = mi.ad.Adam(learning_rate, pyramid.levels, epsilon=1e-15)
     decay = (final_learning_rate / learning_rate) ** (1 / max(1, steps - 1))
     draw = generator(seed, "environment", "steps")
     loss_curve = np.empty(steps)
-    seen = dr.zeros(mi.Bool, dr.width(parameter))
+    seen = dr.zeros(mi.Bool, 18 * resolution**2)
     for step in track(range(steps), "Environment"):
         view = int(draw.integers(points.views))
         batch = points.batch(view, pixels, draw)
-        light = CubemapLight(dr.exp(optimizer["log_radiance"]), resolution)
+        log_radiance = pyramid.compose(optimizer)
+        light = CubemapLight(dr.exp(log_radiance), resolution)
         ray_seed = integer(seed, "environment", "rays", step)
         transport = Transport.trace(tracer, batch, light, rays, ray_seed)
         error = dr.abs(_estimate(transport, light, batch, estimator) - batch.target)
         loss = dr.mean((error.x + error.y + error.z) / 3)
         dr.backward(loss)
-        seen |= dr.grad(optimizer["log_radiance"]) != 0
+        seen |= dr.grad(optimizer[pyramid.finest]) != 0
         dr.schedule(seen)
-        optimizer.set_learning_rate(dr.opaque(mi.Float, learning_rate * decay**step))
+        for name in pyramid.levels:
+            rate = learning_rate * decay**step * pyramid.rate(name)
+            optimizer.set_learning_rate({name: dr.opaque(mi.Float, rate)})
         optimizer.step()
         loss_curve[step] = float(loss[0])
         if not np.isfinite(loss_curve[step]):
@@ -117,7 +124,7 @@ def refine(
                 f"the loss of the environment is {loss_curve[step]} at step {step}",
                 mend="lower the learning rate, or look at the irradiance prior",
             )
-    texels = np.array(dr.exp(optimizer["log_radiance"])).reshape(6, resolution, resolution, 3)
+    texels = np.array(dr.exp(pyramid.compose(optimizer))).reshape(6, resolution, resolution, 3)
     met = np.array(seen).reshape(6, resolution, resolution, 3).any(-1)
     return Refinement(texels, met, loss_curve)
 

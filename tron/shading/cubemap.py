@@ -73,6 +73,27 @@ def bilinear(texels: mi.Float, first: mi.UInt32, resolution: mi.UInt32, d: mi.Ve
     return mi.Color3f(value.x, value.y, value.z)
 
 
+def seamless(texels: mi.Float, resolution: int, d: mi.Vector3f) -> mi.Color3f:
+    """Bilinear lookup in directions ``d`` of any three channels on a cubemap without borders, differentiable.
+
+    Args:
+        texels: channels of texels in order of face, row (v), column (u), 18 resolution^2 numbers.
+        resolution: texels along a face edge.
+    """
+    first, width = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, resolution)
+    return bilinear(_bordered(texels, resolution), first, width, d)
+
+
+def texel_directions(resolution: int) -> mi.Vector3f:
+    """Unit world directions of the centres of 6 resolution^2 texels, in order of face, row, column."""
+    width = dr.opaque(mi.UInt32, resolution)
+    lane = dr.arange(mi.UInt32, 6 * resolution**2)
+    step = 2 / mi.Float(width)
+    u = (mi.Float(lane % width) + 0.5) * step - 1
+    v = (mi.Float((lane // width) % width) + 0.5) * step - 1
+    return face_direction(lane // (width * width), u, v)
+
+
 class CubemapLight:
     """A cubemap on the device: radiance, importance sampling, and its density.
 

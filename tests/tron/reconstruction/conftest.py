@@ -73,7 +73,7 @@ def captured(tracer: SurfelTracer) -> Callable[..., Capture]:
                 eye / np.linalg.norm(eye) * 4, (0, 0, 0), fov_deg=32, width=SIZE, height=SIZE
             )
             gbuffer = tracer.gbuffer(camera)
-            prior = [irradiance(tracer, gbuffer, lighting.light, 64, seed)[0] for seed in range(4)]
+            prior = [irradiance(tracer, gbuffer, lighting.light, 64, seed)[0] for seed in range(2)]
             prior = prior_scale * np.mean([np.array(p).T for p in prior], 0).reshape(SIZE, SIZE, 3)
             shadowed = render_guidance(tracer, camera, lighting, 64, seed=9).shadowed
             made.append(View(f"{i}", camera, agx(exposure * shadowed), "display", irradiance=prior))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -12,8 +14,9 @@ from tron.captures import Capture
 from tron.errors import TronError
 from tron.reconstruction import EnvironmentFit, FitSettings, fit_environment
 from tron.reconstruction.light_scale import choose_photos, fit_scale
+from tron.reconstruction.log_pyramid import LogPyramid
 from tron.seeds import generator
-from tron.shading import EnvironmentMap, Lighting
+from tron.shading import EnvironmentMap, Lighting, render_guidance
 
 QUICK = FitSettings(resolution=16, steps=250, rays=16, pixels=512, scale_steps=100, split_sum_resolution=64)
 
@@ -95,8 +98,6 @@ def test_sigma_is_a_known_scale_within_a_hundredth(tracer, captured, studio) -> 
 
 
 def test_linear_photos_ask_for_the_same_scale(tracer, captured, studio) -> None:
-    from tron.shading import render_guidance
-
     capture, lighting = captured(studio, views=3), Lighting(studio, 64)
     linear = [
         replace(view, image=render_guidance(tracer, view.camera, lighting, 64, 9).shadowed, space="linear")
@@ -129,16 +130,14 @@ def test_the_sky_counts_in_neither_stage(tracer, captured, studio) -> None:
 
 def test_texels_that_no_ray_met_keep_the_first_light(tracer, captured, studio) -> None:
     capture = captured(studio, views=1)
-    settings = replace(QUICK, resolution=64, steps=2, rays=2, pixels=16, scale_steps=0)
-    found = fit_environment(capture, tracer, settings)
+    one_by_one = replace(QUICK, resolution=64, coarsest=64, steps=2, rays=2, pixels=16, scale_steps=0)
+    found = fit_environment(capture, tracer, replace(one_by_one, estimator="plain"))
     assert 0 < found.seen.mean() < 1
     assert np.ptp(found.texels[~found.seen], axis=0).max() < 1e-5
     assert np.ptp(found.texels[found.seen], axis=0).max() > 1e-3
 
 
 def test_one_thread_repeats_bit_by_bit_and_seeds_differ(tracer, captured, studio) -> None:
-    import drjit as dr
-
     capture, settings = captured(studio, views=2), replace(QUICK, steps=10, scale_steps=0)
     dr.set_thread_count(1)  # the fixture drjit_threads gives them back
     one, two = (fit_environment(capture, tracer, settings).texels for _ in range(2))
@@ -171,6 +170,30 @@ def test_a_scene_without_fronts_is_refused(tracer, captured, studio) -> None:
 def test_settings_outside_their_range_are_refused(change: dict) -> None:
     with pytest.raises(TronError, match=next(iter(change))):
         FitSettings(**change)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["venice_sunset_1k.hdr", "empty_warehouse_01_1k.hdr"])
+def test_a_real_light_is_found(tracer, captured, shared_data, name: str) -> None:
+    truth = EnvironmentMap.load(shared_data / "hdri" / name).resized(256)
+    found = fit_environment(captured(truth, prior_scale=0.5), tracer, FitSettings(scale_steps=100))
+    # The witness sums points, so suns of a few texels are spread out first.
+    assert irradiance_error(found.environment.resized(96), truth.resized(96)) < 0.05
+    assert found.sigma == pytest.approx(2, rel=0.04)
+
+
+def test_levels_add_up_to_the_light_they_start_from_and_stay_smooth(variant: str) -> None:
+    texels = (0.1 + generator(0, "texels").random((6, 16, 16, 3))).astype(np.float32)
+    pyramid = LogPyramid(texels, 4)
+    assert list(pyramid.levels) == ["level_4", "level_8", "level_16"]
+    levels = dict(pyramid.levels)
+    np.testing.assert_allclose(np.exp(np.array(pyramid.compose(levels))), texels.ravel(), rtol=1e-5)
+    levels["level_4"] = dr.full(mi.Float, 0.5, 18 * 16)
+    np.testing.assert_allclose(
+        np.exp(np.array(pyramid.compose(levels))), texels.ravel() * np.exp(0.5), rtol=1e-5
+    )
+    assert pyramid.rate("level_4") == 1 > pyramid.rate("level_16")
+    assert list(LogPyramid(texels, 16).levels) == ["level_16"]
 
 
 def test_the_papers_settings() -> None:
