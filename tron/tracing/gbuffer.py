@@ -14,7 +14,7 @@ import numpy as np
 
 from tron.cameras import Camera
 from tron.gaussians.harmonics import sh_basis
-from tron.tracing.adjoint import attach
+from tron.tracing.adjoint import attach, has_gradients
 from tron.tracing.compositing import STOP_TRANSMITTANCE, Composite, HitList, composite
 from tron.tracing.hits import MAX_HITS, collect, sort
 from tron.tracing.kbuffer import composite_rounds, search_list
@@ -68,8 +68,10 @@ def tile_rays(camera: Camera) -> TileRays:
     return TileRays(origin, direction, tile, inside)
 
 
-def trace_tiles(records: SurfelRecords, lists: TileLists, rays: TileRays) -> tuple[Composite, list[HitList]]:
-    """Sums of every ray in tile order, and the hits that they are made of.
+def trace_tiles(
+    records: SurfelRecords, lists: TileLists, rays: TileRays, keep_hits: bool
+) -> tuple[Composite, list[HitList]]:
+    """Sums of every ray in tile order, and the hits that they are made of, if they are to be kept.
 
     Collecting, sorting and compositing are one kernel, with room for ``MAX_HITS`` hits a ray. Rays that met
     more are traced once more, some hits at a time, without limit.
@@ -80,26 +82,31 @@ def trace_tiles(records: SurfelRecords, lists: TileLists, rays: TileRays) -> tup
     """
     start = dr.gather(mi.UInt32, lists.start, rays.tile)
     count = dr.select(rays.inside, dr.gather(mi.UInt32, lists.count, rays.tile), 0)
-    out = HitList.empty(dr.arange(mi.UInt32, dr.width(rays.tile)), MAX_HITS)
+    out = HitList.empty(dr.arange(mi.UInt32, dr.width(rays.tile)), MAX_HITS) if keep_hits else None
     hits = collect(records, lists.entries, start, count, rays.origin, rays.direction, STOP_TRANSMITTANCE)
     sort(hits)
     basis = sh_basis(rays.direction.x, rays.direction.y, rays.direction.z)
     sums = composite(records, hits, basis, Composite.start(), out)
-    out.count = dr.select(hits.met > MAX_HITS, 0, sums.count)
-    dr.eval(sums, out.ids, out.count, hits.met)
+    kept = []
+    if out is not None:
+        out.count = dr.select(hits.met > MAX_HITS, 0, sums.count)
+        kept.append(out)
+    dr.eval(sums, kept, hits.met)
     crowded = dr.compress(hits.met > MAX_HITS)
     if dr.width(crowded) == 0:
-        return sums, [out]
+        return sums, kept
     room = int(dr.max(dr.gather(mi.UInt32, hits.met, crowded))[0])  # met counts all that can be composited
-    more = HitList.empty(crowded, room)
+    more = HitList.empty(crowded, room) if keep_hits else None
     start, count = (dr.gather(mi.UInt32, values, crowded) for values in (start, count))
     direction = dr.gather(mi.Vector3f, rays.direction, crowded)
     search = partial(search_list, records, lists.entries, start, count, rays.origin, direction)
     again = composite_rounds(records, search, direction, mi.Bool(True), more)
-    more.count = again.count
-    dr.eval(again, more.ids, more.count)
+    if more is not None:
+        more.count = again.count
+        kept.append(more)
+    dr.eval(again, kept)
     _overwrite(sums, again, crowded)
-    return sums, [out, more]
+    return sums, kept
 
 
 def _overwrite(sums: Composite, some: Composite, ray: mi.UInt32) -> None:
@@ -114,7 +121,7 @@ def _overwrite(sums: Composite, some: Composite, ray: mi.UInt32) -> None:
 def trace_gbuffer(records: SurfelRecords, lists: TileLists, camera: Camera) -> GBuffer:
     """Render a camera's G-buffer from its tile lists; differentiable in the records."""
     rays = tile_rays(camera)
-    sums, hits = trace_tiles(records.detached(), lists, rays)
+    sums, hits = trace_tiles(records.detached(), lists, rays, has_gradients(records, rays.direction))
     sums = attach(sums, records, rays.origin, rays.direction, hits)
     lane = lanes_of_pixels(camera.width, camera.height)
 

@@ -97,19 +97,34 @@ def collect(
     return LocalHits(kept_t, kept_index, kept_alpha, kept, met)
 
 
+@dr.syntax
 def sort(hits: LocalHits) -> None:
-    """Order each lane's hits by (t, id) in place, by a sorting network in registers: no branches."""
-    t, index, alpha = [], [], []
-    for slot in range(MAX_HITS):
-        t.append(dr.select(hits.count > slot, hits.t[mi.UInt32(slot)], dr.inf))
-        index.append(hits.index[mi.UInt32(slot)])
-        alpha.append(hits.alpha[mi.UInt32(slot)])
-    for low, high in odd_even_merge_network(MAX_HITS):
-        swap = (t[high] < t[low]) | ((t[high] == t[low]) & (index[high] < index[low]))
-        for keys in (t, index, alpha):
+    """Order each lane's hits by (t, id) in place, by a sorting network in registers.
+
+    Most packets use less than half the slots, and half the slots are a third of the network.
+    """
+    t, index, alpha = hits.t, hits.index, hits.alpha
+    if hits.count > MAX_HITS // 2:
+        t, index, alpha = _sorted(hits.count, t, index, alpha, MAX_HITS)
+    else:
+        t, index, alpha = _sorted(hits.count, t, index, alpha, MAX_HITS // 2)
+    hits.t, hits.index, hits.alpha = t, index, alpha
+
+
+def _sorted(count: mi.UInt32, t: Any, index: Any, alpha: Any, size: int) -> tuple[Any, Any, Any]:
+    """The first ``size`` slots in order; slots beyond ``count`` hold nothing and end up last."""
+    ts, ids, alphas = [], [], []
+    for slot in range(size):
+        ts.append(dr.select(count > slot, t[mi.UInt32(slot)], dr.inf))
+        ids.append(index[mi.UInt32(slot)])
+        alphas.append(alpha[mi.UInt32(slot)])
+    for low, high in odd_even_merge_network(size):
+        swap = (ts[high] < ts[low]) | ((ts[high] == ts[low]) & (ids[high] < ids[low]))
+        for keys in (ts, ids, alphas):
             first, second = keys[low], keys[high]
             keys[low], keys[high] = dr.select(swap, second, first), dr.select(swap, first, second)
-    for slot in range(MAX_HITS):
-        hits.t[mi.UInt32(slot)] = t[slot]
-        hits.index[mi.UInt32(slot)] = index[slot]
-        hits.alpha[mi.UInt32(slot)] = alpha[slot]
+    for slot in range(size):
+        t[mi.UInt32(slot)] = ts[slot]
+        index[mi.UInt32(slot)] = ids[slot]
+        alpha[mi.UInt32(slot)] = alphas[slot]
+    return t, index, alpha

@@ -80,7 +80,7 @@ def test_hand_written_adjoint_is_what_local_differentiation_gives(random_scene, 
     records = pack(SurfelParameters.from_scene(random_scene(120, degree=degree, sh_degree=sh_degree)))
     lists = build_tiles(records, CAMERA)
     rays = tile_rays(CAMERA)
-    sums, hits = trace_tiles(records, lists, rays)
+    sums, hits = trace_tiles(records, lists, rays, keep_hits=True)
     rng = seeds.generator(0, "tests", "outer")
     outer = [mi.Float(rng.normal(size=dr.width(sums.count)).astype(np.float32)) for _ in range(13)]
     buffers = ("geometry", "features", "harmonics")
