@@ -2,7 +2,7 @@
 
 An ``envmap`` that stands upright in a z-up world (a turn about +z after ``rotate([1, 0, 0], 90)``) is taken
 texel by texel. Any other emitter (tilted, mirrored, of another shape, ``constant``, ``sunsky``) is asked for
-its radiance on a grid four times as fine as the map, and averaged.
+its radiance on a grid finer than the map, and averaged.
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false
@@ -20,10 +20,10 @@ import numpy as np
 from tron.errors import TronError
 from tron.shading.environment import EnvironmentMap
 
-SAMPLED_HEIGHT = 256
-"""Rows of the map of an emitter that has none of its own."""
-OVERSAMPLING = 4
-"""Rows that are asked for, for each row of a sampled map."""
+SAMPLED_HEIGHT = 512
+"""Rows of the map of an emitter that is not taken texel by texel."""
+OVERSAMPLING = 3
+"""Rows that are asked for, for each row of such a map."""
 
 
 def environment_of(scene: mi.Scene) -> EnvironmentMap:
@@ -39,12 +39,12 @@ def environment_of(scene: mi.Scene) -> EnvironmentMap:
             mend="add an emitter such as `envmap` or `constant` to it, or give the integrator `environment`",
         )
     if emitter.class_name() != "EnvironmentMapEmitter":
-        return _sampled(emitter, SAMPLED_HEIGHT)
+        return _sampled(emitter)
     parameters: Any = mi.traverse(emitter)
     image = np.array(parameters["data"])[:, 1:-1, :3]  # Mitsuba repeats a column at either side
     rotation = _turn_about_z(np.array(parameters["to_world"].matrix)[..., 0])
     if rotation is None or image.shape[1] != 2 * image.shape[0]:
-        return _sampled(emitter, image.shape[0])
+        return _sampled(emitter)
     return EnvironmentMap(image * float(parameters["scale"][0]), rotation)
 
 
@@ -78,15 +78,14 @@ def _turn_about_z(to_world: np.ndarray) -> float | None:
     return math.degrees(angle)
 
 
-def _sampled(emitter: mi.Emitter, height: int) -> EnvironmentMap:
+def _sampled(emitter: mi.Emitter) -> EnvironmentMap:
     """The emitter's radiance by directions; rows stand on the poles, columns on half texels."""
-    rows = OVERSAMPLING * height
-    theta, turn = np.meshgrid(
-        np.arange(rows) / (rows - 1) * np.pi, (np.arange(2 * rows) + 0.5) / rows * np.pi, indexing="ij"
-    )
-    theta = theta.clip(1e-4, np.pi - 1e-4)  # at a pole an azimuth is anybody's guess
-    d = np.stack([np.sin(theta) * np.sin(turn), np.sin(theta) * np.cos(turn), np.cos(theta)])
-    si = dr.zeros(mi.SurfaceInteraction3f, d[0].size)
-    si.wi = -mi.Vector3f(d.reshape(3, -1).astype(np.float32))
-    radiance = np.array(mi.Color3f(emitter.eval(si))).T
-    return EnvironmentMap(radiance.reshape(rows, 2 * rows, 3)).resized(height)
+    rows = OVERSAMPLING * SAMPLED_HEIGHT
+    texel = dr.arange(mi.UInt32, 2 * rows * rows)
+    polar = mi.Float(texel // (2 * rows)) * (math.pi / (rows - 1))
+    across, along = dr.sincos((mi.Float(texel % (2 * rows)) + 0.5) * (math.pi / rows))
+    sin, cos = dr.sincos(dr.clip(polar, 1e-4, math.pi - 1e-4))  # at a pole an azimuth is anybody's guess
+    si = dr.zeros(mi.SurfaceInteraction3f, 2 * rows * rows)
+    si.wi = -mi.Vector3f(sin * across, sin * along, cos)
+    radiance = mi.Color3f(emitter.eval(si)) + dr.zeros(mi.Color3f, 2 * rows * rows)
+    return EnvironmentMap(np.array(radiance).T.reshape(rows, 2 * rows, 3)).resized(SAMPLED_HEIGHT)

@@ -6,7 +6,8 @@
                         object    or from memory: tron.integrators.embed(environment_map)
                                   without either, the Mitsuba scene's own environment emitter
     buffer              string    main channels: pbr (default), irradiance, unshadowed or shadowed
-    shadow_rays         integer   a camera ray, even; 64 (default) for one sample a pixel, fewer for more
+    shadow_rays         integer   for each camera ray, even (default: 64); of many camera rays a pixel, each
+                                  may have fewer: 2 darken penumbrae by a hundredth or two, 16 by nothing
     two_sided           boolean   whether back faces block shadow rays (default: true)
     cubemap_resolution  integer   of the prefiltered environment
 

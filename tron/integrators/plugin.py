@@ -75,7 +75,9 @@ def plugin_class(name: str, make: Callable[[mi.Properties], Appearance]) -> type
             border = 2 * film.rfilter().border_size() if film.sample_border() else 0
             width = (film.crop_size().x + border) * spp
             root = seed if isinstance(seed, int) else int(seed[0])
-            shown = self.appearance.show(scene, ray, mi.Bool(True), width, root)
+            # Mitsuba evaluates loops step by step for gradients by AD; the tracer replays hit lists instead.
+            with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
+                shown = self.appearance.show(scene, ray, mi.Bool(True), width, root)
             block = film.create_block()
             block.set_coalesce(block.coalesce() and spp >= 4)
             Steps._splat_to_block(
