@@ -107,6 +107,7 @@ class _Compositing(dr.CustomOp):
         rest = transmittance * replay.sums.transmittance + mean_depth * replay.sums.mean_depth
         for gradient, value in zip(channels, replay.sums.channels, strict=True):
             rest = dr.fma(gradient, value, rest)
+        heard = tuple(not _silent(channels[4 * group : 4 * group + 4]) for group in range(3))
         dr.eval(channels, mean_depth, rest)
         # Those that nobody asked for, such as the geometry's once it is frozen, cost nothing.
         out = _Gradients(
@@ -125,7 +126,7 @@ class _Compositing(dr.CustomOp):
             basis = sh_basis(direction.x, direction.y, direction.z)
             added = _replay(
                 records, hits, replay.origin, direction, basis, outer, depth,
-                dr.gather(mi.Float, rest, hits.ray), out, len(by_basis),
+                dr.gather(mi.Float, rest, hits.ray), out, heard, len(by_basis),
             )  # fmt: skip
             for target, value in zip(by_basis, added, strict=True):
                 dr.scatter(target, value, hits.ray, hits.count > 0)
@@ -136,6 +137,11 @@ class _Compositing(dr.CustomOp):
             self.set_grad_in("basis", by_basis)
 
 
+def _silent(gradients: list[mi.Float]) -> bool:
+    """Whether a loss left these outputs out: what it did not use stands for is never read, nor added to."""
+    return all(g.state == dr.VarState.Literal and g[0] == 0 for g in gradients)
+
+
 def _add(target: mi.Float | None, packet: mi.UInt32, values: list[mi.Float], active: mi.Bool) -> None:
     if target is not None:
         dr.scatter_reduce(dr.ReduceOp.Add, target, mi.Vector4f(*values), packet, active)
@@ -144,7 +150,8 @@ def _add(target: mi.Float | None, packet: mi.UInt32, values: list[mi.Float], act
 @dr.syntax
 def _replay(
     records: SurfelRecords, hits: HitList, origin: mi.Point3f, direction: mi.Vector3f, basis: list[mi.Float],
-    outer: list[mi.Float], outer_depth: mi.Float, rest: mi.Float, out: _Gradients, functions: int,
+    outer: list[mi.Float], outer_depth: mi.Float, rest: mi.Float, out: _Gradients, heard: tuple[bool, ...],
+    functions: int,
 ) -> list[mi.Float]:  # fmt: skip
     """Walk each list front to back and add its gradients to ``out``.
 
@@ -154,6 +161,7 @@ def _replay(
         outer, outer_depth: gradients of the channels and of the mean depth.
         rest: sum of outer gradients times what they belong to (module docstring).
         out: receives the gradients of the records.
+        heard: whether any channel of each packet, and of the radiance, has a gradient at all.
         functions: how many basis functions, from the second on, to differentiate by.
 
     Returns:
@@ -169,15 +177,19 @@ def _replay(
         weight = remaining * met.alpha
         projected = outer_depth * met.t
         for packet in range(MATERIAL_PACKETS):
-            at = index * FEATURE_PACKETS + packet
-            feature = dr.gather(mi.Vector4f, records.features, at, active)
-            gradient = outer[4 * packet : 4 * packet + 4]
-            for k in range(4):
-                projected = dr.fma(gradient[k], feature[k], projected)
-            _add(out.features, at, [weight * value for value in gradient], active)
-        color, by_basis = _replay_radiance(records, index, basis, weight, outer[8:11], by_basis, out, active)
-        for k in range(3):
-            projected = dr.fma(outer[8 + k], color[k], projected)
+            if dr.hint(heard[packet], mode="scalar"):
+                at = index * FEATURE_PACKETS + packet
+                feature = dr.gather(mi.Vector4f, records.features, at, active)
+                gradient = outer[4 * packet : 4 * packet + 4]
+                for k in range(4):
+                    projected = dr.fma(gradient[k], feature[k], projected)
+                _add(out.features, at, [weight * value for value in gradient], active)
+        if dr.hint(heard[2], mode="scalar"):
+            color, by_basis = _replay_radiance(
+                records, index, basis, weight, outer[8:11], by_basis, out, active
+            )
+            for k in range(3):
+                projected = dr.fma(outer[8 + k], color[k], projected)
         rest = dr.fma(-weight, projected, rest)
         by_alpha = remaining * projected - rest / (1 - met.alpha)
         _replay_hit(records, index, met, direction, by_alpha, weight * outer_depth, out, active)

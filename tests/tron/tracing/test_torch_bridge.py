@@ -129,7 +129,7 @@ def test_later_steps_compile_nothing_and_keep_nothing(random_scene, device):
     def steps(count: int, surfels: dict[str, torch.Tensor]) -> None:
         optimiser = torch.optim.Adam(surfels.values(), 1e-4)
         for k in range(count):
-            seen = render(surfels, view(0.1 * k))
+            seen = render(surfels, view(0.1 * k, 48))
             optimiser.zero_grad()
             (seen["rgb"].mean() + seen["opacity"].mean() + seen["normal"].mean()).backward()
             optimiser.step()
@@ -152,8 +152,8 @@ def test_later_steps_compile_nothing_and_keep_nothing(random_scene, device):
     variables, before = str(dr.whos(as_string=True)), resident()
     steps(200, surfels)
     assert str(dr.whos(as_string=True)).count("\n") == variables.count("\n")
-    # The images and hit lists of 200 steps would be some 100 MB.
-    assert resident() - before < 30
+    # The images and hit lists of 200 steps would be some 200 MB.
+    assert resident() - before < 60
 
 
 def test_tensors_that_cannot_be_read_in_place_are_refused(random_scene, device):
