@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
-from tron.tracing.bvh import build_bvh
+from tron.errors import TronError
+from tron.tracing.bvh import build_bvh, refit
 from tron.tracing.gbuffer import GBuffer, trace_gbuffer
 from tron.tracing.parameters import SurfelParameters, pack
 from tron.tracing.rays import trace_rays
@@ -22,11 +24,16 @@ if TYPE_CHECKING:
     from tron.gaussians.scene import GaussianScene
 
 
+LOOSE_BOXES = 1.5
+"""A hierarchy is built anew once its boxes' area is this many times what it was when it was last built."""
+
+
 class SurfelTracer:
     """Traces one :class:`GaussianScene`, uploaded and sorted into a hierarchy at once.
 
     Args:
-        scene: the surfels; must be valid (``scene.validate()``), and must not change while the tracer lives.
+        scene: the surfels; must be valid (``scene.validate()``), and must not change while the tracer lives:
+            for surfels that move there is :meth:`moved`.
         two_sided: let back faces block shadow rays beyond two spacings; False is the paper's rule.
         parameters: traced instead of the scene's own arrays; results are differentiable by those of them that
             have gradients enabled.
@@ -38,12 +45,39 @@ class SurfelTracer:
     def __init__(
         self, scene: GaussianScene, *, two_sided: bool = True, parameters: SurfelParameters | None = None
     ) -> None:
-        self.scene = scene
+        self.scene, self.two_sided = scene, two_sided
         self.records = pack(parameters or SurfelParameters.from_scene(scene))
         # Not built when first needed: that may be inside a recorded loop, where nothing can be evaluated.
         self.bvh = build_bvh(self.records.detached())
+        self._sorted_area = self.bvh.area
         reach = BACK_FACE_SPACINGS * scene.spacing if two_sided else float("inf")
         self._back_faces_from = dr.opaque(mi.Float, reach)
+
+    def moved(self, scene: GaussianScene) -> SurfelTracer:
+        """A tracer of the same surfels where they are now; this one goes on tracing where they were.
+
+        Their order in the hierarchy is kept and its boxes are made anew, unless they have grown so loose that
+        sorting costs less than tracing on (``LOOSE_BOXES``).
+
+        Args:
+            scene: as many surfels, in the same order (:func:`tron.gaussians.edit.moved`).
+
+        Raises:
+            TronError: another number of surfels.
+        """
+        if len(scene) != len(self.scene):
+            raise TronError(
+                f"{len(scene)} surfels cannot be where {len(self.scene)} were",
+                mend="make a new SurfelTracer where surfels come or go",
+            )
+        other = copy(self)
+        other.scene = scene
+        other.records = pack(SurfelParameters.from_scene(scene))
+        other.bvh = refit(self.bvh.order, self.bvh.levels, other.records)
+        if bool((other.bvh.area > LOOSE_BOXES * self._sorted_area)[0]):
+            other.bvh = build_bvh(other.records)
+            other._sorted_area = other.bvh.area
+        return other
 
     def gbuffer(self, camera: Camera) -> GBuffer:
         """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it."""
