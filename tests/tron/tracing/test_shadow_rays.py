@@ -75,7 +75,7 @@ def test_few_rays_were_left_out_and_many_were_blocked(random_scene):
 @pytest.mark.parametrize("degree", [2, 4])
 @pytest.mark.parametrize("tilt", [0.0, 50.0, 80.0])
 def test_one_surfel_has_its_closed_form(disks, degree, tilt):
-    """1 - o exp(-r^2 / 2 s^2), or with r^4 / 18 s^4; r where the ray meets the tilted plane. 1 beyond the cut."""
+    """1 - o exp(-r^2 / 2 s^2), or with r^4 / 18 s^4; r where it meets the tilted plane. 1 past the cut."""
     sigma, opacity = 0.1, 0.7
     scene = disks([[0, 0, 0]], [False], opacity=opacity, sigma=sigma, degree=degree)
     half = np.radians(tilt) / 2
