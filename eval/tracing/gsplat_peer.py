@@ -1,7 +1,7 @@
 """A peer for camera rays on NVIDIA GPUs: gsplat's rasteriser of 2D Gaussians (2DGS), where it is installed.
 
 It projects where we trace, composites both sides of a surfel, ends at transmittance 1e-4, and gathers colour,
-normal and depth. It is not a dependency: install it by hand to have the rows.
+normal and depth. It comes with the extra ``gpu-peers``, which a machine without a GPU has no use for.
 """
 
 from __future__ import annotations
