@@ -2,14 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from tron.cameras import Camera
-from tron.gaussians.scene import GaussianScene
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
 from tron.shading.irradiance import irradiance
-from tron.tracing import SurfelTracer
 
 BUFFERS = ("pbr", "irradiance", "unshadowed", "shadowed")
 
@@ -127,77 +124,3 @@ def test_the_filter_helps_two_rays_and_leaves_open_light_and_background_alone(
     np.testing.assert_array_equal(filtered.irradiance[truth.mask == 0], noisy.irradiance[truth.mask == 0])
     still = render_guidance(sphere_over_plane(sphere=False), camera, lighting, spp=2, denoise=True)
     np.testing.assert_allclose(still.irradiance, still.unshadowed, rtol=1e-5)
-
-
-def surfels(points: np.ndarray, normals: np.ndarray, spacing: float) -> GaussianScene:
-    """A dense scene of surfels: kernel degree 4, scale 0.5 spacings, opacity 0.99."""
-    helper = np.where(np.abs(normals[:, :1]) > 0.9, [[0, 1.0, 0]], [[1.0, 0, 0]])
-    u = np.cross(helper, normals)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    rotation = np.stack([u, np.cross(normals, u), normals], axis=-1)
-    n = len(points)
-    return GaussianScene(
-        means=points,
-        quats=Rotation.from_matrix(rotation).as_quat()[:, [3, 0, 1, 2]],
-        log_scales=np.full((n, 2), np.log(0.5 * spacing)),
-        opacity_logits=np.full(n, np.log(0.99 / 0.01)),
-        sh=np.zeros((n, 16, 3)),
-        base_color=np.full((n, 3), 0.5),
-        roughness=np.full(n, 0.5),
-        metallic=np.zeros(n),
-        object_id=np.zeros(n),
-        kernel_degree=4,
-        spacing=spacing,
-    )
-
-
-def plane_surfels(spacing: float = 0.05, half: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
-    x, y = np.meshgrid(*[np.arange(-half, half, spacing) + spacing / 2] * 2)
-    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
-    return points, np.tile([0.0, 0, 1], (len(points), 1))
-
-
-def sphere_surfels(
-    spacing: float = 0.05, radius: float = 1.0, height: float = 0.0
-) -> tuple[np.ndarray, np.ndarray]:
-    n = int(4 * np.pi * radius**2 / spacing**2)
-    i = np.arange(n) + 0.5
-    z, phi = 1 - 2 * i / n, np.pi * (1 + 5**0.5) * i  # Fibonacci lattice
-    r = np.sqrt(1 - z * z)
-    normals = np.stack([r * np.cos(phi), r * np.sin(phi), z], 1)
-    return normals * radius + [0, 0, height], normals
-
-
-@pytest.mark.parametrize("shape", [plane_surfels, sphere_surfels])
-def test_dense_surfels_do_not_darken_themselves(variant: str, shape) -> None:
-    tracer = SurfelTracer(surfels(*shape(), spacing=0.05))
-    camera = Camera.look_at((2.0, -3.0, 2.5), (0, 0, 0), fov_deg=20, width=40, height=40)
-    guidance = render_guidance(tracer, camera, Lighting(EnvironmentMap.constant(1.0)), spp=64)
-    facing = -(guidance.gbuffer["normal"] * guidance.gbuffer["direction"]).sum(-1)
-    inner = (guidance.mask > 0.99) & (facing > 0.3)
-    assert inner.mean() > 0.3
-    assert guidance.irradiance[inner].mean() >= 0.98
-    assert np.quantile(guidance.irradiance[inner], 0.02) >= 0.95
-
-
-def test_no_light_leaks_into_a_closed_sphere(variant: str, points_gbuffer) -> None:
-    tracer = SurfelTracer(surfels(*sphere_surfels(), spacing=0.05))
-    inside = points_gbuffer(np.zeros((500, 3)), np.eye(3)[np.arange(500) % 3])
-    shadowed, _ = irradiance(tracer, inside, Lighting(EnvironmentMap.constant(1.0)).light, 64, 0)
-    assert np.array(shadowed).mean() < 0.005
-
-
-def test_shadow_of_surfels_reaches_the_contact(variant: str, points_gbuffer, sun_map) -> None:
-    """A sphere resting on the floor, lit from one side: the floor just behind the contact is dark."""
-    floor, ball = plane_surfels(half=3.0), sphere_surfels(height=1.0)
-    points, normals = (np.concatenate(pair) for pair in zip(floor, ball, strict=True))
-    tracer = SurfelTracer(surfels(points, normals, spacing=0.05))
-    lighting = Lighting(sun_map)
-    # The sun is at columns 30 and 31: away from it, from a tenth of the ball's radius to half of it.
-    azimuth = 31 / 128 * 2 * np.pi
-    away = -np.array([np.sin(azimuth), np.cos(azimuth)])
-    distance = np.linspace(0.1, 0.5, 50)
-    position = np.concatenate([distance[:, None] * away, np.zeros((50, 1))], 1)
-    gbuffer = points_gbuffer(position, np.tile([0.0, 0, 1], (50, 1)))
-    shadowed, unshadowed = irradiance(tracer, gbuffer, lighting.light, 256, 0)
-    assert (np.array(shadowed)[1] / np.array(unshadowed)[1]).max() < 0.12

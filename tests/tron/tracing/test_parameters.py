@@ -25,7 +25,7 @@ def test_gradients_add_to_those_of_a_regulariser(random_scene, first: str) -> No
             dr.enable_grad(getattr(parameters, name))
 
         def penalty() -> mi.Float:
-            return sum(dr.sum(dr.square(getattr(parameters, name))) for name in PARAMETERS)
+            return dr.sum([dr.sum(dr.square(getattr(parameters, name))) for name in PARAMETERS])
 
         total = penalty() if with_penalty and first == "penalty" else mi.Float(0)
         if with_records:

@@ -1,0 +1,55 @@
+"""Laws of energy: split-sum reflects at most what arrives, over every roughness, angle and material."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tron.shading.environment import EnvironmentMap
+from tron.shading.guidance import DIELECTRIC_F0
+from tron.shading.split_sum import SplitSum, brdf_table
+
+
+@pytest.fixture
+def furnace(variant: str) -> SplitSum:
+    return SplitSum(EnvironmentMap.constant(1.0), 64)
+
+
+def every_case() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cosines n.v, roughnesses and reflectances F0 at the normal, with ends beyond the outermost texels."""
+    cosine = np.concatenate([[1e-4, 1e-3, 0.999, 1.0], np.linspace(0.01, 0.99, 40)])
+    roughness = np.concatenate([[0.0, 1e-3, 1.0], np.linspace(0.01, 0.99, 40)])
+    grid = np.meshgrid(cosine, roughness, [0.0, DIELECTRIC_F0, 0.3, 1.0], indexing="ij")
+    return tuple(values.ravel().astype(np.float32) for values in grid)  # type: ignore[return-value]
+
+
+def test_the_table_never_reflects_more_than_all(variant: str) -> None:
+    table = brdf_table()
+    assert table.min() >= 0
+    assert table.sum(-1).max() <= 1 + 1e-5  # float32
+
+
+def test_white_and_other_surfaces_in_a_furnace(furnace: SplitSum) -> None:
+    cosine, roughness, f0 = every_case()
+    view = np.stack([np.sqrt(np.maximum(1 - cosine**2, 0)), 0 * cosine, cosine])
+    normal = mi.Vector3f(0, 0, 1)
+    seen = np.array(
+        furnace.specular(normal, mi.Vector3f(view), mi.Float(roughness), mi.Color3f(mi.Float(f0)))
+    )[0]
+    assert np.isfinite(seen).all()
+    assert seen.max() <= 1 + 1e-4
+    assert seen.min() >= 0
+    brighter = seen.reshape(-1, 4)  # more reflectance at the normal is more at every angle
+    assert (np.diff(brighter, axis=1) >= -1e-6).all()
+    mirror = (roughness < 0.01) & (f0 == 1) & (cosine > 0.05)
+    assert seen[mirror].min() > 0.99
+
+
+def test_a_smooth_dielectric_follows_schlick(furnace: SplitSum) -> None:
+    """F0 + (1 - F0) (1 - n.v)^5: where roughness vanishes the lobe is a mirror's."""
+    cosine = np.linspace(0.05, 1, 60).astype(np.float32)
+    view = mi.Vector3f(np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine]))
+    seen = furnace.specular(mi.Vector3f(0, 0, 1), view, mi.Float(0.02), mi.Color3f(DIELECTRIC_F0))
+    expected = DIELECTRIC_F0 + (1 - DIELECTRIC_F0) * (1 - cosine) ** 5
+    np.testing.assert_allclose(np.array(seen)[0], expected, atol=0.01)
