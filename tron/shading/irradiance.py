@@ -127,10 +127,11 @@ class _ShadingPoints:
     def in_tile_order(cls, gbuffer: GBuffer, offset: float) -> _ShadingPoints:
         _, x, y, inside = tile_pixels(gbuffer.width, gbuffer.height)
         pixel = y * dr.opaque(mi.UInt32, gbuffer.width) + x
-        normal = _gather(mi.Normal3f(gbuffer.normal), pixel, inside)
-        origin = _gather(mi.Point3f(gbuffer.position), pixel, inside)
+        # Rays stand still where the surface is differentiated.
+        normal = _gather(mi.Normal3f(dr.detach(gbuffer.normal)), pixel, inside)
+        origin = _gather(mi.Point3f(dr.detach(gbuffer.position)), pixel, inside)
         origin += normal * dr.opaque(mi.Float, offset)
-        surface = inside & (dr.gather(mi.Float, gbuffer.opacity, pixel, inside) > 0)
+        surface = inside & (dr.gather(mi.Float, dr.detach(gbuffer.opacity), pixel, inside) > 0)
         frame = mi.Frame3f(normal)
         dr.eval(pixel, surface, frame, origin)
         return cls(pixel, surface, frame, origin)
