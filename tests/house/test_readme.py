@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,18 +37,30 @@ def plane_view() -> GBufferView:
 
 
 @pytest.mark.usefixtures("variant")
-def test_the_python_example_relights_a_scene(tmp_path, monkeypatch):
-    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    assert "width=512, height=512" in code
+def test_the_python_examples_do_what_they_say(tmp_path, monkeypatch):
+    first, second = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    assert "width=512, height=512" in first
     surfels_from_gbuffers([plane_view()], count=500).save(tmp_path / "scene.ply")
     write_image(tmp_path / "studio.hdr", np.full((16, 32, 3), 0.7, np.float32))
     monkeypatch.chdir(tmp_path)
-    exec(compile(code.replace("512", "24"), str(README), "exec"), {})
+    names: dict[str, Any] = {}
+    exec(compile(first.replace("512", "24"), str(README), "exec"), names)
     pbr = read_image(tmp_path / "pbr.exr")
     assert pbr.shape == (24, 24, 3)
     # A grey floor under a constant light of 0.7: half of it comes back, and a little gloss.
     assert 0.3 < pbr[12, 12, 0] < 0.45
     assert read_image(tmp_path / "irradiance.png")[12, 12, 0] > 0.5
+
+    assert "steps=500" in second
+    smaller = second.replace("512", "24").replace("steps=500", "steps=30, scale_steps=2")
+    exec(compile(smaller, str(README), "exec"), names)
+    assert names["surfels"]["base_color"].grad.abs().max() > 0
+    assert names["tracer"].scene is not names["scene"]
+    # Above the horizon, where the floor sees it, the light comes back as it was.
+    assert np.median(read_image(tmp_path / "fitted.exr")[:16]) == pytest.approx(0.7, rel=0.2)
+    picture = np.array(names["picture"])
+    assert picture.shape == (24, 24, 13)  # RGB, three other buffers, opacity
+    assert 0.3 < picture[12, 12, 0] < 0.45
 
 
 def test_the_line_for_cuda_users_names_the_gpu_or_says_in_one_line_why_not():

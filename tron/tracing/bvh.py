@@ -68,8 +68,9 @@ class Bvh:
 def build_bvh(records: SurfelRecords) -> Bvh:
     """Build the hierarchy of a scene's surfels, none included."""
     leaves = -(-max(records.count, 1) // LEAF_SIZE)
-    levels = -(-(leaves - 1).bit_length() // ROUNDS)
-    return refit(_median_order(records, ROUNDS * levels), levels, records)
+    rounds = (leaves - 1).bit_length()
+    # Where the root has two children of its four, the round that would make the others has nothing to split.
+    return refit(_median_order(records, rounds), -(-rounds // ROUNDS), records)
 
 
 def refit(order: mi.UInt32, levels: int, records: SurfelRecords) -> Bvh:
