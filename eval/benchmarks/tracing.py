@@ -85,7 +85,7 @@ class Tracing(Benchmark):
     growth_surfels: list[PositiveInt] = Field(description="scenes of the growth chart, at the first size")
     growth_pixels: list[PositiveInt] = Field(description="images of the growth chart, second-size scene")
     shadow_rays: PositiveInt = Field(default=200_000, description="random shadow rays")
-    shadow_spp: PositiveInt = Field(default=16, description="rays a pixel of the traced irradiance pass")
+    shadow_spp: PositiveInt = Field(default=64, description="rays a pixel of the traced irradiance pass")
     gradient: list[Case] = Field(description="(surfels, pixels) of the gradient steps")
     irradiance: Case = Field(description="(surfels, pixels) of the comparison with Mitsuba's direct")
     noise: Case = Field(description="(surfels, pixels) of the error of irradiance")
