@@ -31,7 +31,7 @@ from tron.cameras import mitsuba_sensor
 from tron.color import luminance
 from tron.shading import EnvironmentLight, Lighting, irradiance, render_guidance
 from tron.shading.guidance import shade
-from tron.shading.irradiance import ORIGIN_OFFSET
+from tron.shading.irradiance import ORIGIN_OFFSET, visible_share
 from tron.tracing import GBuffer, SurfelTracer
 from tron.tracing.tiles import lanes_of_pixels, tile_pixels
 
@@ -117,8 +117,7 @@ def measure_noise(contenders: Contenders, size: int, light: str, reference_spp: 
 
     def independent(spp: int, trial: int) -> np.ndarray:
         shadowed, unshadowed = independent_irradiance(tracer, gbuffer, lighting.light, spp, seed + trial)
-        visibility = dr.select(unshadowed > 0, shadowed / unshadowed, 1)
-        return shade(gbuffer, visibility, lighting).irradiance
+        return shade(gbuffer, visible_share(shadowed, unshadowed), lighting).irradiance
 
     times = interleaved(
         {

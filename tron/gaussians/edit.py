@@ -33,20 +33,18 @@ def moved(
         pivot: (3,), world; the mean of the moved centres by default.
 
     Raises:
-        TronError: nothing is selected, or ``rotation`` is not a rotation.
+        TronError: nothing is selected, or what there is not; ``rotation`` is not a rotation, or another
+            argument not three finite numbers.
     """
-    selected = np.zeros(len(scene), bool)
-    selected[np.asarray(which)] = True
-    if not selected.any():
-        raise TronError("no surfel is selected", mend="give a mask or indices of the surfels to move")
+    selected = _selection(which, len(scene))
     turn = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
     if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=_TOLERANCE):
         raise TronError("rotation is not a rotation matrix", mend="give an orthogonal (3, 3) array")
     if np.linalg.det(turn) < 0:
         raise TronError("rotation mirrors the surfels", mend="give a matrix of determinant 1")
-    shift = np.zeros(3) if translation is None else np.asarray(translation, np.float64)
     means = scene.means[selected].astype(np.float64)
-    about = means.mean(0) if pivot is None else np.asarray(pivot, np.float64)
+    shift = _vector("translation", np.zeros(3) if translation is None else translation)
+    about = _vector("pivot", means.mean(0) if pivot is None else pivot)
 
     changed = scene.means.copy()
     changed[selected] = (means - about) @ turn.T + about + shift
@@ -56,3 +54,29 @@ def moved(
     quats[selected] = quats_from_matrices(turn @ scene.rotations()[selected])
     sh[selected] = rotate_sh(scene.sh[selected], turn)
     return replace(scene, means=changed, quats=quats, sh=sh)
+
+
+def _selection(which: np.ndarray, count: int) -> np.ndarray:
+    """(count,) bool mask of a mask or of indices."""
+    which = np.asarray(which)
+    if which.dtype == bool:
+        if which.shape != (count,):
+            raise TronError(
+                f"the mask has shape {which.shape}", mend=f"give one bool for each of {count} surfels"
+            )
+        selected = which
+    else:
+        if which.size and (which.dtype.kind not in "iu" or which.min() < 0 or which.max() >= count):
+            raise TronError("the selection is neither a mask nor indices", mend=f"indices are 0..{count - 1}")
+        selected = np.zeros(count, bool)
+        selected[which.astype(np.int64)] = True
+    if not selected.any():
+        raise TronError("no surfel is selected", mend="give a mask or indices of the surfels to move")
+    return selected
+
+
+def _vector(name: str, values: np.ndarray) -> np.ndarray:
+    values = np.asarray(values, np.float64)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise TronError(f"{name} is {values.tolist()}", mend="give three finite numbers")
+    return values

@@ -14,9 +14,10 @@
     image = mi.render(scene, spp=16)
 
 Surfels come from a file (``filename``) or from memory (``surfels``, of :func:`embed`). They are all that is
-seen: shapes of the Mitsuba scene are not. Every sensor and film of Mitsuba works: rays go where its sampler
-sends them, and its reconstruction filter makes pixels of what they show. All rays of a render are traced at
-once, so memory grows with pixels x samples. Plugins:
+seen: shapes of the Mitsuba scene are not. Rays go where Mitsuba's sensor and sampler send them, and the
+film's filter makes pixels of what they show. Perspective, thin-lens and orthographic sensors are tested;
+those that place rays by the bounds of the scene's shapes, such as ``distant``, see nothing. All rays of a
+render are traced at once, so memory grows with pixels x samples. Plugins:
 
 ``tron_gbuffer`` (:mod:`tron.integrators.gbuffer`): what the surfels are, their harmonics' radiance included.
 ``tron_guidance`` (:mod:`tron.integrators.guidance`): what they look like under an environment.

@@ -100,7 +100,7 @@ def plugin_class(name: str, make: Callable[[mi.Properties], Appearance]) -> type
             """Mitsuba's contract for single rays. The seed comes from ``sampler``."""
             del medium
             width = dr.width(ray)
-            seed = int(dr.max(sampler.next_1d())[0] * 2**24)
+            seed = int(sampler.next_1d()[0] * 2**24)
             shown = self.appearance.show(scene, ray, mi.Bool(active), width, seed)
             return shown.color, shown.alpha > 0, shown.extra
 

@@ -16,9 +16,9 @@ import mitsuba as mi
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.tracing import Surface, SurfelTracer
-from tron.tracing.bvh import build_bvh
-from tron.tracing.parameters import PARAMETERS, SurfelParameters, pack
-from tron.tracing.rays import trace_rays
+from tron.tracing.parameters import PARAMETERS, SurfelParameters
+
+MAX_SH_DEGREE = 3
 
 
 def embed(value: Any) -> mi.Object:
@@ -78,7 +78,8 @@ class Surfels:
         else:
             self.scene = unwrap(properties, "surfels", GaussianScene, plugin).validate()
         self.parameters = SurfelParameters.from_scene(self.scene)
-        self.tracer = SurfelTracer(self.scene, two_sided=bool(properties.get("two_sided", True)))
+        two_sided = bool(properties.get("two_sided", True))
+        self.tracer = SurfelTracer(self.scene, two_sided=two_sided, parameters=self.parameters)
 
     def traverse(self, callback: Any) -> None:
         """Expose the parameters, all differentiable."""
@@ -87,13 +88,12 @@ class Surfels:
 
     def parameters_changed(self) -> None:
         """Take new values of the parameters: shapes stay, surfels may have moved."""
-        with dr.suspend_grad():
-            self.tracer.records = pack(self.parameters).detached()
-            self.tracer.bvh = build_bvh(self.tracer.records)
+        # Harmonics of any degree may have come, or be about to be learnt.
+        self.parameters.sh_degree = MAX_SH_DEGREE
+        self.tracer.update()
 
     def trace(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> Surface:
         """What rays see, attached to the parameters where their gradients are wanted."""
-        wanted = dr.grad_enabled(*[getattr(self.parameters, name) for name in PARAMETERS])
-        # Packed anew each time: the first backward pass frees the edges between parameters and records.
-        records = pack(self.parameters) if wanted else self.tracer.records
-        return trace_rays(records, self.tracer.bvh, origin, direction, active)
+        if dr.grad_enabled(self.parameters.sh):
+            self.parameters.sh_degree = MAX_SH_DEGREE
+        return self.tracer.trace(origin, direction, active)

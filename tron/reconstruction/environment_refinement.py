@@ -31,7 +31,7 @@ from tron.reconstruction.log_pyramid import LogPyramid
 from tron.reconstruction.surface_points import PointBatch, SurfacePoints
 from tron.seeds import generator, integer
 from tron.shading.cubemap import CubemapLight
-from tron.shading.irradiance import Occluder
+from tron.shading.irradiance import Occluder, visible_share
 from tron.shading.prefilter import unoccluded_irradiance
 from tron.shading.transport import Transport
 
@@ -71,9 +71,8 @@ def refine(
     estimator: Estimator,
     coarsest: int,
     track: Callable[[Iterable[int], str], Iterable[int]],
-    initial: np.ndarray | None = None,
 ) -> Refinement:
-    """Fit the cubemap.
+    """Fit the cubemap, beginning with the constant whose unshadowed irradiance is the prior's mean.
 
     Args:
         tracer: what blocks light.
@@ -87,16 +86,12 @@ def refine(
         seed: root of views, points and rays.
         estimator: see the module.
         track: wraps the steps, to show progress.
-        initial: (6, R, R, 3) radiance to start from; else the constant whose unshadowed irradiance is the
-            prior's mean.
 
     Raises:
         TronError: the loss is not finite; the message names the step.
     """
-    if initial is None:
-        mean = np.maximum(points.mean_target, DARKEST * points.mean_target.max())
-        initial = np.broadcast_to(mean, (6, resolution, resolution, 3))
-    pyramid = LogPyramid(np.asarray(initial), coarsest)
+    mean = np.maximum(points.mean_target, DARKEST * points.mean_target.max())
+    pyramid = LogPyramid(np.broadcast_to(mean, (6, resolution, resolution, 3)), coarsest)
     optimizer = mi.ad.Adam(learning_rate, pyramid.levels, epsilon=1e-15)
     decay = (final_learning_rate / learning_rate) ** (1 / max(1, steps - 1))
     draw = generator(seed, "environment", "steps")
@@ -135,5 +130,4 @@ def _estimate(
     shadowed, unshadowed = transport.irradiance(light)
     if estimator == "plain":
         return shadowed
-    visible = [dr.select(u > 0, s / u, 1) for s, u in zip(shadowed, unshadowed)]
-    return unoccluded_irradiance(light, batch.normal) * mi.Color3f(*visible)
+    return unoccluded_irradiance(light, batch.normal) * visible_share(shadowed, unshadowed)

@@ -28,7 +28,7 @@ import numpy as np
 
 from tron.shading.denoise import atrous
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
-from tron.shading.irradiance import Occluder, irradiance
+from tron.shading.irradiance import Occluder, irradiance, visible_share
 from tron.shading.split_sum import CUBEMAP_RESOLUTION, SplitSum
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def visibility(
     shadowed, unshadowed = irradiance(tracer, gbuffer, lighting.light, spp, seed)
     if denoise:
         shadowed, unshadowed = atrous(shadowed, unshadowed, gbuffer, tracer.scene.spacing)
-    return dr.select(unshadowed > 0, shadowed / unshadowed, 1)
+    return visible_share(shadowed, unshadowed)
 
 
 @dataclass

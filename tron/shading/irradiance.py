@@ -27,7 +27,7 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.errors import TronError
-from tron.shading.sampling import PixelPoints
+from tron.shading.sampling import PixelPoints, has_strata
 from tron.tracing.tiles import lanes_of_pixels, tile_pixels
 
 if TYPE_CHECKING:
@@ -169,7 +169,13 @@ class RayPlan:
     @property
     def fan(self) -> int:
         """Rays that are traced together: consecutive, of one kind, within an eighth of its unit square."""
-        return next(size for size in (4, 2, 1) if self.points.count % (8 * size) == 0 or size == 1)
+        count = self.points.count
+        return next(size for size in (4, 2, 1) if (has_strata(count) and count >= 8 * size) or size == 1)
+
+
+def visible_share(shadowed: mi.Color3f, unshadowed: mi.Color3f) -> mi.Color3f:
+    """Share of the unshadowed light that arrives, by channel; all of none."""
+    return mi.Color3f(*[dr.select(u > 0, s / u, 1) for s, u in zip(shadowed, unshadowed, strict=True)])
 
 
 def shadow_ray(

@@ -10,7 +10,8 @@ Burley 2020, "Practical Hash-based Owen Scrambling") makes every point uniform b
 unbiased, and keeps all of that structure; it also shuffles the Z order.
 
 Within a pixel the points come in the order of their strata, the same for all pixels: neighbouring lanes then
-send rays in neighbouring directions, and so do four consecutive points of one lane.
+send rays in neighbouring directions, and so do four consecutive points of one lane. All of this holds for
+2^k points a pixel; other numbers take what comes next in the sequence, and are merely well spread.
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
@@ -66,6 +67,11 @@ def morton(x: mi.UInt32, y: mi.UInt32) -> mi.UInt32:
     return spread(x & 0xFFFF) | (spread(y & 0xFFFF) << 1)
 
 
+def has_strata(count: int) -> bool:
+    """Whether runs of ``count`` points are stratified: whether it is a power of two."""
+    return count & (count - 1) == 0
+
+
 @cache
 def stratum_order(log_count: int) -> np.ndarray:
     """Indices, within the first run of 2^log_count points, in Z order of the points' strata; (2^log_count,).
@@ -106,16 +112,15 @@ class PixelPoints:
 
     Attributes:
         count: points a pixel, in each set.
-        log_count: of the run of points that a pixel takes: the next power of two.
-        order: indices within a run, in the order in which they are used.
-        shift: see :func:`row_shift`; zero where ``count`` is no power of two and strata are not complete.
+        order: indices within a pixel's run of points, in the order in which they are used: by strata where
+            ``count`` is a power of two; otherwise there are none, and the sequence is used as it comes.
+        shift: see :func:`row_shift`; zero without strata.
         row_mask: of the bits that ``shift`` is looked up by.
         seeds: of the pixels' order, then of columns and rows of each set.
         width, across: pixels and blocks across the image.
     """
 
     count: int
-    log_count: mi.UInt32
     order: mi.UInt32
     shift: mi.UInt32
     row_mask: mi.UInt32
@@ -126,14 +131,12 @@ class PixelPoints:
     @classmethod
     def make(cls, count: int, sets: int, width: int, seed: int, *path: str | int) -> PixelPoints:
         """Points of an image ``width`` pixels across; seed and path as in :func:`tron.seeds.integer`."""
-        log_count = (count - 1).bit_length()
-        if count == 1 << log_count:
+        order, shift = np.arange(count, dtype=np.uint32), np.zeros(1, np.uint32)
+        if has_strata(count):
+            log_count = count.bit_length() - 1
             order, shift = stratum_order(log_count), row_shift(log_count)
-        else:
-            order, shift = np.arange(count, dtype=np.uint32), np.zeros(1, np.uint32)
         return cls(
             count=count,
-            log_count=dr.opaque(mi.UInt32, log_count),
             order=mi.UInt32(order),
             shift=mi.UInt32(shift),
             row_mask=dr.opaque(mi.UInt32, len(shift) - 1),
@@ -150,12 +153,13 @@ class PixelPoints:
         rank = (block << (2 * BLOCK_BITS)) | morton(x & low, y & low)
         # From the highest bit down: blocks of pixels of every size stay together.
         rank = dr.brev(scramble(dr.brev(rank), dr.gather(mi.UInt32, self.seeds, 0)))
-        return rank << self.log_count
+        # Runs follow each other without gaps: a point that no pixel takes would be missing everywhere.
+        return rank * dr.opaque(mi.UInt32, self.count)
 
     def point(self, run: mi.UInt32, i: mi.UInt32, which: mi.UInt32) -> mi.Point2f:
         """Point ``i`` of 0..count-1 of the set ``which``, of the pixel whose run begins at ``run``."""
         own = dr.gather(mi.UInt32, self.shift, pascal(run) & self.row_mask)
-        index = run | (dr.gather(mi.UInt32, self.order, i) ^ own)
+        index = run + (dr.gather(mi.UInt32, self.order, i) ^ own)
         column = scramble(index, dr.gather(mi.UInt32, self.seeds, 2 * which + 1))
         row = scramble(pascal(index), dr.gather(mi.UInt32, self.seeds, 2 * which + 2))
         # 24 bits are what a float32 below one can hold.

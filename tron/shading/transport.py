@@ -2,7 +2,8 @@
 
 The rays of :mod:`tron.shading.irradiance`, the same estimator and the same weights, are traced once and kept
 with their visibility, one lane a ray. Irradiance / pi is then a weighted sum of looked-up radiance: gradients
-reach the light's texels, and stop at directions, densities and visibility. Memory grows with pixels x rays;
+reach the light's texels and, on request, the opacities that cast shadows; they stop at directions and
+densities. Memory grows with pixels x rays;
 where no gradient is wanted, :func:`tron.shading.irradiance` stores nothing.
 """
 
@@ -12,15 +13,16 @@ where no gradient is wanted, :func:`tron.shading.irradiance` stores nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import drjit as dr
 import mitsuba as mi
 
+from tron.errors import TronError
 from tron.shading.irradiance import ORIGIN_OFFSET, Light, Occluder, RayPlan, shadow_ray
 
 if TYPE_CHECKING:
-    from tron.tracing import GBuffer
+    from tron.tracing import GBuffer, SurfelTracer
 
 
 @dataclass
@@ -40,18 +42,30 @@ class Transport:
     per_pixel: int
 
     @classmethod
-    def trace(cls, tracer: Occluder, gbuffer: GBuffer, light: Light, spp: int, seed: int) -> Transport:
+    def trace(
+        cls,
+        tracer: Occluder,
+        gbuffer: GBuffer,
+        light: Light,
+        spp: int,
+        seed: int,
+        by_opacity: bool = False,
+    ) -> Transport:
         """Draw and trace rays as :func:`tron.shading.irradiance` does; ``light`` only chooses directions.
 
         Args:
             tracer, gbuffer, spp, seed: as there; pixels of opacity 0 get rays of weight 0.
             light: what half the rays are drawn from.
+            by_opacity: let gradients reach the opacities of the surfels that cast the shadows, which the
+                paper does not; ``tracer`` must then be a ``SurfelTracer`` of differentiable parameters.
 
         Raises:
-            TronError: ``spp`` is odd or not positive.
+            TronError: ``spp`` is odd or not positive, or there are more rays than 32-bit indices address.
         """
         plan = RayPlan.make(spp, seed, gbuffer.width)
         pixels = dr.width(gbuffer.opacity)
+        if pixels * spp >= 1 << 32:
+            raise TronError(f"{pixels} pixels of {spp} rays are too many at once", mend="take fewer pixels")
         lane = dr.arange(mi.UInt32, pixels * spp)
         rays = dr.opaque(mi.UInt32, plan.rays)
         pixel, ray = lane // rays, lane % rays
@@ -66,9 +80,13 @@ class Transport:
             counts = surface & (weight > 0)
             offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
             origin = spread(gbuffer.position) + normal * offset
-            (visibility,) = tracer.transmittances(origin, [direction], [counts])
             weight = dr.select(counts, weight, 0) / mi.Float(plan.count)
-            dr.eval(direction, weight, visibility)
+            dr.eval(direction, weight, origin, counts)
+        if by_opacity:
+            visibility = cast("SurfelTracer", tracer).transmittance_by_opacity(origin, direction, counts)
+        else:
+            (visibility,) = tracer.transmittances(origin, [direction], [counts])
+        dr.eval(visibility)
         return cls(direction, weight, visibility, spp)
 
     def irradiance(self, light: Light) -> tuple[mi.Color3f, mi.Color3f]:

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from tron.tracing.kernel import GEOMETRY_PACKETS, SurfelRecords
+from tron.tracing.kernel import GEOMETRY_PACKETS, SurfelRecords, half_axes
 
 LEAF_SIZE = 2
 CHILDREN = 4
@@ -137,11 +137,8 @@ def _bounds(geometry: mi.Float, count: int, places: int) -> tuple[mi.Vector3f, m
         dr.gather(mi.Vector4f, geometry, place * GEOMETRY_PACKETS + k, real) for k in range(GEOMETRY_PACKETS)
     )
     real &= v.w >= 0
-    reach2 = dr.maximum(v.w, 0)
-    axis_u, axis_v = mi.Vector3f(u.x, u.y, u.z), mi.Vector3f(v.x, v.y, v.z)
-    # t_u / s_u has length 1 / s_u: divided by its squared length it is s_u t_u.
-    half_u, half_v = axis_u / dr.squared_norm(axis_u), axis_v / dr.squared_norm(axis_v)
-    extent = dr.sqrt((half_u * half_u + half_v * half_v) * reach2)
+    half_u, half_v = half_axes(mi.Vector3f(u.x, u.y, u.z), mi.Vector3f(v.x, v.y, v.z), v.w)
+    extent = dr.sqrt(half_u * half_u + half_v * half_v)
     middle = mi.Vector3f(centre.x, centre.y, centre.z)
     low, high = dr.select(real, middle - extent, dr.inf), dr.select(real, middle + extent, -dr.inf)
     dr.eval(low, high)

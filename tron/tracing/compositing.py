@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from tron.errors import TronError
 from tron.tracing.hits import LocalHits
 from tron.tracing.kernel import FEATURE_PACKETS, SH_PACKETS, SurfelRecords
 
@@ -41,8 +42,17 @@ class HitList:
 
     @staticmethod
     def empty(ray: mi.UInt32, room: int) -> HitList:
-        """Lists of up to ``room`` hits for the rays ``ray``."""
+        """Lists of up to ``room`` hits for the rays ``ray``.
+
+        Raises:
+            TronError: more than 32-bit indices can address.
+        """
         rays = dr.width(ray)
+        if room * rays >= 1 << 32:
+            raise TronError(
+                f"{rays} rays of up to {room} hits are too many to differentiate at once",
+                mend="render the image in parts, or without gradients",
+            )
         return HitList(dr.empty(mi.UInt32, room * rays), dr.zeros(mi.UInt32, rays), ray)
 
 

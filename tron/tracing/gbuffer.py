@@ -95,7 +95,8 @@ def trace_tiles(
     crowded = dr.compress(hits.met > MAX_HITS)
     if dr.width(crowded) == 0:
         return sums, kept
-    room = int(dr.max(dr.gather(mi.UInt32, hits.met, crowded))[0])  # met counts all that can be composited
+    # Met counts all that can be composited, but multiplied in another order: rounding may let one more in.
+    room = int(dr.max(dr.gather(mi.UInt32, hits.met, crowded))[0]) + 1
     more = HitList.empty(crowded, room) if keep_hits else None
     start, count = (dr.gather(mi.UInt32, values, crowded) for values in (start, count))
     direction = dr.gather(mi.Vector3f, rays.direction, crowded)

@@ -54,6 +54,13 @@ def cut_radius_squared(opacity: mi.Float, degree: int) -> mi.Float:
     return dr.select(threshold <= 1, q, -1)
 
 
+def half_axes(u_axis: mi.Vector3f, v_axis: mi.Vector3f, q_cut: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """Half axes of the disk within which a surfel counts, from ``t_u / s_u``, ``t_v / s_v`` of its record."""
+    reach = dr.sqrt(dr.select(q_cut > 0, q_cut, 0))
+    # t_u / s_u has length 1 / s_u: divided by its squared length it is s_u t_u.
+    return u_axis * (reach / dr.squared_norm(u_axis)), v_axis * (reach / dr.squared_norm(v_axis))
+
+
 def response(q: Any, degree: int) -> Any:
     """Response of the kernel at squared Mahalanobis distance ``q`` (Dr.Jit float)."""
     return dr.exp(-0.5 * q) if degree == 2 else dr.exp((-1.0 / 18.0) * q * q)

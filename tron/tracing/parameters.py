@@ -55,12 +55,21 @@ class SurfelParameters:
     sh_degree: int
 
     @staticmethod
-    def from_scene(scene: GaussianScene) -> SurfelParameters:
-        """Upload a scene (of zero surfels, too)."""
+    def from_scene(scene: GaussianScene, sh_degree: int | None = None) -> SurfelParameters:
+        """Upload a scene (of zero surfels, too).
+
+        ``sh_degree`` is the highest with a coefficient that is not zero, unless given: harmonics that are to
+        be learnt begin at zero, and those beyond the degree get no gradient.
+        """
+        degree = highest_sh_degree(scene) if sh_degree is None else sh_degree
         arrays = {name: mi.Float(getattr(scene, name).ravel()) for name in PARAMETERS}
         return SurfelParameters(
-            **arrays, count=len(scene), kernel_degree=scene.kernel_degree, sh_degree=highest_sh_degree(scene)
+            **arrays, count=len(scene), kernel_degree=scene.kernel_degree, sh_degree=degree
         )
+
+    def differentiable(self) -> bool:
+        """Whether any of them has gradients enabled."""
+        return dr.grad_enabled(*[getattr(self, name) for name in PARAMETERS])
 
 
 PARAMETERS = (

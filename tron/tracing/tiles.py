@@ -20,12 +20,14 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.cameras import Camera
-from tron.tracing.kernel import GEOMETRY_PACKETS, SurfelRecords
+from tron.tracing.kernel import GEOMETRY_PACKETS, SurfelRecords, half_axes
 
 TILE = 4
 LANES = TILE * TILE
 MARGIN = 1e-2
 """Pixels added around a surfel's bounds: candidates may be too many by rounding, never too few."""
+TOUCHING = 5e-3
+"""Nearest times farthest depth of an ellipse, as a share of its centre's squared; below it, no bounds."""
 
 
 @dataclass(frozen=True)
@@ -124,9 +126,7 @@ def _touched_tiles(
     u, v = mi.Vector3f(axis_u.x, axis_u.y, axis_u.z), mi.Vector3f(axis_v.x, axis_v.y, axis_v.z)
     q_cut = axis_v.w
     facing = dr.dot(dr.cross(u, v), to_centre) < 0  # a flat disk shows one side to a point
-    # t_u / s_u has length 1 / s_u: divided by its squared length it is s_u t_u.
-    reach = dr.safe_sqrt(q_cut)
-    u, v = u * (reach / dr.squared_norm(u)), v * (reach / dr.squared_norm(v))
+    u, v = half_axes(u, v, q_cut)
 
     def seen(vector: mi.Vector3f) -> mi.Vector3f:
         return mi.Vector3f(dr.dot(right, vector), dr.dot(down, vector), dr.dot(forward, vector))
@@ -159,7 +159,8 @@ def _screen_bounds(
     m = c[k] / depth
     a_off, b_off = a[k] - m * a.z, b[k] - m * b.z
     in_front = depth * depth - a.z * a.z - b.z * b.z
-    clear = (in_front > 0) & (depth > 0)
+    # Where the ellipse all but touches the camera's plane the roots are ill-conditioned, and far out anyway.
+    clear = (in_front > TOUCHING * depth * depth) & (depth > 0)
     cross = -(a_off * a.z + b_off * b.z)
     root = dr.sqrt(dr.maximum(cross * cross + in_front * (a_off * a_off + b_off * b_off), 0))
     low, high = m + (cross - root) / in_front, m + (cross + root) / in_front

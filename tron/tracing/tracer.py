@@ -12,6 +12,7 @@ import mitsuba as mi
 from tron.errors import TronError
 from tron.tracing.bvh import build_bvh, refit
 from tron.tracing.gbuffer import GBuffer, trace_gbuffer
+from tron.tracing.kernel import SurfelRecords
 from tron.tracing.parameters import SurfelParameters, pack
 from tron.tracing.rays import trace_rays
 from tron.tracing.shadow_gradient import transmittance_by_opacity
@@ -36,19 +37,19 @@ class SurfelTracer:
             for surfels that move there is :meth:`moved`.
         two_sided: let back faces block shadow rays beyond two spacings; False is the paper's rule.
         parameters: traced instead of the scene's own arrays; results are differentiable by those of them that
-            have gradients enabled.
+            have gradients enabled, as often as they are asked for. After new values, :meth:`update`.
 
     Attributes:
-        records: the surfels as every kernel reads them. bvh: their hierarchy.
+        records: the surfels as every kernel reads them, without gradients. bvh: their hierarchy.
     """
 
     def __init__(
         self, scene: GaussianScene, *, two_sided: bool = True, parameters: SurfelParameters | None = None
     ) -> None:
-        self.scene, self.two_sided = scene, two_sided
-        self.records = pack(parameters or SurfelParameters.from_scene(scene))
+        self.scene, self._parameters = scene, parameters
+        self.records = pack(parameters or SurfelParameters.from_scene(scene)).detached()
         # Not built when first needed: that may be inside a recorded loop, where nothing can be evaluated.
-        self.bvh = build_bvh(self.records.detached())
+        self.bvh = build_bvh(self.records)
         self._sorted_area = self.bvh.area
         reach = BACK_FACE_SPACINGS * scene.spacing if two_sided else float("inf")
         self._back_faces_from = dr.opaque(mi.Float, reach)
@@ -63,8 +64,10 @@ class SurfelTracer:
             scene: as many surfels, in the same order (:func:`tron.gaussians.edit.moved`).
 
         Raises:
-            TronError: another number of surfels.
+            TronError: another number of surfels, or a tracer of ``parameters``.
         """
+        if self._parameters is not None:
+            raise TronError("this tracer follows parameters", mend="change them and call its update()")
         if len(scene) != len(self.scene):
             raise TronError(
                 f"{len(scene)} surfels cannot be where {len(self.scene)} were",
@@ -72,17 +75,34 @@ class SurfelTracer:
             )
         other = copy(self)
         other.scene = scene
-        other.records = pack(SurfelParameters.from_scene(scene))
-        other.bvh = refit(self.bvh.order, self.bvh.levels, other.records)
-        if bool((other.bvh.area > LOOSE_BOXES * self._sorted_area)[0]):
-            other.bvh = build_bvh(other.records)
-            other._sorted_area = other.bvh.area
+        other._take(pack(SurfelParameters.from_scene(scene)))
         return other
+
+    def update(self) -> None:
+        """Take the new values of ``parameters``: as many surfels, which may have moved."""
+        if self._parameters is not None:
+            with dr.suspend_grad():
+                self._take(pack(self._parameters).detached())
+
+    def _take(self, records: SurfelRecords) -> None:
+        self.records = records
+        self.bvh = refit(self.bvh.order, self.bvh.levels, records)
+        if bool((self.bvh.area > LOOSE_BOXES * self._sorted_area)[0]):
+            self.bvh = build_bvh(records)
+            self._sorted_area = self.bvh.area
+
+    def _attached(self) -> SurfelRecords:
+        """The records, attached to the parameters that have gradients enabled.
+
+        Packed anew each time, because a backward pass frees the edges between parameters and records.
+        """
+        if self._parameters is None or not self._parameters.differentiable():
+            return self.records
+        return pack(self._parameters)
 
     def gbuffer(self, camera: Camera) -> GBuffer:
         """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it."""
-        lists = build_tiles(self.records.detached(), camera)
-        return trace_gbuffer(self.records, lists, camera)
+        return trace_gbuffer(self._attached(), build_tiles(self.records, camera), camera)
 
     def trace(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True) -> Surface:
         """What any rays see, from ``origin`` along unit ``direction``; inactive lanes see nothing.
@@ -90,7 +110,7 @@ class SurfelTracer:
         The same surfels composited in the same order as by :meth:`gbuffer`, without the coherence that makes
         camera rays fast.
         """
-        return trace_rays(self.records, self.bvh, origin, direction, mi.Bool(active))
+        return trace_rays(self._attached(), self.bvh, origin, direction, mi.Bool(active))
 
     def transmittance(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
@@ -109,5 +129,5 @@ class SurfelTracer:
     ) -> mi.Float:
         """:meth:`transmittance`, differentiable by the opacities; not inside a recorded loop."""
         return transmittance_by_opacity(
-            self.records, self.bvh, origin, direction, self._back_faces_from, mi.Bool(active)
+            self._attached(), self.bvh, origin, direction, self._back_faces_from, mi.Bool(active)
         )

@@ -70,8 +70,19 @@ def test_moving_back_restores(scene: GaussianScene) -> None:
         ([0], 2 * np.eye(3), "not a rotation"),
         ([0], np.eye(4), "not a rotation"),
         ([0], np.diag([1.0, 1, -1]), "mirrors"),
+        ([40], np.eye(3), "neither a mask nor indices"),
+        ([-1], np.eye(3), "neither a mask nor indices"),
+        ([0.0, 1.0], np.eye(3), "neither a mask nor indices"),
+        ([True, False], np.eye(3), "mask has shape"),
     ],
 )
 def test_what_cannot_be_moved_is_refused(scene: GaussianScene, which, rotation, what) -> None:
     with pytest.raises(TronError, match=what):
-        moved(scene, np.array(which, int), rotation)
+        moved(scene, np.array(which), rotation)
+
+
+@pytest.mark.parametrize("vector", [2.0, [1.0, 2.0], [np.nan, 0, 0]])
+@pytest.mark.parametrize("name", ["translation", "pivot"])
+def test_where_to_is_three_finite_numbers(scene: GaussianScene, name: str, vector) -> None:
+    with pytest.raises(TronError, match=name):
+        moved(scene, np.array([0]), **{name: vector})

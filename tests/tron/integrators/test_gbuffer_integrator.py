@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import drjit as dr
@@ -197,6 +198,22 @@ def test_new_parameters_are_a_new_scene(surfels) -> None:
     parameters.update()
     surfels.means = moved
     assert_same(render(integrator, scene), SurfelTracer(surfels).gbuffer(CAMERA).numpy())
+
+
+def test_harmonics_that_were_zero_can_be_learnt(surfels) -> None:
+    flat = dataclasses.replace(surfels, sh=np.concatenate([surfels.sh[:, :1], 0 * surfels.sh[:, 1:]], 1))
+    integrator, scene = plugin(flat), scene_of(sensor())
+    parameters = mi.traverse(integrator)
+    dr.enable_grad(parameters["sh"])
+    dr.backward(dr.sum(mi.render(scene, parameters, integrator=integrator, spp=1)[..., :3], axis=None))
+    gradient = np.abs(np.array(dr.grad(parameters["sh"])).reshape(-1, 16, 3)).max((0, 2))
+    assert (gradient > 0).all()
+    before = render(integrator, scene)["rgb"]
+    coefficients = flat.sh.copy()
+    coefficients[:, 1] += 0.5
+    parameters["sh"] = mi.Float(coefficients.ravel())
+    parameters.update()
+    assert np.abs(render(integrator, scene)["rgb"] - before).max() > 0.1
 
 
 def test_gradients_through_render_are_the_finite_differences(surfels) -> None:

@@ -148,6 +148,24 @@ def test_seeds_are_reproducible_and_independent(variant: str, sphere_over_plane,
     assert abs(np.corrcoef(one, two)[0, 1]) < 0.02
 
 
+@pytest.mark.parametrize("spp", [6, 10, 20, 64, 100])
+def test_no_number_of_rays_errs_over_the_whole_image(
+    variant: str, sphere_over_plane, points_gbuffer, spp: int
+) -> None:
+    """The mean over 1024 pixels of a small light, over seeds: no worse than of independent pixels."""
+    image = np.zeros((64, 128, 3), np.float32)
+    image[20:23, 40:43] = 100.0
+    light = EnvironmentLight(EnvironmentMap(image))
+    gbuffer = points_gbuffer(np.zeros((1024, 3)), np.tile([0, 0, 1.0], (1024, 1)))
+    gbuffer.width = gbuffer.height = 32
+    tracer = sphere_over_plane(sphere=False)
+    pixels = np.stack([columns(irradiance(tracer, gbuffer, light, spp, s)[1])[:, 0] for s in range(12)])
+    truth = columns(irradiance(tracer, gbuffer, light, 1024, 99)[1])[:, 0].mean()
+    shared = np.sqrt(np.mean((pixels.mean(1) / truth - 1) ** 2))
+    independent = pixels.std() / truth / np.sqrt(1024)
+    assert shared < 1.7 * independent  # 12 seeds know their own deviation to a fifth
+
+
 def test_strata_beat_independent_rays(variant: str, sphere_over_plane, points_gbuffer) -> None:
     image = np.zeros((32, 64, 3), np.float32)
     image[:16, :40] = 1.0

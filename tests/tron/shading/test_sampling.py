@@ -54,6 +54,15 @@ def test_points_without_structure_are_no_net(variant: str) -> None:
     assert not is_net(blocks(shuffled, 1))
 
 
+@pytest.mark.parametrize("count", [3, 5, 6, 50])
+def test_other_numbers_leave_no_stratum_out_everywhere(variant: str, count: int) -> None:
+    """What every pixel leaves out is an error of the whole image, which no filter removes."""
+    points = drawn(count).reshape(-1, 2)
+    for axis in (0, 1):
+        share = np.histogram(points[:, axis], bins=64, range=(0, 1))[0] / len(points)
+        np.testing.assert_allclose(share, 1 / 64, rtol=0.05)
+
+
 @pytest.mark.parametrize("count", [16, 32])
 def test_all_pixels_take_their_strata_in_one_order_and_neighbours_follow_each_other(variant, count) -> None:
     points = drawn(count, rows=16)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 
 import drjit as dr
@@ -13,6 +14,10 @@ import numpy as np
 import pytest
 
 from tron import seeds
+from tron.cameras import Camera
+from tron.errors import TronError
+from tron.shading.environment import EnvironmentLight, EnvironmentMap
+from tron.shading.transport import Transport
 from tron.tracing import SurfelTracer, reference
 from tron.tracing.parameters import PARAMETERS, SurfelParameters
 
@@ -84,3 +89,58 @@ def test_by_default_shadows_have_no_gradient(disks):
     tracer, _ = tracer_and_parameters(disks([[0, 0, 0.5]], [True], opacity=0.5, sigma=0.3))
     assert not dr.grad_enabled(tracer.transmittance(*rays([[0, 0, 0]], [[0, 0, 1]])))
     assert dr.grad_enabled(tracer.transmittance_by_opacity(*rays([[0, 0, 0]], [[0, 0, 1]])))
+
+
+def test_gradients_come_as_often_as_they_are_asked_for(random_scene):
+    tracer, parameters = tracer_and_parameters(random_scene(60))
+    camera = Camera.look_at((2.5, 1, 0.7), (0, 0, 0), fov_deg=50, width=12, height=8)
+    gradients = []
+    for _ in range(3):
+        dr.backward(dr.sum(tracer.gbuffer(camera).opacity))
+        gradients.append(np.array(dr.grad(parameters.opacity_logits)))
+        dr.clear_grad(parameters.opacity_logits)
+    assert np.abs(gradients[0]).max() > 0
+    np.testing.assert_allclose(gradients[1], gradients[0], rtol=1e-5)
+    np.testing.assert_allclose(gradients[2], gradients[0], rtol=1e-5)
+
+
+def test_a_tracer_follows_its_parameters(random_scene):
+    scene = random_scene(60)
+    parameters = SurfelParameters.from_scene(scene)
+    tracer = SurfelTracer(scene, parameters=parameters)
+    camera = Camera.look_at((2.5, 1, 0.7), (0, 0, 0), fov_deg=50, width=12, height=8)
+    moved = dataclasses.replace(scene, means=scene.means + np.float32([0.1, -0.2, 0.3]))
+    parameters.means = mi.Float(moved.means.ravel())
+    tracer.update()
+    expected = SurfelTracer(moved).gbuffer(camera).numpy()
+    np.testing.assert_allclose(tracer.gbuffer(camera).numpy()["rgb"], expected["rgb"], atol=1e-6)
+    with pytest.raises(TronError, match="follows parameters"):
+        tracer.moved(moved)
+
+
+def test_shadowed_irradiance_is_differentiable_by_opacity_on_request(disks):
+    """A disk above a floor point, straight under a light: less of it arrives the more opaque the disk."""
+    scene = disks([[0, 0, 1.0]], [False], opacity=0.6, sigma=2.0)
+    light = EnvironmentLight(EnvironmentMap.constant(1.0))
+    point = SimpleNamespace(
+        position=mi.Point3f(0, 0, 0),
+        normal=mi.Normal3f(0, 0, 1),
+        opacity=mi.Float(1),
+        width=1,
+        height=1,
+    )
+
+    def arriving(logit: float, by_opacity: bool):
+        scene.opacity_logits[:] = logit
+        tracer, parameters = tracer_and_parameters(scene)
+        transport = Transport.trace(tracer, point, light, 64, 0, by_opacity=by_opacity)
+        return transport.irradiance(light)[0].x, parameters
+
+    found, parameters = arriving(0.4, by_opacity=True)
+    dr.backward(found)
+    step = 1e-2
+    ends = [float(arriving(0.4 + sign * step, by_opacity=False)[0][0]) for sign in (1, -1)]
+    expected = (ends[0] - ends[1]) / (2 * step)
+    assert expected < -0.05
+    assert float(dr.grad(parameters.opacity_logits)[0]) == pytest.approx(expected, rel=0.02)
+    assert not dr.grad_enabled(arriving(0.4, by_opacity=False)[0])
