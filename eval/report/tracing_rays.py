@@ -59,9 +59,9 @@ def camera_section(settings: Tracing, measured: Measured, output_dir: Path) -> l
             "fiftieth of their width as thickness. They have no front side, so surfels seen from behind are "
             "composited too. It orders them by where the ray enters their hull, and starts again 0.0001 "
             "behind each hit, which skips those that nearly coincide. It gathers radiance alone, while TRON "
-            "also gathers normal, base color, roughness, metallic, mean and median depth, and keeps the list "
-            "of hits that the gradient replays. A closest hit is one Embree query against a quad around each "
-            "surfel: no opacity, no order, no colour; what any tracer of triangles spends at the least."
+            "also gathers normal, base color, roughness, metallic, mean and median depth. A closest hit is "
+            "one Embree query against a quad around each surfel: no opacity, no order, no colour; what any "
+            "tracer of triangles spends at the least."
         ),
     ]
     extras = [frame for frame in (measured.harmonics, measured.from_gbuffers) if frame is not None]

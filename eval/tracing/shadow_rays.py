@@ -11,6 +11,7 @@ and taken off both sides.
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -79,14 +80,15 @@ class ShadowRays:
         return [Row(metric=f"{name}.{case}", value=v, unit=unit, n=n) for name, (v, unit) in figures.items()]
 
 
-class _Occluder:
+class _Occluder(abc.ABC):
     """What the irradiance pass asks of a tracer; fans of rays are traced one by one."""
 
     def __init__(self, scene: GaussianScene) -> None:
         self.scene = scene
 
+    @abc.abstractmethod
     def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        raise NotImplementedError
+        """Transmittance of one ray a lane."""
 
     def transmittances(
         self, origin: mi.Point3f, directions: Sequence[mi.Vector3f], active: Sequence[mi.Bool]
