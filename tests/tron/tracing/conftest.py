@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from tron import seeds
 from tron.gaussians.scene import GaussianScene
+from tron.tracing import SurfelTracer
 
 
 def _random_scene(count: int, *, degree: int = 2, sh_degree: int = 3, seed: int = 0) -> GaussianScene:
@@ -61,3 +63,27 @@ def random_scene() -> Callable[..., GaussianScene]:
 @pytest.fixture
 def disks() -> Callable[..., GaussianScene]:
     return _disks
+
+
+def _random_rays(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Origins (count, 3) about the unit cube and unit directions (count, 3), float32."""
+    rng = seeds.generator(seed, "tests", "rays")
+    directions = rng.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return rng.uniform(-1.5, 1.5, (count, 3)).astype(np.float32), directions.astype(np.float32)
+
+
+def _shadows(tracer: SurfelTracer, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """(P,) transmittances of rays (P, 3)."""
+    columns = [np.ascontiguousarray(np.asarray(rays, np.float32).T) for rays in (origins, directions)]
+    return np.array(tracer.transmittance(mi.Point3f(columns[0]), mi.Vector3f(columns[1])))
+
+
+@pytest.fixture
+def random_rays() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    return _random_rays
+
+
+@pytest.fixture
+def shadows() -> Callable[..., np.ndarray]:
+    return _shadows

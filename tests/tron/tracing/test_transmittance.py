@@ -17,32 +17,20 @@ from tron.tracing import SurfelTracer, reference
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def random_rays(count):
-    rng = seeds.generator(0, "tests", "shadow rays")
-    directions = rng.normal(size=(count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return rng.uniform(-1.5, 1.5, (count, 3)).astype(np.float32), directions.astype(np.float32)
-
-
-def trace(tracer, origins, directions):
-    origin = mi.Point3f(np.asarray(origins, np.float32).T.copy())
-    return np.array(tracer.transmittance(origin, mi.Vector3f(np.asarray(directions, np.float32).T.copy())))
-
-
 @pytest.mark.parametrize("degree", [2, 4])
 @pytest.mark.parametrize("two_sided", [True, False])
 @pytest.mark.parametrize("count", [1, 2, 3, 400])
-def test_agrees_with_the_float64_reference(random_scene, degree, two_sided, count):
+def test_agrees_with_the_float64_reference(random_rays, shadows, random_scene, degree, two_sided, count):
     scene = random_scene(count, degree=degree)
     origins, directions = random_rays(1000)
     truth, margin = reference.transmittance(scene, origins, directions, two_sided=two_sided)
     steady = margin > 1e-5
     assert (~steady).mean() < 0.05
-    found = trace(SurfelTracer(scene, two_sided=two_sided), origins, directions)
+    found = shadows(SurfelTracer(scene, two_sided=two_sided), origins, directions)
     np.testing.assert_allclose(found[steady], truth[steady], atol=1e-4)
 
 
-def test_order_of_surfels_does_not_matter(random_scene):
+def test_order_of_surfels_does_not_matter(random_rays, shadows, random_scene):
     scene = random_scene(300)
     order = seeds.generator(0, "tests", "order").permutation(len(scene))
     arrays = {
@@ -51,32 +39,32 @@ def test_order_of_surfels_does_not_matter(random_scene):
         if isinstance(getattr(scene, f.name), np.ndarray) and f.name != "up"
     }
     origins, directions = random_rays(1000)
-    first = trace(SurfelTracer(scene), origins, directions)
-    second = trace(SurfelTracer(dataclasses.replace(scene, **arrays)), origins, directions)
+    first = shadows(SurfelTracer(scene), origins, directions)
+    second = shadows(SurfelTracer(dataclasses.replace(scene, **arrays)), origins, directions)
     np.testing.assert_allclose(first, second, atol=1e-5)
 
 
-def test_front_faces_block_from_zero_and_back_faces_beyond_two_spacings(disks):
+def test_front_faces_block_from_zero_and_back_faces_beyond_two_spacings(shadows, disks):
     heights = np.array([0.15, 0.25])  # spacing is 0.1: the rule's threshold lies between them
     up = [[0, 0, 1]] * 2
     for down, expected in ((True, [0.2, 0.2]), (False, [1.0, 0.2])):
         found = [
-            trace(SurfelTracer(disks([[0, 0, h]], [down], opacity=0.8, sigma=0.2)), [[0, 0, 0]], up[:1])[0]
+            shadows(SurfelTracer(disks([[0, 0, h]], [down], opacity=0.8, sigma=0.2)), [[0, 0, 0]], up[:1])[0]
             for h in heights
         ]
         np.testing.assert_allclose(found, expected, rtol=1e-5)
     one_sided = SurfelTracer(disks([[0, 0, 0.25]], [False], opacity=0.8, sigma=0.2), two_sided=False)
-    assert trace(one_sided, [[0, 0, 0]], up[:1])[0] == 1.0
+    assert shadows(one_sided, [[0, 0, 0]], up[:1])[0] == 1.0
 
 
-def test_behind_the_origin_nothing_blocks(disks):
+def test_behind_the_origin_nothing_blocks(shadows, disks):
     tracer = SurfelTracer(disks([[0, 0, -0.5]], [False], opacity=0.8, sigma=0.2))
-    assert trace(tracer, [[0, 0, 0]], [[0, 0, 1]])[0] == 1.0
+    assert shadows(tracer, [[0, 0, 0]], [[0, 0, 1]])[0] == 1.0
 
 
-def test_many_layers_are_exactly_opaque(disks):
+def test_many_layers_are_exactly_opaque(shadows, disks):
     layers = disks([[0, 0, 0.3 + 0.1 * k] for k in range(6)], [True] * 6, opacity=0.8, sigma=0.5)
-    assert trace(SurfelTracer(layers), [[0, 0, 0]], [[0, 0, 1]])[0] == 0.0
+    assert shadows(SurfelTracer(layers), [[0, 0, 0]], [[0, 0, 1]])[0] == 0.0
 
 
 def test_inactive_lanes_are_clear(disks):
@@ -86,9 +74,9 @@ def test_inactive_lanes_are_clear(disks):
     np.testing.assert_allclose(found, [0.2, 1.0], rtol=1e-5)
 
 
-def test_faint_surfels_block_nothing(disks):
+def test_faint_surfels_block_nothing(shadows, disks):
     tracer = SurfelTracer(disks([[0, 0, 0.5]], [True], opacity=0.003, sigma=0.5))
-    assert trace(tracer, [[0, 0, 0]], [[0, 0, 1]])[0] == 1.0
+    assert shadows(tracer, [[0, 0, 0]], [[0, 0, 1]])[0] == 1.0
 
 
 def built(monkeypatch):
@@ -101,11 +89,13 @@ def built(monkeypatch):
     return calls
 
 
-def test_a_tenth_of_the_surfels_may_move_every_frame_without_a_new_hierarchy(random_scene, monkeypatch):
+def test_a_tenth_of_the_surfels_may_move_every_frame_without_a_new_hierarchy(
+    random_rays, shadows, random_scene, monkeypatch
+):
     scene = random_scene(400)
     tracer, calls = SurfelTracer(scene), built(monkeypatch)
     origins, directions = random_rays(300)
-    before = trace(tracer, origins, directions)
+    before = shadows(tracer, origins, directions)
     current, now = tracer, scene
     part = np.argsort(np.linalg.norm(scene.means - [0.5, 0.5, 0.5], axis=1))[:40]
     turn = Rotation.from_rotvec([0.0, 0.1, 0.2]).as_matrix()
@@ -114,10 +104,10 @@ def test_a_tenth_of_the_surfels_may_move_every_frame_without_a_new_hierarchy(ran
         current = current.moved(now)
         truth, margin = reference.transmittance(now, origins, directions)
         steady = margin > 1e-5
-        np.testing.assert_allclose(trace(current, origins, directions)[steady], truth[steady], atol=1e-4)
+        np.testing.assert_allclose(shadows(current, origins, directions)[steady], truth[steady], atol=1e-4)
     assert not calls
-    assert np.abs(trace(current, origins, directions) - before).max() > 0.1
-    np.testing.assert_array_equal(trace(tracer, origins, directions), before)
+    assert np.abs(shadows(current, origins, directions) - before).max() > 0.1
+    np.testing.assert_array_equal(shadows(tracer, origins, directions), before)
 
 
 def test_a_hierarchy_gone_loose_is_built_anew(random_scene, monkeypatch):
