@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,8 +22,10 @@ class Capture:
         points: (N, 3) float32 points on surfaces, world, if some are known.
         point_colors: (N, 3) float32 of the points, display space.
         up: (3,) float64 unit up direction, world.
+        transform: (4, 4) float64 from the world of the files that the capture was read from to its world.
         exposure: what linear radiance is multiplied by before AgX to look like the images; one number for
             all, because all show one light. Radiance of unknown scale has 1.
+        skipped: what the files name and the capture lacks: name -> why, such as "image not found".
 
     Raises:
         TronError: no views, names that repeat, a held-out name that no view has, no view left to train on,
@@ -36,12 +38,17 @@ class Capture:
     point_colors: np.ndarray | None = None
     up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     exposure: float = 1.0
+    transform: np.ndarray = field(default_factory=lambda: np.eye(4))
+    skipped: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "views", tuple(self.views))
         object.__setattr__(self, "test", frozenset(self.test))
         object.__setattr__(self, "up", np.asarray(self.up, np.float64))
+        object.__setattr__(self, "transform", np.asarray(self.transform, np.float64))
         self._check_names()
+        if self.transform.shape != (4, 4) or not np.isfinite(self.transform).all():
+            raise TronError("transform of a capture is not a finite 4 x 4 matrix")
         if self.up.shape != (3,) or not abs(np.linalg.norm(self.up) - 1) < 1e-3:
             raise TronError(f"up of a capture is {self.up.tolist()}", mend="give a unit vector")
         if not (np.isfinite(self.exposure) and self.exposure > 0):

@@ -25,8 +25,9 @@ _CHANNELS = {
     "irradiance": 3,
     "mask": 1,
     "sky_mask": 1,
+    "depth": 1,
 }
-_NOT_NEGATIVE = ("image", "base_color", "roughness", "metallic", "irradiance", "mask", "sky_mask")
+_NOT_NEGATIVE = ("image", "base_color", "roughness", "metallic", "irradiance", "mask", "sky_mask", "depth")
 _AT_MOST_ONE = ("base_color", "roughness", "metallic", "mask", "sky_mask")
 _TOLERANCE = 1e-3
 
@@ -44,8 +45,10 @@ class View:
         base_color: (H, W, 3) linear, in [0, 1].
         roughness, metallic: (H, W) in [0, 1].
         irradiance: (H, W, 3) linear irradiance / pi, the radiance of a white diffuse surface.
-        mask: (H, W) in [0, 1], 1 on the subject.
+        mask: (H, W) in [0, 1], 1 on the subject; the alpha of an RGBA picture, whose colours are straight.
         sky_mask: (H, W) in [0, 1], 1 on the sky.
+        depth: (H, W) distance from the camera's position along the pixel's ray, world units; 0 where nothing
+            is known.
 
     Raises:
         TronError: no name, an unknown colour space, or an array that the camera contradicts, that is not
@@ -63,6 +66,7 @@ class View:
     irradiance: Pixels | None = None
     mask: Pixels | None = None
     sky_mask: Pixels | None = None
+    depth: Pixels | None = None
 
     def __post_init__(self) -> None:
         if not self.name:
