@@ -144,7 +144,7 @@ def _check_exr_header(parts: list[Any], file_bytes: int) -> None:
         raise TronError(f"OpenEXR file has {len(parts)} parts", mend="store one image a file")
     header = parts[0].header
     (x0, y0), (x1, y1) = (np.asarray(corner, dtype=np.int64) for corner in header["dataWindow"])
-    _check_size(int(x1 - x0 + 1), int(y1 - y0 + 1), len(header["channels"]), file_bytes)
+    check_size(int(x1 - x0 + 1), int(y1 - y0 + 1), len(header["channels"]), file_bytes)
     if "deep" in str(header.get("type", "")):
         raise TronError("OpenEXR file has deep pixels", mend="flatten it")
     if not np.array_equal(header["dataWindow"], header["displayWindow"]):
@@ -166,7 +166,7 @@ def decode_png(data: bytes) -> np.ndarray:
     """
     try:
         with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as picture:
-            _check_size(*picture.size, len(picture.getbands()), len(data))
+            check_size(*picture.size, len(picture.getbands()), len(data))
             if picture.mode.startswith("I"):  # 16 bits of grey
                 return np.asarray(picture, dtype=np.float32)[..., None] / 65535
             if picture.mode not in ("L", "RGB", "RGBA"):
@@ -202,7 +202,7 @@ def _decode_hdr(data: bytes) -> np.ndarray:
             "not a readable Radiance HDR image", mend="rows must run from top to bottom (-Y H +X W)"
         )
     height, width = int(header[1]), int(header[2])
-    _check_size(width, height, 3, len(data))
+    check_size(width, height, 3, len(data))
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # damage is ours to report
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -237,7 +237,8 @@ def _shaped(image: np.ndarray, channels: tuple[int, ...]) -> np.ndarray:
     return image
 
 
-def _check_size(width: int, height: int, channels: int, file_bytes: int) -> None:
+def check_size(width: int, height: int, channels: int, file_bytes: int) -> None:
+    """TronError if a header claims more pixels than are decoded here, or than the file's bytes can hold."""
     decoded = width * height * channels * 4
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and decoded <= MAX_DECODED_BYTES):
         raise TronError(f"image of {width} x {height} pixels and {channels} channels is too large")
