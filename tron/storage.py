@@ -74,6 +74,63 @@ def write_atomic(path: str | os.PathLike[str], data: bytes | str) -> None:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
+@contextmanager
+def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give an empty folder beside ``path``; it becomes ``path`` when the block succeeds.
+
+    What is at ``path`` by then is replaced: whether it may be is for the caller to ask beforehand. All files
+    are flushed to disk at the end, at once, so that the block can write them plainly. On any exception the
+    temporary folder is removed; what a killed process leaves is emptied by the next one, since its name is
+    always the same. Parent folders are made.
+
+    Raises:
+        TronError: the folder cannot be made or written to, or another run is writing it.
+    """
+    final = Path(path).absolute()
+    temporary, old = (final.with_name(f".{final.name}.{state}") for state in ("part", "old"))
+    try:
+        temporary.mkdir(parents=True, exist_ok=True)
+        with _claimed_folder(temporary):
+            try:
+                yield temporary
+                for inner in (*temporary.rglob("*"), temporary):
+                    _flush(inner)
+                _remove(old)
+                if final.exists():
+                    os.replace(final, old)
+                os.replace(temporary, final)
+                _flush(final.parent)
+                _remove(old)
+            finally:
+                _remove(temporary)
+    except BlockingIOError as error:
+        raise TronError("folder is being written by another run", final, "wait for it") from error
+    except OSError as error:
+        raise TronError(f"cannot write: {error.strerror or error}", final) from error
+
+
+@contextmanager
+def _claimed_folder(path: Path) -> Iterator[None]:
+    """Lock a folder and empty it; BlockingIOError if it is locked or was renamed meanwhile."""
+    handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not (path.exists() and os.path.samestat(os.fstat(handle), path.stat())):
+            raise BlockingIOError("renamed by the run that held it")
+        for inner in path.iterdir():
+            _remove(inner)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
 def sha256(path: str | os.PathLike[str]) -> str:
     """Return the SHA-256 of a file as 64 hexadecimal digits; TronError if it cannot be read."""
     try:

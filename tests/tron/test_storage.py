@@ -67,6 +67,38 @@ def test_killed_writer_leaves_nothing_that_the_next_one_does_not_clear(tmp_path:
     assert [path.name for path in tmp_path.iterdir()] == ["a.bin"]
 
 
+def test_a_folder_appears_whole_and_replaces_the_old_one_whole(tmp_path: Path):
+    for content in ("old", "new"):
+        with storage.atomic_folder(tmp_path / "deep" / "a") as temporary:
+            assert list(temporary.iterdir()) == []
+            (temporary / f"{content}.txt").write_text(content)
+            assert not (tmp_path / "deep" / "a" / f"{content}.txt").exists()
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["a"]
+    assert [path.name for path in (tmp_path / "deep" / "a").iterdir()] == ["new.txt"]
+
+
+def test_a_folder_that_fails_leaves_the_old_one_and_nothing_else(tmp_path: Path):
+    with storage.atomic_folder(tmp_path / "a") as temporary:
+        (temporary / "old.txt").write_text("old")
+    with pytest.raises(RuntimeError), storage.atomic_folder(tmp_path / "a") as temporary:
+        write_half_and_fail(temporary / "new.txt")
+    assert [path.name for path in tmp_path.rglob("*")] == ["a", "old.txt"]
+
+
+def test_a_folder_is_written_by_one_run_and_what_a_killed_one_left_is_emptied(tmp_path: Path):
+    with (
+        storage.atomic_folder(tmp_path / "a"),
+        pytest.raises(TronError, match="being written by another run"),
+        storage.atomic_folder(tmp_path / "a"),
+    ):
+        pass
+    left = tmp_path / ".b.part"
+    (left / "deep").mkdir(parents=True)
+    with storage.atomic_folder(tmp_path / "b"):
+        pass
+    assert list((tmp_path / "b").iterdir()) == []
+
+
 def test_new_files_follow_the_umask(tmp_path: Path):
     old = os.umask(0o027)
     try:
