@@ -1,6 +1,8 @@
 """Captures: posed views of a scene, photographed or path-traced; the same type for both."""
 
 from tron.captures.capture import Capture
+from tron.captures.load import load_capture
+from tron.captures.settings import LoadSettings, PosingSettings
 from tron.captures.view import View
 
-__all__ = ["Capture", "View"]
+__all__ = ["Capture", "LoadSettings", "PosingSettings", "View", "load_capture"]

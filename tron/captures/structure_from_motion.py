@@ -1,0 +1,224 @@
+"""Photos without poses, posed by pycolmap: SIFT, matching and incremental mapping on the CPU.
+
+Features are sought in upright, reduced copies, so that nothing in the files (EXIF orientation, 16 bits, alpha)
+can be read in two ways. The copies of photos that one camera and lens took at one size lie in a folder of their
+own and share a camera, COLMAP's OPENCV model refined with the poses.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from PIL import Image, ImageOps
+
+from tron.captures.assembly import PosedPhoto, PosedPhotos
+from tron.captures.colmap import points_of, posed_by, read_model
+from tron.captures.image_folder import photos_in
+from tron.captures.photographs import inspect_photo
+from tron.captures.settings import PosingSettings
+from tron.errors import TronError
+from tron.storage import locked, sha256, write_atomic
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[str], None]
+
+WORKSPACE = "structure_from_motion"
+_VERSION = 1
+_EXIF_FOLDER = 0x8769
+_CAMERA_TAGS = (0x010F, 0x0110)  # make, model
+_LENS_TAGS = (0x920A, 0xA405, 0xA404)  # focal length, the same for 35 mm film, digital zoom
+_FOCAL_35MM = 0xA405
+_EXHAUSTIVE_UP_TO = 200
+_FEWEST = 3
+_QUALITY = 95
+
+
+def pose_photos(folder: Path, settings: PosingSettings, progress: Progress = log.info) -> PosedPhotos:
+    """Pose the photos of a folder; the world's scale and axes are arbitrary.
+
+    The result is kept in the workspace and taken from there while photos and settings stay the same. Of several
+    models that do not connect the largest is taken; photos outside of it are skipped.
+
+    Args:
+        folder: holds the photos themselves.
+        settings: see :class:`PosingSettings`.
+        progress: told in a line what begins.
+
+    Raises:
+        TronError: fewer than three usable photos, or none that could be posed.
+    """
+    workspace = settings.workspace or folder / WORKSPACE
+    skipped: dict[str, str] = {}
+    photos: list[Path] = []
+    for path in photos_in(folder):
+        try:
+            inspect_photo(path)
+            photos.append(path)
+        except TronError as error:
+            skipped[path.name] = error.what
+    if len(photos) < _FEWEST:
+        raise TronError(
+            f"{len(photos)} usable photos{f', {len(skipped)} damaged' if skipped else ''}",
+            folder,
+            f"posing photos needs at least {_FEWEST}, overlapping",
+        )
+    with locked(workspace):
+        copies = _posed_copies(photos, workspace, settings, progress)
+        model = read_model(workspace / "sparse")
+    by_name = {path.name: path for path in photos}
+    posed = []
+    for copy, camera_to_world, lens in posed_by(model):
+        name = copies[copy]
+        posed.append(PosedPhoto(name, by_name.pop(name), camera_to_world, lambda _w, _h, lens=lens: lens))
+    skipped |= dict.fromkeys(by_name, "not posed: too few features in common with the others")
+    points, colors = points_of(model)
+    return PosedPhotos(folder, posed, points, colors, skipped=skipped, upright=True)
+
+
+def _posed_copies(
+    photos: Sequence[Path], workspace: Path, settings: PosingSettings, progress: Progress
+) -> dict[str, str]:
+    """Names of photos by those of their posed copies; makes the model if the kept one is of something else."""
+    record = workspace / "photos.json"
+    wanted = {
+        "version": _VERSION,
+        "photos": {path.name: sha256(path) for path in photos},
+        "matching": settings.matching,
+        "max_side": settings.max_side,
+        "seed": settings.seed,
+    }
+    kept = _kept(record)
+    if kept.get("wanted") == wanted and (workspace / "sparse").is_dir():
+        progress(f"poses of {len(photos)} photos taken from {workspace}")
+        return kept["copies"]
+    record.unlink(missing_ok=True)
+    for name in ("images", "models", "sparse"):
+        shutil.rmtree(workspace / name, ignore_errors=True)
+    for stale in workspace.glob("database.db*"):
+        stale.unlink()
+    progress(f"copying {len(photos)} photos for feature extraction")
+    copies = _copy(photos, workspace / "images", settings.max_side)
+    _map(workspace, len(photos), settings, progress)
+    write_atomic(record, json.dumps({"wanted": wanted, "copies": copies}, indent=1))
+    shutil.rmtree(workspace / "images", ignore_errors=True)
+    shutil.rmtree(workspace / "models", ignore_errors=True)
+    for stale in workspace.glob("database.db*"):
+        stale.unlink()
+    return copies
+
+
+def _kept(record: Path) -> dict[str, Any]:
+    try:
+        kept = json.loads(record.read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return kept if isinstance(kept, dict) and isinstance(kept.get("copies"), dict) else {}
+
+
+def _copy(photos: Sequence[Path], folder: Path, max_side: int) -> dict[str, str]:
+    """Write upright 8-bit copies, those of one camera into one folder; their names below ``folder``."""
+    cameras: dict[tuple[Any, ...], str] = {}
+    copies = {}
+    for index, path in enumerate(photos):
+        with Image.open(path) as picture:
+            exif = picture.getexif()
+            lens = exif.get_ifd(_EXIF_FOLDER)
+            upright = ImageOps.exif_transpose(picture)
+            key = (
+                upright.size,
+                *(exif.get(t) for t in _CAMERA_TAGS),
+                *(str(lens.get(t)) for t in _LENS_TAGS),
+            )
+            group = cameras.setdefault(key, f"camera_{len(cameras):03d}")
+            upright = _eight_bits(upright)
+            upright.thumbnail((max_side, max_side), Image.Resampling.LANCZOS, reducing_gap=None)
+            kept = Image.Exif()
+            if lens.get(_FOCAL_35MM):
+                kept.get_ifd(_EXIF_FOLDER)[_FOCAL_35MM] = lens[_FOCAL_35MM]
+            copy = f"{group}/{index:05d}.jpg"
+            (folder / group).mkdir(parents=True, exist_ok=True)
+            upright.save(folder / copy, quality=_QUALITY, exif=kept)
+            copies[copy] = path.name
+    return copies
+
+
+def _eight_bits(picture: Image.Image) -> Image.Image:
+    if picture.mode.startswith(("I", "F")):  # 16 bits of grey, which Pillow would clip
+        return picture.point(lambda value: value / 257).convert("L").convert("RGB")
+    return picture.convert("RGB")
+
+
+def _map(workspace: Path, count: int, settings: PosingSettings, progress: Progress) -> None:
+    """Make ``workspace/sparse`` of ``workspace/images``: the largest model."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 2
+    pycolmap.set_random_seed(settings.seed)
+    threads = settings.threads or (os.cpu_count() or 1)
+    database, images = workspace / "database.db", workspace / "images"
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = "OPENCV"
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.num_threads, extraction.use_gpu = threads, False
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads, matching.use_gpu = threads, False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = settings.seed
+    exhaustive = settings.matching == "exhaustive" or (
+        settings.matching == "auto" and count <= _EXHAUSTIVE_UP_TO
+    )
+    try:
+        progress(f"extracting features of {count} photos")
+        pycolmap.extract_features(
+            database,
+            images,
+            camera_mode=pycolmap.CameraMode.PER_FOLDER,
+            reader_options=reader,
+            extraction_options=extraction,
+            device=pycolmap.Device.cpu,
+        )
+        progress(f"matching features, {'every pair' if exhaustive else 'neighbours in time'}")
+        match = pycolmap.match_exhaustive if exhaustive else pycolmap.match_sequential
+        match(
+            database,
+            matching_options=matching,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
+        progress("finding cameras and points")
+        models = pycolmap.incremental_mapping(
+            database, images, workspace / "models", options=_mapping_options(count, threads, settings.seed)
+        )
+    except Exception as error:  # pycolmap raises ValueError, RuntimeError, OSError and its own
+        raise TronError(f"structure from motion failed: {error}", workspace) from error
+    if not models:
+        raise TronError(
+            f"none of {count} photos could be posed",
+            images,
+            "take more photos that overlap by half or more, from different places, of a textured scene",
+        )
+    largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    progress(f"{largest.num_reg_images()} of {count} photos posed, {largest.num_points3D()} points")
+    (workspace / "sparse").mkdir()
+    largest.write_binary(workspace / "sparse")
+
+
+def _mapping_options(count: int, threads: int, seed: int) -> pycolmap.IncrementalPipelineOptions:
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = threads, seed
+    options.mapper.num_threads, options.mapper.random_seed = threads, seed
+    options.triangulation.random_seed = seed
+    options.min_model_size = min(options.min_model_size, count)
+    return options

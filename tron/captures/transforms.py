@@ -1,0 +1,235 @@
+"""``transforms.json`` of NeRF-synthetic, instant-ngp, nerfstudio and DL3DV.
+
+The dialects agree on OpenGL camera-to-world matrices; they differ in what else they say:
+
+- NeRF-synthetic: one file a split, ``camera_angle_x`` alone, names without ``.png``;
+- instant-ngp: intrinsics and OpenCV distortion for the file, ``is_fisheye``;
+- nerfstudio: the same for the file or each frame, ``camera_model``, ``train_filenames`` and so on,
+  ``applied_transform`` and ``applied_scale``, points in ``ply_file_path``;
+- DL3DV: nerfstudio's, with intrinsics of the full resolution and reduced images.
+
+With p the world of COLMAP and q that of the file, nerfstudio wrote q = scale (A p + t); it is undone, so that
+the capture's world is p. Its points are written in q and taken along. ``mask_path`` and ``depth_file_path`` are
+not read.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from tron.cameras import opengl_to_opencv
+from tron.captures.assembly import PosedPhoto, PosedPhotos, rigid_pose
+from tron.captures.distortion import Lens, opencv_lens
+from tron.captures.image_folder import ImageFolder, relative_parts
+from tron.errors import TronError
+
+_MAX_BYTES = 500_000_000
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_FISHEYE = "OPENCV_FISHEYE"
+_SPLITS = ("train", "val", "test")
+
+Split = Literal["train", "test"]
+
+
+def read_transforms(path: Path, images: str | Path | None = None) -> PosedPhotos:
+    """Read the poses of a capture.
+
+    Args:
+        path: a ``.json`` file, or a folder with ``transforms.json`` or ``transforms_train.json`` (and
+            ``transforms_test.json``, which is held out; ``transforms_val.json`` is left alone).
+        images: as in :class:`ImageFolder`.
+
+    Raises:
+        TronError: unreadable JSON, JSON of another shape, an image name that leads out of the folder.
+    """
+    files = _files(path)
+    root = path if path.is_dir() else path.parent
+    folder = ImageFolder(root, images)
+    photos: list[PosedPhoto] = []
+    skipped: dict[str, str] = {}
+    points = colors = None
+    transform = np.eye(4)
+    for file, split in files:
+        meta = read_json(file)
+        transform = _to_original(meta, file)
+        frames = meta.get("frames")
+        if not isinstance(frames, list) or not frames:
+            raise TronError("JSON holds no list of frames", file, "is this a transforms.json?")
+        listed = _listed_splits(meta, file)
+        for index, frame in enumerate(frames):
+            photo = _photo(frame, meta, f"{file}, frame {index}", folder, transform)
+            photos.append(_assigned(photo, split, listed))
+        if points is None and isinstance(meta.get("ply_file_path"), str):
+            points, colors = _points(root, meta["ply_file_path"], transform)
+    return PosedPhotos(path, photos, points, colors, transform, skipped)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON file that holds an object; TronError if it cannot be read or holds something else."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise TronError("JSON file is too large", path)
+        content = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise TronError(f"cannot read: {error.strerror or error}", path) from error
+    except (ValueError, RecursionError) as error:
+        raise TronError(f"not readable as JSON: {error}", path) from error
+    if not isinstance(content, dict):
+        raise TronError(f"JSON holds a {type(content).__name__}, not an object", path)
+    return content
+
+
+def _files(path: Path) -> list[tuple[Path, Split | None]]:
+    if path.is_file():
+        return [(path, None)]
+    if (path / "transforms.json").is_file():
+        return [(path / "transforms.json", None)]
+    train, test = path / "transforms_train.json", path / "transforms_test.json"
+    if not train.is_file():
+        raise TronError("no transforms.json or transforms_train.json", path)
+    return [(train, "train"), (test, "test")] if test.is_file() else [(train, None)]
+
+
+def _photo(
+    frame: object, meta: Mapping[str, Any], where: str, folder: ImageFolder, transform: np.ndarray
+) -> PosedPhoto:
+    if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+        raise TronError("frame has no file_path", where)
+    name, matrix = frame["file_path"], frame.get("transform_matrix")
+    try:
+        image = folder.find(name)
+    except TronError as error:
+        raise TronError(error.what, where, error.mend) from error
+    camera_to_world, refused = None, None
+    try:
+        camera_to_world = transform @ opengl_to_opencv(rigid_pose(matrix))
+    except TronError as error:
+        refused = error.what
+    return PosedPhoto(
+        name, image, camera_to_world, _lens_maker({**_shared(meta, frame), **frame}), refused=refused
+    )
+
+
+def _shared(meta: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
+    """The file's intrinsics, less the focal lengths where the frame has its own in another form."""
+    own = {"fl_x", "camera_angle_x"} & frame.keys()
+    focal = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
+    return {key: value for key, value in meta.items() if key != "frames" and not (own and key in focal)}
+
+
+def _lens_maker(data: Mapping[str, Any]) -> Callable[[int, int], Lens]:
+    def lens(width: int, height: int) -> Lens:
+        w, h = _number(data, "w", width), _number(data, "h", height)
+        fx = _focal(data, "x", w)
+        fy = _focal(data, "y", h)
+        if fx is None and fy is None:
+            raise TronError("no focal length: fl_x or camera_angle_x is missing")
+        focal = (fx if fx is not None else fy, fy if fy is not None else fx)
+        center = (_number(data, "cx", w / 2), _number(data, "cy", h / 2))
+        k1, k2, k3, k4 = (_number(data, key, 0.0) for key in ("k1", "k2", "k3", "k4"))
+        tangential = (_number(data, "p1", 0.0), _number(data, "p2", 0.0))
+        model = data.get("camera_model") or (_FISHEYE if data.get("is_fisheye") else "OPENCV")
+        if model == _FISHEYE:
+            return Lens(_FISHEYE, w, h, (*focal, *center, k1, k2, k3, k4))  # type: ignore[arg-type]
+        if model not in _PERSPECTIVE:
+            raise TronError(f"camera model {model!r} is not supported")
+        if k4:
+            raise TronError("a fourth radial coefficient k4 is read in different ways: calibrate without it")
+        return opencv_lens(w, h, focal, center, radial=(k1, k2, k3), tangential=tangential)  # type: ignore[arg-type]
+
+    return lens
+
+
+def _focal(data: Mapping[str, Any], axis: str, side: float) -> float | None:
+    if data.get(f"fl_{axis}") is not None:
+        return _number(data, f"fl_{axis}", 0.0)
+    if data.get(f"camera_angle_{axis}") is not None:
+        angle = _number(data, f"camera_angle_{axis}", 0.0)
+        if not 0 < angle < math.pi:
+            raise TronError(f"camera_angle_{axis} is {angle:g}, not between 0 and pi")
+        return 0.5 * side / math.tan(0.5 * angle)
+    return None
+
+
+def _number(data: Mapping[str, Any], key: str, default: float) -> float:
+    value = data.get(key)
+    if value is None:
+        return float(default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise TronError(f"{key} is {value!r}, not a number")
+    return float(value)
+
+
+def _listed_splits(meta: Mapping[str, Any], file: Path) -> dict[tuple[str, ...], str]:
+    """Which split nerfstudio's lists put an image into; empty where there are none."""
+    listed: dict[tuple[str, ...], str] = {}
+    for split in _SPLITS:
+        names = meta.get(f"{split}_filenames") or []
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise TronError(f"{split}_filenames is not a list of names", file)
+        listed |= {relative_parts(name): split for name in names}
+    if "test" not in listed.values():  # a file with train and val alone means val to be held out
+        listed = {name: "test" if split == "val" else split for name, split in listed.items()}
+    return listed
+
+
+def _assigned(photo: PosedPhoto, split: Split | None, listed: Mapping[tuple[str, ...], str]) -> PosedPhoto:
+    if not listed:
+        return replace(photo, split=split)
+    name = listed.get(relative_parts(photo.name))
+    if name is None or name == "val":
+        reason = "a validation view" if name else "in none of the file's lists of train and test views"
+        return replace(photo, refused=photo.refused or reason)
+    return replace(photo, split=name)
+
+
+def _to_original(meta: Mapping[str, Any], file: Path) -> np.ndarray:
+    """(4, 4) from the file's world to the one before applied_transform and applied_scale."""
+    applied = np.eye(4)
+    if meta.get("applied_transform") is not None:
+        try:
+            matrix = np.array(meta["applied_transform"], dtype=np.float64)
+            applied[:3] = matrix[:3]
+            if matrix.shape not in ((3, 4), (4, 4)):
+                raise ValueError("shape")
+        except (TypeError, ValueError) as error:
+            raise TronError("applied_transform is not a 3 x 4 matrix", file) from error
+    scale = _number(meta, "applied_scale", 1.0)
+    applied[:3] *= scale
+    linear = applied[:3, :3]
+    size = np.cbrt(abs(np.linalg.det(linear)))
+    if not (
+        size > 1e-9 and scale > 0 and np.allclose(linear @ linear.T, size**2 * np.eye(3), atol=1e-3 * size**2)
+    ):
+        raise TronError("applied_transform is not a rotation with one scale", file)
+    if np.linalg.det(linear) < 0:
+        raise TronError("applied_transform is mirrored", file)
+    return np.linalg.inv(applied)
+
+
+def _points(root: Path, name: str, transform: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points (N, 3) in the capture's world and colours (N, 3) of a PLY in the file's world."""
+    path = root.joinpath(*relative_parts(name))
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        vertex = PlyData.read(str(path))["vertex"]
+        points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
+        names = {each.name for each in vertex.properties}
+        channels = ("red", "green", "blue")
+        colors = np.stack([vertex[c] for c in channels], 1) if names.issuperset(channels) else None
+    except (OSError, ValueError, KeyError, PlyParseError, MemoryError) as error:
+        raise TronError(f"cannot read points: {error}", path) from error
+    finite = np.isfinite(points).all(1)
+    points = points[finite] @ transform[:3, :3].T + transform[:3, 3]
+    if colors is None:
+        return points, None
+    scale = 255.0 if np.issubdtype(colors.dtype, np.integer) else 1.0
+    return points, np.clip(colors[finite] / scale, 0, 1)
