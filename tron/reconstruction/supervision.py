@@ -1,0 +1,92 @@
+"""What a view asks of the surfels, and how far they are from it: the loss of stages 1 and 2.
+
+Both stages compare with the same loss, (1 - w) L1 + w (1 - SSIM); they differ in which maps are compared and
+in which parameters may answer. Colours are composited over a background, the photo's by its mask, the
+surfels' by their opacity. Normals are compared as they come, faded by opacity, so that a wanted normal also
+asks for a surface; materials only where there is one, because their geometry is frozen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tron.captures import View
+from tron.reconstruction.losses import SSIM_WEIGHT, photometric_loss
+
+MATERIALS = ("base_color", "roughness", "metallic")
+_COMPARED = ("image", "normal", *MATERIALS)
+_SURFACE = 0.5
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What each map counts in the loss; maps that a view lacks count nothing."""
+
+    rgb: float = 0.0
+    normal: float = 0.0
+    mask: float = 0.0
+    base_color: float = 0.0
+    roughness: float = 0.0
+    metallic: float = 0.0
+    ssim: float = SSIM_WEIGHT
+
+    def wanted(self) -> tuple[str, ...]:
+        """The maps of a view that count, the mask always among them."""
+        names = [name for name in _COMPARED if getattr(self, "rgb" if name == "image" else name) > 0]
+        return (*names, "mask")
+
+
+def targets(view: View, wanted: tuple[str, ...], device: str | torch.device) -> dict[str, Tensor]:
+    """Those of the wanted maps that the view has, (H, W[, 3]) float32; images are display values."""
+    return {name: torch.from_numpy(view.read(name)).to(device) for name in wanted if view.has(name)}
+
+
+def loss_of(
+    seen: Mapping[str, Tensor], target: Mapping[str, Tensor], weights: Weights, background: np.ndarray
+) -> Tensor:
+    """The weighted loss of one view, a scalar.
+
+    Args:
+        seen: images of :func:`tron.tracing.torch_bridge.render`.
+        target: the view's maps (see :func:`targets`).
+        weights: what counts.
+        background: (3,) display colour behind the surfels.
+    """
+    opacity, mask = seen["opacity"], target.get("mask")
+    total = opacity.new_zeros(())
+    if weights.rgb and "image" in target:
+        behind = torch.tensor(background, dtype=torch.float32, device=opacity.device)
+        rgb = seen["rgb"]
+        wanted = target["image"]
+        if mask is not None:
+            wanted = mask[..., None] * wanted + (1 - mask[..., None]) * behind
+        if background.any():
+            rgb = rgb + (1 - opacity[..., None]) * behind
+        total = total + weights.rgb * photometric_loss(rgb, wanted, ssim_weight=weights.ssim)
+    if weights.normal and "normal" in target:
+        total = total + weights.normal * _normal_loss(seen, target, weights.ssim)
+    if weights.mask and mask is not None:
+        total = total + weights.mask * (opacity - mask).abs().mean()
+    surface = opacity.detach() > _SURFACE
+    if mask is not None:
+        surface = surface & (mask > _SURFACE)
+    for name in MATERIALS:
+        if getattr(weights, name) and name in target:
+            loss = photometric_loss(seen[name], target[name], surface, weights.ssim)
+            total = total + getattr(weights, name) * loss
+    return total
+
+
+def _normal_loss(seen: Mapping[str, Tensor], target: Mapping[str, Tensor], ssim: float) -> Tensor:
+    """Normals as colours, (n + 1) / 2; pixels whose normal nobody knows do not count."""
+    wanted = target["normal"]
+    known = (wanted * wanted).sum(-1) > 0.25
+    if "mask" in target:  # where the subject is not, no normal is known to be the truth
+        known = known | (target["mask"] < _SURFACE)
+    normal = seen["normal"] * seen["opacity"][..., None]
+    return photometric_loss(0.5 * normal + 0.5, 0.5 * wanted + 0.5, known, ssim)

@@ -1,0 +1,229 @@
+"""The optimisation loop of stages 1 and 2: one view a step, Adam, density control, a guard against NaN.
+
+A run is a function of its settings, its seed and the step: views come in a random order drawn anew each time
+all have been seen, so that a run that goes on from a checkpoint repeats the one that was never interrupted,
+bit by bit with one Dr.Jit and one torch thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tron.captures import View
+from tron.errors import TronError
+from tron.reconstruction.density import DensityControl
+from tron.reconstruction.settings import MaterialSettings, RadianceSettings
+from tron.reconstruction.supervision import MATERIALS, Weights, loss_of, targets
+from tron.reconstruction.surfels import LearntSurfels
+from tron.seeds import generator
+from tron.tracing.torch_bridge import render
+
+Background = Literal["black", "white", "random"]
+_PSNR_MEMORY = 0.98
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a stage stands after a step.
+
+    Attributes:
+        stage: its name. step, steps: done, and in all.
+        loss: of the step. psnr: of recent steps' pictures, dB, NaN where the stage compares none.
+        surfels: their number.
+    """
+
+    stage: str
+    step: int
+    steps: int
+    loss: float
+    psnr: float
+    surfels: int
+
+
+Watch = Callable[[Progress, "Stage"], None]
+"""Called after every step: to show progress, to write checkpoints, to measure."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One stage, as the loop sees it.
+
+    Attributes:
+        name: of the stage; part of the seeds' paths.
+        steps: how many.
+        weights: what is compared. rates: Adam's rate of what is learnt.
+        position_rate_final: rate of the positions at the last step, reached log-linearly; None keeps it.
+        sh_degree, sh_every: highest degree, and steps after which one more is learnt.
+        background: behind the surfels.
+        density: makes and removes surfels; None leaves their number.
+    """
+
+    name: str
+    steps: int
+    weights: Weights
+    rates: dict[str, float]
+    position_rate_final: float | None = None
+    sh_degree: int = 0
+    sh_every: int = 1
+    background: Background = "black"
+    density: DensityControl | None = None
+
+
+def radiance_plan(settings: RadianceSettings, extent: float, seed: int) -> Plan:
+    """Stage 1: geometry and radiance; ``extent`` in world units scales the rate of the positions."""
+    rates = {
+        "means": settings.position_rate * extent,
+        "quats": settings.rotation_rate,
+        "log_scales": settings.scale_rate,
+        "opacity_logits": settings.opacity_rate,
+        "sh_dc": settings.sh_rate,
+    }
+    if settings.sh_degree > 0:
+        rates["sh_rest"] = settings.sh_rest_rate
+    return Plan(
+        name="radiance",
+        steps=settings.steps,
+        weights=Weights(rgb=1.0, normal=settings.normal, mask=settings.mask, ssim=settings.ssim),
+        rates=rates,
+        position_rate_final=settings.position_rate_final * extent,
+        sh_degree=settings.sh_degree,
+        sh_every=settings.sh_every,
+        background=settings.background,
+        density=DensityControl(settings.density, extent, seed),
+    )
+
+
+def materials_plan(settings: MaterialSettings) -> Plan:
+    """Stage 2: base color, roughness and metallic on frozen geometry."""
+    return Plan(
+        name="materials",
+        steps=settings.steps,
+        weights=Weights(base_color=1.0, roughness=1.0, metallic=1.0, ssim=settings.ssim),
+        rates=dict.fromkeys(MATERIALS, settings.rate),
+    )
+
+
+class Stage:
+    """One stage under way.
+
+    Args:
+        plan: what to do.
+        views: training views.
+        surfels: what is learnt; changed in place.
+        kernel_degree: of the surfels.
+        seed: root of every random number.
+
+    Raises:
+        TronError: no views.
+    """
+
+    def __init__(
+        self, plan: Plan, views: Sequence[View], surfels: LearntSurfels, kernel_degree: int, seed: int
+    ) -> None:
+        if not views:
+            raise TronError("there is no view to learn from")
+        self.plan, self.views, self.surfels = plan, views, surfels
+        self.kernel_degree, self.seed = kernel_degree, seed
+        self.step = 0
+        self._psnr = float("nan")
+        self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
+
+    def run(self, watch: Watch | None = None) -> None:
+        """Take the steps that are left.
+
+        Raises:
+            TronError: a parameter or the loss is no longer finite; it names the step and the parameter.
+        """
+        while self.step < self.plan.steps:
+            progress = self.advance()
+            if watch is not None:
+                watch(progress, self)
+
+    def advance(self) -> Progress:
+        """Take one step."""
+        plan, surfels, number = self.plan, self.surfels, self.step + 1
+        view = self._view(self.step)
+        target = targets(view, plan.weights.wanted(), surfels.device)
+        self._set_rates()
+        degree = min(self.step // plan.sh_every, plan.sh_degree)
+        seen = render(
+            surfels.rendered(), view.camera, kernel_degree=self.kernel_degree, sh_degree=degree
+        )
+        background = self._background()
+        loss = loss_of(seen, target, plan.weights, background)
+        if not loss.requires_grad:
+            raise TronError(
+                f"stage {plan.name} has nothing to learn from view {view.name}", mend="give it maps or an image"
+            )
+        surfels.clear_gradients()
+        loss.backward()
+        value = float(loss.detach())
+        if not np.isfinite(value):
+            raise self._not_finite("loss", view)
+        self._guard(view)
+        if plan.density is not None:
+            camera = torch.tensor(view.camera.position, dtype=torch.float32, device=surfels.device)
+            plan.density.observe(surfels, camera)
+        surfels.step()
+        if plan.density is not None:
+            plan.density.after(surfels, number)
+        self.step = number
+        self._remember(seen, target, background)
+        return Progress(plan.name, number, plan.steps, value, self._psnr, len(surfels))
+
+    def _view(self, step: int) -> View:
+        """Views in random order, each once before any comes again."""
+        epoch, place = divmod(step, len(self.views))
+        if self._order[0] != epoch:
+            order = generator(self.seed, self.plan.name, "views", epoch).permutation(len(self.views))
+            self._order = (epoch, order)
+        return self.views[self._order[1][place]]
+
+    def _background(self) -> np.ndarray:
+        if self.plan.background == "random":
+            return generator(self.seed, self.plan.name, "background", self.step).random(3)
+        return np.full(3, 1.0 if self.plan.background == "white" else 0.0)
+
+    def _set_rates(self) -> None:
+        plan = self.plan
+        if plan.position_rate_final is not None and "means" in plan.rates:
+            done = self.step / max(plan.steps - 1, 1)
+            first = plan.rates["means"]
+            self.surfels.set_rate("means", first * (plan.position_rate_final / first) ** done)
+
+    def _guard(self, view: View) -> None:
+        """Refuse gradients that are not finite before they reach any parameter."""
+        gradients = {name: self.surfels[name].grad for name in self.plan.rates}
+        found = {name: g for name, g in gradients.items() if g is not None}
+        # One number tells of all: a sum is not finite if any term is not.
+        if not np.isfinite(float(sum(g.abs().sum() for g in found.values()))):
+            for name, gradient in found.items():
+                if not bool(torch.isfinite(gradient).all()):
+                    raise self._not_finite(f"gradient of {name}", view)
+
+    def _not_finite(self, what: str, view: View) -> TronError:
+        return TronError(
+            f"{what} is not finite at step {self.step + 1} of stage {self.plan.name}",
+            f"view {view.name}",
+            "lower the learning rates, or go on from the last checkpoint with another seed",
+        )
+
+    def _remember(self, seen: dict[str, Tensor], target: dict[str, Tensor], background: np.ndarray) -> None:
+        """Running mean of the squared error of the pictures, as PSNR."""
+        if not self.plan.weights.rgb or "image" not in target:
+            return
+        with torch.no_grad():
+            behind = torch.tensor(background, dtype=torch.float32, device=self.surfels.device)
+            picture = seen["rgb"] + (1 - seen["opacity"][..., None]) * behind
+            wanted = target["image"]
+            if "mask" in target:
+                wanted = target["mask"][..., None] * wanted + (1 - target["mask"][..., None]) * behind
+            now = -10 * float(torch.log10(((picture - wanted) ** 2).mean().clamp(min=1e-12)))
+        before = self._psnr
+        self._psnr = now if np.isnan(before) else _PSNR_MEMORY * before + (1 - _PSNR_MEMORY) * now
