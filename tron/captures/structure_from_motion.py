@@ -1,8 +1,8 @@
 """Photos without poses, posed by pycolmap: SIFT, matching and incremental mapping on the CPU.
 
-Features are sought in upright, reduced copies, so that nothing in the files (EXIF orientation, 16 bits, alpha)
-can be read in two ways. The copies of photos that one camera and lens took at one size lie in a folder of their
-own and share a camera, COLMAP's OPENCV model refined with the poses.
+Features are sought in upright, reduced copies, so that nothing in the files (EXIF orientation, 16 bits,
+alpha) can be read in two ways. The copies of photos that one camera and lens took at one size lie in a folder
+of their own and share a camera, COLMAP's OPENCV model refined with the poses.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ _QUALITY = 95
 def pose_photos(folder: Path, settings: PosingSettings, progress: Progress = log.info) -> PosedPhotos:
     """Pose the photos of a folder; the world's scale and axes are arbitrary.
 
-    The result is kept in the workspace and taken from there while photos and settings stay the same. Of several
-    models that do not connect the largest is taken; photos outside of it are skipped.
+    The result is kept in the workspace and taken from there while photos and settings stay the same. Of
+    several models that do not connect the largest is taken; photos outside of it are skipped.
 
     Args:
         folder: holds the photos themselves.
@@ -88,7 +88,7 @@ def pose_photos(folder: Path, settings: PosingSettings, progress: Progress = log
 def _posed_copies(
     photos: Sequence[Path], workspace: Path, settings: PosingSettings, progress: Progress
 ) -> dict[str, str]:
-    """Names of photos by those of their posed copies; makes the model if the kept one is of something else."""
+    """Names of photos by those of their posed copies; makes the model unless it is kept."""
     record = workspace / "photos.json"
     wanted = {
         "version": _VERSION,

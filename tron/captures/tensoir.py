@@ -1,9 +1,8 @@
 """TensoIR's synthetic scenes: photos under known lights with true albedo and normals.
 
 A view is a folder ``train_000`` or ``test_000`` with ``metadata.json`` (Blender's camera), ``rgba.png`` or
-``rgba_{light}.png`` (straight alpha, display values), ``albedo.png`` (linear base color behind a curve of 1/2.2,
-not sRGB's) and ``normal.png`` (world, (n + 1) / 2). The dataset's own loaders are the source of these facts:
-github.com/Haian-Jin/TensoIR, ``dataLoader``.
+``rgba_{light}.png`` (straight alpha, display values), ``albedo.png`` (linear base color behind a curve of
+1/2.2, not sRGB's) and ``normal.png`` (world, (n + 1) / 2). Facts of github.com/Haian-Jin/TensoIR.
 """
 
 from __future__ import annotations

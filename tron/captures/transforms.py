@@ -9,17 +9,18 @@ The dialects agree on OpenGL camera-to-world matrices; they differ in what else 
 - DL3DV: nerfstudio's, with intrinsics of the full resolution and reduced images.
 
 With p the world of COLMAP and q that of the file, nerfstudio wrote q = scale (A p + t); it is undone, so that
-the capture's world is p. Its points are written in q and taken along. ``mask_path`` and ``depth_file_path`` are
-not read.
+the capture's world is p. Its points are written in q and taken along; where there are none, a COLMAP model
+that lies beside gives its own. ``mask_path`` and ``depth_file_path`` are not read.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
@@ -30,9 +31,12 @@ from tron.captures.distortion import Lens, opencv_lens
 from tron.captures.image_folder import ImageFolder, relative_parts
 from tron.errors import TronError
 
+log = logging.getLogger(__name__)
+
 _MAX_BYTES = 500_000_000
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _FISHEYE = "OPENCV_FISHEYE"
+_SAME_PLACE = 0.01
 _SPLITS = ("train", "val", "test")
 
 Split = Literal["train", "test"]
@@ -68,6 +72,8 @@ def read_transforms(path: Path, images: str | Path | None = None) -> PosedPhotos
             photos.append(_assigned(photo, split, listed))
         if points is None and isinstance(meta.get("ply_file_path"), str):
             points, colors = _points(root, meta["ply_file_path"], transform)
+    if points is None and "applied_transform" in meta:
+        points, colors = _colmap_points(root, photos)
     return PosedPhotos(path, photos, points, colors, transform, skipped)
 
 
@@ -233,3 +239,29 @@ def _points(root: Path, name: str, transform: np.ndarray) -> tuple[np.ndarray, n
         return points, None
     scale = 255.0 if np.issubdtype(colors.dtype, np.integer) else 1.0
     return points, np.clip(colors[finite] / scale, 0, 1)
+
+
+def _colmap_points(root: Path, photos: Sequence[PosedPhoto]) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Points and colours of a COLMAP model beside the file, if its cameras stand where the file's do."""
+    from tron.captures.colmap import model_folder, points_of, posed_by, read_model
+
+    folder = model_folder(root)
+    if folder is None:
+        return None, None
+    try:
+        model = read_model(folder)
+    except TronError as error:
+        log.warning("%s; the capture has no points", error)
+        return None, None
+    theirs = {PurePosixPath(name).stem: matrix[:3, 3] for name, matrix, _ in posed_by(model)}
+    ours = {PurePosixPath(photo.name).stem: photo.camera_to_world for photo in photos if not photo.refused}
+    pairs = [(np.asarray(ours[stem])[:3, 3], theirs[stem]) for stem in sorted(ours.keys() & theirs.keys())]
+    if len(pairs) < 2:
+        return None, None
+    mine, other = (np.array(each) for each in zip(*pairs))
+    apart = np.median(np.linalg.norm(mine - other, axis=1))
+    extent = np.median(np.linalg.norm(other - np.median(other, axis=0), axis=1))
+    if not apart < _SAME_PLACE * extent:
+        log.warning("%s: its cameras stand elsewhere than those of transforms.json; points not used", folder)
+        return None, None
+    return points_of(model)
