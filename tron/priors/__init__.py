@@ -1,0 +1,23 @@
+"""Per-view priors: maps of normals, materials and light that a capture's photos do not hold themselves.
+
+One protocol (:mod:`tron.priors.prior`), one provider a file, each built from plain values. None of them loads
+torch before it needs it.
+"""
+
+from tron.priors.classical import Classical
+from tron.priors.ground_truth import GroundTruth
+from tron.priors.point_normals import estimate_point_normals
+from tron.priors.precomputed import Precomputed
+from tron.priors.prior import FIELDS, Prior, apply_prior
+from tron.priors.rgbx import RgbX
+
+__all__ = [
+    "FIELDS",
+    "Classical",
+    "GroundTruth",
+    "Precomputed",
+    "Prior",
+    "RgbX",
+    "apply_prior",
+    "estimate_point_normals",
+]

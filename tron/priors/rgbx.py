@@ -1,0 +1,144 @@
+"""RGB->X: base color, normals, roughness, metallicity and irradiance of a photo, by a diffusion model.
+
+Zeng et al. 2024, "RGB<->X: Image Decomposition and Synthesis Using Material- and Lighting-aware Diffusion
+Models". The model is a Stable Diffusion 2 network whose input is the noisy latent beside the photo's latent;
+the text prompt says which map is wanted. What follows from its authors' program (zheng95z/rgbx, read in July
+2026): the prompts; the photo in linear light (a curve of 2.2), not scaled or tone-mapped further when it is
+an 8-bit one; the mode of the photo's latent, times the autoencoder's scaling factor; no guidance; DDIM with
+trailing steps and zero terminal signal-to-noise; colours come out linear, normals signed in camera space,
+scalars in the first channel.
+
+The weights are not ours and are never fetched: give the path of a local copy of
+huggingface.co/zheng95z/rgb-to-x, and see its license.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+
+from tron.captures import Capture, View
+from tron.captures.view import Pixels
+from tron.color import luminance
+from tron.errors import TronError
+from tron.priors.map_geometry import resized, world_normals
+from tron.priors.prior import Maps, Request
+from tron.priors.rgbx_checkpoint import check_checkpoint
+from tron.seeds import integer
+
+if TYPE_CHECKING:
+    from tron.priors.rgbx_model import RgbXModel
+
+Dtype = Literal["float32", "float16", "bfloat16"]
+
+PROMPTS = {
+    "base_color": "Albedo (diffuse basecolor)",
+    "normal": "Camera-space Normal",
+    "roughness": "Roughness",
+    "metallic": "Metallicness",
+    "irradiance": "Irradiance (diffuse lighting)",
+}
+
+_CURVE = 2.2  # the authors' display curve; not sRGB's, which the model was not trained with
+_MIDDLE_GREY = 0.18
+_MULTIPLE = 8  # pixels a latent
+
+
+@dataclass(frozen=True)
+class RgbX:
+    """The RGB->X model from a local checkpoint in diffusers' layout.
+
+    Attributes:
+        checkpoint: folder with unet, vae, text_encoder, tokenizer and scheduler; weights in safetensors.
+        steps: denoising steps a map.
+        seed: root of the noise; each view and map has a stream of its own.
+        device: torch's name of where it runs.
+        dtype: of the weights and of the arithmetic.
+        longest_side: photos are brought to this many pixels along their longer side, as the authors do.
+
+    Raises:
+        TronError: an option out of its range.
+    """
+
+    checkpoint: str | None = None
+    steps: int = 50
+    seed: int = 0
+    device: str = "cpu"
+    dtype: Dtype = "float32"
+    longest_side: int = 1000
+
+    def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise TronError(f"steps is {self.steps}", mend="give at least 1")
+        if self.longest_side < _MULTIPLE:
+            raise TronError(f"longest_side is {self.longest_side}", mend=f"give at least {_MULTIPLE}")
+        if self.dtype not in get_args(Dtype):
+            raise TronError(f"dtype is {self.dtype!r}", mend=f"use {', '.join(get_args(Dtype))}")
+
+    @property
+    def needs_geometry(self) -> frozenset[str]:
+        """None: it sees the photo alone."""
+        return frozenset()
+
+    def fields(self, capture: Capture) -> Mapping[str, str]:  # noqa: ARG002 (the protocol's)
+        """All but a sky mask; the checkpoint's files are looked for, not loaded.
+
+        Raises:
+            TronError: no checkpoint, or one that lacks a part.
+        """
+        check_checkpoint(self.checkpoint)
+        how = dict.fromkeys(PROMPTS, f"RGB->X, {self.steps} steps")
+        how["irradiance"] += ", at most 1 and of unknown scale"
+        return how
+
+    def prepare(self, request: Request) -> Maps:
+        """Load the model; it is freed with the function that is returned.
+
+        Raises:
+            TronError: a part of the checkpoint cannot be loaded.
+        """
+        from tron.priors.rgbx_model import RgbXModel
+
+        model = RgbXModel.load(check_checkpoint(self.checkpoint), self.device, self.dtype)
+
+        def maps(view: View) -> Mapping[str, Pixels]:
+            width, height = self._size(view.camera.width, view.camera.height)
+            photo = resized(linear_photo(view), width, height)
+            return {
+                field: self._map(model, field, photo, view) for field in PROMPTS if field in request.fields
+            }
+
+        return maps
+
+    def _size(self, width: int, height: int) -> tuple[int, int]:
+        scale = self.longest_side / max(width, height)
+        width, height = (max(int(side * scale) // _MULTIPLE, 1) * _MULTIPLE for side in (width, height))
+        return width, height
+
+    def _map(self, model: RgbXModel, field: str, photo: np.ndarray, view: View) -> np.ndarray:
+        seed = integer(self.seed, "prior", "rgbx", view.name, field, bits=63)
+        pixels = model(photo, PROMPTS[field], self.steps, seed)
+        width, height = view.camera.width, view.camera.height
+        if field == "normal":
+            unit = world_normals(pixels, view.camera, "camera_opengl")
+            return world_normals(resized(unit, width, height), view.camera, "world")
+        unsigned = (pixels / 2 + 0.5).clip(0, 1)
+        if field in ("roughness", "metallic"):
+            unsigned = unsigned[..., 0]
+        return resized(unsigned, width, height)
+
+
+def linear_photo(view: View) -> np.ndarray:
+    """The view's image (H, W, 3) in [0, 1] as the model knows photos: linear light.
+
+    Display images lose a curve of 2.2. Linear ones are exposed so that the mean of their log luminance is
+    middle grey, and clipped, as the authors do with EXR files.
+    """
+    image = view.read()
+    if view.space == "display":
+        return image**_CURVE
+    mean = np.exp(np.log(np.maximum(luminance(image), 1e-6)).mean())
+    return (image * (_MIDDLE_GREY / mean)).clip(0, 1)
