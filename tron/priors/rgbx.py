@@ -44,6 +44,7 @@ PROMPTS = {
 
 _CURVE = 2.2  # the authors' display curve; not sRGB's, which the model was not trained with
 _MIDDLE_GREY = 0.18
+_SCHEDULE = 1000  # steps of noise that the model was trained with
 _MULTIPLE = 8  # pixels a latent
 
 
@@ -53,7 +54,7 @@ class RgbX:
 
     Attributes:
         checkpoint: folder with unet, vae, text_encoder, tokenizer and scheduler; weights in safetensors.
-        steps: denoising steps a map.
+        steps: denoising steps a map, a divisor of 1000.
         seed: root of the noise; each view and map has a stream of its own.
         device: torch's name of where it runs.
         dtype: of the weights and of the arithmetic.
@@ -71,8 +72,9 @@ class RgbX:
     longest_side: int = 1000
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise TronError(f"steps is {self.steps}", mend="give at least 1")
+        # DDIM with trailing steps reaches the clean image only if its steps are all of one length.
+        if self.steps < 1 or _SCHEDULE % self.steps:
+            raise TronError(f"steps is {self.steps}", mend=f"give a divisor of {_SCHEDULE}, such as 20 or 50")
         if self.longest_side < _MULTIPLE:
             raise TronError(f"longest_side is {self.longest_side}", mend=f"give at least {_MULTIPLE}")
         if self.dtype not in get_args(Dtype):

@@ -39,9 +39,11 @@ class RgbXModel:
         Raises:
             TronError: a part is damaged or not what RGB->X is made of, or the device is not there.
         """
-        unet = _load(UNet2DConditionModel, folder, "unet")
-        vae = _load(AutoencoderKL, folder, "vae")
-        text_encoder = _load(CLIPTextModel, folder, "text_encoder")
+        kind = getattr(torch, dtype)
+        fast = {"low_cpu_mem_usage": False}  # the other way needs a package of its own
+        unet = _load(UNet2DConditionModel, folder, "unet", torch_dtype=kind, **fast)
+        vae = _load(AutoencoderKL, folder, "vae", torch_dtype=kind, **fast)
+        text_encoder = _load(CLIPTextModel, folder, "text_encoder", dtype=kind)
         tokenizer = _load(CLIPTokenizer, folder, "tokenizer")
         if unet.config.in_channels != 2 * vae.config.latent_channels:
             raise TronError(
@@ -52,7 +54,7 @@ class RgbXModel:
             )
         try:
             for network in (unet, vae, text_encoder):
-                network.requires_grad_(False).eval().to(torch.device(device), getattr(torch, dtype))
+                network.requires_grad_(False).eval().to(torch.device(device))
         except (RuntimeError, AssertionError) as error:
             raise TronError(f"device {device!r}: {_first_line(error)}", mend="use cpu") from error
         return cls(unet, vae, text_encoder, tokenizer, _scheduler(folder))
@@ -93,8 +95,8 @@ class RgbXModel:
         return self.text_encoder(tokens.input_ids.to(self.unet.device))[0]
 
 
-def _load(part: Any, folder: Path, name: str) -> Any:
-    options: dict[str, Any] = {"local_files_only": True}
+def _load(part: Any, folder: Path, name: str, **options: Any) -> Any:
+    options["local_files_only"] = True
     if name in WEIGHTED:
         options["use_safetensors"] = True
         files = [file.name for file in (folder / name).glob("*.safetensors")]

@@ -29,6 +29,7 @@ _HUBER = 0.2  # log units beyond which shadows and highlights lose their say
 _ROUNDS = 15
 _PULL = 1e-3  # towards uniform light, of directions that nobody sees
 _CLUSTERING = 20  # rounds of k-means
+_DIGITS = 2  # of log chromaticity that tell colours apart
 _CELLS = 4  # a side of the cube on which normals are counted, a face
 
 
@@ -76,8 +77,10 @@ def fit_shading(
         groups: K, the most chromaticities that are told apart.
         seed: root of their clustering.
     """
+    # k-means cannot tell apart more colours than there are.
+    groups = min(groups, len(np.unique(chroma.round(_DIGITS), axis=0)))
     draw = generator(seed, "prior", "classical", "chromaticity")
-    centres, _ = kmeans2(chroma, min(groups, len(chroma)), iter=_CLUSTERING, minit="++", rng=draw)
+    centres, _ = kmeans2(chroma, groups, iter=_CLUSTERING, minit="++", rng=draw)
     group = _nearest(chroma, centres)
     basis = sh_matrix(normals)[:, 1:TERMS]
     importance = 1 / np.sqrt(_crowding(normals))
