@@ -174,6 +174,8 @@ def _require_option(override: Override, options: Sequence[str]) -> None:
 def _one_line(error: pydantic.ValidationError, values: Any, settings: type[pydantic.BaseModel]) -> TronError:
     # Unknown keys first: a misspelt key often leaves a second error behind, of the key that was meant.
     first = min(error.errors(), key=lambda each: each["type"] != "extra_forbidden")
+    if not first["loc"]:  # a rule between several keys: its message names them
+        return TronError(first["msg"].removeprefix("Value error, "))
     key = _written_key(first["loc"], values)
     if first["type"] == "extra_forbidden":
         return unknown_key(key, list(field_keys(settings)))

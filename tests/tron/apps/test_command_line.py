@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import pytest
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tron.apps.command_line import command
 from tron.errors import TronError
@@ -59,6 +59,12 @@ class Settings(BaseModel):
     stages: list[Stage] = Field(description="One after the other.")
     cluster: dict[str, Any] = Field(description="Where it runs.")
     note: str | None = Field(default=None, description="Free text.")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Settings":
+        if self.quality == "final" and self.frames > 100:
+            raise ValueError("quality=final takes at most 100 frames")
+        return self
 
 
 Run = Callable[..., tuple[int, str, str]]
@@ -128,6 +134,7 @@ def run(toy_conf: str, capsys: pytest.CaptureFixture[str], monkeypatch, tmp_path
         (["output_dir=o", "~frames"], ["'frames' has no value"]),
         (["output_dir=o", "lens.fov_deg=-1"], ["'lens.fov_deg'", "greater than 0"]),
         (["output_dir=o", "quality=best"], ["'quality'", "'preview' or 'final'"]),
+        (["output_dir=o", "quality=final", "frames=101"], ["toy: quality=final takes at most 100 frames"]),
         (["output_dir=o", "frames=1,2"], ["'frames'", "one value", "[1,2]"]),
         (["output_dir=o", "note=${nowhere}"], ["nowhere"]),
         (["frames=3"], ["'output_dir' has no value", "output_dir=VALUE"]),
