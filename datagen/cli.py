@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datagen.captures import make_captures
 from datagen.run import make
 from datagen.settings import Settings
 from datagen.validate import validate
@@ -9,14 +10,18 @@ from tron.apps.command_line import command
 
 
 def main(settings: Settings) -> int:
-    """Make a dataset for the neural renderer, or validate one.
+    """Make a dataset for the neural renderer, validate one, or make captures to reconstruct.
 
     Scenes are drawn from seeds, path-traced by Mitsuba, turned into surfels and rendered again by TRON's
-    tracer; the pairs land in tar shards with a manifest. An interrupted run goes on where it stopped. The
-    exit code is 1 if a scene could not be made (failures.jsonl says why) or if validation found a problem.
+    tracer; the pairs land in tar shards with a manifest. With mode=captures scenes are path-traced from all
+    sides instead, with true maps, as folders that tron-reconstruct and nerfstudio read. An interrupted run
+    goes on where it stopped. The exit code is 1 if a scene could not be made (failures.jsonl says why) or if
+    validation found a problem.
     """
     if settings.mode == "validate":
         return 1 if validate(settings.output_dir) else 0
+    if settings.mode == "captures":
+        return 1 if make_captures(settings) else 0
     return 1 if make(settings) else 0
 
 
@@ -29,5 +34,6 @@ cli = command(
         "tron-datagen experiment=demo output_dir=outputs/dataset",
         "tron-datagen experiment=demo output_dir=outputs/mine assets=models environments=hdris workers=8",
         "tron-datagen output_dir=outputs/dataset mode=validate",
+        "tron-datagen experiment=captures output_dir=outputs/synthetic",
     ),
 )

@@ -27,7 +27,12 @@ LANES = 2**22
 
 
 def render_frames(
-    scene: mi.Scene, cameras: Sequence[Camera], spp: int, seeds: Sequence[int], max_depth: int = MAX_DEPTH
+    scene: mi.Scene,
+    cameras: Sequence[Camera],
+    spp: int,
+    seeds: Sequence[int],
+    max_depth: int = MAX_DEPTH,
+    transparent: bool = False,
 ) -> np.ndarray:
     """Path-trace one frame a camera.
 
@@ -37,19 +42,24 @@ def render_frames(
         spp: paths a pixel.
         seeds: one a frame, in [0, 2**32); frames depend on nothing else.
         max_depth: longest path in segments; 6 is five bounces.
+        transparent: leave out the light that is seen directly, and give coverage as a fourth channel.
 
     Returns:
-        (K, H, W, 3) float32 linear radiance.
+        (K, H, W, 3) float32 linear radiance; or (K, H, W, 4), radiance times coverage, and coverage, the
+        share of the pixel that surfaces cover.
     """
-    integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": max_depth})
+    channels = 4 if transparent else 3
+    integrator = mi.load_dict(
+        {"type": "path", "max_depth": max_depth, "rr_depth": max_depth, "hide_emitters": transparent}
+    )
     frames = []
     for camera, seed in zip(cameras, seeds):
-        description = mitsuba_sensor(camera, spp)
+        description = mitsuba_sensor(camera, spp, pixel_format="rgba" if transparent else "rgb")
         # Samples that cover pixel, light and lobe evenly: at 64 spp 3 to 6 dB less noise than independent
         # ones, free.
         description["sampler"]["type"] = "multijitter"
         sensor = mi.load_dict(description)
-        total = np.zeros((camera.height, camera.width, 3))
+        total = np.zeros((camera.height, camera.width, channels))
         done = 0
         while done < spp:
             part = min(spp - done, max(LANES // (camera.width * camera.height), 1))
@@ -58,7 +68,7 @@ def render_frames(
             image = mi.render(
                 scene, sensor=sensor, integrator=integrator, spp=part, seed=_pass_seed(seed, done)
             )
-            total += part * np.array(image, np.float64)[..., :3]
+            total += part * np.array(image, np.float64)[..., :channels]
             done += part
         frames.append((total / spp).astype(np.float32))
     return np.stack(frames)

@@ -8,9 +8,10 @@ record exists, which is written last.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -160,19 +161,12 @@ def adopt(settings: Settings) -> None:
     if path.is_file():
         try:
             old = yaml.safe_load(path.read_text("utf-8"))
-            before, scenes = _leaves(old["recipe"]), old["scenes"]
+            before, scenes = dict(old["recipe"]), old["scenes"]
         except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
             raise TronError(
                 "config.yaml of the dataset is damaged", path, "choose another output_dir"
             ) from error
-        now = _leaves(settings.recipe())
-        for key in sorted(before.keys() | now.keys()):
-            if before.get(key) != now.get(key):
-                raise TronError(
-                    f"output_dir holds a dataset made with {key}={before.get(key)}, not {now.get(key)}",
-                    settings.output_dir,
-                    "choose another output_dir, or delete that one",
-                )
+        require_same(before, settings.recipe(), settings.output_dir, "a dataset")
         for split in SPLITS:
             if scenes.get(split, 0) > settings.split(split).scenes:
                 raise TronError(
@@ -187,8 +181,20 @@ def adopt(settings: Settings) -> None:
     write_if_changed(path, text)
 
 
+def require_same(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path, what: str) -> None:
+    """TronError, naming the first key that differs, unless two recipes (nested plain values) are one."""
+    old, new = _leaves(before), _leaves(now)
+    for key in sorted(old.keys() | new.keys()):
+        if old.get(key) != new.get(key):
+            raise TronError(
+                f"output_dir holds {what} made with {key}={old.get(key)}, not {new.get(key)}",
+                folder,
+                "choose another output_dir, or delete that one",
+            )
+
+
 def _leaves(value: object, prefix: str = "") -> dict[str, object]:
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {
             k: v
             for name, inner in value.items()

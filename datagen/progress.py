@@ -19,9 +19,10 @@ class Progress:
 
     Args:
         scenes, clips: how many there are in all.
+        unit: what clips are called, where it is not clips that scenes give.
     """
 
-    def __init__(self, scenes: int, clips: int):
+    def __init__(self, scenes: int, clips: int, unit: str = "clips"):
         self._scenes, self._clips = scenes, clips
         self._seen = self._seen_clips = 0
         self._start = time.monotonic()
@@ -31,7 +32,7 @@ class Progress:
                 TextColumn("{task.description}"),
                 BarColumn(),
                 MofNCompleteColumn(),
-                TextColumn("clips"),
+                TextColumn(unit),
                 TimeElapsedColumn(),
                 TextColumn("left"),
                 TimeRemainingColumn(),

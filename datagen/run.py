@@ -14,16 +14,16 @@ import json
 import logging
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import numpy as np
 
 from datagen.assets import for_split, load_models
-from datagen.build import build
+from datagen.build import Geometry, build
 from datagen.card import card_text, command_line
 from datagen.models import outline
 from datagen.plan import (
@@ -46,7 +46,7 @@ from datagen.plan import (
 from datagen.preview import contact_row, index_html, sheet_name, write_sheet
 from datagen.progress import Progress
 from datagen.scene import SceneSpec, draw_scene
-from datagen.settings import Settings
+from datagen.settings import LightChoice, Settings
 from datagen.synthetic import first_bad_value, make_clips, make_surfels
 from tron.errors import TronError
 from tron.runtime import activate
@@ -57,8 +57,9 @@ from tron.storage import locked, require_free_space, write_atomic
 log = logging.getLogger(__name__)
 
 FAILURES_NAME = "failures.jsonl"
-Outcome = Record | str
-"""A scene's record, or the reason why there is none."""
+Made = TypeVar("Made")
+Task = Callable[[Work, Settings, Sources], Made]
+"""What makes something of one scene, in a worker; it can be pickled."""
 
 
 def make(settings: Settings) -> int:
@@ -84,7 +85,7 @@ def make(settings: Settings) -> int:
             with Progress(
                 len(missing), sum(len(settings.split(i.split).lights) for i in missing)
             ) as progress:
-                for item, outcome in _outcomes(missing, settings, sources):
+                for item, outcome in outcomes(make_scene, missing, settings, sources):
                     clips = len(settings.split(item.split).lights)
                     if isinstance(outcome, str):
                         reasons[item.name] = outcome
@@ -106,7 +107,7 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
     """
     activate(settings.variant, threads=1)
     output = settings.output_dir
-    spec, geometry = _scene(item, settings, sources)
+    spec, geometry = draw_and_build(item, settings, sources, settings.split(item.split).lights)
     folder = scene_folder(output, item.name)
     write_atomic(folder / "spec.json", spec.to_json())
     surfels = make_surfels(spec, geometry, settings)
@@ -133,7 +134,10 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
     return record
 
 
-def _scene(item: Work, settings: Settings, sources: Sources) -> tuple[SceneSpec, Any]:
+def draw_and_build(
+    item: Work, settings: Settings, sources: Sources, lights: Sequence[LightChoice]
+) -> tuple[SceneSpec, Geometry]:
+    """A scene's specification, with a light of each of the given families, and its meshes."""
     recipe = settings.split(item.split)
     models = load_models(settings.assets, sources.assets) if settings.assets is not None else {}
     spec = draw_scene(
@@ -141,7 +145,7 @@ def _scene(item: Work, settings: Settings, sources: Sources) -> tuple[SceneSpec,
         item.split,
         item.index,
         style=recipe.style,
-        lights=recipe.lights,
+        lights=lights,
         families=settings.light_families(),
         environments=for_split(sources.environments, item.split),
         assets={name: outline(parts) for name, parts in models.items()},
@@ -160,21 +164,25 @@ def _set_aside(path: Path, frames: Sequence[dict[str, np.ndarray]]) -> None:
     write_atomic(path, buffer.getvalue())
 
 
-def attempt(item: Work, settings: Settings, sources: Sources) -> Outcome:
-    """make_scene, with whatever goes wrong as one line: one scene's failure is not the run's."""
+def attempt(task: Task[Made], item: Work, settings: Settings, sources: Sources) -> Made | str:
+    """Do a task, with whatever goes wrong as one line: one scene's failure is not the run's."""
     try:
-        return make_scene(item, settings, sources)
+        return task(item, settings, sources)
     except Exception as error:
         log.debug("scene %s", item.name, exc_info=True)
         text = str(error) if isinstance(error, TronError) else f"{type(error).__name__}: {error}"
         return " ".join(text.split())
 
 
-def _outcomes(items: Sequence[Work], settings: Settings, sources: Sources) -> Iterator[tuple[Work, Outcome]]:
-    """Scenes as they are finished, in any order."""
+def outcomes(
+    task: Task[Made], items: Sequence[Work], settings: Settings, sources: Sources
+) -> Iterator[tuple[Work, Made | str]]:
+    """Do a task for every scene, here or on the cluster: what it gave, or the reason why it gave nothing, as
+    scenes are finished, in any order.
+    """
     if settings.cluster is None:
         for item in items:
-            yield item, attempt(item, settings, sources)
+            yield item, attempt(task, item, settings, sources)
         return
     from dask.distributed import Client, as_completed
     from hydra.utils import instantiate
@@ -187,7 +195,7 @@ def _outcomes(items: Sequence[Work], settings: Settings, sources: Sources) -> It
         queue = iter(items)
         while wave := list(islice(queue, _workers(client) * settings.recycle_after)):
             futures = {
-                client.submit(attempt, item, settings, sources, key=item.name, pure=False): item
+                client.submit(attempt, task, item, settings, sources, key=item.name, pure=False): item
                 for item in wave
             }
             for future in as_completed(futures):

@@ -12,8 +12,26 @@ from datagen.materials import Style
 
 LightChoice = Literal["any", "sun", "studio", "overcast", "hdri"]
 Split = Literal["train", "train_b", "test"]
-OUTSIDE = {"output_dir", "mode", "only", "workers", "recycle_after", "cluster"}
+OUTSIDE = {"output_dir", "mode", "only", "workers", "recycle_after", "cluster", "captures"}
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
+
+CAPTURED = {
+    "seed": True,
+    "test": {"style", "frames"},
+    "path_frames": True,
+    "objects": True,
+    "families": True,
+    "mesh_edge": True,
+    "environment_height": True,
+    "assets": True,
+    "asset_share": True,
+    "environments": True,
+    "catalogue": True,
+    "allow_unlicensed": True,
+    "variant": True,
+    "captures": {"lights", "views", "width", "height", "path_spp", "reference_spp", "points"},
+}
+"""Keys that decide what is in a capture."""
 
 SPLITS: tuple[Split, ...] = ("train", "train_b", "test")
 
@@ -48,12 +66,43 @@ class SplitSettings(_Model):
     reference_spp: int = Field(ge=2, description="Shadow rays a pixel of Mitsuba's direct irradiance.")
 
 
+class CaptureSettings(_Model):
+    """Scenes of the test split as captures: spiral views under one light, path-traced, with true maps."""
+
+    scenes: int = Field(
+        4, ge=1, le=1_000_000, description="Captures that mode=captures makes, of as many test scenes."
+    )
+    lights: list[LightChoice] = Field(
+        default=["overcast", "studio", "sun"],
+        min_length=1,
+        max_length=64,
+        description="Light family of each capture, in rotation; any draws one of families.",
+    )
+    views: int = Field(
+        64, ge=2, le=100_000, description="Spiral views of a capture; each 8th is held out, from the first."
+    )
+    width: int = Field(128, ge=8, le=8192, description="View width in pixels.")
+    height: int = Field(128, ge=8, le=8192, description="View height in pixels.")
+    path_spp: int = Field(
+        64, ge=1, description="Paths a pixel; rounded up to a product of near numbers, such as 8 x 8."
+    )
+    reference_spp: int = Field(32, ge=2, description="Shadow rays a pixel of the irradiance maps.")
+    points: int | None = Field(
+        None,
+        ge=1,
+        le=10_000_000,
+        description="Also store about so many points on surfaces, with their colours, as photos would give.",
+    )
+
+
 class Settings(_Model):
     """Everything that ``tron-datagen`` can be told."""
 
     output_dir: Path = Field(description="Folder of the dataset; a run that was interrupted goes on in it.")
-    mode: Literal["make", "validate"] = Field(
-        "make", description="make the dataset, or validate the one in output_dir and list every problem."
+    mode: Literal["make", "validate", "captures"] = Field(
+        "make",
+        description="make the dataset, validate the one in output_dir and list every problem, or path-trace "
+        "captures for tron-reconstruct into output_dir/captures.",
     )
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."
@@ -61,6 +110,7 @@ class Settings(_Model):
     train: SplitSettings = Field(description="First training split.")
     train_b: SplitSettings = Field(description="Second training split, of another distribution.")
     test: SplitSettings = Field(description="Held-out scenes under held-out lights.")
+    captures: CaptureSettings = Field(description="Captures to reconstruct, of the test scenes.")
     path_frames: int = Field(
         93, ge=1, le=100_000, description="Frames of the whole path that clips are cut from."
     )
@@ -114,21 +164,22 @@ class Settings(_Model):
 
     @model_validator(mode="after")
     def _consistent(self) -> Settings:
+        if self.mode == "captures" and self.environments is None and self._ask_hdri(self.captures.lights):
+            raise ValueError("captures.lights or families ask for hdri: give environments=FOLDER")
         for name in SPLITS:
             split = self.split(name)
             if split.frames > self.path_frames:
                 raise ValueError(
                     f"{name}.frames is {split.frames}, longer than path_frames, {self.path_frames}"
                 )
-            if (
-                split.scenes
-                and "hdri" in {*split.lights, *self.light_families()}
-                and self.environments is None
-            ):
+            if split.scenes and self.environments is None and self._ask_hdri(split.lights):
                 raise ValueError(f"{name}.lights or families ask for hdri: give environments=FOLDER")
         if self.objects is not None and not 1 <= self.objects[0] <= self.objects[1]:
             raise ValueError("objects must be [least, greatest] with 1 <= least <= greatest")
         return self
+
+    def _ask_hdri(self, lights: list[LightChoice]) -> bool:
+        return "hdri" in {*lights, *self.light_families()}
 
     def split(self, name: str) -> SplitSettings:
         """The settings of one split."""
@@ -146,3 +197,7 @@ class Settings(_Model):
         for name in SPLITS:
             del values[name]["scenes"]
         return values
+
+    def capture_recipe(self) -> dict[str, Any]:
+        """What decides a capture's content, as plain values."""
+        return self.model_dump(mode="json", include=CAPTURED)

@@ -1,0 +1,256 @@
+"""Scenes as captures to reconstruct: path-traced views from all sides under one light, with the true maps.
+
+What a photographer would have brought home, and what he could not: alpha, normals, materials, irradiance,
+depth and the light itself. A capture is the test split's scene of the same index; its folder appears whole
+(``tron.captures.folder``), so it is finished when it is there.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import yaml
+
+from datagen.build import Geometry
+from datagen.lights import bake
+from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
+from datagen.plan import Sources, Work, chosen, find_sources, require_same, write_if_changed
+from datagen.progress import Progress
+from datagen.run import draw_and_build, outcomes
+from datagen.scene import SceneSpec, scene_name
+from datagen.settings import CaptureSettings, Settings
+from tron.cameras import Camera
+from tron.captures import Capture, View
+from tron.captures.folder import read_capture_folder, write_capture
+from tron.color import to_display
+from tron.errors import TronError
+from tron.images import encode_exr
+from tron.runtime import activate
+from tron.seeds import generator, integer
+from tron.shading.environment import EnvironmentMap
+from tron.storage import locked, require_free_space
+
+log = logging.getLogger(__name__)
+
+HELD_OUT = 8
+"""Each view of this distance is a test view, the first included, as COLMAP's captures are split."""
+
+GROUP_PIXELS = 2**20
+"""Pixels of the views that are rendered together: bounds memory."""
+
+CONFIG_NAME = "config.yaml"
+ENVIRONMENT_NAME = "environment.exr"
+SPEC_NAME = "spec.json"
+PIXEL_BYTES = 4 + 2 * (3 + 3 + 1 + 1 + 3) + 4
+
+
+def make_captures(settings: Settings) -> int:
+    """Make what is missing of ``output_dir/captures``; return how many captures failed.
+
+    Raises:
+        TronError: wrong settings, a folder in use, made otherwise or not writable, too little space: all
+            before the first scene.
+    """
+    wanted = settings.captures
+    items = [Work("test", i, scene_name("test", i), first_shard=0) for i in range(wanted.scenes)]
+    items = chosen(items, settings.only)
+    activate(settings.variant, threads=1)
+    sources = find_sources(settings)
+    folder = settings.output_dir / "captures"
+    failures = 0
+    with locked(settings.output_dir):
+        _adopt(settings, folder)
+        missing = [item for item in items if not _finished(folder / item.name, wanted)]
+        require_free_space(folder, len(missing) * _estimate_bytes(settings))
+        with Progress(len(missing), len(missing) * wanted.views, "views") as progress:
+            for item, outcome in outcomes(make_capture, missing, settings, sources):
+                if isinstance(outcome, str):
+                    failures += 1
+                    progress.failed(item.name, outcome, wanted.views)
+                else:
+                    progress.done(item.name, wanted.views)
+    log.info("%d of %d captures are in %s", len(items) - failures, len(items), folder)
+    return failures
+
+
+def make_capture(item: Work, settings: Settings, sources: Sources) -> Path:
+    """Make one capture and return its folder. Runs in a worker; a second run writes the same bytes.
+
+    Raises:
+        TronError: a buffer holds NaN or infinity, or the folder cannot be written.
+    """
+    activate(settings.variant, threads=1)
+    wanted = settings.captures
+    folder = settings.output_dir / "captures" / item.name
+    family = wanted.lights[item.index % len(wanted.lights)]
+    spec, geometry = draw_and_build(item, settings, sources, [family])
+    maps = None if settings.environments is None else str(settings.environments)
+    environment = bake(spec.lights[0], settings.environment_height, maps).baked()
+    beside = {
+        SPEC_NAME: spec.to_json().encode(),
+        ENVIRONMENT_NAME: encode_exr(environment.image, half=False),
+    }
+    write = partial(write_capture, folder, overwrite=True, beside=beside)
+    write(captured(spec, geometry, environment, wanted))
+    if wanted.points is not None:
+        # Read back, for points have the colours of the pictures, and views are not held in memory.
+        capture = read_capture_folder(folder)
+        points, colors = surface_points(capture, wanted.points, spec)
+        write(replace(capture, points=points, point_colors=colors))
+    del geometry
+    gc.collect()
+    dr.flush_malloc_cache()
+    return folder
+
+
+def captured(
+    spec: SceneSpec, geometry: Geometry, environment: EnvironmentMap, settings: CaptureSettings
+) -> Capture:
+    """The capture of a scene under a light; views are rendered when they are read, best in their order.
+
+    Images are AgX of straight (not premultiplied) radiance times the light's exposure, with anti-aliased
+    coverage as their mask. Maps are of the pixel centres, zero where there is no surface.
+    """
+    cameras = spec.spiral(settings.views, settings.width, settings.height)
+    shots = _Shots(spec, geometry, environment, cameras, settings)
+    views = []
+    for number, camera in enumerate(cameras):
+        fields: dict[str, Any] = {field: partial(shots.read, number, field) for field in _Shots.FIELDS}
+        views.append(View(f"view_{number:05d}", camera, space="display", **fields))
+    test = frozenset(view.name for view in views[::HELD_OUT])
+    return Capture(tuple(views), test, up=np.array([0.0, 0.0, 1.0]), exposure=environment.exposure())
+
+
+def surface_points(capture: Capture, count: int, spec: SceneSpec) -> tuple[np.ndarray, np.ndarray]:
+    """About ``count`` points (N, 3) that training views see, and their colours, display space."""
+    rng = generator(spec.seed, spec.split, spec.index, "capture", "points")
+    views = capture.train_views
+    points, colors = [], []
+    for view, share in zip(views, np.diff(np.arange(len(views) + 1) * count // len(views))):
+        depth = view.read("depth")
+        rows, columns = np.nonzero((depth > 0) & (view.read("mask") == 1))
+        picked = rng.permutation(len(rows))[:share]
+        pixels = rows[picked], columns[picked]
+        points.append(view.camera.position + view.camera.rays()[pixels] * depth[pixels][:, None])
+        colors.append(view.read()[pixels])
+    return np.concatenate(points), np.concatenate(colors)
+
+
+class _Shots:
+    """Views that are rendered a group at a time, the group of the one that is asked for; the last is kept."""
+
+    FIELDS = ("image", "mask", "normal", "base_color", "roughness", "metallic", "irradiance", "depth")
+
+    def __init__(
+        self,
+        spec: SceneSpec,
+        geometry: Geometry,
+        environment: EnvironmentMap,
+        cameras: list[Camera],
+        settings: CaptureSettings,
+    ) -> None:
+        self._spec, self._geometry, self._cameras, self._settings = spec, geometry, cameras, settings
+        self._scene: mi.Scene = geometry.lit(environment)
+        self._exposure = environment.exposure()
+        self._size = max(GROUP_PIXELS // (settings.width * settings.height), 1)
+        self._group = -1
+        self._rendered: list[dict[str, np.ndarray]] = []
+
+    def read(self, number: int, field: str) -> np.ndarray:
+        """One field of one view, float32."""
+        group, place = divmod(number, self._size)
+        if group != self._group:
+            first = group * self._size
+            self._rendered = self._render(first, self._cameras[first : first + self._size])
+            self._group = group
+        return self._rendered[place][field]
+
+    def _render(self, first: int, cameras: list[Camera]) -> list[dict[str, np.ndarray]]:
+        seeds = [self._seed(first + i, "path") for i in range(len(cameras))]
+        frames = render_frames(self._scene, cameras, self._settings.path_spp, seeds, transparent=True)
+        shots = []
+        for i, (camera, truth, frame) in enumerate(zip(cameras, gbuffers(self._geometry, cameras), frames)):
+            seen = truth.valid
+            direct = direct_irradiance(
+                self._geometry,
+                self._scene,
+                camera,
+                self._settings.reference_spp,
+                self._seed(first + i, "reference"),
+            )
+            maps = {
+                "normal": truth.normal,
+                "base_color": truth.base_color,
+                "roughness": truth.roughness,
+                "metallic": truth.metallic,
+                "irradiance": direct.shadowed,
+                "depth": np.linalg.norm(truth.position - camera.position, axis=-1),
+            }
+            maps = {
+                name: np.where(seen if x.ndim == 2 else seen[..., None], x, 0) for name, x in maps.items()
+            }
+            image, mask = develop(frame, self._exposure, f"view {first + i} of {self._spec.name}")
+            shots.append({"image": image, "mask": mask, **maps})
+        return shots
+
+    def _seed(self, number: int, what: str) -> int:
+        spec = self._spec
+        return integer(spec.seed, spec.split, spec.index, "capture", number, what)
+
+
+def develop(frame: np.ndarray, exposure: float, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Premultiplied linear radiance and coverage (H, W, 4) -> straight AgX picture (H, W, 3), mask (H, W).
+
+    The tone curve bends, so colours are straightened before it: the rim of an object has the object's
+    colours, not darker ones. What is not covered is black.
+
+    Raises:
+        TronError: the frame is not finite, which the tone curve would hide.
+    """
+    bad = int((~np.isfinite(frame)).sum())
+    if bad:
+        raise TronError(f"the path-traced frame has {bad} values that are not finite", where)
+    mask = np.clip(frame[..., 3], 0.0, 1.0)
+    covered = mask[..., None] > 0
+    straight = np.where(covered, frame[..., :3] / np.where(covered, mask[..., None], 1.0), 0.0)
+    return np.where(covered, to_display(straight, exposure), 0.0), mask
+
+
+def _adopt(settings: Settings, folder: Path) -> None:
+    """Make the folder of captures this recipe's, or make sure that it is already."""
+    path, recipe = folder / CONFIG_NAME, settings.capture_recipe()
+    if path.is_file():
+        try:
+            before = dict(yaml.safe_load(path.read_text("utf-8")))
+        except (yaml.YAMLError, TypeError, ValueError) as error:
+            raise TronError(
+                "config.yaml of the captures is damaged", path, "choose another output_dir"
+            ) from error
+        require_same(before, recipe, folder, "captures")
+    elif folder.is_dir() and any(folder.iterdir()):
+        raise TronError(
+            "folder holds something else than these captures", folder, "choose another output_dir"
+        )
+    write_if_changed(path, yaml.safe_dump(recipe, sort_keys=True, allow_unicode=True))
+
+
+def _finished(folder: Path, settings: CaptureSettings) -> bool:
+    try:
+        capture = read_capture_folder(folder)
+    except TronError:
+        return False
+    return settings.points is None or capture.points is not None
+
+
+def _estimate_bytes(settings: Settings) -> int:
+    wanted = settings.captures
+    pixels = wanted.views * wanted.width * wanted.height
+    return pixels * PIXEL_BYTES + wanted.views * 10_000 + settings.environment_height**2 * 2 * 12
