@@ -46,3 +46,37 @@ def _lines(items: Iterable[Item], label: str, total: int | None) -> Iterator[Ite
         if total and done * _LINES // total > told:
             told = done * _LINES // total
             log.info("%s: %d of %d", label, done, total)
+
+
+class StepBar:
+    """A bar for one stage of many steps, with what its last step said of itself.
+
+    Args:
+        label: of the stage. total: its steps. start: steps done before.
+    """
+
+    def __init__(self, label: str, total: int, start: int = 0) -> None:
+        self._label, self._total, self._told = label, total, start * _LINES // max(total, 1)
+        console = Console(stderr=True)
+        self._bar: Progress | None = None
+        if console.is_terminal:
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+            self._bar = Progress(
+                *columns, TextColumn("{task.fields[said]}"), TimeRemainingColumn(), console=console
+            )
+            self._task = self._bar.add_task(label, total=total, completed=start, said="")
+            self._bar.start()
+
+    def update(self, done: int, said: str) -> None:
+        """``done`` steps are behind us; ``said`` is a few words, such as "31.2 dB, 9,800 surfels"."""
+        if self._bar is not None:
+            self._bar.update(self._task, completed=done, said=said)
+        elif done * _LINES // self._total > self._told:
+            self._told = done * _LINES // self._total
+            logging.getLogger(__name__).info("%s: %d of %d, %s", self._label, done, self._total, said)
+
+    def close(self) -> None:
+        """Leave the bar as it is and give the terminal back."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None

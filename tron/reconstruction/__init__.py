@@ -1,5 +1,14 @@
-"""From captures to relightable scenes: so far their light (stage 3, the environment map)."""
+"""From captures to relightable scenes: surfels with materials (stages 1 and 2) and their light (stage 3)."""
 
-from tron.reconstruction.environment import EnvironmentFit, FitSettings, fit_environment
+from tron.reconstruction.environment import EnvironmentFit, fit_environment
+from tron.reconstruction.pipeline import Reconstruction, reconstruct
+from tron.reconstruction.settings import FitSettings, ReconstructionSettings
 
-__all__ = ["EnvironmentFit", "FitSettings", "fit_environment"]
+__all__ = [
+    "EnvironmentFit",
+    "FitSettings",
+    "Reconstruction",
+    "ReconstructionSettings",
+    "fit_environment",
+    "reconstruct",
+]

@@ -1,8 +1,9 @@
-"""Adaptive density control: surfels are added where positions are pulled hard, and removed where transparent.
+"""Adaptive density control: surfels are added where positions are pulled hard, removed where transparent.
 
-From "3D Gaussian Splatting" (Kerbl et al. 2023), with the gradient of the 3D position that 3DGRT uses in place
-of the screen's ("3D Gaussian Ray Tracing", Moenne-Loccoz et al. 2024): a surfel is cloned or split where the
-mean of |d loss / d position| x distance to the camera / 2, over the steps that saw it, exceeds a threshold.
+From "3D Gaussian Splatting" (Kerbl et al. 2023), with the gradient of the 3D position that 3DGRT uses in
+place of the screen's ("3D Gaussian Ray Tracing", Moenne-Loccoz et al. 2024): a surfel is cloned or split
+where the mean of |d loss / d position| x distance to the camera / 2, over the steps that saw it, exceeds a
+threshold.
 """
 
 from __future__ import annotations
@@ -85,7 +86,10 @@ class DensityControl:
 
     def _halves(self, surfels: LearntSurfels, chosen: Tensor, step: int) -> dict[str, Tensor]:
         """Two smaller surfels for each one chosen, at points drawn from it in its plane."""
-        rows = {name: values.detach()[chosen].repeat_interleave(2, dim=0) for name, values in surfels.tensors.items()}
+        rows = {
+            name: values.detach()[chosen].repeat_interleave(2, dim=0)
+            for name, values in surfels.tensors.items()
+        }
         draw = generator(self.seed, "density", "split", step).standard_normal((len(chosen) * 2, 2))
         place = torch.tensor(draw, dtype=torch.float32, device=surfels.device) * rows["log_scales"].exp()
         tangent_u, tangent_v = _tangents(rows["quats"])

@@ -7,8 +7,7 @@ Stage 3a (:mod:`tron.reconstruction.environment_refinement`) fits a cubemap to t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
@@ -16,80 +15,16 @@ import numpy as np
 from tron.captures import Capture
 from tron.errors import TronError
 from tron.gaussians import GaussianScene
-from tron.reconstruction.environment_refinement import Estimator, refine
+from tron.reconstruction.environment_refinement import refine
 from tron.reconstruction.light_scale import LightScale, choose_photos, fit_scale
+from tron.reconstruction.settings import FitSettings
 from tron.reconstruction.surface_points import SurfacePoints
 from tron.shading.cubemap import CubemapLight
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Lighting, ViewTracer
-from tron.shading.split_sum import CUBEMAP_RESOLUTION
 from tron.tracing import SurfelTracer
 
 Track = Callable[[Iterable, str], Iterable]
-
-
-@dataclass(frozen=True)
-class FitSettings:
-    """How an environment is fitted. The defaults take about half a minute on two CPU cores for a small scene;
-    ``FitSettings.paper()`` wants a GPU.
-
-    Attributes:
-        resolution: texels along a face edge of the cubemap.
-        steps: updates of the cubemap.
-        rays: shadow rays a point, even.
-        pixels: surface points a step, all of one view.
-        learning_rate, final_learning_rate: Adam's steps in log radiance, which fall exponentially.
-        estimator: "ratio", or "plain", the paper's, which needs far more rays (see stage 3a).
-        coarsest: texels along a face edge of the coarsest level that log radiance is a sum of, at least 2;
-            ``resolution`` or more fits each texel by itself, which gives the same irradiance and a noisy map.
-        points_per_view: most surface points kept of a view.
-        scale_steps: updates of the scale; 0 leaves it at 1.
-        scale_learning_rate: first step in log sigma.
-        scale_views, scale_pixels: at most so many photos, reduced to at most so many pixels each.
-        scale_rays: shadow rays a pixel of those, even.
-        split_sum_resolution: see :class:`tron.shading.SplitSum`.
-        seed: root of every random number.
-
-    Raises:
-        TronError: a number outside its range.
-    """
-
-    resolution: int = 64
-    steps: int = 1000
-    rays: int = 8
-    pixels: int = 1024
-    learning_rate: float = 0.1
-    final_learning_rate: float = 0.01
-    estimator: Estimator = "ratio"
-    coarsest: int = 4
-    points_per_view: int = 1 << 16
-    scale_steps: int = 200
-    scale_learning_rate: float = 0.1
-    scale_views: int = 8
-    scale_pixels: int = 1 << 14
-    scale_rays: int = 16
-    split_sum_resolution: int = CUBEMAP_RESOLUTION
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        least = {"resolution": 2, "coarsest": 2, "scale_steps": 0, "seed": None, "rays": 2, "scale_rays": 2}
-        for field in fields(self):
-            value, low = getattr(self, field.name), least.get(field.name, 1)
-            if field.type == "int" and low is not None and (value != int(value) or value < low):
-                raise TronError(f"{field.name} is {value}", mend=f"give a whole number of at least {low}")
-            if field.type == "float" and not (np.isfinite(value) and value > 0):
-                raise TronError(f"{field.name} is {value}", mend="give a positive number")
-        for name in ("rays", "scale_rays"):
-            if getattr(self, name) % 2:
-                raise TronError(f"{name} is {getattr(self, name)}", mend="give an even number of shadow rays")
-        if self.estimator not in ("ratio", "plain"):
-            raise TronError(f"estimator is {self.estimator!r}", mend="use ratio or plain")
-
-    @classmethod
-    def paper(cls, **changes: Any) -> FitSettings:
-        """The paper's size: 512 texels a face edge, 4000 steps; the other numbers are ours, it names none."""
-        large = {"resolution": 512, "steps": 4000, "rays": 64, "pixels": 1 << 14, "scale_rays": 64}
-        return cls(**{**large, "scale_pixels": 1 << 18, **changes})
 
 
 @dataclass(frozen=True, eq=False)

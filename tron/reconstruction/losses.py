@@ -3,9 +3,9 @@
 From "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (Kerbl et al. 2023); SSIM from "Image
 Quality Assessment" (Wang et al. 2004), with the Gaussian window of 11 pixels and sigma 1.5.
 
-SSIM is written out here, although torchmetrics (which the tests compare it with, and reports use) has it: on a
-processor its convolutions took a third of an optimisation step. A separable window is a product with two band
-matrices, and the adjoint needs three filtered maps instead of five; docs/experiments.md has the times.
+SSIM is written out here, although torchmetrics (which the tests compare it with, and reports use) has it: on
+a processor its convolutions took a third of an optimisation step. A separable window is a product with two
+band matrices, and the adjoint filters three maps instead of five; docs/experiments.md has the times.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a reconstruction can be told: stage 1 (radiance and geometry), its density control, stage 2 (materials).
+"""What a reconstruction can be told: its beginning, and stages 1 (radiance), 2 (materials) and 3 (light).
 
 The defaults are those of 3DGRT, which the paper inherits (facts.md section 2): 30,000 steps, then 7,000. A
 machine without a GPU takes fewer of them: ``scaled`` shortens every schedule at once, as gsplat's
@@ -7,7 +7,7 @@ machine without a GPU takes fewer of them: ``scaled`` shortens every schedule at
 
 from __future__ import annotations
 
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -22,66 +22,70 @@ class InitialSettings(_Model):
     """Where the first surfels come from."""
 
     source: Literal["auto", "points", "depth", "random"] = Field(
-        "auto",
+        default="auto",
         description="points of the capture (COLMAP's), depth maps of its views, or random points in the "
         "cameras' box; auto: points where there are any, else depth, else random.",
     )
     count: int = Field(
-        100_000, ge=4, description="Number of surfels made from depth maps or random points, about."
+        default=100_000, ge=4, description="Number of surfels made from depth maps or random points, about."
     )
-    opacity: float = Field(0.1, gt=0.005, lt=1, description="Opacity of surfels made from points.")
+    opacity: float = Field(default=0.1, gt=0.005, lt=1, description="Opacity of surfels made from points.")
     kernel_degree: Literal[2, 4] = Field(
-        2, description="Kernel of the surfels: 2, Gaussian, or 4, 3DGRT's flatter and sharper one."
+        default=2, description="Kernel of the surfels: 2, Gaussian, or 4, 3DGRT's flatter and sharper one."
     )
 
 
 class DensitySettings(_Model):
     """Where surfels are added and taken away, after "3D Gaussian Splatting" (Kerbl et al. 2023)."""
 
-    start: int = Field(500, ge=0, description="First step after which surfels are added.")
-    end: int = Field(15_000, ge=0, description="Step from which none is added and no opacity is reset.")
-    every: int = Field(300, ge=1, description="Steps between two additions.")
+    start: int = Field(default=500, ge=0, description="First step after which surfels are added.")
+    end: int = Field(default=15_000, ge=0, description="Step from which surfels are left alone.")
+    every: int = Field(default=300, ge=1, description="Steps between two additions.")
     threshold: float = Field(
-        2e-4,
+        default=2e-4,
         gt=0,
         description="Mean gradient of the position times half the distance to the camera, above which a "
         "surfel is cloned or split.",
     )
     clone_below: float = Field(
-        0.01, gt=0, description="Surfels up to this scale, in extents, are cloned, larger ones split in two."
+        default=0.01, gt=0, description="Scale in extents up to which surfels are cloned, else split."
     )
-    split_shrink: float = Field(1.6, gt=1, description="What the scales of a split surfel are divided by.")
-    prune_every: int = Field(100, ge=1, description="Steps between two prunings.")
-    prune_below: float = Field(0.005, ge=0, lt=1, description="Opacity below which a surfel is removed.")
+    split_shrink: float = Field(default=1.6, gt=1, description="Divisor of a split surfel's scales.")
+    prune_every: int = Field(default=100, ge=1, description="Steps between two prunings.")
+    prune_below: float = Field(default=0.005, ge=0, lt=1, description="Least opacity that is kept.")
     reset_every: int = Field(
-        3000, ge=0, description="Steps between two resets of all opacities; 0 never resets them."
+        default=3000, ge=0, description="Steps between two resets of all opacities; 0 never resets them."
     )
-    reset_to: float = Field(0.01, gt=0, lt=1, description="Greatest opacity after a reset.")
-    most: int = Field(1_000_000, ge=4, description="Most surfels; those with the largest gradient come first.")
+    reset_to: float = Field(default=0.01, gt=0, lt=1, description="Greatest opacity after a reset.")
+    most: int = Field(
+        default=1_000_000, ge=4, description="Most surfels; those with the largest gradient come first."
+    )
 
 
 class RadianceSettings(_Model):
-    """Stage 1: geometry and radiance. Rates are Adam's; positions' are in extents (see ``Capture extent``)."""
+    """Stage 1: geometry and radiance. Rates are Adam's; those of positions are in extents."""
 
-    steps: int = Field(30_000, ge=0, description="Steps; each renders one view.")
-    position_rate: float = Field(1.6e-4, gt=0, description="First rate of the positions, in extents.")
-    position_rate_final: float = Field(1.6e-6, gt=0, description="Last one; it falls log-linearly.")
-    opacity_rate: float = Field(0.05, gt=0, description="Rate of the opacities' logits.")
-    sh_rate: float = Field(2.5e-3, gt=0, description="Rate of the constant harmonic.")
-    sh_rest_rate: float = Field(1.25e-4, gt=0, description="Rate of the other harmonics.")
-    rotation_rate: float = Field(1e-3, gt=0, description="Rate of the quaternions.")
-    scale_rate: float = Field(5e-3, gt=0, description="Rate of the scales' logarithms.")
-    sh_degree: int = Field(3, ge=0, le=3, description="Highest degree of the radiance's harmonics.")
-    sh_every: int = Field(1000, ge=1, description="Steps after which one more degree is learnt.")
-    ssim: float = Field(0.2, ge=0, le=1, description="Weight of 1 - SSIM; L1 has the rest.")
+    steps: int = Field(default=30_000, ge=0, description="Steps; each renders one view.")
+    position_rate: float = Field(default=1.6e-4, gt=0, description="First rate of the positions, in extents.")
+    position_rate_final: float = Field(default=1.6e-6, gt=0, description="Last one; it falls log-linearly.")
+    opacity_rate: float = Field(default=0.05, gt=0, description="Rate of the opacities' logits.")
+    sh_rate: float = Field(default=2.5e-3, gt=0, description="Rate of the constant harmonic.")
+    sh_rest_rate: float = Field(default=1.25e-4, gt=0, description="Rate of the other harmonics.")
+    rotation_rate: float = Field(default=1e-3, gt=0, description="Rate of the quaternions.")
+    scale_rate: float = Field(default=5e-3, gt=0, description="Rate of the scales' logarithms.")
+    sh_degree: int = Field(default=3, ge=0, le=3, description="Highest degree of the radiance's harmonics.")
+    sh_every: int = Field(default=1000, ge=1, description="Steps after which one more degree is learnt.")
+    ssim: float = Field(default=0.2, ge=0, le=1, description="Weight of 1 - SSIM; L1 has the rest.")
     normal: float = Field(
-        0.1, ge=0, description="lambda_n: weight of the same loss on normals, where a prior gives them."
+        default=0.1, ge=0, description="lambda_n: weight of the same loss on a prior's normals."
     )
-    mask: float = Field(0.2, ge=0, description="Weight of |opacity - mask|, where views have masks.")
+    mask: float = Field(default=0.2, ge=0, description="Weight of |opacity - mask|, where views have masks.")
     background: Literal["black", "white", "random"] = Field(
-        "black", description="What lies behind the surfels, and behind the subject where views have masks."
+        default="black", description="What lies behind surfels and behind masked subjects."
     )
-    density: DensitySettings = Field(default_factory=lambda: DensitySettings(), description="")
+    density: DensitySettings = Field(
+        default_factory=lambda: DensitySettings(), description="Surfels added and removed."
+    )
 
     def scaled(self, factor: float) -> RadianceSettings:
         """The same schedule in ``factor`` times as many steps; a step number of 0 stays 0."""
@@ -92,13 +96,71 @@ class RadianceSettings(_Model):
 class MaterialSettings(_Model):
     """Stage 2: base color, roughness and metallic from the priors, geometry frozen."""
 
-    steps: int = Field(7000, ge=0, description="Steps; each renders one view.")
-    rate: float = Field(2.5e-3, gt=0, description="Adam's rate of base color, roughness and metallic.")
-    ssim: float = Field(0.2, ge=0, le=1, description="Weight of 1 - SSIM; L1 has the rest.")
+    steps: int = Field(default=7000, ge=0, description="Steps; each renders one view.")
+    rate: float = Field(default=2.5e-3, gt=0, description="Adam's rate of all three.")
+    ssim: float = Field(default=0.2, ge=0, le=1, description="Weight of 1 - SSIM; L1 has the rest.")
 
     def scaled(self, factor: float) -> MaterialSettings:
         """The same in ``factor`` times as many steps."""
         return _scaled(self, ("steps",), factor)
+
+
+class ReconstructionSettings(_Model):
+    """How surfels are found; the defaults are the paper's."""
+
+    initial: InitialSettings = Field(
+        default_factory=lambda: InitialSettings(), description="Where the first surfels come from."
+    )
+    radiance: RadianceSettings = Field(default_factory=lambda: RadianceSettings(), description="Stage 1.")
+    materials: MaterialSettings = Field(default_factory=lambda: MaterialSettings(), description="Stage 2.")
+    steps_scaler: float = Field(
+        default=1.0,
+        gt=0,
+        le=100,
+        description="Factor on every number of steps of both stages: 0.1 takes 3,000 + 700.",
+    )
+    checkpoint_every: int = Field(default=500, ge=1, description="Steps between two checkpoints.")
+    seed: int = Field(default=0, description="Root of all random numbers.")
+
+
+class FitSettings(_Model):
+    """How an environment is fitted. The defaults take about half a minute on two CPU cores for a small scene;
+    ``FitSettings.paper()`` wants a GPU.
+    """
+
+    resolution: int = Field(default=64, ge=2, description="Texels along a face edge of the cubemap.")
+    steps: int = Field(default=1000, ge=1, description="Updates of the cubemap.")
+    rays: int = Field(default=8, ge=2, multiple_of=2, description="Shadow rays a point, even.")
+    pixels: int = Field(default=1024, ge=1, description="Surface points a step, all of one view.")
+    learning_rate: float = Field(default=0.1, gt=0, description="Adam's first rate, in log radiance.")
+    final_learning_rate: float = Field(default=0.01, gt=0, description="Its last rate; falls exponentially.")
+    estimator: Literal["ratio", "plain"] = Field(
+        default="ratio", description="ratio, or plain, the paper's sum, which needs far more rays."
+    )
+    coarsest: int = Field(
+        default=4,
+        ge=2,
+        description="Texels along a face edge of the coarsest level that log radiance is a sum of; "
+        "resolution or more fits each texel by itself, which gives the same irradiance and a noisy map.",
+    )
+    points_per_view: int = Field(default=1 << 16, ge=1, description="Most surface points kept of a view.")
+    scale_steps: int = Field(default=200, ge=0, description="Updates of the scale; 0 leaves it at 1.")
+    scale_learning_rate: float = Field(default=0.1, gt=0, description="First rate in log sigma.")
+    scale_views: int = Field(default=8, ge=1, description="Most photos that the scale is fitted to.")
+    scale_pixels: int = Field(
+        default=1 << 14, ge=1, description="Most pixels of each; larger ones are reduced."
+    )
+    scale_rays: int = Field(default=16, ge=2, multiple_of=2, description="Shadow rays a pixel there, even.")
+    split_sum_resolution: int = Field(
+        default=512, ge=16, description="Texels along a face edge of the prefiltered light."
+    )
+    seed: int = Field(default=0, description="Root of every random number.")
+
+    @classmethod
+    def paper(cls, **changes: Any) -> FitSettings:
+        """The paper's size: 512 texels a face edge, 4000 steps; the other numbers are ours, it names none."""
+        large = {"resolution": 512, "steps": 4000, "rays": 64, "pixels": 1 << 14, "scale_rays": 64}
+        return cls(**{**large, "scale_pixels": 1 << 18, **changes})
 
 
 def _scaled(settings: Model, names: tuple[str, ...], factor: float) -> Model:

@@ -111,7 +111,10 @@ class LearntSurfels:
             return torch.cat([moment, moment.new_zeros((added, *moment.shape[1:]))])
 
         self._rebuild(
-            {name: torch.cat([values.detach(), rows[name].detach()]) for name, values in self.tensors.items()},
+            {
+                name: torch.cat([values.detach(), rows[name].detach()])
+                for name, values in self.tensors.items()
+            },
             extended,
         )
 

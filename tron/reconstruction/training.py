@@ -131,7 +131,7 @@ class Stage:
         self.plan, self.views, self.surfels = plan, views, surfels
         self.kernel_degree, self.seed = kernel_degree, seed
         self.step = 0
-        self._psnr = float("nan")
+        self.psnr = float("nan")
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
     def run(self, watch: Watch | None = None) -> None:
@@ -151,15 +151,15 @@ class Stage:
         view = self._view(self.step)
         target = targets(view, plan.weights.wanted(), surfels.device)
         self._set_rates()
-        degree = min(self.step // plan.sh_every, plan.sh_degree)
         seen = render(
-            surfels.rendered(), view.camera, kernel_degree=self.kernel_degree, sh_degree=degree
+            surfels.rendered(), view.camera, kernel_degree=self.kernel_degree, sh_degree=self.sh_degree
         )
         background = self._background()
         loss = loss_of(seen, target, plan.weights, background)
         if not loss.requires_grad:
             raise TronError(
-                f"stage {plan.name} has nothing to learn from view {view.name}", mend="give it maps or an image"
+                f"stage {plan.name} has nothing to learn from view {view.name}",
+                mend="give it maps or an image",
             )
         surfels.clear_gradients()
         loss.backward()
@@ -175,7 +175,12 @@ class Stage:
             plan.density.after(surfels, number)
         self.step = number
         self._remember(seen, target, background)
-        return Progress(plan.name, number, plan.steps, value, self._psnr, len(surfels))
+        return Progress(plan.name, number, plan.steps, value, self.psnr, len(surfels))
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the harmonics that the next step learns."""
+        return min(self.step // self.plan.sh_every, self.plan.sh_degree)
 
     def _view(self, step: int) -> View:
         """Views in random order, each once before any comes again."""
@@ -225,5 +230,5 @@ class Stage:
             if "mask" in target:
                 wanted = target["mask"][..., None] * wanted + (1 - target["mask"][..., None]) * behind
             now = -10 * float(torch.log10(((picture - wanted) ** 2).mean().clamp(min=1e-12)))
-        before = self._psnr
-        self._psnr = now if np.isnan(before) else _PSNR_MEMORY * before + (1 - _PSNR_MEMORY) * now
+        before = self.psnr
+        self.psnr = now if np.isnan(before) else _PSNR_MEMORY * before + (1 - _PSNR_MEMORY) * now

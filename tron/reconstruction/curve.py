@@ -1,0 +1,85 @@
+"""PSNR of held-out views as training goes: the curve that tells whether more steps would pay."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from tron.captures import View
+from tron.errors import TronError
+from tron.metrics import psnr
+from tron.reconstruction.evaluation import BACKGROUND, picture, wanted_picture
+from tron.reconstruction.training import Progress, Stage
+from tron.storage import write_atomic
+from tron.tracing.torch_bridge import render
+
+
+class Curve:
+    """Scores held-out views every so many steps; kept in a file, so that a resumed run goes on with it.
+
+    Args:
+        path: JSON file.
+        views: scored; none of them is learnt from.
+        every: steps between two scores.
+
+    Attributes:
+        points: stage, step, seconds (of training alone), test_psnr (dB), surfels.
+
+    Raises:
+        TronError: the file holds no curve.
+    """
+
+    def __init__(self, path: Path, views: Sequence[View], every: int) -> None:
+        self.path, self.views, self.every = path, views, every
+        self.points: list[dict[str, Any]] = []
+        if path.exists():
+            try:
+                self.points = [dict(point) for point in json.loads(path.read_text("utf-8"))]
+            except (ValueError, TypeError) as error:
+                raise TronError(f"not a curve: {error}", path, "remove it") from error
+        self._last = time.perf_counter()
+        self._seconds: float | None = None
+
+    def watch(self, progress: Progress, stage: Stage) -> None:
+        """Take note of a step; scores take no part in the seconds."""
+        if self._seconds is None:
+            self._begin(progress)
+        now = time.perf_counter()
+        assert self._seconds is not None
+        self._seconds += now - self._last
+        if stage.plan.weights.rgb and (progress.step % self.every == 0 or progress.step == progress.steps):
+            self.points.append(
+                {
+                    "stage": progress.stage,
+                    "step": progress.step,
+                    "seconds": round(self._seconds, 2),
+                    "test_psnr": round(self._score(stage), 3),
+                    "surfels": progress.surfels,
+                }
+            )
+            write_atomic(self.path, json.dumps(self.points, indent=1) + "\n")
+        self._last = time.perf_counter()
+
+    def _begin(self, progress: Progress) -> None:
+        """Forget what was scored after the checkpoint that the run goes on from."""
+        self.points = [p for p in self.points if p["stage"] != progress.stage or p["step"] < progress.step]
+        self._seconds = self.points[-1]["seconds"] if self.points else 0.0
+
+    def _score(self, stage: Stage) -> float:
+        behind = BACKGROUND[stage.plan.background]
+        scores = []
+        with torch.no_grad():
+            surfels = stage.surfels.rendered()
+            for view in self.views:
+                seen = render(
+                    surfels, view.camera, kernel_degree=stage.kernel_degree, sh_degree=stage.sh_degree
+                )
+                buffers = {name: seen[name].cpu().numpy() for name in ("rgb", "opacity")}
+                scores.append(psnr(picture(buffers, behind), wanted_picture(view, behind)))
+        return float(np.mean(scores))

@@ -1,0 +1,196 @@
+"""Capture -> GaussianScene, the paper's Algorithm 1: radiance and geometry, then materials from priors.
+
+The run is a chain of stages with one checkpoint behind it: whoever calls again with the same capture,
+settings and checkpoint goes on where the last call was cut off.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tron.captures import Capture, View
+from tron.color import srgb_to_linear
+from tron.errors import TronError
+from tron.gaussians.harmonics import SH_C0
+from tron.gaussians.scene import GaussianScene
+from tron.priors import Prior, apply_prior
+from tron.reconstruction.checkpoint import Checkpoint, save_checkpoint
+from tron.reconstruction.initial import extent_of, initial_surfels
+from tron.reconstruction.settings import ReconstructionSettings
+from tron.reconstruction.supervision import MATERIALS
+from tron.reconstruction.surfels import LearntSurfels
+from tron.reconstruction.training import Plan, Progress, Stage, Watch, materials_plan, radiance_plan
+from tron.tracing import SurfelTracer
+
+Track = Callable[[Iterable, str], Iterable]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What stages 1 and 2 made.
+
+    Attributes:
+        scene: surfels with radiance and materials.
+        capture: the capture whose training views carry the prior's maps.
+        seconds: of the stages, those before an interruption included.
+        learnt: the materials that a prior taught; the others are what surfels begin with.
+    """
+
+    scene: GaussianScene
+    capture: Capture
+    seconds: float
+    learnt: tuple[str, ...]
+
+
+def reconstruct(
+    capture: Capture,
+    prior: Prior,
+    settings: ReconstructionSettings,
+    *,
+    checkpoint: Path | None = None,
+    device: str = "cpu",
+    watch: Watch | None = None,
+    track: Track | None = None,
+) -> Reconstruction:
+    """Find the surfels of a capture, whose images are display values.
+
+    Args:
+        capture: training views are learnt from, the others never looked at.
+        prior: gives normals to stage 1 and materials to stage 2, as far as it can.
+        settings: schedules, rates, seed.
+        checkpoint: file to keep the state in and to go on from; None keeps none.
+        device: torch's, that of the active Mitsuba variant.
+        watch: called after each step.
+        track: wraps long loops.
+
+    Raises:
+        TronError: fewer than two training views, images that are not display values, a checkpoint made with
+            other settings or damaged, or numbers that are no longer finite.
+    """
+    views = capture.train_views
+    if len(views) < 2:
+        raise TronError(
+            "a reconstruction needs at least two training views", mend="add photos from elsewhere"
+        )
+    linear = [view.name for view in views if view.space != "display"]
+    if linear:
+        raise TronError(
+            "surfels are learnt from display values and an image is linear", f"view {linear[0]}", "develop it"
+        )
+    run = _Run(settings, made_with(capture, prior, settings), checkpoint, device, watch)
+    radiance = settings.radiance.scaled(settings.steps_scaler)
+    wanted = [] if radiance.normal == 0 else ["normal"]
+    taught = apply_prior(capture, prior, fields=wanted, track=track) if wanted else capture
+    extent = extent_of(views)
+    plan = radiance_plan(radiance, extent, settings.seed)
+    surfels = run.stage(
+        plan, taught.train_views, lambda: initial_surfels(taught, settings.initial, settings.seed)
+    )
+    scene = surfels.scene(settings.initial.kernel_degree, capture.up)
+
+    tracer = SurfelTracer(scene)
+    taught = apply_prior(
+        capture, prior, gbuffers=lambda view: tracer.gbuffer(view.camera).numpy(), track=track
+    )
+    fields = tuple(name for name in MATERIALS if any(view.has(name) for view in taught.train_views))
+    plan = materials_plan(settings.materials.scaled(settings.steps_scaler))
+    plan = replace(plan, rates={name: plan.rates[name] for name in fields})
+    scene = _with_baked_color(scene)
+    if fields:
+        learners = [view for view in taught.train_views if any(view.has(name) for name in fields)]
+        scene = run.stage(plan, learners, lambda: scene).scene(settings.initial.kernel_degree, capture.up)
+    for name in (name for name in MATERIALS if name not in fields):
+        log.warning("no prior for %s: it stays what surfels begin with", name)
+    return Reconstruction(scene.validate(), taught, run.seconds(), fields)
+
+
+def made_with(capture: Capture, prior: Prior, settings: ReconstructionSettings) -> dict[str, Any]:
+    """What a reconstruction is a function of, as plain values: a checkpoint of other values is refused."""
+    digest = hashlib.sha256()
+    for view in capture.train_views:
+        digest.update(repr((view.name, view.camera.to_dict())).encode())
+    values = settings.model_dump(mode="json", exclude={"checkpoint_every"})
+    return {"capture": digest.hexdigest(), "prior": repr(prior), **values}
+
+
+class _Run:
+    """Stages in a row, with the checkpoint behind them."""
+
+    def __init__(
+        self,
+        settings: ReconstructionSettings,
+        values: Mapping[str, Any],
+        path: Path | None,
+        device: str,
+        watch: Watch | None,
+    ) -> None:
+        self.settings, self.values, self.path, self.device, self.watch = settings, values, path, device, watch
+        self.found = Checkpoint(path) if path is not None and path.exists() else None
+        self.before = self.found.seconds if self.found else 0.0
+        self.started = time.perf_counter()
+        if self.found is not None:
+            self._require_same(self.found)
+            log.info("going on from step %d of stage %s", self.found.step, self.found.stage)
+
+    def seconds(self) -> float:
+        """Spent on the run, interrupted parts included."""
+        return self.before + time.perf_counter() - self.started
+
+    def stage(self, plan: Plan, views: Sequence[View], begin: Callable[[], GaussianScene]) -> LearntSurfels:
+        """Run a stage to its end, from the checkpoint if that lies in it or behind it."""
+        degree, seed = self.settings.initial.kernel_degree, self.settings.seed
+        found = self.found
+        if (
+            found is not None
+            and found.stage != plan.name
+            and _ORDER.index(found.stage) > _ORDER.index(plan.name)
+        ):
+            # A later stage is under way: this one's surfels are those of the checkpoint.
+            return found.surfels({}, self.device)
+        if found is not None and found.stage == plan.name:
+            stage = Stage(plan, views, found.surfels(plan.rates, self.device), degree, seed)
+            found.resume(stage)
+        else:
+            surfels = LearntSurfels.of_scene(begin(), plan.rates, self.device)
+            stage = Stage(plan, views, surfels, degree, seed)
+        stage.run(self._after)
+        self._save(stage)
+        return stage.surfels
+
+    def _after(self, progress: Progress, stage: Stage) -> None:
+        if progress.step % self.settings.checkpoint_every == 0 and progress.step < progress.steps:
+            self._save(stage)
+        if self.watch is not None:
+            self.watch(progress, stage)
+
+    def _save(self, stage: Stage) -> None:
+        if self.path is not None:
+            save_checkpoint(self.path, stage, self.values, self.seconds())
+
+    def _require_same(self, found: Checkpoint) -> None:
+        for key, value in self.values.items():
+            if found.made_with.get(key) != value:
+                raise TronError(
+                    f"the checkpoint was made with another {key}",
+                    found.path,
+                    "give the same settings, another output_dir, or overwrite=true",
+                )
+
+
+_ORDER = ("radiance", "materials")
+
+
+def _with_baked_color(scene: GaussianScene) -> GaussianScene:
+    """Base color begins as the radiance of all directions, decoded from sRGB (facts.md 4b)."""
+    baked = srgb_to_linear(np.clip(SH_C0 * scene.sh[:, 0] + 0.5, 0, 1))
+    return replace(scene, base_color=baked.astype(np.float32))
