@@ -1,6 +1,7 @@
 """Folders of maps: the same in every layout, encoding and frame; bad folders say what is bad."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ def grey(view: str) -> np.ndarray:
     return np.full((HEIGHT, WIDTH, 3), 0.25 if view == "frame_0" else 0.5)
 
 
-def save(folder: Path, pattern: str, image) -> None:
+def save(folder: Path, pattern: str, image: Any) -> None:
     for view in NAMES:
         path = folder / pattern.format(view=view)
         path.parent.mkdir(parents=True, exist_ok=True)
