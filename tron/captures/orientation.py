@@ -9,7 +9,7 @@ import numpy as np
 from tron.cameras import Camera
 
 _STEPS = 20
-_ROLL = 0.02
+_ROLL = 0.003
 _SIDEWAYS = 0.9
 _FLAT = 0.1
 
@@ -22,7 +22,7 @@ def estimate_up(cameras: Sequence[Camera]) -> np.ndarray:
 
     - Cameras' up axes agree on the whole. Up is where the robust (L1) mean of these axes and the level x axes
       meet: it minimises ``sum_i w_i (x_i . u)^2 + r |u - m|^2`` over directions u, with m the mean, r =
-      0.02 and weights w that spare rolled cameras. Cameras that all look down on one side of a table pull
+      0.003 and weights w that spare rolled cameras. Cameras that all look down on one side of a table pull
       m over, but not x. Where x axes say nothing, since all are parallel, m decides.
     - Up axes cancel while x axes agree: the photos lie on their side, as a phone held upright stores them.
       The x axis is then vertical, with the sign that has the cameras look down on average.
