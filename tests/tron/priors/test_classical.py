@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from tests.tron.priors.conftest import ring
 from tron.captures import Capture, View
 from tron.color import agx, srgb_to_linear
 from tron.errors import TronError
@@ -102,7 +101,7 @@ def test_agx_is_undone_where_it_does_not_clip() -> None:
     np.testing.assert_allclose(inverse_agx(agx(linear)), linear, rtol=2e-3, atol=1e-4)
 
 
-def test_sky_is_above_the_horizon_far_and_bright() -> None:
+def test_sky_is_above_the_horizon_far_and_bright(ring) -> None:
     camera = ring(2, 32, 32, elevation=0.05)
     rises = camera[0].rays()[..., 2] > 0
     image = np.where(rises[..., None], (0.5, 0.7, 0.95), (0.3, 0.25, 0.2)).astype(np.float32)
@@ -118,7 +117,7 @@ def test_sky_is_above_the_horizon_far_and_bright() -> None:
     np.testing.assert_array_equal(sky[:, 8:], rises[:, 8:])
 
 
-def test_a_capture_without_surfaces_is_refused() -> None:
+def test_a_capture_without_surfaces_is_refused(ring) -> None:
     image = np.full((32, 32, 3), 0.5)
     capture = Capture(tuple(View(f"{i}", c, image, "display") for i, c in enumerate(ring(2, 32, 32))))
     empty = {name: np.zeros((32, 32)) for name in ("opacity", "depth")} | {"normal": np.zeros((32, 32, 3))}

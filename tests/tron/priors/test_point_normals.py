@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from tests.tron.priors.conftest import ring
 from tron.errors import TronError
 from tron.priors import estimate_point_normals
 from tron.seeds import generator
 
 
-def test_a_sphere_seen_from_outside_has_its_radii_as_normals() -> None:
+def test_a_sphere_seen_from_outside_has_its_radii_as_normals(ring) -> None:
     rng = generator(2, "priors")
     radii = rng.normal(size=(3000, 3))
     radii /= np.linalg.norm(radii, axis=1, keepdims=True)
@@ -21,7 +20,7 @@ def test_a_sphere_seen_from_outside_has_its_radii_as_normals() -> None:
     assert (cosine > 0).mean() > 0.97
 
 
-def test_a_room_seen_from_inside_has_normals_that_face_in() -> None:
+def test_a_room_seen_from_inside_has_normals_that_face_in(ring) -> None:
     rng = generator(4, "priors")
     points = rng.uniform(-10, 10, (6000, 3))
     axis, side = rng.integers(0, 3, 6000), rng.choice([-10.0, 10.0], 6000)
@@ -32,7 +31,7 @@ def test_a_room_seen_from_inside_has_normals_that_face_in() -> None:
     assert ((normals * inward).sum(axis=1) > 0.9).mean() > 0.9
 
 
-def test_too_little_to_go_by_is_refused() -> None:
+def test_too_little_to_go_by_is_refused(ring) -> None:
     points = np.zeros((10, 3))
     with pytest.raises(TronError, match="cameras"):
         estimate_point_normals(points, [])

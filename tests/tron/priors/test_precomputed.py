@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.tron.priors.conftest import HEIGHT, WIDTH, plain
 from tron.cameras import opencv_to_opengl
 from tron.captures import Capture
 from tron.color import linear_to_srgb
@@ -14,6 +13,8 @@ from tron.errors import TronError
 from tron.images import write_image
 from tron.priors import FIELDS, Precomputed, apply_prior
 from tron.seeds import generator
+
+HEIGHT, WIDTH = 40, 48  # of plain views
 
 NAMES = ("frame_0", "frame_1")
 LAYOUTS = {
@@ -36,11 +37,12 @@ def save(folder: Path, pattern: str, image: Any) -> None:
     for view in NAMES:
         path = folder / pattern.format(view=view)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, image(view) if callable(image) else image)
+        pixels: Any = image(view) if callable(image) else image
+        write_image(path, pixels)
 
 
 @pytest.mark.parametrize("pattern", LAYOUTS.values(), ids=LAYOUTS)
-def test_every_layout_gives_the_same_linear_base_color(tmp_path: Path, pattern: str) -> None:
+def test_every_layout_gives_the_same_linear_base_color(tmp_path: Path, pattern: str, plain) -> None:
     encode = (lambda x: x) if pattern.endswith("exr") else linear_to_srgb
     save(tmp_path, pattern, lambda view: encode(grey(view)))
     out = apply_prior(plain(), Precomputed(str(tmp_path)))
@@ -49,7 +51,7 @@ def test_every_layout_gives_the_same_linear_base_color(tmp_path: Path, pattern: 
         assert [field for field in FIELDS if view.has(field)] == ["base_color"]
 
 
-def test_frames_that_are_only_numbered_are_matched_by_order(tmp_path: Path) -> None:
+def test_frames_that_are_only_numbered_are_matched_by_order(tmp_path: Path, plain) -> None:
     for i in range(3):
         image = np.full((HEIGHT, WIDTH, 3), linear_to_srgb(np.array(0.1 * (i + 1))))
         path = tmp_path / "clip" / f"0000.{i:04d}.basecolor.png"
@@ -67,7 +69,9 @@ def test_frames_that_are_only_numbered_are_matched_by_order(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("suffix", ["png", "exr"])
 @pytest.mark.parametrize("frame", ["camera_opengl", "camera_opencv", "world"])
-def test_normals_of_any_frame_become_the_same_world_normals(tmp_path: Path, frame: str, suffix: str) -> None:
+def test_normals_of_any_frame_become_the_same_world_normals(
+    tmp_path: Path, frame: str, suffix: str, plain
+) -> None:
     capture = plain()
     rng = generator(7, "priors")
     world = rng.normal(size=(HEIGHT, WIDTH, 3))
@@ -85,7 +89,7 @@ def test_normals_of_any_frame_become_the_same_world_normals(tmp_path: Path, fram
         np.testing.assert_allclose(view.read("normal"), world, atol=0.01)
 
 
-def test_a_surface_that_faces_the_viewer_faces_the_viewer(tmp_path: Path) -> None:
+def test_a_surface_that_faces_the_viewer_faces_the_viewer(tmp_path: Path, plain) -> None:
     """The one fact that fixes the default's sign: blue in these tools' maps looks at the camera."""
     save(tmp_path, "normal/{view}.png", np.full((HEIGHT, WIDTH, 3), (0.5, 0.5, 1.0)))
     for view in apply_prior(plain(), Precomputed(str(tmp_path))).train_views:
@@ -95,7 +99,7 @@ def test_a_surface_that_faces_the_viewer_faces_the_viewer(tmp_path: Path) -> Non
         np.testing.assert_allclose(view.read("normal")[0, 0], view.camera.up, atol=0.01)
 
 
-def test_backgrounds_are_no_normals(tmp_path: Path) -> None:
+def test_backgrounds_are_no_normals(tmp_path: Path, plain) -> None:
     image = np.full((HEIGHT, WIDTH, 3), (0.5, 0.5, 1.0))
     image[:10], image[10:20] = 0.0, 0.5
     save(tmp_path, "normal/{view}.png", image)
@@ -104,7 +108,7 @@ def test_backgrounds_are_no_normals(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.linalg.norm(normal[20:], axis=-1), 1, atol=1e-5)
 
 
-def test_larger_maps_are_averaged_and_their_normals_stay_unit(tmp_path: Path) -> None:
+def test_larger_maps_are_averaged_and_their_normals_stay_unit(tmp_path: Path, plain) -> None:
     checks = np.indices((4 * HEIGHT, 4 * WIDTH)).sum(0) % 2
     tilted = np.where(checks[..., None], (0.6, 0.0, 0.8), (-0.6, 0.0, 0.8))
     save(tmp_path, "normal/{view}.png", (tilted + 1) / 2)
@@ -114,7 +118,7 @@ def test_larger_maps_are_averaged_and_their_normals_stay_unit(tmp_path: Path) ->
     np.testing.assert_allclose(view.read("normal"), np.broadcast_to([0, 0, 1], (HEIGHT, WIDTH, 3)), atol=0.01)
 
 
-def test_irradiance_is_linear_times_its_scale(tmp_path: Path) -> None:
+def test_irradiance_is_linear_times_its_scale(tmp_path: Path, plain) -> None:
     save(tmp_path, "irradiance/{view}.exr", np.full((HEIGHT, WIDTH, 3), 3 * np.pi))
     out = apply_prior(plain(), Precomputed(str(tmp_path), irradiance_scale=1 / np.pi))
     np.testing.assert_allclose(out.train_views[0].read("irradiance"), 3.0, rtol=1e-3)
@@ -125,7 +129,7 @@ def test_irradiance_is_linear_times_its_scale(tmp_path: Path) -> None:
     np.testing.assert_allclose(out.train_views[0].read("irradiance"), 0.5, atol=5e-3)
 
 
-def test_stretched_maps_need_a_word(tmp_path: Path) -> None:
+def test_stretched_maps_need_a_word(tmp_path: Path, plain) -> None:
     save(tmp_path, "roughness/{view}.png", np.full((HEIGHT, 2 * WIDTH), 0.5))
     with pytest.raises(TronError, match="roughness map of 96 x 40 pixels does not fit the view's 48 x 40"):
         apply_prior(plain(), Precomputed(str(tmp_path))).train_views[0].read("roughness")
@@ -133,7 +137,7 @@ def test_stretched_maps_need_a_word(tmp_path: Path) -> None:
     np.testing.assert_allclose(out.train_views[0].read("roughness"), 0.5, atol=5e-3)
 
 
-def test_missing_files_are_counted_and_bad_ones_named(tmp_path: Path, caplog) -> None:
+def test_missing_files_are_counted_and_bad_ones_named(tmp_path: Path, caplog, plain) -> None:
     (tmp_path / "metallic").mkdir()
     write_image(tmp_path / "metallic" / "frame_1.png", np.zeros((HEIGHT, WIDTH)))
     out = apply_prior(plain(), Precomputed(str(tmp_path)))
@@ -144,7 +148,7 @@ def test_missing_files_are_counted_and_bad_ones_named(tmp_path: Path, caplog) ->
         out.train_views[1].read("metallic")
 
 
-def test_two_files_for_one_map_are_refused_and_exr_beats_png(tmp_path: Path) -> None:
+def test_two_files_for_one_map_are_refused_and_exr_beats_png(tmp_path: Path, plain) -> None:
     save(tmp_path, "roughness/{view}.png", np.full((HEIGHT, WIDTH), 0.2))
     save(tmp_path, "roughness/{view}.exr", np.full((HEIGHT, WIDTH), 0.7))
     out = apply_prior(plain(), Precomputed(str(tmp_path)))
@@ -154,7 +158,7 @@ def test_two_files_for_one_map_are_refused_and_exr_beats_png(tmp_path: Path) -> 
         apply_prior(plain(), Precomputed(str(tmp_path)))
 
 
-def test_views_in_folders_are_told_apart_by_their_whole_name(tmp_path: Path) -> None:
+def test_views_in_folders_are_told_apart_by_their_whole_name(tmp_path: Path, plain) -> None:
     one, two, three = plain().views
     views = [
         type(one)(name, v.camera, v.image, "display") for name, v in (("a/0.png", one), ("b/0.png", two))
@@ -177,7 +181,7 @@ def test_wrong_options_are_refused(tmp_path: Path, change: dict) -> None:
         Precomputed(str(tmp_path), **change)
 
 
-def test_a_missing_or_empty_folder_is_refused(tmp_path: Path) -> None:
+def test_a_missing_or_empty_folder_is_refused(tmp_path: Path, plain) -> None:
     with pytest.raises(TronError, match="folder of prior maps not found"):
         apply_prior(plain(), Precomputed(str(tmp_path / "none")))
     with pytest.raises(TronError, match="no maps for 2 views such as frame_0"):

@@ -8,15 +8,16 @@ from functools import partial
 import numpy as np
 import pytest
 
-from tests.tron.priors.conftest import HEIGHT, WIDTH, plain
 from tron.errors import TronError
 from tron.priors import FIELDS, Classical, GroundTruth, apply_prior
 from tron.seeds import generator
 
+HEIGHT, WIDTH = 40, 48  # of plain views
+
 SHAPE = (HEIGHT, WIDTH)
 
 
-def test_ground_truth_gives_the_capture_s_own_maps_unread() -> None:
+def test_ground_truth_gives_the_capture_s_own_maps_unread(plain) -> None:
     calls = []
 
     def read() -> np.ndarray:
@@ -30,12 +31,12 @@ def test_ground_truth_gives_the_capture_s_own_maps_unread() -> None:
     np.testing.assert_array_equal(view.read("base_color"), 0.25)
 
 
-def test_ground_truth_of_photos_is_refused() -> None:
+def test_ground_truth_of_photos_is_refused(plain) -> None:
     with pytest.raises(TronError, match="no true maps"):
         apply_prior(plain(), GroundTruth())
 
 
-def test_what_a_prior_cannot_give_is_none_and_said(caplog: pytest.LogCaptureFixture) -> None:
+def test_what_a_prior_cannot_give_is_none_and_said(caplog: pytest.LogCaptureFixture, plain) -> None:
     capture = plain(metallic=np.zeros(SHAPE), base_color=np.zeros((*SHAPE, 3)))
     with caplog.at_level(logging.INFO):
         out = apply_prior(capture, Classical(roughness=0.4))
@@ -47,7 +48,7 @@ def test_what_a_prior_cannot_give_is_none_and_said(caplog: pytest.LogCaptureFixt
     assert "roughness: constant 0.4" in caplog.text
 
 
-def test_only_the_fields_asked_for_are_touched() -> None:
+def test_only_the_fields_asked_for_are_touched(plain) -> None:
     capture = plain(metallic=np.ones(SHAPE), roughness=np.ones(SHAPE))
     view = apply_prior(capture, Classical(), fields=("roughness",)).train_views[0]
     assert view.read("metallic").min() == 1
@@ -73,7 +74,7 @@ class Given:
         }
 
 
-def test_arrays_are_packed_to_within_half_a_percent_and_checked() -> None:
+def test_arrays_are_packed_to_within_half_a_percent_and_checked(plain) -> None:
     rng = generator(1, "priors")
     irradiance, sky = rng.uniform(0, 50, (*SHAPE, 3)), rng.uniform(0, 1, SHAPE) > 0.5
     view = apply_prior(plain(), Given(irradiance=irradiance, sky_mask=sky)).train_views[0]
@@ -85,7 +86,7 @@ def test_arrays_are_packed_to_within_half_a_percent_and_checked() -> None:
         apply_prior(plain(), Given(roughness=np.zeros((3, 3))))
 
 
-def test_views_without_a_map_are_counted(caplog: pytest.LogCaptureFixture) -> None:
+def test_views_without_a_map_are_counted(caplog: pytest.LogCaptureFixture, plain) -> None:
     normal = partial(np.broadcast_to, np.array([0.0, 0.0, 1.0]), (*SHAPE, 3))
     out = apply_prior(plain(), Given(normal=normal))
     assert [view.has("normal") for view in out.train_views] == [False, True]

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.tron.priors.conftest import plain, ring
 from tron.captures import Capture, View
 from tron.errors import TronError
 from tron.priors import RgbX, apply_prior
@@ -66,7 +65,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def capture(seed: int = 0, width: int = 45, height: int = 30) -> Capture:
+def capture(ring, seed: int = 0, width: int = 45, height: int = 30) -> Capture:
     """Random photos, with sides that are no multiples of 8."""
     rng = generator(seed, "priors")
     cameras = ring(2, width, height)
@@ -79,8 +78,8 @@ def prior(checkpoint: Path, **changes) -> RgbX:
     return RgbX(**{"checkpoint": str(checkpoint), "steps": 2, "longest_side": 64, **changes})
 
 
-def test_every_map_fits_the_view_and_the_seed_alone_decides(checkpoint: Path) -> None:
-    photos = capture()
+def test_every_map_fits_the_view_and_the_seed_alone_decides(checkpoint: Path, ring) -> None:
+    photos = capture(ring)
     first, again = (apply_prior(photos, prior(checkpoint)) for _ in range(2))
     other = apply_prior(photos, prior(checkpoint, seed=1))
     for a, b, c in zip(first.views, again.views, other.views):
@@ -137,15 +136,15 @@ def test_a_perfect_network_gives_what_it_was_shown(checkpoint: Path, steps: int)
     np.testing.assert_allclose(oracle(photo, "Roughness", steps, 5), expected, atol=1e-4)
 
 
-def test_a_view_s_noise_does_not_depend_on_the_others(checkpoint: Path) -> None:
-    photos = capture()
+def test_a_view_s_noise_does_not_depend_on_the_others(checkpoint: Path, ring) -> None:
+    photos = capture(ring)
     alone = Capture((photos.views[1],))
     a = apply_prior(photos, prior(checkpoint), ("roughness",)).views[1].read("roughness")
     b = apply_prior(alone, prior(checkpoint), ("roughness",)).views[0].read("roughness")
     np.testing.assert_array_equal(a, b)
 
 
-def test_linear_photos_are_exposed_before_the_model_sees_them() -> None:
+def test_linear_photos_are_exposed_before_the_model_sees_them(ring) -> None:
     camera = ring(1, 16, 16)[0]
     bright = View("v", camera, np.full((16, 16, 3), 50.0), "linear")
     np.testing.assert_allclose(linear_photo(bright), 0.18, rtol=1e-4)
@@ -153,7 +152,7 @@ def test_linear_photos_are_exposed_before_the_model_sees_them() -> None:
     np.testing.assert_allclose(linear_photo(shown), 0.5**2.2, rtol=1e-5)
 
 
-def test_without_a_checkpoint_one_line_says_what_to_give(tmp_path: Path) -> None:
+def test_without_a_checkpoint_one_line_says_what_to_give(tmp_path: Path, plain) -> None:
     for missing, message in ((None, "has no checkpoint"), (str(tmp_path / "x"), "not found")):
         with pytest.raises(TronError, match=message) as caught:
             apply_prior(plain(), RgbX(missing))
@@ -161,14 +160,14 @@ def test_without_a_checkpoint_one_line_says_what_to_give(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("part", ["unet", "vae", "text_encoder", "tokenizer", "scheduler"])
-def test_a_missing_part_is_named(checkpoint: Path, tmp_path: Path, part: str) -> None:
+def test_a_missing_part_is_named(checkpoint: Path, tmp_path: Path, part: str, plain) -> None:
     copy = shutil.copytree(checkpoint, tmp_path / "copy")
     shutil.rmtree(copy / part)
     with pytest.raises(TronError, match=f"lacks {part}/"):
         apply_prior(plain(), prior(copy))
 
 
-def test_pickled_and_damaged_weights_are_not_read(checkpoint: Path, tmp_path: Path) -> None:
+def test_pickled_and_damaged_weights_are_not_read(checkpoint: Path, tmp_path: Path, plain) -> None:
     copy = shutil.copytree(checkpoint, tmp_path / "copy")
     weights = next((copy / "unet").glob("*.safetensors"))
     weights.write_bytes(weights.read_bytes()[:100])
@@ -180,7 +179,7 @@ def test_pickled_and_damaged_weights_are_not_read(checkpoint: Path, tmp_path: Pa
         apply_prior(plain(), prior(copy))
 
 
-def test_a_scheduler_of_another_kind_is_refused(checkpoint: Path, tmp_path: Path) -> None:
+def test_a_scheduler_of_another_kind_is_refused(checkpoint: Path, tmp_path: Path, plain) -> None:
     copy = shutil.copytree(checkpoint, tmp_path / "copy")
     path = copy / "scheduler" / "scheduler_config.json"
     path.write_text(path.read_text().replace("v_prediction", "epsilon"))
