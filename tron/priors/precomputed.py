@@ -1,6 +1,6 @@
 """Maps that another program has made: DiffusionRenderer's, RGB<->X's, or your own, from a folder.
 
-What those programs write, read in their sources and issues (July 2026):
+What those programs write, read in their sources and issues:
 
 - DiffusionRenderer (Liang et al. 2025): basecolor, normal, roughness, metallic (and depth), 8-bit PNG or
   JPEG; base color as it looks, sRGB; normals (n + 1) / 2 in camera space, x right, y up, z towards the viewer
