@@ -2,10 +2,11 @@
 
 Zeng et al. 2024, "RGB<->X: Image Decomposition and Synthesis Using Material- and Lighting-aware Diffusion
 Models". The model is a Stable Diffusion 2 network whose input is the noisy latent beside the photo's latent;
-the text prompt says which map is wanted. What follows from its authors' program (zheng95z/rgbx): the prompts; the photo in linear light (a curve of 2.2), not scaled or tone-mapped further when it is
-an 8-bit one; the mode of the photo's latent, times the autoencoder's scaling factor; no guidance; DDIM with
-trailing steps and zero terminal signal-to-noise; colours come out linear, normals signed in camera space,
-scalars in the first channel.
+the text prompt says which map is wanted. What follows from its authors' program (zheng95z/rgbx): the prompts;
+the photo in linear light (a curve of 2.2), not scaled or tone-mapped further when it is an 8-bit one; the
+mode of the photo's latent, times the autoencoder's scaling factor; no guidance; DDIM with trailing steps and
+zero terminal signal-to-noise; colours come out linear, normals signed in camera space, scalars in the first
+channel.
 
 The weights are not ours and are never fetched: give the path of a local copy of
 huggingface.co/zheng95z/rgb-to-x, and see its license.
