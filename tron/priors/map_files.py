@@ -9,8 +9,8 @@ A file is known by its relative path alone, field and view in any of these place
     NAME/0000.0000.FIELD.jpg        DiffusionRenderer, one frame a clip: chunk, frame, field
     CLIP/0000.0017.FIELD.png        DiffusionRenderer, many frames a clip: known by order only
 
-The last two are what nv-tlabs' inference_inverse_renderer.py and inference_svd_rgbx.py write. RGB<->X's program
-shows its maps and saves none; its examples are named NAME-FIELD.png.
+The last two are what nv-tlabs' inference_inverse_renderer.py and inference_svd_rgbx.py write. RGB<->X's
+program shows its maps and saves none; its examples are named NAME-FIELD.png.
 """
 
 from __future__ import annotations
