@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tron.captures.assembly import PosedPhoto, PosedPhotos
+from tron.captures.colmap_files import require_whole
 from tron.captures.distortion import Lens
 from tron.captures.image_folder import ImageFolder, photos_in, view_names
 from tron.errors import TronError
@@ -69,6 +70,7 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a sparse model; TronError if pycolmap cannot or if it holds no posed image."""
     import pycolmap
 
+    require_whole(folder)
     pycolmap.logging.minloglevel = 3  # what is wrong with a file is ours to report
     try:
         model = pycolmap.Reconstruction(folder)

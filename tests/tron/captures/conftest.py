@@ -44,6 +44,7 @@ class Photos:
 @pytest.fixture(scope="session")
 def photos() -> Photos:
     rng = generator(4, "captures", "points")
+    middle = np.array([1, -2, 0.5])
     matrices = []
     for azimuth in np.linspace(0.3, 2.6, 10):
         position = 4 * np.array([np.cos(azimuth), np.sin(azimuth), 0.4])
@@ -51,9 +52,9 @@ def photos() -> Photos:
         right = np.cross((0, 0, 1), backward)
         right /= np.linalg.norm(right)
         matrix = np.eye(4)
-        matrix[:3, :4] = np.stack([right, np.cross(backward, right), backward, position + (1, -2, 0.5)], axis=1)
+        matrix[:3, :4] = np.stack([right, np.cross(backward, right), backward, position + middle], axis=1)
         matrices.append(matrix)
-    points = rng.uniform(-0.6, 0.6, (20, 3)) + (1, -2, 0.5)
+    points = rng.uniform(-0.6, 0.6, (20, 3)) + middle
     return Photos(np.array(matrices), points, tuple(f"photo_{index:02d}.png" for index in range(10)))
 
 
@@ -97,7 +98,9 @@ def write_json(path: Path, content: object) -> None:
     path.write_text(json.dumps(content))
 
 
-def write_colmap(folder: Path, photos: Photos, *, text: bool, model: str = "PINHOLE", parameters=None) -> None:
+def write_colmap(
+    folder: Path, photos: Photos, *, text: bool, model: str = "PINHOLE", parameters=None
+) -> None:
     """A sparse model whose points lie exactly where the photos see them; the last one is seen only twice."""
     import pycolmap
 

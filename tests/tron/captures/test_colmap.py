@@ -44,7 +44,9 @@ def test_models_are_found_where_tools_put_them(tmp_path: Path, photos, write, la
     assert len(load_capture(root).views) == len(photos.names)
 
 
-def test_photos_that_were_not_posed_and_poses_without_photos_are_counted(tmp_path: Path, photos, write) -> None:
+def test_photos_that_were_not_posed_and_poses_without_photos_are_counted(
+    tmp_path: Path, photos, write
+) -> None:
     write.colmap(tmp_path / "sparse" / "0", photos, text=False)
     write.photos(tmp_path / "images", photos)
     (tmp_path / "images" / photos.names[3]).unlink()

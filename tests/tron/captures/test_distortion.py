@@ -1,4 +1,4 @@
-"""Dots that a distorting lens photographed lie, once the photo is undistorted, where its camera projects them.
+"""Dots that a distorting lens photographed lie, once undistorted, where the view's camera projects them.
 
 The witness is OpenCV, which draws and distorts the dots; the lens is undistorted through COLMAP's models.
 """

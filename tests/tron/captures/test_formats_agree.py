@@ -65,7 +65,9 @@ FORMATS = [nerf_synthetic, instant_ngp, nerfstudio, per_frame, dl3dv, colmap_bin
 
 @pytest.mark.parametrize("downscale", [1, 2, 3.7])
 @pytest.mark.parametrize("layout", FORMATS, ids=lambda layout: layout.__name__)
-def test_a_world_point_lands_on_the_same_pixel(tmp_path: Path, photos, write, layout, downscale: float) -> None:
+def test_a_world_point_lands_on_the_same_pixel(
+    tmp_path: Path, photos, write, layout, downscale: float
+) -> None:
     layout(tmp_path, photos, write)
     capture = load_capture(tmp_path, LoadSettings(downscale=downscale))
     assert not capture.skipped

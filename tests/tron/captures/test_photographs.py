@@ -142,7 +142,9 @@ def test_nothing_is_decoded_before_it_is_looked_at_and_memory_is_bounded(
     import tron.captures.photographs as module
 
     decoded, decode = [], module._decode
-    monkeypatch.setattr(module, "_decode", lambda path, header: decoded.append(path.name) or decode(path, header))
+    monkeypatch.setattr(
+        module, "_decode", lambda path, header: decoded.append(path.name) or decode(path, header)
+    )
     write.json(tmp_path / "transforms.json", write.transforms(photos))
     write.photos(tmp_path / "images", photos)
     width, height = write.size

@@ -63,7 +63,9 @@ def test_nerfstudios_lists_are_the_split(tmp_path: Path, write, capture: dict) -
     assert loaded.test == {"photo_06", "photo_07", "photo_08"}
     assert len(loaded.train_views) == 5
     assert loaded.skipped.keys() == {"photo_05", "photo_09"}
-    write.json(tmp_path / "transforms.json", {**capture, "train_filenames": names[:8], "val_filenames": names[8:]})
+    write.json(
+        tmp_path / "transforms.json", {**capture, "train_filenames": names[:8], "val_filenames": names[8:]}
+    )
     assert load_capture(tmp_path).test == {"photo_08", "photo_09"}
 
 
@@ -91,7 +93,9 @@ def test_points_come_along_from_the_files_world(tmp_path: Path, photos, write) -
     assert np.array_equal(loaded.point_colors[0], (1, 0, 0))
 
 
-def test_a_colmap_model_beside_the_file_gives_points_if_its_cameras_agree(tmp_path: Path, photos, write) -> None:
+def test_a_colmap_model_beside_the_file_gives_points_if_its_cameras_agree(
+    tmp_path: Path, photos, write
+) -> None:
     write.photos(tmp_path / "images", photos)
     write.colmap(tmp_path / "colmap" / "sparse" / "0", photos, text=False)
     write.json(tmp_path / "transforms.json", write.transforms(photos, applied=True))
@@ -105,7 +109,9 @@ def test_a_colmap_model_beside_the_file_gives_points_if_its_cameras_agree(tmp_pa
     assert load_capture(tmp_path).points is None
 
 
-def test_images_of_mixed_sizes_have_cameras_of_their_own(tmp_path: Path, photos, write, capture: dict) -> None:
+def test_images_of_mixed_sizes_have_cameras_of_their_own(
+    tmp_path: Path, photos, write, capture: dict
+) -> None:
     width, height = write.size
     for name in photos.names[::2]:
         write.save(tmp_path / "images" / name, write.picture(0, (width // 2, height // 2)))
