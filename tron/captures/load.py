@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from tron.captures.assembly import assemble
 from tron.captures.capture import Capture
@@ -38,9 +41,7 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
         raise TronError("capture not found", path)
     kind = _detected(path) if settings.format == "auto" else settings.format
     if kind == "tron":
-        from tron.captures.folder import read_capture_folder
-
-        return read_capture_folder(path)
+        return _path_traced(path, settings)
     if kind == "transforms":
         from tron.captures.transforms import read_transforms
 
@@ -58,6 +59,20 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
     from tron.captures.structure_from_motion import pose_photos
 
     return assemble(pose_photos(_photo_folder(path, settings.images), settings.posing), settings)
+
+
+def _path_traced(path: Path, settings: LoadSettings) -> Capture:
+    """Our own views, read as they are: their maps hold values that resizing must not mix."""
+    from tron.captures.folder import read_capture_folder
+
+    capture = read_capture_folder(path)
+    for view in capture.views:
+        size = (view.camera.width, view.camera.height)
+        if settings.size_of(*size) != size:
+            raise TronError("path-traced views cannot be reduced", path, "render them smaller")
+    if settings.up is None:
+        return capture
+    return replace(capture, up=np.array(settings.up, float) / np.linalg.norm(settings.up))
 
 
 def _detected(path: Path) -> Format:

@@ -47,7 +47,7 @@ class PosingSettings:
 
 @dataclass(frozen=True)
 class LoadSettings:
-    """How a capture is read.
+    """How a capture is read. Of path-traced views (``tron``) only ``up`` counts: they bring their own split.
 
     Attributes:
         format: what the folder holds; ``auto`` looks. ``tron`` is a folder of path-traced views.

@@ -1,4 +1,4 @@
-"""Importing the loaders loads neither OpenCV nor pycolmap nor torch: those wait for a capture that needs them."""
+"""Importing the loaders loads neither OpenCV nor pycolmap: those wait for a capture that needs them."""
 
 import subprocess
 import sys

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tron.captures import Capture, LoadSettings, load_capture
+from tron.errors import TronError
 
 TOLERANCE = 1e-3
 
@@ -112,3 +113,19 @@ def test_max_side_reduces_to_the_longer_side_and_never_enlarges(tmp_path: Path, 
     assert (small.width, small.height) == (48, 32)
     large = load_capture(tmp_path, LoadSettings(max_side=500)).views[0].camera
     assert (large.width, large.height) == write.size
+
+
+def test_a_path_traced_folder_is_recognised_and_read_as_it_is(tmp_path: Path, photos, write) -> None:
+    from tron.captures.folder import write_capture
+
+    instant_ngp(tmp_path / "photos", photos, write)
+    original = load_capture(tmp_path / "photos")
+    write_capture(tmp_path / "traced", original)
+    for path in (tmp_path / "traced", tmp_path / "traced" / "transforms.json"):
+        capture = load_capture(path, LoadSettings(up=(0, 2, 0)))
+        assert capture.test == original.test
+        assert np.allclose(capture.up, (0, 1, 0))
+        for index, view in enumerate(capture.views):
+            assert np.abs(view.camera.project(photos.points)[0] - photos.pixels(index)).max() < TOLERANCE
+    with pytest.raises(TronError, match="cannot be reduced"):
+        load_capture(tmp_path / "traced", LoadSettings(downscale=2))
