@@ -125,6 +125,12 @@ class Settings(_Model):
     view_width: int = Field(800, ge=8, le=8192, description="Width of those views in pixels.")
     view_height: int = Field(800, ge=8, le=8192, description="Height of those views in pixels.")
     surfels: int = Field(200_000, ge=100, description="Number of surfels of a scene, about.")
+    refine_steps: int = Field(
+        200,
+        ge=0,
+        le=100_000,
+        description="Optimisation steps that fit a scene's surfels to its G-buffers; 0 takes them as made.",
+    )
     mesh_edge: float = Field(
         0.03,
         gt=0,

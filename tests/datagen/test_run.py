@@ -41,6 +41,7 @@ TINY = [
     "view_width=32",
     "view_height=32",
     "surfels=1500",
+    "refine_steps=3",
     "mesh_edge=0.2",
     "environment_height=16",
     "path_frames=8",

@@ -11,14 +11,16 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Model = TypeVar("Model", bound="_Model")
+Model = TypeVar("Model", bound="Settings")
 
 
-class _Model(BaseModel):
+class Settings(BaseModel):
+    """What all settings here share: they do not change, and know no other keys and no infinity."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class InitialSettings(_Model):
+class InitialSettings(Settings):
     """Where the first surfels come from."""
 
     source: Literal["auto", "points", "depth", "random"] = Field(
@@ -35,7 +37,7 @@ class InitialSettings(_Model):
     )
 
 
-class DensitySettings(_Model):
+class DensitySettings(Settings):
     """Where surfels are added and taken away, after "3D Gaussian Splatting" (Kerbl et al. 2023)."""
 
     start: int = Field(default=500, ge=0, description="First step after which surfels are added.")
@@ -62,7 +64,7 @@ class DensitySettings(_Model):
     )
 
 
-class RadianceSettings(_Model):
+class RadianceSettings(Settings):
     """Stage 1: geometry and radiance. Rates are Adam's; those of positions are in extents."""
 
     steps: int = Field(default=30_000, ge=0, description="Steps; each renders one view.")
@@ -93,7 +95,7 @@ class RadianceSettings(_Model):
         return _scaled(self, ("steps", "sh_every"), factor).model_copy(update={"density": density})
 
 
-class MaterialSettings(_Model):
+class MaterialSettings(Settings):
     """Stage 2: base color, roughness and metallic from the priors, geometry frozen."""
 
     steps: int = Field(default=7000, ge=0, description="Steps; each renders one view.")
@@ -105,7 +107,7 @@ class MaterialSettings(_Model):
         return _scaled(self, ("steps",), factor)
 
 
-class ReconstructionSettings(_Model):
+class ReconstructionSettings(Settings):
     """How surfels are found; the defaults are the paper's."""
 
     initial: InitialSettings = Field(
@@ -123,7 +125,7 @@ class ReconstructionSettings(_Model):
     seed: int = Field(default=0, description="Root of all random numbers.")
 
 
-class FitSettings(_Model):
+class FitSettings(Settings):
     """How an environment is fitted. The defaults take about half a minute on two CPU cores for a small scene;
     ``FitSettings.paper()`` wants a GPU.
     """

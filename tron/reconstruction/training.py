@@ -7,8 +7,8 @@ bit by bit with one Dr.Jit and one torch thread.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -58,7 +58,7 @@ class Plan:
         name: of the stage; part of the seeds' paths.
         steps: how many.
         weights: what is compared. rates: Adam's rate of what is learnt.
-        position_rate_final: rate of the positions at the last step, reached log-linearly; None keeps it.
+        final_rates: rates at the last step, reached log-linearly; the others stay.
         sh_degree, sh_every: highest degree, and steps after which one more is learnt.
         background: behind the surfels.
         density: makes and removes surfels; None leaves their number.
@@ -68,7 +68,7 @@ class Plan:
     steps: int
     weights: Weights
     rates: dict[str, float]
-    position_rate_final: float | None = None
+    final_rates: Mapping[str, float] = field(default_factory=dict)
     sh_degree: int = 0
     sh_every: int = 1
     background: Background = "black"
@@ -91,7 +91,7 @@ def radiance_plan(settings: RadianceSettings, extent: float, seed: int) -> Plan:
         steps=settings.steps,
         weights=Weights(rgb=1.0, normal=settings.normal, mask=settings.mask, ssim=settings.ssim),
         rates=rates,
-        position_rate_final=settings.position_rate_final * extent,
+        final_rates={"means": settings.position_rate_final * extent},
         sh_degree=settings.sh_degree,
         sh_every=settings.sh_every,
         background=settings.background,
@@ -164,9 +164,7 @@ class Stage:
         surfels.clear_gradients()
         loss.backward()
         value = float(loss.detach())
-        if not np.isfinite(value):
-            raise self._not_finite("loss", view)
-        self._guard(view)
+        self._guard(value, view)
         if plan.density is not None:
             camera = torch.tensor(view.camera.position, dtype=torch.float32, device=surfels.device)
             plan.density.observe(surfels, camera)
@@ -196,21 +194,25 @@ class Stage:
         return np.full(3, 1.0 if self.plan.background == "white" else 0.0)
 
     def _set_rates(self) -> None:
-        plan = self.plan
-        if plan.position_rate_final is not None and "means" in plan.rates:
-            done = self.step / max(plan.steps - 1, 1)
-            first = plan.rates["means"]
-            self.surfels.set_rate("means", first * (plan.position_rate_final / first) ** done)
+        done = self.step / max(self.plan.steps - 1, 1)
+        for name, final in self.plan.final_rates.items():
+            first = self.plan.rates[name]
+            self.surfels.set_rate(name, first * (final / first) ** done)
 
-    def _guard(self, view: View) -> None:
-        """Refuse gradients that are not finite before they reach any parameter."""
-        gradients = {name: self.surfels[name].grad for name in self.plan.rates}
-        found = {name: g for name, g in gradients.items() if g is not None}
+    def _guard(self, loss: float, view: View) -> None:
+        """Refuse what is not finite before any parameter is changed, and name the cause before its effects:
+        parameters (surfels whose place is NaN are seen by no ray and spoil no loss), gradients, the loss.
+        """
+        found = {name: self.surfels[name].detach() for name in self.plan.rates}
+        gradients = {f"gradient of {name}": self.surfels[name].grad for name in self.plan.rates}
+        found |= {name: gradient for name, gradient in gradients.items() if gradient is not None}
         # One number tells of all: a sum is not finite if any term is not.
-        if not np.isfinite(float(sum(g.abs().sum() for g in found.values()))):
-            for name, gradient in found.items():
-                if not bool(torch.isfinite(gradient).all()):
-                    raise self._not_finite(f"gradient of {name}", view)
+        if not np.isfinite(loss + float(sum(values.sum() for values in found.values()))):
+            for name, values in found.items():
+                if not bool(torch.isfinite(values).all()):
+                    raise self._not_finite(name, view)
+            if not np.isfinite(loss):
+                raise self._not_finite("loss", view)
 
     def _not_finite(self, what: str, view: View) -> TronError:
         return TronError(
