@@ -84,6 +84,7 @@ cli = command(
         "tron-eval benchmark=relighting dataset=outputs/data renderer=outputs/train/renderer.safetensors "
         "output_dir=outputs/relighting",
         "tron-eval benchmark=tracing output_dir=outputs/tracing",
+        "tron-eval benchmark=reconstruction output_dir=outputs/reconstruction",
     ),
 )
 

@@ -138,6 +138,32 @@ def growth_chart(
     return Chart(svg, caption, f"Line chart, {y_label} over {x_label}: {ends}.")
 
 
+def progress_chart(
+    lines: Mapping[str, Sequence[tuple[float, float]]],
+    x_label: str,
+    y_label: str,
+    caption: str,
+    bound: tuple[str, float] | None = None,
+) -> Chart:
+    """A chart with both axes linear; ``lines`` maps a label to its (x, y) points, ascending in x.
+
+    ``bound`` is (name, y) of a dotted line across, such as a target.
+    """
+    with _canvas(caption) as (figure, axes):
+        for (label, points), colour in zip(lines.items(), LINE_COLOURS):
+            x, y = zip(*points)
+            axes.plot(x, y, "o-", color=colour, label=label, linewidth=1.6, markersize=3)
+        if bound is not None:
+            name, height = bound
+            axes.axhline(height, color=INK, linewidth=0.8, linestyle=":", label=name)
+        axes.set_xlim(left=0)
+        axes.set_xlabel(x_label)
+        axes.set_ylabel(y_label)
+        svg = _finished(figure, axes)
+    ends = "; ".join(f"{label} ends at {points[-1][1]:.3g}" for label, points in lines.items())
+    return Chart(svg, caption, f"Line chart, {y_label} over {x_label}: {ends}.")
+
+
 @contextmanager
 def _canvas(name: str) -> Iterator[tuple[Any, Any]]:
     """A figure and its axes in the page's style; ``name`` makes the chart's ids its own."""

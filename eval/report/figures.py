@@ -12,6 +12,8 @@ _STYLES = {
     "deg": (1, 2, "°"),
     "1": (1, 3, ""),
     "x": (1, 2, "×"),
+    "surfels": (1, 0, " surfels"),
+    "views": (1, 0, " views"),
 }
 """Unit -> factor, decimals, what is written behind the number."""
 

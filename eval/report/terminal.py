@@ -12,6 +12,11 @@ from rich.table import Table
 from eval.report.figures import bound, verdict, written
 from eval.results import Results, Target
 
+_LISTED = re.compile(
+    r"(demo|surfels|guidance|irradiance|fox|step|reconstruction(\.(classical|depth_init|light))?)\.[a-z_]\w*"
+)
+"""Rows without a target that are listed all the same; rows of one scene end in another segment."""
+
 
 def print_results(results: Results, targets: Sequence[Target], report: Path) -> None:
     """Print tables of the results and the absolute path of the report, to stdout.
@@ -34,7 +39,7 @@ def print_results(results: Results, targets: Sequence[Target], report: Path) -> 
             style = "green" if tone == "good" else "red"
             value = written(row.value, row.unit, signed)
             others.add_row(row.metric, value, bound(target, row.unit), f"[{style}]{words}[/]")
-        elif full is None and re.match(r"(demo|surfels|guidance|irradiance)\.[a-z0-9_]+$", row.metric):
+        elif full is None and _LISTED.fullmatch(row.metric):
             others.add_row(row.metric, written(row.value, row.unit), "", "")
     for target in targets:
         if results.find(target.metric) is None:

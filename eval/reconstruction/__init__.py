@@ -1,0 +1,1 @@
+"""What the benchmark `reconstruction` measures: reconstructions, their lights, optimisation steps."""

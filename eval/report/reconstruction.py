@@ -1,0 +1,136 @@
+"""The reconstruction benchmark in words, tables, charts and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from eval.benchmarks import Outcome
+from eval.report.figures import written
+from eval.report.page import Cell, Section, Table, Text
+from eval.report.reconstruction_fox import fox_section
+from eval.report.reconstruction_scenes import light_section, scenes_section, views_section
+from eval.report.reconstruction_steps import steps_section
+from eval.results import Row
+
+if TYPE_CHECKING:
+    from eval.benchmarks.reconstruction import Measured, Reconstruction
+    from eval.stages import Stages
+
+LEAD = (
+    "A photo shows a thing in the light of that day. To show it in another light one must know what it is "
+    "made of. TRON takes photos from several sides, finds small flat disks (surfels) that together look "
+    "like the photos, asks a prior what the base color, roughness and metallic of their surfaces are, and "
+    "finds the light that explains the photos.",
+    "This page measures that on path-traced scenes, where the truth is known to the last pixel, and on a "
+    "real fox photographed with a phone. Every reconstruction is a run of the command tron-reconstruct, as "
+    "a user would type it; every eighth view is held out, and the figures are those of held-out views "
+    "unless they say otherwise.",
+)
+HEADLINE = {
+    "reconstruction.test_psnr": "Held-out views, from random points",
+    "reconstruction.depth_init.test_psnr": "Held-out views, from depth maps",
+    "reconstruction.base_color_psnr": "Base color, true prior",
+    "reconstruction.normal_mae_deg": "Normals, true prior",
+    "reconstruction.seconds": "Slowest path-traced scene",
+    "fox.test_psnr": "The fox, held-out photos",
+    "fox.seconds": "The fox, from photos to surfels and light",
+    "step.ratio_to_volprim": "A step: times as fast as with Mitsuba's volprim",
+}
+
+
+def outcome(
+    settings: Reconstruction, measured: Measured, rows: Sequence[Row], stages: Stages, output_dir: Path
+) -> Outcome:
+    """Rows and sections of a run."""
+    found = {row.metric: row for row in rows}
+    sections = [
+        *scenes_section(settings, measured, found),
+        *views_section(measured),
+        *light_section(measured),
+        *fox_section(settings, measured, found),
+        *steps_section(settings, measured, found),
+        _limits(settings, measured),
+        *_stages(stages),
+    ]
+    overrides = [f"output_dir={output_dir}"]
+    if settings.variant != "llvm_ad_rgb":
+        overrides.insert(0, f"benchmark.variant={settings.variant}")
+    return Outcome(
+        rows=rows,
+        title="Reconstruction: from photos to relightable surfels",
+        verdict=_verdict(found),
+        lead=LEAD,
+        sections=sections,
+        headline=HEADLINE,
+        reproduce=[" ".join(["tron-eval benchmark=reconstruction", *overrides])],
+        inputs={"settings": settings.model_dump(mode="json", exclude={"targets"})},
+    )
+
+
+def _verdict(found: dict[str, Row]) -> str:
+    def says(metric: str) -> str | None:
+        row = found.get(metric)
+        return None if row is None else written(row.value, row.unit)
+
+    parts = []
+    if "reconstruction.test_psnr" in found:
+        parts.append(
+            f"From random points, path-traced scenes reach {says('reconstruction.test_psnr')} on held-out "
+            f"views, in at most {says('reconstruction.seconds')} a scene."
+        )
+    if "fox.test_psnr" in found:
+        parts.append(f"The photographed fox reaches {says('fox.test_psnr')} after {says('fox.seconds')}.")
+    if "step.ratio_to_volprim" in found:
+        parts.append(
+            f"An optimisation step is {found['step.ratio_to_volprim'].value:.1f} times as fast as the same "
+            "step with Mitsuba's volprim."
+        )
+    return " ".join(parts) or "Only some parts were run."
+
+
+def _limits(settings: Reconstruction, measured: Measured) -> Section:
+    texts = [
+        "The path-traced scenes are small, made of a few procedural objects on a floor, photographed without "
+        "noise, blur or changing exposure, with poses and masks that are exact. Real captures have none of "
+        "that, and the fox stands for them alone.",
+        "The true prior is a teacher that no photograph comes with: figures under it say what the method can "
+        "do with perfect normals and materials, not what a user gets. The classical prior is what needs no "
+        "weights; it guesses one roughness and metallic for everything and cannot tell paint from shade.",
+        "Base color is scored after one factor a view and channel, as the TRON paper does, because photos "
+        "alone do not tell bright paint in dim light from dim paint in bright light.",
+        "The fox's materials, normals and light have no truth to be held against; its relit pictures are to "
+        "be looked at, and show shading without the neural renderer.",
+    ]
+    if measured.steps:
+        texts.append(
+            "The peer of the steps composites radiance alone, of flat ellipsoids that it sees from both "
+            "sides; TRON composites normals, materials and depth as well, and skips back faces, with which "
+            "the surfels were trained. No settings of either make the work exactly equal; the two pictures' "
+            "PSNR beside the times says how alike they are."
+        )
+    if not all(part in settings.parts for part in ("scenes", "fox", "steps")):
+        texts.append(f"Only these parts were run: {', '.join(settings.parts)}.")
+    return Section("limits", "What these figures do not say", [Text(text) for text in texts])
+
+
+def _stages(stages: Stages) -> list[Section]:
+    if not stages.records:
+        return []
+    table = [
+        [
+            Cell(name),
+            Cell(written(record.seconds, "s"), "strong"),
+            Cell(str(record.attempts)),
+            Cell(record.commit or "unknown"),
+            Cell("; ".join(" ".join(command) for command in record.commands), "faint"),
+        ]
+        for name, record in stages.records.items()
+    ]
+    caption = (
+        "Wall time of the commands, from start to end; a command that was interrupted counts all its "
+        "attempts. What was finished before is not run again: the commit is that of the code that made it."
+    )
+    headings = ["Stage", "Time", "Attempts", "Commit", "Command"]
+    return [Section("stages", "The commands", [Table(caption, headings, table, words=[4])])]

@@ -1,0 +1,117 @@
+"""The real capture: figures, curve, held-out photos beside the surfels, and the fox under other lights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from eval.report.charts import progress_chart
+from eval.report.figures import written
+from eval.report.page import Block, Cell, Picture, Pictures, Section, Table, Text
+from eval.results import Row
+from tron.images import read_image
+
+if TYPE_CHECKING:
+    from eval.benchmarks.reconstruction import Measured, Reconstruction
+    from eval.reconstruction.relit import Fox
+
+WORDS = {
+    "fox.test_psnr": "PSNR of held-out photos",
+    "fox.ssim": "SSIM of held-out photos",
+    "fox.lpips": "LPIPS of held-out photos",
+    "fox.train_psnr": "PSNR of training photos",
+    "fox.surfels": "surfels",
+    "fox.seconds": "whole command",
+    "fox.surfels_seconds": "of that, surfels and materials",
+    "fox.light_seconds": "of that, the light",
+    "fox.relight_seconds": "relighting under all the lights, final quality",
+}
+
+
+def fox_section(settings: Reconstruction, measured: Measured, found: Mapping[str, Row]) -> list[Section]:
+    """Everything about the fox, or why there is nothing."""
+    if measured.fox is None:
+        if not measured.no_fox:
+            return []
+        reason = Text(f"The real capture was not reconstructed: {measured.no_fox}. Its figures are absent.")
+        return [Section("fox", "The fox", [reason])]
+    fox = measured.fox
+    capture = fox.run.report.capture
+    skipped = (
+        f" {len(capture.skipped)} photos that its poses name are absent, and were skipped."
+        if capture.skipped
+        else ""
+    )
+    blocks: list[Block] = [
+        Text(
+            f"{capture.views} photos of a stuffed fox, taken with a phone whose lens distorts, "
+            f"{len(capture.held_out)} of them held out.{skipped} No mask tells the fox from the room behind "
+            "it, and no prior knows its materials: they come from the classical decomposition, which needs "
+            "no weights."
+        ),
+        Table(
+            "What was measured.",
+            ["Figure", "Measured"],
+            [
+                [Cell(text), Cell(written(found[metric].value, found[metric].unit), "strong")]
+                for metric, text in WORDS.items()
+                if metric in found
+            ],
+        ),
+    ]
+    if len(fox.run.curve()) > 1:
+        target = next((t for t in settings.targets if t.metric == "fox.test_psnr"), None)
+        blocks.append(
+            progress_chart(
+                {"fox": fox.run.curve()},
+                "seconds of training",
+                "held-out PSNR in dB",
+                "Held-out PSNR of the fox while its surfels are learnt.",
+                None if target is None else ("target", target.value),
+            )
+        )
+    blocks += [*_held_out(fox), *_relit(fox), *_sheet(fox)]
+    return [Section("fox", "The fox", blocks)]
+
+
+def _held_out(fox: Fox) -> list[Pictures]:
+    blocks = []
+    for name, photo in fox.photos.items():
+        figures = fox.run.report.views.get(name, {})
+        pictures = [Picture(photo, "photo", f"held-out photo {name} of the fox")]
+        for channel, image in fox.shown[name].items():
+            figure = f"{figures['psnr']:.1f} dB" if channel == "radiance" and "psnr" in figures else ""
+            pictures.append(Picture(image, channel, f"{channel} of the surfels, view {name}", figure))
+        blocks.append(Pictures(f"Held-out photo {name}", pictures, columns=4))
+    return blocks
+
+
+def _relit(fox: Fox) -> list[Pictures]:
+    if not fox.relit:
+        return []
+    views = list(fox.photos)
+    blocks = []
+    if fox.light is not None:
+        before = [Picture(fox.light, "fitted light", "environment map that was fitted to the photos")]
+        before += [Picture(photo, f"photo {name}", f"photo {name}") for name, photo in fox.photos.items()]
+        blocks.append(Pictures("As it was photographed", before, columns=len(before)))
+    for light, (environment, *frames) in fox.relit.items():
+        pictures = [Picture(environment, "light", f"environment map {light}")]
+        pictures += [
+            Picture(frame, f"view {name}", f"the fox from view {name}, lit by {light}")
+            for name, frame in zip(views, frames, strict=True)
+        ]
+        note = (
+            "Made by tron-relight of the same scene.ply: traced shadows and split-sum reflections, no neural "
+            "renderer; the environment is seen where there are no surfels."
+        )
+        blocks.append(Pictures(f"Under {light.replace('_', ' ')}", pictures, note, len(pictures)))
+    return blocks
+
+
+def _sheet(fox: Fox) -> list[Pictures]:
+    path = fox.run.folder / "contact_sheet.png"
+    if not path.is_file():
+        return []
+    picture = Picture(read_image(path), "contact sheet", "held-out photos and every channel of the surfels")
+    return [Pictures("The command's own contact sheet", [picture], columns=1)]

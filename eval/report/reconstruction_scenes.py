@@ -1,0 +1,203 @@
+"""The path-traced scenes: figures of every way, curves, pictures beside the truth, lights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from eval.report.charts import progress_chart
+from eval.report.figures import written
+from eval.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
+from eval.results import Row
+
+if TYPE_CHECKING:
+    from eval.benchmarks.reconstruction import Measured, Reconstruction
+    from eval.reconstruction.pictures import Compared
+    from eval.reconstruction.runs import Run
+
+WAYS = {
+    "random": "random points, true prior",
+    "depth_init": "depth maps, true prior",
+    "classical": "random points, classical prior",
+}
+COLUMNS = {
+    "test_psnr": "Held-out PSNR",
+    "test_psnr_subject": "on the subject",
+    "test_ssim": "SSIM",
+    "train_psnr": "Training PSNR",
+    "normal_mae_deg": "Normals",
+    "base_color_psnr": "Base color",
+    "roughness_mae": "Roughness",
+    "metallic_mae": "Metallic",
+    "surfels": "Surfels",
+    "seconds": "Time",
+}
+CHANNEL_ALTS = {
+    "radiance": "a held-out view",
+    "normal": "surface normals as colours",
+    "base color": "base color",
+    "light": "the environment map",
+}
+
+
+def way_title(way: str) -> str:
+    """A way in words; its name where it is not one of the shipped ones."""
+    return WAYS.get(way, way)
+
+
+def scenes_section(settings: Reconstruction, measured: Measured, found: Mapping[str, Row]) -> list[Section]:
+    """Tables and curves of the path-traced scenes, if they were reconstructed."""
+    if not measured.runs:
+        return []
+    first = next(iter(measured.runs.values()))
+    blocks: list[Block] = [
+        Text(
+            f"{len(first)} scenes of {first[0].report.capture.views} path-traced views each, reconstructed "
+            "in each of these ways. From random points nothing is known but the cameras and the pictures' "
+            "masks; from depth maps surfels begin on the true surfaces. The true prior gives normals, base "
+            "color, roughness, metallic and irradiance of the training views; the classical one computes "
+            "what it can from the photos. Normals are off by a mean angle; base color is PSNR on linear "
+            "values after one factor a view and channel; roughness and metallic are mean absolute errors."
+        ),
+        _means(measured, found),
+    ]
+    blocks += _curves(settings, measured)
+    blocks += [
+        _scene_table(way, number == 0, runs, found)
+        for number, (way, runs) in enumerate(measured.runs.items())
+    ]
+    return [Section("scenes", "Path-traced scenes", blocks)]
+
+
+def _prefix(way: str, main: bool) -> str:
+    return "reconstruction" if main else f"reconstruction.{way}"
+
+
+def _cell(row: Row | None) -> Cell:
+    return Cell("—" if row is None else written(row.value, row.unit))
+
+
+def _means(measured: Measured, found: Mapping[str, Row]) -> Table:
+    table = [
+        [
+            Cell(way_title(way)),
+            *(_cell(found.get(f"{_prefix(way, number == 0)}.{name}")) for name in COLUMNS),
+        ]
+        for number, way in enumerate(measured.runs)
+    ]
+    caption = "Means over the scenes; surfels and time (the whole command) are of the scene with the most."
+    return Table(caption, ["Begun from", *COLUMNS.values()], table)
+
+
+def _scene_table(way: str, main: bool, runs: Sequence[Run], found: Mapping[str, Row]) -> Table:
+    table = [
+        [
+            Cell(run.name),
+            *(
+                _cell(found.get(f"{_prefix(way, main)}.{name}.{run.name.replace('-', '_')}"))
+                for name in COLUMNS
+            ),
+        ]
+        for run in runs
+    ]
+    return Table(f"Each scene: {way_title(way)}.", ["Scene", *COLUMNS.values()], table)
+
+
+def _curves(settings: Reconstruction, measured: Measured) -> list[Chart]:
+    charts = []
+    target = next((t for t in settings.targets if t.metric == "reconstruction.test_psnr"), None)
+    bound = None if target is None else ("target from random points", target.value)
+    means = {way_title(way): mean for way, runs in measured.runs.items() if (mean := _mean_curve(runs))}
+    axes = "seconds of training", "held-out PSNR in dB"
+    if means:
+        caption = "Held-out PSNR while surfels are learnt, mean over the scenes."
+        charts.append(progress_chart(means, *axes, caption, bound))
+    way, runs = next(iter(measured.runs.items()))
+    lines = {run.name: run.curve() for run in runs if len(run.curve()) > 1}
+    if lines:
+        charts.append(progress_chart(lines, *axes, f"The same for each scene: {way_title(way)}.", bound))
+    return charts
+
+
+def _mean_curve(runs: Sequence[Run]) -> list[tuple[float, float]]:
+    """Mean (seconds, dB) over the scenes at the steps that all of them scored."""
+    by_step = [{point.step: point for point in run.report.curve} for run in runs]
+    steps = sorted(set.intersection(*(set(points) for points in by_step)))
+    if len(steps) < 2:
+        return []
+    return [
+        (
+            float(np.mean([points[step].seconds for points in by_step])),
+            float(np.mean([points[step].test_psnr for points in by_step])),
+        )
+        for step in steps
+    ]
+
+
+def views_section(measured: Measured) -> list[Section]:
+    """A held-out view of each scene beside the truth, in every way."""
+    if not measured.compared:
+        return []
+    blocks: list[Block] = [
+        Text(
+            "The middle held-out view of each scene: what the surfels show, their normals and base color "
+            "(scaled as its figure is), and the light that was found, all lights by the true one's exposure. "
+            "The first row is the truth."
+        )
+    ]
+    blocks += [_gallery(compared) for compared in measured.compared]
+    return [Section("views", "Held-out views beside the truth", blocks)]
+
+
+def _gallery(compared: Compared) -> Pictures:
+    pictures = [
+        Picture(
+            image, f"true {channel}" if channel != "radiance" else "photo", _alt(channel, compared, "truth")
+        )
+        for channel, image in compared.truth.items()
+    ]
+    columns = len(pictures)
+    for way, images in compared.ways.items():
+        pictures += [
+            Picture(
+                images[channel],
+                f"{way}: {channel}",
+                _alt(channel, compared, way_title(way)),
+                compared.figures[way].get(channel, ""),
+            )
+            for channel in compared.truth
+            if channel in images
+        ]
+    note = f"View {compared.view}. " + "; ".join(f"{way}: {way_title(way)}" for way in compared.ways) + "."
+    return Pictures(f"Scene {compared.scene}", pictures, note, columns)
+
+
+def _alt(channel: str, compared: Compared, who: str) -> str:
+    return f"{CHANNEL_ALTS[channel]} of scene {compared.scene}, {who}"
+
+
+def light_section(measured: Measured) -> list[Section]:
+    """How far the fitted lights are from the true ones."""
+    table = [
+        [
+            Cell(run.name),
+            Cell(way_title(way)),
+            Cell(written(run.light["irradiance_error"], "fraction"), "strong"),
+            Cell(written(run.light["irradiance_error_scaled"], "fraction")),
+        ]
+        for way, runs in measured.runs.items()
+        for run in runs
+        if run.light
+    ]
+    if not table:
+        return []
+    intro = Text(
+        "The light that each run found, held against the one that the scene was path-traced under: the "
+        "relative difference (L2) of the irradiance that either gives to unoccluded surfaces of all normals. "
+        "The second figure is after one factor on the whole light, which leaves errors of colour and "
+        "direction. No target was set."
+    )
+    headings = ["Scene", "Begun from", "Irradiance off by", "after one factor"]
+    return [Section("light", "The light", [intro, Table("Fitted lights.", headings, table, words=[1])])]

@@ -1,0 +1,87 @@
+"""What an optimisation step costs: beside Mitsuba's volprim, and as surfels and pixels grow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from eval.report.charts import growth_chart
+from eval.report.figures import written
+from eval.report.page import Block, Cell, Chart, Section, Table, Text
+from eval.results import Row
+
+if TYPE_CHECKING:
+    from eval.benchmarks.reconstruction import Measured, Reconstruction
+
+
+def steps_section(settings: Reconstruction, measured: Measured, found: Mapping[str, Row]) -> list[Section]:
+    """Ratios and growth, as far as they were measured."""
+    blocks: list[Block] = []
+    if measured.steps:
+        blocks += _beside_the_peer(measured, found)
+    blocks += _growth(settings, measured)
+    return [Section("steps", "An optimisation step", blocks)] if blocks else []
+
+
+def _beside_the_peer(measured: Measured, found: Mapping[str, Row]) -> list[Block]:
+    from eval.reconstruction.step import SHIPPED, TRON, VOLPRIM
+
+    shape = measured.steps[0].shape
+    intro = Text(
+        "A step renders one view, compares it with the photo by 0.8 L1 + 0.2 (1 - SSIM), differentiates by "
+        "positions, rotations, scales, opacities and harmonics up to degree 3, and updates them all by Adam. "
+        "Both sides hold the same tensors in torch, under the same Adam and the same loss, on a scene "
+        "that was reconstructed above; they differ in what renders and differentiates: TRON, or Mitsuba's "
+        f"volprim_rf_basic on {shape} (the faster of its two plugins here) through dr.wrap. The peer stops a "
+        "ray where TRON does; its own limit, ten times as high, ends rays sooner and is shown beside it. "
+        "What either must make anew for surfels that have moved, TRON's tile lists and Mitsuba's hierarchy, "
+        "is counted. All take turns in one process; figures are medians."
+    )
+    headings = [
+        "Surfels",
+        "Pixels",
+        "TRON",
+        "volprim",
+        "as shipped",
+        "ratio",
+        "range",
+        "as shipped",
+        "Pictures alike",
+    ]
+    table = []
+    for steps in measured.steps:
+        times = steps.times
+        low, high = times[VOLPRIM].range_over(times[TRON])
+        table.append(
+            [
+                Cell(f"{steps.count:,}"),
+                Cell(f"{steps.size}²"),
+                *(Cell(written(1e3 * times[name].median, "ms")) for name in (TRON, VOLPRIM, SHIPPED)),
+                Cell(written(steps.ratio(), "x"), "strong"),
+                Cell(f"{low:.1f}–{high:.1f}", "faint"),
+                Cell(written(steps.ratio(SHIPPED), "x")),
+                Cell(written(found[f"step.psnr_to_volprim.{steps.size}"].value, "dB")),
+            ]
+        )
+    caption = (
+        "Time of one whole step, and how many times as long the peer's takes; the smallest ratio is the one "
+        "held to the target. The last column compares both sides' pictures before the first step."
+    )
+    groups = [("", 2), ("Time of a step", 3), ("volprim over TRON", 3), ("", 1)]
+    return [intro, Table(caption, headings, table, groups)]
+
+
+def _growth(settings: Reconstruction, measured: Measured) -> list[Chart]:
+    surfels, pixels = settings.growth_at
+    by_count = sorted((n, t.median) for (n, size), t in measured.growth.items() if size == pixels)
+    by_size = sorted(
+        (float(size * size), t.median) for (n, size), t in measured.growth.items() if n == surfels
+    )
+    charts = []
+    if len(by_count) > 1:
+        caption = f"Seconds a step as surfels grow, {pixels}² pixels, on the tracing benchmark's scene."
+        charts.append(growth_chart({"a step": by_count}, "surfels", "seconds", caption))
+    if len(by_size) > 1:
+        caption = f"Seconds a step as pixels grow, {surfels:,} surfels, on the same scene."
+        charts.append(growth_chart({"a step": by_size}, "pixels", "seconds", caption))
+    return charts
