@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 import tron
 from datagen.assets import Asset
-from datagen.plan import Sources, config_sha256
+from datagen.plan import Figures, Refinement, Sources, config_sha256
 from datagen.settings import OUTSIDE, SPLITS, Settings
 from tron.apps.recipes import compose_recipe
 from tron.runtime import describe_machine
@@ -66,7 +66,11 @@ def _hydra(value: Any) -> str:
 
 
 def card_text(
-    settings: Settings, manifest: Manifest, sources: Sources, lights: Mapping[str, Counter[str]]
+    settings: Settings,
+    manifest: Manifest,
+    sources: Sources,
+    lights: Mapping[str, Counter[str]],
+    refinements: Sequence[Refinement] = (),
 ) -> str:
     """card.md, the same bytes for the same dataset.
 
@@ -75,6 +79,7 @@ def card_text(
         manifest: what it holds.
         sources: the user's files it drew from.
         lights: split -> light family -> clips.
+        refinements: of the scenes' surfels, where they were refined.
     """
     lines = [
         "# Dataset card",
@@ -109,6 +114,7 @@ def card_text(
         f"Root seed {settings.seed}. Frames by Mitsuba's path tracer, guidance by TRON's surfel tracer on "
         f"about {settings.surfels:,} surfels a scene, from {settings.views} views. Buffers are linear; "
         "`exposure` in a clip's metadata is the scalar to apply before AgX.",
+        *_refinement(refinements),
         "",
         "| software | version |",
         "|---|---|",
@@ -125,6 +131,26 @@ def card_text(
     if not sources.maps:
         lines.append("Lights are procedural; skies follow Mitsuba's `sunsky`.")
     return "\n".join(lines) + "\n"
+
+
+def _refinement(found: Sequence[Refinement]) -> list[str]:
+    """What fitting the surfels to their G-buffers gained, means over scenes."""
+    if not found:
+        return []
+    before, after = (
+        [
+            sum(getattr(getattr(each, when), name) for each in found) / len(found)
+            for name in Figures.model_fields
+        ]
+        for when in ("before", "after")
+    )
+    return [
+        "",
+        f"{found[0].steps} optimisation steps fit a scene's surfels to its G-buffers. At held-out cameras "
+        f"that took base color from {before[0]:.1f} to {after[0]:.1f} dB, normals from {before[1]:.2f} to "
+        f"{after[1]:.2f} degrees, and silhouettes (mean of |opacity - mask|) from {before[2]:.4f} to "
+        f"{after[2]:.4f}.",
+    ]
 
 
 def _asset_row(asset: Asset) -> str:

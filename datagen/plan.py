@@ -57,6 +57,30 @@ class Quarantined(BaseModel):
     reason: str
 
 
+class Figures(BaseModel):
+    """Surfels against the true G-buffers of views that they were not fitted to.
+
+    base_color_psnr in dB, linear, each view and channel scaled by least squares; normal_mae_deg in degrees;
+    silhouette_error is the mean of |opacity - mask|.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    base_color_psnr: float
+    normal_mae_deg: float
+    silhouette_error: float
+
+
+class Refinement(BaseModel):
+    """What a number of steps made of a scene's surfels."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    steps: int
+    before: Figures
+    after: Figures
+
+
 class Record(BaseModel):
     """scenes/NAME/record.json: the scene is finished, and this is what it gave."""
 
@@ -65,6 +89,7 @@ class Record(BaseModel):
     name: str
     shards: list[ShardEntry]
     quarantined: list[Quarantined]
+    refinement: Refinement | None = None
 
 
 def plan(settings: Settings) -> list[Work]:

@@ -110,7 +110,7 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
     spec, geometry = draw_and_build(item, settings, sources, settings.split(item.split).lights)
     folder = scene_folder(output, item.name)
     write_atomic(folder / "spec.json", spec.to_json())
-    surfels = make_surfels(spec, geometry, settings)
+    surfels, refinement = make_surfels(spec, geometry, settings)
     surfels.save(folder / "surfels.ply")
 
     quarantined: list[Quarantined] = []
@@ -126,7 +126,7 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
             rows[meta.key] = contact_row(meta, frames[0])
     for entry in writer.entries:
         write_sheet(output / sheet_name(entry.name), [rows[key] for key in entry.keys])
-    record = Record(name=item.name, shards=writer.entries, quarantined=quarantined)
+    record = Record(name=item.name, shards=writer.entries, quarantined=quarantined, refinement=refinement)
     write_atomic(folder / RECORD_NAME, record.model_dump_json(indent=1) + "\n")
     del geometry, surfels
     gc.collect()
@@ -245,7 +245,8 @@ def _account(settings: Settings, items: Sequence[Work], sources: Sources, reason
         lights[spec.split].update(
             light.family for i, light in enumerate(spec.lights) if f"{spec.name}-l{i}" in kept
         )
-    write_if_changed(output / "card.md", card_text(settings, manifest, sources, lights))
+    refinements = [record.refinement for record in made if record.refinement is not None]
+    write_if_changed(output / "card.md", card_text(settings, manifest, sources, lights, refinements))
     write_if_changed(output / "index.html", index_html("TRON dataset", shards))
     write_if_changed(output / "manifest.json", manifest.model_dump_json(indent=1) + "\n")
     return len(failures)

@@ -12,15 +12,13 @@ import numpy as np
 from datagen.build import Geometry
 from datagen.lights import LightSpec, bake, classify
 from datagen.pathtrace import DirectIrradiance, direct_irradiance, gbuffers, render_frames
+from datagen.plan import Refinement
+from datagen.refinement import refine_surfels
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from tron.cameras import Camera
-from tron.captures import View
-from tron.color import linear_to_srgb
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.gaussians.scene import GaussianScene
-from tron.reconstruction.refinement import RefinementSettings, refine
-from tron.runtime import set_torch_threads
 from tron.seeds import integer
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
@@ -36,36 +34,23 @@ REFERENCE_COLOR_SPACE: dict[str, ColorSpace] = dict.fromkeys(
 )
 
 
-def make_surfels(spec: SceneSpec, geometry: Geometry, settings: Settings) -> GaussianScene:
-    """Surfels through what the spiral views see of a scene, then fitted to it step by step."""
+def make_surfels(
+    spec: SceneSpec, geometry: Geometry, settings: Settings
+) -> tuple[GaussianScene, Refinement | None]:
+    """Surfels through what the spiral views see of a scene, then fitted to it, and what that gained.
+
+    They are judged by the cameras of the first clip, which are not among the spiral's.
+    """
     cameras = spec.spiral(settings.views, settings.view_width, settings.view_height)
     seen = gbuffers(geometry, cameras)
     surfels = surfels_from_gbuffers(seen, count=settings.surfels)
     if not settings.refine_steps:
-        return surfels
-    # The loss is small beside the tracing, and sums repeat bit by bit with one thread alone.
-    set_torch_threads(1)
-    views = [_as_view(number, view) for number, view in enumerate(seen)]
+        return surfels, None
+    recipe = settings.split(spec.split)
+    held_out = gbuffers(geometry, spec.clip(0, recipe.frames, recipe.width, recipe.height))
     device = "cuda" if settings.variant.startswith("cuda") else "cpu"
     seed = integer(spec.seed, spec.split, spec.index, "refinement")
-    return refine(surfels, views, RefinementSettings(steps=settings.refine_steps), seed, device)
-
-
-def _as_view(number: int, seen: GBufferView) -> View:
-    """A true G-buffer as what a reconstruction learns from; no light is on, so the picture is base color."""
-    inside = seen.valid[..., None]
-    base_color = np.where(inside, seen.base_color, 0)
-    return View(
-        name=f"{number:04d}",
-        camera=seen.camera,
-        image=linear_to_srgb(base_color),
-        space="display",
-        normal=np.where(inside, seen.normal, 0),
-        base_color=base_color,
-        roughness=np.where(seen.valid, seen.roughness, 0),
-        metallic=np.where(seen.valid, seen.metallic, 0),
-        mask=seen.valid.astype(np.float32),
-    )
+    return refine_surfels(surfels, seen, held_out, settings.refine_steps, seed, device)
 
 
 def make_clips(
