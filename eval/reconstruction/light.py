@@ -36,7 +36,7 @@ def irradiance(light: EnvironmentMap, normals: np.ndarray) -> np.ndarray:
 def light_errors(found: EnvironmentMap, truth: EnvironmentMap) -> dict[str, float]:
     """Relative L2 errors of irradiance over normals drawn evenly on the sphere.
 
-    ``irradiance_error`` as it is; ``irradiance_error_scaled`` after the one factor that makes it least, which
+    ``irradiance_error`` as it is; ``scaled_error`` after the one factor that makes it least, which
     leaves what is wrong with colour and direction.
     """
     normals = generator(0, "reconstruction", "light normals").normal(size=(NORMALS, 3))
@@ -47,7 +47,7 @@ def light_errors(found: EnvironmentMap, truth: EnvironmentMap) -> dict[str, floa
     size = float(np.linalg.norm(wanted))
     return {
         "irradiance_error": float(np.linalg.norm(ours - wanted)) / size,
-        "irradiance_error_scaled": float(np.linalg.norm(factor * ours - wanted)) / size,
+        "scaled_error": float(np.linalg.norm(factor * ours - wanted)) / size,
     }
 
 

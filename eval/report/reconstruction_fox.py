@@ -24,7 +24,7 @@ WORDS = {
     "fox.seconds": "whole command",
     "fox.surfels_seconds": "of that, surfels and materials",
     "fox.light_seconds": "of that, the light",
-    "fox.relight_seconds": "relighting under all the lights, final quality",
+    "fox.relight_seconds": "relighting, all the lights together",
 }
 
 

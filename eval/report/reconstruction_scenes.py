@@ -54,7 +54,8 @@ def scenes_section(settings: Reconstruction, measured: Measured, found: Mapping[
     first = next(iter(measured.runs.values()))
     blocks: list[Block] = [
         Text(
-            f"{len(first)} scenes of {first[0].report.capture.views} path-traced views each, reconstructed "
+            f"{len(first)} {'scenes' if len(first) > 1 else 'scene'} of {first[0].report.capture.views} "
+            "path-traced views each, reconstructed "
             "in each of these ways. From random points nothing is known but the cameras and the pictures' "
             "masks; from depth maps surfels begin on the true surfaces. The true prior gives normals, base "
             "color, roughness, metallic and irradiance of the training views; the classical one computes "
@@ -76,7 +77,9 @@ def _prefix(way: str, main: bool) -> str:
 
 
 def _cell(row: Row | None) -> Cell:
-    return Cell("—" if row is None else written(row.value, row.unit))
+    if row is None:
+        return Cell("—")
+    return Cell(f"{row.value:,.0f}" if row.unit == "surfels" else written(row.value, row.unit))
 
 
 def _means(measured: Measured, found: Mapping[str, Row]) -> Table:
@@ -185,7 +188,7 @@ def light_section(measured: Measured) -> list[Section]:
             Cell(run.name),
             Cell(way_title(way)),
             Cell(written(run.light["irradiance_error"], "fraction"), "strong"),
-            Cell(written(run.light["irradiance_error_scaled"], "fraction")),
+            Cell(written(run.light["scaled_error"], "fraction")),
         ]
         for way, runs in measured.runs.items()
         for run in runs
