@@ -93,8 +93,9 @@ def reconstruct(
     taught = apply_prior(capture, prior, fields=wanted, track=track) if wanted else capture
     extent = extent_of(views)
     plan = radiance_plan(radiance, extent, settings.seed)
+    most = radiance.density.most
     surfels = run.stage(
-        plan, taught.train_views, lambda: initial_surfels(taught, settings.initial, settings.seed)
+        plan, taught.train_views, lambda: initial_surfels(taught, settings.initial, settings.seed, most)
     )
     scene = surfels.scene(settings.initial.kernel_degree, capture.up)
 
@@ -139,7 +140,7 @@ class _Run:
         self.before = self.found.seconds if self.found else 0.0
         self.started = time.perf_counter()
         if self.found is not None:
-            self._require_same(self.found)
+            require_same(self.found, self.values)
             log.info("going on from step %d of stage %s", self.found.step, self.found.stage)
 
     def seconds(self) -> float:
@@ -156,7 +157,7 @@ class _Run:
             and _ORDER.index(found.stage) > _ORDER.index(plan.name)
         ):
             # A later stage is under way: this one's surfels are those of the checkpoint.
-            return found.surfels({}, self.device)
+            return found.surfels(plan.rates, self.device)
         if found is not None and found.stage == plan.name:
             stage = Stage(plan, views, found.surfels(plan.rates, self.device), degree, seed)
             found.resume(stage)
@@ -177,14 +178,28 @@ class _Run:
         if self.path is not None:
             save_checkpoint(self.path, stage, self.values, self.seconds())
 
-    def _require_same(self, found: Checkpoint) -> None:
-        for key, value in self.values.items():
-            if found.made_with.get(key) != value:
-                raise TronError(
-                    f"the checkpoint was made with another {key}",
-                    found.path,
-                    "give the same settings, another output_dir, or overwrite=true",
-                )
+
+def require_same(found: Checkpoint, values: Mapping[str, Any]) -> None:
+    """Raise TronError naming the first key in which a checkpoint differs from ``values`` (``made_with``)."""
+    key = _first_difference(found.made_with, values)
+    if key is not None:
+        raise TronError(
+            f"the checkpoint was made with another {key}",
+            found.path,
+            "give the same settings, another output_dir, or overwrite=true",
+        )
+
+
+def _first_difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> str | None:
+    for key in dict.fromkeys((*other, *one)):
+        a, b = one.get(key), other.get(key)
+        if isinstance(a, Mapping) and isinstance(b, Mapping):
+            inner = _first_difference(a, b)
+            if inner is not None:
+                return f"{key}.{inner}"
+        elif a != b:
+            return key
+    return None
 
 
 _ORDER = ("radiance", "materials")

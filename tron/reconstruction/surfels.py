@@ -30,6 +30,7 @@ ROWS: dict[str, tuple[int, ...]] = {
 }
 """Tensors by name and the shape of a row; as in :class:`GaussianScene`, but for the harmonics."""
 UNIT_INTERVAL = ("base_color", "roughness", "metallic")
+_UNIT_WITHIN = 1e-6
 
 
 class LearntSurfels:
@@ -162,7 +163,8 @@ class LearntSurfels:
                 if f"adam.{name}.{moment}" in stored
             }
             if moments:
-                on = {m: v if m == "step" else v.to(device) for m, v in moments.items()}
+                # The fused implementation counts its steps where the parameters are.
+                on = {moment: values.to(device) for moment, values in moments.items()}
                 surfels._adam.state[surfels.tensors[name]] = on
         return surfels
 
@@ -171,6 +173,8 @@ class LearntSurfels:
         arrays = {name: values.detach().cpu().numpy() for name, values in self.tensors.items()}
         quats = arrays["quats"].astype(np.float64)
         lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+        # What is a unit quaternion already stays as it is, bit by bit, however often a scene is learnt from.
+        lengths = np.where(np.abs(lengths - 1) < _UNIT_WITHIN, 1, lengths)
         return GaussianScene(
             means=arrays["means"],
             quats=np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1), (1.0, 0, 0, 0)),
