@@ -21,9 +21,13 @@ from tron.reconstruction.settings import InitialSettings
 from tron.seeds import generator
 
 _EXTENT_MARGIN = 1.1
+_SAME_PLACE = 1e-9  # rounding moves cameras that turn on the spot by about 1e-16
 _DRAWS = 64
+_DRAWS_OF_BOX = 16
 _LEAST_SHARE = 0.25
 _INSIDE = 0.95
+_OUTWARD = 4.0
+_ABOUT = 0.99  # surfels from depth maps are as many as asked for within half a percent
 
 
 def extent_of(views: Sequence[View]) -> float:
@@ -31,13 +35,19 @@ def extent_of(views: Sequence[View]) -> float:
     positions = np.stack([view.camera.position for view in views])
     distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     extent = float(_EXTENT_MARGIN * np.median(distance))
-    if not extent > 0:
+    if not extent > _SAME_PLACE * np.abs(positions).max():
         raise TronError("all cameras of the capture stand at one place", mend="photograph it from around it")
     return extent
 
 
-def initial_surfels(capture: Capture, settings: InitialSettings, seed: int) -> GaussianScene:
+def initial_surfels(
+    capture: Capture, settings: InitialSettings, seed: int, most: int | None = None
+) -> GaussianScene:
     """Surfels to begin with.
+
+    Args:
+        capture: its training views and points. settings: from what. seed: root of all random numbers.
+        most: surfels; of more points as many are drawn.
 
     Raises:
         TronError: the source asked for is not there.
@@ -49,12 +59,19 @@ def initial_surfels(capture: Capture, settings: InitialSettings, seed: int) -> G
     if source == "points":
         if capture.points is None:
             raise TronError("the capture has no points", mend="start from depth maps or random points")
-        return surfels_at(capture.points, capture.point_colors, capture, settings, seed)
+        points, colors = capture.points, capture.point_colors
+        if most is not None and len(points) > most:
+            draw = generator(seed, "reconstruction", "points")
+            chosen = np.sort(draw.choice(len(points), most, replace=False))
+            points, colors = points[chosen], None if colors is None else colors[chosen]
+        return surfels_at(points, colors, capture, settings, seed)
     if source == "depth":
         from tron.reconstruction.depth_maps import surfels_from_depth
 
+        if most is not None and settings.count > _ABOUT * most:
+            settings = settings.model_copy(update={"count": int(_ABOUT * most)})
         return surfels_from_depth(capture, settings, seed)
-    points = random_points(capture, settings.count, seed)
+    points = random_points(capture, min(settings.count, most or settings.count), seed)
     return surfels_at(points, None, capture, settings, seed)
 
 
@@ -96,28 +113,35 @@ def surfels_at(
 def random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
     """(count, 3) float32 points, uniform over the part of the cameras' box that the pictures show.
 
-    The box is that of the camera positions, made symmetric about the point that the cameras look at. Points
-    that few cameras see are left out, and so are those that the masks show to be empty (the visual hull of
-    Laurentini 1994, with some tolerance).
+    The box is that of the camera positions, made symmetric about the point that the cameras look at, and a
+    few times as large where they look outwards. Points that few cameras see are left out, and so are those
+    that the masks show to be empty (the visual hull of Laurentini 1994, with some tolerance). What is left
+    may be so small that fewer points are found.
     """
     views = capture.train_views
-    focus = _focus([view.camera.camera_to_world for view in views])
+    focus, outward = _focus([view.camera.camera_to_world for view in views])
     reach = np.abs(np.stack([view.camera.position for view in views]) - focus).max(axis=0)
-    reach = np.maximum(reach, 0.1 * reach.max())
+    reach = np.maximum(reach, 0.1 * reach.max()) * (_OUTWARD if outward else 1)
     masks = [view.read("mask") > 0.5 if view.has("mask") else None for view in views]
     rng = generator(seed, "reconstruction", "random points")
+    centre = focus
     seen, inside, points = [], [], []
-    for _ in range(_DRAWS):
-        batch = focus + rng.uniform(-1, 1, (count, 3)) * reach
+    chosen = np.zeros((0, 3))
+    for draw in range(_DRAWS):
+        if draw >= _DRAWS_OF_BOX and len(chosen) > 1:
+            # A small subject in a large box: go on in the box around what was found of it, and some more.
+            low, high = chosen.min(axis=0), chosen.max(axis=0)
+            centre, reach = (low + high) / 2, np.minimum(0.6 * (high - low), reach)
+        batch = centre + rng.uniform(-1, 1, (count, 3)) * reach
         shown, filled = _coverage(batch, views, masks)
         points.append(batch)
         seen.append(shown)
         inside.append(filled)
         most = max(np.max(s) for s in seen)
         kept = [(s >= max(_LEAST_SHARE * most, 1)) & (f >= _INSIDE * s) for s, f in zip(seen, inside)]
-        if sum(k.sum() for k in kept) >= count:
+        chosen = np.concatenate([p[k] for p, k in zip(points, kept)])[:count]
+        if len(chosen) == count:
             break
-    chosen = np.concatenate([p[k] for p, k in zip(points, kept)])[:count]
     if len(chosen) < min(count, 4):
         raise TronError("no part of space is seen by several cameras", mend="check the poses and the masks")
     return chosen.astype(np.float32)
@@ -145,8 +169,10 @@ def _pixels(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     return column, row, within
 
 
-def _focus(camera_to_world: Sequence[np.ndarray]) -> np.ndarray:
-    """(3,) the point nearest to all optical axes, least squares; in front of the cameras if they diverge."""
+def _focus(camera_to_world: Sequence[np.ndarray]) -> tuple[np.ndarray, bool]:
+    """(3,) the point nearest to all optical axes, least squares; in front of the cameras if they diverge. And
+    whether they do.
+    """
     matrices = np.stack(camera_to_world)
     origins, axes = matrices[:, :3, 3], matrices[:, :3, 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -158,7 +184,7 @@ def _focus(camera_to_world: Sequence[np.ndarray]) -> np.ndarray:
     pull = 1e-3 * len(origins)
     point = np.linalg.solve(normal + pull * np.eye(3), np.einsum("nij,nj->i", across, origins) + pull * ahead)
     in_front = np.einsum("ni,ni->n", point - origins, axes) > 0
-    return point if in_front.mean() > 0.5 else ahead
+    return (point, False) if in_front.mean() > 0.5 else (ahead, True)
 
 
 def _towards_cameras(points: np.ndarray, views: Sequence[View], seed: int) -> np.ndarray:
