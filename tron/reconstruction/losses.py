@@ -43,8 +43,9 @@ def photometric_loss(
     loss = ((predicted - target).abs().sum(-1) * weight).sum() / channels
     if ssim_weight == 0 or min(height, width) <= _WINDOW // 2:
         return loss
-    similarity = (structural_similarity(predicted, target).mean(-1) * weight).sum()
-    return (1 - ssim_weight) * loss + ssim_weight * (1 - similarity)
+    # Not 1 - the mean: where the mask holds no pixel, nothing is wrong.
+    difference = ((1 - structural_similarity(predicted, target).mean(-1)) * weight).sum()
+    return (1 - ssim_weight) * loss + ssim_weight * difference
 
 
 def structural_similarity(predicted: Tensor, target: Tensor) -> Tensor:

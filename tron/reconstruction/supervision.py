@@ -86,7 +86,8 @@ def _normal_loss(seen: Mapping[str, Tensor], target: Mapping[str, Tensor], ssim:
     """Normals as colours, (n + 1) / 2; pixels whose normal nobody knows do not count."""
     wanted = target["normal"]
     known = (wanted * wanted).sum(-1) > 0.25
-    if "mask" in target:  # where the subject is not, no normal is known to be the truth
-        known = known | (target["mask"] < _SURFACE)
+    if "mask" in target:  # beside the subject is no surface, whatever a prior sees there
+        outside = target["mask"] < _SURFACE
+        wanted, known = torch.where(outside[..., None], 0, wanted), known | outside
     normal = seen["normal"] * seen["opacity"][..., None]
     return photometric_loss(0.5 * normal + 0.5, 0.5 * wanted + 0.5, known, ssim)
