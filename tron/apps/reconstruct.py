@@ -36,6 +36,7 @@ SHEET_VIEWS = 6
 TRAIN_VIEWS_SCORED = 8
 SHADOW_RAYS = 16
 CHECKPOINT = "checkpoint.safetensors"
+RESULTS = ("scene.ply", "environment.exr", "metrics.json", "curve.json", "light.png", "contact_sheet.png")
 SURFEL_BYTES = 1600  # PLY, checkpoint with Adam's moments, and their temporary copies
 
 
@@ -112,7 +113,7 @@ def main(settings: Settings) -> None:
     # Dr.Jit has the cores; the loss is small, and torch's threads would wait for theirs.
     set_torch_threads(1)
     with locked(settings.output_dir):
-        _claim(settings)
+        _claim(settings, capture, prior)
         _run(settings, capture, prior, lpips)
 
 
@@ -156,11 +157,21 @@ def _load_settings(settings: Settings) -> LoadSettings:
     )
 
 
-def _claim(settings: Settings) -> None:
-    """Keep the resolved configuration, and clear the way for a new run where that is asked for."""
+def _claim(settings: Settings, capture: Capture, prior: Any) -> None:
+    """Keep the resolved configuration, and clear the way for a new run where that is asked for.
+
+    Raises:
+        TronError: the folder holds another run; nothing in it is changed.
+    """
+    from tron.reconstruction.checkpoint import Checkpoint
+    from tron.reconstruction.pipeline import made_with, require_same
+
     if settings.overwrite:
-        for name in (CHECKPOINT, "curve.json", "metrics.json"):
+        for name in (CHECKPOINT, *RESULTS):
             (settings.output_dir / name).unlink(missing_ok=True)
+    checkpoint = settings.output_dir / CHECKPOINT
+    if checkpoint.exists():
+        require_same(Checkpoint(checkpoint), made_with(capture, prior, _only_reconstruction(settings)))
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False)
     write_atomic(settings.output_dir / "config.yaml", text)
 

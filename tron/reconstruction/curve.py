@@ -19,6 +19,8 @@ from tron.reconstruction.training import Progress, Stage
 from tron.storage import write_atomic
 from tron.tracing.torch_bridge import render
 
+_POINT = ("stage", "step", "seconds", "test_psnr", "surfels")
+
 
 class Curve:
     """Scores held-out views every so many steps; kept in a file, so that a resumed run goes on with it.
@@ -40,8 +42,9 @@ class Curve:
         self.points: list[dict[str, Any]] = []
         if path.exists():
             try:
-                self.points = [dict(point) for point in json.loads(path.read_text("utf-8"))]
-            except (ValueError, TypeError) as error:
+                points = json.loads(path.read_text("utf-8"))
+                self.points = [{name: point[name] for name in _POINT} for point in points]
+            except (ValueError, TypeError, KeyError) as error:
                 raise TronError(f"not a curve: {error}", path, "remove it") from error
         self._last = time.perf_counter()
         self._seconds: float | None = None
