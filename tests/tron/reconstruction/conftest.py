@@ -11,7 +11,7 @@ from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.color import agx
 from tron.gaussians import GaussianScene
-from tron.gaussians.harmonics import SH_COUNT
+from tron.gaussians.harmonics import SH_COUNT, rgb_to_dc
 from tron.gaussians.scene import quats_from_normals
 from tron.shading import EnvironmentMap, Lighting, irradiance, render_guidance
 from tron.tracing import SurfelTracer
@@ -80,3 +80,78 @@ def captured(tracer: SurfelTracer) -> Callable[..., Capture]:
         return Capture(tuple(made), exposure=exposure)
 
     return capture
+
+
+def painted_spheres(per_sphere: int = 300) -> GaussianScene:
+    """The spheres with colours that change smoothly from place to place, base color among them."""
+    scene = spheres(per_sphere)
+    paint = 0.5 + 0.35 * np.sin(5 * scene.means + np.array([0.0, 2.0, 4.0]))
+    scene.sh[:, 0] = rgb_to_dc(paint)
+    scene.base_color = np.ascontiguousarray(paint[:, ::-1], np.float32)
+    scene.roughness = (0.3 + 0.4 * (scene.means[:, 2] > 0)).astype(np.float32)
+    scene.metallic = (scene.means[:, 0] > 0).astype(np.float32)
+    return scene.validate()
+
+
+def cameras_around(count: int, distance: float = 4.0, size: int = SIZE) -> list[Camera]:
+    """Cameras on three rings that look at the origin."""
+    cameras = []
+    for i in range(count):
+        turn, height = 2 * np.pi * i / count, (2.0, 0.3, -2.0)[i % 3]
+        eye = np.array([3 * np.cos(turn), 3 * np.sin(turn), height])
+        eye *= distance / np.linalg.norm(eye)
+        cameras.append(Camera.look_at(eye, (0, 0, 0), fov_deg=32, width=size, height=size))
+    return cameras
+
+
+def seen_by(tracer: SurfelTracer, camera: Camera, name: str) -> View:
+    """What a camera sees of a scene, its true maps included; the opacity is the mask."""
+    seen = tracer.gbuffer(camera).numpy()
+    solid = (seen["opacity"] > 0.5)[..., None]
+    opacity = np.maximum(seen["opacity"], 1e-6)[..., None]
+    return View(
+        name,
+        camera,
+        np.clip(seen["rgb"] / opacity, 0, 1) * (opacity > 1e-3),  # straight, as in RGBA files
+        "display",
+        normal=seen["normal"] * solid,
+        base_color=np.clip(seen["base_color"], 0, 1) * solid,
+        roughness=np.clip(seen["roughness"], 0, 1),
+        metallic=np.clip(seen["metallic"], 0, 1),
+        depth=seen["depth"],
+        mask=np.clip(seen["opacity"], 0, 1),
+    )
+
+
+@pytest.fixture(scope="session")
+def painted(variant: str) -> GaussianScene:
+    """Two spheres in many colours; not to be changed."""
+    return painted_spheres()
+
+
+@pytest.fixture(scope="session")
+def capture_of(variant: str) -> Callable[..., Capture]:
+    """Makes the capture of a scene with all true maps; every fourth of its views is held out."""
+
+    def make(scene: GaussianScene, views: int = 12) -> Capture:
+        tracer = SurfelTracer(scene)
+        made = [seen_by(tracer, camera, f"{i:02d}") for i, camera in enumerate(cameras_around(views))]
+        return Capture(tuple(made), test=frozenset(view.name for view in made[::4]))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def painted_capture(painted: GaussianScene, capture_of) -> Capture:
+    """Twelve views of the painted spheres, three of them held out."""
+    return capture_of(painted)
+
+
+@pytest.fixture
+def one_thread(variant: str) -> None:
+    """Sums in a fixed order; the fixture drjit_threads gives the threads back."""
+    import drjit as dr
+    import torch
+
+    dr.set_thread_count(1)
+    torch.set_num_threads(1)

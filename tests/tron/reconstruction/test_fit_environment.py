@@ -73,7 +73,7 @@ def test_a_small_sun_is_found(tracer, captured) -> None:
     image = np.full((32, 64, 3), 0.3, np.float32)
     image[7:9, 20:22] = (300.0, 280.0, 240.0)
     sun = EnvironmentMap(image)
-    settings = replace(QUICK, steps=400, scale_steps=0)
+    settings = QUICK.model_copy(update={"steps": 400, "scale_steps": 0})
     found = fit_environment(captured(sun), tracer, settings)
     assert found.sigma == 1
     assert irradiance_error(found.environment, sun) < 0.05
@@ -111,7 +111,7 @@ def test_linear_photos_ask_for_the_same_scale(tracer, captured, studio) -> None:
 
 def test_the_sky_counts_in_neither_stage(tracer, captured, studio) -> None:
     capture = captured(studio)
-    settings = replace(QUICK, steps=100, scale_steps=50)
+    settings = QUICK.model_copy(update={"steps": 100, "scale_steps": 50})
     spoiled = []
     for view in capture.views:
         sky = np.zeros((32, 32), np.float32)
@@ -131,18 +131,18 @@ def test_the_sky_counts_in_neither_stage(tracer, captured, studio) -> None:
 
 def test_texels_that_no_ray_met_keep_the_first_light(tracer, captured, studio) -> None:
     capture = captured(studio, views=1)
-    one_by_one = replace(QUICK, resolution=64, coarsest=64, steps=2, rays=2, pixels=16, scale_steps=0)
-    found = fit_environment(capture, tracer, replace(one_by_one, estimator="plain"))
+    few = {"resolution": 64, "coarsest": 64, "steps": 2, "rays": 2, "pixels": 16, "scale_steps": 0}
+    found = fit_environment(capture, tracer, QUICK.model_copy(update={**few, "estimator": "plain"}))
     assert 0 < found.seen.mean() < 1
     assert np.ptp(found.texels[~found.seen], axis=0).max() < 1e-5
     assert np.ptp(found.texels[found.seen], axis=0).max() > 1e-3
 
 
 def test_one_thread_repeats_bit_by_bit_and_seeds_differ(tracer, captured, studio) -> None:
-    capture, settings = captured(studio, views=2), replace(QUICK, steps=10, scale_steps=0)
+    capture, settings = captured(studio, views=2), QUICK.model_copy(update={"steps": 10, "scale_steps": 0})
     dr.set_thread_count(1)  # the fixture drjit_threads gives them back
     one, two = (fit_environment(capture, tracer, settings).texels for _ in range(2))
-    other = fit_environment(capture, tracer, replace(settings, seed=1)).texels
+    other = fit_environment(capture, tracer, settings.model_copy(update={"seed": 1})).texels
     np.testing.assert_array_equal(one, two)
     assert (one != other).any()
 

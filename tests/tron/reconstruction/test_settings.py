@@ -1,0 +1,94 @@
+"""The defaults are the paper's, wherever they are written; scaling a schedule changes step numbers alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+from pydantic import ValidationError
+
+from tron.apps.recipes import compose_recipe
+from tron.reconstruction.settings import (
+    DensitySettings,
+    FitSettings,
+    InitialSettings,
+    MaterialSettings,
+    RadianceSettings,
+    ReconstructionSettings,
+)
+
+STEP_NUMBERS = {
+    "steps",
+    "sh_every",
+    *("density.start", "density.end", "density.every", "density.prune_every", "density.reset_every"),
+}
+
+
+def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return found
+
+
+def test_the_defaults_are_those_of_the_facts() -> None:
+    """facts.md sections 1 and 2."""
+    radiance, density = RadianceSettings(), DensitySettings()
+    assert (radiance.steps, MaterialSettings().steps) == (30_000, 7000)
+    assert (radiance.position_rate, radiance.position_rate_final) == (1.6e-4, 1.6e-6)
+    assert (radiance.opacity_rate, radiance.sh_rate, radiance.sh_rest_rate) == (0.05, 2.5e-3, 1.25e-4)
+    assert (radiance.rotation_rate, radiance.scale_rate) == (1e-3, 5e-3)
+    assert (radiance.sh_degree, radiance.sh_every) == (3, 1000)
+    assert (radiance.ssim, MaterialSettings().ssim, radiance.mask) == (0.2, 0.2, 0.2)
+    assert radiance.background == "black"
+    assert (density.start, density.end, density.every, density.threshold) == (500, 15_000, 300, 2e-4)
+    assert (density.clone_below, density.split_shrink) == (0.01, 1.6)
+    assert (density.prune_every, density.prune_below) == (100, 0.005)
+    assert (density.reset_every, density.reset_to) == (3000, 0.01)
+    assert InitialSettings().kernel_degree == 2
+
+
+def test_the_papers_experiment_is_the_defaults() -> None:
+    recipe: Any = OmegaConf.to_container(compose_recipe("conf.reconstruct", ["experiment=paper"]))
+    defaults = ReconstructionSettings().model_dump(mode="json")
+    for name in ("initial", "radiance", "materials", "steps_scaler", "checkpoint_every", "seed"):
+        assert recipe[name] == defaults[name], name
+    assert recipe["light"] == FitSettings.paper().model_dump(mode="json")
+    assert recipe["max_side"] is None
+
+
+def test_the_commands_own_rates_are_the_papers() -> None:
+    recipe: Any = OmegaConf.to_container(compose_recipe("conf.reconstruct", []))
+    own, paper = (
+        flat({name: values[name] for name in ("radiance", "materials")})
+        for values in (recipe, ReconstructionSettings().model_dump(mode="json"))
+    )
+    different = {name for name in paper if own[name] != paper[name]}
+    assert different == {"radiance.density.reset_every", "radiance.density.most"}
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.5, 2.0])
+def test_scaling_changes_step_numbers_and_nothing_else(factor: float) -> None:
+    before, after = (flat(s.model_dump()) for s in (RadianceSettings(), RadianceSettings().scaled(factor)))
+    assert before.keys() == after.keys()
+    for name, value in before.items():
+        assert after[name] == (round(value * factor) if name in STEP_NUMBERS else value), name
+    one, other = MaterialSettings(), MaterialSettings().scaled(factor)
+    assert other == one.model_copy(update={"steps": round(one.steps * factor)})
+
+
+def test_a_scaled_step_number_stays_one_and_one_that_was_off_stays_off() -> None:
+    density = DensitySettings(reset_every=0, prune_every=1)
+    short = RadianceSettings(steps=0, density=density).scaled(1e-3)
+    assert short.density.prune_every == short.density.every == short.sh_every == 1
+    assert short.density.reset_every == short.steps == 0
+
+
+def test_settings_neither_change_nor_take_what_they_do_not_know() -> None:
+    with pytest.raises(ValidationError):
+        RadianceSettings().steps = 3  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(ValidationError, match="stepz"):
+        RadianceSettings(stepz=3)  # pyright: ignore[reportCallIssue]
+    with pytest.raises(ValidationError, match="scale_rate"):
+        RadianceSettings(scale_rate=float("nan"))
