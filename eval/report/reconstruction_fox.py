@@ -37,11 +37,8 @@ def fox_section(settings: Reconstruction, measured: Measured, found: Mapping[str
         return [Section("fox", "The fox", [reason])]
     fox = measured.fox
     capture = fox.run.report.capture
-    skipped = (
-        f" {len(capture.skipped)} photos that its poses name are absent, and were skipped."
-        if capture.skipped
-        else ""
-    )
+    skipped = f" Photos that its poses name and that are absent: {len(capture.skipped)}."
+    skipped = skipped if capture.skipped else ""
     blocks: list[Block] = [
         Text(
             f"{capture.views} photos of a stuffed fox, taken with a phone whose lens distorts, "

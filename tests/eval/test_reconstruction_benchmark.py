@@ -1,0 +1,361 @@
+"""The reconstruction benchmark: lights against closed forms, steps against the peer's, orchestration."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from eval import stages as stages_module
+from eval.cli import cli
+from eval.reconstruction import step
+from eval.reconstruction.light import irradiance, light_errors
+from eval.reconstruction.runs import Report, Run, read_report, rows_of
+from eval.reconstruction.subjects import drawn
+from eval.results import Results
+from eval.tracing import volprim
+from tron.captures import Capture, View
+from tron.captures.folder import write_capture
+from tron.errors import TronError
+from tron.images import encode_exr, write_image
+from tron.reconstruction.losses import photometric_loss
+from tron.reconstruction.surfels import LearntSurfels
+from tron.seeds import generator
+from tron.shading import EnvironmentMap
+from tron.tracing import SurfelTracer
+from tron.tracing.torch_bridge import render
+from tron.trajectories import spiral
+
+SCENE = "test-000000"
+SCENE_FIGURES = ("test_psnr", "normal_mae_deg", "base_color_psnr", "surfels", "seconds")
+
+
+def unit(count: int) -> np.ndarray:
+    normals = generator(0, "test normals").normal(size=(count, 3))
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def sky(height: int = 96) -> EnvironmentMap:
+    """Smooth, different in every direction and channel: 1 + a . d."""
+    map_ = EnvironmentMap.constant(1.0, height)
+    polar = np.arange(height)[:, None] * np.pi / (height - 1)
+    around = (np.arange(2 * height) + 0.5)[None] * np.pi / height
+    x, y = np.sin(polar) * np.sin(around), np.sin(polar) * np.cos(around)
+    z = np.cos(polar) + 0 * around
+    tilt = np.array([[0.5, 0.1, -0.3], [0.0, 0.6, 0.2], [-0.4, 0.2, 0.5]])
+    return replace(map_, image=(1 + np.stack([x, y, z], -1) @ tilt).astype(np.float32))
+
+
+def test_irradiance_is_the_cosine_integral(variant: str):
+    normals = unit(40)
+    np.testing.assert_allclose(irradiance(EnvironmentMap.constant(0.7), normals), 0.7, rtol=2e-3)
+    # The integral of (1 + a . d) max(n . d, 0) / pi over the sphere is 1 + 2/3 a . n; a from lookups.
+    light = sky()
+    tilt = np.stack([light.lookup(axis) - light.lookup(-axis) for axis in np.eye(3)]) / 2
+    np.testing.assert_allclose(irradiance(light, normals), 1 + normals @ tilt * 2 / 3, rtol=2e-3)
+
+
+def test_light_errors_know_scale_from_direction(variant: str):
+    light = sky()
+    assert light_errors(light, light) == pytest.approx({"irradiance_error": 0, "scaled_error": 0}, abs=1e-9)
+    dimmed = light_errors(replace(light, image=light.image * 0.6), light)
+    assert dimmed["irradiance_error"] == pytest.approx(0.4, abs=1e-5)
+    assert dimmed["scaled_error"] == pytest.approx(0, abs=1e-5)
+    turned = light_errors(light.rotated(90), light)
+    assert turned["scaled_error"] > 0.1
+    assert turned["scaled_error"] <= turned["irradiance_error"]
+    assert light_errors(replace(light, image=0 * light.image), light)["irradiance_error"] == 1
+
+
+def report(**test: float) -> Report:
+    return Report.model_validate(
+        {
+            "capture": {"views": 9, "held_out": ["a", "b"]},
+            "surfels": int(test.pop("surfels", 10)),
+            "test": {"psnr": 30.0, **test},
+            "train": {"psnr": 31.0, "views": 7},
+            "views": {},
+            "seconds": {"surfels": 3.0, "light": 2.0},
+            "something else": 1,
+        }
+    )
+
+
+def test_rows_are_means_but_the_most_of_seconds_and_surfels():
+    here = Path()
+    runs = [
+        Run("a-1", here, here, report(psnr=30, surfels=10, ssim=0.5), 7.0, {"irradiance_error": 0.1}),
+        Run("b-2", here, here, report(psnr=20, surfels=30), 5.0, {"irradiance_error": 0.3}),
+    ]
+    found = {row.metric: row for row in rows_of("reconstruction", runs)}
+    assert found["reconstruction.test_psnr"].value == 25
+    assert found["reconstruction.test_psnr"].n == 2
+    assert found["reconstruction.test_psnr.b_2"].value == 20
+    assert found["reconstruction.surfels"].value == 30
+    assert found["reconstruction.seconds"].value == 7
+    assert found["reconstruction.light.irradiance_error"].value == pytest.approx(0.2)
+    # One scene lacks it: a mean of the other would stand beside means of both.
+    assert "reconstruction.test_ssim" not in found
+    assert found["reconstruction.test_ssim.a_1"].value == 0.5
+
+
+def test_metrics_that_are_none_are_refused(tmp_path: Path):
+    with pytest.raises(TronError, match="cannot read"):
+        read_report(tmp_path)
+    (tmp_path / "metrics.json").write_text('{"surfels": 3}')
+    with pytest.raises(TronError, match="not tron-reconstruct's metrics: capture"):
+        read_report(tmp_path)
+    nan = json.loads(report().model_dump_json()) | {"test": {"psnr": float("nan")}}
+    (tmp_path / "metrics.json").write_text(json.dumps(nan))
+    with pytest.raises(TronError, match=r"test\.psnr"):
+        read_report(tmp_path)
+
+
+def test_the_peer_is_given_the_same_surfels(variant: str):
+    """Against the NumPy conversion that the tracing benchmark uses."""
+    import mitsuba as mi
+
+    scene, _, extent = drawn(50, 16, seed=0)
+    surfels = LearntSurfels.of_scene(scene, step.step_plan(extent, 0).rates)
+    wanted = mi.traverse(volprim.primitives(scene, 3))
+    names = ("surfels.data", "surfels.opacities", "surfels.sh_coeffs")
+    for name, tensor in zip(names, step.ellipsoids(surfels), strict=True):
+        np.testing.assert_allclose(tensor.detach().numpy().ravel(), np.array(wanted[name]), atol=2e-6)
+
+
+def test_both_sides_differentiate_the_same_loss_and_learn(variant: str):
+    scene, view, extent = drawn(300, 32, seed=0)
+    plan = step.step_plan(extent, 0)
+    ours, peer = (LearntSurfels.of_scene(scene, plan.rates) for _ in range(2))
+    target = torch.from_numpy(view.read())
+    integrator = volprim.load_integrator(volprim.OUR_STOP)
+    draw = step.peer_picture(volprim.primitives(scene, 3), view, integrator)
+    photometric_loss(render(ours.rendered(), view.camera)["rgb"], target).backward()
+    photometric_loss(draw(peer), target).backward()
+    assert set(plan.rates) == {"means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest"}
+    for name in plan.rates:
+        a, b = (side[name].grad for side in (ours, peer))
+        assert a is not None
+        assert b is not None
+        assert a.any()
+        assert b.any()
+        if name in ("sh_dc", "opacity_logits"):
+            assert torch.cosine_similarity(a.ravel(), b.ravel(), dim=0) > 0.8
+
+    before = float(photometric_loss(draw(peer), target).detach())
+    peer.step()
+    for _ in range(4):
+        loss = photometric_loss(draw(peer), target)
+        peer.clear_gradients()
+        loss.backward()
+        peer.step()
+    assert float(photometric_loss(draw(peer), target).detach()) < before
+
+
+def test_a_step_changes_what_it_learns_and_is_timed(variant: str):
+    scene, view, extent = drawn(200, 16, seed=0)
+    found = step.measure_steps(scene, view, extent, 0, 2, 1, shape="ellipsoids")
+    assert (found.count, found.size, found.shape) == (200, 16, "ellipsoids")
+    assert set(found.times) == {step.TRON, step.VOLPRIM, step.SHIPPED}
+    assert len(found.times[step.TRON].seconds) == 2
+    assert found.ratio() > 0
+    assert found.agreement > 15
+    assert step.measure_growth(scene, view, extent, 0, 2).median > 0
+
+
+# Stand-ins for the commands: they copy what those would make.
+STAND_IN = """#!{python}
+import pathlib, shutil, sys
+given = dict(argument.split("=", 1) for argument in sys.argv[1:])
+with open({log!r}, "a") as log:
+    log.write(" ".join(["{name}", *sys.argv[1:]]) + "\\n")
+shutil.copytree({made!r}, given["output_dir"], dirs_exist_ok=True)
+"""
+
+
+def small_capture() -> Capture:
+    """Nine views of drawn surfels with their true maps."""
+    scene, _, _ = drawn(300, 32, seed=0)
+    tracer, views = SurfelTracer(scene), []
+    cameras = spiral(9, target=(0, 0, 0.4), radius=5, width=24, height=32, fov_deg=35)
+    for number, camera in enumerate(cameras):
+        seen = tracer.gbuffer(camera).numpy()
+        maps = {name: np.clip(seen[name], 0, 1) for name in ("base_color", "roughness", "metallic")}
+        mask, image = np.float32(seen["opacity"] > 0.5), np.clip(seen["rgb"], 0, 1)
+        views.append(View(f"v{number}", camera, image, "display", normal=seen["normal"], mask=mask, **maps))
+    return Capture(tuple(views), frozenset({"v0", "v8"}))
+
+
+@pytest.fixture
+def stand_ins(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Puts stand-ins in place and real_data beside; returns the file that lists the commands that ran."""
+    made = {name: tmp_path / "made" / name for name in ("tron-datagen", "tron-reconstruct", "tron-relight")}
+    light = EnvironmentMap.constant(0.5, 16)
+    beside = {"environment.exr": encode_exr(light.image, half=False)}
+    write_capture(made["tron-datagen"] / "captures" / SCENE, small_capture(), beside=beside)
+    write_capture(tmp_path / "real" / "captures" / "fox", small_capture())
+    light.save(tmp_path / "real" / "noon.exr")
+    (tmp_path / "real" / "hdri").mkdir()
+    (tmp_path / "real" / "noon.exr").rename(tmp_path / "real" / "hdri" / "noon.exr")
+
+    folder = made["tron-reconstruct"]
+    folder.mkdir(parents=True)
+    drawn(300, 32, seed=0)[0].save(folder / "scene.ply")
+    light.save(folder / "environment.exr")
+    figures = {"psnr": 33.0, "ssim": 0.9, "normal_mae_deg": 4.0, "base_color_psnr": 31.0}
+    metrics = {
+        "capture": {"views": 9, "held_out": ["v0", "v8"], "skipped": {"v9": "image not found"}},
+        "surfels": 300,
+        "test": {"views": 2, **figures},
+        "train": {"views": 7, "psnr": 34.0},
+        "views": {"v0": figures, "v8": figures},
+        "seconds": {"surfels": 3.0, "light": 2.0},
+        "curve": [
+            {"stage": "radiance", "step": n, "seconds": n / 10, "test_psnr": 20 + n / 10, "surfels": 300}
+            for n in (10, 20, 30)
+        ],
+    }
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    write_image(folder / "contact_sheet.png", np.full((20, 30, 3), 0.5))
+
+    frames = made["tron-relight"] / "frames"
+    frames.mkdir(parents=True)
+    for index in range(2):
+        write_image(frames / f"{index:04d}.shadowed.exr", np.full((64, 48, 3), 0.2), half=True)
+    (frames.parent / "relight.json").write_text('{"exposure": 0.8}')
+
+    log = tmp_path / "commands.txt"
+    for name, source in made.items():
+        path = tmp_path / name
+        path.write_text(STAND_IN.format(python=sys.executable, log=str(log), name=name, made=str(source)))
+        path.chmod(0o755)
+    monkeypatch.setattr(stages_module, "script_path", lambda name: str(tmp_path / name))
+    return log
+
+
+def run(folder: Path, *arguments: str) -> int:
+    with pytest.raises(SystemExit) as end:
+        cli(
+            [
+                "benchmark=reconstruction",
+                f"output_dir={folder / 'out'}",
+                f"benchmark.real_data={folder / 'real'}",
+                "benchmark.hdris=[noon.exr,dusk.exr]",
+                "benchmark.fox_downscale=1",
+                "benchmark.relit_views=2",
+                *arguments,
+            ]
+        )
+    return end.value.code  # type: ignore[return-value]
+
+
+def test_every_scene_in_every_way_and_the_fox_are_run_once(stand_ins: Path, tmp_path: Path):
+    assert run(tmp_path, "benchmark.parts=[scenes,fox]") == 0
+    out = tmp_path / "out"
+    commands = stand_ins.read_text().splitlines()
+    assert commands[0] == f"tron-datagen experiment=captures output_dir={out / 'dataset'}"
+    assert [command.split()[0] for command in commands[1:]] == [*["tron-reconstruct"] * 4, "tron-relight"]
+    folders = [command.rpartition("output_dir=")[2] for command in commands[1:4]]
+    ways = ("random", "depth_init", "classical")
+    assert folders == [str(out / "scenes" / SCENE / way) for way in ways]
+    assert all(f"capture={out / 'dataset' / 'captures' / SCENE}" in command for command in commands[1:4])
+    assert ["prior=classical" in command for command in commands[1:4]] == [False, False, True]
+    cameras = json.loads((out / "fox_cameras.json").read_text())
+    assert [camera["width"] for camera in cameras] == [24, 24]
+    assert f"scene={out / 'fox' / 'scene.ply'}" in commands[-1]
+    assert "width=48 height=64" in commands[-1]
+
+    results = Results.load(out / "results.json")
+    prefixes = ("reconstruction", "reconstruction.depth_init", "reconstruction.classical")
+    for prefix in prefixes:
+        for name in SCENE_FIGURES:
+            assert results.find(f"{prefix}.{name}") is not None
+            assert results.find(f"{prefix}.{name}.test_000000") is not None
+        assert results.value(f"{prefix}.light.irradiance_error") == pytest.approx(0, abs=1e-6)
+    stages = json.loads((out / "stages.json").read_text())["stages"]
+    assert results.value("reconstruction.seconds") == stages[f"{SCENE} random"]["seconds"]
+    for name, value in (("test_psnr", 33.0), ("ssim", 0.9), ("surfels", 300.0), ("views", 9.0)):
+        assert results.value(f"fox.{name}") == value
+    assert results.find("step.ratio_to_volprim") is None
+    assert results.find("fox.test_psnr").reference == "target: at least 22 dB"  # type: ignore[union-attr]
+
+    page = (out / "report.html").read_text()
+    for anchor in ("targets", "scenes", "views", "light", "fox", "limits", "stages"):
+        assert f'id="{anchor}"' in page
+    assert "Under noon" in page
+    assert "name and that are absent: 1." in page
+    assert page.count("<svg") == 3
+    assert (out / "pictures" / f"{SCENE}.png").is_file()
+
+    assert run(tmp_path, "benchmark.parts=[scenes,fox]") == 0
+    assert stand_ins.read_text().splitlines() == commands
+
+
+def test_without_real_data_the_fox_has_no_rows_and_the_page_says_so(stand_ins: Path, tmp_path: Path):
+    assert run(tmp_path, "benchmark.parts=[fox]", f"benchmark.real_data={tmp_path / 'nowhere'}") == 0
+    results = Results.load(tmp_path / "out" / "results.json")
+    assert results.rows == []
+    assert not stand_ins.exists()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "The real capture was not reconstructed" in page
+    assert "not measured" in page
+
+
+def test_steps_without_a_scene_are_one_line(
+    stand_ins: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
+    assert run(tmp_path, "benchmark.parts=[steps]") == 2
+    assert "no reconstructed scene to take steps on" in capfd.readouterr().err
+
+
+QUICK = (
+    '"steps_scaler=0.002","light.resolution=8","light.steps=5","light.scale_steps=3","light.pixels=64",'
+    '"light.split_sum_resolution=64","score_every=10","radiance.density.most=600","initial.count=300"'
+)
+CAPTURES = (
+    '"experiment=captures","captures.scenes=1","captures.views=9","captures.width=32","captures.height=32",'
+    '"captures.path_spp=4","captures.reference_spp=4","mesh_edge=0.2","environment_height=32","cluster=null"'
+)
+
+
+@pytest.mark.long
+def test_the_whole_benchmark_with_the_real_commands(shared_data: Path, tmp_path: Path, variant: str):
+    """One scene of 32 x 32 pixels in a few steps; a way is enough beside the fox."""
+    with pytest.raises(SystemExit) as end:
+        cli(
+            [
+                "benchmark=reconstruction",
+                f"output_dir={tmp_path}",
+                f"benchmark.variant={variant}",
+                f"benchmark.real_data={shared_data}",
+                f"benchmark.datagen=[{CAPTURES}]",
+                f"benchmark.reconstruct=[{QUICK}]",
+                'benchmark.ways={random: ["prior=ground_truth","initial.source=random"]}',
+                "benchmark.fox_downscale=32",
+                f"benchmark.fox=[{QUICK}]",
+                'benchmark.relight=["quality=preview"]',
+                "benchmark.hdris=[studio_small_03_1k.hdr]",
+                "benchmark.relit_views=2",
+                "benchmark.step_pixels=[16,32]",
+                "benchmark.growth_surfels=[200,400]",
+                "benchmark.growth_pixels=[32,64]",
+                "benchmark.growth_at=[200,32]",
+                "benchmark.repetitions=1",
+                "benchmark.slow_repetitions=1",
+            ]
+        )
+    assert end.value.code == 0
+    results = Results.load(tmp_path / "results.json")
+    found = {row.metric for row in results.rows}
+    assert {f"reconstruction.{name}" for name in SCENE_FIGURES} <= found
+    assert {"fox.test_psnr", "fox.seconds", "fox.ssim", "fox.surfels", "fox.relight_seconds"} <= found
+    assert {"step.ratio_to_volprim", "step.tron_ms.32", "step.volprim_ms.16"} <= found
+    assert {"step.seconds.200_32", "step.seconds.400_32", "step.seconds.200_64"} <= found
+    assert results.value("fox.views") == 50
+    page = (tmp_path / "report.html").read_text()
+    for anchor in ("targets", "scenes", "views", "light", "fox", "steps", "limits", "stages"):
+        assert f'id="{anchor}"' in page
+    assert len(json.loads((tmp_path / "times.json").read_text())["trained 600 32"]["tron"]) == 1
