@@ -1,0 +1,243 @@
+"""Laws of the whole run: what each prior teaches, and that an interrupted run is the uninterrupted one."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tron.captures import Capture
+from tron.color import srgb_to_linear
+from tron.errors import TronError
+from tron.gaussians import GaussianScene
+from tron.gaussians.harmonics import SH_C0
+from tron.priors import Classical, GroundTruth
+from tron.reconstruction import Reconstruction, reconstruct
+from tron.reconstruction.evaluation import mean_figures, score_views
+from tron.reconstruction.settings import (
+    DensitySettings,
+    InitialSettings,
+    MaterialSettings,
+    RadianceSettings,
+    ReconstructionSettings,
+)
+from tron.reconstruction.training import Progress, Stage
+from tron.tracing import SurfelTracer
+
+DENSITY = DensitySettings(start=0, end=16, every=6, threshold=1e-5, prune_every=4, reset_every=0, most=420)
+
+
+def settings(**changes: Any) -> ReconstructionSettings:
+    """A dozen and some steps, with density changes; rates for so few."""
+    radiance = RadianceSettings(
+        steps=14, position_rate=1e-3, sh_rate=0.05, scale_rate=0.02, sh_every=4, density=DENSITY
+    )
+    values = {
+        "initial": InitialSettings(source="depth", count=300),
+        "radiance": radiance,
+        "materials": MaterialSettings(steps=6, rate=0.03),
+        "checkpoint_every": 5,
+    }
+    return ReconstructionSettings(**{**values, **changes})
+
+
+def without(capture: Capture, *names: str) -> Capture:
+    """The capture, its training views without some maps."""
+    kept = (v if v.name in capture.test else replace(v, **dict.fromkeys(names)) for v in capture.views)
+    return replace(capture, views=tuple(kept))
+
+
+def same(one: GaussianScene, other: GaussianScene) -> bool:
+    pairs = ((getattr(one, f.name), getattr(other, f.name)) for f in fields(GaussianScene))
+    return all(np.array_equal(a, b) for a, b in pairs)
+
+
+class Cut(Exception):
+    """Stands for whatever ends a process."""
+
+
+class CutAt:
+    """A watch that counts steps and ends the run after one of them."""
+
+    def __init__(self, stage: str = "", step: int = 0) -> None:
+        self.at, self.steps = (stage, step), []
+
+    def __call__(self, progress: Progress, stage: Stage) -> None:
+        self.steps.append((progress.stage, progress.step))
+        if self.steps[-1] == self.at:
+            raise Cut
+
+
+@pytest.fixture(scope="module")
+def truthful(painted_capture: Capture) -> Reconstruction:
+    """Forty steps and forty with the true maps, from depth."""
+    longer = settings(
+        radiance=settings().radiance.model_copy(update={"steps": 40}),
+        materials=MaterialSettings(steps=40, rate=0.03),
+    )
+    return reconstruct(painted_capture, GroundTruth(), longer)
+
+
+def test_true_maps_teach_normals_and_all_materials(
+    truthful: Reconstruction, painted_capture: Capture
+) -> None:
+    assert truthful.learnt == ("base_color", "roughness", "metallic")
+    figures = mean_figures(score_views(SurfelTracer(truthful.scene), painted_capture.test_views))
+    assert figures["psnr"] > 22
+    assert figures["normal_mae_deg"] < 15
+    assert figures["base_color_psnr"] > 22
+    assert figures["roughness_mae"] < 0.1
+    assert truthful.seconds > 0
+
+
+def test_base_color_begins_as_the_radiance(painted_capture: Capture) -> None:
+    """Without a step of stage 2, and without a prior, base color is the decoded SH DC."""
+    for prior_maps, steps in ((("base_color", "roughness", "metallic"), 6), ((), 0)):
+        found = reconstruct(
+            without(painted_capture, *prior_maps),
+            GroundTruth(),
+            settings(materials=MaterialSettings(steps=steps)),
+        ).scene
+        expected = srgb_to_linear(np.clip(SH_C0 * found.sh[:, 0] + 0.5, 0, 1))
+        np.testing.assert_allclose(found.base_color, expected, atol=1e-6)
+
+
+def test_what_a_prior_lacks_stays_as_it_was_and_is_said(painted_capture, caplog) -> None:
+    capture = without(painted_capture, "metallic", "roughness")
+    with caplog.at_level(logging.WARNING):
+        found = reconstruct(
+            capture, GroundTruth(), settings(initial=InitialSettings(source="random", count=200))
+        )
+    assert found.learnt == ("base_color",)
+    assert (found.scene.roughness == 0.5).all()
+    assert (found.scene.metallic == 0).all()
+    assert "no prior for roughness" in caplog.text
+    assert "no prior for metallic" in caplog.text
+
+
+def test_the_classical_prior_has_its_say_once_there_is_geometry(painted_capture: Capture) -> None:
+    capture = without(painted_capture, "normal", "base_color", "roughness", "metallic")
+    found = reconstruct(capture, Classical(roughness=0.35, metallic=0.25), settings())
+    assert found.learnt == ("base_color", "roughness", "metallic")
+    for view in found.capture.train_views:
+        assert all(view.has(name) for name in ("normal", "irradiance", "base_color"))
+        seen = view.read("normal").any(-1)
+        assert np.median(np.linalg.norm(view.read("normal"), axis=-1)[seen]) == pytest.approx(1, abs=0.01)
+        assert view.read("irradiance")[seen].min() > 0
+    # Stage 2 pulls towards the constants.
+    assert abs(np.median(found.scene.roughness) - 0.35) < abs(0.5 - 0.35)
+    assert np.median(found.scene.metallic) > 0.05
+    for view, before in zip(found.capture.test_views, capture.test_views):
+        assert view is before
+
+
+def test_held_out_views_are_never_looked_at(painted_capture: Capture) -> None:
+    def forbidden() -> np.ndarray:
+        raise AssertionError("a held-out view was read")
+
+    hidden = tuple(
+        replace(v, image=forbidden, mask=forbidden, normal=forbidden) if v.name in painted_capture.test else v
+        for v in painted_capture.views
+    )
+    reconstruct(replace(painted_capture, views=hidden), GroundTruth(), settings())
+
+
+@pytest.mark.parametrize(
+    "cut", [("radiance", 5), ("radiance", 13), ("materials", 2), ("materials", 5)], ids=str
+)
+def test_an_interrupted_run_is_the_uninterrupted_one_bit_by_bit(
+    painted_capture, one_thread, tmp_path: Path, whole: Reconstruction, cut: tuple[str, int]
+) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    prior = Classical()
+    with pytest.raises(Cut):
+        reconstruct(painted_capture, prior, settings(), checkpoint=path, watch=CutAt(*cut))
+    watch = CutAt()
+    found = reconstruct(painted_capture, prior, settings(), checkpoint=path, watch=watch)
+    lost = cut[1] % 5 if cut[0] == "radiance" or cut[1] >= 5 else cut[1]
+    assert watch.steps[0] == (cut[0], cut[1] - lost + 1)
+    assert same(found.scene, whole.scene)
+
+
+@pytest.fixture(scope="module")
+def whole(painted_capture: Capture) -> Reconstruction:
+    """The run that nobody interrupts, on one thread."""
+    import drjit as dr
+    import torch
+
+    dr.set_thread_count(1)
+    torch.set_num_threads(1)
+    found = reconstruct(painted_capture, Classical(), settings())
+    assert len(found.scene) != 300  # density control had its say
+    return found
+
+
+def test_a_finished_run_is_not_trained_again(painted_capture, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    first = reconstruct(painted_capture, GroundTruth(), settings(), checkpoint=path)
+    watch = CutAt()
+    second = reconstruct(painted_capture, GroundTruth(), settings(), checkpoint=path, watch=watch)
+    assert watch.steps == []
+    assert same(first.scene, second.scene)
+    assert second.seconds >= first.seconds - 0.5
+    third = reconstruct(
+        painted_capture, GroundTruth(), settings(checkpoint_every=50), checkpoint=path, watch=watch
+    )
+    assert watch.steps == []  # how often it is saved changes nothing else
+    assert same(first.scene, third.scene)
+
+
+def test_a_checkpoint_of_another_run_is_refused_by_the_name_of_what_differs(
+    painted_capture, tmp_path: Path
+) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    brief = settings(
+        radiance=settings().radiance.model_copy(update={"steps": 1}), materials=MaterialSettings(steps=0)
+    )
+    reconstruct(painted_capture, GroundTruth(), brief, checkpoint=path)
+    before = path.read_bytes()
+    dense = brief.radiance.density.model_copy(update={"most": 99})
+    others = {
+        "seed": (painted_capture, GroundTruth(), brief.model_copy(update={"seed": 1})),
+        "radiance.density.most": (
+            painted_capture,
+            GroundTruth(),
+            brief.model_copy(update={"radiance": brief.radiance.model_copy(update={"density": dense})}),
+        ),
+        "prior": (painted_capture, Classical(), brief),
+        "capture": (replace(painted_capture, test=frozenset({"01"})), GroundTruth(), brief),
+    }
+    for key, (capture, prior, other) in others.items():
+        with pytest.raises(TronError, match=f"made with another {key} ") as caught:
+            reconstruct(capture, prior, other, checkpoint=path)
+        assert "\n" not in str(caught.value)
+    assert path.read_bytes() == before
+
+
+def test_bad_captures_are_refused_before_work(painted_capture: Capture) -> None:
+    one = Capture(painted_capture.views[:1])
+    with pytest.raises(TronError, match="at least two training views"):
+        reconstruct(one, GroundTruth(), settings())
+    linear = replace(painted_capture.views[1], space="linear")
+    views = (painted_capture.views[0], linear, painted_capture.views[2])
+    with pytest.raises(TronError, match=r"display values.*view 01"):
+        reconstruct(Capture(views), GroundTruth(), settings())
+
+
+def test_a_steps_scaler_shortens_both_stages(painted_capture: Capture) -> None:
+    watch = CutAt()
+    reconstruct(painted_capture, GroundTruth(), settings(steps_scaler=0.5), watch=watch)
+    assert [sum(name == stage for name, _ in watch.steps) for stage in ("radiance", "materials")] == [7, 3]
+
+
+def test_surfels_never_outnumber_the_cap(painted_capture: Capture) -> None:
+    counts: list[int] = []
+    many = settings(initial=InitialSettings(source="random", count=600))
+    reconstruct(
+        painted_capture, GroundTruth(), many, watch=lambda progress, _: counts.append(progress.surfels)
+    )
+    assert max(counts) <= DENSITY.most
