@@ -156,12 +156,12 @@ class Reconstruction(Benchmark):
     def _collect_scenes(self, made: dict[tuple[str, str], float], folder: Path, measured: Measured) -> None:
         from eval.reconstruction.light import errors_of_files
         from eval.reconstruction.pictures import compare_scene, write_sheet
-        from eval.reconstruction.runs import Run, read_report
+        from eval.reconstruction.runs import Run, light_family, read_report
 
         for (way, scene), seconds in made.items():
             capture, out = folder / "dataset" / "captures" / scene, folder / "scenes" / scene / way
             light = errors_of_files(out / "environment.exr", capture / "environment.exr")
-            run = Run(scene, out, capture, read_report(out), seconds, light)
+            run = Run(scene, out, capture, read_report(out), seconds, light, light_family(capture))
             measured.runs.setdefault(way, []).append(run)
         for scene in dict.fromkeys(scene for _, scene in made):
             ways = {way: run for way, runs in measured.runs.items() for run in runs if run.name == scene}

@@ -29,13 +29,14 @@ class Compared:
     """One held-out view of a path-traced scene.
 
     Attributes:
-        scene: its name. view: the view's.
+        scene: its name. family: of its light, if known. view: the view's name.
         truth: channel -> (H, W, 3) display values, of the capture.
         ways: way -> channel -> the same, of the reconstruction.
         figures: way -> channel -> a short figure of that very picture, where there is one.
     """
 
     scene: str
+    family: str
     view: str
     truth: dict[str, np.ndarray]
     ways: dict[str, dict[str, np.ndarray]]
@@ -76,7 +77,7 @@ def compare_scene(runs: Mapping[str, Run]) -> Compared:
             found = EnvironmentMap.load(each.folder / "environment.exr")
             ways[way]["light"] = light_picture(found, exposure)
         figures[way] = _figures(each, view.name)
-    return Compared(run.name, view.name, truth, ways, figures)
+    return Compared(run.name, run.family, view.name, truth, ways, figures)
 
 
 def middle_view(views: Sequence[View]) -> View:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -74,6 +75,7 @@ class Run:
         name: of the scene. folder: what the command wrote. capture: what it read.
         report: its metrics.json. seconds: wall time of the command from start to end.
         light: figures of its light against the true one, name -> value; empty where either is unknown.
+        family: of the true light, such as "sun"; empty if unknown.
     """
 
     name: str
@@ -82,6 +84,7 @@ class Run:
     report: Report
     seconds: float
     light: dict[str, float] = field(default_factory=dict)
+    family: str = ""
 
     def curve(self) -> list[tuple[float, float]]:
         """(seconds of training, dB) of held-out views."""
@@ -101,6 +104,14 @@ def read_report(folder: Path) -> Report:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"]) or "file"
         raise TronError(f"not tron-reconstruct's metrics: {place}: {first['msg']}", path) from error
+
+
+def light_family(capture: Path) -> str:
+    """What kind of light a path-traced capture stands in, as its spec.json says; empty where none says so."""
+    try:
+        return str(json.loads((capture / "spec.json").read_text("utf-8"))["lights"][0]["family"])
+    except (OSError, ValueError, LookupError, TypeError):
+        return ""
 
 
 def rows_of(prefix: str, runs: Sequence[Run]) -> Iterator[Row]:

@@ -120,6 +120,8 @@ def growth_chart(
 
     Straight lines are powers: where x is ten times as large and y is too, growth is linear.
     """
+    from matplotlib.ticker import LogLocator
+
     with _canvas(caption) as (figure, axes):
         for (label, points), colour in zip(lines.items(), LINE_COLOURS):
             x, y = zip(*points)
@@ -129,6 +131,8 @@ def growth_chart(
         ticks = sorted({x for points in lines.values() for x, _ in points})
         axes.set_xticks(ticks, [f"{x:,.0f}" for x in ticks])
         axes.minorticks_off()
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # a decade may hold them all
+        axes.yaxis.set_major_formatter("{x:g}")
         axes.set_xlabel(x_label)
         axes.set_ylabel(y_label)
         svg = _finished(figure, axes)

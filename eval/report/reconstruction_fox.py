@@ -27,6 +27,11 @@ WORDS = {
     "fox.relight_seconds": "relighting, all the lights together",
 }
 
+RELIT = (
+    "Made by tron-relight of the same scene.ply, as are those below: traced shadows and split-sum "
+    "reflections, no neural renderer; the environment is seen where there are no surfels."
+)
+
 
 def fox_section(settings: Reconstruction, measured: Measured, found: Mapping[str, Row]) -> list[Section]:
     """Everything about the fox, or why there is nothing."""
@@ -98,10 +103,7 @@ def _relit(fox: Fox) -> list[Pictures]:
             Picture(frame, f"view {name}", f"the fox from view {name}, lit by {light}")
             for name, frame in zip(views, frames, strict=True)
         ]
-        note = (
-            "Made by tron-relight of the same scene.ply: traced shadows and split-sum reflections, no neural "
-            "renderer; the environment is seen where there are no surfels."
-        )
+        note = RELIT if light == next(iter(fox.relit)) else ""
         blocks.append(Pictures(f"Under {light.replace('_', ' ')}", pictures, note, len(pictures)))
     return blocks
 

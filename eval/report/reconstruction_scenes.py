@@ -174,7 +174,8 @@ def _gallery(compared: Compared) -> Pictures:
             if channel in images
         ]
     note = f"View {compared.view}. " + "; ".join(f"{way}: {way_title(way)}" for way in compared.ways) + "."
-    return Pictures(f"Scene {compared.scene}", pictures, note, columns)
+    light = f" · {compared.family}" if compared.family else ""
+    return Pictures(f"Scene {compared.scene}{light}", pictures, note, columns)
 
 
 def _alt(channel: str, compared: Compared, who: str) -> str:
@@ -186,6 +187,7 @@ def light_section(measured: Measured) -> list[Section]:
     table = [
         [
             Cell(run.name),
+            Cell(run.family or "—"),
             Cell(way_title(way)),
             Cell(written(run.light["irradiance_error"], "fraction"), "strong"),
             Cell(written(run.light["scaled_error"], "fraction")),
@@ -202,5 +204,5 @@ def light_section(measured: Measured) -> list[Section]:
         "The second figure is after one factor on the whole light, which leaves errors of colour and "
         "direction. No target was set."
     )
-    headings = ["Scene", "Begun from", "Irradiance off by", "after one factor"]
-    return [Section("light", "The light", [intro, Table("Fitted lights.", headings, table, words=[1])])]
+    headings = ["Scene", "True light", "Begun from", "Irradiance off by", "after one factor"]
+    return [Section("light", "The light", [intro, Table("Fitted lights.", headings, table, words=[1, 2])])]

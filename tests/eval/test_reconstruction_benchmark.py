@@ -184,7 +184,7 @@ def small_capture() -> Capture:
     for number, camera in enumerate(cameras):
         seen = tracer.gbuffer(camera).numpy()
         maps = {name: np.clip(seen[name], 0, 1) for name in ("base_color", "roughness", "metallic")}
-        mask, image = np.float32(seen["opacity"] > 0.5), np.clip(seen["rgb"], 0, 1)
+        mask, image = (seen["opacity"] > 0.5).astype(np.float32), np.clip(seen["rgb"], 0, 1)
         views.append(View(f"v{number}", camera, image, "display", normal=seen["normal"], mask=mask, **maps))
     return Capture(tuple(views), frozenset({"v0", "v8"}))
 
