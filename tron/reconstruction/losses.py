@@ -19,6 +19,7 @@ from torch import Tensor
 SSIM_WEIGHT = 0.2
 _WINDOW = 11
 _SIGMA = 1.5
+_BLOCK = 32
 _C1, _C2 = 0.01**2, 0.03**2
 
 
@@ -67,7 +68,7 @@ class _StructuralSimilarity(torch.autograd.Function):
     def forward(ctx: Any, predicted: Tensor, target: Tensor) -> Tensor:
         x, y = predicted.detach().movedim(-1, 0), target.detach().movedim(-1, 0)
         rows, columns = _window(x.shape[1], x.device), _window(x.shape[2], x.device)
-        mx, my, xx, yy, xy = rows @ torch.stack([x, y, x * x, y * y, x * y]) @ columns.T
+        mx, my, xx, yy, xy = _filtered(torch.stack([x, y, x * x, y * y, x * y]), rows, columns)
         a, p = 2 * mx * my + _C1, mx * mx + my * my + _C1
         b, q = 2 * (xy - mx * my) + _C2, xx - mx * mx + yy - my * my + _C2
         ctx.save_for_backward(x, y, mx, my, a, b, p, q)
@@ -82,8 +83,23 @@ class _StructuralSimilarity(torch.autograd.Function):
         by_xx = -a * ratio
         by_mx = 2 * my * (b - a) * outer - 2 * mx * (a * b * outer / p + by_xx)
         rows, columns = _window(x.shape[1], x.device), _window(x.shape[2], x.device)
-        by_mx, by_xx, by_xy = rows.T @ torch.stack([by_mx, by_xx, by_xy]) @ columns
+        by_mx, by_xx, by_xy = _filtered(torch.stack([by_mx, by_xx, by_xy]), rows.T, columns.T)
         return (by_mx + 2 * x * by_xx + y * by_xy).movedim(0, -1), None
+
+
+def _filtered(images: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """``rows @ images @ columns.T`` of band matrices, (..., H, W): block by block, for the rest is zero."""
+    reach = _WINDOW - 1  # reflection at the border widens the band there
+    parts = []
+    for first in range(0, len(rows), _BLOCK):
+        low, high = max(first - reach, 0), min(first + _BLOCK + reach, len(rows))
+        parts.append(rows[first : first + _BLOCK, low:high] @ images[..., low:high, :])
+    images = torch.cat(parts, dim=-2)
+    parts = []
+    for first in range(0, len(columns), _BLOCK):
+        low, high = max(first - reach, 0), min(first + _BLOCK + reach, len(columns))
+        parts.append(images[..., low:high] @ columns[first : first + _BLOCK, low:high].T)
+    return torch.cat(parts, dim=-1)
 
 
 @cache
