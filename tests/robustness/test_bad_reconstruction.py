@@ -17,7 +17,7 @@ from tron.captures import Capture, View
 from tron.captures.folder import write_capture
 
 SIZE = 24
-SHORT = ("steps_scaler=1", "radiance.steps=2", "materials.steps=1", "initial.count=50", "light=null")
+SHORT = ("steps_scaler=1", "radiance.steps=2", "materials.steps=1", "initial.count=50")
 
 
 def photos(count: int = 5) -> list[View]:
@@ -117,6 +117,10 @@ BAD = {
     "a prior's number": (["capture={inputs}/good", "prior.roughness=7"], "roughness is 7"),
     "a prior's word": (["capture={inputs}/good", "prior.tone_curve=film"], "film"),
     "output is a file": (["capture={inputs}/good", "output_dir={inputs}/file"], "file"),
+    "a size no light has": (
+        ["capture={inputs}/good", "light.split_sum_resolution=100"],
+        "light.split_sum_resolution",
+    ),
     "lpips, absent": (["capture={inputs}/good", "lpips_weights={inputs}/absent.pth"], "absent.pth"),
     "lpips, foreign": (["capture={inputs}/good", "lpips_weights={inputs}/file"], "VGG-16"),
     "no depth": (["capture={inputs}/good", "initial.source=depth"], "no training view has a depth map"),

@@ -153,8 +153,8 @@ class FitSettings(Settings):
         default=1 << 14, ge=1, description="Most pixels of each; larger ones are reduced."
     )
     scale_rays: int = Field(default=16, ge=2, multiple_of=2, description="Shadow rays a pixel there, even.")
-    split_sum_resolution: int = Field(
-        default=512, ge=16, description="Texels along a face edge of the prefiltered light."
+    split_sum_resolution: Literal[64, 128, 256, 512, 1024] = Field(
+        default=512, description="Texels along a face edge of the prefiltered light."
     )
     seed: int = Field(default=0, description="Root of every random number.")
 
