@@ -49,7 +49,7 @@ def test_a_perfect_scene_is_perfect(tracer, painted_capture, background: str) ->
 def test_base_color_is_judged_whatever_its_scale_in_each_channel(
     painted, painted_capture, scale: tuple[float, ...]
 ) -> None:
-    darker = replace(painted, base_color=painted.base_color * np.float32(scale))
+    darker = replace(painted, base_color=painted.base_color * np.array(scale, np.float32))
     tracer, view = SurfelTracer(darker), painted_capture.test_views[0]
     assert figures(tracer, view)["base_color_psnr"] > 60
     noise = generator(0, "noise").normal(size=painted.base_color.shape) * 0.2

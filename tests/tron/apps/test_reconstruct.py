@@ -1,0 +1,281 @@
+"""tron-reconstruct from end to end on a tiny capture: files, figures, resuming, beginning anew, refusals."""
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from tron.apps import reconstruct as app
+from tron.apps.reconstruct import cli
+from tron.apps.relight import cli as relight_cli
+from tron.cameras import Camera
+from tron.captures import Capture, View
+from tron.captures.folder import write_capture
+from tron.gaussians import GaussianScene
+from tron.images import read_image
+from tron.shading.environment import EnvironmentMap
+from tron.tracing import SurfelTracer
+
+SIZE, VIEWS = 32, 9
+TINY = (
+    "steps_scaler=1", "checkpoint_every=5", "score_every=4", "initial.source=depth", "initial.count=300",
+    "radiance.steps=12", "radiance.sh_every=4", "radiance.density.start=0", "radiance.density.every=5",
+    "radiance.density.threshold=1e-5", "radiance.density.most=340", "materials.steps=6",
+    "light.steps=6", "light.resolution=8", "light.rays=4", "light.pixels=64", "light.scale_steps=3",
+    "light.scale_pixels=256", "light.scale_rays=4", "light.split_sum_resolution=64",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def capture_path(variant, ball_on_floor, tmp_path_factory) -> Path:
+    """Nine views of the ball with every true map, three of them held out."""
+    tracer, views = SurfelTracer(ball_on_floor(spacing=0.12)), []
+    for i in range(VIEWS):
+        turn = 2 * math.pi * i / VIEWS
+        eye = (3 * math.cos(turn), 3 * math.sin(turn), 1.5 + 0.5 * (i % 2))
+        camera = Camera.look_at(eye, (0, 0, 0.3), fov_deg=45, width=SIZE, height=SIZE)
+        seen = tracer.gbuffer(camera).numpy()
+        solid = (seen["opacity"] > 0.5)[..., None]
+        views.append(
+            View(
+                f"{i:02d}",
+                camera,
+                np.clip(seen["rgb"], 0, 1),
+                "display",
+                normal=seen["normal"] * solid,
+                base_color=np.clip(seen["base_color"], 0, 1) * solid,
+                roughness=np.clip(seen["roughness"], 0, 1),
+                metallic=np.clip(seen["metallic"], 0, 1),
+                irradiance=np.full((SIZE, SIZE, 3), 0.4) * solid,
+                depth=seen["depth"],
+                mask=np.clip(seen["opacity"], 0, 1),
+            )
+        )
+    path = tmp_path_factory.mktemp("captures") / "ball"
+    write_capture(path, Capture(tuple(views), test=frozenset({"00", "03", "06"})))
+    return path
+
+
+@pytest.fixture
+def reconstruct(variant, capture_path) -> Callable[..., int]:
+    """Runs the command in this process on the tiny capture; gives its exit code."""
+
+    def run(out: Path, *overrides: str, prior: str = "ground_truth") -> int:
+        chosen = (f"capture={capture_path}", f"output_dir={out}", f"variant={variant}", f"prior={prior}")
+        with pytest.raises(SystemExit) as exit_info:
+            cli([*chosen, *TINY, *overrides])
+        return int(exit_info.value.code or 0)
+
+    return run
+
+
+@pytest.fixture
+def steps(monkeypatch) -> list[tuple[str, int]]:
+    """The steps that a command takes, as they come."""
+    taken: list[tuple[str, int]] = []
+    watch = app._Bars.watch
+
+    def counting(self, progress) -> None:
+        taken.append((progress.stage, progress.step))
+        watch(self, progress)
+
+    monkeypatch.setattr(app._Bars, "watch", counting)
+    return taken
+
+
+@pytest.fixture(scope="module")
+def finished(variant, capture_path, tmp_path_factory) -> Path:
+    """The output of a run that nobody disturbed; not to be changed."""
+    out = tmp_path_factory.mktemp("finished")
+    with pytest.raises(SystemExit) as exit_info:
+        cli(
+            [
+                f"capture={capture_path}",
+                f"output_dir={out}",
+                f"variant={variant}",
+                "prior=ground_truth",
+                *TINY,
+            ]
+        )
+    assert not exit_info.value.code
+    return out
+
+
+def test_it_writes_everything_that_it_says(finished: Path):
+    assert {path.name for path in finished.iterdir() if not path.name.startswith(".")} == {
+        "scene.ply",
+        "environment.exr",
+        "metrics.json",
+        "curve.json",
+        "contact_sheet.png",
+        "light.png",
+        "config.yaml",
+        "checkpoint.safetensors",
+    }
+    scene = GaussianScene.load(finished / "scene.ply").validate()
+    assert 200 < len(scene) <= 340
+    assert scene.kernel_degree == 2
+    assert EnvironmentMap.load(finished / "environment.exr").image.min() >= 0
+    sheet = read_image(finished / "contact_sheet.png")
+    rows = 12  # photo, radiance, error, opacity, depth, position, normal, three materials, pbr, irradiance
+    assert sheet.shape == (18 + rows * (180 + 2), 110 + 3 * (180 + 2), 3)
+    photo = sheet[18:198, 110:290]
+    assert np.ptp(photo) > 0.3
+    config = yaml.safe_load((finished / "config.yaml").read_text())
+    assert config["radiance"]["steps"] == 12
+    assert config["prior"]["_target_"] == "tron.priors.GroundTruth"
+
+
+def test_the_report_is_whole_and_strict_json(finished: Path):
+    def refuse(word: str):
+        raise AssertionError(word)
+
+    report = json.loads((finished / "metrics.json").read_text(), parse_constant=refuse)
+    assert {"version", "capture", "surfels", "materials_learnt", "test", "train", "views", "light"} < set(
+        report
+    )
+    assert {"albedo_scaling", "seconds", "settings", "machine", "curve"} < set(report)
+    assert report["capture"]["held_out"] == ["00", "03", "06"]
+    assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
+    figures = {"psnr", "psnr_subject", "ssim", "normal_mae_deg", "base_color_psnr"}
+    figures |= {"roughness_mae", "metallic_mae"}
+    assert set(report["test"]) == set(report["train"]) == figures | {"views"}
+    assert (report["test"]["views"], report["train"]["views"]) == (3, 6)
+    assert report["test"]["psnr"] > 18  # from depth maps: good before it begins
+    assert report["test"]["normal_mae_deg"] < 20
+    assert report["surfels"] == len(GaussianScene.load(finished / "scene.ply"))
+    assert [point["step"] for point in report["curve"]] == [4, 8, 12]
+    assert report["seconds"]["surfels"] > 0
+
+
+def test_what_it_writes_can_be_relit(variant, finished: Path, tmp_path: Path):
+    out = tmp_path / "relit"
+    chosen = [f"scene={finished / 'scene.ply'}", f"environment={finished / 'environment.exr'}"]
+    with pytest.raises(SystemExit) as exit_info:
+        relight_cli([*chosen, f"output_dir={out}", "frames=1", "width=24", "height=24", f"variant={variant}"])
+    assert not exit_info.value.code
+    report = json.loads((out / "relight.json").read_text())
+    assert report["scene"]["materials_guessed"] is False
+    assert read_image(out / "frames" / "0000.mask.exr").max() > 0.9
+
+
+def test_a_finished_run_is_not_trained_again(reconstruct, steps, tmp_path: Path):
+    out = tmp_path / "out"
+    assert reconstruct(out) == 0
+    assert len(steps) == 12 + 6
+    scene, report = (out / "scene.ply").read_bytes(), json.loads((out / "metrics.json").read_text())
+    steps.clear()
+    assert reconstruct(out) == 0
+    assert steps == []
+    assert (out / "scene.ply").read_bytes() == scene
+    again = json.loads((out / "metrics.json").read_text())
+    assert again["test"] == pytest.approx(report["test"])
+    assert again["curve"] == report["curve"]
+
+
+@pytest.mark.parametrize("cut", [("radiance", 8), ("materials", 3)], ids=str)
+def test_an_interrupted_run_goes_on_where_it_was_saved(
+    reconstruct, steps, tmp_path: Path, monkeypatch, capsys, cut: tuple[str, int]
+):
+    out, counting = tmp_path / "out", app._Bars.watch
+
+    def interrupting(self, progress) -> None:
+        counting(self, progress)
+        if (progress.stage, progress.step) == cut:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(app._Bars, "watch", interrupting)
+    assert reconstruct(out) == 130
+    assert capsys.readouterr().err.strip() == "tron-reconstruct: interrupted"
+    assert not (out / "metrics.json").exists()
+    monkeypatch.setattr(app._Bars, "watch", counting)
+    steps.clear()
+    assert reconstruct(out) == 0
+    assert steps[0] == (("radiance", 6) if cut[0] == "radiance" else ("materials", 1))
+    assert steps[-1] == ("materials", 6)
+    report = json.loads((out / "metrics.json").read_text())
+    assert [point["step"] for point in report["curve"]] == [4, 8, 12]
+    assert report["test"]["psnr"] > 18
+
+
+def test_one_thread_repeats_bit_by_bit_through_an_interruption(reconstruct, tmp_path: Path, monkeypatch):
+    """And writes OpenEXR, for which Mitsuba wants a second thread."""
+    watch = app._Bars.watch
+
+    def interrupting(self, progress) -> None:
+        if (progress.stage, progress.step) == ("radiance", 8):
+            raise KeyboardInterrupt
+        watch(self, progress)
+
+    assert reconstruct(tmp_path / "whole", "threads=1") == 0
+    monkeypatch.setattr(app._Bars, "watch", interrupting)
+    assert reconstruct(tmp_path / "cut", "threads=1") == 130
+    monkeypatch.setattr(app._Bars, "watch", watch)
+    assert reconstruct(tmp_path / "cut", "threads=1") == 0
+    whole, cut = ((tmp_path / name / "scene.ply").read_bytes() for name in ("whole", "cut"))
+    assert whole == cut
+    maps = [EnvironmentMap.load(tmp_path / name / "environment.exr").image for name in ("whole", "cut")]
+    np.testing.assert_array_equal(maps[0], maps[1])
+
+
+def test_other_settings_are_refused_and_change_nothing_unless_told_to(
+    reconstruct, steps, tmp_path: Path, capsys
+):
+    out = tmp_path / "out"
+    assert reconstruct(out) == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    steps.clear()
+    capsys.readouterr()
+    assert reconstruct(out, "radiance.sh_rate=0.01") == 2
+    error = capsys.readouterr().err.strip()
+    assert error.startswith("tron-reconstruct: ")
+    assert "another radiance.sh_rate" in error
+    assert "overwrite=true" in error
+    assert "\n" not in error
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert reconstruct(out, "radiance.sh_rate=0.01", "light=null", "overwrite=true") == 0
+    assert len(steps) == 12 + 6
+    assert (out / "scene.ply").read_bytes() != before["scene.ply"]
+    assert not (out / "environment.exr").exists()  # the old light is not the new scene's
+    assert json.loads((out / "metrics.json").read_text())["light"] is None
+
+
+def test_without_priors_for_light_there_is_no_light_and_it_is_said(
+    reconstruct, capture_path, tmp_path: Path, caplog
+):
+    """Maps in folders, of which irradiance is not one."""
+    maps = tmp_path / "maps"
+    shutil.copytree(capture_path / "normal", maps / "normal")
+    out = tmp_path / "out"
+    assert reconstruct(out, f"prior.folder={maps}", "prior.normal_frame=world", prior="precomputed") == 0
+    assert "no light can be fitted" in caplog.text
+    assert not (out / "environment.exr").exists()
+    assert json.loads((out / "metrics.json").read_text())["materials_learnt"] == []
+
+
+def test_the_default_prior_needs_nothing_but_photos(reconstruct, tmp_path: Path):
+    out = tmp_path / "out"
+    assert reconstruct(out, prior="classical") == 0
+    report = json.loads((out / "metrics.json").read_text())
+    assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
+    assert report["light"]["sigma"] > 0
+    assert (out / "environment.exr").exists()
+
+
+def test_without_held_out_views_the_others_are_shown(reconstruct, capture_path, tmp_path: Path):
+    from dataclasses import replace
+
+    from tron.captures.folder import read_capture_folder
+
+    path = tmp_path / "all"
+    write_capture(path, replace(read_capture_folder(capture_path), test=frozenset()))
+    assert reconstruct(tmp_path / "out", f"capture={path}", "light=null") == 0
+    report = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert report["test"] is None
+    assert report["train"]["psnr"] > 18
+    assert (tmp_path / "out" / "contact_sheet.png").exists()
