@@ -19,6 +19,7 @@ SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scrip
 # Enough to get past the checks of keys; {inputs} is the folder that the fixture below fills.
 COMPLETE = {
     "tron-datagen": ["experiment=demo"],
+    "tron-reconstruct": ["capture={inputs}/empty"],
     "tron-train": ["dataset={inputs}/empty"],
     "tron-eval": ["dataset={inputs}/empty", "renderer={inputs}/text.safetensors"],
     "tron-relight": ["scene={inputs}/good.ply", "environment={inputs}/text.hdr"],
