@@ -114,7 +114,12 @@ def main(settings: Settings) -> None:
     set_torch_threads(1)
     with locked(settings.output_dir):
         _claim(settings, capture, prior)
-        _run(settings, capture, prior, lpips)
+        report = _finished(settings)
+        if report is None:
+            _run(settings, capture, prior, lpips)
+        else:
+            log.info("finished before; overwrite=true begins anew")
+            _say(report, settings.output_dir)
 
 
 def _make_prior(settings: Settings) -> Any:
@@ -174,6 +179,24 @@ def _claim(settings: Settings, capture: Capture, prior: Any) -> None:
         require_same(Checkpoint(checkpoint), made_with(capture, prior, _only_reconstruction(settings)))
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False)
     write_atomic(settings.output_dir / "config.yaml", text)
+
+
+def _finished(settings: Settings) -> dict[str, Any] | None:
+    """The report of a run with these settings that came to its end, all its files still there; else None."""
+    try:
+        report = json.loads((settings.output_dir / "metrics.json").read_text("utf-8"))
+        same = report["settings"] == json.loads(settings.model_dump_json()) | {"overwrite": False}
+        files = [
+            "scene.ply",
+            "contact_sheet.png",
+            *(["environment.exr", "light.png"] if report["light"] else []),
+        ]
+        complete = report["version"] == tron.__version__ and all(
+            (settings.output_dir / name).is_file() for name in files
+        )
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return report if same and complete else None
 
 
 def _run(settings: Settings, capture: Capture, prior: Any, lpips: LPIPS | None) -> None:
@@ -284,7 +307,7 @@ def _report(
         if light is None
         else {"sigma": light.sigma, "irradiance_l1": float(np.mean(light.irradiance_loss[-50:]))},
         "seconds": seconds,
-        "settings": settings.model_dump(mode="json"),
+        "settings": {**settings.model_dump(mode="json"), "overwrite": False},
         "machine": describe_machine(),
     }
 

@@ -164,12 +164,29 @@ def test_what_it_writes_can_be_relit(variant, finished: Path, tmp_path: Path):
     assert read_image(out / "frames" / "0000.mask.exr").max() > 0.9
 
 
-def test_a_finished_run_is_not_trained_again(reconstruct, steps, tmp_path: Path):
+def test_a_finished_run_is_left_as_it_is(reconstruct, steps, tmp_path: Path, caplog):
+    out = tmp_path / "out"
+    assert reconstruct(out, "overwrite=true") == 0
+    steps.clear()
+    before = {path.name: path.stat().st_mtime_ns for path in out.iterdir() if path.name != "config.yaml"}
+    caplog.set_level("INFO")
+    assert reconstruct(out) == 0
+    assert steps == []
+    assert "finished before" in caplog.text
+    assert "test, 3 views: psnr" in caplog.text
+    after = {path.name: path.stat().st_mtime_ns for path in out.iterdir() if path.name != "config.yaml"}
+    assert {name: time for name, time in after.items() if not name.startswith(".")} == {
+        name: time for name, time in before.items() if not name.startswith(".")
+    }
+
+
+def test_lost_results_come_back_without_training(reconstruct, steps, tmp_path: Path):
     out = tmp_path / "out"
     assert reconstruct(out) == 0
     assert len(steps) == 12 + 6
     scene, report = (out / "scene.ply").read_bytes(), json.loads((out / "metrics.json").read_text())
     steps.clear()
+    (out / "scene.ply").unlink()
     assert reconstruct(out) == 0
     assert steps == []
     assert (out / "scene.ply").read_bytes() == scene
