@@ -27,7 +27,7 @@ def witness(predicted: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     return found[1][0].movedim(0, -1)
 
 
-@pytest.mark.parametrize("size", [(32, 32), (19, 40), (11, 7), (6, 6)])
+@pytest.mark.parametrize("size", [(32, 32), (19, 40), (11, 7), (6, 6), (150, 301)])
 def test_ssim_and_its_gradient_are_those_of_torchmetrics(size: tuple[int, int]) -> None:
     predicted, target = pair(*size)
     weights = torch.tensor(generator(1, "weights").random((*size, 3)), dtype=torch.float32)
