@@ -11,16 +11,19 @@ composited hits are written out in order, so that the adjoint can replay exactly
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ceil, log
 
 import drjit as dr
 import mitsuba as mi
 
 from tron.errors import TronError
 from tron.tracing.hits import LocalHits
-from tron.tracing.kernel import FEATURE_PACKETS, SH_PACKETS, SurfelRecords
+from tron.tracing.kernel import FEATURE_PACKETS, MIN_ALPHA, SH_PACKETS, SurfelRecords
 
 STOP_TRANSMITTANCE = 1e-3
 MEDIAN_TRANSMITTANCE = 0.5
+MOST_HITS = ceil(log(STOP_TRANSMITTANCE) / log(1 - MIN_ALPHA)) + 1
+"""Most hits that any ray composites, one of them for rounding: 1764 of the faintest stop it."""
 CHANNELS = 11
 MATERIAL_PACKETS = 2
 """Packets of a feature record that are composited as they are: normal, roughness | base color, metallic."""
@@ -54,6 +57,35 @@ class HitList:
                 mend="render the image in parts, or without gradients",
             )
         return HitList(dr.empty(mi.UInt32, room * rays), dr.zeros(mi.UInt32, rays), ray)
+
+    @property
+    def room(self) -> int:
+        """Most hits of a list."""
+        return dr.width(self.ids) // dr.width(self.ray)
+
+    def rows(self) -> HitRows:
+        """Where compositing writes the ids."""
+        lists, room = dr.width(self.ray), self.room
+        return HitRows(
+            self.ids, dr.arange(mi.UInt32, lists), dr.opaque(mi.UInt32, lists), dr.opaque(mi.UInt32, room)
+        )
+
+
+@dataclass
+class HitRows:
+    """The memory of a :class:`HitList`, as a kernel sees it: its sizes are variables.
+
+    Literals would compile a kernel for each size of image.
+
+    Attributes:
+        ids: mi.UInt32. lane: mi.UInt32, 0, 1, .. one a list.
+        lists, room: mi.UInt32, one number each.
+    """
+
+    ids: mi.UInt32
+    lane: mi.UInt32
+    lists: mi.UInt32
+    room: mi.UInt32
 
 
 @dataclass
@@ -113,7 +145,7 @@ def radiance(
 
 @dr.syntax
 def composite(
-    records: SurfelRecords, hits: LocalHits, basis: list[mi.Float], sums: Composite, out: HitList | None
+    records: SurfelRecords, hits: LocalHits, basis: list[mi.Float], sums: Composite, out: HitRows | None
 ) -> Composite:
     """Composite the sorted ``hits`` of each lane behind what ``sums`` holds already.
 
@@ -122,18 +154,14 @@ def composite(
         hits: sorted local hits, in the same kernel; all of them lie behind those in ``sums``.
         basis: spherical harmonics at the unit ray direction (3DGRT evaluates SH there).
         sums: what was composited before; :meth:`Composite.start` at first.
-        out: receives the ids, list r from lane r; the caller evaluates it.
+        out: receives the ids, list r from lane r, as many as it has room for; the caller evaluates it.
     """
     slot = mi.UInt32(0)
-    lane, lists = mi.UInt32(0), mi.UInt32(0)
-    if dr.hint(out is not None, mode="scalar"):
-        lane = dr.arange(mi.UInt32, dr.width(out.ray))
-        lists = dr.opaque(mi.UInt32, dr.width(out.ray))  # a literal would compile a kernel per image size
     active = (slot < hits.count) & (sums.transmittance >= STOP_TRANSMITTANCE)
     while active:
         alpha, index, t = hits.alpha[slot], hits.index[slot], hits.t[slot]
         if dr.hint(out is not None, mode="scalar"):
-            dr.scatter(out.ids, index, sums.count * lists + lane, active)
+            dr.scatter(out.ids, index, sums.count * out.lists + out.lane, active & (sums.count < out.room))
         weight = sums.transmittance * alpha
         channels = []
         for packet in range(MATERIAL_PACKETS):

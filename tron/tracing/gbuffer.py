@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import drjit as dr
@@ -13,14 +13,18 @@ import mitsuba as mi
 import numpy as np
 
 from tron.cameras import Camera
-from tron.gaussians.harmonics import sh_basis
 from tron.tracing.adjoint import attach, has_gradients
-from tron.tracing.compositing import STOP_TRANSMITTANCE, Composite, HitList, composite
-from tron.tracing.hits import MAX_HITS, collect, sort
+from tron.tracing.compositing import MOST_HITS, Composite, HitList
 from tron.tracing.kbuffer import composite_rounds, search_list
 from tron.tracing.kernel import SurfelRecords
+from tron.tracing.streaming import stream
 from tron.tracing.surface import Surface, surface
 from tron.tracing.tiles import TileLists, lanes_of_pixels, tile_pixels
+
+KEPT_HITS = 128
+"""Most hits a ray for whose ids there is room at once, 4 bytes each."""
+FEW_HITS = 64
+"""The same where no tile list is longer."""
 
 
 @dataclass
@@ -73,8 +77,7 @@ def trace_tiles(
 ) -> tuple[Composite, list[HitList]]:
     """Sums of every ray in tile order, and the hits that they are made of, if they are to be kept.
 
-    Collecting, sorting and compositing are one kernel, with room for ``MAX_HITS`` hits a ray. Rays that met
-    more are traced once more, some hits at a time, without limit.
+    Rays that streaming has no room for are traced once more, some hits at a time, without limit.
 
     Args:
         records: the surfels, detached.
@@ -82,31 +85,34 @@ def trace_tiles(
     """
     start = dr.gather(mi.UInt32, lists.start, rays.tile)
     count = dr.select(rays.inside, dr.gather(mi.UInt32, lists.count, rays.tile), 0)
-    out = HitList.empty(dr.arange(mi.UInt32, dr.width(rays.tile)), MAX_HITS) if keep_hits else None
-    hits = collect(records, lists.entries, start, count, rays.origin, rays.direction, STOP_TRANSMITTANCE)
-    sort(hits)
-    basis = sh_basis(rays.direction.x, rays.direction.y, rays.direction.z)
-    sums = composite(records, hits, basis, Composite.start(), out)
+    out = None
+    if keep_hits:
+        # One of two sizes only: the kernel is recorded anew for each size of memory that is not written yet.
+        room = FEW_HITS if int(dr.max(lists.count)[0]) <= FEW_HITS else KEPT_HITS
+        out = HitList.empty(dr.arange(mi.UInt32, dr.width(rays.tile)), room)
+    sums, crowded, kept_hits = stream(
+        # Not how many surfels there are, which would be one more thing to record the kernel anew for.
+        replace(records, count=0), lists.entries, start, count, rays.origin, rays.direction,
+        None if out is None else out.rows(),
+    )  # fmt: skip
     kept = []
     if out is not None:
-        out.count = dr.select(hits.met > MAX_HITS, 0, sums.count)
+        out.count = kept_hits
         kept.append(out)
-    dr.eval(sums, kept, hits.met)
-    crowded = dr.compress(hits.met > MAX_HITS)
-    if dr.width(crowded) == 0:
+    again = dr.compress(crowded)
+    if dr.width(again) == 0:
         return sums, kept
-    # Met counts all that can be composited, but multiplied in another order: rounding may let one more in.
-    room = int(dr.max(dr.gather(mi.UInt32, hits.met, crowded))[0]) + 1
-    more = HitList.empty(crowded, room) if keep_hits else None
-    start, count = (dr.gather(mi.UInt32, values, crowded) for values in (start, count))
-    direction = dr.gather(mi.Vector3f, rays.direction, crowded)
+    start, count = (dr.gather(mi.UInt32, values, again) for values in (start, count))
+    room = min(int(dr.max(count)[0]), MOST_HITS)
+    more = HitList.empty(again, room) if keep_hits else None
+    direction = dr.gather(mi.Vector3f, rays.direction, again)
     search = partial(search_list, records, lists.entries, start, count, rays.origin, direction)
-    again = composite_rounds(records, search, direction, mi.Bool(True), more)
+    traced = composite_rounds(records, search, direction, mi.Bool(True), more)
     if more is not None:
-        more.count = again.count
+        more.count = traced.count
         kept.append(more)
-    dr.eval(again, kept)
-    _overwrite(sums, again, crowded)
+    dr.eval(traced, kept)
+    _overwrite(sums, traced, again)
     return sums, kept
 
 

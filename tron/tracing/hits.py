@@ -15,7 +15,7 @@ import mitsuba as mi
 from tron.tracing.kernel import T_MIN, SurfelRecords, intersect
 
 MAX_HITS = 64
-"""Hits kept a ray; rays that meet more are traced by :mod:`tron.tracing.kbuffer` instead."""
+"""Hits that a ray keeps at a time until they are composited."""
 
 
 NEAR_SLACK = 0.9999
@@ -24,18 +24,62 @@ NEAR_SLACK = 0.9999
 
 @dataclass
 class LocalHits:
-    """The hits of each lane in thread-local memory, slot 0 nearest; alive inside one kernel only.
+    """Hits of each lane in thread-local memory; alive inside one kernel only.
 
     Attributes:
         t, alpha: local arrays of mi.Float; index: of mi.UInt32. ``MAX_HITS`` slots and one for rejects.
-        count: mi.UInt32, hits kept; met: hits met before the cap.
+        count: mi.UInt32, how many there are, from slot 0 on.
     """
 
     t: Any
     index: Any
     alpha: Any
     count: mi.UInt32
-    met: mi.UInt32
+
+    @staticmethod
+    def none() -> LocalHits:
+        """Room for ``MAX_HITS`` of them, and none."""
+        # The last slot takes the writes of rejected candidates: a masked write in a nested loop crashed LLVM.
+        return LocalHits(
+            dr.alloc_local(mi.Float, MAX_HITS + 1, value=mi.Float(0)),
+            dr.alloc_local(mi.UInt32, MAX_HITS + 1, value=mi.UInt32(0)),
+            dr.alloc_local(mi.Float, MAX_HITS + 1, value=mi.Float(0)),
+            mi.UInt32(0),
+        )
+
+
+@dataclass
+class Walk:
+    """How far each lane has gone through its list of candidates, and how far it needs to go.
+
+    Attributes:
+        cursor, end: mi.UInt32, the next candidate and the end of the list.
+        near: mi.Float, what is still to come lies no nearer than this.
+        product: mi.Float, transmittance of all that was met. farthest: t of the farthest of it.
+        t_cut: mi.Float, nothing beyond it can matter.
+        open: mi.Bool, there may be more to meet.
+    """
+
+    cursor: mi.UInt32
+    end: mi.UInt32
+    near: mi.Float
+    product: mi.Float
+    farthest: mi.Float
+    t_cut: mi.Float
+    open: mi.Bool
+
+    @staticmethod
+    def along(start: mi.UInt32, count: mi.UInt32) -> Walk:
+        """At the beginning of the lists of ``count`` candidates from ``start`` on."""
+        return Walk(
+            mi.UInt32(start),
+            start + count,
+            mi.Float(0),
+            mi.Float(1),
+            mi.Float(0),
+            mi.Float(dr.inf),
+            count > 0,
+        )
 
 
 @cache
@@ -57,10 +101,10 @@ def odd_even_merge_network(size: int) -> tuple[tuple[int, int], ...]:
 
 @dr.syntax
 def collect(
-    records: SurfelRecords, entries: mi.UInt32, start: mi.UInt32, count: mi.UInt32,
-    origin: mi.Point3f, direction: mi.Vector3f, stop: float,
-) -> LocalHits:  # fmt: skip
-    """Walk each lane's candidate list and keep its front-facing hits, unsorted.
+    records: SurfelRecords, entries: mi.UInt32, origin: mi.Point3f, direction: mi.Vector3f, stop: float,
+    walk: Walk, hits: LocalHits,
+) -> tuple[Walk, LocalHits]:  # fmt: skip
+    """Walk on through each lane's candidates, adding its front-facing hits, until there is no room for more.
 
     Exact early end: once the product of (1 - alpha) over what was met falls below ``stop``, nothing beyond
     the farthest hit met so far can matter, because those hits alone already stop the ray.  Lists are sorted
@@ -68,37 +112,77 @@ def collect(
 
     Args:
         records: the surfels.
-        entries: tile lists' ids; start, count: each lane's slice of them.
+        entries: tile lists' ids.
         origin, direction: world rays, unit directions.
         stop: transmittance at which compositing ends.
+        walk: where each lane stands. hits: what it has kept.
     """
-    # Slot MAX_HITS takes the writes of rejected candidates: a masked write inside a nested loop crashed LLVM.
-    kept_t = dr.alloc_local(mi.Float, MAX_HITS + 1, value=mi.Float(0))
-    kept_index = dr.alloc_local(mi.UInt32, MAX_HITS + 1, value=mi.UInt32(0))
-    kept_alpha = dr.alloc_local(mi.Float, MAX_HITS + 1, value=mi.Float(0))
-    met, cursor, end = mi.UInt32(0), mi.UInt32(start), start + count
-    product, farthest, t_cut = mi.Float(1), mi.Float(0), mi.Float(dr.inf)
-    active = cursor < end
+    active = walk.open & (hits.count < MAX_HITS)
     while active:
-        index = dr.gather(mi.UInt32, entries, cursor)
+        index = dr.gather(mi.UInt32, entries, walk.cursor)
         hit = intersect(records.geometry, index, origin, direction, records.degree)
-        valid = hit.within & hit.front & (hit.t > T_MIN) & (hit.t <= t_cut)
-        slot = dr.select(valid & (met < MAX_HITS), met, mi.UInt32(MAX_HITS))
-        kept_t[slot] = hit.t
-        kept_index[slot] = index
-        kept_alpha[slot] = hit.alpha
-        met += dr.select(valid, mi.UInt32(1), mi.UInt32(0))
-        product = dr.select(valid, product * (1 - hit.alpha), product)
-        farthest = dr.select(valid & (hit.t > farthest), hit.t, farthest)
-        t_cut = dr.select((product < stop) & (t_cut == dr.inf), farthest, t_cut)
-        cursor += 1
-        active &= (cursor < end) & (NEAR_SLACK * hit.near <= t_cut)
-    kept = dr.select(met < MAX_HITS, met, mi.UInt32(MAX_HITS))
-    return LocalHits(kept_t, kept_index, kept_alpha, kept, met)
+        valid = hit.within & hit.front & (hit.t > T_MIN) & (hit.t <= walk.t_cut)
+        slot = dr.select(valid, hits.count, mi.UInt32(MAX_HITS))
+        hits.t[slot] = hit.t
+        hits.index[slot] = index
+        hits.alpha[slot] = hit.alpha
+        hits.count += dr.select(valid, mi.UInt32(1), mi.UInt32(0))
+        walk.product = dr.select(valid, walk.product * (1 - hit.alpha), walk.product)
+        walk.farthest = dr.select(valid & (hit.t > walk.farthest), hit.t, walk.farthest)
+        walk.t_cut = dr.select((walk.product < stop) & (walk.t_cut == dr.inf), walk.farthest, walk.t_cut)
+        walk.near = NEAR_SLACK * hit.near
+        walk.cursor += 1
+        walk.open &= (walk.cursor < walk.end) & (walk.near <= walk.t_cut)
+        active &= walk.open & (hits.count < MAX_HITS)
+    return walk, hits
 
 
 @dr.syntax
-def sort(hits: LocalHits) -> None:
+def settle(
+    walk: Walk, hits: LocalHits, transmittance: mi.Float, stop: float
+) -> tuple[Walk, LocalHits, mi.UInt32]:
+    """How many of the sorted ``hits`` are final: no candidate to come can lie before them.
+
+    Those behind the one at which the ray stops are dropped; where that is known there may be nothing left to
+    walk to, and all that remain are final.
+
+    Args:
+        transmittance: in front of the first of them.
+    """
+    slot, final = mi.UInt32(0), mi.UInt32(0)
+    t, product = mi.Float(0), mi.Float(transmittance)
+    active = walk.open & (hits.count > 0)
+    while active:
+        t = hits.t[slot]
+        final += dr.select(t < walk.near, mi.UInt32(1), mi.UInt32(0))
+        product *= 1 - hits.alpha[slot]
+        slot += 1
+        active &= (slot < hits.count) & (product >= stop)
+    hits.count = dr.select(walk.open, slot, hits.count)
+    walk.product = product
+    walk.farthest = t
+    walk.t_cut = dr.select(walk.open & (product < stop), t, walk.t_cut)
+    walk.open &= walk.near <= walk.t_cut
+    return walk, hits, dr.select(walk.open, final, hits.count)
+
+
+@dr.syntax
+def drop(hits: LocalHits, first: mi.UInt32, active: mi.Bool) -> LocalHits:
+    """Forget the ``first`` hits; the others move up."""
+    slot = mi.UInt32(first)
+    moving = active & (slot < hits.count) & (first > 0)
+    while moving:
+        hits.t[slot - first] = hits.t[slot]
+        hits.index[slot - first] = hits.index[slot]
+        hits.alpha[slot - first] = hits.alpha[slot]
+        slot += 1
+        moving &= slot < hits.count
+    hits.count = dr.select(active, hits.count - first, 0)
+    return hits
+
+
+@dr.syntax
+def sort(hits: LocalHits) -> LocalHits:
     """Order each lane's hits by (t, id) in place, by a sorting network in registers.
 
     Most packets use less than half the slots, and half the slots are a third of the network.
@@ -108,7 +192,7 @@ def sort(hits: LocalHits) -> None:
         t, index, alpha = _sorted(hits.count, t, index, alpha, MAX_HITS)
     else:
         t, index, alpha = _sorted(hits.count, t, index, alpha, MAX_HITS // 2)
-    hits.t, hits.index, hits.alpha = t, index, alpha
+    return LocalHits(t, index, alpha, hits.count)
 
 
 def _sorted(count: mi.UInt32, t: Any, index: Any, alpha: Any, size: int) -> tuple[Any, Any, Any]:

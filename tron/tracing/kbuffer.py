@@ -2,11 +2,12 @@
 
 Each round looks for the K nearest hits behind the last one composited; (t, id) orders hits, so coincident
 surfels are neither lost nor met twice. Rays that no tile holds look for them in the hierarchy; the few camera
-rays that meet more than a hit list holds look in the list of their tile. Slower than one sorted list, but
-nothing overflows.
+rays that :mod:`tron.tracing.streaming` has no room for look in the list of their tile. Slower, but nothing
+overflows.
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false
+# pyright: reportOptionalMemberAccess=false
 # (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations
@@ -133,6 +134,9 @@ def composite_rounds(
     local_index = dr.alloc_local(mi.UInt32, K, value=mi.UInt32(0))
     local_alpha = dr.alloc_local(mi.Float, K, value=mi.Float(0))
     sums = Composite.start()
+    rows = None
+    if dr.hint(out is not None, mode="scalar"):
+        rows = out.rows()
     nearest, last = mi.Float(T_MIN), mi.UInt32(_NO_ID)  # no id is larger: a hit at T_MIN itself is none
     going = mi.Bool(active)
     while going:
@@ -143,8 +147,8 @@ def composite_rounds(
             local_index[slot] = kept.index[slot]
             local_alpha[slot] = kept.alpha[slot]
             count += dr.select(kept.t[slot] < dr.inf, mi.UInt32(1), mi.UInt32(0))
-        hits = LocalHits(local_t, local_index, local_alpha, count, count)
-        sums = composite(records, hits, basis, sums, out)
+        hits = LocalHits(local_t, local_index, local_alpha, count)
+        sums = composite(records, hits, basis, sums, rows)
         nearest, last = kept.t[K - 1], kept.index[K - 1]
         going &= (count == K) & (sums.transmittance >= STOP_TRANSMITTANCE)
     return sums

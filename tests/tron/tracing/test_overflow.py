@@ -1,9 +1,10 @@
-"""Rays that meet more surfels than a hit list holds, and rays of any kind through the hierarchy."""
+"""Rays that meet more surfels than fit at a time, and rays of any kind through the hierarchy."""
 
 from __future__ import annotations
 
 import dataclasses
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -11,8 +12,11 @@ import pytest
 from tron import seeds
 from tron.cameras import Camera
 from tron.errors import TronError
-from tron.tracing import SurfelTracer, reference
+from tron.gaussians.scene import GaussianScene
+from tron.tracing import SurfelTracer, adjoint, gbuffer, reference
 from tron.tracing.hits import MAX_HITS
+from tron.tracing.parameters import PARAMETERS, SurfelParameters
+from tron.tracing.streaming import stream
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -24,6 +28,12 @@ def camera():
 
 def single(values):
     return np.asarray(values, np.float32)
+
+
+@pytest.fixture
+def close_up():
+    """Sees nothing but :func:`stack`."""
+    return Camera.look_at((0.001, 0.002, 1), (0, 0, 0), up=(0, 1, 0), fov_deg=1.5, width=9, height=7)
 
 
 def rays(camera):
@@ -69,6 +79,120 @@ def test_more_hits_than_a_list_holds_at_different_depths(disks, camera):
     truth = reference.composite(scene, *rays(camera))
     assert truth.hits.max() > 2 * MAX_HITS
     assert_agrees(SurfelTracer(scene).gbuffer(camera), truth)
+
+
+@pytest.fixture
+def once(monkeypatch):
+    """Fails where rays have to be traced a second time."""
+
+    def second_time(*args):
+        raise AssertionError("these rays have room enough")
+
+    monkeypatch.setattr(gbuffer, "composite_rounds", second_time)
+
+
+def stack(disks, levels, alike, opacity):
+    """Levels of small disks, ``alike`` coincident ones on each; ids say nothing about depth."""
+    heights = np.repeat(np.linspace(-1, 0.5, levels), alike)
+    rng = seeds.generator(0, "tests", "small", levels, alike)
+    means = np.stack([np.zeros(len(heights)), np.zeros(len(heights)), rng.permutation(heights)], 1)
+    scene = disks(means, [False] * len(heights), opacity=opacity, sigma=0.02)
+    scene.base_color = single(rng.random((len(heights), 3)))
+    return scene
+
+
+@pytest.mark.parametrize("alike", [1, 3, 7])
+def test_many_hits_of_small_surfels_are_composited_as_they_come(disks, close_up, once, alike):
+    scene = stack(disks, 420 // alike, alike, 0.02)
+    truth = reference.composite(scene, *rays(close_up))
+    assert truth.hits.min() > 4 * MAX_HITS
+    assert_agrees(SurfelTracer(scene).gbuffer(close_up), truth)
+
+
+def crowd(seed, count=700):
+    """Large, faint surfels about the origin that face the camera, as reconstructions begin."""
+    rng = seeds.generator(seed, "tests", "crowd", count)
+    quats = rng.normal(size=(count, 4)) * [1, 0.3, 0.3, 1]
+    return GaussianScene(
+        means=rng.uniform([-0.3, -0.3, -0.6], [0.3, 0.3, 0.4], (count, 3)),
+        quats=quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        log_scales=np.log(rng.uniform(0.02, 0.12, (count, 2))),
+        opacity_logits=rng.normal(-2, 0.7, count),
+        sh=0.3 * rng.normal(size=(count, 16, 3)),
+        base_color=rng.random((count, 3)),
+        roughness=rng.random(count),
+        metallic=rng.random(count),
+        object_id=np.zeros(count),
+        kernel_degree=2,
+        spacing=0.05,
+    ).validate()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_crowds_agree_with_the_reference_without_a_second_pass(camera, once, seed):
+    scene = crowd(seed)
+    truth = reference.composite(scene, *rays(camera))
+    assert np.median(truth.hits) > MAX_HITS
+    assert_agrees(SurfelTracer(scene).gbuffer(camera), truth)
+
+
+def gradients(scene, trace):
+    """Of a fixed sum over what ``trace(tracer)`` sees, by every parameter."""
+    parameters = SurfelParameters.from_scene(scene)
+    for name in PARAMETERS:
+        dr.enable_grad(getattr(parameters, name))
+    seen = trace(SurfelTracer(scene, parameters=parameters))
+    ray = dr.arange(mi.Float, dr.width(seen.opacity))
+    channels = [*seen.rgb, *seen.base_color, *seen.normal, seen.roughness, seen.metallic, seen.opacity]
+    total = mi.Float(0)
+    for k, value in enumerate(channels):
+        total += dr.sin(1 + ray + 3 * k) * value
+    dr.backward(dr.sum(total))
+    return {name: np.array(dr.grad(getattr(parameters, name))) for name in PARAMETERS}
+
+
+@pytest.mark.parametrize("kind", ["crowd", "more than are kept", "all wait"])
+def test_gradients_of_crowds_are_those_of_rays_through_the_hierarchy(disks, camera, close_up, kind):
+    if kind == "crowd":
+        scene = crowd(2, 480)
+    elif kind == "more than are kept":
+        scene, camera = stack(disks, 300, 1, 0.01), close_up
+    else:
+        scene = disks([[0, 0, 0.001 * k] for k in range(120)], [False] * 120, opacity=0.02, sigma=0.4)
+    hits = reference.composite(scene, *rays(camera)).hits
+    assert np.median(hits) > MAX_HITS
+    assert (hits > gbuffer.KEPT_HITS).any() == (kind == "more than are kept")
+    by_tiles = gradients(scene, lambda tracer: tracer.gbuffer(camera))
+    by_rounds = gradients(scene, lambda tracer: tracer.trace(*mitsuba_rays(*rays(camera))))
+    for name, expected in by_rounds.items():
+        np.testing.assert_allclose(by_tiles[name], expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+
+
+def test_gradients_are_the_same_where_threads_have_no_copies_to_add_to(camera, monkeypatch):
+    scene = crowd(3, 200)
+    expected = gradients(scene, lambda tracer: tracer.gbuffer(camera))
+    monkeypatch.setattr(adjoint, "COPIED_BYTES", 0)
+    for name, found in gradients(scene, lambda tracer: tracer.gbuffer(camera)).items():
+        np.testing.assert_allclose(found, expected[name], rtol=1e-3, atol=1e-5 * np.abs(found).max())
+
+
+def test_what_is_recorded_serves_scenes_and_images_of_any_size(random_scene):
+    def see(count, width, height, differentiable):
+        view = Camera.look_at((2.5, 1, 0.7), (0, 0, 0), fov_deg=50, width=width, height=height)
+        # Harmonics would be read where NumPy has them, and memory that is not aligned is recorded once more.
+        scene = random_scene(count, sh_degree=0)
+        parameters = SurfelParameters.from_scene(scene)
+        dr.set_grad_enabled(parameters.means, differentiable)
+        tracer = SurfelTracer(scene, parameters=parameters)
+        assert_agrees(tracer.gbuffer(view), reference.composite(scene, *rays(view)))
+
+    see(100, 17, 9, False)
+    see(100, 17, 9, True)
+    before = stream.n_recordings
+    for count, width, height in ((150, 30, 22), (100, 8, 31), (151, 17, 9)):
+        see(count, width, height, False)
+        see(count, 17, 9, True)  # memory for hits is of one size for one image
+    assert stream.n_recordings == before
 
 
 def test_crowded_and_ordinary_pixels_share_an_image(disks, camera):

@@ -1,0 +1,66 @@
+"""Camera rays along their tiles' lists: hits are collected, sorted and composited, as many at a time as fit.
+
+A list is sorted by a lower bound of distance, so what a ray has met nearer than the next candidate's bound
+is final: nothing to come lies before it. Each ray collects until it has ``MAX_HITS`` hits or its list ends,
+sorts them, composites the final ones and keeps the others for the next round. Most rays need one round. It
+fails only where as many hits as fit wait for candidates that might lie before all of them: surfels much
+larger than the distances between them.
+"""
+
+# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
+# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.gaussians.harmonics import sh_basis
+from tron.tracing.compositing import STOP_TRANSMITTANCE, Composite, HitRows, composite
+from tron.tracing.hits import MAX_HITS, LocalHits, Walk, collect, drop, settle, sort
+from tron.tracing.kernel import SurfelRecords
+
+
+# Tracing the sorting networks takes as long as 16,000 rays, so the kernel is recorded once for each kind of
+# arguments: degrees, whether hits are kept, and if so for how many. Other sizes are free.
+@dr.freeze(limit=64, warn_after=1000)
+def stream(
+    records: SurfelRecords, entries: mi.UInt32, start: mi.UInt32, count: mi.UInt32,
+    origin: mi.Point3f, direction: mi.Vector3f, out: HitRows | None,
+) -> tuple[Composite, mi.Bool, mi.UInt32]:  # fmt: skip
+    """Composite the front-facing hits of each ray, in one kernel.
+
+    Args:
+        records: the surfels, detached.
+        entries: tile lists' ids; start, count: each ray's slice of them.
+        origin, direction: world rays, unit directions.
+        out: receives the composited ids, list r from lane r, as many as it has room for.
+
+    Returns:
+        All evaluated: the sums of each ray; whether it was not finished, or has more hits than there is room
+        for; and how many ids it has in ``out``, none where that is so.
+    """
+    sums, crowded = _rounds(records, entries, Walk.along(start, count), origin, direction, out)
+    if out is not None:
+        crowded |= sums.count > out.room
+    return sums, crowded, dr.select(crowded, 0, sums.count)
+
+
+@dr.syntax
+def _rounds(
+    records: SurfelRecords, entries: mi.UInt32, walk: Walk, origin: mi.Point3f, direction: mi.Vector3f,
+    out: HitRows | None,
+) -> tuple[Composite, mi.Bool]:  # fmt: skip
+    basis = sh_basis(direction.x, direction.y, direction.z)
+    hits, sums, full = LocalHits.none(), Composite.start(), mi.Bool(False)
+    going = mi.Bool(walk.open)
+    while going:
+        walk, hits = collect(records, entries, origin, direction, STOP_TRANSMITTANCE, walk, hits)
+        hits = sort(hits)
+        walk, hits, final = settle(walk, hits, sums.transmittance, STOP_TRANSMITTANCE)
+        ready = LocalHits(hits.t, hits.index, hits.alpha, final)
+        sums = composite(records, ready, basis, sums, out)
+        hits = drop(hits, final, walk.open)
+        full = walk.open & (hits.count == MAX_HITS)
+        going &= walk.open & ~full
+    return sums, full
