@@ -105,7 +105,7 @@ def reconstruct(
     )
     fields = tuple(name for name in MATERIALS if any(view.has(name) for view in taught.train_views))
     plan = materials_plan(settings.materials.scaled(settings.steps_scaler))
-    plan = replace(plan, rates={name: plan.rates[name] for name in fields})
+    plan = plan.learning(fields)
     scene = _with_baked_color(scene)
     if fields:
         learners = [view for view in taught.train_views if any(view.has(name) for name in fields)]

@@ -7,8 +7,8 @@ bit by bit with one Dr.Jit and one torch thread.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -74,6 +74,12 @@ class Plan:
     background: Background = "black"
     density: DensityControl | None = None
 
+    def learning(self, names: Collection[str]) -> Plan:
+        """The same plan, learning these parameters alone."""
+        kept = {name: rate for name, rate in self.rates.items() if name in names}
+        final = {name: rate for name, rate in self.final_rates.items() if name in names}
+        return replace(self, rates=kept, final_rates=final)
+
 
 def radiance_plan(settings: RadianceSettings, extent: float, seed: int) -> Plan:
     """Stage 1: geometry and radiance; ``extent`` in world units scales the rate of the positions."""
@@ -106,6 +112,7 @@ def materials_plan(settings: MaterialSettings) -> Plan:
         steps=settings.steps,
         weights=Weights(base_color=1.0, roughness=1.0, metallic=1.0, ssim=settings.ssim),
         rates=dict.fromkeys(MATERIALS, settings.rate),
+        final_rates=dict.fromkeys(MATERIALS, settings.rate_final),
     )
 
 
