@@ -119,7 +119,7 @@ def test_it_writes_everything_that_it_says(finished: Path):
     }
     scene = GaussianScene.load(finished / "scene.ply").validate()
     assert 200 < len(scene) <= 340
-    assert scene.kernel_degree == 2
+    assert scene.kernel_degree == 4  # the recipe's
     assert EnvironmentMap.load(finished / "environment.exr").image.min() >= 0
     sheet = read_image(finished / "contact_sheet.png")
     rows = 12  # photo, radiance, error, opacity, depth, position, normal, three materials, pbr, irradiance
