@@ -100,7 +100,12 @@ class MaterialSettings(Settings):
 
     steps: int = Field(default=7000, ge=0, description="Steps; each renders one view.")
     rate: float = Field(default=2.5e-3, gt=0, description="First rate of all three, Adam's.")
-    rate_final: float = Field(default=2.5e-3, gt=0, description="Last one; it changes log-linearly.")
+    decay: float = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="Share of it that is left at the last step, falling log-linearly.",
+    )
     ssim: float = Field(default=0.2, ge=0, le=1, description="Weight of 1 - SSIM; L1 has the rest.")
 
     def scaled(self, factor: float) -> MaterialSettings:

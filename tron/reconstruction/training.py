@@ -112,7 +112,7 @@ def materials_plan(settings: MaterialSettings) -> Plan:
         steps=settings.steps,
         weights=Weights(base_color=1.0, roughness=1.0, metallic=1.0, ssim=settings.ssim),
         rates=dict.fromkeys(MATERIALS, settings.rate),
-        final_rates=dict.fromkeys(MATERIALS, settings.rate_final),
+        final_rates=dict.fromkeys(MATERIALS, settings.decay * settings.rate),
     )
 
 
