@@ -334,7 +334,7 @@ def _write_sheet(path: Path, tracer: SurfelTracer, capture: Capture, light: Envi
             "depth": _relative(buffers["depth"]),
             "position": _relative(buffers["position"], buffers["opacity"] > 0.5),
             "normal": 0.5 * buffers["normal"] + 0.5,
-            "base color": to_srgb(buffers["base_color"]),
+            "base color": _srgb(buffers["base_color"]),
             "roughness": buffers["roughness"],
             "metallic": buffers["metallic"],
         }.items():
@@ -348,11 +348,11 @@ def _write_sheet(path: Path, tracer: SurfelTracer, capture: Capture, light: Envi
     write_image(path, labelled_sheet(rows, [view.name for view in views]))
 
 
-def to_srgb(linear: np.ndarray) -> np.ndarray:
+def _srgb(linear: np.ndarray) -> np.ndarray:
     """Base color as a picture."""
     from tron.color import linear_to_srgb
 
-    return linear_to_srgb(np.clip(linear, 0, 1))
+    return linear__srgb(np.clip(linear, 0, 1))
 
 
 def _relative(values: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:

@@ -31,7 +31,7 @@ class Curve:
         every: steps between two scores.
 
     Attributes:
-        points: stage, step, seconds (of training alone), test_psnr (dB), surfels.
+        points: stage, step, seconds (since the run was set up, scores left out), test_psnr (dB), surfels.
 
     Raises:
         TronError: the file holds no curve.
