@@ -352,7 +352,7 @@ def _srgb(linear: np.ndarray) -> np.ndarray:
     """Base color as a picture."""
     from tron.color import linear_to_srgb
 
-    return linear__srgb(np.clip(linear, 0, 1))
+    return linear_to_srgb(np.clip(linear, 0, 1))
 
 
 def _relative(values: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
