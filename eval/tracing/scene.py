@@ -1,9 +1,10 @@
-"""The benchmark's scene in two forms: surfels, and a mesh of the same surfaces for Mitsuba.
+"""The benchmark's scenes in two forms: surfels, and a mesh of the same surfaces for Mitsuba.
 
-A floor, three spheres, a torus and a box. Surfels stand evenly by area along Roberts' R2 sequence (2018, "The
+A floor, three spheres, a torus and a box, seen from outside; and the same things in a room and on a wide
+ground, with the camera within. Surfels stand evenly by area along Roberts' R2 sequence (2018, "The
 Unreasonable Effectiveness of Quasirandom Sequences"), a little off the surface and a little tilted, as a
-reconstruction leaves them; the floor, of which a camera sees much, gets half its share. Their scales are set
-so that the summed area of their three-sigma disks covers the surface ``overlap`` times.
+reconstruction leaves them; floor or walls, of which a camera sees much, get half their share. Their scales
+are set so that the summed area of their three-sigma disks covers the surface ``overlap`` times.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from tron.cameras import Camera
 from tron.gaussians.harmonics import SH_COUNT, rgb_to_dc
 from tron.gaussians.scene import GaussianScene, measure_spacing, neighbour_distances, quats_from_matrices
 
-FLOOR = Floor(3.0)
-SURFACES: tuple[Surface, ...] = (
-    FLOOR,
+OBJECTS: tuple[Surface, ...] = (
     Sphere((0.0, 0.0, 0.8), 0.8),
     Sphere((1.5, 0.8, 0.5), 0.5),
     Sphere((-0.9, -1.3, 0.4), 0.4),
     Torus((-1.4, 0.6, 0.25), 0.6, 0.25),
     Box((0.9, -1.2, 0.45), 0.45),
 )
+FLOOR = Floor(3.0)
+SURFACES: tuple[Surface, ...] = (FLOOR, *OBJECTS)
 FLOOR_SHARE = 0.5
 _PLASTIC = 1.32471795724474602596
 """The real root of x^3 = x + 1: the plane's golden ratio, on which R2 rests."""
@@ -62,20 +63,55 @@ FROM_GBUFFERS = Recipe(degree=4, overlap=0.0, anisotropy=0.0, tilt=0.01, lift=0.
 """As :func:`tron.gaussians.initialize.surfels_from_gbuffers` makes them: sigma is 0.4 neighbour distances."""
 
 
+@dataclass(frozen=True)
+class Place:
+    """:data:`OBJECTS` on a floor or in a room, and a camera that sees them.
+
+    Attributes:
+        name: as metrics spell it; empty for the usual one.
+        floor: what they stand on, or in.
+        eye, target: world, the camera's centre and what it looks at. fov_deg: angle of view.
+    """
+
+    name: str
+    floor: Surface
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float]
+    fov_deg: float
+
+    @property
+    def surfaces(self) -> tuple[Surface, ...]:
+        """Floor first."""
+        return (self.floor, *OBJECTS)
+
+    def camera(self, size: int) -> Camera:
+        """The view of ``size`` x ``size`` pixels."""
+        return Camera.look_at(self.eye, self.target, fov_deg=self.fov_deg, width=size, height=size)
+
+
+OUTSIDE = Place("", FLOOR, (4.2, -3.6, 3.0), (0.0, 0.0, 0.35), 27)
+"""The usual view; a few pixels at the top miss the floor."""
+ROOM = Place("room", Box((0.0, 0.0, 3.0), 3.0, inwards=True), (-2.6, -2.2, 1.5), (0.1, -0.1, 0.7), 60)
+"""Within a cube on whose lower side they stand, at eye height near a corner."""
+GROUND = Place("ground", Floor(10.0), (-2.6, -2.2, 1.5), (0.1, -0.1, 0.7), 60)
+"""At eye height on a ground that goes on behind the camera; above the horizon there is nothing."""
+
+
 def camera(size: int) -> Camera:
-    """The benchmark's view of ``size`` x ``size`` pixels; a few at the top miss the floor."""
-    return Camera.look_at((4.2, -3.6, 3.0), (0.0, 0.0, 0.35), fov_deg=27, width=size, height=size)
+    """The usual view."""
+    return OUTSIDE.camera(size)
 
 
-def surfels(count: int, seed: int, recipe: Recipe = STUDY) -> GaussianScene:
-    """``count`` surfels over :data:`SURFACES`, in random order."""
-    rng = seeds.generator(seed, "tracing", "surfels", count, recipe.degree)
-    areas = np.array([s.area for s in SURFACES])
-    shares = areas * np.where([s is FLOOR for s in SURFACES], FLOOR_SHARE, 1.0)
+def surfels(count: int, seed: int, recipe: Recipe = STUDY, place: Place = OUTSIDE) -> GaussianScene:
+    """``count`` surfels over the surfaces of ``place``, in random order."""
+    rng = seeds.generator(seed, "tracing", "surfels", *place.name.split(), count, recipe.degree)
+    surfaces = place.surfaces
+    areas = np.array([s.area for s in surfaces])
+    shares = areas * np.where([s is place.floor for s in surfaces], FLOOR_SHARE, 1.0)
     ends = np.round(np.cumsum(shares) / shares.sum() * count).astype(int)
     numbers = np.diff(ends, prepend=0)
     points, normals = [], []
-    for surface, number in zip(SURFACES, numbers):
+    for surface, number in zip(surfaces, numbers):
         u, v = r2_sequence(number, rng.random(2))
         p, n = surface.at(u, v)
         points.append(p)
@@ -103,7 +139,7 @@ def surfels(count: int, seed: int, recipe: Recipe = STUDY) -> GaussianScene:
         base_color=colors[order],
         roughness=(0.5 + 0.4 * np.sin(3 * means[:, 0]))[order],
         metallic=(0.5 + 0.5 * np.sin(2 * means[:, 1]))[order],
-        object_id=np.repeat(np.arange(len(SURFACES)), numbers)[order],
+        object_id=np.repeat(np.arange(len(surfaces)), numbers)[order],
         kernel_degree=recipe.degree,
         spacing=measure_spacing(lifted),
     ).validate()

@@ -152,10 +152,14 @@ class Torus(Surface):
 
 @dataclass(frozen=True)
 class Box(Surface):
-    """A cube along the axes; u picks the face, and what is left of it a place along the face."""
+    """A cube along the axes; u picks the face, and what is left of it a place along the face.
+
+    ``inwards`` it is a room: its normals point to the middle.
+    """
 
     centre: tuple[float, float, float]
     half: float
+    inwards: bool = False
 
     @property
     def area(self) -> float:
@@ -171,7 +175,7 @@ class Box(Surface):
         points = normals.copy()
         points[row, (axis + 1) % 3] = 2 * (u * 6 - face) - 1
         points[row, (axis + 2) % 3] = 2 * v - 1
-        return np.array(self.centre) + self.half * points, normals
+        return np.array(self.centre) + self.half * points, -normals if self.inwards else normals
 
     def patches(self, fineness: int) -> list[tuple[np.ndarray, np.ndarray]]:  # noqa: ARG002 (flat)
         """One quad a face; the faces' upper ends stay a hair inside their strip of u."""

@@ -2,8 +2,9 @@
 
 A tile's 16 pixels fill one 16-lane packet, so every lane of a packet walks the same list. A surfel is a
 candidate for a tile where the exact screen-space bounds of its (cut) ellipse overlap the tile's pixel
-centres. Lists are sorted by ``near = |c - o| - r``, a lower bound of the distance to any point of the
-surfel, which lets traversal stop early without being wrong.
+centres; of one that crosses the camera's plane, the bounds of the part in front. Lists are sorted by
+``near = |c - o| - r``, a lower bound of the distance to any point of the surfel, which lets traversal stop
+early without being wrong.
 
 Surfels are ordered by ``near`` first and written out tile by tile, so one stable sort by tile orders both.
 All of it runs in Dr.Jit; only the number of entries comes back to Python, because arrays need a size.
@@ -20,14 +21,18 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.cameras import Camera
+from tron.errors import TronError
 from tron.tracing.kernel import GEOMETRY_PACKETS, SurfelRecords, half_axes
 
 TILE = 4
 LANES = TILE * TILE
 MARGIN = 1e-2
 """Pixels added around a surfel's bounds: candidates may be too many by rounding, never too few."""
-TOUCHING = 5e-3
-"""Nearest times farthest depth of an ellipse, as a share of its centre's squared; below it, no bounds."""
+TOUCHING = 1e-4
+"""Nearest depth of an ellipse as a share of its farthest; below it, the farther bound is none."""
+ROUNDING = 1e-6
+"""Some units in the last place of a float32, by which bounds are widened."""
+TINY = 1e-30
 
 
 @dataclass(frozen=True)
@@ -81,13 +86,22 @@ class _Axis:
 
 
 def build_tiles(records: SurfelRecords, camera: Camera) -> TileLists:
-    """Make the lists of one camera."""
+    """Make the lists of one camera.
+
+    Raises:
+        TronError: more entries than 32-bit indices can address.
+    """
     tiles_x, tiles_y = tile_counts(camera.width, camera.height)
     first_x, across, first_y, touched, near = _touched_tiles(records, camera)
     order = dr.argsort(near)
     touched = dr.gather(mi.UInt32, touched, order)
     offset = dr.prefix_sum(touched)  # exclusive
-    total = int(dr.sum(touched)[0])
+    total = int(dr.sum(mi.UInt64(touched))[0])
+    if total >= 1 << 32:
+        raise TronError(
+            f"{records.count:,} surfels touch {total:,} tiles of 4 x 4 pixels, too many to list",
+            mend="render the image in parts, or without surfels as large as the view",
+        )
     if total == 0:
         empty = dr.zeros(mi.UInt32, tiles_x * tiles_y)
         return TileLists(empty, empty, dr.zeros(mi.UInt32, 1), tiles_x, tiles_y)
@@ -149,25 +163,34 @@ def _opaque(*numbers: float) -> tuple[mi.Float, ...]:
 def _screen_bounds(
     c: mi.Vector3f, a: mi.Vector3f, b: mi.Vector3f, k: int, axis: _Axis
 ) -> tuple[mi.Float, mi.Float]:
-    """Pixel range of the ellipse ``c + a cos + b sin`` along image axis k; unbounded where z = 0 is crossed.
+    """Pixel range along image axis k of the part in front (z > 0) of the disk within ``c + a cos + b sin``.
 
-    The bounds of x/z are the roots m at which the plane x = m z is tangent to the ellipse,
-    ``(c_x - m c_z)^2 = (a_x - m a_z)^2 + (b_x - m b_z)^2``. They are sought as offsets from the centre's own
-    c_x / c_z: then both terms under the root are positive, and float32 is enough.
+    The half axes are turned first, until ``b_z = 0`` and ``a_z >= 0``: then ``c + a`` lies furthest ahead and
+    is seen at ``m = (c_x + a_x) / (c_z + a_z)``. The bounds of x/z are sought as offsets d from there. With
+    ``e = c_x - m c_z`` and ``h = c_z + a_z``, the plane ``x = (m + d) z`` is tangent to the ellipse where
+
+        (c_z - a_z) h d^2 - 2 e h d - b_x^2 = 0.
+
+    If all of the disk is in front, the roots have opposite signs and are the bounds. One that crosses the
+    camera's plane shows as one branch of a hyperbola: the root on the side of m away from e is a bound and
+    there is no other; or, where there are no roots, it surrounds the axis and has none.
     """
-    depth = c.z
-    m = c[k] / depth
-    a_off, b_off = a[k] - m * a.z, b[k] - m * b.z
-    in_front = depth * depth - a.z * a.z - b.z * b.z
-    # Where the ellipse all but touches the camera's plane the roots are ill-conditioned, and far out anyway.
-    clear = (in_front > TOUCHING * depth * depth) & (depth > 0)
-    cross = -(a_off * a.z + b_off * b.z)
-    root = dr.sqrt(dr.maximum(cross * cross + in_front * (a_off * a_off + b_off * b_off), 0))
-    low, high = m + (cross - root) / in_front, m + (cross + root) / in_front
-    return (
-        dr.select(clear, axis.focal * low + axis.principal, -dr.inf),
-        dr.select(clear, axis.focal * high + axis.principal, dr.inf),
-    )
+    longest = dr.sqrt(a.z * a.z + b.z * b.z)
+    tilted = longest > 0
+    cos, sin = dr.select(tilted, a.z / longest, 1), dr.select(tilted, b.z / longest, 0)
+    a_x, b_x = a[k] * cos + b[k] * sin, b[k] * cos - a[k] * sin
+    ahead, behind = c.z + longest, c.z - longest
+    m = (c[k] + a_x) / ahead
+    e = c[k] - m * c.z
+    squared = ahead * (ahead * e * e + behind * b_x * b_x)
+    reach = dr.abs(e) * ahead + dr.sqrt(dr.maximum(squared, 0))
+    rounding = ROUNDING * (dr.abs(c[k]) + dr.abs(a_x) + dr.abs(m) * (dr.abs(c.z) + longest)) / ahead
+    near = rounding + dr.select(squared >= 0, b_x * b_x / dr.maximum(reach, TINY), dr.inf)
+    # Where the ellipse all but touches the camera's plane this root is ill-conditioned, and far out anyway.
+    far = reach / (behind * ahead) * (1 + ROUNDING * ahead / behind)
+    far = rounding + dr.select(behind > TOUCHING * ahead, far, dr.inf)
+    low, high = m - dr.select(e > 0, near, far), m + dr.select(e > 0, far, near)
+    return axis.focal * low + axis.principal, axis.focal * high + axis.principal
 
 
 def _tile_range(low: mi.Float, high: mi.Float, axis: _Axis) -> tuple[mi.UInt32, mi.UInt32]:
