@@ -21,12 +21,13 @@ if TYPE_CHECKING:
     from eval.tracing.contenders import Contenders
     from eval.tracing.gradients import GradientStep
     from eval.tracing.irradiance import DirectTimes, Noise
+    from eval.tracing.scene import Place
     from eval.tracing.shadow_rays import ShadowRays
     from eval.tracing.timing import Times
 
 log = logging.getLogger("tron.eval")
 
-Part = Literal["camera", "growth", "shadow", "gradient", "irradiance", "noise", "error", "memory"]
+Part = Literal["camera", "inside", "growth", "shadow", "gradient", "irradiance", "noise", "error", "memory"]
 Case = tuple[PositiveInt, PositiveInt]
 
 
@@ -36,13 +37,15 @@ class Measured:
 
     Attributes:
         camera: case such as "50k_512" -> times of one frame; those of the growth charts included.
+        inside: frames of a camera within its scene, the room first.
         harmonics, from_gbuffers: the second recipe's and the degree-3 comparison's times, if measured.
         shapes: times of the peer's two plugins, and the one that was taken.
-        pictures: name -> (H, W, 3) display values.
+        pictures: name -> (H, W, 3) display values. inside_pictures: the same, by place.
         hits: mean candidates, front-facing and effective hits a camera ray.
     """
 
     camera: dict[str, CameraRays] = dataclasses.field(default_factory=dict)
+    inside: list[CameraRays] = dataclasses.field(default_factory=list)
     harmonics: CameraRays | None = None
     from_gbuffers: CameraRays | None = None
     shapes: dict[str, Times] = dataclasses.field(default_factory=dict)
@@ -55,10 +58,12 @@ class Measured:
     memory: dict[str, float] = dataclasses.field(default_factory=dict)
     hits: tuple[float, float, float] | None = None
     pictures: dict[str, Any] = dataclasses.field(default_factory=dict)
+    inside_pictures: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def seconds(self) -> dict[str, dict[str, list[float]]]:
         """Every time that was taken: case -> contestant -> seconds of its rounds."""
         cases = {f"camera {case}": frame.times for case, frame in self.camera.items()}
+        cases |= {f"camera {frame.case}": frame.times for frame in self.inside}
         for name, frame in (("degree 3", self.harmonics), ("from G-buffers", self.from_gbuffers)):
             if frame is not None:
                 cases[f"camera {frame.case}, {name}"] = frame.times
@@ -82,6 +87,8 @@ class Tracing(Benchmark):
     surfels: list[PositiveInt] = Field(description="sizes of the scene", min_length=1)
     pixels: list[PositiveInt] = Field(description="widths of the image, multiples of 4", min_length=1)
     sh_degree: int = Field(default=0, ge=0, le=3, description="harmonics' degree in the comparison")
+    room: Case = Field(description="(surfels, pixels) of the frame from within a room")
+    ground: Case = Field(description="(surfels, pixels) of the frame from a ground that one stands on")
     growth_surfels: list[PositiveInt] = Field(description="scenes of the growth chart, at the first size")
     growth_pixels: list[PositiveInt] = Field(description="images of the growth chart, second-size scene")
     shadow_rays: PositiveInt = Field(default=200_000, description="random shadow rays")
@@ -97,7 +104,8 @@ class Tracing(Benchmark):
 
     def check(self) -> None:
         """Refuse sizes that the tile order of the rays cannot take."""
-        odd = [size for size in (*self.pixels, *self.growth_pixels) if size % 4]
+        sizes = (*self.pixels, self.room[1], self.ground[1], *self.growth_pixels)
+        odd = [size for size in sizes if size % 4]
         if odd:
             raise TronError(f"images of {odd[0]} pixels", "benchmark.pixels", "give multiples of 4")
 
@@ -115,12 +123,12 @@ class Tracing(Benchmark):
         write_atomic(output_dir / "times.json", json.dumps(measured.seconds(), indent=1) + "\n")
         return page.outcome(self, measured, list(rows(measured, self)), output_dir)
 
-    def _contenders(self, count: int, **recipe: Any) -> Contenders:
+    def _contenders(self, count: int, place: Place | None = None, **recipe: Any) -> Contenders:
         from eval.tracing.contenders import Contenders
-        from eval.tracing.scene import STUDY, surfels
+        from eval.tracing.scene import OUTSIDE, STUDY, surfels
 
-        made = dataclasses.replace(STUDY, **{"sh_degree": self.sh_degree, **recipe})
-        return Contenders(surfels(count, self.seed, made), made.sh_degree)
+        made, place = dataclasses.replace(STUDY, **{"sh_degree": self.sh_degree, **recipe}), place or OUTSIDE
+        return Contenders(surfels(count, self.seed, made, place), made.sh_degree, place=place)
 
     def _measure_camera(self, measured: Measured) -> None:
         from eval.tracing import volprim
@@ -147,6 +155,20 @@ class Tracing(Benchmark):
         flat = self._contenders(count, **dataclasses.asdict(FROM_GBUFFERS))
         measured.from_gbuffers = self._frame(flat, size, {})
 
+    def _measure_inside(self, measured: Measured) -> None:
+        from eval.tracing import volprim
+        from eval.tracing.camera_rays import SHIPPED, VOLPRIM
+        from eval.tracing.scene import GROUND, ROOM
+
+        integrators = {VOLPRIM: volprim.load_integrator(volprim.OUR_STOP), SHIPPED: volprim.load_integrator()}
+        for place, (count, size) in ((ROOM, self.room), (GROUND, self.ground)):
+            contenders = self._contenders(count, place)
+            contenders.shape = measured.shape
+            usual = self._contenders(count) if place is ROOM else None
+            measured.inside.append(self._frame(contenders, size, integrators, usual))
+            picture = contenders.tracer.gbuffer(place.camera(size)).numpy()["rgb"]
+            measured.inside_pictures[place.name] = picture.clip(0, 1)
+
     @property
     def _middle(self) -> tuple[int, int]:
         """The case of the targets: the second scene at the last size."""
@@ -172,10 +194,17 @@ class Tracing(Benchmark):
         if case not in measured.camera:
             measured.camera[case] = self._frame(contenders, size, integrators)
 
-    def _frame(self, contenders: Contenders, size: int, integrators: dict[str, Any]) -> CameraRays:
+    def _frame(
+        self,
+        contenders: Contenders,
+        size: int,
+        integrators: dict[str, Any],
+        usual: Contenders | None = None,
+    ) -> CameraRays:
         from eval.tracing.camera_rays import TRON, measure_camera_rays
 
-        frame = measure_camera_rays(contenders, size, integrators, self.repetitions, self.slow_repetitions)
+        rounds = self.repetitions, self.slow_repetitions
+        frame = measure_camera_rays(contenders, size, integrators, *rounds, usual)
         told = ", ".join(f"{name} {1e3 * times.median:.1f} ms" for name, times in frame.times.items())
         log.info("camera rays %s: %.2f Mrays/s (%s)", frame.case, frame.mrays(TRON), told)
         return frame
@@ -254,6 +283,8 @@ def rows(measured: Measured, settings: Tracing) -> Iterator[Row]:
     from eval.tracing.irradiance import noise_rows
 
     for frame in measured.camera.values():
+        yield from frame.rows()
+    for frame in measured.inside:
         yield from frame.rows()
     if measured.harmonics is not None:
         yield from measured.harmonics.rows("_sh3")

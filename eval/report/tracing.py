@@ -10,7 +10,14 @@ from eval.benchmarks import Outcome
 from eval.report.figures import written
 from eval.report.page import Cell, Section, Table, Text
 from eval.report.tracing_light import irradiance_section, noise_section
-from eval.report.tracing_rays import camera_section, family, gradient_section, growth_section, shadow_section
+from eval.report.tracing_rays import (
+    camera_section,
+    family,
+    gradient_section,
+    growth_section,
+    inside_section,
+    shadow_section,
+)
 from eval.results import Row
 
 if TYPE_CHECKING:
@@ -23,8 +30,9 @@ LEAD = (
     "product of what each lets through. To fit the disks to photographs, the camera rays must be "
     "differentiated.",
     "This page measures TRON's tracer on one scene, a floor with spheres, a torus and a box covered by "
-    "surfels, beside what a user of Mitsuba would pick instead. Everyone runs in turns, in one process, on "
-    "the same machine; every figure is a median over the rounds (times.json beside this page has them all). "
+    "surfels, and on the same things with the camera among them, beside what a user of Mitsuba would pick "
+    "instead. Everyone runs in turns, in one process, on the same machine; every figure is a median over the "
+    "rounds (times.json beside this page has them all). "
     "TRON's preparations (lists of surfels for each tile of the image, the hierarchy for shadow rays) are "
     "counted in its times; the peers' hierarchies are not in theirs.",
 )
@@ -42,6 +50,7 @@ def outcome(settings: Tracing, measured: Measured, rows: Sequence[Row], output_d
     found = {row.metric: row for row in rows}
     sections = [
         *camera_section(settings, measured, output_dir),
+        *inside_section(measured, output_dir),
         *growth_section(settings, measured),
         *shadow_section(measured, found),
         *gradient_section(measured),

@@ -89,6 +89,38 @@ def camera_section(settings: Tracing, measured: Measured, output_dir: Path) -> l
     return [Section("camera", "Camera rays", blocks)]
 
 
+def inside_section(measured: Measured, output_dir: Path) -> list[Section]:
+    """Frames of cameras within their scenes."""
+    if not measured.inside:
+        return []
+    from eval.tracing.camera_rays import USUAL
+
+    intro = (
+        "Views so far look at the scene from outside. Here the camera stands in a room, and on a ground that "
+        "goes on behind it: surfels lie on all sides, and many cross the plane through the camera, where "
+        "projection has no bounds. The things are the same, and so are all rules of the comparison above."
+    )
+    blocks: list[Block] = [Text(intro), _camera_table(measured.inside)]
+    for frame in measured.inside:
+        if USUAL in frame.times:
+            ours, usual = frame.times["tron"], frame.times[USUAL]
+            low, high = ours.range_over(usual)
+            blocks.append(
+                Text(
+                    f"In turns with the {frame.place} TRON renders the usual view of {frame.count:,} "
+                    f"surfels: a ray from within takes {ours.over(usual):.2f} times as long as one from "
+                    f"outside (rounds from {low:.2f} to {high:.2f})."
+                )
+            )
+    pictures = [
+        Picture(picture, f"in a {place}", f"radiance from within a {place}")
+        for place, picture in measured.inside_pictures.items()
+    ]
+    group = Pictures("What the cameras see", pictures, "", columns=2)
+    write_strips([group], ["inside"], output_dir / "pictures")
+    return [Section("inside", "From within", [*blocks, group])]
+
+
 def _has(frame: CameraRays) -> bool:
     return "volprim" in frame.times
 
@@ -118,7 +150,7 @@ def _camera_table(frames: Sequence[CameraRays]) -> Table:
     for frame in frames:
         ours = frame.times["tron"]
         row = [
-            Cell(f"{frame.count:,} surfels, {frame.size}²"),
+            Cell(f"{f'{frame.place}, ' if frame.place else ''}{frame.count:,} surfels, {frame.size}²"),
             Cell(_ms(ours.median)),
             Cell(_ms(frame.times["binning"].median)),
             Cell(f"{frame.mrays('tron'):.2f}", "strong"),

@@ -1,7 +1,8 @@
 """Camera rays: one frame of TRON against Mitsuba's volprim, against one closest hit, and against gsplat.
 
-TRON's time counts everything a new camera costs: tile lists, tracing, sorting, compositing twelve channels,
-normalising, and the list of hits for the gradient. The peers' hierarchies are built before and not counted.
+TRON's time counts everything a new camera costs: tile lists, tracing, sorting, compositing twelve channels
+and normalising. The hits' ids, of which only gradients have need, are not kept: :mod:`eval.tracing.gradients`
+times that. The peers' hierarchies are built before and not counted.
 """
 
 from __future__ import annotations
@@ -25,20 +26,30 @@ from tron.tracing.tiles import TILE, build_tiles
 TRON, BINNING = "tron", "binning"
 VOLPRIM, SHIPPED = "volprim", "volprim_as_shipped"
 EMBREE, GSPLAT = "embree_closest_hit", "gsplat"
+USUAL = "tron_outside"
+"""TRON again, on the usual scene with as many surfels: what a camera inside is held against."""
 PEERS = (VOLPRIM, SHIPPED, EMBREE, GSPLAT)
 
 
 @dataclass(frozen=True)
 class CameraRays:
-    """Times of one frame of ``size`` x ``size`` pixels over ``count`` surfels, contestant -> times."""
+    """Times of one frame of ``size`` x ``size`` pixels over ``count`` surfels, contestant -> times.
+
+    ``place`` is the name of the place if it is not the usual one.
+    """
 
     count: int
     size: int
     times: Mapping[str, Times]
+    place: str = ""
 
     @property
     def case(self) -> str:
-        """How metrics spell the case, such as 50k_512."""
+        """How metrics spell the case, such as 50k_512 or room_50k_512."""
+        return "_".join([*self.place.split(), self._sizes])
+
+    @property
+    def _sizes(self) -> str:
         return f"{spelled(self.count)}_{self.size}"
 
     def mrays(self, name: str) -> float:
@@ -69,6 +80,9 @@ class CameraRays:
             binning = self.times[BINNING]
             metric = f"primary.binning_ms{suffix}.{self.case}"
             rows.append(Row(metric=metric, value=1e3 * binning.median, unit="ms", n=len(binning.seconds)))
+        if USUAL in self.times:
+            metric = f"primary.inside_over_outside{suffix}.{self._sizes}"
+            rows.append(Row(metric=metric, value=ours.over(self.times[USUAL]), unit="x", n=len(ours.seconds)))
         return rows
 
 
@@ -78,13 +92,15 @@ def measure_camera_rays(
     integrators: Mapping[str, Any],
     repetitions: int,
     slow_repetitions: int,
+    usual: Contenders | None = None,
 ) -> CameraRays:
     """Time all contestants on one view, in turns.
 
     Args:
         integrators: name (:data:`VOLPRIM`, :data:`SHIPPED`) -> the peer's integrator; one with another stop.
+        usual: the same number of surfels elsewhere, of which TRON renders a frame of as many pixels beside.
     """
-    view = camera(size)
+    view = contenders.place.camera(size)
     tracer, records, quads = contenders.tracer, contenders.records, contenders.quads
     origin, direction = tile_rays(view)
     contestants: dict[str, Any] = {
@@ -98,8 +114,11 @@ def measure_camera_rays(
             contestants[name] = lambda i=integrator: volprim.render(primitives, sensor, i)
     if gsplat_peer.available():
         contestants[GSPLAT] = gsplat_peer.renderer(contenders.scene, view)
+    if usual is not None:
+        other = usual.place.camera(size)
+        contestants[USUAL] = lambda: usual.tracer.gbuffer(other)
     times = interleaved(contestants, repetitions, slow_repetitions)
-    return CameraRays(len(contenders.scene), size, times)
+    return CameraRays(len(contenders.scene), size, times, contenders.place.name)
 
 
 def tile_rays(view: Camera) -> tuple[mi.Point3f, mi.Vector3f]:

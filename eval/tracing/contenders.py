@@ -8,6 +8,7 @@ from functools import cached_property
 import mitsuba as mi
 
 from eval.tracing import embree, volprim
+from eval.tracing.scene import OUTSIDE, Place
 from tron.gaussians.scene import GaussianScene
 from tron.tracing import SurfelTracer
 from tron.tracing.kernel import SurfelRecords
@@ -21,11 +22,13 @@ class Contenders:
         scene: the surfels.
         sh_degree: degree of the radiance's harmonics that the peer is given.
         shape: Mitsuba's plugin for the peer's primitives, one of ``volprim.SHAPES``.
+        place: where they are, and the camera that sees them.
     """
 
     scene: GaussianScene
     sh_degree: int = 0
     shape: str = "ellipsoids"
+    place: Place = OUTSIDE
 
     @property
     def label(self) -> str:

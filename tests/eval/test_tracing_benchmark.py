@@ -23,6 +23,8 @@ pytestmark = pytest.mark.usefixtures("variant")
 TOY = {
     "surfels": "[300,400]",
     "pixels": "[32]",
+    "room": "[300,32]",
+    "ground": "[400,32]",
     "growth_surfels": "[300,400]",
     "growth_pixels": "[32,64]",
     "shadow_rays": "500",
@@ -45,6 +47,11 @@ ROWS = [
     "primary.ratio_to_volprim_sh3.400_32",
     "primary.mrays_from_gbuffers.400_32",
     "primary.ratio_to_volprim.400_64",
+    "primary.ratio_to_volprim.room_300_32",
+    "primary.ratio_to_volprim_as_shipped.ground_400_32",
+    "primary.mrays.room_300_32",
+    "primary.binning_ms.ground_400_32",
+    "primary.inside_over_outside.300_32",
     "shadow.ratio_to_embree_restart.300",
     "shadow.ratio_to_embree_closest_hit.300",
     "bvh.build_ms.300",
@@ -87,7 +94,17 @@ def test_the_whole_benchmark_runs_and_every_promised_row_is_there(tmp_path: Path
     assert error < 1e-4
     assert len(json.loads((tmp_path / "times.json").read_text())["camera 300_32"]["tron"]) == 1
     page = (tmp_path / "report.html").read_text()
-    for anchor in ("camera", "growth", "shadow", "gradient", "irradiance", "noise", "exactness", "memory"):
+    for anchor in (
+        "camera",
+        "inside",
+        "growth",
+        "shadow",
+        "gradient",
+        "irradiance",
+        "noise",
+        "exactness",
+        "memory",
+    ):
         assert f'id="{anchor}"' in page
     assert (tmp_path / "pictures" / "camera.png").stat().st_size > 0
 
@@ -95,7 +112,14 @@ def test_the_whole_benchmark_runs_and_every_promised_row_is_there(tmp_path: Path
 def test_a_part_alone_gives_its_rows_alone(tmp_path: Path):
     settings = {"surfels": [300], "pixels": [32], "growth_surfels": [], "growth_pixels": []}
     benchmark = Tracing(
-        **settings, parts=["error"], gradient=[], irradiance=(300, 32), noise=(300, 32), error_rays=20
+        **settings,
+        parts=["error"],
+        room=(300, 32),
+        ground=(300, 32),
+        gradient=[],
+        irradiance=(300, 32),
+        noise=(300, 32),
+        error_rays=20,
     )
     outcome = benchmark.run(tmp_path)
     assert {row.metric.split(".")[0] for row in outcome.rows} == {"primary", "shadow"}
@@ -119,6 +143,19 @@ def test_surfels_lie_on_the_mesh_that_stands_for_them():
         assert ((cross * normals[faces[:, 0]]).sum(1) > 0).all(), "wound outwards"
         moved = points + 1e-3 * normals
         assert surface.distance(moved) == pytest.approx(np.full(len(points), 1e-3), abs=1e-5)
+
+
+@pytest.mark.parametrize("place", [scene.ROOM, scene.GROUND])
+def test_cameras_inside_stand_among_surfels_on_all_sides_that_face_them(place):
+    made, view = scene.surfels(3000, 0, place=place), place.camera(32)
+    off = np.min([surface.distance(made.means.astype(np.float64)) for surface in place.surfaces], axis=0)
+    assert np.median(off / made.scales().mean(1)) < scene.STUDY.lift
+    to_centre = made.means - view.position
+    around = made.object_id == 0
+    assert ((made.normals() * to_centre).sum(1) < 0)[around].mean() > 0.9
+    depth = to_centre @ view.world_to_camera[2, :3]
+    assert 0.2 < (depth[around] < 0).mean() < 0.8
+    assert (np.abs(depth) < made.scales().max(1)).sum() > 20, "some cross the plane through the camera"
 
 
 def test_surfels_are_even_by_area():

@@ -18,7 +18,9 @@ where alpha is clipped its derivative is zero.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, cast
 
 import drjit as dr
@@ -36,6 +38,7 @@ from tron.tracing.kernel import (
     intersect,
     log_response_slope,
 )
+from tron.tracing.relisting import lanes_of
 
 COPIED_BYTES = 1 << 30
 """Most memory for the copies into which threads add the gradients of one kind of record."""
@@ -58,7 +61,7 @@ class _Replay:
     records: SurfelRecords
     origin: mi.Point3f
     direction: mi.Vector3f
-    hits: list[HitList]
+    hits: list[Iterable[HitList]]
     sums: Composite
     wanted: tuple[str, ...]
     differentiate_basis: bool
@@ -71,7 +74,11 @@ def has_gradients(records: SurfelRecords, direction: mi.Vector3f) -> bool:
 
 
 def attach(
-    sums: Composite, records: SurfelRecords, origin: mi.Point3f, direction: mi.Vector3f, hits: list[HitList]
+    sums: Composite,
+    records: SurfelRecords,
+    origin: mi.Point3f,
+    direction: mi.Vector3f,
+    hits: list[Iterable[HitList]],
 ) -> Composite:
     """Give sums traced without gradients their derivatives by the records and by SH's view direction.
 
@@ -80,7 +87,7 @@ def attach(
 
     Args:
         sums: of each ray, evaluated. records: what they were traced from.
-        origin, direction: the rays. hits: what they met.
+        origin, direction: the rays. hits: what they met, each ray on one list, for each backward pass.
     """
     if not has_gradients(records, direction):
         return sums
@@ -121,13 +128,13 @@ class _Compositing(dr.CustomOp):
         by_basis = (
             [dr.zeros(mi.Float, dr.width(rest)) for _ in self.basis] if replay.differentiate_basis else []
         )
-        for hits in replay.hits:
+        for hits in chain.from_iterable(replay.hits):
             outer = [dr.gather(mi.Float, channel, hits.ray) for channel in channels]
             depth = dr.gather(mi.Float, mean_depth, hits.ray)
-            direction = dr.gather(mi.Vector3f, replay.direction, hits.ray)
+            origin, direction = (lanes_of(v, hits.ray) for v in (replay.origin, replay.direction))
             basis = sh_basis(direction.x, direction.y, direction.z)
             added = _replay(
-                records, hits, replay.origin, direction, basis, outer, depth,
+                records, hits, origin, direction, basis, outer, depth,
                 dr.gather(mi.Float, rest, hits.ray), out, heard, len(by_basis),
             )  # fmt: skip
             for target, value in zip(by_basis, added, strict=True):

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
@@ -15,8 +16,9 @@ import numpy as np
 from tron.cameras import Camera
 from tron.tracing.adjoint import attach, has_gradients
 from tron.tracing.compositing import MOST_HITS, Composite, HitList
-from tron.tracing.kbuffer import composite_rounds, search_list
+from tron.tracing.kbuffer import Search, composite_rounds, search_list
 from tron.tracing.kernel import SurfelRecords
+from tron.tracing.relisting import LISTED_IDS, RelistedHits
 from tron.tracing.streaming import stream
 from tron.tracing.surface import Surface, surface
 from tron.tracing.tiles import TileLists, lanes_of_pixels, tile_pixels
@@ -74,10 +76,11 @@ def tile_rays(camera: Camera) -> TileRays:
 
 def trace_tiles(
     records: SurfelRecords, lists: TileLists, rays: TileRays, keep_hits: bool
-) -> tuple[Composite, list[HitList]]:
-    """Sums of every ray in tile order, and the hits that they are made of, if they are to be kept.
+) -> tuple[Composite, list[Iterable[HitList]]]:
+    """Sums of every ray in tile order, and the hits that they are made of, if they are to be known.
 
-    Rays that streaming has no room for are traced once more, some hits at a time, without limit.
+    Rays that streaming has no room for are traced once more, some hits at a time, without limit. If their
+    hits are too many to be kept, iteration finds them again.
 
     Args:
         records: the surfels, detached.
@@ -95,25 +98,34 @@ def trace_tiles(
         replace(records, count=0), lists.entries, start, count, rays.origin, rays.direction,
         None if out is None else out.rows(),
     )  # fmt: skip
-    kept = []
+    known: list[Iterable[HitList]] = []
     if out is not None:
         out.count = kept_hits
-        kept.append(out)
+        known.append([out])
     again = dr.compress(crowded)
     if dr.width(again) == 0:
-        return sums, kept
+        return sums, known
     start, count = (dr.gather(mi.UInt32, values, again) for values in (start, count))
-    room = min(int(dr.max(count)[0]), MOST_HITS)
-    more = HitList.empty(again, room) if keep_hits else None
     direction = dr.gather(mi.Vector3f, rays.direction, again)
-    search = partial(search_list, records, lists.entries, start, count, rays.origin, direction)
-    traced = composite_rounds(records, search, direction, mi.Bool(True), more)
+
+    def search(lane: mi.UInt32) -> Search:
+        first, length = (dr.gather(mi.UInt32, values, lane) for values in (start, count))
+        along = dr.gather(mi.Vector3f, direction, lane)
+        return partial(search_list, records, lists.entries, first, length, rays.origin, along)
+
+    room = min(int(dr.max(count)[0]), MOST_HITS)
+    fits = keep_hits and room * dr.width(again) <= LISTED_IDS
+    more = HitList.empty(again, room) if fits else None
+    every = dr.arange(mi.UInt32, dr.width(again))
+    traced = composite_rounds(records, search(every), direction, mi.Bool(True), more)
+    dr.eval(traced, more)
     if more is not None:
         more.count = traced.count
-        kept.append(more)
-    dr.eval(traced, kept)
+        known.append([more])
+    elif keep_hits:
+        known.append(RelistedHits(records, search, direction, again, traced.count))
     _overwrite(sums, traced, again)
-    return sums, kept
+    return sums, known
 
 
 def _overwrite(sums: Composite, some: Composite, ray: mi.UInt32) -> None:

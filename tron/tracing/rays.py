@@ -7,9 +7,9 @@ import mitsuba as mi
 
 from tron.tracing.adjoint import attach, has_gradients
 from tron.tracing.bvh import Bvh
-from tron.tracing.compositing import HitList
-from tron.tracing.kbuffer import composite_rounds, search_hierarchy
+from tron.tracing.kbuffer import Search, composite_rounds, search_hierarchy
 from tron.tracing.kernel import SurfelRecords
+from tron.tracing.relisting import RelistedHits, lanes_of
 from tron.tracing.surface import Surface, surface
 
 
@@ -28,11 +28,12 @@ def trace_rays(
     search = search_hierarchy(bvh, at, along)
     sums = composite_rounds(still, search, along, active)
     if has_gradients(records, direction):
-        # The lists that the adjoint replays need room, and how much is known only now.
         dr.eval(sums)
         ray = dr.arange(mi.UInt32, dr.width(sums.count))
-        hits = HitList.empty(ray, max(1, int(dr.max(sums.count)[0])))
-        hits.count = composite_rounds(still, search, along, active, hits).count
-        dr.eval(hits.ids, hits.count)
+
+        def search_lanes(lane: mi.UInt32) -> Search:
+            return search_hierarchy(bvh, lanes_of(at, lane), lanes_of(along, lane))
+
+        hits = RelistedHits(still, search_lanes, along, ray, sums.count)
         sums = attach(sums, records, at, direction, [hits])
     return surface(sums, at, along)

@@ -13,7 +13,8 @@ from tron import seeds
 from tron.cameras import Camera
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
-from tron.tracing import SurfelTracer, adjoint, gbuffer, reference
+from tron.tracing import SurfelTracer, adjoint, gbuffer, reference, relisting
+from tron.tracing.compositing import HitList
 from tron.tracing.hits import MAX_HITS
 from tron.tracing.parameters import PARAMETERS, SurfelParameters
 from tron.tracing.streaming import stream
@@ -166,6 +167,34 @@ def test_gradients_of_crowds_are_those_of_rays_through_the_hierarchy(disks, came
     by_rounds = gradients(scene, lambda tracer: tracer.trace(*mitsuba_rays(*rays(camera))))
     for name, expected in by_rounds.items():
         np.testing.assert_allclose(by_tiles[name], expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("way", ["tiles", "hierarchy"])
+def test_gradients_of_crowds_need_no_more_memory_than_they_are_given(disks, camera, monkeypatch, way):
+    scene = disks([[0, 0, 0.001 * k] for k in range(120)], [False] * 120, opacity=0.02, sigma=0.4)
+
+    def trace(tracer):
+        return tracer.gbuffer(camera) if way == "tiles" else tracer.trace(*mitsuba_rays(*rays(camera)))
+
+    expected = gradients(scene, trace)
+    most, reserved = 20 * 120, []
+    for module in (gbuffer, relisting):
+        monkeypatch.setattr(module, "LISTED_IDS", most)
+
+    class Watched(HitList):
+        @staticmethod
+        def empty(ray, room):
+            reserved.append(room * dr.width(ray))
+            return HitList.empty(ray, room)
+
+    monkeypatch.setattr(relisting, "HitList", Watched)
+    found = gradients(scene, trace)
+    assert len(reserved) >= 4  # 63 pixels, at most 20 of which have room at a time
+    assert max(reserved) <= most
+    for name in PARAMETERS:
+        np.testing.assert_allclose(
+            found[name], expected[name], rtol=1e-3, atol=1e-4 * np.abs(found[name]).max()
+        )
 
 
 def test_gradients_are_the_same_where_threads_have_no_copies_to_add_to(camera, monkeypatch):
