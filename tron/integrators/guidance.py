@@ -11,8 +11,9 @@
     two_sided           boolean   whether back faces block shadow rays (default: true)
     cubemap_resolution  integer   of the prefiltered environment
 
-Buffers are those of :mod:`tron.shading.guidance`: linear, blended with the environment by opacity, which is
-alpha. Those that are not the main channels follow as ``irradiance.R`` and so on, then ``opacity.Y``.
+Buffers are those of :mod:`tron.shading.guidance`: linear, in front of the environment, which is not seen
+through opaque surfels; alpha is opacity. Those that are not the main channels follow as ``irradiance.R`` and
+so on, then ``opacity.Y``.
 
 Gradients reach the surfels through what camera rays see, as shading has it; what shadow rays find is a
 constant, and so is the light.

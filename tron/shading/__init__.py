@@ -5,6 +5,7 @@ it once, and :func:`render_guidance` turns a camera into the buffers the neural 
 Everything here is linear and scene-referred; exposure and AgX come at the very end, elsewhere.
 """
 
+from tron.shading.background import background_share
 from tron.shading.cubemap import CubemapLight
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
@@ -18,6 +19,7 @@ __all__ = [
     "Guidance",
     "Lighting",
     "SplitSum",
+    "background_share",
     "irradiance",
     "render_guidance",
 ]

@@ -1,17 +1,19 @@
 """G-buffer + environment -> guidance: the buffers that the neural renderer is conditioned on.
 
     pbr         base (1 - m) U + S             unshadowed split-sum
-    irradiance  U shadowed_n / unshadowed_n    a white diffuse surface, shadows included
+    irradiance  U share of the light           a white diffuse surface, shadows included
     shadowed    base (1 - m) irradiance + S    the strongest picture that needs no network
 
 U is the unshadowed irradiance / pi, S the split-sum specular, F0 = 0.04 (1 - m) + m base. The n-ray
-estimates of shadowed and unshadowed irradiance share their rays, so their ratio keeps the shadows and sheds
-the noise of the light, and U, which has none, puts the light back (Heitz et al. 2018). At 64 rays under a
-sun this takes the relative error from 0.13 to 0.04, and irradiance over unshadowed is exactly 1 where
-nothing is in the way; the price, a bias of the ratio, is 0.2 % there.
+estimates of shadowed and unshadowed irradiance share their rays, so the share that arrives keeps the shadows
+and sheds the noise of the light, and U, which has none, puts the light back (Heitz et al. 2018). From 16 rays
+it is their ratio, below a regression that is not biased in shadow (:mod:`tron.shading.few_rays`). At 64 rays
+under a sun this takes the relative error from 0.13 to 0.04; irradiance over unshadowed is exactly 1 where
+nothing is in the way.
 
-Every buffer shows the environment where surfels are absent: opacity x shaded + (1 - opacity) x radiance seen.
-All of it is linear; exposure and AgX are applied when a buffer is looked at or loaded.
+Every buffer shows the environment where surfels are absent: (1 - share) x shaded + share x radiance seen,
+with the share of :mod:`tron.shading.background`, exactly 0 behind opaque surfels. All of it is linear;
+exposure and AgX are applied when a buffer is looked at or loaded.
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
@@ -19,6 +21,7 @@ All of it is linear; exposure and AgX are applied when a buffer is looked at or 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -26,8 +29,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from tron.shading.background import over_background
 from tron.shading.denoise import atrous
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
+from tron.shading.few_rays import RATIO_FROM_RAYS, grey, regressed_share
 from tron.shading.irradiance import Occluder, irradiance, visible_share
 from tron.shading.split_sum import CUBEMAP_RESOLUTION, SplitSum
 
@@ -60,7 +65,7 @@ class Lighting:
 
 @dataclass
 class Guidance:
-    """Buffers of one frame, NumPy float32, linear, blended with the environment by opacity.
+    """Buffers of one frame, NumPy float32, linear, in front of the environment.
 
     Attributes:
         pbr: (H, W, 3) unshadowed split-sum radiance.
@@ -86,6 +91,7 @@ def render_guidance(
     spp: int = 64,
     seed: int = 0,
     denoise: bool = False,
+    background: Sequence[float] | None = None,
 ) -> Guidance:
     """Trace ``camera``'s view of the surfels and shade it under ``lighting``.
 
@@ -96,12 +102,13 @@ def render_guidance(
         spp: shadow rays a pixel, even; 64 for final frames, 2 for previews.
         seed: root of the shadow rays' random numbers.
         denoise: filter the visibility over the image; for previews.
+        background: linear RGB radiance that is seen behind the surfels; None: the environment.
 
     Raises:
         TronError: ``spp`` is odd or not positive.
     """
     gbuffer = tracer.gbuffer(camera)
-    return shade(gbuffer, visibility(tracer, gbuffer, lighting, spp, seed, denoise), lighting)
+    return shade(gbuffer, visibility(tracer, gbuffer, lighting, spp, seed, denoise), lighting, background)
 
 
 def visibility(
@@ -109,9 +116,32 @@ def visibility(
 ) -> mi.Color3f:
     """Share of the unshadowed irradiance that reaches each pixel; arguments as of :func:`render_guidance`."""
     shadowed, unshadowed = irradiance(tracer, gbuffer, lighting.light, spp, seed)
-    if denoise:
-        shadowed, unshadowed = atrous(shadowed, unshadowed, gbuffer, tracer.scene.spacing)
-    return visible_share(shadowed, unshadowed)
+    return reaching_share(shadowed, unshadowed, gbuffer, lighting, tracer.scene.spacing, spp, denoise)
+
+
+def reaching_share(
+    shadowed: mi.Color3f,
+    unshadowed: mi.Color3f,
+    gbuffer: GBuffer,
+    lighting: Lighting,
+    spacing: float,
+    spp: int,
+    denoise: bool = False,
+) -> mi.Color3f:
+    """The same from what ``spp`` rays a pixel found: :func:`tron.shading.irradiance`'s two estimates."""
+    if spp >= RATIO_FROM_RAYS and not denoise:
+        return visible_share(shadowed, unshadowed)
+    known = lighting.split_sum.diffuse(_normal(gbuffer))
+    share = regressed_share(shadowed, unshadowed, known, gbuffer, spacing)
+    if not denoise:
+        return share
+    filtered = atrous(shadowed, unshadowed, grey(share), gbuffer, spacing)
+    return visible_share(*filtered)
+
+
+def _normal(seen: Surface) -> mi.Vector3f:
+    # An empty pixel has no normal, and 0 / 0 must not reach a lookup.
+    return dr.select(seen.opacity > 0, mi.Vector3f(seen.normal), mi.Vector3f(0, 0, 1))
 
 
 @dataclass
@@ -124,20 +154,26 @@ class Shaded:
     shadowed: mi.Color3f
 
 
-def shade_surface(seen: Surface, visibility: mi.Color3f, lighting: Lighting) -> Shaded:
-    """Shade what rays see, given the share of the unshadowed irradiance that reaches each of them."""
-    surface = seen.opacity > 0
-    # An empty pixel has no normal, and 0 / 0 must not reach a lookup.
-    normal = dr.select(surface, mi.Vector3f(seen.normal), mi.Vector3f(0, 0, 1))
+def shade_surface(
+    seen: Surface, visibility: mi.Color3f, lighting: Lighting, background: Sequence[float] | None = None
+) -> Shaded:
+    """Shade what rays see, given the share of the unshadowed irradiance that reaches each of them.
+
+    ``background`` as of :func:`render_guidance`.
+    """
+    normal = _normal(seen)
     diffuse_color = seen.base_color * (1 - seen.metallic)
     f0 = DIELECTRIC_F0 * (1 - seen.metallic) + seen.metallic * seen.base_color
     unshadowed = lighting.split_sum.diffuse(normal)
     specular = lighting.split_sum.specular(normal, -seen.direction, seen.roughness, f0)
     shadowed = unshadowed * visibility
-    behind = lighting.light.radiance(seen.direction)
+    if background is None:
+        behind = lighting.light.radiance(seen.direction)
+    else:
+        behind = mi.Color3f(*(dr.opaque(mi.Float, float(channel)) for channel in background))
 
     def shown(shaded: mi.Color3f) -> mi.Color3f:
-        return dr.select(surface, dr.lerp(behind, shaded, seen.opacity), behind)
+        return over_background(shaded, behind, seen.opacity)
 
     buffers = Shaded(
         pbr=shown(diffuse_color * unshadowed + specular),
@@ -149,9 +185,11 @@ def shade_surface(seen: Surface, visibility: mi.Color3f, lighting: Lighting) -> 
     return buffers
 
 
-def shade(gbuffer: GBuffer, visibility: mi.Color3f, lighting: Lighting) -> Guidance:
+def shade(
+    gbuffer: GBuffer, visibility: mi.Color3f, lighting: Lighting, background: Sequence[float] | None = None
+) -> Guidance:
     """Guidance from a G-buffer and the share of the unshadowed irradiance that reaches each pixel."""
-    shaded = shade_surface(gbuffer, visibility, lighting)
+    shaded = shade_surface(gbuffer, visibility, lighting, background)
 
     def image(color: mi.Color3f) -> np.ndarray:
         return np.ascontiguousarray(np.array(color).T.reshape(gbuffer.height, gbuffer.width, 3))
