@@ -173,10 +173,10 @@ def _irradiance_block(
     geometry: Geometry, scene: mi.Scene, origins: np.ndarray, directions: np.ndarray, pairs: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     lanes = len(origins) * pairs
+    si, normal = _surface_points(geometry, scene, _upload(origins, directions))
+    dr.eval(si, normal)
     pixel = dr.arange(mi.UInt32, lanes) // pairs
-    ray = _upload(origins, directions)
-    ray = mi.Ray3f(dr.gather(mi.Point3f, ray.o, pixel), dr.gather(mi.Vector3f, ray.d, pixel))
-    si, normal = _surface_points(geometry, scene, ray)
+    si, normal = dr.gather(mi.SurfaceInteraction3f, si, pixel), dr.gather(mi.Normal3f, normal, pixel)
     valid = si.is_valid()
     u = [_stratified(lanes, pairs, seed + 2 * kind) for kind in range(2)]
     emitter = scene.environment()
