@@ -127,7 +127,10 @@ def _contrast(path: str, _sha256: str) -> Literal["high", "low"]:
 
 
 def for_split(maps: Sequence[HdriSpec], split: str) -> list[HdriSpec]:
-    """The maps that light a split: every HELD_OUT-th is the test split's own; a few maps are shared."""
+    """The maps that light a split: every HELD_OUT-th is the test split's own; a few maps are shared.
+
+    Validation has those of training: to hold out more would take them from it.
+    """
     if len(maps) < HELD_OUT:
         return list(maps)
     return [m for i, m in enumerate(maps) if (i % HELD_OUT == HELD_OUT - 1) == (split == "test")]

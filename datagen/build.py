@@ -19,6 +19,7 @@ from datagen.materials import MaterialSpec, evaluate
 from datagen.models import Part
 from datagen.scene import SceneSpec
 from datagen.shapes import make_mesh, split_creases
+from tron.aligned import aligned
 from tron.errors import TronError
 from tron.shading.environment import EnvironmentMap
 
@@ -184,7 +185,7 @@ def _texture(value: np.ndarray | float) -> Any:
 
 
 def _flat(values: np.ndarray) -> Any:
-    return np.ascontiguousarray(values, np.float32).ravel()
+    return aligned(np.ascontiguousarray(values, np.float32).ravel())
 
 
 def _mesh(
@@ -208,7 +209,7 @@ def _mesh(
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = _flat(vertices)
     parameters["vertex_normals"] = _flat(normals)
-    parameters["faces"] = np.ascontiguousarray(faces, np.uint32).ravel()
+    parameters["faces"] = aligned(np.ascontiguousarray(faces, np.uint32).ravel())
     if uv is not None:
         parameters["vertex_texcoords"] = _flat(uv)
     parameters.update()

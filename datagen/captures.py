@@ -20,11 +20,12 @@ import numpy as np
 import yaml
 
 from datagen.build import Geometry
+from datagen.capture_manifest import CaptureManifest
 from datagen.lights import bake
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.plan import Sources, Work, chosen, find_sources, require_same, write_if_changed
 from datagen.progress import Progress
-from datagen.run import draw_and_build, outcomes
+from datagen.run import FAILURES_NAME, draw_and_build, failure, outcomes, write_failures
 from datagen.scene import SceneSpec, scene_name
 from datagen.settings import CaptureSettings, Settings
 from tron.cameras import Camera
@@ -46,6 +47,9 @@ HELD_OUT = 8
 GROUP_PIXELS = 2**20
 """Pixels of the views that are rendered together: bounds memory."""
 
+CAPTURES = "captures"
+"""Folder of the captures within output_dir."""
+
 CONFIG_NAME = "config.yaml"
 ENVIRONMENT_NAME = "environment.exr"
 SPEC_NAME = "spec.json"
@@ -64,21 +68,33 @@ def make_captures(settings: Settings) -> int:
     items = chosen(items, settings.only)
     activate(settings.variant, threads=1)
     sources = find_sources(settings)
-    folder = settings.output_dir / "captures"
-    failures = 0
+    folder = settings.output_dir / CAPTURES
+    reasons: dict[str, str] = {}
     with locked(settings.output_dir):
         _adopt(settings, folder)
+        manifest = CaptureManifest.load(folder)
         missing = [item for item in items if not _finished(folder / item.name, wanted)]
         require_free_space(folder, len(missing) * _estimate_bytes(settings))
         with Progress(len(missing), len(missing) * wanted.views, "views") as progress:
             for item, outcome in outcomes(make_capture, missing, settings, sources):
                 if isinstance(outcome, str):
-                    failures += 1
+                    reasons[item.name] = outcome
                     progress.failed(item.name, outcome, wanted.views)
                 else:
+                    manifest.record(outcome)
                     progress.done(item.name, wanted.views)
-    log.info("%d of %d captures are in %s", len(items) - failures, len(items), folder)
-    return failures
+        for item in items:  # those that an older or an interrupted run has finished
+            if item.name not in manifest.captures and item.name not in reasons:
+                manifest.record(folder / item.name)
+        manifest.save(folder)
+        write_failures(
+            folder / FAILURES_NAME,
+            [failure(settings, i, reasons[i.name]) for i in items if i.name in reasons],
+        )
+    log.info("%d of %d captures are in %s", len(items) - len(reasons), len(items), folder)
+    if reasons:
+        log.error("%d failures, listed in %s", len(reasons), folder / FAILURES_NAME)
+    return len(reasons)
 
 
 def make_capture(item: Work, settings: Settings, sources: Sources) -> Path:
@@ -89,7 +105,7 @@ def make_capture(item: Work, settings: Settings, sources: Sources) -> Path:
     """
     activate(settings.variant, threads=1)
     wanted = settings.captures
-    folder = settings.output_dir / "captures" / item.name
+    folder = settings.output_dir / CAPTURES / item.name
     family = wanted.lights[item.index % len(wanted.lights)]
     spec, geometry = draw_and_build(item, settings, sources, [family])
     maps = None if settings.environments is None else str(settings.environments)

@@ -2,6 +2,9 @@
 
 Frames are anti-aliased (box filter). G-buffers and irradiance are taken along rays through the pixel centres:
 the mean of two surfaces is a point on neither.
+
+Kernels are compiled once and serve every view, light and scene of a recipe: seeds are opaque, and vectors
+cross between NumPy and Dr.Jit a coordinate at a time, for interleaved ones name their length in the kernel.
 """
 
 # pyright: reportArgumentType=false, reportCallIssue=false
@@ -18,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from datagen.build import Geometry
+from tron.aligned import aligned
 from tron.cameras import Camera, mitsuba_sensor
 from tron.gaussians.initialize import GBufferView
 
@@ -97,11 +101,11 @@ def gbuffers(geometry: Geometry, cameras: Sequence[Camera]) -> list[GBufferView]
 
 def _views(geometry: Geometry, scene: mi.Scene, cameras: Sequence[Camera]) -> list[GBufferView]:
     rays = [_pixel_rays(camera) for camera in cameras]
-    origins, directions = (np.concatenate(part) for part in zip(*rays))
-    si, normal = _surface_points(geometry, scene, origins, directions)
+    ray = _upload(*(np.concatenate(part) for part in zip(*rays)))
+    si, normal = _surface_points(geometry, scene, ray)
     valid = si.is_valid()
     base_color, roughness, metallic = mi.Color3f(0.0), mi.Float(0.0), mi.Float(0.0)
-    object_id = dr.zeros(mi.UInt32, len(origins))
+    object_id = dr.zeros(mi.UInt32, dr.width(valid))
     for surface in geometry.surfaces:
         here = valid & (si.shape == mi.ShapePtr(surface.shape))
         base_color = dr.select(here, surface.principled.eval_attribute_3("base_color", si, here), base_color)
@@ -111,9 +115,9 @@ def _views(geometry: Geometry, scene: mi.Scene, cameras: Sequence[Camera]) -> li
         object_id = dr.select(here, ids, object_id)
     dr.eval(si.p, normal, base_color, roughness, metallic, object_id, valid)
     columns = {
-        "position": np.array(si.p).T,
-        "normal": np.array(normal).T,
-        "base_color": np.clip(np.array(base_color).T, 0.0, 1.0),
+        "position": _download(si.p),
+        "normal": _download(normal),
+        "base_color": np.clip(_download(base_color), 0.0, 1.0),
         "roughness": np.clip(np.array(roughness), 0.0, 1.0),
         "metallic": np.clip(np.array(metallic), 0.0, 1.0),
         "valid": np.array(valid),
@@ -168,10 +172,13 @@ def direct_irradiance(
 def _irradiance_block(
     geometry: Geometry, scene: mi.Scene, origins: np.ndarray, directions: np.ndarray, pairs: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    repeated = np.repeat(np.arange(len(origins)), pairs)
-    si, normal = _surface_points(geometry, scene, origins[repeated], directions[repeated])
+    lanes = len(origins) * pairs
+    si, normal = _surface_points(geometry, scene, _upload(origins, directions))
+    dr.eval(si, normal)
+    pixel = dr.arange(mi.UInt32, lanes) // pairs
+    si, normal = dr.gather(mi.SurfaceInteraction3f, si, pixel), dr.gather(mi.Normal3f, normal, pixel)
     valid = si.is_valid()
-    u = [_stratified(len(repeated), pairs, seed + 2 * kind) for kind in range(2)]
+    u = [_stratified(lanes, pairs, seed + 2 * kind) for kind in range(2)]
     emitter = scene.environment()
 
     light, _ = scene.sample_emitter_direction(si, u[0], False, valid)
@@ -180,10 +187,10 @@ def _irradiance_block(
 
     shadowed, unshadowed = mi.Color3f(0.0), mi.Color3f(0.0)
     for direction in (light.d, cosine):
-        seen = dr.zeros(mi.SurfaceInteraction3f, len(repeated))
+        seen = dr.zeros(mi.SurfaceInteraction3f, lanes)
         seen.wi = -direction
         radiance = emitter.eval(seen, valid)
-        sample = dr.zeros(mi.DirectionSample3f, len(repeated))
+        sample = dr.zeros(mi.DirectionSample3f, lanes)
         sample.d = direction
         sample.emitter = mi.EmitterPtr(emitter)
         pdf_light = scene.pdf_emitter_direction(si, sample, valid)
@@ -194,9 +201,8 @@ def _irradiance_block(
         blocked = scene.ray_test(si.spawn_ray(direction), counts)
         unshadowed += value
         shadowed += dr.select(blocked, 0.0, value)
-    mean = [
-        np.array(dr.block_sum(mi.Color3f(x), pairs)).T / np.float32(pairs) for x in (shadowed, unshadowed)
-    ]
+    dr.eval(shadowed, unshadowed)  # all six channels at once: one by one each would trace every ray again
+    mean = [_download(dr.block_sum(x, pairs)) / np.float32(pairs) for x in (shadowed, unshadowed)]
     return mean[0], mean[1]
 
 
@@ -204,7 +210,7 @@ def _stratified(lanes: int, count: int, seed: int) -> mi.Point2f:
     """Jittered points in the unit square, ``count`` in a row sharing one grid: a pixel's samples cover it
     evenly.
     """
-    sampler = mi.PCG32(size=lanes, initstate=seed % 2**32)
+    sampler = mi.PCG32(size=lanes, initstate=dr.opaque(mi.UInt64, seed % 2**32))
     columns = max(d for d in range(1, math.isqrt(count) + 1) if count % d == 0)
     cell = dr.arange(mi.UInt32, lanes) % count
     x = (mi.Float(cell % columns) + sampler.next_float32()) / columns
@@ -219,11 +225,21 @@ def _pixel_rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(origins), directions
 
 
+def _upload(origins: np.ndarray, directions: np.ndarray) -> mi.Ray3f:
+    """Rays on the device, from (N, 3) float32 each."""
+    o, d = ([mi.Float(aligned(column)) for column in values.T] for values in (origins, directions))
+    return mi.Ray3f(mi.Point3f(*o), mi.Vector3f(*d))
+
+
+def _download(vector: mi.Vector3f | mi.Color3f) -> np.ndarray:
+    """(N, 3) float32 of an evaluated vector."""
+    return np.stack([np.array(coordinate) for coordinate in vector], axis=-1)
+
+
 def _surface_points(
-    geometry: Geometry, scene: mi.Scene, origins: np.ndarray, directions: np.ndarray
+    geometry: Geometry, scene: mi.Scene, ray: mi.Ray3f
 ) -> tuple[mi.SurfaceInteraction3f, mi.Normal3f]:
     """First hits and their unit shading normals on the side of the ray's origin."""
-    ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T))
     si = scene.ray_intersect(ray)
     normal = mi.Normal3f(si.sh_frame.n)
     for surface in geometry.surfaces:

@@ -95,12 +95,12 @@ class Record(BaseModel):
 def plan(settings: Settings) -> list[Work]:
     """Every scene of the dataset, in order of split and index."""
     items = []
-    for split in SPLITS:
+    for split in settings.used_splits():
         recipe = settings.split(split)
         shards = -(-len(recipe.lights) // settings.clips_per_shard)
         items += [Work(split, i, scene_name(split, i), i * shards) for i in range(recipe.scenes)]
     if not items:
-        raise TronError("the dataset would have no scenes", "train.scenes, train_b.scenes, test.scenes")
+        raise TronError("the dataset would have no scenes", "give a split scenes, e.g. train.scenes=16")
     return items
 
 
@@ -156,7 +156,7 @@ def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
     total = 0
     for item in items:
         recipe = settings.split(item.split)
-        pixel = 5 * 3 * 2 + 2 + 1 + (3 * 3 * 2 + 2 * 3 * 4 if recipe.reference_buffers else 0)
+        pixel = 5 * 3 * 2 + 2 + 1 + (4 * 3 * 2 + 2 * 4 * 4 if recipe.reference_buffers else 0)
         frame = recipe.width * recipe.height * pixel + 16_384
         total += len(recipe.lights) * recipe.frames * frame + settings.surfels * SURFEL_BYTES
     return total
@@ -186,12 +186,19 @@ def adopt(settings: Settings) -> None:
     if path.is_file():
         try:
             old = yaml.safe_load(path.read_text("utf-8"))
-            before, scenes = dict(old["recipe"]), old["scenes"]
+            before, scenes = dict(old["recipe"]), dict(old["scenes"])
         except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
             raise TronError(
                 "config.yaml of the dataset is damaged", path, "choose another output_dir"
             ) from error
-        require_same(before, settings.recipe(), settings.output_dir, "a dataset")
+        now = settings.recipe()
+        for split in SPLITS:
+            if not scenes.get(split):  # there is nothing of it yet, so it may be anything from now on
+                before.pop(split, None)
+                now.pop(split, None)
+        for split in set(before) & set(SPLITS) - set(now):
+            del before[split]  # fewer scenes than there are: that is told below
+        require_same(before, now, settings.output_dir, "a dataset")
         for split in SPLITS:
             if scenes.get(split, 0) > settings.split(split).scenes:
                 raise TronError(

@@ -46,7 +46,7 @@ from datagen.plan import (
 from datagen.preview import contact_row, index_html, sheet_name, write_sheet
 from datagen.progress import Progress
 from datagen.scene import SceneSpec, draw_scene
-from datagen.settings import LightChoice, Settings
+from datagen.settings import SPLITS, LightChoice, Settings
 from datagen.synthetic import first_bad_value, make_clips, make_surfels
 from tron.errors import TronError
 from tron.runtime import activate
@@ -224,21 +224,17 @@ def _account(settings: Settings, items: Sequence[Work], sources: Sources, reason
     for item in items:
         record = records[item.name]
         if record is not None:
-            failures += [_failure(settings, item, q.reason, q.key) for q in record.quarantined]
+            failures += [failure(settings, item, q.reason, q.key) for q in record.quarantined]
         elif item.name in reasons:
-            failures.append(_failure(settings, item, reasons[item.name]))
+            failures.append(failure(settings, item, reasons[item.name]))
         elif item.name in known:
             failures.append(known[item.name])
-    path = output / FAILURES_NAME
-    if failures:
-        write_if_changed(path, "".join(json.dumps(failure) + "\n" for failure in failures))
-    else:
-        path.unlink(missing_ok=True)
+    write_failures(output / FAILURES_NAME, failures)
 
     made = [record for record in records.values() if record is not None]
     shards = sorted((entry for record in made for entry in record.shards), key=lambda entry: entry.name)
     manifest = Manifest(config_sha256=config_sha256(settings), shards=shards, failures=len(failures))
-    lights = {split: Counter[str]() for split in ("train", "train_b", "test")}
+    lights = {split: Counter[str]() for split in SPLITS}
     for record in made:
         spec = SceneSpec.model_validate_json((scene_folder(output, record.name) / "spec.json").read_bytes())
         kept = {key for entry in record.shards for key in entry.keys}
@@ -252,7 +248,16 @@ def _account(settings: Settings, items: Sequence[Work], sources: Sources, reason
     return len(failures)
 
 
-def _failure(settings: Settings, item: Work, reason: str, clip: str | None = None) -> dict[str, Any]:
+def write_failures(path: Path, failures: Sequence[dict[str, Any]]) -> None:
+    """One line of JSON a failure; no file where there is none."""
+    if failures:
+        write_if_changed(path, "".join(json.dumps(each) + "\n" for each in failures))
+    else:
+        path.unlink(missing_ok=True)
+
+
+def failure(settings: Settings, item: Work, reason: str, clip: str | None = None) -> dict[str, Any]:
+    """What failures.jsonl says of a scene, clip or capture: with the command that tries it again."""
     return {
         "scene": item.name,
         "clip": clip,

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+    model_validator,
+)
 
 from datagen.lights import Family
 from datagen.materials import Style
 
 LightChoice = Literal["any", "sun", "studio", "overcast", "hdri"]
-Split = Literal["train", "train_b", "test"]
+Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {"output_dir", "mode", "only", "workers", "recycle_after", "cluster", "captures"}
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
@@ -33,7 +42,7 @@ CAPTURED = {
 }
 """Keys that decide what is in a capture."""
 
-SPLITS: tuple[Split, ...] = ("train", "train_b", "test")
+SPLITS: tuple[Split, ...] = ("train", "train_b", "validation", "test")
 
 
 class _Model(BaseModel):
@@ -61,7 +70,8 @@ class SplitSettings(_Model):
         ge=2, multiple_of=2, description="Shadow rays a pixel of the surfels' irradiance, even."
     )
     reference_buffers: bool = Field(
-        description="Also store Mitsuba's direct irradiance, base color and normals, and the surfels' own."
+        description="Also store Mitsuba's direct irradiance, with and without shadows, base color, normals "
+        "and depth, and the surfels' own."
     )
     reference_spp: int = Field(ge=2, description="Shadow rays a pixel of Mitsuba's direct irradiance.")
 
@@ -109,7 +119,12 @@ class Settings(_Model):
     )
     train: SplitSettings = Field(description="First training split.")
     train_b: SplitSettings = Field(description="Second training split, of another distribution.")
-    test: SplitSettings = Field(description="Held-out scenes under held-out lights.")
+    validation: SplitSettings = Field(
+        description="Scenes whose PSNR training shows; nothing is trained on them."
+    )
+    test: SplitSettings = Field(
+        description="Held-out scenes under held-out lights, for evaluation alone: training never reads them."
+    )
     captures: CaptureSettings = Field(description="Captures to reconstruct, of the test scenes.")
     path_frames: int = Field(
         93, ge=1, le=100_000, description="Frames of the whole path that clips are cut from."
@@ -168,17 +183,30 @@ class Settings(_Model):
         None, description="Dask cluster by _target_; null makes scenes one by one in this process."
     )
 
+    @field_validator(*SPLITS, mode="wrap")
+    @classmethod
+    def _judge_what_is_made(
+        cls, value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo
+    ) -> SplitSettings:
+        """A split without scenes may say what it likes; captures have the test split's style."""
+        captures = info.data.get("mode") == "captures"
+        made = info.field_name == "test" if captures else not _without_scenes(value)
+        return handler(value) if made else SplitSettings.model_construct(**dict(value))
+
     @model_validator(mode="after")
     def _consistent(self) -> Settings:
-        if self.mode == "captures" and self.environments is None and self._ask_hdri(self.captures.lights):
-            raise ValueError("captures.lights or families ask for hdri: give environments=FOLDER")
-        for name in SPLITS:
+        captures = self.mode == "captures"
+        lights = {"captures": self.captures.lights} if captures else {}
+        for name in ["test"] if captures else self.used_splits():
             split = self.split(name)
             if split.frames > self.path_frames:
                 raise ValueError(
                     f"{name}.frames is {split.frames}, longer than path_frames, {self.path_frames}"
                 )
-            if split.scenes and self.environments is None and self._ask_hdri(split.lights):
+            if not captures:
+                lights[name] = split.lights
+        for name, wanted in lights.items():
+            if self.environments is None and self._ask_hdri(wanted):
                 raise ValueError(f"{name}.lights or families ask for hdri: give environments=FOLDER")
         if self.objects is not None and not 1 <= self.objects[0] <= self.objects[1]:
             raise ValueError("objects must be [least, greatest] with 1 <= least <= greatest")
@@ -191,6 +219,10 @@ class Settings(_Model):
         """The settings of one split."""
         return getattr(self, name)
 
+    def used_splits(self) -> list[Split]:
+        """The splits that have scenes."""
+        return [name for name in SPLITS if self.split(name).scenes]
+
     def light_families(self) -> list[Family]:
         """The families that ``any`` chooses from."""
         if self.families is not None:
@@ -201,9 +233,16 @@ class Settings(_Model):
         """What decides a scene's content, as plain values: not where it goes, who makes it or how many."""
         values = self.model_dump(mode="json", exclude=OUTSIDE)
         for name in SPLITS:
-            del values[name]["scenes"]
+            if name in self.used_splits():
+                del values[name]["scenes"]
+            else:
+                del values[name]
         return values
 
     def capture_recipe(self) -> dict[str, Any]:
         """What decides a capture's content, as plain values."""
         return self.model_dump(mode="json", include=CAPTURED)
+
+
+def _without_scenes(split: Any) -> bool:
+    return isinstance(split, Mapping) and split.get("scenes") == 0

@@ -22,7 +22,7 @@ from tron.gaussians.scene import GaussianScene
 from tron.seeds import integer
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
-from tron.shards.schema import REFERENCE_MEMBERS, ClipMeta
+from tron.shards.schema import ClipMeta
 from tron.tracing import SurfelTracer
 
 Frame = dict[str, np.ndarray]
@@ -30,7 +30,7 @@ ColorSpace = Literal["linear", "display"]
 
 COLOR_SPACE: dict[str, ColorSpace] = dict.fromkeys(("pbr", "irr", "rgb", "unshadowed", "shadowed"), "linear")
 REFERENCE_COLOR_SPACE: dict[str, ColorSpace] = dict.fromkeys(
-    ("irr_ref", "base_color_ref", "base_color"), "linear"
+    ("irr_ref", "unshadowed_ref", "base_color_ref", "base_color"), "linear"
 )
 
 
@@ -159,7 +159,7 @@ def _reference(
     """
     seen = truth.valid[..., None]
     behind = environment.lookup(camera.rays())
-    members = {
+    return {
         "irr_ref": np.where(seen, direct.shadowed, behind),
         "unshadowed_ref": np.where(seen, direct.unshadowed, behind),
         "depth_ref": np.where(truth.valid, np.linalg.norm(truth.position - camera.position, axis=-1), 0.0),
@@ -169,4 +169,3 @@ def _reference(
         "normal": guidance.gbuffer["normal"],
         "depth": guidance.gbuffer["depth"],
     }
-    return {name: image for name, image in members.items() if name in REFERENCE_MEMBERS}

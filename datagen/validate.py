@@ -1,24 +1,43 @@
-"""Check a dataset folder: are its shards what its manifest says, and its scenes what its shards need?"""
+"""Check a dataset folder: are its shards what its manifest says, its scenes what its shards need, and its
+captures what was written?
+"""
 
 from __future__ import annotations
 
 import logging
 from pathlib import Path
 
-from tron.shards.manifest import Manifest, verify
+from datagen.capture_manifest import verify_captures
+from datagen.captures import CAPTURES
+from tron.shards.manifest import MANIFEST_NAME, Manifest, verify
 
 log = logging.getLogger(__name__)
 
 
 def validate(folder: Path) -> int:
-    """Log every problem of a dataset, one line each, and return their number.
+    """Log every problem of a dataset and of the captures beside it, one line each, and return their number.
 
     Beside what ``tron.shards.manifest.verify`` finds in the shards, every scene that has clips must still
-    have its specification and its surfels.
+    have its specification and its surfels. A folder may hold captures alone.
 
     Raises:
-        TronError: the folder is no dataset at all.
+        TronError: the folder holds neither a dataset nor captures.
     """
+    captures = folder / CAPTURES
+    problems = [f"{CAPTURES}/{problem}" for problem in verify_captures(captures)] if captures.is_dir() else []
+    if (folder / MANIFEST_NAME).exists() or not captures.is_dir():
+        problems = _dataset_problems(folder) + problems
+    else:
+        log.info("no dataset here, captures alone")
+    for problem in problems:
+        log.error("%s", problem)
+    if captures.is_dir():
+        log.info("%d captures", len(list(captures.glob("[!.]*/"))))
+    log.info("%d problems", len(problems))
+    return len(problems)
+
+
+def _dataset_problems(folder: Path) -> list[str]:
     problems = verify(folder)
     manifest = Manifest.load(folder)
     scenes = sorted({key.rsplit("-l", 1)[0] for entry in manifest.shards for key in entry.keys})
@@ -26,8 +45,6 @@ def validate(folder: Path) -> int:
         for name in ("spec.json", "surfels.ply"):
             if not (folder / "scenes" / scene / name).is_file():
                 problems.append(f"scenes/{scene}/{name}: missing")
-    for problem in problems:
-        log.error("%s", problem)
     clips = sum(entry.samples for entry in manifest.shards)
-    log.info("%d shards, %d clips, %d problems", len(manifest.shards), clips, len(problems))
-    return len(problems)
+    log.info("%d shards, %d clips", len(manifest.shards), clips)
+    return problems

@@ -7,19 +7,30 @@ light.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from eval.results import Row
 from eval.scores import PSNR_CAP
-from eval.shadows import ShadowCounts, both_have_surface, count_shadow_errors, same_surface
+from eval.shadows import MEMBERS as SHADOW_MEMBERS
+from eval.shadows import (
+    ShadowCounts,
+    both_have_surface,
+    count_shadow_errors,
+    direct_light,
+    same_depth,
+    same_normal,
+)
 from tron import metrics
 from tron.color import to_display
 from tron.shards.schema import Clip
 
-MEMBERS = ("irr_ref", "base_color_ref", "normal_ref", "base_color", "normal")
-"""Optional members of test clips that these measurements need."""
+log = logging.getLogger("tron.eval")
+
+JUDGED = {"": same_depth, "_same_normal": same_normal, "_with_silhouettes": both_have_surface}
+"""Tail of a row's name -> which pixels of a frame shadows are judged on."""
 
 
 @dataclass
@@ -27,11 +38,13 @@ class GuidanceScores:
     """Gathers the measurements of test clips; a clip without the reference members adds nothing."""
 
     irradiance_psnr: dict[str, list[float]] = field(default_factory=dict)
-    shadows: dict[str, list[ShadowCounts]] = field(default_factory=dict)
-    everywhere: dict[str, list[ShadowCounts]] = field(default_factory=dict)
+    shadows: dict[str, dict[str, list[ShadowCounts]]] = field(
+        default_factory=lambda: {tail: {} for tail in JUDGED}
+    )
     base_color_psnr: list[float] = field(default_factory=list)
     normal_error: list[float] = field(default_factory=list)
     _views: set[str] = field(default_factory=set)
+    _told: bool = False
 
     def add(self, clip: Clip) -> None:
         """Measure every frame of a clip, on the ground-truth foreground.
@@ -47,7 +60,7 @@ class GuidanceScores:
                 shown, truth = (to_display(frames[name][k], meta.exposure) for name in ("irr", "irr_ref"))
                 psnr = min(metrics.psnr(shown, truth, foreground), PSNR_CAP)
                 self.irradiance_psnr.setdefault(meta.light_family, []).append(psnr)
-                self._count_shadows({name: images[k] for name, images in frames.items()}, meta.light_family)
+                self._count_shadows(clip, k)
             view = f"{meta.scene} {sorted(meta.cameras[k].items())}"
             if view in self._views:
                 continue
@@ -62,17 +75,28 @@ class GuidanceScores:
                 if both.any():
                     self.normal_error.append(float(metrics.angular_error_deg(ours, truth, both)))
 
-    def _count_shadows(self, frame: dict[str, np.ndarray], family: str) -> None:
-        buffers = frame["irr"], frame["unshadowed"], frame["irr_ref"]
-        self.everywhere.setdefault(family, []).append(count_shadow_errors(*buffers, both_have_surface(frame)))
-        self.shadows.setdefault(family, []).append(count_shadow_errors(*buffers, same_surface(frame)))
+    def _count_shadows(self, clip: Clip, k: int) -> None:
+        missing = [name for name in SHADOW_MEMBERS if name not in clip.frames]
+        if missing:
+            if not self._told:
+                log.warning(
+                    "no shadow figures: clips of this dataset lack %s; make it again with this tron-datagen",
+                    ", ".join(missing),
+                )
+            self._told = True
+            return
+        frame = {name: images[k] for name, images in clip.frames.items()}
+        for tail, judged in JUDGED.items():
+            counts = count_shadow_errors(frame["irr"], direct_light(frame), judged(frame))
+            self.shadows[tail].setdefault(clip.meta.light_family, []).append(counts)
 
     def rows(self) -> list[Row]:
         """``guidance.*`` (all lights, and ``.FAMILY``) and ``surfels.*``; what was not measured has no row.
 
         ``guidance.irradiance_psnr`` is the lowest of the light families' means over frames; the two
-        fractions are taken over the pixels of all frames together, for a frame may hold hardly any shadow;
-        ``_with_silhouettes`` also judges pixels where surfels and truth show different surfaces.
+        fractions are taken over the pixels of all frames together, for a frame may hold hardly any shadow.
+        They are judged where surfels and truth show the same surface by its distance; ``_same_normal`` goes
+        by its normal, and ``_with_silhouettes`` also judges pixels where they show different surfaces.
         """
         rows: list[Row] = []
         if self.irradiance_psnr:
@@ -85,10 +109,10 @@ class GuidanceScores:
                 rows.append(
                     Row(metric=f"guidance.irradiance_psnr{name}", value=means[family], unit="dB", n=n)
                 )
-            for name, by_family in (("", self.shadows), ("_with_silhouettes", self.everywhere)):
-                rows += _fractions(name, [counts for family in by_family.values() for counts in family])
+            for tail, by_family in self.shadows.items():
+                rows += _fractions(tail, [counts for family in by_family.values() for counts in family])
                 for family in means:
-                    rows += _fractions(f"{name}.{family}", by_family[family])
+                    rows += _fractions(f"{tail}.{family}", by_family.get(family, []))
         for metric, values, unit in (
             ("surfels.base_color_psnr", self.base_color_psnr, "dB"),
             ("surfels.normal_mae_deg", self.normal_error, "deg"),

@@ -1,14 +1,17 @@
 """Where the surfels' shadows are wrong: light that leaks into shadow, and lit surfaces that are darkened.
 
-The definitions are those of the study in the design notes (guidance): pixels are judged where surfels and
-truth show the same surface. A surfel that overhangs a silhouette by a pixel shows another surface, with that
-one's light; the error is counted where it belongs, in base color and the irradiance PSNR, which judge every
-pixel of the foreground. The study compared depths; clips hold no depth, so normals are compared.
+The definitions are those of the study in the design notes (guidance). What is in shadow and what is lit is
+the path tracer's to say: its irradiance with shadows over its own without, so that an error of the surfels'
+normals moves no pixel from one class to another. Pixels are judged where surfels and truth show the same
+surface. A surfel that overhangs a silhouette by a pixel shows another surface, with that one's light; the
+error is counted where it belongs, in base color and the irradiance PSNR, which judge every pixel of the
+foreground. Same surface is said by distance, as in the study, or by normals, and both are reported.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,8 +26,14 @@ LEAK_OVER_MEAN = 0.15
 """
 DARKENED_BELOW = 0.75
 """A lit pixel is darkened if it keeps less than this share of the reference."""
-SAME_SURFACE_DEG = 20.0
-"""Surfels and truth show the same surface where their normals differ by less than this."""
+SAME_DEPTH = 0.03
+"""Surfels and truth show the same surface where their distances differ by less than this, world units: a
+hundredth of a scene's width, the study's value."""
+SAME_NORMAL_DEG = 20.0
+"""The same by normals: where they differ by less than this."""
+
+MEMBERS = ("irr", "irr_ref", "unshadowed_ref", "depth", "depth_ref", "normal", "normal_ref")
+"""Members of a clip that the judgement needs, beside ``foreground`` and ``mask``."""
 
 
 @dataclass(frozen=True)
@@ -37,43 +46,53 @@ class ShadowCounts:
     darkened: int
 
 
-def shadow_classes(
-    unshadowed: np.ndarray, reference: np.ndarray, judged: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+class DirectLight(NamedTuple):
+    """The path tracer's direct irradiance / pi, linear, (H, W, 3) each: with shadows, and with nothing in the
+    way.
+    """
+
+    shadowed: np.ndarray
+    unshadowed: np.ndarray
+
+
+def shadow_classes(reference: DirectLight, judged: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which pixels the reference has in shadow, and which it has lit: two (H, W) bool; see
     :func:`shadow_errors`.
     """
-    truth, open_sky = luminance(reference), luminance(unshadowed)
-    share = np.divide(truth, open_sky, out=np.ones_like(truth), where=open_sky > 0)
+    arriving, open_sky = luminance(reference.shadowed), luminance(reference.unshadowed)
+    share = np.divide(arriving, open_sky, out=np.ones_like(arriving), where=open_sky > 0)
     return judged & (share < SHADOWED_BELOW), judged & (share > LIT_ABOVE)
 
 
 def shadow_errors(
-    irradiance: np.ndarray, unshadowed: np.ndarray, reference: np.ndarray, judged: np.ndarray
+    irradiance: np.ndarray, reference: DirectLight, judged: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which pixels leak and which are darkened, by luminance, as the constants of this file define.
 
     Args:
-        irradiance, unshadowed: (H, W, 3) linear E / pi of the surfels, with and without shadows.
-        reference: (H, W, 3) linear E / pi of the path tracer's direct light.
+        irradiance: (H, W, 3) linear E / pi of the surfels, with shadows.
+        reference: the truth.
         judged: (H, W) bool, the pixels where both see a surface; the mean reference is taken over them.
 
     Returns:
         leaking, darkened: (H, W) bool.
     """
-    shadowed, lit = shadow_classes(unshadowed, reference, judged)
-    ours, truth = luminance(irradiance), luminance(reference)
+    shadowed, lit = shadow_classes(reference, judged)
+    ours, truth = luminance(irradiance), luminance(reference.shadowed)
     mean = truth[judged].mean() if judged.any() else 0.0
     return shadowed & (ours > truth + LEAK_OVER_MEAN * mean), lit & (ours < DARKENED_BELOW * truth)
 
 
-def count_shadow_errors(
-    irradiance: np.ndarray, unshadowed: np.ndarray, reference: np.ndarray, judged: np.ndarray
-) -> ShadowCounts:
+def count_shadow_errors(irradiance: np.ndarray, reference: DirectLight, judged: np.ndarray) -> ShadowCounts:
     """Count the pixels of :func:`shadow_classes` and :func:`shadow_errors`; arguments as there."""
-    shadowed, lit = shadow_classes(unshadowed, reference, judged)
-    leaking, darkened = shadow_errors(irradiance, unshadowed, reference, judged)
+    shadowed, lit = shadow_classes(reference, judged)
+    leaking, darkened = shadow_errors(irradiance, reference, judged)
     return ShadowCounts(*(int(pixels.sum()) for pixels in (shadowed, leaking, lit, darkened)))
+
+
+def direct_light(frames: dict[str, np.ndarray]) -> DirectLight:
+    """The path tracer's, from ``irr_ref`` and ``unshadowed_ref``."""
+    return DirectLight(frames["irr_ref"], frames["unshadowed_ref"])
 
 
 def both_have_surface(frames: dict[str, np.ndarray]) -> np.ndarray:
@@ -81,9 +100,15 @@ def both_have_surface(frames: dict[str, np.ndarray]) -> np.ndarray:
     return (frames["foreground"][..., 0] > 0.5) & (frames["mask"][..., 0] > 0.5)
 
 
-def same_surface(frames: dict[str, np.ndarray]) -> np.ndarray:
+def same_depth(frames: dict[str, np.ndarray]) -> np.ndarray:
+    """Of those the ones where it is the same surface by its distance, from ``depth`` and ``depth_ref``."""
+    apart = np.abs(frames["depth"] - frames["depth_ref"])[..., 0]
+    return both_have_surface(frames) & (apart < SAME_DEPTH)
+
+
+def same_normal(frames: dict[str, np.ndarray]) -> np.ndarray:
     """Of those the ones where it is the same surface by its normal, from ``normal`` and ``normal_ref``."""
     ours, truth = frames["normal"], frames["normal_ref"]
     cosine = (ours * truth).sum(-1)
     lengths = np.linalg.norm(ours, axis=-1) * np.linalg.norm(truth, axis=-1)
-    return both_have_surface(frames) & (cosine > lengths * np.cos(np.radians(SAME_SURFACE_DEG)))
+    return both_have_surface(frames) & (cosine > lengths * np.cos(np.radians(SAME_NORMAL_DEG)))

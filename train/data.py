@@ -178,6 +178,12 @@ class TrainingData(lightning.LightningDataModule):
         self.stage: Stage | None = None
         self.first_step = 0
         self._held_out: list[Clip] | None = None
+        self.validation_split = validation.split
+        if validation.split == ValidationSettings.DEFAULT and validation.split not in self.manifest.splits():
+            log.info("No validation: this dataset has no split '%s'", validation.split)
+            self.validation_split = None
+        elif validation.split is not None:
+            self.manifest.of_split(validation.split)  # a wrong name is told now, not after hours
 
     def open(self, stages: Sequence[Stage]) -> None:
         """Check that every stage finds its splits, frames and sizes; decode the splits that fit in memory."""
@@ -242,10 +248,10 @@ class TrainingData(lightning.LightningDataModule):
 
     def val_dataloader(self) -> DataLoader | list[Any]:
         """Held-out clips as `windows_of` the stage's K frames, one clip a batch."""
-        if self.stage is None or self.validation.split is None:
+        if self.stage is None or self.validation_split is None:
             return []
         if self._held_out is None:
-            split, count = self.validation.split, self.validation.clips
+            split, count = self.validation_split, self.validation.clips
             members = (*BUFFERS, "foreground")
             self._held_out = list(spread_clips(self.folder, self.manifest, split, count, members))
         windows = [windows_of(clip, self.stage.frames) for clip in self._held_out]

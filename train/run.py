@@ -130,7 +130,7 @@ def _run_stage(
         val_check_interval=min(settings.validation.every, stage.steps),
         check_val_every_n_epoch=None,
         num_sanity_val_steps=0,
-        limit_val_batches=0 if settings.validation.split is None else 1.0,
+        limit_val_batches=0 if data.validation_split is None else 1.0,
         callbacks=callbacks,
         plugins=[AtomicCheckpoints()],
         logger=False,

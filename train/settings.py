@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from train.curriculum import Stage
+
+HELD_OUT = "test"
+"""The split that evaluation judges by."""
 
 
 class OptimizerSettings(BaseModel):
@@ -80,9 +83,14 @@ class DataSettings(BaseModel):
 class ValidationSettings(BaseModel):
     """Clips whose PSNR is shown while training; nothing is selected or stopped by it."""
 
+    DEFAULT: ClassVar[str] = "validation"
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    split: str | None = Field(default="test", description="Split to validate on; null validates nothing.")
+    split: str | None = Field(
+        default=DEFAULT,
+        description="Split to validate on; nothing is where it is null, or `validation` and not there.",
+    )
     clips: int = Field(default=8, ge=1, description="How many of its clips, spread evenly over it.")
     every: int = Field(default=250, ge=1, description="Steps between validations.")
 
@@ -132,3 +140,15 @@ class Settings(BaseModel):
         if not any(stage.steps for stage in stages):
             raise ValueError("no stage has any steps")
         return stages
+
+    @model_validator(mode="after")
+    def _test_is_held_out(self) -> Settings:
+        read = {"validation.split": {self.validation.split}}
+        read |= {f"stage {stage.name}": set(stage.splits()) for stage in self.stages}
+        for name, splits in read.items():
+            if HELD_OUT in splits:
+                raise ValueError(
+                    f"{name} asks for the split '{HELD_OUT}', which is kept for evaluation: training never "
+                    "reads it"
+                )
+        return self

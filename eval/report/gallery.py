@@ -10,7 +10,8 @@ import numpy as np
 
 from eval.report.page import Picture, Pictures
 from eval.scores import PSNR_CAP
-from eval.shadows import same_surface, shadow_errors
+from eval.shadows import MEMBERS as SHADOW_MEMBERS
+from eval.shadows import direct_light, same_depth, shadow_errors
 from tron import metrics
 from tron.color import linear_to_srgb, luminance, to_display
 from tron.images import write_image
@@ -86,8 +87,9 @@ def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
         "irradiance, surfels": ours,
         "irradiance, path-traced": truth,
         f"difference ×{ERROR_GAIN}": np.clip(np.abs(ours - truth) * ERROR_GAIN, 0, 1),
-        "shadow errors": _shadow_error_picture(frames, truth),
     }
+    if set(SHADOW_MEMBERS) <= frames.keys():
+        pictures["shadow errors"] = _shadow_error_picture(frames, truth)
     for name, title in (("base_color", "base color"), ("normal", "normals")):
         for member, whose in ((name, "surfels"), (f"{name}_ref", "true")):
             image = frames[member]
@@ -101,9 +103,7 @@ def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
 
 def _shadow_error_picture(frames: dict[str, np.ndarray], truth: np.ndarray) -> np.ndarray:
     """The true irradiance in faint grey, leaking pixels orange, darkened pixels blue."""
-    leaking, darkened = shadow_errors(
-        frames["irr"], frames["unshadowed"], frames["irr_ref"], same_surface(frames)
-    )
+    leaking, darkened = shadow_errors(frames["irr"], direct_light(frames), same_depth(frames))
     picture = np.repeat(luminance(truth)[..., None] * 0.6, 3, axis=-1)
     picture[leaking] = (1.0, 0.5, 0.05)
     picture[darkened] = (0.2, 0.6, 1.0)

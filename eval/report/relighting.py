@@ -15,7 +15,14 @@ from eval.report.gallery import Shown, comparison, guidance, write_strips
 from eval.report.page import Block, Cell, Chart, Section, Table, Text
 from eval.results import Row
 from eval.scores import GROUPS, REGIONS, Scores
-from eval.shadows import DARKENED_BELOW, LEAK_OVER_MEAN, LIT_ABOVE, SAME_SURFACE_DEG, SHADOWED_BELOW
+from eval.shadows import (
+    DARKENED_BELOW,
+    LEAK_OVER_MEAN,
+    LIT_ABOVE,
+    SAME_DEPTH,
+    SAME_NORMAL_DEG,
+    SHADOWED_BELOW,
+)
 from tron.shards.schema import ClipMeta
 
 WHAT = {
@@ -187,12 +194,13 @@ def _guidance_section(scores: GuidanceScores, shown: Sequence[Shown], output_dir
     intro = Text(
         "What the network is given decides what it can do. Irradiance of the surfels is compared with the "
         "path tracer's direct irradiance of the true scene, displayed through the same tone curve, on the "
-        f"foreground. A pixel is in shadow where under {SHADOWED_BELOW:.0%} of the unshadowed light arrives "
-        f"in the reference, and leaks if it is brighter than the reference by more than {LEAK_OVER_MEAN:.0%}"
-        f" of the frame's mean; it is lit where over {LIT_ABOVE:.0%} arrives, and darkened if it keeps less "
-        f"than {DARKENED_BELOW:.0%} of it. Both are judged where surfels and truth show the same surface "
-        f"(normals within {SAME_SURFACE_DEG:.0f}°): at silhouettes surfels overhang by a pixel and show "
-        "another one. Pictures called shadow errors show leaking pixels in orange, darkened ones in blue."
+        f"foreground. A pixel is in shadow where under {SHADOWED_BELOW:.0%} of the path tracer's own "
+        "unshadowed light arrives in the reference, and leaks if it is brighter than the reference by more "
+        f"than {LEAK_OVER_MEAN:.0%} of the frame's mean; it is lit where over {LIT_ABOVE:.0%} arrives, and "
+        f"darkened if it keeps less than {DARKENED_BELOW:.0%} of it. Both are judged where surfels and truth "
+        f"show the same surface (distances within {SAME_DEPTH:g} units, or normals within "
+        f"{SAME_NORMAL_DEG:.0f}°): at silhouettes surfels overhang by a pixel and show another one. Pictures "
+        "called shadow errors show leaking pixels in orange, darkened ones in blue."
     )
     blocks: list[Block] = [intro]
     families = sorted(scores.irradiance_psnr)
@@ -200,8 +208,10 @@ def _guidance_section(scores: GuidanceScores, shown: Sequence[Shown], output_dir
         metrics = {
             "irradiance PSNR": "guidance.irradiance_psnr",
             "shadow pixels leaking": "guidance.shadow_leak",
+            "shadow pixels leaking, same surface by normals": "guidance.shadow_leak_same_normal",
             "shadow pixels leaking, silhouettes included": "guidance.shadow_leak_with_silhouettes",
             "lit pixels darkened": "guidance.lit_darkened",
+            "lit pixels darkened, same surface by normals": "guidance.lit_darkened_same_normal",
             "lit pixels darkened, silhouettes included": "guidance.lit_darkened_with_silhouettes",
         }
         table_rows = [

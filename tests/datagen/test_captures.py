@@ -1,6 +1,8 @@
 """Captures of scenes: what they show is what the path tracer and the true buffers say, twice the same."""
 
 import json
+import shlex
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.plan import Work
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
+from datagen.validate import validate
 from tron.apps.recipes import check, compose_recipe
 from tron.captures import Capture
 from tron.captures.folder import read_capture_folder
@@ -184,9 +187,65 @@ def test_nothing_that_is_not_finite_is_stored(tmp_path, monkeypatch):
 
     monkeypatch.setattr(datagen.captures, "render_frames", spoilt)
     assert make_captures(tiny(tmp_path, "captures.scenes=1", "captures.path_spp=1")) == 1
-    assert [path.name for path in (tmp_path / "captures").iterdir()] == ["config.yaml"]
+    listed = tmp_path / "captures" / "failures.jsonl"
+    assert {path.name for path in (tmp_path / "captures").iterdir()} == {
+        "config.yaml", "manifest.json", "failures.jsonl",
+    }  # fmt: skip
+    told = json.loads(listed.read_text())
+    assert told["scene"] == "test-000000"
+    assert "values that are not finite" in told["reason"]
     monkeypatch.undo()
-    assert make_captures(tiny(tmp_path, "captures.scenes=1", "captures.path_spp=1")) == 0
+    words = shlex.split(told["command"])
+    assert make_captures(check(compose_recipe("conf.datagen", words[1:]), Settings)) == 0
+    assert not listed.exists()
+
+
+def _damaged(folder: Path, how: str) -> str:
+    """Damage a folder of captures in one way; return what must be said of it."""
+    picture, normal = (
+        folder / "test-000000/images/view_00002.png",
+        folder / "test-000001/normal/view_00001.exr",
+    )
+    if how == "flipped":
+        data = bytearray(normal.read_bytes())
+        data[-9] ^= 1
+        normal.write_bytes(bytes(data))
+        return "test-000001/normal/view_00001.exr: sha256 differs"
+    if how == "cut":
+        picture.write_bytes(picture.read_bytes()[:-30])
+        return "test-000000/images/view_00002.png: "
+    if how == "missing":
+        normal.unlink()
+        return "test-000001/normal/view_00001.exr: missing"
+    if how == "stray":
+        (folder / "test-000000" / "notes.txt").write_text("mine")
+        return "test-000000/notes.txt: not in the manifest"
+    if how == "gone":
+        shutil.rmtree(folder / "test-000001")
+        return "test-000001: missing"
+    (folder / "manifest.json").write_text("{")
+    return "manifest of the captures is damaged"
+
+
+@pytest.mark.parametrize("how", ["flipped", "cut", "missing", "stray", "gone", "manifest"])
+def test_validation_finds_every_damage_of_captures(output, tmp_path, how, caplog):
+    copy = tmp_path / "copy"
+    shutil.copytree(output, copy)
+    assert validate(copy) == 0
+    said = _damaged(copy / "captures", how)
+    assert validate(copy) >= 1
+    assert f"captures/{'the ' if how == 'manifest' else ''}{said}" in caplog.text
+
+
+def test_captures_of_an_older_engine_are_recorded_by_the_next_run(output, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(output, copy)
+    before = (copy / "captures" / "manifest.json").read_bytes()
+    (copy / "captures" / "manifest.json").unlink()
+    assert validate(copy) == 2, "each capture is not in the manifest"
+    assert make_captures(tiny(copy)) == 0
+    assert (copy / "captures" / "manifest.json").read_bytes() == before
+    assert validate(copy) == 0
 
 
 def test_captures_repeat_byte_by_byte_in_any_groups_and_company(output, tmp_path, monkeypatch):

@@ -59,7 +59,9 @@ def _frame(random: np.random.Generator, size: int) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory) -> Path:
-    return write_dataset(tmp_path_factory.mktemp("dataset"), {"train": 5, "train_b": 3, "test": 2})
+    return write_dataset(
+        tmp_path_factory.mktemp("dataset"), {"train": 5, "train_b": 3, "validation": 2, "test": 2}
+    )
 
 
 @pytest.fixture(scope="session")

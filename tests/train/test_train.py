@@ -99,7 +99,7 @@ def test_resuming_holds_with_muon_an_averaged_model_and_streamed_data(
 def test_training_lowers_the_loss_and_the_seed_decides_the_result(train, dataset, finished, tmp_path):
     stages = [{"name": "one", "split": "train", "steps": 60, "batch_size": 4, "crop": 16}]
     optimizer = {"learning_rate": 5e-3, "warmup_steps": 2}
-    validation = {"split": "test", "clips": 2, "every": 30}
+    validation = {"clips": 2, "every": 30}
     train(dataset, tmp_path / "long", stages=stages, optimizer=optimizer, validation=validation)
     rows = list(csv.DictReader((tmp_path / "long" / "metrics.csv").open()))
     assert rows[-1]["val_psnr"]

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from tron.aligned import aligned
 from tron.captures import View
 from tron.errors import TronError
 from tron.seeds import generator
@@ -88,7 +89,7 @@ class SurfacePoints:
             )
         self.starts = np.cumsum([0] + [len(part) for part in parts])
         points = np.concatenate(parts)
-        columns = [mi.Float(np.ascontiguousarray(column)) for column in points.T]
+        columns = [mi.Float(aligned(column)) for column in points.T]
         self._position, self._normal, self._target = columns[0:3], columns[3:6], columns[6:9]
         self.mean_target = points[:, 6:9].mean(0, dtype=np.float64)
 

@@ -24,6 +24,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import sparse
 
+from tron.aligned import aligned
 from tron.color import luminance
 from tron.errors import TronError
 from tron.images import read_image, write_image
@@ -201,7 +202,7 @@ class EnvironmentLight:
         # Opaque numbers: lights of other sizes and rotations must share one compiled kernel.
         self._width, self._last_row = dr.opaque(mi.Int, width), dr.opaque(mi.Int, height - 1)
         rgba = np.concatenate([image, np.zeros_like(image[..., :1])], axis=-1)
-        self._texels = mi.Float(rgba.ravel())
+        self._texels = mi.Float(aligned(rgba.ravel()))
         self._rotation = dr.opaque(mi.Float, environment.rotation_deg / 360)
 
         coarse = environment if width <= pdf_width else environment.resized(pdf_width // 2, pdf_width)
@@ -215,7 +216,7 @@ class EnvironmentLight:
         mean = (y * area).sum() / (4 * np.pi)
         mass = np.maximum(y, PDF_FLOOR * mean if mean > 0 else 1.0) * area
         mass /= mass.sum()
-        self._density = mi.Float((mass / area).astype(np.float32).ravel())
+        self._density = mi.Float(aligned((mass / area).astype(np.float32).ravel()))
         self._distribution = mi.DiscreteDistribution2D(mass.astype(np.float32))
 
     @property

@@ -23,6 +23,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from tron.aligned import aligned
 from tron.color import LUMINANCE
 from tron.shading.cubemap import CubemapLight, face_direction
 from tron.shading.environment import EnvironmentLight
@@ -51,7 +52,7 @@ class LightTree:
             levels.append([dr.block_sum(value, 4) for value in levels[-1]])
         r, g, b, x, y, z, area = (dr.concat(list(column)) for column in zip(*levels[::-1]))
         centroid = dr.normalize(mi.Vector3f(x, y, z))
-        index, after = (mi.UInt32(np.concatenate(part)) for part in zip(*_preorder(depth)))
+        index, after = (mi.UInt32(aligned(np.concatenate(part))) for part in zip(*_preorder(depth)))
         records = dr.zeros(mi.Float, 8 * dr.width(index))
         dr.scatter(records, mi.Vector4f(*centroid, dr.sqrt(area)), 2 * index)
         dr.scatter(records, mi.Vector4f(r, g, b, mi.Float(after)), 2 * index + 1)

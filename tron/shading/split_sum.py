@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from tron.aligned import aligned
 from tron.errors import TronError
 from tron.shading.cubemap import CubemapLight, bilinear, face_direction
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
@@ -66,9 +67,9 @@ class SplitSum:
         ]
         offsets = np.cumsum([0] + [6 * (r + 2) ** 2 for r in resolutions[:-1]])
         self._texels = dr.concat(levels)
-        self._offsets = mi.UInt32(offsets.astype(np.uint32))
-        self._resolutions = mi.UInt32(np.array(resolutions, np.uint32))
-        self._table = mi.Float(brdf_table().ravel())
+        self._offsets = mi.UInt32(aligned(offsets.astype(np.uint32)))
+        self._resolutions = mi.UInt32(aligned(np.array(resolutions, np.uint32)))
+        self._table = mi.Float(aligned(brdf_table().ravel()))
         dr.eval(self._texels)
 
     def diffuse(self, normal: mi.Vector3f) -> mi.Color3f:

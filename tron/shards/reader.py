@@ -100,7 +100,12 @@ def decode_clip(
         for index in indices:
             name = _file_name(index, member)
             if name not in files:
-                raise TronError(f"clip {meta.key} has no member {name}")
+                mend = (
+                    "make the dataset again: its test split is older than this member, or was made without "
+                    "reference buffers"
+                )
+                optional = member in REFERENCE_MEMBERS
+                raise TronError(f"clip {meta.key} has no member {name}", mend=mend if optional else None)
             image = decode_member(name, files[name])
             if image.shape[:2] != (meta.height, meta.width):
                 raise TronError(f"clip {meta.key} {name} has size {image.shape[1::-1]}, not the clip's")

@@ -45,12 +45,18 @@ MEMBERS: dict[str, Member] = {
 
 REFERENCE_MEMBERS: dict[str, Member] = {
     "irr_ref": Member("exr", 3, True),  # Mitsuba's direct irradiance / pi, linear
+    "unshadowed_ref": Member("exr", 3, True),  # the same with nothing in the way
     "base_color_ref": Member("exr", 3, True),  # true base color, linear
     "normal_ref": Member("exr", 3, False),  # true unit normals, world (x, y, z)
     "base_color": Member("exr", 3, True),  # the surfels' base color, linear
     "normal": Member("exr", 3, False),  # the surfels' unit normals, world (x, y, z)
+    "depth_ref": Member("exr", 1, False),  # true distance from the camera, world units, 0 where there is none
+    "depth": Member("exr", 1, False),  # the surfels' median distance, likewise
 }
-"""Members of splits made with reference buffers (test splits); all of them or none."""
+"""Members of splits made with reference buffers (test splits).
+
+All of them or none are written. Datasets made before one of them was added lack it, and are read without.
+"""
 
 ALL_MEMBERS: dict[str, Member] = MEMBERS | REFERENCE_MEMBERS
 META_SUFFIX = "meta.json"

@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from tron.aligned import aligned
 from tron.gaussians.harmonics import SH_C0
 from tron.tracing.kernel import SH_PACKETS, SurfelRecords, cut_radius_squared
 
@@ -62,7 +63,7 @@ class SurfelParameters:
         be learnt begin at zero, and those beyond the degree get no gradient.
         """
         degree = highest_sh_degree(scene) if sh_degree is None else sh_degree
-        arrays = {name: mi.Float(getattr(scene, name).ravel()) for name in PARAMETERS}
+        arrays = {name: mi.Float(aligned(getattr(scene, name).ravel())) for name in PARAMETERS}
         return SurfelParameters(
             **arrays, count=len(scene), kernel_degree=scene.kernel_degree, sh_degree=degree
         )
