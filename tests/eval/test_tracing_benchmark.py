@@ -47,6 +47,8 @@ ROWS = [
     "primary.ratio_to_volprim.400_64",
     "shadow.ratio_to_embree_restart.300",
     "shadow.ratio_to_embree_closest_hit.300",
+    "shadow.ratio_to_embree_any_hit.300",
+    "shadow.ratio_to_embree_any_hit_random.300",
     "bvh.build_ms.300",
     "bvh.refit_ms.300",
     "gradient.ratio_to_volprim.300_32",
