@@ -224,18 +224,21 @@ def shadow_section(measured: Measured, found: dict[str, Row]) -> list[Section]:
         "of the irradiance pass in its own order, timed by running the pass with each tracer in turn; what "
         "the pass costs with nothing in the way is taken off both. The restarting peer is the way to all "
         "hits through Mitsuba's queries: closest hit on a quad around each surfel, again 0.0001 behind it, "
-        "with TRON's rules for opacity and sides, until less than 1% is left. The build of TRON's hierarchy "
+        "with TRON's rules for opacity and sides, until less than 1% is left. A closest hit and an any hit "
+        "are one query each on the same quads, ignoring opacity and sides: most any hits end at the surface "
+        "that their ray leaves. The build of TRON's hierarchy "
         "is in the ratios; the peers' builds are not. A refit keeps the hierarchy's order when surfels move: "
         "here a tenth of them, together, by five spacings."
     )
     headings = [
-        "Surfels", "TRON", "restarts", "closest hit", "× restarts", "× closest hit",
-        "TRON", "closest hit", "× closest hit", "build", "refit", "Embree's build", "tracing after refit",
+        "Surfels", "TRON", "restarts", "closest hit", "any hit", "× restarts", "× closest hit", "× any hit",
+        "TRON", "closest hit", "any hit", "× closest hit", "× any hit",
+        "build", "refit", "Embree's build", "tracing after refit",
     ]  # fmt: skip
     groups = [
         ("", 1),
-        ("random rays, Mrays/s", 5),
-        ("irradiance pass, Mrays/s", 3),
+        ("random rays, Mrays/s", 7),
+        ("irradiance pass, Mrays/s", 5),
         ("hierarchy, ms", 3),
         ("", 1),
     ]
@@ -243,11 +246,15 @@ def shadow_section(measured: Measured, found: dict[str, Row]) -> list[Section]:
         "shadow.mrays_random",
         "shadow.embree_restart_mrays_random",
         "shadow.embree_closest_hit_mrays_random",
+        "shadow.embree_any_hit_mrays_random",
         "shadow.ratio_to_embree_restart",
         "shadow.ratio_to_embree_closest_hit_random",
+        "shadow.ratio_to_embree_any_hit_random",
         "shadow.mrays_irradiance",
         "shadow.embree_closest_hit_mrays_irradiance",
+        "shadow.embree_any_hit_mrays_irradiance",
         "shadow.ratio_to_embree_closest_hit",
+        "shadow.ratio_to_embree_any_hit",
         "bvh.build_ms",
         "bvh.refit_ms",
         "bvh.embree_build_ms",

@@ -1,9 +1,10 @@
 """Peers for single rays: Mitsuba's ray queries (Embree on a CPU, OptiX on a GPU) on quads around the surfels.
 
-A quad is the square around the part of a surfel's ellipse that counts. One closest hit is what any tracer of
-triangles spends at the least, and it is not what the surfels need: it ignores opacity, and stops at corners
-of quads that the ellipse does not reach. Mitsuba and Dr.Jit offer no any-hit program, so whoever wants all
-hits along a ray starts the query again behind each: :class:`RestartedShadows`.
+A quad is the square around the part of a surfel's ellipse that counts. One any hit is the least that a tracer
+of triangles spends on a shadow ray, and it is not what the surfels need: it ignores opacity and sides, and
+stops at corners of quads that the ellipse does not reach, mostly at the surface that the ray leaves. Mitsuba
+and Dr.Jit offer no program to be run at each hit, so whoever wants all hits along a ray starts the query
+again behind each: :class:`RestartedShadows`.
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
@@ -51,6 +52,13 @@ def _geometry(scene: GaussianScene) -> mi.Float:
 def closest_hit(scene: mi.Scene, origin: mi.Point3f, direction: mi.Vector3f, coherent: bool) -> mi.Float:
     """Distance of the nearest quad along each ray, infinite where there is none."""
     return scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=mi.Bool(coherent)).t
+
+
+def any_hit(
+    scene: mi.Scene, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
+) -> mi.Bool:
+    """Whether a quad lies anywhere along each ray."""
+    return scene.ray_test(mi.Ray3f(origin, direction), coherent=mi.Bool(False), active=mi.Bool(active))
 
 
 class RestartedShadows:

@@ -1,4 +1,4 @@
-"""Shadow rays: transmittance through TRON's hierarchy against restarts and against one closest hit.
+"""Shadow rays: transmittance through TRON's hierarchy against restarts, one any hit, and one closest hit.
 
 Two sets of rays. Random ones leave the visible surface under cosine-distributed directions of their own: the
 worst case of every packet tracer. The others are those of the irradiance pass, in its order, by running the
@@ -52,7 +52,7 @@ class ShadowRays:
         build = times["build"].median
         random = times["random tron"].median
         idle = times["pass idle"].median
-        ours, closest = times["pass tron"].median - idle, times["pass closest"].median - idle
+        ours, closest, anything = (times[f"pass {name}"].median - idle for name in ("tron", "closest", "any"))
         figures = {
             "shadow.ratio_to_embree_restart": (times["random restart"].median / (random + build), "x"),
             "shadow.ratio_to_embree_closest_hit": (closest / (ours + build), "x"),
@@ -60,6 +60,8 @@ class ShadowRays:
                 times["random closest"].median / (random + build),
                 "x",
             ),
+            "shadow.ratio_to_embree_any_hit": (anything / (ours + build), "x"),
+            "shadow.ratio_to_embree_any_hit_random": (times["random any"].median / (random + build), "x"),
             "shadow.mrays_random": (self.rays / random / 1e6, "Mrays/s"),
             "shadow.mrays_irradiance": (self.pass_rays / ours / 1e6, "Mrays/s"),
             "shadow.embree_restart_mrays_random": (
@@ -71,6 +73,8 @@ class ShadowRays:
                 "Mrays/s",
             ),
             "shadow.embree_closest_hit_mrays_irradiance": (self.pass_rays / closest / 1e6, "Mrays/s"),
+            "shadow.embree_any_hit_mrays_random": (self.rays / times["random any"].median / 1e6, "Mrays/s"),
+            "shadow.embree_any_hit_mrays_irradiance": (self.pass_rays / anything / 1e6, "Mrays/s"),
             "bvh.build_ms": (1e3 * build, "ms"),
             "bvh.refit_ms": (1e3 * times["refit"].median, "ms"),
             "bvh.embree_build_ms": (1e3 * times["embree build"].median, "ms"),
@@ -120,6 +124,19 @@ class ClosestHits(_Occluder):
         return dr.select(active & found.is_valid(), mi.Float(0), 1)
 
 
+class AnyHits(_Occluder):
+    """Quads in the way: one any-hit query a ray, opaque or not; what one would ask for a shadow."""
+
+    def __init__(self, scene: GaussianScene, traced: mi.Scene) -> None:
+        super().__init__(scene)
+        self._traced = traced
+
+    def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """0 where a quad is met."""
+        met = embree.any_hit(self._traced, origin, direction, active)
+        return dr.select(active & met, mi.Float(0), 1)
+
+
 class Counted(_Occluder):
     """Counts the rays that the pass asks for, as an occluder in their way."""
 
@@ -148,7 +165,8 @@ def measure_shadow_rays(
     origin, direction = random_rays(gbuffer, scene.spacing, rays, seed)
     light = EnvironmentLight(soft())
     restarted = embree.RestartedShadows(scene, contenders.quads)
-    closest, idle, counted = ClosestHits(scene, contenders.quads), Unshadowed(scene), Counted(scene)
+    closest, anything = ClosestHits(scene, contenders.quads), AnyHits(scene, contenders.quads)
+    idle, counted = Unshadowed(scene), Counted(scene)
     irradiance(counted, gbuffer, light, spp, seed)
     moved = moved_surfels(contenders, seed)
     old, rebuilt = tracer.bvh, build_bvh(moved.records)
@@ -165,8 +183,10 @@ def measure_shadow_rays(
             "random tron": lambda: tracer.transmittance(origin, direction),
             "random restart": lambda: restarted.transmittance(origin, direction),
             "random closest": lambda: embree.closest_hit(contenders.quads, origin, direction, coherent=False),
+            "random any": lambda: embree.any_hit(contenders.quads, origin, direction),
             "pass tron": lambda: shaded(tracer),
             "pass closest": lambda: shaded(closest),
+            "pass any": lambda: shaded(anything),
             "pass idle": lambda: shaded(idle),
             "build": lambda: build_bvh(contenders.records).nodes,
             "refit": lambda: refit(old.order, old.levels, moved.records).nodes,

@@ -54,6 +54,8 @@ ROWS = [
     "primary.inside_over_outside.300_32",
     "shadow.ratio_to_embree_restart.300",
     "shadow.ratio_to_embree_closest_hit.300",
+    "shadow.ratio_to_embree_any_hit.300",
+    "shadow.ratio_to_embree_any_hit_random.300",
     "bvh.build_ms.300",
     "bvh.refit_ms.300",
     "gradient.ratio_to_volprim.300_32",
