@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import lightning
-import torch
 from lightning.pytorch.callbacks import Callback
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from train.curriculum import Pace, Stage
+from train.processes import Processes
 from tron.storage import write_atomic
 
 log = logging.getLogger(__name__)
@@ -26,15 +26,23 @@ SMOOTHING = 0.98
 
 
 class Clock(Callback):
-    """Runs the stage's pace, and ends the stage when its time is up."""
+    """Runs the stage's pace, and ends the stage when its time is up: by the first process's clock in all."""
 
-    def __init__(self, pace: Pace):
-        self.pace = pace
+    def __init__(self, pace: Pace, processes: Processes):
+        self.pace, self.processes = pace, processes
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Start the clock: setting up and loading do not count."""
         del trainer, pl_module
         self.pace.start()
+
+    def on_before_optimizer_step(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, optimizer: Any
+    ) -> None:
+        """Look at the clock: learning rate and end of this step follow from what it shows now."""
+        del trainer, pl_module, optimizer
+        if self.pace.seconds_limit is not None:
+            self.pace.shown = self.processes.number_of_first(self.pace.seconds())
 
     def on_train_batch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, *_args: Any, **_kwargs: Any
@@ -104,10 +112,9 @@ class TrainingLog(Callback):
         """Note the loss of a step."""
         del pl_module, batch, batch_idx
         step = trainer.global_step
-        loss = outputs["loss"].item() if torch.device(outputs["loss"].device).type == "cpu" else None
-        if loss is None and step % 10 == 0:  # reading a number from a GPU waits for it: not at every step
-            loss = outputs["loss"].item()
-        if loss is not None:
+        # Reading a number from a GPU waits for it, and from other processes too: there not at every step.
+        if outputs["loss"].device.type == "cpu" or step % 10 == 0:
+            loss = trainer.strategy.reduce(outputs["loss"].detach(), reduce_op="mean").item()
             self.loss = loss if self.loss != self.loss else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
         if not trainer.is_global_zero:
             return

@@ -66,13 +66,15 @@ class Pace:
 
     By steps a run is reproducible; by time the schedule anneals to its end within the limit on any machine,
     and the number of steps depends on the machine. Time counts only while the stage runs: `seconds` is what
-    earlier sessions of a resumed run have spent.
+    earlier sessions of a resumed run have spent. Progress goes by what the clock last showed, which processes
+    that train together tell each other.
     """
 
     def __init__(self, steps: int, seconds_limit: float | None = None):
         self.steps = steps
         self.seconds_limit = seconds_limit
         self.spent = 0.0
+        self.shown = 0.0
         self._since: float | None = None
 
     def start(self) -> None:
@@ -89,7 +91,7 @@ class Pace:
 
     def progress(self, step: int) -> float:
         """Fraction of the stage that is done after `step` steps."""
-        done = step / self.steps if self.seconds_limit is None else self.seconds() / self.seconds_limit
+        done = step / self.steps if self.seconds_limit is None else self.shown / self.seconds_limit
         return min(1.0, done)
 
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from train.curriculum import Stage
+from train.processes import Processes
 from train.settings import DataSettings, ValidationSettings
 from train.sources import (
     BUFFERS,
@@ -31,6 +33,7 @@ from train.sources import (
     decoded_bytes,
     display_video,
     first_meta,
+    is_display,
     spread_clips,
 )
 from tron import seeds
@@ -42,14 +45,16 @@ from tron.shards.schema import Clip
 
 log = logging.getLogger(__name__)
 
+STAND_IN = "train_b"  # the second distribution that tron-datagen makes, for want of photographs
 SEGMENT = 500  # batches after which a stream starts anew, so that resuming skips fewer than this
 
 
 class Batches(IterableDataset):
     """Endless batches {"pbr", "irr", "rgb": (B, 3, K, h, w)} of one stage, from step `first_step` on.
 
-    Batch s of rank r is a function of (seed, stage, r, s), so a resumed run sees what it would have seen. A
-    streamed split also depends on the number of loader processes, which must then stay the same.
+    Batch s is a function of (seed, stage, s), so a resumed run sees what it would have seen. Ranks share it:
+    together the batches of R ranks are the batch of R times the size that one process would have. A streamed
+    split also depends on the number of loader processes, which must then stay the same.
     """
 
     def __init__(
@@ -66,6 +71,7 @@ class Batches(IterableDataset):
         super().__init__()
         self.stage, self.cached, self.folder, self.settings = stage, cached, folder, settings
         self.seed, self.first_step, self.rank, self.ranks = seed, first_step, rank, ranks
+        self.places = stage.batch_size * ranks
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
@@ -73,27 +79,42 @@ class Batches(IterableDataset):
         # torch takes batches from process 0, 1, ... in turn, wherever the run resumes: so process n starts
         # with the n-th batch to come, and the stream it reads is named after what its steps have in common.
         step = self.first_step + number
-        segment, sources = -1, {}
+        segment, source = step // SEGMENT, self._sources(step // SEGMENT, step, workers)
         while True:
             if step // SEGMENT != segment:
                 segment = step // SEGMENT
-                sources = self._sources(segment, step, workers)
-            yield self._batch(step, sources)
+                source = self._sources(segment, step, workers)
+            yield self._batch(step, source)
             step += workers
 
-    def _sources(self, segment: int, step: int, workers: int) -> dict[str, Source]:
-        """The stage's splits: from memory, or as streams of this segment wound forward to `step`."""
-        sources: dict[str, Source] = {}
+    def _sources(self, segment: int, step: int, workers: int) -> Callable[[str, int], Source]:
+        """(split, place in the batch) -> where its samples come from: memory, or a stream of this segment,
+        wound forward to `step`. Each place has a stream of its own, so that ranks read what they use.
+        """
+        streams: dict[tuple[str, int], Source] = {}
         earlier = range(segment * SEGMENT + (step - segment * SEGMENT) % workers, step, workers)
-        for split in self.stage.splits():
+        drawn = Counter(
+            (split, sample % self.places) for past in earlier for split, _, sample in self._plan(past)
+        )
+        buffer = -(-self.settings.shuffle_buffer // self.places)
+
+        def source(split: str, place: int) -> Source:
             if split in self.cached:
-                sources[split] = self.cached[split]
-                continue
-            drawn = sum(name == split for past in earlier for name, _, _ in self._plan(past))
-            path = ("stream", self.stage.name, split, self.rank, step % workers, segment)
-            seed = seeds.integer(self.seed, "train", *path)
-            sources[split] = StreamedSplit(self.folder, split, self.stage.frames, self.settings, seed, drawn)
-        return sources
+                return self.cached[split]
+            if (split, place) not in streams:
+                path = ("stream", self.stage.name, split, place, step % workers, segment)
+                streams[split, place] = StreamedSplit(
+                    self.folder,
+                    split,
+                    self.stage.frames,
+                    seeds.integer(self.seed, "train", *path),
+                    shuffle_buffer=buffer,
+                    per_clip=self.settings.samples_per_clip,
+                    skip=drawn[split, place],
+                )
+            return streams[split, place]
+
+        return source
 
     def _plan(self, step: int) -> list[tuple[str, int, int]]:
         """(split, number within that split's samples, number within all samples) of a batch's samples.
@@ -104,7 +125,7 @@ class Batches(IterableDataset):
         ratio = stage.rehearsal_ratio if stage.rehearsal_split else 0.0
         plan = []
         for place in range(stage.batch_size):
-            sample = (step * self.ranks + self.rank) * stage.batch_size + place
+            sample = step * self.places + self.rank * stage.batch_size + place
             rehearsed = math.floor(sample * ratio)
             if stage.rehearsal_split and math.floor((sample + 1) * ratio) > rehearsed:
                 plan.append((stage.rehearsal_split, rehearsed, sample))
@@ -112,11 +133,12 @@ class Batches(IterableDataset):
                 plan.append((stage.split, sample - rehearsed, sample))
         return plan
 
-    def _batch(self, step: int, sources: Mapping[str, Source]) -> dict[str, Tensor]:
+    def _batch(self, step: int, source: Callable[[str, int], Source]) -> dict[str, Tensor]:
         samples = []
         for split, number, sample in self._plan(step):
             random = seeds.generator(self.seed, "train", "sample", self.stage.name, sample)
-            drawn = sources[split].sample(Draw(number, random, self.stage.frames_of(step)))
+            draw = Draw(number, random, self.stage.frames_of(step))
+            drawn = source(split, sample % self.places).sample(draw)
             samples.append(varied(drawn, random, self.stage.crop, self.settings))
         shapes = {tuple(sample.buffers["rgb"].shape) for sample in samples}
         if len(shapes) > 1:
@@ -170,8 +192,16 @@ def varied(sample: Sample, random: np.random.Generator, crop: int | None, settin
 class TrainingData(lightning.LightningDataModule):
     """The dataset folder's splits, in memory where they fit, and batches for one stage at a time."""
 
-    def __init__(self, folder: str | Path, settings: DataSettings, seed: int, validation: ValidationSettings):
+    def __init__(
+        self,
+        folder: str | Path,
+        settings: DataSettings,
+        seed: int,
+        validation: ValidationSettings,
+        processes: Processes | None = None,
+    ):
         super().__init__()
+        self.processes = processes or Processes()
         self.folder, self.settings, self.seed, self.validation = Path(folder), settings, seed, validation
         self.manifest = Manifest.load(folder)
         self.cached: dict[str, CachedSplit] = {}
@@ -214,6 +244,10 @@ class TrainingData(lightning.LightningDataModule):
     def _size(self, split: str, size: float) -> tuple[int, float]:
         return len(self.cached[split].clips), size / 1e9
 
+    def stands_in(self, split: str) -> bool:
+        """Whether a split holds path-traced pictures where the curriculum would have photographs."""
+        return split == STAND_IN and not is_display(first_meta(self.folder, self.manifest, split), "rgb")
+
     def calibration(self, stages: Sequence[Stage], clips: int = 64) -> Iterator[Tensor]:
         """Training videos (1, 3, K, H, W), all buffers, of the longest stage's K, to fit the codec on."""
         longest = max(stages, key=lambda stage: stage.frames)
@@ -232,7 +266,6 @@ class TrainingData(lightning.LightningDataModule):
         """Endless batches of the stage that `begin` chose."""
         if self.stage is None:
             raise RuntimeError("begin() chooses the stage first")
-        trainer = self.trainer
         batches = Batches(
             self.stage,
             self.cached,
@@ -240,22 +273,34 @@ class TrainingData(lightning.LightningDataModule):
             self.settings,
             self.seed,
             self.first_step,
-            trainer.global_rank if trainer else 0,
-            trainer.world_size if trainer else 1,
+            self.processes.rank,
+            self.processes.count,
         )
         in_memory = all(split in self.cached for split in self.stage.splits())
         return DataLoader(batches, batch_size=None, num_workers=0 if in_memory else self.settings.workers)
 
     def val_dataloader(self) -> DataLoader | list[Any]:
-        """Held-out clips as `windows_of` the stage's K frames, one clip a batch."""
+        """This process's share of the held-out clips as `windows_of` the stage's K frames, one a batch."""
         if self.stage is None or self.validation_split is None:
             return []
         if self._held_out is None:
-            split, count = self.validation_split, self.validation.clips
             members = (*BUFFERS, "foreground")
-            self._held_out = list(spread_clips(self.folder, self.manifest, split, count, members))
-        windows = [windows_of(clip, self.stage.frames) for clip in self._held_out]
-        return DataLoader([w for w in windows if len(w["rgb"])], batch_size=None)  # type: ignore[arg-type]
+            chosen = (self.validation_split, self.validation.clips, members)
+            share = slice(self.processes.rank, None, self.processes.count)
+            self._held_out = list(spread_clips(self.folder, self.manifest, *chosen, share))
+        return DataLoader(HeldOut(self._held_out, self.stage.frames), batch_size=None)
+
+
+class HeldOut(IterableDataset):
+    """Windows of clips that have any; without a length, for even a process without clips must validate."""
+
+    def __init__(self, clips: Sequence[Clip], frames: int):
+        super().__init__()
+        self.clips, self.frames = clips, frames
+
+    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+        windows = (windows_of(clip, self.frames) for clip in self.clips)
+        return (window for window in windows if len(window["rgb"]))
 
 
 def windows_of(clip: Clip, frames: int) -> dict[str, Tensor]:

@@ -24,6 +24,7 @@ class RendererModule(lightning.LightningModule):
         self.settings = optimizer
         self.stage: Stage | None = None
         self.pace = Pace(1)
+        self._psnr = torch.zeros(2, 2)
 
     def begin(self, stage: Stage, pace: Pace) -> None:
         """Choose the stage whose optimiser and schedule are made next."""
@@ -34,13 +35,25 @@ class RendererModule(lightning.LightningModule):
         return self.loss(self.renderer(batch["pbr"], batch["irr"]), batch["rgb"])
 
     def validation_step(self, batch: dict[str, Tensor], _index: int) -> None:
-        """PSNR of held-out windows, of the foreground and of the full frame, averaged over frames."""
+        """PSNR of held-out windows, of the foreground and of the full frame: sums over frames and counts."""
         shown = self.renderer(batch["pbr"], batch["irr"])
-        foreground = psnr_per_frame(shown, batch["rgb"], batch["mask"])
-        full = psnr_per_frame(shown, batch["rgb"])
-        size = full.numel()
-        self.log("val_psnr", foreground.nanmean(), batch_size=size, sync_dist=True)
-        self.log("val_psnr_full", full.mean(), batch_size=size, sync_dist=True)
+        for row, mask in enumerate((batch["mask"], None)):
+            psnr = psnr_per_frame(shown, batch["rgb"], mask)
+            psnr = psnr[~psnr.isnan()]  # frames without foreground
+            self._psnr[row] += torch.stack([psnr.sum(), psnr.new_tensor(psnr.numel())])
+
+    def on_validation_epoch_start(self) -> None:
+        """Begin the sums."""
+        self._psnr = torch.zeros(2, 2, device=self.device)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log means over the frames of all processes, which may have had different numbers of them."""
+        sums, counts = self.trainer.strategy.reduce(self._psnr, reduce_op="sum").unbind(1)
+        for name, total, count in zip(("val_psnr", "val_psnr_full"), sums, counts):
+            if count > 0:
+                self.log(
+                    name, total / count, sync_dist=True
+                )  # they are equal: it keeps Lightning from asking
 
     def configure_optimizers(self) -> Any:
         """The stage's optimiser, with warm-up and a cosine over the stage."""
@@ -62,4 +75,4 @@ class RendererModule(lightning.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Go on counting a stage's time where it was left."""
-        self.pace.spent = float(checkpoint["tron_seconds"])
+        self.pace.spent = self.pace.shown = float(checkpoint["tron_seconds"])

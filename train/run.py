@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-import warnings
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import yaml
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging
+from lightning.pytorch.strategies import DDPStrategy
 from pydantic import ValidationError
 from torch import nn
 
@@ -28,6 +30,7 @@ from train.checkpoints import (
 from train.curriculum import Pace, Stage
 from train.data import TrainingData
 from train.module import RendererModule
+from train.processes import Processes, launch
 from train.settings import Settings
 from tron import seeds
 from tron.errors import TronError
@@ -44,36 +47,68 @@ RENDERER_NAME = "renderer.safetensors"
 
 
 def run(settings: Settings) -> None:
-    """Train a neural renderer on a dataset through the stages of a curriculum.
+    """Train a neural renderer on a dataset through the stages of a curriculum, on one device or several.
 
     Ends with output_dir/renderer.safetensors. A run that was interrupted goes on from its last checkpoint
     when the same command is given again; a finished one is left as it is.
     """
-    _quiet_lightning()
+    launch(train, settings)
+
+
+def train(processes: Processes, settings: Settings) -> None:
+    """What each process of a run does; the first holds the folder and writes."""
     if settings.threads is not None:
         set_torch_threads(settings.threads)
     stages = [stage for stage in settings.stages if stage.steps > 0]
-    data = TrainingData(settings.dataset, settings.data, settings.seed, settings.validation)
-    with locked(settings.output_dir):
-        _claim(settings)
+    data = processes.together(
+        lambda: TrainingData(settings.dataset, settings.data, settings.seed, settings.validation, processes)
+    )
+    with ExitStack() as held:
         folder = settings.output_dir / "checkpoints"
-        position = find_position(folder, stages)
-        if position.stage == len(stages) and (settings.output_dir / RENDERER_NAME).is_file():
-            log.info("%s is trained already", settings.output_dir / RENDERER_NAME)
+        position = processes.from_first(lambda: _claim(held, settings, processes.count, stages))
+        if position is None:
             return
-        torch.manual_seed(seeds.integer(settings.seed, "train", "weights", bits=63))
-        renderer = build_renderer(settings.renderer)
-        module = RendererModule(renderer, RendererLoss(**settings.loss.model_dump()), settings.optimizer)
-        data.open(stages)
-        if position.stage > 0:
-            _take_weights(renderer, stage_end(folder, position.stage, stages[position.stage - 1]))
-        elif isinstance(codec := getattr(renderer, "codec", None), BlockDCT) and position.checkpoint is None:
-            codec.fit(data.calibration(stages))
+        module = processes.together(lambda: _make_module(settings, stages, position, data))
+        codec = getattr(module.renderer, "codec", None)
+        if isinstance(codec, BlockDCT) and position == Position(0):
+            codec.load_state_dict(processes.from_first(lambda: _fitted(codec, data, stages)))
         for index in range(position.stage, len(stages)):
             here = position if index == position.stage else Position(index)
-            _run_stage(settings, stages, here, module, data)
-        save_renderer(settings.output_dir / RENDERER_NAME, renderer)
-        log.info("Renderer: %s", settings.output_dir / RENDERER_NAME)
+            _run_stage(settings, stages, here, module, data, processes)
+            processes.from_first(partial(_end_stage, folder, index + 1, stages[index], module))
+        path = settings.output_dir / RENDERER_NAME
+        processes.from_first(lambda: save_renderer(path, module.renderer))
+        log.info("Renderer: %s", path)
+
+
+def _claim(held: ExitStack, settings: Settings, processes: int, stages: list[Stage]) -> Position | None:
+    """Hold the output folder, make it this run's, and find where it stands; None if it is finished."""
+    held.enter_context(locked(settings.output_dir))
+    _claim_settings(settings, processes)
+    position = find_position(settings.output_dir / "checkpoints", stages)
+    if position.stage == len(stages) and (settings.output_dir / RENDERER_NAME).is_file():
+        log.info("%s is trained already", settings.output_dir / RENDERER_NAME)
+        return None
+    return position
+
+
+def _make_module(
+    settings: Settings, stages: list[Stage], position: Position, data: TrainingData
+) -> RendererModule:
+    """The renderer as the stage before the position left it, with its loss; the data are opened for it."""
+    torch.manual_seed(seeds.integer(settings.seed, "train", "weights", bits=63))
+    renderer = build_renderer(settings.renderer)
+    module = RendererModule(renderer, RendererLoss(**settings.loss.model_dump()), settings.optimizer)
+    data.open(stages)
+    if position.stage > 0:
+        folder = settings.output_dir / "checkpoints"
+        _take_weights(renderer, stage_end(folder, position.stage, stages[position.stage - 1]))
+    return module
+
+
+def _fitted(codec: BlockDCT, data: TrainingData, stages: list[Stage]) -> dict[str, torch.Tensor]:
+    codec.fit(data.calibration(stages))
+    return codec.state_dict()
 
 
 def build_renderer(recipe: dict[str, Any]) -> nn.Module:
@@ -97,22 +132,28 @@ def build_renderer(recipe: dict[str, Any]) -> nn.Module:
 
 
 def _run_stage(
-    settings: Settings, stages: list[Stage], position: Position, module: RendererModule, data: TrainingData
+    settings: Settings,
+    stages: list[Stage],
+    position: Position,
+    module: RendererModule,
+    data: TrainingData,
+    processes: Processes,
 ) -> None:
     number, stage = position.stage + 1, stages[position.stage]
     folder = settings.output_dir / "checkpoints"
     share = stage.steps / sum(each.steps for each in stages)
     pace = Pace(stage.steps, settings.max_seconds * share if settings.max_seconds else None)
-    _announce(number, stages, settings.max_seconds, position.step)
+    _announce(number, stages, settings.max_seconds, position.step, data.stands_in(stage.split))
     if position.checkpoint and pace.seconds_limit is None and position.step >= stage.steps:
         # Interrupted between its last step and its end: Lightning would not even start, nor average weights.
-        module.load_state_dict(AtomicCheckpoints().load_checkpoint(position.checkpoint)["state_dict"])
-        _end_stage(folder, number, stage, module)
+        checkpoint = position.checkpoint
+        state = processes.together(lambda: AtomicCheckpoints().load_checkpoint(checkpoint)["state_dict"])
+        module.load_state_dict(state)
         return
     module.begin(stage, pace)
     data.begin(stage, position.step)
     callbacks: list[Callback] = [
-        Clock(pace),
+        Clock(pace, processes),
         TrainingLog(settings.output_dir / "metrics.csv", stage, pace, first_step=position.step),
         periodic_checkpoint(folder, number, stage, settings.checkpoint_every),
     ]
@@ -123,8 +164,11 @@ def _run_stage(
         max_steps=stage.steps if pace.seconds_limit is None else -1,
         max_epochs=-1,
         accelerator=settings.accelerator,
-        devices=settings.devices,
+        devices=settings.devices if processes.count == 1 else processes.count // settings.nodes,
         num_nodes=settings.nodes,
+        # Buffers are constants here; broadcasting them would also tie together how often ranks validate.
+        strategy="auto" if processes.count == 1 else DDPStrategy(broadcast_buffers=False),
+        use_distributed_sampler=False,
         precision=settings.precision,  # type: ignore[arg-type]
         gradient_clip_val=settings.optimizer.gradient_clip,
         val_check_interval=min(settings.validation.every, stage.steps),
@@ -144,9 +188,6 @@ def _run_stage(
         raise KeyboardInterrupt from error
     if trainer.interrupted:
         raise KeyboardInterrupt
-    if trainer.is_global_zero:
-        _end_stage(folder, number, stage, module)
-    trainer.strategy.barrier()
 
 
 def _end_stage(folder: Path, number: int, stage: Stage, module: RendererModule) -> None:
@@ -154,32 +195,37 @@ def _end_stage(folder: Path, number: int, stage: Stage, module: RendererModule) 
     remove_checkpoints(folder, number, stage)
 
 
-def _announce(number: int, stages: list[Stage], max_seconds: float | None, first_step: int) -> None:
+def _announce(
+    number: int, stages: list[Stage], max_seconds: float | None, first_step: int, stands_in: bool
+) -> None:
     stage = stages[number - 1]
     length = f"{stage.steps} steps"
     if max_seconds is not None:
         length = f"{max_seconds * stage.steps / sum(each.steps for each in stages):.0f} s"
     mixed = f", {stage.rehearsal_ratio:.0%} from '{stage.rehearsal_split}'" if len(stage.splits()) > 1 else ""
     log.info(
-        "Stage %d of %d, %s: split '%s'%s, K = %d, %s%s",
+        "Stage %d of %d, %s: split '%s'%s%s, K = %d, %s%s",
         number,
         len(stages),
         stage.name,
         stage.split,
+        " (path-traced, it stands in for photographs)" if stands_in else "",
         mixed,
         stage.frames,
         length,
         f", from step {first_step}" if first_step else "",
     )
-    if number > 1:
-        log.info("(Captures do not exist yet: split '%s', path-traced too, stands in for them.)", stage.split)
 
 
-def _claim(settings: Settings) -> None:
-    """Write config.yaml, or find that this folder holds a run of other settings or data."""
+def _claim_settings(settings: Settings, processes: int) -> None:
+    """Write config.yaml, or find that this folder holds a run of other settings, data or batches.
+
+    Batches are as many as there are processes: the run remembers their number, not how they were spread.
+    """
     path = settings.output_dir / "config.yaml"
     described = yaml.safe_load(yaml.safe_dump(settings.model_dump(mode="json")))
     described["dataset_sha256"] = sha256(settings.dataset / MANIFEST_NAME)
+    described["processes"] = processes
     if path.is_file():
         try:
             earlier = yaml.safe_load(path.read_text())
@@ -187,7 +233,9 @@ def _claim(settings: Settings) -> None:
             earlier = None
         if not isinstance(earlier, dict):
             raise TronError("config.yaml of an earlier run is damaged", str(path), "remove the folder")
-        free = {"output_dir", "dataset"}  # a run may move; its data are known by their hash
+        earlier.setdefault("processes", 1)
+        # A run may move; its data are known by their hash.
+        free = {"output_dir", "dataset", "devices", "nodes"}
         changed = [key for key in described if key not in free and described[key] != earlier.get(key)]
         if changed:
             raise TronError(
@@ -207,11 +255,3 @@ def _take_weights(renderer: nn.Module, path: Path) -> None:
     from safetensors.torch import load_file
 
     renderer.load_state_dict(load_file(path))
-
-
-def _quiet_lightning() -> None:
-    """Lightning's start-up lines and advice on loaders say nothing about this run."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
-    for message in (".*does not have many workers.*", ".*Checkpoint directory.*", ".*IterableDataset.*"):
-        warnings.filterwarnings("ignore", message)

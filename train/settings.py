@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -59,12 +59,17 @@ class DataSettings(BaseModel):
     cache_gb: float = Field(
         default=4.0,
         ge=0,
-        description="Keep decoded splits in memory up to this size; larger ones are streamed.",
+        description="Keep decoded splits in memory up to this size, in each process; larger ones are "
+        "streamed.",
     )
     workers: int = Field(
         default=0, ge=0, description="Loader processes of streamed splits; cached ones use none."
     )
-    shuffle_buffer: int = Field(default=64, ge=1, description="Samples in a stream's shuffle buffer.")
+    shuffle_buffer: int = Field(
+        default=64,
+        ge=1,
+        description="Streamed samples to shuffle among, shared out over the places of a batch.",
+    )
     samples_per_clip: int = Field(
         default=1, ge=1, description="Random windows taken from a streamed clip each time it is read."
     )
@@ -128,8 +133,16 @@ class Settings(BaseModel):
         description="CPU threads of torch; 1 makes runs reproducible bit by bit, null leaves torch's.",
     )
     accelerator: str = Field(default="auto", description="Lightning accelerator: auto, cpu, gpu.")
-    devices: int | str = Field(default="auto", description="Lightning devices, a number or auto.")
-    nodes: int = Field(default=1, ge=1, description="Machines, under torchrun or Slurm.")
+    devices: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
+        default="auto",
+        description="Devices of this machine, each a process: a number, or auto: every GPU, one process on "
+        "the CPU.",
+    )
+    nodes: int = Field(
+        default=1,
+        ge=1,
+        description="Machines, with a command on each: by torchrun or srun, or see docs/training.md.",
+    )
     precision: str = Field(default="32-true", description="Lightning precision, e.g. 32-true or bf16-mixed.")
 
     @field_validator("stages")

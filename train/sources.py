@@ -17,7 +17,6 @@ from webdataset.filters import detshuffle
 from webdataset.pipeline import DataPipeline
 from webdataset.shardlists import ResampledShards
 
-from train.settings import DataSettings
 from tron import seeds
 from tron.color import to_display
 from tron.errors import TronError
@@ -119,18 +118,24 @@ class StreamedSplit:
     """
 
     def __init__(
-        self, folder: Path, split: str, frames: int, settings: DataSettings, seed: int, skip: int = 0
+        self,
+        folder: Path,
+        split: str,
+        frames: int,
+        seed: int,
+        *,
+        shuffle_buffer: int,
+        per_clip: int = 1,
+        skip: int = 0,
     ):
-        self.frames, self.per_clip, self.seed, self.skip = frames, settings.samples_per_clip, seed, skip
+        self.frames, self.per_clip, self.seed, self.skip = frames, per_clip, seed, skip
         names = [str(folder / e.name) for e in Manifest.load(folder).of_split(split) if e.samples]
         self._pipeline: Any = DataPipeline(
             ResampledShards(
                 names, seed=seeds.integer(seed, "shards", bits=31), worker_seed=_zero, deterministic=True
             ),
             self._undecoded,
-            detshuffle(
-                settings.shuffle_buffer, settings.shuffle_buffer, seed=seeds.integer(seed, "shuffle", bits=31)
-            ),
+            detshuffle(shuffle_buffer, shuffle_buffer, seed=seeds.integer(seed, "shuffle", bits=31)),
         )
         self._samples: Iterator[dict[str, bytes]] | None = None
 
@@ -180,12 +185,18 @@ def decoded_bytes(meta: ClipMeta) -> int:
 
 
 def spread_clips(
-    folder: Path, manifest: Manifest, split: str, count: int, members: Sequence[str]
+    folder: Path,
+    manifest: Manifest,
+    split: str,
+    count: int,
+    members: Sequence[str],
+    share: slice = slice(None),
 ) -> Iterator[Clip]:
-    """Up to `count` clips spread evenly over a split; the others are skipped without decoding."""
+    """A share of up to `count` clips spread evenly over a split; the others are skipped without decoding."""
     entries = manifest.of_split(split)
     total = sum(entry.samples for entry in entries)
-    chosen = set(np.linspace(0, total - 1, min(count, total)).round().astype(int).tolist())
+    spread = np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))
+    chosen = set(spread.tolist()[share])
     number = 0
     for entry in entries:
         if chosen.isdisjoint(range(number, number + entry.samples)):

@@ -43,14 +43,18 @@ def test_a_pace_by_steps_ignores_the_clock():
 def test_a_pace_by_time_ignores_the_steps_and_stands_still_while_stopped():
     pace = Pace(200, seconds_limit=10.0)
     pace.spent = 2.5  # an earlier session's
+    pace.shown = pace.seconds()
     assert pace.progress(10**9) == 0.25
     pace.start()
     time.sleep(0.02)
+    assert pace.progress(0) == 0.25, "nobody has looked at the clock since"
     pace.stop()
-    reached = pace.progress(0)
-    assert 0.252 <= reached < 0.6
+    reached = pace.seconds()
+    assert 2.52 <= reached < 6
     time.sleep(0.01)
-    assert pace.progress(0) == reached
+    assert pace.seconds() == reached
+    pace.shown = reached
+    assert pace.progress(0) == reached / 10
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Batches: a function of seed, stage, rank and step; buffers stay aligned; streams resume where they were."""
+"""Batches: a function of seed, stage and step, shared by ranks; buffers stay aligned; streams resume."""
 
 import itertools
 import shutil
@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader
 from train import data as training_data
 from train.curriculum import Stage
 from train.data import Batches, TrainingData, developed, varied
+from train.processes import Processes
 from train.settings import DataSettings, ValidationSettings
 from train.sources import BUFFERS, CachedSplit, Sample, display_video
 from tron import seeds
@@ -70,6 +71,22 @@ def test_streams_resume_with_several_loader_processes(dataset, monkeypatch):
 
     whole = loaded(0, 9)
     assert same(whole[3:], loaded(3, 6))
+
+
+@pytest.mark.parametrize("stage", [STAGE, MIXED])
+@pytest.mark.parametrize("cache", [True, False])
+@pytest.mark.parametrize("workers", [0, 2])
+def test_ranks_together_see_the_batches_of_one_process(dataset, monkeypatch, stage, cache, workers):
+    monkeypatch.setattr(training_data, "SEGMENT", 4)
+
+    def loaded(stream: Batches) -> list[torch.Tensor]:
+        return take(DataLoader(stream, batch_size=None, num_workers=workers), 6)
+
+    whole = loaded(batches(dataset, stage.model_copy(update={"batch_size": 6}), cache, first_step=1))
+    parts = stage.model_copy(update={"batch_size": 2})
+    ranks = [loaded(batches(dataset, parts, cache, first_step=1, rank=r, ranks=3)) for r in range(3)]
+    assert same(whole, [torch.cat(step, 1) for step in zip(*ranks)])
+    assert not same(ranks[0], ranks[1])
 
 
 def test_ranks_share_each_pass_over_the_clips(dataset):
@@ -181,6 +198,32 @@ def test_validation_shows_whole_frames_with_their_foreground(dataset):
     data.begin(STAGE, 0)
     (window,) = list(data.val_dataloader())
     assert window["rgb"].shape == (6, 3, 1, 24, 24)
+
+
+def test_ranks_validate_on_each_clip_once(dataset):
+    def held_out(rank: int, ranks: int) -> list[torch.Tensor]:
+        data = TrainingData(
+            dataset, DataSettings(), 0, ValidationSettings(split="train", clips=4), Processes(rank, ranks)
+        )
+        data.begin(STAGE, 0)
+        return [window["rgb"] for window in data.val_dataloader()]
+
+    whole = held_out(0, 1)
+    assert len(whole) == 4
+    parts = [held_out(rank, 3) for rank in range(3)]
+    assert [len(part) for part in parts] == [2, 1, 1]
+    assert same(whole, [parts[0][0], parts[1][0], parts[2][0], parts[0][1]])
+    assert [len(held_out(rank, 6)) for rank in range(6)] == [1, 1, 1, 1, 0, 0]
+
+
+def test_a_path_traced_second_split_stands_in_for_photographs_and_photographs_do_not(dataset, monkeypatch):
+    data = TrainingData(dataset, DataSettings(), 0, ValidationSettings())
+    assert [data.stands_in(split) for split in ("train", "train_b", "test")] == [False, True, False]
+    photographs = next(read_clips(dataset, "train_b")).meta.model_copy(
+        update={"color_space": {"rgb": "display"}}
+    )
+    monkeypatch.setattr(training_data, "first_meta", lambda *_: photographs)
+    assert not data.stands_in("train_b")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,246 @@
+"""The processes of a training run, one for each device: started here, or by torchrun or Slurm.
+
+Lightning's own launcher runs the command line again and kills without a word; here the processes are spawned
+from the checked settings and watched, so that whatever ends one of them ends all, with its reason.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import lightning
+import torch
+from lightning.fabric.plugins.environments.lightning import find_free_network_port
+from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from torch import distributed
+from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException, start_processes
+
+from train.settings import Settings
+from tron.apps.command_line import INTERRUPTED, USER_ERROR, configure_logging
+from tron.errors import TronError
+
+GRACE_SECONDS = 15.0
+"""Seconds that processes have to end by themselves after one of them has failed or was interrupted."""
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Processes:
+    """This process's rank among those that train together, and what passes between their CPUs."""
+
+    rank: int = 0
+    count: int = 1
+    group: Any = None
+
+    @property
+    def first(self) -> bool:
+        """Whether this is global rank 0, which alone locks, writes and speaks."""
+        return self.rank == 0
+
+    def from_first(self, work: Callable[[], Result]) -> Result:
+        """What `work` gives in the first process, which alone does it; its TronError ends all processes."""
+        outcome = [_outcome(work) if self.first else None]
+        if self.count > 1:
+            distributed.broadcast_object_list(outcome, src=0, group=self.group)
+        return self._unless_failed(outcome[0], [outcome[0]])
+
+    def together(self, work: Callable[[], Result]) -> Result:
+        """What `work` gives in this process, done by each; the TronError of any of them ends all."""
+        own = _outcome(work)
+        failures: list[Any] = [own if isinstance(own, TronError) else None] * self.count
+        if self.count > 1:
+            distributed.all_gather_object(failures, failures[0], group=self.group)
+        return self._unless_failed(own, failures)
+
+    def number_of_first(self, number: float) -> float:
+        """The first process's number, in every process."""
+        if self.count == 1:
+            return number
+        shared = torch.tensor(number, dtype=torch.float64)
+        distributed.broadcast(shared, src=0, group=self.group)
+        return shared.item()
+
+    def _unless_failed(self, outcome: Any, failures: list[Any]) -> Any:
+        error = next((each for each in failures if isinstance(each, TronError)), None)
+        if error is None:
+            return outcome
+        if self.first:
+            raise error
+        raise SystemExit(USER_ERROR)  # one process says it
+
+
+def _outcome(work: Callable[[], Result]) -> Result | TronError:
+    try:
+        return work()
+    except TronError as error:
+        return error
+
+
+def launch(work: Callable[[Processes, Settings], None], settings: Settings) -> None:
+    """Do `work` in every process of a run: here if it is one, in new processes, or in those that torchrun or
+    srun has started, of which this is one.
+
+    Raises:
+        TronError: devices, nodes, accelerator or precision that this machine has not; or what any process
+            raised.
+        KeyboardInterrupt: a process was interrupted; all have ended.
+    """
+    _quiet_lightning()
+    outer = _outer_launcher()
+    devices = _devices(settings, outer)
+    if outer is not None:
+        count = outer.world_size()
+        if devices * settings.nodes != count:
+            raise TronError(
+                f"{count} processes were started, but devices={devices} on nodes={settings.nodes} are "
+                f"{devices * settings.nodes}",
+                mend="start one process for each device (torchrun --nproc-per-node, srun --ntasks-per-node)",
+            )
+        work(_joined(settings, devices), settings)
+    elif devices * settings.nodes == 1:
+        work(Processes(), settings)
+    else:
+        _spawn(work, settings, devices)
+
+
+def _outer_launcher() -> Any:
+    """Lightning's view of torchrun or Slurm, where one of them has started this process."""
+    if TorchElasticEnvironment.detect():
+        return TorchElasticEnvironment()
+    return SLURMEnvironment() if SLURMEnvironment.detect() else None
+
+
+def _devices(settings: Settings, outer: Any) -> int:
+    """How many devices of this machine train; TronError where it has fewer."""
+    fabric = _fabric(settings, settings.devices, 1)
+    on_cpu = fabric.device.type == "cpu"
+    if settings.devices == "auto" and on_cpu and outer is not None:
+        return max(1, outer.world_size() // settings.nodes)
+    devices = getattr(fabric.strategy, "num_processes", 1)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if on_cpu and devices > cores and outer is None:
+        raise TronError(f"devices={devices} of accelerator cpu", mend=f"this machine has {cores} cores")
+    return devices
+
+
+def _fabric(settings: Settings, devices: int | str, nodes: int, **more: Any) -> lightning.Fabric:
+    try:
+        return lightning.Fabric(
+            accelerator=settings.accelerator,
+            devices=devices,
+            num_nodes=nodes,
+            precision=settings.precision,  # type: ignore[arg-type]
+            **more,
+        )
+    except (MisconfigurationException, ValueError, RuntimeError) as error:
+        asked = (
+            f"devices={settings.devices} accelerator={settings.accelerator} precision={settings.precision}"
+        )
+        raise TronError(f"cannot train on {asked}", mend=str(error)) from error
+
+
+def _joined(settings: Settings, devices: int) -> Processes:
+    """Join the other processes of the run, which do the same."""
+    if devices * settings.nodes == 1:
+        return Processes()
+    if settings.threads is not None:  # else Lightning would share all cores among this machine's processes
+        os.environ["OMP_NUM_THREADS"] = str(settings.threads)
+    fabric = _fabric(settings, devices, settings.nodes, strategy="ddp")
+    fabric.launch()
+    processes = Processes(fabric.global_rank, fabric.world_size, distributed.new_group(backend="gloo"))
+    if processes.first:
+        configure_logging()
+    else:  # it would only say again what the first one says
+        logging.getLogger().setLevel(logging.ERROR)
+        warnings.simplefilter("ignore")
+    return processes
+
+
+def _spawn(work: Callable[[Processes, Settings], None], settings: Settings, devices: int) -> None:
+    """Start this machine's processes, wait for them, and end them all as the first to fail has ended."""
+    shared = {"WORLD_SIZE": str(devices * settings.nodes)}
+    if settings.nodes == 1:
+        port = str(find_free_network_port())
+        shared |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "NODE_RANK": "0"}
+    elif not {"MASTER_ADDR", "MASTER_PORT", "NODE_RANK"} <= os.environ.keys():
+        raise TronError(
+            f"nodes={settings.nodes} without a launcher",
+            mend="start it by torchrun or srun, or set MASTER_ADDR, MASTER_PORT and NODE_RANK on each",
+        )
+    errors = torch.multiprocessing.get_context("spawn").SimpleQueue()
+    context = start_processes(
+        _spawned, (work, settings, devices, shared, errors), nprocs=devices, join=False, start_method="spawn"
+    )
+    assert context is not None
+    try:
+        while not context.join(grace_period=GRACE_SECONDS):
+            pass
+    except (ProcessRaisedException, ProcessExitedException) as error:
+        if not errors.empty():
+            raise errors.get() from None
+        if isinstance(error, ProcessRaisedException):
+            raise
+        if error.exit_code == INTERRUPTED:
+            raise KeyboardInterrupt from error
+        raise TronError(
+            f"training {error}",
+            mend="if that was for want of memory, make batch_size or data.cache_gb smaller",
+        ) from error
+    finally:
+        _end(context.processes)
+
+
+def _end(processes: list[Any]) -> None:
+    """Interrupt what still runs, and kill what does not listen."""
+    for number, seconds in ((signal.SIGINT, GRACE_SECONDS), (signal.SIGKILL, None)):
+        running = [process for process in processes if process.is_alive()]
+        for process in running:
+            os.kill(process.pid, number)
+        deadline = None if seconds is None else time.monotonic() + seconds
+        for process in running:
+            process.join(None if deadline is None else max(0.0, deadline - time.monotonic()))
+
+
+def _spawned(
+    local_rank: int,
+    work: Callable[[Processes, Settings], None],
+    settings: Settings,
+    devices: int,
+    environment: dict[str, str],
+    errors: Any,
+) -> None:
+    os.environ.update(environment, LOCAL_RANK=str(local_rank))
+    _quiet_lightning()
+    try:
+        processes = _joined(settings, devices)
+        work(processes, settings)
+    except TronError as error:
+        errors.put(error)
+        raise SystemExit(USER_ERROR) from error
+    except KeyboardInterrupt as error:
+        raise SystemExit(INTERRUPTED) from error
+
+
+def _quiet_lightning() -> None:
+    """Lightning's start-up lines and advice on loaders say nothing about this run."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
+    for message in (
+        ".*does not have many workers.*",
+        ".*Checkpoint directory.*",
+        ".*IterableDataset.*",
+        ".*`srun` command is available.*",
+        ".*`broadcast_buffers` is deprecated.*",  # what torch has instead is not in 2.6
+        ".*LeafSpec.*",
+    ):
+        warnings.filterwarnings("ignore", message)
