@@ -1,4 +1,4 @@
-"""Camera paths around a target: the data engine's spiral and oscillation, an orbit, and keyframes.
+"""Camera paths around a target: the data engine's spiral and oscillation, an orbit, a stand, and keyframes.
 
 Angles are in degrees. Azimuth turns counter-clockwise about ``up`` seen from its tip, and is measured from
 the world's x axis where up is +z. Elevation is the angle above the plane through the target orthogonal to
@@ -103,6 +103,26 @@ def orbit(
     _fractions(n)
     azimuth = phase + 360.0 * np.arange(n) / n
     return _around(azimuth, np.full(n, elevation_deg), target, radius, up, fov_deg, width, height)
+
+
+def still(
+    n: int,
+    *,
+    target: Vector,
+    radius: float,
+    width: int,
+    height: int,
+    fov_deg: float,
+    elevation_deg: float = 25.0,
+    phase: float = 0.0,
+    up: Vector = Z_UP,
+) -> list[Camera]:
+    """Stay at the first camera of :func:`orbit`, one object n times: for clips in which only the light moves.
+
+    Args: as in :func:`spiral`.
+    """
+    where = np.array([phase]), np.array([elevation_deg])
+    return _around(*where, target, radius, up, fov_deg, width, height) * len(_fractions(n))
 
 
 def keyframed(cameras: Sequence[Camera], n: int) -> list[Camera]:

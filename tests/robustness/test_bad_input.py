@@ -22,7 +22,7 @@ COMPLETE = {
     "tron-reconstruct": ["capture={inputs}/empty"],
     "tron-train": ["dataset={inputs}/empty"],
     "tron-eval": ["dataset={inputs}/empty", "renderer={inputs}/text.safetensors"],
-    "tron-relight": ["scene={inputs}/good.ply", "environment={inputs}/text.hdr"],
+    "tron-relight": ["scene={inputs}/good.ply", "environment={inputs}/good.exr"],
 }
 
 BAD_FILES = [
@@ -33,17 +33,17 @@ BAD_FILES = [
     ("tron-relight", ["environment={inputs}/absent.hdr"], ["absent.hdr"]),
     ("tron-relight", ["environment={inputs}/text.hdr"], ["text.hdr"]),
     ("tron-relight", ["environment={inputs}/text.xyz"], ["text.xyz"]),
-    (
-        "tron-relight",
-        ["environment={inputs}/good.exr", "checkpoint={inputs}/absent.safetensors"],
-        ["absent.safe"],
-    ),
-    (
-        "tron-relight",
-        ["environment={inputs}/good.exr", "checkpoint={inputs}/text.safetensors"],
-        ["text.safe"],
-    ),
-    ("tron-relight", ["environment={inputs}/good.exr", "cameras={inputs}/absent.json"], ["absent.json"]),
+    ("tron-relight", ["environment=[{inputs}/good.exr,{inputs}/absent.hdr]"], ["absent.hdr"]),
+    ("tron-relight", ["environment={inputs}/walk.mp4"], ["a video cannot hold", "walk.mp4"]),
+    ("tron-relight", ["scene={inputs}/walk.mp4"], ["a video", "ffmpeg -i walk.mp4", "tron-reconstruct"]),
+    ("tron-relight", ["scene={inputs}/cat.splat"], ["antimatter15", "splat-transform cat.splat cat.ply"]),
+    ("tron-relight", ["scene={inputs}/cat.spz"], ["Niantic", "splat-transform cat.spz cat.ply"]),
+    ("tron-relight", ["scene={inputs}/cat.compressed.ply"], ["PlayCanvas", "cat.compressed.ply cat.ply"]),
+    ("tron-relight", ["checkpoint={inputs}/absent.safetensors"], ["absent.safe"]),
+    ("tron-relight", ["checkpoint={inputs}/text.safetensors"], ["text.safe"]),
+    ("tron-relight", ["vae={inputs}/absent.pth"], ["absent.pth"]),
+    ("tron-relight", ["cameras={inputs}/absent.json"], ["absent.json"]),
+    ("tron-reconstruct", ["capture={inputs}/walk.mp4"], ["a video", "ffmpeg", "capture=DIR"]),
     ("tron-train", ["dataset={inputs}/absent"], ["absent"]),
     ("tron-train", ["dataset={inputs}/empty"], ["empty"]),
     ("tron-train", ["dataset={inputs}/text.ply"], ["text.ply"]),
@@ -60,10 +60,13 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Files that are fine, hostile in the simplest way, or absent."""
     folder = tmp_path_factory.mktemp("inputs")
     (folder / "empty").mkdir()
-    for name in ("text.ply", "text.hdr", "text.xyz", "text.safetensors"):
+    for name in ("text.ply", "text.hdr", "text.xyz", "text.safetensors", "walk.mp4", "cat.splat", "cat.spz"):
         (folder / name).write_text("not what the name says\n")
     header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
     (folder / "points.ply").write_text(header + "end_header\n0 0 0\n")
+    packed = "element chunk 1\nproperty float min_x\nelement vertex 1\nproperty uint packed_position\n"
+    body = "end_header\n" + 8 * "x"
+    (folder / "cat.compressed.ply").write_text(f"ply\nformat binary_little_endian 1.0\n{packed}{body}")
     one_surfel().save(folder / "good.ply")
     EnvironmentMap.constant(1.0).save(folder / "good.exr")
     return folder

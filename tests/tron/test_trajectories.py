@@ -9,7 +9,7 @@ from tron import trajectories
 from tron.cameras import Camera
 from tron.errors import TronError
 
-PATHS = [trajectories.spiral, trajectories.oscillating, trajectories.orbit]
+PATHS = [trajectories.spiral, trajectories.oscillating, trajectories.orbit, trajectories.still]
 VIEW = {"width": 32, "height": 24, "fov_deg": 40.0}
 TARGET = np.array([1.0, -2.0, 0.5])
 
@@ -55,6 +55,14 @@ def test_spiral_is_even_over_the_area_of_the_sphere():
     height = np.sin(np.radians(elevations_deg(path)))
     counts, _ = np.histogram(height, bins=6)
     assert np.ptp(counts) <= 2
+
+
+def test_still_is_where_an_orbit_starts_one_object_for_all_frames():
+    path = trajectories.still(5, target=TARGET, radius=2, phase=30, **VIEW)
+    start = trajectories.orbit(7, target=TARGET, radius=2, phase=30, **VIEW)[0]
+    assert len(path) == 5
+    assert all(camera is path[0] for camera in path)
+    np.testing.assert_array_equal(path[0].world_to_camera, start.world_to_camera)
 
 
 def test_oscillation_swings_about_its_mean_between_its_azimuths():

@@ -79,13 +79,17 @@ class FrameFolder:
         """A frame's buffer as (H, W, 3) float32."""
         return read_image(self.path(index, name, "exr"))
 
+    def write_linear(self, index: int, name: str, image: np.ndarray) -> None:
+        """Write linear values that follow from the buffers, (H, W, 3) or (H, W, 4), as NNNN.NAME.exr."""
+        write_image(self.path(index, name, "exr"), image)
+
     def write_picture(self, index: int, name: str, display: np.ndarray) -> None:
-        """Write (H, W, 3) display values in [0, 1] as NNNN.NAME.png."""
+        """Write display values in [0, 1], (H, W, 3) or with straight alpha (H, W, 4), as NNNN.NAME.png."""
         write_image(self.path(index, name, "png"), display)
 
     def row(self, index: int, names: Sequence[str]) -> np.ndarray:
-        """A frame's pictures side by side, (H, W * len(names), 3) display values."""
-        return np.concatenate([read_image(self.path(index, name, "png")) for name in names], axis=1)
+        """A frame's pictures side by side, (H, W * len(names), 3) display values; with alpha, over black."""
+        return np.concatenate([_over_black(self.path(index, name, "png")) for name in names], axis=1)
 
     def write_video(self, path: Path, frames: int, names: Sequence[str], fps: float) -> None:
         """Write the pictures of all frames, side by side, as a video."""
@@ -99,6 +103,11 @@ class FrameFolder:
         columns = np.linspace(0, frames, min(frames, _SHEET_COLUMNS), endpoint=False).astype(int)
         rows = [[_thumbnail(self.row(index, [name])) for index in columns] for name in names]
         write_image(path, np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0))
+
+
+def _over_black(path: Path) -> np.ndarray:
+    picture = read_image(path, channels=4)
+    return picture[..., :3] * picture[..., 3:]
 
 
 def _thumbnail(display: np.ndarray) -> np.ndarray:

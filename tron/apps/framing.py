@@ -6,20 +6,17 @@ view that shows all of it shows little else. Strays are left out by quantiles.
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from tron import trajectories
 from tron.cameras import Camera
-from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 
-TrajectoryName = Literal["orbit", "spiral", "oscillating"]
+TrajectoryName = Literal["orbit", "spiral", "oscillating", "still"]
 
 # Fraction of the subject's surfels that may lie outside the frame.
 STRAYS = 0.01
@@ -93,6 +90,7 @@ def plan_cameras(
         "orbit": trajectories.orbit,
         "spiral": trajectories.spiral,
         "oscillating": trajectories.oscillating,
+        "still": trajectories.still,
     }[trajectory]
 
     def at(radius: float) -> list[Camera]:
@@ -125,35 +123,6 @@ def _hold(cameras: list[Camera], points: np.ndarray) -> bool:
         if inside.mean() < 1 - STRAYS:
             return False
     return True
-
-
-def read_cameras(path: Path, width: int, height: int) -> list[Camera]:
-    """Cameras of a JSON file, resized: a list of cameras (Camera.to_dict), or an object with such a list as
-    "cameras", as relight.json and the metadata of shards have it.
-
-    Raises TronError if the file is missing, is no such JSON, holds no camera, or has another aspect ratio.
-    """
-    try:
-        content = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise TronError(f"cannot read: {error.strerror or error}", path) from error
-    except ValueError as error:
-        raise TronError(f"not JSON: {error}", path) from error
-    entries = content.get("cameras") if isinstance(content, dict) else content
-    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
-        raise TronError("no cameras found", path, 'give a list of cameras, or {"cameras": [...]}')
-    try:
-        cameras = [Camera.from_dict(entry) for entry in entries]
-    except TronError as error:
-        raise TronError(error.what, path, error.mend) from error
-    for camera in cameras:
-        if abs(camera.width * height - camera.height * width) > max(width, height):
-            raise TronError(
-                f"cameras are {camera.width} x {camera.height}, frames {width} x {height}",
-                path,
-                "choose width and height of the same aspect ratio",
-            )
-    return [camera.resized(width, height) for camera in cameras]
 
 
 def turn_cameras(cameras: list[Camera], rotation: np.ndarray) -> list[Camera]:

@@ -172,20 +172,52 @@ def _require_option(override: Override, options: Sequence[str]) -> None:
 
 
 def _one_line(error: pydantic.ValidationError, values: Any, settings: type[pydantic.BaseModel]) -> TronError:
+    errors = error.errors()
     # Unknown keys first: a misspelt key often leaves a second error behind, of the key that was meant.
-    first = min(error.errors(), key=lambda each: each["type"] != "extra_forbidden")
+    first = min(errors, key=lambda each: each["type"] != "extra_forbidden")
     if not first["loc"]:  # a rule between several keys: its message names them
         return TronError(first["msg"].removeprefix("Value error, "))
     key = _written_key(first["loc"], values)
     if first["type"] == "extra_forbidden":
         return unknown_key(key, list(field_keys(settings)))
-    if first["type"] == "missing" or first["input"] is None:
-        return _required(key)
+    # What may be of several types fails as each of them: the error furthest inside a list says most.
+    same = [each for each in errors if f"{_written_key(each['loc'], values)}.".startswith(f"{key}.")]
+    first = max(same, key=lambda each: (len(_written_key(each["loc"], values)), _wrong_length(each)))
+    key = _written_key(first["loc"], values)
     shown = repr(first["input"])
     if len(shown) > SHOWN_CHARACTERS:
         shown = shown[:SHOWN_CHARACTERS] + "..."
     reason = first["msg"].removeprefix("Value error, ")
-    return TronError(f"wrong value for '{key}'", where=shown, mend=reason[:1].lower() + reason[1:])
+    reason = reason[:1].lower() + reason[1:]
+    if _wrong_length(first) or (first["input"] is not None and any(map(_wants_list, same))):
+        as_list = f"a list is written {key}={_list_example(first['loc'], settings) or [first['input']]}"
+        plain = _wants_list(first) or first["type"] == "missing"
+        return TronError(f"wrong value for '{key}'", shown, as_list if plain else f"{reason}; {as_list}")
+    if first["type"] == "missing" or first["input"] is None:
+        return _required(key)
+    return TronError(f"wrong value for '{key}'", where=shown, mend=reason)
+
+
+def _wants_list(error: Any) -> bool:
+    return error["type"] in ("tuple_type", "list_type")
+
+
+def _wrong_length(error: Any) -> bool:
+    return error["type"] in ("too_short", "too_long") or (
+        error["type"] == "missing" and isinstance(error["loc"][-1], int)
+    )
+
+
+def _list_example(location: Sequence[str | int], settings: type[pydantic.BaseModel]) -> str | None:
+    """The first example that a settings model's field gives of itself, if it gives one."""
+    model: type[pydantic.BaseModel] | None = settings
+    field = None
+    for part in location:
+        found = model.model_fields.get(str(part)) if model else None
+        if found is None:
+            break
+        field, model = found, nested_model(found.annotation)
+    return str(field.examples[0]) if field is not None and field.examples else None
 
 
 def field_keys(model: type[pydantic.BaseModel], prefix: str = "") -> Iterator[str]:
@@ -218,7 +250,7 @@ def _written_key(location: Sequence[str | int], values: Any) -> str:
         if isinstance(inside, Mapping):
             parts.append(str(part))
             inside = inside.get(part)
-        elif isinstance(inside, list) and isinstance(part, int):
+        elif isinstance(inside, list) and isinstance(part, int) and part < len(inside):
             parts.append(str(part))
             inside = inside[part]
     return ".".join(parts)

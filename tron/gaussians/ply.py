@@ -13,9 +13,10 @@ cannot ask for terabytes.
 
 from __future__ import annotations
 
+import logging
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +24,12 @@ import plyfile
 
 from tron.color import srgb_to_linear
 from tron.errors import TronError
+from tron.foreign_files import packed_splats, refuse_foreign
 from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
 from tron.gaussians.scene import GaussianScene, measure_spacing
 from tron.storage import atomic_path
+
+log = logging.getLogger(__name__)
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
@@ -42,6 +46,10 @@ FLATNESS = 1e-3
 # What a Gaussian without materials is taken to be made of: a rough dielectric in its own colours.
 GUESSED_ROUGHNESS = 0.6
 GUESSED_METALLIC = 0.0
+# Up in a file that does not say: 3DGS keeps COLMAP's world, whose y axis points down where photos are level.
+GUESSED_UP = (0.0, -1.0, 0.0)
+# What an opacity of exactly 1, whose logit is infinite, is stored as: 3e-7 below 1.
+OPAQUE_LOGIT = 15.0
 
 _HEADER_LIMIT = 1 << 16
 _TYPE_BYTES = {
@@ -82,15 +90,16 @@ def read_ply(path: str | Path) -> GaussianScene:
     along which the Gaussian was thinnest; quaternions are normalised. f_rest of degree 0 to 3 is accepted. A
     file without materials gets guessed ones (base colour from the mean colour, rough, not metallic) and says
     so in `materials_guessed`; a file that is not TRON's has unoriented normals (`oriented` is False), kernel
-    degree 2, z up and a measured spacing.
+    degree 2 and a measured spacing. Up is what a comment says, TRON's or nerfstudio's ("Vertical Axis: z");
+    where none does it is -y, and `up_guessed` is True. An opacity logit of +infinity means opaque; surfels
+    whose logit is -infinity or NaN are left out, with one line in the log that counts both.
 
-    Raises TronError, one line, for files that are missing, are no PLY, lack properties (named), declare more
-    than they hold, or hold NaN, infinities or zero quaternions.
+    Raises TronError, one line, for files that are missing, are no PLY or a packed one, lack properties
+    (named), declare more than they hold, or hold NaN, infinities or zero quaternions elsewhere.
     """
     path = Path(path)
+    check_header(path)
     try:
-        with open(path, "rb") as stream:
-            _check_header(stream.read(_HEADER_LIMIT), os.fstat(stream.fileno()).st_size, path)
         data = plyfile.PlyData.read(str(path))
     except OSError as error:
         raise TronError(f"cannot read: {error.strerror or error}", path) from error
@@ -99,6 +108,8 @@ def read_ply(path: str | Path) -> GaussianScene:
     constants = _read_constants(data.comments, path)
     columns = {p.name: data["vertex"][p.name] for p in data["vertex"].properties}
     _check_properties(columns, path)
+    columns = _with_finite_opacity(columns, path)
+    up, up_guessed = _up(constants, data.comments)
 
     def stack(names: tuple[str, ...]) -> np.ndarray:
         return np.stack([np.asarray(columns[name], dtype=np.float32) for name in names], axis=-1)
@@ -126,16 +137,36 @@ def read_ply(path: str | Path) -> GaussianScene:
         object_id=_object_id(columns, len(means), path),
         kernel_degree=int(constants.get("kernel_degree", [2])[0]),
         spacing=constants["spacing"][0] if "spacing" in constants else measure_spacing(means),
-        up=np.array(constants.get("up", (0.0, 0.0, 1.0))),
+        up=np.array(up),
+        up_guessed=up_guessed,
         materials_guessed=guessed or bool(constants.get("materials_guessed", [0])[0]),
         oriented=bool(constants.get("oriented", [0])[0]),
     )
     return scene.validate(path)
 
 
+def check_header(path: Path) -> None:
+    """Look at the first bytes of a scene's file alone: a wrong one is found before anything is loaded.
+
+    Raises TronError if the file cannot be opened, is no PLY of Gaussians as far as its header tells, or is
+    shorter than the header says.
+    """
+    try:
+        with open(path, "rb") as stream:
+            head, size = stream.read(_HEADER_LIMIT), os.fstat(stream.fileno()).st_size
+    except OSError as error:
+        raise TronError(f"cannot read: {error.strerror or error}", path) from error
+    if not head.startswith(b"ply"):
+        refuse_foreign(path)
+        raise TronError("not a PLY file", path, _EXPORT)
+    _check_sizes(head, size, path)
+
+
 def _constants(scene: GaussianScene) -> list[str]:
     up = " ".join(repr(float(v)) for v in scene.up)
+    guessed = ["tron up_guessed 1"] if scene.up_guessed else []
     return [
+        *guessed,
         f"tron kernel_degree {scene.kernel_degree}",
         f"tron spacing {scene.spacing!r}",
         f"tron up {up}",
@@ -161,17 +192,28 @@ def _read_constants(comments: list[str], path: Path) -> dict[str, list[float]]:
     return constants
 
 
-def _check_header(head: bytes, size: int, path: Path) -> None:
+def _up(constants: dict[str, list[float]], comments: list[str]) -> tuple[Sequence[float], bool]:
+    """Up direction of a file, and whether it was guessed."""
+    if "up" in constants:
+        return constants["up"], bool(constants.get("up_guessed", [0])[0])
+    for comment in comments:
+        words = comment.lower().split()
+        if words[:2] == ["vertical", "axis:"] and words[2:] in (["x"], ["y"], ["z"]):
+            return [float(axis == words[2]) for axis in "xyz"], False
+    return GUESSED_UP, True
+
+
+def _check_sizes(head: bytes, size: int, path: Path) -> None:
     """Raise TronError unless the elements that the header declares fit into the bytes that follow it.
 
     `head` holds the first bytes of the file, `size` is the file's length. Only sizes are judged here; the
     grammar is plyfile's business.
     """
-    if not head.startswith(b"ply"):
-        raise TronError("not a PLY file", path)
     end = head.find(b"end_header")
     if end < 0:
         raise TronError("the PLY header has no end", path)
+    if b"packed_position" in head[:end]:
+        raise packed_splats(path, "PlayCanvas's compressed PLY")
     ascii_body = False
     elements: list[tuple[str, int, int]] = []  # name, count, least bytes of a row
     for line in head[:end].decode("ascii", "replace").splitlines():
@@ -211,6 +253,20 @@ def _check_properties(columns: dict[str, np.ndarray], path: Path) -> None:
     if present and len(present) < len(MATERIALS):
         absent = ", ".join(name for name in MATERIALS if name not in columns)
         raise TronError(f"the PLY has {present[0]} but lacks {absent}", path, "write all materials or none")
+
+
+def _with_finite_opacity(columns: dict[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:
+    """The rows whose opacity is that of a surfel, infinite logits clipped; the log counts the others."""
+    logits = np.asarray(columns["opacity"], dtype=np.float32)
+    opaque, absent = np.isposinf(logits), np.isnan(logits) | np.isneginf(logits)
+    if not (opaque.any() or absent.any()):
+        return columns
+    log.warning(
+        "%s: %d infinite opacities taken as opaque, %d surfels left out (opacity 0 or NaN)",
+        path, opaque.sum(), absent.sum(),
+    )  # fmt: skip
+    columns = columns | {"opacity": np.where(opaque, np.float32(OPAQUE_LOGIT), logits)}
+    return {name: values[~absent] for name, values in columns.items()}
 
 
 def _guess(sh: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

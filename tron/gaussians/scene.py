@@ -58,6 +58,7 @@ class GaussianScene:
     kernel_degree              2: exp(-d^2 / 2), as in 2DGS; 4: exp(-4.5/81 d^4), flatter and sharper
     spacing                    distance between neighbouring surfels, world units (see measure_spacing)
     up              (3,)       unit up direction
+    up_guessed                 True where nobody has said which way is up
     materials_guessed          True where the materials were derived from colours, not measured
     oriented                   False where the sign of the normals means nothing, as in files of 3DGS: camera
     rays
@@ -76,6 +77,7 @@ class GaussianScene:
     kernel_degree: int = 2
     spacing: float = 0.0
     up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    up_guessed: bool = False
     materials_guessed: bool = False
     oriented: bool = True
 

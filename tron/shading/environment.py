@@ -15,6 +15,7 @@ Between those samples radiance is bilinear in (u, v), and every integral below i
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from scipy import sparse
 from tron.aligned import aligned
 from tron.color import luminance
 from tron.errors import TronError
+from tron.foreign_files import VIDEOS
 from tron.images import read_image, write_image
 
 PDF_WIDTH = 512
@@ -69,8 +71,9 @@ class EnvironmentMap:
         """
         path = Path(path)
         if path.suffix.lower() not in (".hdr", ".exr"):
+            kind = "a video" if path.suffix.lower() in VIDEOS else path.suffix or "a file without suffix"
             raise TronError(
-                f"{path.suffix or 'a file without suffix'} cannot hold an environment map",
+                f"{kind} cannot hold an environment map",
                 where=str(path),
                 mend="give a lat-long .hdr or .exr",
             )
@@ -218,6 +221,13 @@ class EnvironmentLight:
         mass /= mass.sum()
         self._density = mi.Float(aligned((mass / area).astype(np.float32).ravel()))
         self._distribution = mi.DiscreteDistribution2D(mass.astype(np.float32))
+
+    def turned_to(self, rotation_deg: float) -> EnvironmentLight:
+        """The same map at another rotation. Texels and densities are shared, so this costs nothing."""
+        other = copy(self)
+        other.environment = replace(self.environment, rotation_deg=rotation_deg)
+        other._rotation = dr.opaque(mi.Float, rotation_deg / 360)
+        return other
 
     @property
     def face_resolution(self) -> int:

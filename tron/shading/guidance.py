@@ -22,7 +22,8 @@ exposure and AgX are applied when a buffer is looked at or loaded.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import drjit as dr
@@ -61,6 +62,14 @@ class Lighting:
         self.environment = environment
         self.light = EnvironmentLight(environment)
         self.split_sum = SplitSum(environment, cubemap_resolution, self.light)
+
+    def turned_to(self, rotation_deg: float) -> Lighting:
+        """The same environment at another rotation about +z, in microseconds: lookups are turned."""
+        other = copy(self)
+        other.environment = replace(self.environment, rotation_deg=rotation_deg)
+        other.light = self.light.turned_to(rotation_deg)
+        other.split_sum = self.split_sum.turned_to(rotation_deg)
+        return other
 
 
 @dataclass

@@ -11,6 +11,8 @@ more, at 32 texels a face: its kink at the terminator shows at 16 (4 % off at wo
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
 from functools import cache
 
 import drjit as dr
@@ -56,6 +58,12 @@ class SplitSum:
     ) -> None:
         if resolution not in (64, 128, 256, 512, 1024):
             raise TronError(f"cubemap resolution is {resolution}", mend="use 64, 128, 256, 512 or 1024")
+        # Levels are those of the map at rest, and lookups are turned: one preparation serves all rotations.
+        self._turn_to(0.0)
+        if isinstance(environment, EnvironmentMap):
+            self._turn_to(environment.rotation_deg)
+            environment = replace(environment, rotation_deg=0.0)
+            light = light and light.turned_to(0.0)
         tree = LightTree.build(_on_device(environment, 8 * resolution, light), resolution)
         resolutions = _level_resolutions(resolution)
         roughnesses = _level_roughnesses(len(resolutions))
@@ -72,9 +80,19 @@ class SplitSum:
         self._table = mi.Float(aligned(brdf_table().ravel()))
         dr.eval(self._texels)
 
+    def turned_to(self, rotation_deg: float) -> SplitSum:
+        """The same map, prepared once, at another rotation about +z (as ``EnvironmentMap.rotation_deg``)."""
+        other = copy(self)
+        other._turn_to(rotation_deg)
+        return other
+
+    def _turn_to(self, rotation_deg: float) -> None:
+        angle = np.radians(rotation_deg)
+        self._cos, self._sin = (dr.opaque(mi.Float, float(value)) for value in (np.cos(angle), np.sin(angle)))
+
     def diffuse(self, normal: mi.Vector3f) -> mi.Color3f:
         """Unoccluded irradiance / pi: linear radiance of a white diffuse surface of unit ``normal``."""
-        return self._level(mi.Vector3f(normal), self._last + 1)
+        return self._level(self._at_rest(mi.Vector3f(normal)), self._last + 1)
 
     def specular(
         self, normal: mi.Vector3f, to_camera: mi.Vector3f, roughness: mi.Float, f0: mi.Color3f
@@ -96,12 +114,17 @@ class SplitSum:
 
     def prefiltered(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
         """Environment filtered by the lobe of ``roughness``, trilinear, in unit world ``direction``."""
+        direction = self._at_rest(mi.Vector3f(direction))
         level = self._level_of(roughness)
         lower = mi.UInt32(level)
         lower = dr.select(lower < self._last, lower, self._last - 1)
         return dr.lerp(
             self._level(direction, lower), self._level(direction, lower + 1), level - mi.Float(lower)
         )
+
+    def _at_rest(self, d: mi.Vector3f) -> mi.Vector3f:
+        """World directions in the frame of the map before it is turned."""
+        return mi.Vector3f(self._cos * d.x + self._sin * d.y, self._cos * d.y - self._sin * d.x, d.z)
 
     def _level_of(self, roughness: mi.Float) -> mi.Float:
         before_last = mi.Float(self._last) - 1

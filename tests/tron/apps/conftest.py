@@ -1,13 +1,18 @@
 """A small scene with everything that relighting shows: a metal ball and its shadow on a floor."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tron.apps.relight import cli
 from tron.gaussians.harmonics import rgb_to_dc
 from tron.gaussians.scene import GaussianScene, quats_from_normals
+from tron.shading.environment import EnvironmentMap
 
+SIZE = 32
+"""Pixels along a side of a frame that the command renders here."""
 CENTRE, RADIUS = np.array([0.0, 0.0, 0.5]), 0.5
 
 
@@ -44,3 +49,33 @@ def make_ball_on_floor(spacing: float = 0.06, half: float = 1.5) -> GaussianScen
 def ball_on_floor() -> Callable[..., GaussianScene]:
     """Makes a fresh scene at each call."""
     return make_ball_on_floor
+
+
+@pytest.fixture(scope="module")
+def scene_path(ball_on_floor, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "surfels.ply"
+    ball_on_floor().save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def light_path(tmp_path_factory) -> Path:
+    """A dim sky with a bright patch low in the +x direction."""
+    image = np.full((32, 64, 3), 0.3, np.float32)
+    row, column = 9, 16  # u = atan2(x, y) / 2 pi = 1/4
+    image[row - 1 : row + 2, column - 2 : column + 2] = 60.0
+    path = tmp_path_factory.mktemp("light") / "lamp.exr"
+    EnvironmentMap(image).save(path)
+    return path
+
+
+@pytest.fixture
+def relight(variant) -> Callable[..., int]:
+    """Runs the command in this process; gives its exit code."""
+
+    def run(*overrides: str) -> int:
+        with pytest.raises(SystemExit) as exit_info:
+            cli([f"width={SIZE}", f"height={SIZE}", f"variant={variant}", *overrides])
+        return int(exit_info.value.code or 0)
+
+    return run

@@ -1,16 +1,15 @@
 """tron-relight from end to end on a tiny scene: files, laws of light, resuming, and mistakes."""
 
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import plyfile
 import pytest
 
-from tron.apps import relight as app
+from tron.apps import clip as clips
+from tron.apps.clip import GUIDANCE, Clip
 from tron.apps.frame_folder import FrameFolder
-from tron.apps.relight import cli
+from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
 from tron.gaussians.ply import MATERIALS
 from tron.images import read_image
@@ -21,52 +20,24 @@ from tron.video import read_video
 SIZE = 32
 
 
-@pytest.fixture(scope="module")
-def scene_path(ball_on_floor, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("scene") / "surfels.ply"
-    ball_on_floor().save(path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def light_path(tmp_path_factory) -> Path:
-    """A dim sky with a bright patch low in the +x direction."""
-    image = np.full((32, 64, 3), 0.3, np.float32)
-    row, column = 9, 16  # u = atan2(x, y) / 2 pi = 1/4
-    image[row - 1 : row + 2, column - 2 : column + 2] = 60.0
-    path = tmp_path_factory.mktemp("light") / "lamp.exr"
-    EnvironmentMap(image).save(path)
-    return path
-
-
-@pytest.fixture
-def relight(variant) -> Callable[..., int]:
-    """Runs the command in this process; gives its exit code."""
-
-    def run(*overrides: str) -> int:
-        with pytest.raises(SystemExit) as exit_info:
-            cli([*overrides, f"width={SIZE}", f"height={SIZE}", f"variant={variant}"])
-        return int(exit_info.value.code or 0)
-
-    return run
-
-
 def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, tmp_path):
     out = tmp_path / "out"
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=2"]
     assert relight(*base, "buffers=[normal,depth,mask]") == 0
     frames = sorted(path.name for path in (out / "frames").iterdir())
-    buffers = ("depth", "irradiance", "mask", "normal", "pbr")
+    buffers = ("depth", "irradiance", "mask", "normal", "pbr", "shadowed")
     expected = [f"{i:04d}.{name}.exr" for i in range(2) for name in buffers]
-    expected += [f"{i:04d}.{name}.png" for i in range(2) for name in ("irradiance", "pbr")]
+    expected += [f"{i:04d}.{name}.png" for i in range(2) for name in ("irradiance", "pbr", "relit")]
     assert frames == sorted([*expected, "settings.json"])
     assert read_video(out / "guidance.mp4").shape == (2, SIZE, 2 * SIZE, 3)
-    assert read_image(out / "contact_sheet.png").shape == (2 * SIZE, 2 * SIZE, 3)
+    assert read_video(out / "relit.mp4").shape == (2, SIZE, SIZE, 3)
+    assert read_image(out / "contact_sheet.png").shape == (3 * SIZE, 2 * SIZE, 3)
     assert not (out / "neural.mp4").exists()
     report = json.loads((out / "relight.json").read_text())
     assert report["frames"] == report["frames_rendered"] == 2
     assert report["exposure"] == pytest.approx(EnvironmentMap.load(light_path).exposure())
     assert report["scene"]["materials_guessed"] is False
+    assert report["relit"] == "shadowed"
 
     normal, mask = (read_image(out / "frames" / f"0000.{name}.exr") for name in ("normal", "mask"))
     middle = normal[SIZE // 2, SIZE // 2]
@@ -151,7 +122,8 @@ def test_a_plain_3dgs_file_is_relit_with_a_warning(relight, scene_path, light_pa
     plyfile.PlyData([plyfile.PlyElement.describe(plain, "vertex")], byte_order="<").write(str(path))
     masks = []
     for scene, out in ((scene_path, tmp_path / "ours"), (path, tmp_path / "plain")):
-        assert relight(f"scene={scene}", f"environment={light_path}", f"output_dir={out}", "frames=1") == 0
+        base = [f"scene={scene}", f"environment={light_path}", f"output_dir={out}", "frames=1"]
+        assert relight(*base, "up=[0,0,1]") == 0
         masks.append(read_image(out / "frames" / "0000.mask.exr")[..., 0])
     assert "materials" in caplog.text
     assert "guessed" in caplog.text
@@ -172,6 +144,9 @@ def test_a_new_renderer_shows_the_pbr_buffer(relight, scene_path, light_path, tm
     for index in range(2):
         neural, pbr = (read_image(out / "frames" / f"{index:04d}.{name}.png") for name in ("neural", "pbr"))
         np.testing.assert_allclose(neural, pbr, atol=1.01 / 255)
+        relit = out / "frames" / f"{index:04d}.relit.png"
+        assert relit.read_bytes() == relit.with_name(f"{index:04d}.neural.png").read_bytes()
+    assert json.loads((out / "relight.json").read_text())["relit"] == "neural"
     assert read_video(out / "guidance.mp4").shape == (2, SIZE, 3 * SIZE, 3)
     assert read_video(out / "neural.mp4").shape == (2, SIZE, SIZE, 3)
 
@@ -186,13 +161,14 @@ def test_a_clip_in_parts_is_the_clip_in_one(tmp_path, monkeypatch):
     renderer = NeuralRenderer(RendererConfig(window=5, backbone=small)).eval()
     torch.manual_seed(1)
     torch.nn.init.normal_(renderer.backbone.transformer.proj_out.weight, std=0.1)
-    folder = FrameFolder(tmp_path, app.GUIDANCE)
+    folder = FrameFolder(tmp_path, GUIDANCE)
     rng = generator(0, "test", "clip")
     for index in range(13):
-        folder.write(index, {name: rng.uniform(0, 2, (16, 16, 3)) for name in app.GUIDANCE})
-    monkeypatch.setattr(app, "CLIP_FRAMES", 6)
-    app._neural_pass(renderer, folder, 13, exposure=0.7)
-    clip = (np.stack([folder.read(i, name) for i in range(13)]) for name in app.GUIDANCE)
+        folder.write(index, {name: rng.uniform(0, 2, (16, 16, 3)) for name in GUIDANCE})
+    monkeypatch.setattr(clips, "CLIP_FRAMES", 6)
+    light, picture = EnvironmentMap.constant(1.0), RelitPicture("environment", neural=True)
+    Clip(light, [0.0] * 13, 0.7, picture, folder).draw(renderer)
+    clip = (np.stack([folder.read(i, name) for i in range(13)]) for name in GUIDANCE)
     whole = render_clip(renderer, *clip, exposure=0.7)
     for index in range(13):
         np.testing.assert_allclose(folder.row(index, ["neural"]), whole[index], atol=1.01 / 255)
@@ -223,13 +199,23 @@ def test_a_scene_lying_on_its_side_is_stood_up(relight, ball_on_floor, light_pat
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"scene": "absent.ply"}, "cannot read"),
+        ({"scene": "absent.ply"}, "file not found (absent.ply)"),
         ({"environment": "absent.hdr"}, "absent.hdr"),
+        ({"environment": "[a.hdr,b/a.hdr]"}, "a.hdr, b/a.hdr"),
+        ({"vae": "absent.pth"}, "file not found (absent.pth)"),
         ({"checkpoint": "absent.safetensors"}, "absent.safetensors"),
         ({"cameras": "absent.json"}, "absent.json"),
         ({"quality": "best"}, "'quality'"),
         ({"up": "[0,0,0]"}, "'up'"),
         ({"exposure": "-1"}, "'exposure'"),
+        ({"buffers": "pbr"}, "a list is written buffers=[pbr]"),
+        ({"up": "0,0,1"}, "write 'up=[0,0,1]'"),
+        ({"up": "[0,1]"}, "a list is written up=[0,0,1]"),
+        ({"rotation": "fast"}, "a list is written rotation=[0,360]"),
+        ({"rotation": "[0,x]"}, "'rotation.1'"),
+        ({"background": "white"}, "a list is written background=[1,1,1]"),
+        ({"background": "[0,0,255]"}, "'background.2' (255)"),
+        ({"checkpoint": "absent.safetensors", "buffers": "[relit]"}, "no relit.exr with a checkpoint"),
         ({"buffers": "[pbr,nonsense]"}, "'buffers"),
         ({"framse": "3"}, "framse"),
     ],

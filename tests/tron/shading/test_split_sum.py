@@ -9,6 +9,7 @@ from tron.errors import TronError
 from tron.seeds import generator
 from tron.shading.cubemap import direction_face, face_direction
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
+from tron.shading.guidance import Lighting
 from tron.shading.prefilter import LightTree, ggx_prefilter
 from tron.shading.split_sum import SplitSum, brdf_table
 
@@ -192,6 +193,22 @@ def test_turning_the_light_turns_its_filters(variant: str) -> None:
             SplitSum(environment.rotated(90), 64).prefiltered(vector(d @ turn.T), mi.Float(roughness))
         )
         np.testing.assert_allclose(turned, still, rtol=0.01, atol=0.01)
+
+
+def test_one_preparation_serves_every_rotation(variant: str) -> None:
+    """To the last bit, so that frames under a turning light are those of each angle alone."""
+    image, d = random_map().image, unit(500)
+    anew = Lighting(EnvironmentMap(image, 130), 64)
+    turned = Lighting(EnvironmentMap(image, 20), 64).turned_to(130)
+    u = mi.Point2f(np.linspace(0.01, 0.99, 500), np.linspace(0.99, 0.01, 500))
+    for one, other in (
+        (anew.split_sum.diffuse(vector(d)), turned.split_sum.diffuse(vector(d))),
+        (anew.split_sum.prefiltered(vector(d), 0.3), turned.split_sum.prefiltered(vector(d), 0.3)),
+        (anew.light.radiance(vector(d)), turned.light.radiance(vector(d))),
+        (anew.light.sample(u)[0], turned.light.sample(u)[0]),
+    ):
+        np.testing.assert_array_equal(rows(one), rows(other))
+    assert turned.environment.rotation_deg == 130
 
 
 def monte_carlo_albedo(cosine: float, alpha: float, n: int = 400_000) -> tuple[float, float]:

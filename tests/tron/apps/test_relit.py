@@ -1,0 +1,281 @@
+"""Laws of the relit picture, through the command: what it shows, over what, and in which light."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tron.apps import clip as clips
+from tron.apps.relight_settings import Settings
+from tron.cameras import Camera
+from tron.color import agx, to_display
+from tron.gaussians.scene import GaussianScene
+from tron.images import read_image
+from tron.seeds import generator
+from tron.shading.background import background_share
+from tron.shading.environment import EnvironmentMap
+from tron.video import read_video
+
+SIZE = 32
+STEP = 1.01 / 255
+BACKGROUNDS = {"environment": "environment", "transparent": "transparent", "colour": "[0.2,0.9,0.4]"}
+
+
+@pytest.fixture(scope="module")
+def lights(tmp_path_factory) -> list[Path]:
+    """Two skies of random texels, nothing in them alike."""
+    folder = tmp_path_factory.mktemp("lights")
+    for name in ("dawn", "night"):
+        texels = generator(0, "tests", name).gamma(0.5, size=(16, 32, 3))
+        EnvironmentMap(texels.astype(np.float32)).save(folder / f"{name}.exr")
+    return [folder / "dawn.exr", folder / "night.exr"]
+
+
+@pytest.fixture(scope="module")
+def over(variant, scene_path, lights, tmp_path_factory):
+    """One frame over each background, all from one folder of buffers: name -> folder of pictures."""
+    from tron.apps.relight import cli
+
+    base = tmp_path_factory.mktemp("over")
+    for name, background in BACKGROUNDS.items():
+        with pytest.raises(SystemExit) as stop:
+            cli([f"scene={scene_path}", f"environment={lights[0]}", f"output_dir={base / name}", "frames=1",
+                 f"background={background}", f"width={SIZE}", f"height={SIZE}", f"variant={variant}",
+                 "buffers=[relit,mask,foreground,shadowed]"])  # fmt: skip
+        assert stop.value.code == 0
+    return base
+
+
+def picture(folder: Path, name: str, index: int = 0, suffix: str = "png") -> np.ndarray:
+    return read_image(folder / "frames" / f"{index:04d}.{name}.{suffix}", channels=None)
+
+
+def directional_albedo(cosine: float, alpha: float, n: int = 400_000) -> float:
+    """Share of light from everywhere that a GGX mirror of F0 = 0.04 sends to the eye.
+
+    Half vectors drawn from D n.h, float64, Smith's masking for either side and Schlick's Fresnel; independent
+    of tron.shading.
+    """
+    rng = generator(0, "tests", "albedo")
+    u, phi = rng.random(n), rng.random(n) * 2 * np.pi
+    z = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))
+    radius = np.sqrt(1 - z * z)
+    half = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], 1)
+    view = np.array([np.sqrt(1 - cosine**2), 0, cosine])
+    along = half @ view
+    down = 2 * along * z - cosine  # cosine of the mirrored direction
+    fresnel = 0.04 + 0.96 * (1 - np.clip(along, 0, 1)) ** 5
+
+    def masking(c: np.ndarray | float) -> np.ndarray:
+        return 2 / (1 + np.sqrt(1 + alpha**2 * (1 / np.square(c) - 1)))
+
+    weight = fresnel * masking(np.maximum(down, 1e-9)) * masking(cosine) * along / (cosine * z)
+    return float(np.where((down > 0) & (along > 0), weight, 0).mean())
+
+
+@pytest.mark.parametrize(("exposure", "factor"), [("auto", None), ("0.7", 0.7)])
+def test_a_white_surface_in_constant_light_shows_the_exposed_value(
+    relight, dense_surfels, tmp_path, exposure, factor
+):
+    """Nothing in the way, base color 1, metallic 0: the diffuse part alone sends back the light's c exactly.
+
+    What the dielectric coat adds is c times its reflectance, known here from an integral of its own.
+    """
+    light, roughness = np.array([0.5, 1.0, 2.0]), 0.5
+    plane = dense_surfels.plane()
+    white = np.ones((len(plane.points), 3))
+    dense_surfels.scene(plane, base_color=white, roughness=white[:, 0] * roughness).save(tmp_path / "a.ply")
+    EnvironmentMap.constant(light).save(tmp_path / "c.exr")
+    view = Camera.look_at((0.5, -3, 1.2), (0, 0, 0), fov_deg=0.5, width=SIZE, height=SIZE)
+    (tmp_path / "view.json").write_text(json.dumps([view.to_dict()]))
+    out = tmp_path / "out"
+    files = [f"scene={tmp_path / 'a.ply'}", f"environment={tmp_path / 'c.exr'}", f"output_dir={out}"]
+    files += [f"cameras={tmp_path / 'view.json'}", "buffers=[relit]"]
+    assert relight(*files, f"exposure={exposure}") == 0
+    factor = factor or 0.4 / (light @ (0.2126, 0.7152, 0.0722))
+
+    everywhere = np.ones((SIZE, SIZE, 3))
+    diffuse = picture(out, "irradiance", suffix="exr")
+    np.testing.assert_allclose(diffuse, light * everywhere, rtol=1e-3)
+    np.testing.assert_allclose(picture(out, "irradiance"), agx(factor * light) * everywhere, atol=STEP)
+    coat = directional_albedo(float(-view.forward[2]), roughness**2)
+    assert coat > 0.05
+    linear = picture(out, "relit", suffix="exr")
+    np.testing.assert_allclose(linear, (1 + coat) * light * everywhere, rtol=3e-3)
+    np.testing.assert_allclose(
+        picture(out, "relit"), agx(factor * (1 + coat) * light) * everywhere, atol=STEP
+    )
+
+
+def test_alpha_is_the_mask(over):
+    rgba, mask = picture(over / "transparent", "relit"), picture(over / "transparent", "mask", suffix="exr")
+    assert rgba.shape == (SIZE, SIZE, 4)
+    np.testing.assert_allclose(rgba[..., 3], mask[..., 0], atol=0.5 / 255 + 1e-4)
+    assert {0.0, 1.0} <= set(rgba[..., 3].ravel().round(2))
+
+
+def test_opaque_pixels_do_not_depend_on_the_background(over):
+    shown = {name: picture(over / name, "relit")[..., :3] for name in BACKGROUNDS}
+    mask = picture(over / "colour", "mask", suffix="exr")[..., 0]
+    opaque, empty = mask > 0.991, mask == 0
+    assert opaque.sum() > 300
+    assert empty.sum() > 50
+    for name in ("transparent", "colour"):
+        np.testing.assert_array_equal(shown[name][opaque], shown["environment"][opaque])
+    np.testing.assert_allclose(shown["colour"][empty], np.tile([0.2, 0.9, 0.4], (empty.sum(), 1)), atol=STEP)
+    assert (shown["transparent"][empty] == 0).all()
+    assert np.ptp(shown["environment"][empty]) > 0.1
+
+
+def test_foreground_over_the_sky_is_the_picture_in_the_environment(over, lights):
+    """The buffers let anyone composite by the one rule of tron.shading.background."""
+    folder = over / "environment"
+    foreground, mask, shadowed, relit = (
+        picture(folder, name, suffix="exr") for name in ("foreground", "mask", "shadowed", "relit")
+    )
+    camera = Camera.from_dict(json.loads((folder / "relight.json").read_text())["cameras"][0])
+    share = background_share(1 - mask)
+    sky = EnvironmentMap.load(lights[0]).lookup(camera.rays())
+    assert ((share > 0.05) & (share < 0.95)).sum() > 10, "rims are tested"
+    np.testing.assert_allclose((1 - share) * foreground + share * sky, shadowed, rtol=0.01, atol=2e-3)
+    np.testing.assert_array_equal(relit, shadowed)
+    exposure = json.loads((folder / "relight.json").read_text())["exposure"]
+    np.testing.assert_allclose(picture(folder, "relit"), to_display(shadowed, exposure), atol=STEP)
+
+
+def test_linear_picture_without_a_sky_is_multiplied_by_its_alpha(over):
+    relit, foreground, mask = (
+        picture(over / "transparent", name, suffix="exr") for name in ("relit", "foreground", "mask")
+    )
+    np.testing.assert_allclose(relit, np.concatenate([foreground * mask, mask], 2), rtol=2e-3, atol=1e-4)
+
+
+def test_another_background_traces_nothing_again(relight, scene_path, lights, tmp_path):
+    base = [f"scene={scene_path}", f"environment={lights[0]}", f"output_dir={tmp_path}", "frames=1"]
+    for background, traced in (("environment", 1), ("transparent", 0), ("[1,1,1]", 0)):
+        assert relight(*base, f"background={background}") == 0
+        assert json.loads((tmp_path / "relight.json").read_text())["frames_rendered"] == traced
+    assert picture(tmp_path, "relit").shape[2] == 3
+
+
+def test_what_has_alpha_is_black_behind_in_videos_and_sheets(relight, scene_path, lights, tmp_path):
+    base = [f"scene={scene_path}", f"environment={lights[0]}", f"output_dir={tmp_path}", "frames=2"]
+    assert relight(*base, "background=transparent") == 0
+    empty = picture(tmp_path, "relit")[..., 3] == 0
+    assert empty[0, 0]
+    assert read_video(tmp_path / "relit.mp4")[0][:3, :3].max() < 12
+    sheet = read_image(tmp_path / "contact_sheet.png")[:SIZE, :SIZE]
+    assert (sheet[empty] == 0).all()
+
+
+def test_a_networks_picture_is_composited_by_the_mask(relight, scene_path, lights, tmp_path):
+    from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
+    from tron.neural.weights import save_renderer
+
+    save_renderer(tmp_path / "r.safetensors", PixelMLP(PixelMLPConfig(width=4)))
+    base = [f"scene={scene_path}", f"environment={lights[0]}", f"output_dir={tmp_path / 'out'}", "frames=1"]
+    base += [f"checkpoint={tmp_path / 'r.safetensors'}", "buffers=[mask]"]
+    assert relight(*base, "background=transparent") == 0
+    neural, mask = picture(tmp_path / "out", "neural"), picture(tmp_path / "out", "mask", suffix="exr")
+    rgba = picture(tmp_path / "out", "relit")
+    np.testing.assert_array_equal(rgba[..., :3], neural)
+    np.testing.assert_allclose(rgba[..., 3:], mask, atol=0.5 / 255 + 1e-4)
+    assert relight(*base, "background=[1,0,0]") == 0
+    share = background_share(1 - mask)
+    expected = (1 - share) * neural + share * np.array([1.0, 0, 0])
+    np.testing.assert_allclose(picture(tmp_path / "out", "relit"), expected, atol=STEP)
+
+
+def test_a_turn_starts_at_its_first_angle_and_loops():
+    def turned(rotation, frames: int) -> list[float]:
+        files = {"scene": "a.ply", "environment": "a.hdr", "output_dir": "out"}
+        return Settings.model_validate({**files, "rotation": rotation}).rotations(frames)
+
+    assert turned(30, 3) == [30, 30, 30]
+    assert turned([0, 360], 4) == [0, 90, 180, 270]
+    assert turned([90, -90], 2) == [90, 0]
+
+
+def test_a_turning_light_on_a_still_view_is_each_angle_alone(
+    relight, scene_path, lights, tmp_path, monkeypatch
+):
+    """The same bytes; and the view, which stands still, is traced once."""
+    from tron.tracing import SurfelTracer
+
+    traced = []
+    gbuffer = SurfelTracer.gbuffer
+    monkeypatch.setattr(SurfelTracer, "gbuffer", lambda *args: traced.append(args) or gbuffer(*args))
+    base = [f"scene={scene_path}", f"environment={lights[0]}", "trajectory=still", "frames=3"]
+    assert relight(*base, f"output_dir={tmp_path / 'turning'}", "rotation=[0,360]") == 0
+    assert len(traced) == 1
+    assert json.loads((tmp_path / "turning" / "relight.json").read_text())["rotations"] == [0, 120, 240]
+    assert relight(*base, f"output_dir={tmp_path / 'at'}", "rotation=120") == 0
+    turning, alone = (frame_files(tmp_path / name, index=1) for name in ("turning", "at"))
+    assert turning == alone
+    shots = [picture(tmp_path / "turning", "irradiance", index, "exr") for index in range(3)]
+    assert np.abs(shots[0] - shots[1]).mean() > 0.01
+    masks = [picture(tmp_path / "turning", "mask", index, "exr") for index in range(3)]
+    assert (masks[0] == masks[2]).all()
+
+
+def frame_files(output_dir: Path, index: int | None = None) -> dict[str, bytes]:
+    pattern = "[0-9]*.*" if index is None else f"{index:04d}.*"
+    return {path.name: path.read_bytes() for path in (output_dir / "frames").glob(pattern)}
+
+
+def test_several_lights_give_what_each_gives_alone_from_one_scene(
+    relight, scene_path, lights, tmp_path, monkeypatch
+):
+    loaded, views = [], []
+    load, tracers = GaussianScene.load, clips._tracers
+    monkeypatch.setattr(GaussianScene, "load", lambda path: loaded.append(path) or load(path))
+
+    def counted(scene):
+        tracer_for = tracers(scene)
+        return lambda camera: views.append(camera) or tracer_for(camera)
+
+    monkeypatch.setattr(clips, "_tracers", counted)
+    base = [f"scene={scene_path}", "frames=2", "rotation=[0,90]"]
+    both = f"environment=[{lights[0]},{lights[1]}]"
+    assert relight(*base, both, f"output_dir={tmp_path / 'both'}") == 0
+    assert (len(loaded), len(views)) == (1, 2)
+    for light in lights:
+        assert relight(*base, f"environment={light}", f"output_dir={tmp_path / light.stem}") == 0
+        together, alone = tmp_path / "both" / light.stem, tmp_path / light.stem
+        assert frame_files(together) == frame_files(alone)
+        assert (together / "relit.mp4").read_bytes() == (alone / "relit.mp4").read_bytes()
+        reports = [json.loads((folder / "relight.json").read_text()) for folder in (together, alone)]
+        assert reports[0]["exposure"] == reports[1]["exposure"]
+        assert reports[0]["settings"]["environment"] == str(light)
+    lost = tmp_path / "both" / "night" / "frames" / "0001.mask.exr"
+    before = lost.read_bytes()
+    lost.unlink()
+    assert relight(*base, both, f"output_dir={tmp_path / 'both'}") == 0
+    rendered = [
+        json.loads((tmp_path / "both" / light.stem / "relight.json").read_text())["frames_rendered"]
+        for light in lights
+    ]
+    assert rendered == [0, 1]
+    assert lost.read_bytes() == before
+
+
+def test_every_file_is_looked_for_before_the_scene_is_loaded(
+    relight, scene_path, lights, tmp_path, monkeypatch, capsys
+):
+    def unwanted(path):
+        raise AssertionError(f"{path} was loaded")
+
+    monkeypatch.setattr(GaussianScene, "load", unwanted)
+    base = [f"scene={scene_path}", f"output_dir={tmp_path / 'out'}"]
+    (tmp_path / "broken.hdr").write_text("<html>")
+    (tmp_path / "broken.json").write_text("[]")
+    for wrong in (
+        f"environment=[{lights[0]},{tmp_path / 'absent.hdr'}]",
+        f"environment={tmp_path / 'broken.hdr'}",
+        f"cameras={tmp_path / 'broken.json'}",
+        f"checkpoint={tmp_path / 'absent.safetensors'}",
+        f"vae={tmp_path / 'absent.pth'}",
+    ):
+        assert relight(*base, f"environment={lights[0]}", wrong) == 2
+        assert Path(wrong.rstrip("]")).name in capsys.readouterr().err

@@ -1,0 +1,163 @@
+"""One light's clip on disk: linear buffers that are traced once, pictures developed from them, and videos."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tron import seeds
+from tron.apps.frame_folder import FrameFolder
+from tron.apps.progress import track
+from tron.apps.relit import RelitPicture, surfels_alone
+from tron.cameras import Camera
+from tron.color import to_display
+from tron.gaussians.scene import GaussianScene
+
+if TYPE_CHECKING:
+    from tron.shading.environment import EnvironmentMap
+    from tron.shading.guidance import Lighting
+    from tron.tracing import GBuffer, SurfelTracer
+
+GUIDANCE = ("pbr", "irradiance")
+# Frames that the neural renderer gets at once; bounds memory, not its view into the past.
+CLIP_FRAMES = 16
+
+
+@dataclass
+class Clip:
+    """Frames under one light.
+
+    Attributes:
+        environment: the light, not turned.
+        rotations: its turn in each frame, degrees.
+        exposure: factor before AgX.
+        picture: how the relit picture is made.
+        folder: the frames; claimed before anything is written.
+        keeps_linear: whether the relit picture is written as EXR too.
+        seconds: of each frame that was traced in this run.
+    """
+
+    environment: EnvironmentMap
+    rotations: Sequence[float]
+    exposure: float
+    picture: RelitPicture
+    folder: FrameFolder
+    keeps_linear: bool = False
+    seconds: list[float] = field(default_factory=list)
+
+    def develop(self, index: int) -> None:
+        """Write the pictures of a frame whose buffers are there, those that need no network."""
+        for name in GUIDANCE:
+            self.folder.write_picture(index, name, to_display(self.folder.read(index, name), self.exposure))
+        if not self.picture.neural:
+            self.folder.write_picture(index, "relit", self.picture.display(self.folder, index, self.exposure))
+        if self.keeps_linear:
+            self.folder.write_linear(index, "relit", self.picture.linear(self.folder, index))
+        else:  # that of an earlier run may stand before another background
+            self.folder.path(index, "relit", "exr").unlink(missing_ok=True)
+
+    def draw(self, renderer: Any) -> None:
+        """Write the neural renderer's pictures, as one window sliding over the clip gives them."""
+        from tron.neural.renderer import render_clip
+
+        # A window that starts this many frames before a part makes the part's own frames independent of the
+        # cut.
+        before = getattr(getattr(renderer, "config", None), "window", 1) - 1
+        frames, step = len(self.rotations), max(CLIP_FRAMES, before + 1)
+        for start in track(range(0, frames, step), "neural"):
+            first, end = max(start - before, 0), min(start + step, frames)
+            pbr, irradiance = (
+                np.stack([self.folder.read(i, name) for i in range(first, end)]) for name in GUIDANCE
+            )
+            display = render_clip(renderer, pbr, irradiance, self.exposure)
+            for index in range(start, end):
+                neural = display[index - first]
+                self.folder.write_picture(index, "neural", neural)
+                relit = self.picture.display(self.folder, index, self.exposure, neural)
+                self.folder.write_picture(index, "relit", relit)
+
+    def assemble(self, output_dir: Path, fps: float) -> None:
+        """Write videos and the contact sheet from the pictures of all frames."""
+        frames, drawn = len(self.rotations), ["neural"] if self.picture.neural else []
+        for name, pictures in {"relit": ["relit"], "guidance": [*GUIDANCE, *drawn], "neural": drawn}.items():
+            if pictures:
+                self.folder.write_video(output_dir / f"{name}.mp4", frames, pictures, fps)
+        self.folder.write_sheet(output_dir / "contact_sheet.png", frames, ["relit", *GUIDANCE, *drawn])
+
+
+def trace(
+    scene: GaussianScene,
+    cameras: Sequence[Camera],
+    clips: Sequence[Clip],
+    *,
+    spp: int,
+    denoise: bool,
+    seed: int,
+) -> None:
+    """Trace the frames that are missing, each view once for all lights, and develop all of them.
+
+    Args:
+        scene: the surfels. cameras: one a frame.
+        spp, denoise: shadow rays a pixel, and whether they are filtered.
+        seed: root of their random numbers; a frame's do not depend on the light.
+    """
+    tracer_for = _tracers(scene)
+    prepared: dict[int, Lighting] = {}
+    seen: tuple[Camera, SurfelTracer, GBuffer] | None = None
+    for index, camera in enumerate(track(cameras, "guidance")):
+        for number, clip in enumerate(clips):
+            if not clip.folder.finished(index):
+                started = time.perf_counter()
+                if number not in prepared:
+                    prepared[number] = _lighting(clip.environment)
+                if seen is None or seen[0] is not camera:
+                    tracer = tracer_for(camera)
+                    seen = camera, tracer, tracer.gbuffer(camera)
+                lighting = prepared[number].turned_to(clip.rotations[index])
+                ray_seed = seeds.integer(seed, "relight", index)
+                buffers = _shade(*seen[1:], lighting, clip.folder.buffers, spp, ray_seed, denoise)
+                clip.seconds.append(time.perf_counter() - started)
+                clip.folder.write(index, buffers)
+            clip.develop(index)
+
+
+def _lighting(environment: EnvironmentMap) -> Lighting:
+    from tron.shading.guidance import Lighting
+
+    return Lighting(environment)
+
+
+def _tracers(scene: GaussianScene) -> Callable[[Camera], SurfelTracer]:
+    """The tracer for a camera: one for all, unless normals mean nothing and must be turned to each camera."""
+    from tron.tracing import SurfelTracer
+
+    if scene.oriented:
+        tracer = SurfelTracer(scene)
+        return lambda _: tracer
+    return lambda camera: SurfelTracer(scene.facing(camera.position))
+
+
+def _shade(
+    tracer: SurfelTracer,
+    gbuffer: GBuffer,
+    lighting: Lighting,
+    names: Sequence[str],
+    spp: int,
+    seed: int,
+    denoise: bool,
+) -> dict[str, np.ndarray]:
+    """The buffers ``names`` of one frame."""
+    from tron.shading.guidance import shade, visibility
+
+    reaching = visibility(tracer, gbuffer, lighting, spp, seed, denoise)
+    guidance = shade(gbuffer, reaching, lighting)
+    made = guidance.gbuffer | vars(guidance)
+    if "foreground" in names:
+        over_black = shade(gbuffer, reaching, lighting, background=(0, 0, 0)).shadowed
+        made["foreground"] = surfels_alone(over_black, guidance.mask)
+    return {name: made[name] for name in names}

@@ -1,0 +1,133 @@
+"""Settings of tron-relight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from tron.apps.framing import TrajectoryName
+from tron.apps.relit import Background
+from tron.errors import TronError
+
+BufferName = Literal[
+    "pbr",
+    "irradiance",
+    "unshadowed",
+    "shadowed",
+    "foreground",
+    "mask",
+    "base_color",
+    "normal",
+    "depth",
+    "position",
+    "roughness",
+    "metallic",
+    "rgb",
+    "relit",
+]
+# Shadow rays a pixel, and whether they are denoised: guidance.md measured both.
+QUALITY = {"preview": (2, True), "final": (64, False)}
+
+Side = Annotated[int, Field(ge=8, le=8192)]
+
+
+class Settings(BaseModel):
+    """Everything that tron-relight can be told."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    scene: Path = Field(description="PLY of the scene: TRON's, or a plain 3DGS or 2DGS file")
+    environment: Path | Annotated[tuple[Path, ...], Field(min_length=1)] = Field(
+        description="lat-long environment map, .hdr or .exr; of several, [a.hdr,b.hdr], each has its own "
+        "folder in output_dir, named after the file",
+        examples=["[a.hdr,b.hdr]"],
+    )
+    output_dir: Path = Field(description="folder for frames, videos and relight.json")
+    background: Background = Field(
+        "environment",
+        description="what stands behind the surfels in the relit picture: the environment, nothing (PNG with "
+        "alpha; black in videos), or a colour as on screen, such as [1,1,1] for white",
+        examples=["[1,1,1]"],
+    )
+    rotation: float | tuple[float, float] = Field(
+        0.0,
+        description="turn of the environment about up, degrees, counter-clockwise seen from above; [0,360] "
+        "turns it evenly over the clip, whose end is left out so that it loops: frame i of n is at 360 i/n",
+        examples=["[0,360]"],
+    )
+    trajectory: TrajectoryName = Field("orbit", description="camera path around the scene; still: no motion")
+    cameras: Path | None = Field(
+        None,
+        description="JSON to use instead of a trajectory: a list of cameras (as in relight.json), or "
+        "nerfstudio's camera_path.json",
+    )
+    quality: Literal["preview", "final"] = Field(
+        "preview", description="preview: 2 shadow rays a pixel, denoised; final: 64"
+    )
+    frames: int = Field(60, ge=1, le=10_000, description="number of frames (those of `cameras` win)")
+    width: Side = Field(512, description="pixels")
+    height: Side = Field(512, description="pixels")
+    fov: float = Field(40.0, gt=1, lt=150, description="horizontal field of view, degrees")
+    distance: float = Field(1.0, gt=0, le=100, description="factor on the automatic distance to the subject")
+    fps: float = Field(24.0, gt=0, le=240, description="frames a second of the videos")
+    exposure: Literal["auto"] | Annotated[float, Field(gt=0)] = Field(
+        "auto", description="factor before the tone curve; auto: from the light on an upward plane"
+    )
+    up: tuple[float, float, float] | None = Field(
+        None,
+        description="up direction of the scene, such as [0,0,1]; null: the file's own, -y where it has none",
+        examples=["[0,0,1]"],
+    )
+    checkpoint: Path | None = Field(
+        None, description="renderer.safetensors: the relit picture is then the neural renderer's"
+    )
+    vae: Path | None = Field(None, description="WAN 2.1 VAE, for checkpoints that were trained with it")
+    buffers: tuple[BufferName, ...] = Field(
+        ("pbr", "irradiance", "unshadowed", "shadowed", "foreground", "mask"),
+        description="buffers written as EXR; relit is the relit picture before exposure (without checkpoint)",
+        examples=["[pbr]"],
+    )
+    overwrite: bool = Field(False, description="replace frames that were made with other settings")
+    seed: int = Field(0, description="root of all random numbers")
+    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = Field(
+        "llvm_ad_rgb", description="Mitsuba variant: processor or NVIDIA GPU"
+    )
+    threads: int | None = Field(None, ge=1, description="threads of renderer and network; null: all")
+
+    @model_validator(mode="after")
+    def _has_radiance(self) -> Settings:
+        if self.checkpoint is not None and "relit" in self.buffers:
+            raise ValueError(
+                "a network draws display values, so there is no relit.exr with a checkpoint: leave 'relit' "
+                "out of buffers, or take 'shadowed'"
+            )
+        return self
+
+    def by_light(self) -> list[Settings]:
+        """The settings that give each environment's frames alone.
+
+        Raises:
+            TronError: two environments would share a folder.
+        """
+        if isinstance(self.environment, Path) or len(self.environment) == 1:
+            only = self.environment if isinstance(self.environment, Path) else self.environment[0]
+            return [self.model_copy(update={"environment": only})]
+        stems = [path.stem for path in self.environment]
+        twice = [path for path in self.environment if stems.count(path.stem) > 1]
+        if twice:
+            named = ", ".join(map(str, twice))
+            raise TronError("environments of one name would share a folder", named, "rename one of them")
+        return [
+            self.model_copy(update={"environment": path, "output_dir": self.output_dir / path.stem})
+            for path in self.environment
+        ]
+
+    def rotations(self, frames: int) -> list[float]:
+        """Turn of the environment in each of so many frames, degrees.
+
+        From a to b the end is left out, so that a whole turn loops: a + (b - a) i / n.
+        """
+        first, end = self.rotation if isinstance(self.rotation, tuple) else (self.rotation, self.rotation)
+        return [first + (end - first) * index / frames for index in range(frames)]

@@ -1,0 +1,110 @@
+"""The relit picture: what a run of tron-relight is for, developed from the buffers on disk.
+
+With a checkpoint it is the neural picture, without one `shadowed` (diffuse light with traced shadows plus
+split-sum reflections). What stands behind the surfels is chosen:
+
+    environment  as the buffers have it: the light itself
+    transparent  RGBA, straight alpha: alpha is the mask, colours are those of the surfels alone
+    [r, g, b]    one colour, in display values as a picture on the screen has them (sRGB, 0 to 1)
+
+A colour is composited after AgX, so that an empty pixel shows it exactly; it has the background's share of
+tron.shading.background, which is none behind opaque surfels. A network draws surfels and sky as one: at the
+rim of the surfels its colours hold some of the light's, whatever stands behind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from tron.apps.frame_folder import FrameFolder
+from tron.color import to_display
+
+Channel = Annotated[float, Field(ge=0, le=1)]
+Background = Literal["environment", "transparent"] | tuple[Channel, Channel, Channel]
+
+
+@dataclass(frozen=True)
+class RelitPicture:
+    """How a frame's relit picture is made of its buffers.
+
+    Attributes:
+        background: see above.
+        neural: whether a network draws the surfels.
+    """
+
+    background: Background
+    neural: bool
+
+    @property
+    def source(self) -> str:
+        """The picture of the surfels: "neural" or "shadowed"."""
+        return "neural" if self.neural else "shadowed"
+
+    @property
+    def buffers(self) -> tuple[str, ...]:
+        """Buffers that a frame must have on disk for it."""
+        if self.background == "environment":
+            return () if self.neural else ("shadowed",)
+        return ("mask",) if self.neural else ("mask", "foreground")
+
+    def describe(self) -> str:
+        """One line for the log."""
+        made = "drawn by the neural renderer" if self.neural else "shadowed guidance (no checkpoint)"
+        behind = {"environment": "over the environment", "transparent": "with alpha"}
+        shown = behind.get(str(self.background)) or f"over the colour {list(self.background)}"
+        return f"relit pictures: {made}, {shown}"
+
+    def display(
+        self, folder: FrameFolder, index: int, exposure: float, neural: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Display values of frame ``index``, (H, W, 3), or (H, W, 4) with straight alpha where transparent.
+
+        Args:
+            folder: frames with ``buffers``.
+            exposure: the light's.
+            neural: the network's picture (H, W, 3), display values, if it is the source.
+        """
+        if self.background == "environment":
+            return to_display(folder.read(index, "shadowed"), exposure) if neural is None else neural
+        surfels = to_display(folder.read(index, "foreground"), exposure) if neural is None else neural
+        mask = folder.read(index, "mask")[..., :1]
+        if self.background == "transparent":
+            return np.concatenate([surfels, mask], axis=2)
+        return composite(surfels, self.background, mask)
+
+    def linear(self, folder: FrameFolder, index: int) -> np.ndarray:
+        """Radiance of frame ``index`` before exposure.
+
+        In front of the environment (H, W, 3). Otherwise (H, W, 4), multiplied by alpha, the mask, as OpenEXR
+        has it; so too for a colour, which has no radiance.
+        """
+        if self.background == "environment":
+            return folder.read(index, "shadowed")
+        mask = folder.read(index, "mask")[..., :1]
+        return np.concatenate([folder.read(index, "foreground") * mask, mask], axis=2)
+
+
+def composite(surfels: np.ndarray, color: Sequence[float], mask: np.ndarray) -> np.ndarray:
+    """Display values (H, W, 3) of surfels over one colour; ``mask`` (H, W, 1) is their opacity."""
+    from tron.shading.background import background_share
+
+    share = background_share(1 - mask)
+    return (1 - share) * surfels + share * np.asarray(color, np.float32)
+
+
+def surfels_alone(over_black: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Radiance (H, W, 3) of surfels without what is behind them, 0 where there are none.
+
+    Args:
+        over_black: their radiance in front of black.
+        mask: (H, W) their opacity.
+    """
+    from tron.shading.background import background_share
+
+    weight = 1 - background_share(1 - mask)[..., None]
+    return np.divide(over_black, weight, out=np.zeros_like(over_black), where=weight > 0)
