@@ -146,8 +146,9 @@ def _methods(scores: Scores) -> list[Block]:
         "over frames; SSIM likewise. “Neural gains” is the neural renderer's mean PSNR minus the method's. "
         "Foreground is where a ray through the pixel's centre meets true geometry. Best of three: "
         f"{', '.join(THREE)}. Products are taken in linear light before the tone curve. Blends and factors "
-        "are fitted on the training split in float64, once for the foreground and once for full frames: each "
-        "is judged where it is strongest."
+        "are fitted on the foreground of the training split in float64. On full frames the blends and the "
+        "per-pixel network are laid over pbr by the surfels' opacity, because a blend that suits surfaces is "
+        "wrong for the sky, which pbr shows as it is."
     )
     caption = "PSNR and gains in dB; higher is better everywhere."
     return [Table(caption, headings, rows, groups, words=[1]), Text(notes)]
