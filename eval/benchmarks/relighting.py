@@ -79,7 +79,15 @@ class Relighting(Benchmark):
             if path is not None:
                 inputs[f"{name}_sha256"] = sha256(path)
         return page.outcome(
-            scores, guidance, clips, shown, self._curves(), inputs, output_dir, self._typed(output_dir)
+            scores,
+            guidance,
+            clips,
+            shown,
+            self._curves(),
+            inputs,
+            output_dir,
+            self._typed(output_dir),
+            self.seed,
         )
 
     def _dataset(self) -> Path:
