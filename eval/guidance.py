@@ -13,7 +13,6 @@ import numpy as np
 
 from eval.confidence import interval, mean_interval, quotient, scene_sums
 from eval.results import Row
-from eval.scores import PSNR_CAP
 from eval.shadows import ShadowCounts, both_have_surface, count_shadow_errors, same_surface
 from tron import metrics
 from tron.color import to_display
@@ -49,7 +48,7 @@ class GuidanceScores:
                 continue
             if "irr_ref" in frames:
                 shown, truth = (to_display(frames[name][k], meta.exposure) for name in ("irr", "irr_ref"))
-                psnr = min(metrics.psnr(shown, truth, foreground), PSNR_CAP)
+                psnr = metrics.capped_psnr(shown, truth, foreground)
                 self.irradiance_psnr.setdefault(meta.light_family, []).append((meta.scene, psnr))
                 self._count_shadows({name: images[k] for name, images in frames.items()}, meta)
             view = f"{meta.scene} {sorted(meta.cameras[k].items())}"
@@ -58,7 +57,7 @@ class GuidanceScores:
             self._views.add(view)
             if {"base_color", "base_color_ref"} <= frames.keys():
                 ours, truth = (np.clip(frames[name][k], 0, 1) for name in ("base_color", "base_color_ref"))
-                psnr = min(metrics.psnr(ours, truth, foreground), PSNR_CAP)
+                psnr = metrics.capped_psnr(ours, truth, foreground)
                 self.base_color_psnr.append((meta.scene, psnr))
             if {"normal", "normal_ref"} <= frames.keys():
                 ours, truth = frames["normal"][k], frames["normal_ref"][k]

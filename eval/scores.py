@@ -2,8 +2,9 @@
 
 PSNR is computed on each displayed frame against a peak of 1 and then averaged over frames, not of an average
 error: a dark, easy frame counts as much as a bright, hard one. SSIM likewise. A frame that equals the truth
-has no finite PSNR and counts as PSNR_CAP. Intervals are over scenes (:mod:`eval.confidence`), whose frames
-and lights are no independent observations; a gain's is of the differences on the same frames.
+has no finite PSNR and counts as PSNR_CAP of :mod:`tron.metrics`. Intervals are over scenes
+(:mod:`eval.confidence`), whose frames and lights are no independent observations; a gain's is of the
+differences on the same frames.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from eval.results import Row
 from tron import metrics
 from tron.shards.schema import Clip
 
-PSNR_CAP = 100.0
 METHODS = ("neural", *SEVEN)
 GROUPS = {"best_of_three": THREE, "best_of_seven": SEVEN}
 RIVALS: dict[str, Sequence[str]] = {**{method: (method,) for method in SEVEN}, **GROUPS}
@@ -71,7 +71,7 @@ class Scores:
                         clip.meta.scene,
                         clip.meta.key,
                         k,
-                        min(metrics.psnr(image, target, where), PSNR_CAP),
+                        metrics.capped_psnr(image, target, where),
                         metrics.ssim(image, target, where),
                     )
                     self._kept.setdefault((method, region), []).append(score)

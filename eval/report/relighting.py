@@ -41,7 +41,8 @@ HEADLINE = {
     "surfels.normal_mae_deg": "Normals of the surfels, mean error",
 }
 PAIRED = (
-    "A gain's interval is that of the differences on the same frames, not the difference of two intervals."
+    "A gain's interval is that of the differences on the same frames, not the difference of two intervals. "
+    "No interval says how much another training of the same networks would differ."
 )
 LEAD = (
     "TRON relights captured 3D worlds. A scene becomes a cloud of small flat disks (surfels) with "
@@ -171,6 +172,8 @@ def _gain_cell(row: Row | None) -> Cell:
     if row is None:
         return Cell("")
     text = with_interval(row, signed=True).replace(" dB", "")
+    if row.low is not None and row.high is not None and row.low <= 0 <= row.high:
+        return Cell(text)  # other scenes may turn it round
     return Cell(text, "good" if text[0] == "+" else "bad" if text[0] == MINUS else "plain")
 
 

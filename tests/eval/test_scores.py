@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from eval.predictions import Predictor, displayed_truth, fit_baselines, region_mask
-from eval.scores import PSNR_CAP, Scores
+from eval.scores import Scores
 from tron.color import to_display
 from tron.errors import TronError
+from tron.metrics import PSNR_CAP
 from tron.shards.schema import Clip
 
 MakeClip = Callable[..., Clip]
