@@ -13,8 +13,12 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 - ``affine_ratio``: the same with D(B E / E0) as a third input.
 - ``pixel_mlp``: 1x1 convolutions on D(B) and D(E), trained on the same data for the same time.
 
-Blends and s are fitted on training data against the displayed truth, with the squared error that PSNR
-measures, in float64 (float32 sums over millions of pixels were several dB off).
+Blends and s are fitted on the foreground of training data against the displayed truth, with the squared error
+that PSNR measures, in float64 (float32 sums over millions of pixels were several dB off).
+
+A blend of surfaces is wrong for the sky, which both buffers show as it is. On full frames the blends and
+``pixel_mlp`` are therefore laid over pbr, whose sky is the displayed environment: o x blend + (1 - o) D(B),
+clipped (:func:`over_environment`). The other methods show the environment by themselves.
 """
 
 from __future__ import annotations
@@ -53,6 +57,16 @@ def shadow_ratio(
     lit = unshadowed * exposure > RATIO_FLOOR
     share = np.where(lit, irradiance / np.where(lit, unshadowed, 1), 1)
     return (pbr * np.clip(share, 0, 1)).astype(np.float32)
+
+
+def over_environment(shown: np.ndarray, pbr: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+    """A method's surfaces before pbr's sky: o x shown + (1 - o) D(B).
+
+    Args:
+        shown, pbr: (..., 3) display values in [0, 1].
+        opacity: (..., 1) of the surfels, [0, 1].
+    """
+    return opacity * shown + (1 - opacity) * pbr
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from eval.confidence import interval, mean_interval, quotient, scene_sums
 from eval.results import Row
-from eval.scores import PSNR_CAP
 from eval.shadows import MEMBERS as SHADOW_MEMBERS
 from eval.shadows import (
     ShadowCounts,
@@ -35,14 +35,17 @@ JUDGED = {"": same_depth, "_same_normal": same_normal, "_with_silhouettes": both
 
 @dataclass
 class GuidanceScores:
-    """Gathers the measurements of test clips; a clip without the reference members adds nothing."""
+    """Gathers the measurements of test clips, each with its scene, those of irradiance by the light's family.
 
-    irradiance_psnr: dict[str, list[float]] = field(default_factory=dict)
-    shadows: dict[str, dict[str, list[ShadowCounts]]] = field(
+    A clip without the reference members adds nothing.
+    """
+
+    irradiance_psnr: dict[str, list[tuple[str, float]]] = field(default_factory=dict)
+    shadows: dict[str, dict[str, list[tuple[str, ShadowCounts]]]] = field(
         default_factory=lambda: {tail: {} for tail in JUDGED}
     )
-    base_color_psnr: list[float] = field(default_factory=list)
-    normal_error: list[float] = field(default_factory=list)
+    base_color_psnr: list[tuple[str, float]] = field(default_factory=list)
+    normal_error: list[tuple[str, float]] = field(default_factory=list)
     _views: set[str] = field(default_factory=set)
     _told: bool = False
 
@@ -58,8 +61,8 @@ class GuidanceScores:
                 continue
             if "irr_ref" in frames:
                 shown, truth = (to_display(frames[name][k], meta.exposure) for name in ("irr", "irr_ref"))
-                psnr = min(metrics.psnr(shown, truth, foreground), PSNR_CAP)
-                self.irradiance_psnr.setdefault(meta.light_family, []).append(psnr)
+                psnr = metrics.capped_psnr(shown, truth, foreground)
+                self.irradiance_psnr.setdefault(meta.light_family, []).append((meta.scene, psnr))
                 self._count_shadows(clip, k)
             view = f"{meta.scene} {sorted(meta.cameras[k].items())}"
             if view in self._views:
@@ -67,13 +70,15 @@ class GuidanceScores:
             self._views.add(view)
             if {"base_color", "base_color_ref"} <= frames.keys():
                 ours, truth = (np.clip(frames[name][k], 0, 1) for name in ("base_color", "base_color_ref"))
-                self.base_color_psnr.append(min(metrics.psnr(ours, truth, foreground), PSNR_CAP))
+                psnr = metrics.capped_psnr(ours, truth, foreground)
+                self.base_color_psnr.append((meta.scene, psnr))
             if {"normal", "normal_ref"} <= frames.keys():
                 ours, truth = frames["normal"][k], frames["normal_ref"][k]
                 lengths = np.minimum(*(np.linalg.norm(n, axis=-1) for n in (ours, truth)))
                 both = foreground & (lengths > 0.5)
                 if both.any():
-                    self.normal_error.append(float(metrics.angular_error_deg(ours, truth, both)))
+                    error = float(metrics.angular_error_deg(ours, truth, both))
+                    self.normal_error.append((meta.scene, error))
 
     def _count_shadows(self, clip: Clip, k: int) -> None:
         missing = [name for name in SHADOW_MEMBERS if name not in clip.frames]
@@ -88,48 +93,56 @@ class GuidanceScores:
         frame = {name: images[k] for name, images in clip.frames.items()}
         for tail, judged in JUDGED.items():
             counts = count_shadow_errors(frame["irr"], direct_light(frame), judged(frame))
-            self.shadows[tail].setdefault(clip.meta.light_family, []).append(counts)
+            self.shadows[tail].setdefault(clip.meta.light_family, []).append((clip.meta.scene, counts))
 
-    def rows(self) -> list[Row]:
+    def rows(self, seed: int = 0) -> list[Row]:
         """``guidance.*`` (all lights, and ``.FAMILY``) and ``surfels.*``; what was not measured has no row.
 
         ``guidance.irradiance_psnr`` is the lowest of the light families' means over frames; the two
         fractions are taken over the pixels of all frames together, for a frame may hold hardly any shadow.
         They are judged where surfels and truth show the same surface by its distance; ``_same_normal`` goes
         by its normal, and ``_with_silhouettes`` also judges pixels where they show different surfaces.
+        ``seed`` draws the scenes of the intervals.
         """
         rows: list[Row] = []
         if self.irradiance_psnr:
-            means = {
-                family: float(np.mean(values)) for family, values in sorted(self.irradiance_psnr.items())
+            by_family = {
+                family: _mean(f"guidance.irradiance_psnr.{family}", "dB", values, seed)
+                for family, values in sorted(self.irradiance_psnr.items())
             }
-            lowest = min(means, key=lambda family: means[family])
-            for name, family in (("", lowest), *((f".{family}", family) for family in means)):
-                n = len(self.irradiance_psnr[family])
-                rows.append(
-                    Row(metric=f"guidance.irradiance_psnr{name}", value=means[family], unit="dB", n=n)
-                )
-            for tail, by_family in self.shadows.items():
-                rows += _fractions(tail, [counts for family in by_family.values() for counts in family])
-                for family in means:
-                    rows += _fractions(f"{tail}.{family}", by_family.get(family, []))
+            lowest = min(by_family.values(), key=lambda row: row.value)
+            rows.append(lowest.model_copy(update={"metric": "guidance.irradiance_psnr"}))
+            rows += by_family.values()
+            for tail, counted in self.shadows.items():
+                rows += _fractions(tail, [counts for family in counted.values() for counts in family], seed)
+                for family in by_family:
+                    rows += _fractions(f"{tail}.{family}", counted.get(family, []), seed)
         for metric, values, unit in (
             ("surfels.base_color_psnr", self.base_color_psnr, "dB"),
             ("surfels.normal_mae_deg", self.normal_error, "deg"),
         ):
             if values:
-                rows.append(Row(metric=metric, value=float(np.mean(values)), unit=unit, n=len(values)))
+                rows.append(_mean(metric, unit, values, seed))
         return rows
 
 
-def _fractions(tail: str, counts: list[ShadowCounts]) -> list[Row]:
+def _mean(metric: str, unit: str, found: list[tuple[str, float]], seed: int) -> Row:
+    scenes, values = zip(*found)
+    row = Row(metric=metric, value=float(np.mean(values)), unit=unit, n=len(values))
+    return row.within(mean_interval(scenes, values, seed))
+
+
+def _fractions(tail: str, counted: list[tuple[str, ShadowCounts]], seed: int) -> list[Row]:
     rows = []
     for metric, bad, of in (
         ("guidance.shadow_leak", "leaking", "shadowed"),
         ("guidance.lit_darkened", "darkened", "lit"),
     ):
-        total = sum(getattr(c, of) for c in counts)
-        if total:
-            value = sum(getattr(c, bad) for c in counts) / total
-            rows.append(Row(metric=metric + tail, value=value, unit="fraction", n=len(counts)))
+        pixels = np.array([[getattr(counts, bad), getattr(counts, of)] for _, counts in counted], float)
+        per_scene = scene_sums([scene for scene, _ in counted], pixels)
+        per_scene = per_scene[per_scene[:, 1] > 0]  # a scene without such pixels says nothing about them
+        if len(per_scene):
+            value = float(quotient(per_scene.sum(0)))
+            row = Row(metric=metric + tail, value=value, unit="fraction", n=len(counted))
+            rows.append(row.within(interval(per_scene, quotient, seed)))
     return rows

@@ -8,7 +8,14 @@ from typing import Literal
 
 import numpy as np
 
-from eval.baselines import AffineBlend, AffineFit, ScaleFit, product_terms, shadow_ratio
+from eval.baselines import (
+    AffineBlend,
+    AffineFit,
+    ScaleFit,
+    over_environment,
+    product_terms,
+    shadow_ratio,
+)
 from tron.color import to_display
 from tron.errors import TronError
 from tron.seeds import generator
@@ -16,13 +23,15 @@ from tron.shards.schema import Clip
 
 Region = Literal["foreground", "frame"]
 REGIONS: tuple[Region, Region] = ("foreground", "frame")
+SURFACES = ("affine", "affine_ratio", "pixel_mlp")
+"""Methods that know surfaces alone, and get pbr's sky on full frames."""
 MEMBERS = ("pbr", "irr", "rgb", "unshadowed", "shadowed", "mask", "foreground")
 """Members of a clip that predictions and their scores need."""
 
 
 @dataclass(frozen=True)
 class Fits:
-    """What the fitted baselines learned from training pixels of one region."""
+    """What the fitted baselines learned from the foreground of training frames."""
 
     scale: float
     affine: AffineBlend
@@ -44,23 +53,18 @@ def region_mask(clip: Clip, region: Region) -> np.ndarray:
     return foreground if region == "foreground" else np.ones_like(foreground)
 
 
-def fit_baselines(clips: Iterable[Clip], seed: int, scale_pixels: int = 512) -> dict[Region, Fits]:
-    """Fit s and the two affine blends on training clips, once for each region they will be judged on.
-
-    A blend fitted on whole frames would be a weaker baseline on the foreground, and the other way round.
+def fit_baselines(clips: Iterable[Clip], seed: int, scale_pixels: int = 512) -> Fits:
+    """Fit s and the two affine blends on the foreground of training clips.
 
     Args:
         clips: the training split, read once, one clip in memory at a time.
         seed: of the choice of pixels for s.
-        scale_pixels: pixels of a frame and region that s is fitted on; the blends use every pixel.
+        scale_pixels: pixels of a frame that s is fitted on; the blends use the whole foreground.
 
     Raises:
         TronError: there are no training clips.
     """
-    scale = {region: ScaleFit() for region in REGIONS}
-    affine = {region: AffineFit(2) for region in REGIONS}
-    affine_ratio = {region: AffineFit(3) for region in REGIONS}
-    n_frames = 0
+    scale, affine, affine_ratio, n_frames = ScaleFit(), AffineFit(2), AffineFit(3), 0
     for clip in clips:
         truth, frames, exposure = displayed_truth(clip), clip.frames, clip.meta.exposure
         pbr, irradiance = (to_display(frames[name], exposure) for name in ("pbr", "irr"))
@@ -69,21 +73,16 @@ def fit_baselines(clips: Iterable[Clip], seed: int, scale_pixels: int = 512) -> 
         )
         terms = product_terms(frames["pbr"], frames["irr"], frames["mask"], exposure)
         n_frames += len(truth)
-        for region in REGIONS:
-            inside = region_mask(clip, region)
-            affine[region].add([pbr[inside], irradiance[inside]], truth[inside])
-            affine_ratio[region].add([pbr[inside], irradiance[inside], ratio[inside]], truth[inside])
-            rng = generator(seed, "eval", "scale", clip.meta.key, region)
-            pixels = _some(inside, scale_pixels * len(truth), rng)
-            scale[region].add(terms.at(pixels), truth[pixels])
+        inside = region_mask(clip, "foreground")
+        affine.add([pbr[inside], irradiance[inside]], truth[inside])
+        affine_ratio.add([pbr[inside], irradiance[inside], ratio[inside]], truth[inside])
+        pixels = _some(inside, scale_pixels * len(truth), generator(seed, "eval", "scale", clip.meta.key))
+        scale.add(terms.at(pixels), truth[pixels])
     if not n_frames:
         raise TronError(
             "no training clips to fit the baselines on", mend="the data set needs a training split"
         )
-    return {
-        region: Fits(scale[region].solve(), affine[region].solve(), affine_ratio[region].solve(), n_frames)
-        for region in REGIONS
-    }
+    return Fits(scale.solve(), affine.solve(), affine_ratio.solve(), n_frames)
 
 
 def _some(inside: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
@@ -102,31 +101,29 @@ Render = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 class Predictor:
     """Shows clips by every method there is; ``networks`` holds ``neural`` and ``pixel_mlp``, if given."""
 
-    fits: Mapping[Region, Fits]
+    fits: Fits
     networks: Mapping[str, Render] = field(default_factory=dict)
 
     def shown(self, clip: Clip) -> dict[Region, dict[str, np.ndarray]]:
         """Method name -> (K, H, W, 3) display float32 in [0, 1], for each region.
 
-        The images differ between regions only for the fitted baselines, whose weights do.
+        The images differ between regions only for SURFACES, which full frames show over the environment.
         """
         frames, exposure = clip.frames, clip.meta.exposure
         pbr, irradiance, mask = frames["pbr"], frames["irr"], frames["mask"]
         displayed = [to_display(image, exposure) for image in (pbr, irradiance)]
         ratio = to_display(shadow_ratio(pbr, irradiance, frames["unshadowed"], exposure), exposure)
-        same = {
+        foreground = {
             "pbr": displayed[0],
             "shadow_ratio": ratio,
             "shadowed": to_display(frames["shadowed"], exposure),
+            "pbr_x_irradiance": product_terms(pbr, irradiance, mask, exposure).displayed(self.fits.scale),
+            "affine": self.fits.affine.displayed(displayed),
+            "affine_ratio": self.fits.affine_ratio.displayed([*displayed, ratio]),
+            **{name: network(pbr, irradiance, exposure) for name, network in self.networks.items()},
         }
-        same |= {name: network(pbr, irradiance, exposure) for name, network in self.networks.items()}
-        terms = product_terms(pbr, irradiance, mask, exposure)
-        return {
-            region: {
-                **same,
-                "pbr_x_irradiance": terms.displayed(fits.scale),
-                "affine": fits.affine.displayed(displayed),
-                "affine_ratio": fits.affine_ratio.displayed([*displayed, ratio]),
-            }
-            for region, fits in self.fits.items()
+        frame = {
+            name: over_environment(image, displayed[0], mask) if name in SURFACES else image
+            for name, image in foreground.items()
         }
+        return {"foreground": foreground, "frame": frame}

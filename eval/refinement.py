@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from eval.report.figures import written
-from eval.report.page import Cell, Section, Table
+from eval.confidence import mean_interval
+from eval.report.figures import with_interval
+from eval.report.intervals import interval_note
+from eval.report.page import Cell, Section, Table, Text
 from eval.results import Row
 from tron.errors import TronError
 
@@ -20,8 +22,10 @@ FIGURES = {
 }
 
 
-def refinement(dataset: Path) -> tuple[list[Row], list[Section]]:
+def refinement(dataset: Path, seed: int) -> tuple[list[Row], list[Section]]:
     """Rows ``refinement.*`` and their table, over all scenes; empty where surfels were taken as made.
+
+    ``seed`` draws the scenes of the intervals.
 
     Raises:
         TronError: a scene's record is not readable.
@@ -38,10 +42,9 @@ def refinement(dataset: Path) -> tuple[list[Row], list[Section]]:
         return [], []
     rows, table = [], []
     for name, (label, unit, how) in FIGURES.items():
-        before, after = (_mean(found, when, name) for when in ("before", "after"))
-        for when, value in (("before", before), ("after", after)):
-            rows.append(Row(metric=f"refinement.{name}.{when}", value=value, unit=unit, n=len(found)))
-        cells = [Cell(written(before, unit)), Cell(written(after, unit), "strong")]
+        before, after = (_mean(found, when, name, unit, seed) for when in ("before", "after"))
+        rows += [before, after]
+        cells = [Cell(with_interval(before)), Cell(with_interval(after), "strong")]
         table.append([Cell(label), *cells, Cell(how, "faint")])
     caption = (
         f"Surfels before and after {found[0]['steps']} steps that fit them to their scene's G-buffers, at "
@@ -51,10 +54,15 @@ def refinement(dataset: Path) -> tuple[list[Row], list[Section]]:
         Section(
             "refinement",
             "What fitting the surfels gained",
-            [Table(caption, ["Figure", "as made", "fitted", "How"], table, words=[3])],
+            [
+                Table(caption, ["Figure", "as made", "fitted", "How"], table, words=[3]),
+                Text(interval_note(len(found), f"{len(found)} means")),
+            ],
         )
     ]
 
 
-def _mean(records: Sequence[dict], when: str, name: str) -> float:
-    return float(np.mean([record[when][name] for record in records]))
+def _mean(records: Sequence[dict], when: str, name: str, unit: str, seed: int) -> Row:
+    values = [record[when][name] for record in records]
+    row = Row(metric=f"refinement.{name}.{when}", value=float(np.mean(values)), unit=unit, n=len(values))
+    return row.within(mean_interval([str(k) for k in range(len(values))], values, seed))

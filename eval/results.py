@@ -3,6 +3,9 @@
 The file is ``{"benchmark", "environment", "rows": [{"metric", "value", "unit", "reference", "ratio",
 "n"}]}``. Metric names are unique; a figure that was not measured has no row, and a row never holds NaN or
 infinity (JSON has no way to write them).
+
+A row that is a mean over scenes also has ``"scenes"``, their number, and where that is two or more ``"low"``
+and ``"high"``, the ends of its confidence interval (:mod:`eval.confidence`); other rows lack these keys.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from typing import Any, Literal
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt
 
+from eval.confidence import Interval
 from tron.errors import TronError
 from tron.storage import write_atomic
 
@@ -34,6 +38,29 @@ class Row(BaseModel):
     reference: str | None = Field(default=None, description="what the value is held against, in words")
     ratio: FiniteFloat | None = None
     n: PositiveInt
+    low: FiniteFloat | None = Field(default=None, description="lower end of the interval over scenes")
+    high: FiniteFloat | None = None
+    scenes: PositiveInt | None = Field(default=None, description="independent scenes behind the n")
+
+    @pydantic.model_validator(mode="after")
+    def _interval(self) -> Row:
+        if (self.low is None) != (self.high is None):
+            raise ValueError(f"{self.metric}: an interval has two ends")
+        if self.low is not None and self.high is not None:
+            if self.low > self.high:
+                raise ValueError(f"{self.metric}: the interval's ends are exchanged")
+            if (self.scenes or 0) < 2:
+                raise ValueError(f"{self.metric}: an interval needs two scenes")
+        return self
+
+    def within(self, interval: Interval) -> Row:
+        """A copy with the interval over scenes."""
+        return self.model_copy(update={"low": interval.low, "high": interval.high, "scenes": interval.scenes})
+
+    @pydantic.model_serializer(mode="wrap")
+    def _without_absent(self, plain: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        absent = {name for name in ("low", "high", "scenes") if getattr(self, name) is None}
+        return {name: value for name, value in plain(self).items() if name not in absent}
 
 
 class Target(BaseModel):

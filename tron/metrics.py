@@ -18,6 +18,9 @@ from tron.errors import TronError
 if TYPE_CHECKING:
     import torch
 
+PSNR_CAP = 100.0
+"""dB that a picture without any error counts as in means and files; float32 pictures hold no more."""
+
 
 def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Peak signal-to-noise ratio in dB for peak 1, over all channels of the pixels in the mask; inf if equal.
@@ -29,6 +32,11 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     _same_shape(a, b)
     error = _selected((np.asarray(a, np.float64) - np.asarray(b, np.float64)) ** 2, mask).mean()
     return float("inf") if error == 0 else float(-10 * np.log10(error))
+
+
+def capped_psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """:func:`psnr`, at most PSNR_CAP: finite, so that it can be averaged and written as JSON."""
+    return min(psnr(a, b, mask), PSNR_CAP)
 
 
 def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:

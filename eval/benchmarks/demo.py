@@ -69,7 +69,7 @@ class Demo(Benchmark):
         stages.restart("eval")  # never stale: it costs a minute and shows the code as it is now
         with stages.timed("eval", [["tron-eval", "benchmark=demo", f"output_dir={output_dir}"]]):
             outcome = evaluation.run(output_dir)
-        rows, sections = refinement(dataset)
+        rows, sections = refinement(dataset, self.relighting.seed)
         outcome = dataclasses.replace(
             outcome, rows=[*outcome.rows, *rows], sections=[*outcome.sections, *sections]
         )

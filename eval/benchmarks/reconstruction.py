@@ -134,7 +134,7 @@ class Reconstruction(Benchmark):
             write_atomic(folder / "times.json", json.dumps(measured.seconds(), indent=1) + "\n")
         from eval.report import reconstruction as page
 
-        return page.outcome(self, measured, list(rows(measured)), stages, output_dir)
+        return page.outcome(self, measured, list(rows(measured, self.seed)), stages, output_dir)
 
     def _reconstruct_scenes(self, stages: Stages, folder: Path) -> dict[tuple[str, str], float]:
         """(way, scene) -> wall seconds, every scene in every way."""
@@ -243,12 +243,12 @@ def _scenes(dataset: Path) -> list[str]:
     return sorted(path.parent.name for path in (dataset / "captures").glob("*/transforms.json"))
 
 
-def rows(measured: Measured) -> Iterator[Row]:
-    """Every figure of a run."""
+def rows(measured: Measured, seed: int) -> Iterator[Row]:
+    """Every figure of a run; ``seed`` draws the scenes of the intervals."""
     from eval.reconstruction.runs import rows_of
 
     for number, (way, runs) in enumerate(measured.runs.items()):
-        yield from rows_of("reconstruction" if number == 0 else f"reconstruction.{way}", runs)
+        yield from rows_of("reconstruction" if number == 0 else f"reconstruction.{way}", runs, seed)
     if measured.fox is not None:
         yield from _fox_rows(measured)
     yield from _step_rows(measured)

@@ -73,13 +73,21 @@ class Relighting(Benchmark):
         inputs: dict[str, Any] = {
             "dataset_config_sha256": manifest.config_sha256,
             "clips": {entry: sum(s.samples for s in manifest.of_split(entry)) for entry in manifest.splits()},
-            "fitted_scale": {region: fits.scale for region, fits in predictor.fits.items()},
+            "fitted_scale": predictor.fits.scale,
         }
         for name, path in (("renderer", self.renderer), ("pixel_mlp", self.pixel_mlp)):
             if path is not None:
                 inputs[f"{name}_sha256"] = sha256(path)
         return page.outcome(
-            scores, guidance, clips, shown, self._curves(), inputs, output_dir, self._typed(output_dir)
+            scores,
+            guidance,
+            clips,
+            shown,
+            self._curves(),
+            inputs,
+            output_dir,
+            self._typed(output_dir),
+            self.seed,
         )
 
     def _dataset(self) -> Path:

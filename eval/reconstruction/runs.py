@@ -10,6 +10,7 @@ from pathlib import Path
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
+from eval.confidence import mean_interval
 from eval.results import Row
 from tron.errors import TronError
 
@@ -114,8 +115,9 @@ def light_family(capture: Path) -> str:
         return ""
 
 
-def rows_of(prefix: str, runs: Sequence[Run]) -> Iterator[Row]:
-    """Means over the scenes (of seconds and surfels the most), then every scene's own figures.
+def rows_of(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
+    """Means over the scenes with intervals (of seconds and surfels the most, which has none), then every
+    scene's own figures. ``seed`` draws the scenes of the intervals.
 
     A figure that a scene lacks has no row for it, and no mean, which would be of other scenes than its
     neighbours are.
@@ -124,7 +126,8 @@ def rows_of(prefix: str, runs: Sequence[Run]) -> Iterator[Row]:
         if len(values) == len(runs):
             worst = unit in ("s", "surfels")
             value = max(values.values()) if worst else sum(values.values()) / len(values)
-            yield Row(metric=f"{prefix}.{metric}", value=value, unit=unit, n=len(values))
+            row = Row(metric=f"{prefix}.{metric}", value=value, unit=unit, n=len(values))
+            yield row if worst else row.within(mean_interval([*values], [*values.values()], seed))
         for run in runs:
             if run.name in values:
                 n = 1 if unit in ("s", "surfels") else max(len(run.report.capture.held_out), 1)

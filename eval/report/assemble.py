@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from eval.benchmarks import Outcome
-from eval.report.figures import bound, verdict, written
+from eval.report.figures import bound, verdict, with_interval
 from eval.report.page import Cell, Code, Page, Section, Table, Text, Tile
 from eval.results import Results, Target
 
@@ -49,7 +49,7 @@ def _tiles(headline: dict[str, str], results: Results, targets: Sequence[Target]
         row, target = results.find(metric), by_metric.get(metric)
         if row is None:
             continue
-        value = written(row.value, row.unit, signed=".gain" in metric)
+        value = with_interval(row, signed=".gain" in metric)
         if target is None:
             tiles.append(Tile(label, value))
         else:
@@ -61,14 +61,13 @@ def _tiles(headline: dict[str, str], results: Results, targets: Sequence[Target]
 def _targets(results: Results, targets: Sequence[Target]) -> Section:
     rows = []
     for target in targets:
-        measured, unit = results.value(target.metric), _unit(results, target)
+        row, unit = results.find(target.metric), _unit(results, target)
+        measured = None if row is None else row.value
         words, tone = verdict(target, measured, unit)
         rows.append(
             [
                 Cell(target.what or target.metric),
-                Cell(
-                    "—" if measured is None else written(measured, unit, ".gain" in target.metric), "strong"
-                ),
+                Cell("—" if row is None else with_interval(row, ".gain" in target.metric), "strong"),
                 Cell(bound(target, unit)),
                 Cell(words, tone),
             ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from eval.report.page import Tone
-from eval.results import Target
+from eval.results import Row, Target
 
 MINUS = "\N{MINUS SIGN}"
 _STYLES = {
@@ -32,6 +32,16 @@ def written(value: float, unit: str, signed: bool = False) -> str:
     scale, digits, suffix = _STYLES.get(unit, (1, 2, f" {unit}"))
     value = round(scale * value, digits) + 0.0  # adding zero turns a negative zero into zero
     return f"{value:{'+' if signed and value else ''}.{digits}f}{suffix}".replace("-", MINUS)
+
+
+def with_interval(row: Row, signed: bool = False) -> str:
+    """A row's figure with its unit, and its interval over scenes behind it: ``34.10 dB [32.85, 35.20]``."""
+    figure = written(row.value, row.unit, signed)
+    if row.low is None or row.high is None:
+        return figure
+    suffix = _STYLES.get(row.unit, (1, 2, f" {row.unit}"))[2]
+    low, high = (written(end, row.unit, signed).removesuffix(suffix) for end in (row.low, row.high))
+    return f"{figure} [{low}, {high}]"
 
 
 def verdict(target: Target, measured: float | None, unit: str) -> tuple[str, Tone]:

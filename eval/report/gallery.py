@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from eval.report.page import Picture, Pictures
-from eval.scores import PSNR_CAP
 from eval.shadows import MEMBERS as SHADOW_MEMBERS
 from eval.shadows import direct_light, same_depth, shadow_errors
 from tron import metrics
@@ -68,7 +67,7 @@ def middle_frame(clip: Clip, shown: dict[str, np.ndarray], truth: np.ndarray) ->
     foreground = frames["foreground"][k, ..., 0] > 0.5
     where = foreground if foreground.any() else None
     psnr = {
-        name: min(metrics.psnr(image, truth[k], where), PSNR_CAP)
+        name: metrics.capped_psnr(image, truth[k], where)
         for name, image in methods.items()
         if name != "irradiance"
     }

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from eval.benchmarks import Outcome
-from eval.report.figures import written
+from eval.report.figures import with_interval, written
 from eval.report.page import Cell, Section, Table, Text
 from eval.report.reconstruction_fox import fox_section
 from eval.report.reconstruction_scenes import light_section, scenes_section, views_section
@@ -72,7 +72,7 @@ def outcome(
 def _verdict(found: dict[str, Row]) -> str:
     def says(metric: str) -> str | None:
         row = found.get(metric)
-        return None if row is None else written(row.value, row.unit)
+        return None if row is None else with_interval(row)
 
     parts = []
     if "reconstruction.test_psnr" in found:

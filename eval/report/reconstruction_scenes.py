@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eval.report.charts import progress_chart
-from eval.report.figures import written
+from eval.report.figures import with_interval, written
+from eval.report.intervals import interval_note
 from eval.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
 from eval.results import Row
 
@@ -63,6 +64,7 @@ def scenes_section(settings: Reconstruction, measured: Measured, found: Mapping[
             "values after one factor a view and channel; roughness and metallic are mean absolute errors."
         ),
         _means(measured, found),
+        Text(interval_note(len(first), f"{len(first)} means")),
     ]
     blocks += _curves(settings, measured)
     blocks += [
@@ -79,7 +81,7 @@ def _prefix(way: str, main: bool) -> str:
 def _cell(row: Row | None) -> Cell:
     if row is None:
         return Cell("—")
-    return Cell(f"{row.value:,.0f}" if row.unit == "surfels" else written(row.value, row.unit))
+    return Cell(f"{row.value:,.0f}" if row.unit == "surfels" else with_interval(row))
 
 
 def _means(measured: Measured, found: Mapping[str, Row]) -> Table:

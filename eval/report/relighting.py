@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +10,12 @@ from eval.baselines import SEVEN, THREE
 from eval.benchmarks import Outcome
 from eval.guidance import GuidanceScores
 from eval.predictions import Region
-from eval.report.figures import MINUS, written
+from eval.report.figures import MINUS, with_interval
 from eval.report.gallery import Shown, comparison, guidance, write_strips
-from eval.report.page import Block, Cell, Chart, Section, Table, Text
+from eval.report.intervals import interval_note
+from eval.report.page import Block, Cell, Chart, Section, Table, Text, Tone
 from eval.results import Row
-from eval.scores import GROUPS, REGIONS, Scores
+from eval.scores import GROUPS, REGIONS, SUFFIX, Scores
 from eval.shadows import (
     DARKENED_BELOW,
     LEAK_OVER_MEAN,
@@ -46,6 +47,10 @@ HEADLINE = {
     "surfels.base_color_psnr": "Base color of the surfels",
     "surfels.normal_mae_deg": "Normals of the surfels, mean error",
 }
+PAIRED = (
+    "A gain's interval is that of the differences on the same frames, not the difference of two intervals. "
+    "No interval says how much another training of the same networks would differ."
+)
 LEAD = (
     "TRON relights captured 3D worlds. A scene becomes a cloud of small flat disks (surfels) with "
     "materials; under a new light, a ray tracer turns them into two quick pictures: pbr, shading without "
@@ -65,11 +70,17 @@ def outcome(
     inputs: dict[str, Any],
     output_dir: Path,
     reproduce: Sequence[str],
+    seed: int,
 ) -> Outcome:
-    """Rows and sections of an evaluation; the pictures are also written below ``output_dir/pictures``."""
+    """Rows and sections of an evaluation; the pictures are also written below ``output_dir/pictures``.
+
+    ``seed`` draws the scenes of the intervals.
+    """
+    rows = [*scores.rows(seed), *guidance_scores.rows(seed)]
+    found = {row.metric: row for row in rows}
     sections = [
-        Section("results", "Every method, every held-out frame", [*_methods(scores)]),
-        Section("lights", "By kind of light", [_families(scores)]),
+        Section("results", "Every method, every held-out frame", [*_methods(scores, clips, found)]),
+        Section("lights", "By kind of light", [_families(scores, found)]),
     ]
     if shown:
         comparisons = [comparison(each) for each in shown]
@@ -80,13 +91,13 @@ def outcome(
             " picture shown, on the foreground; higher is better, and 1 dB is easy to see side by side."
         )
         sections.append(Section("pictures", "Held-out scenes under held-out lights", [intro, *comparisons]))
-    sections += _guidance_section(guidance_scores, shown, output_dir)
+    sections += _guidance_section(guidance_scores, found, shown, output_dir)
     if curves:
         sections.append(Section("training", "How the training went", curves))
     return Outcome(
-        rows=[*scores.rows(), *guidance_scores.rows()],
+        rows=rows,
         title="Relighting held-out scenes under held-out lights",
-        verdict=_verdict(scores, clips),
+        verdict=_verdict(scores, clips, found),
         lead=LEAD,
         sections=sections,
         headline=HEADLINE,
@@ -95,32 +106,26 @@ def outcome(
     )
 
 
-def _verdict(scores: Scores, clips: Sequence[ClipMeta]) -> str:
+def _verdict(scores: Scores, clips: Sequence[ClipMeta], found: Mapping[str, Row]) -> str:
     n_frames = sum(meta.frames for meta in clips)
     n_scenes, n_lights = len({meta.scene for meta in clips}), len({meta.light for meta in clips})
     where = f"On {n_frames} held-out frames ({n_scenes} scenes, {n_lights} lights)"
-    neural, best = scores.mean("neural"), scores.best(SEVEN, "foreground")
-    gain_three, gain_seven = scores.gain(THREE, "foreground"), scores.gain(SEVEN, "foreground")
+    neural, pbr = found.get("neural.psnr"), found.get("pbr.psnr")
     if neural is None:
-        pbr = scores.mean("pbr")
-        return (
-            f"{where} pbr alone reaches {pbr[0]:.2f} dB; no neural renderer was given."
-            if pbr
-            else f"{where}."
-        )
-    text = f"{where} the neural renderer reaches {neural[0]:.2f} dB on the foreground"
+        if pbr is None:
+            return f"{where}."
+        return f"{where} pbr alone reaches {with_interval(pbr)}; no neural renderer was given."
+    text = f"{where} the neural renderer reaches {with_interval(neural)} on the foreground"
+    gain_three, gain_seven = (found.get(f"neural.gain_over_{group}") for group in GROUPS)
+    best = scores.best(SEVEN, "foreground")
     if gain_three:
-        text += f", {_more(gain_three[0])} the best of pbr, shadow_ratio and affine"
+        text += f", {with_interval(gain_three, signed=True)} over the best of pbr, shadow_ratio and affine"
     if gain_seven and best:
-        text += f" and {_more(gain_seven[0])} the best of all seven baselines ({best[0]})"
+        text += f", {with_interval(gain_seven, signed=True)} over the best of all seven baselines ({best[0]})"
     return text + "."
 
 
-def _more(gain: float) -> str:
-    return f"{abs(gain):.2f} dB {'more' if gain >= 0 else 'less'} than"
-
-
-def _methods(scores: Scores) -> list[Block]:
+def _methods(scores: Scores, clips: Sequence[ClipMeta], found: Mapping[str, Row]) -> list[Block]:
     headings = ["Method", "What it is", *(["PSNR", "SSIM", "neural gains"] * len(REGIONS))]
     groups = [("", 2), *((REGION_WORDS[region], 3) for region in REGIONS)]
     rows = []
@@ -128,12 +133,11 @@ def _methods(scores: Scores) -> list[Block]:
         tone = "strong" if method == "neural" else "plain"
         row = [Cell(method, tone), Cell(WHAT[method], "faint")]
         for region in REGIONS:
-            psnr, ssim = scores.mean(method, region), scores.mean(method, region, metric="ssim")
-            gain = None if method == "neural" else scores.gain((method,), region)
+            suffix = SUFFIX[region]
             row += [
-                Cell(f"{psnr[0]:.2f}" if psnr else "—", tone),
-                Cell(written(ssim[0], "1") if ssim else "—", tone),
-                _gain_cell(gain),
+                _cell(found.get(f"{method}.psnr{suffix}"), tone),
+                _cell(found.get(f"{method}.ssim{suffix}"), tone),
+                _gain_cell(found.get(f"neural.gain_over_{method}{suffix}")),
             ]
         rows.append(row)
     for group, methods in GROUPS.items():
@@ -143,7 +147,7 @@ def _methods(scores: Scores) -> list[Block]:
             row += [
                 Cell(f"{best[1]:.2f}" if best else "—", "strong"),
                 Cell(best[0] if best else "—", "faint"),
-                _gain_cell(scores.gain(methods, region)),
+                _gain_cell(found.get(f"neural.gain_over_{group}{SUFFIX[region]}")),
             ]
         rows.append(row)
     notes = (
@@ -153,21 +157,34 @@ def _methods(scores: Scores) -> list[Block]:
         "over frames; SSIM likewise. “Neural gains” is the neural renderer's mean PSNR minus the method's. "
         "Foreground is where a ray through the pixel's centre meets true geometry. Best of three: "
         f"{', '.join(THREE)}. Products are taken in linear light before the tone curve. Blends and factors "
-        "are fitted on the training split in float64, once for the foreground and once for full frames: each "
-        "is judged where it is strongest."
+        "are fitted on the foreground of the training split in float64. On full frames the blends and the "
+        "per-pixel network are laid over pbr by the surfels' opacity, because a blend that suits surfaces is "
+        "wrong for the sky, which pbr shows as it is."
     )
     caption = "PSNR and gains in dB; higher is better everywhere."
-    return [Table(caption, headings, rows, groups, words=[1]), Text(notes)]
+    scenes = len({meta.scene for meta in clips})
+    frames = sum(meta.frames for meta in clips)
+    return [
+        Table(caption, headings, rows, groups, words=[1]),
+        Text(f"{interval_note(scenes, f'{frames} frames')} {PAIRED}"),
+        Text(notes),
+    ]
 
 
-def _gain_cell(gain: tuple[float, int] | None) -> Cell:
-    if gain is None:
+def _cell(row: Row | None, tone: Tone = "plain") -> Cell:
+    return Cell("—" if row is None else with_interval(row).replace(" dB", ""), tone)
+
+
+def _gain_cell(row: Row | None) -> Cell:
+    if row is None:
         return Cell("")
-    text = written(gain[0], "dB", signed=True).removesuffix(" dB")
+    text = with_interval(row, signed=True).replace(" dB", "")
+    if row.low is not None and row.high is not None and row.low <= 0 <= row.high:
+        return Cell(text)  # other scenes may turn it round
     return Cell(text, "good" if text[0] == "+" else "bad" if text[0] == MINUS else "plain")
 
 
-def _families(scores: Scores) -> Table:
+def _families(scores: Scores, found: Mapping[str, Row]) -> Table:
     families = scores.families
     headings = ["Method", *families, *families]
     groups = [("", 1), *((REGION_WORDS[region], len(families)) for region in REGIONS)]
@@ -175,10 +192,10 @@ def _families(scores: Scores) -> Table:
     rows = []
     for method in scores.methods:
         tone = "strong" if method == "neural" else "plain"
-        means = [scores.mean(method, region, family) for region, family in places]
-        rows.append([Cell(method, tone), *(Cell(f"{m[0]:.2f}" if m else "—", tone) for m in means)])
-    for group, methods in GROUPS.items():
-        gains = [scores.gain(methods, region, family) for region, family in places]
+        means = [found.get(f"{method}.psnr{SUFFIX[region]}.{family}") for region, family in places]
+        rows.append([Cell(method, tone), *(_cell(mean, tone) for mean in means)])
+    for group in GROUPS:
+        gains = [found.get(f"neural.gain_over_{group}{SUFFIX[region]}.{family}") for region, family in places]
         rows.append([Cell(f"gain over {group.replace('_', ' ')}"), *map(_gain_cell, gains)])
     counts = [
         f"{family}: {mean[1]} frames" for family in families if (mean := scores.mean("pbr", "frame", family))
@@ -186,10 +203,11 @@ def _families(scores: Scores) -> Table:
     return Table(f"PSNR in dB by kind of light ({', '.join(counts)}).", headings, rows, groups)
 
 
-def _guidance_section(scores: GuidanceScores, shown: Sequence[Shown], output_dir: Path) -> list[Section]:
+def _guidance_section(
+    scores: GuidanceScores, rows: Mapping[str, Row], shown: Sequence[Shown], output_dir: Path
+) -> list[Section]:
     """The surfels' own quality; no section where the test clips carry no reference buffers."""
-    rows = {row.metric: row for row in scores.rows()}
-    if not rows:
+    if not any(name.startswith(("guidance.", "surfels.")) for name in rows):
         return []
     intro = Text(
         "What the network is given decides what it can do. Irradiance of the surfels is compared with the "
@@ -239,5 +257,5 @@ def _guidance_section(scores: GuidanceScores, shown: Sequence[Shown], output_dir
     return [Section("guidance", "The guidance itself", [*blocks, *groups])]
 
 
-def _value(row: Row | None, tone: str = "plain") -> Cell:
-    return Cell(written(row.value, row.unit) if row else "—", "strong" if tone == "strong" else "plain")
+def _value(row: Row | None, tone: Tone = "plain") -> Cell:
+    return Cell(with_interval(row) if row else "—", tone)

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from eval.report.figures import bound, verdict, written
+from eval.report.figures import bound, verdict, with_interval
 from eval.results import Results, Target
 
 _LISTED = re.compile(
@@ -22,6 +22,7 @@ def print_results(results: Results, targets: Sequence[Target], report: Path) -> 
     """Print tables of the results and the absolute path of the report, to stdout.
 
     Metrics with a ``_full`` twin share a line; rows of one light family stay in results.json and the report.
+    Brackets are intervals over scenes.
     """
     console = Console(width=None if Console().is_terminal else 110, highlight=False)
     pairs = Table("figure", "foreground", "full frame", box=None, pad_edge=False)
@@ -31,16 +32,16 @@ def print_results(results: Results, targets: Sequence[Target], report: Path) -> 
         full = results.find(f"{row.metric}_full")
         signed = ".gain" in row.metric
         if full is not None:
-            values = [written(each.value, each.unit, signed) for each in (row, full)]
+            values = [with_interval(each, signed) for each in (row, full)]
             pairs.add_row(row.metric, *values)
         target = by_metric.get(row.metric)
         if target is not None:
             words, tone = verdict(target, row.value, row.unit)
             style = "green" if tone == "good" else "red"
-            value = written(row.value, row.unit, signed)
+            value = with_interval(row, signed)
             others.add_row(row.metric, value, bound(target, row.unit), f"[{style}]{words}[/]")
         elif full is None and _LISTED.fullmatch(row.metric):
-            others.add_row(row.metric, written(row.value, row.unit), "", "")
+            others.add_row(row.metric, with_interval(row), "", "")
     for target in targets:
         if results.find(target.metric) is None:
             others.add_row(target.metric, "—", f"{target.bound} {target.value:g}", "[red]not measured[/]")

@@ -93,6 +93,9 @@ def test_rows_are_means_but_the_most_of_seconds_and_surfels():
     found = {row.metric: row for row in rows_of("reconstruction", runs)}
     assert found["reconstruction.test_psnr"].value == 25
     assert found["reconstruction.test_psnr"].n == 2
+    assert (found["reconstruction.test_psnr"].low, found["reconstruction.test_psnr"].high) == (20, 30)
+    assert found["reconstruction.light.irradiance_error"].scenes == 2
+    assert all(row.low is None for name, row in found.items() if "seconds" in name or name.endswith("_2"))
     assert found["reconstruction.test_psnr.b_2"].value == 20
     assert found["reconstruction.surfels"].value == 30
     assert found["reconstruction.seconds"].value == 7

@@ -157,7 +157,7 @@ def test_shown_clips_span_the_ranking_from_the_worst_to_the_best():
     scores = Scores()
     for clip, gain in (("c", 3.0), ("a", 1.0), ("e", 5.0), ("b", 2.0), ("d", 4.0)):
         for method, psnr in (("neural", 20 + gain), ("pbr", 20.0)):
-            score = Score(method, "foreground", "sun", clip, 0, psnr, 0.9)
+            score = Score(method, "foreground", "sun", "scene", clip, 0, psnr, 0.9)
             scores._kept.setdefault((method, "foreground"), []).append(score)
     assert choose_clips(scores, 3) == ["a", "c", "e"]
     assert choose_clips(scores, 1) == ["a"]

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from eval.predictions import Predictor, displayed_truth, fit_baselines, region_mask
-from eval.scores import PSNR_CAP, Scores
+from eval.scores import Scores
 from tron.color import to_display
 from tron.errors import TronError
+from tron.metrics import PSNR_CAP
 from tron.shards.schema import Clip
 
 MakeClip = Callable[..., Clip]
@@ -120,23 +121,48 @@ def test_without_shadows_and_bounces_every_product_is_the_truth(drawn_clip: Make
             np.testing.assert_allclose(images[method], truth, atol=1e-4, err_msg=f"{region} {method}")
 
 
-def test_fits_of_a_region_are_the_better_ones_there(drawn_clip: MakeClip):
-    clips = [drawn_clip(light, seed) for light in ("noon", "softbox") for seed in (0, 1)]
-    fits = fit_baselines(clips, seed=0)
-    for method in ("affine", "affine_ratio", "pbr_x_irradiance"):
-        errors = {}
-        for fitted in ("foreground", "frame"):
-            predictor = Predictor({"foreground": fits[fitted]})
-            errors[fitted] = np.mean(
-                [
-                    np.mean(
-                        (predictor.shown(clip)["foreground"][method] - displayed_truth(clip))[inside] ** 2
-                    )
-                    for clip in clips
-                    for inside in [region_mask(clip, "foreground")]
-                ]
-            )
-        assert errors["foreground"] <= errors["frame"] * (1 + 1e-3), method
+def where_sky_and_surface_differ(clip: Clip) -> np.ndarray:
+    """Truth in which surfaces are a blend of pbr and irradiance, and the sky is as pbr shows it."""
+    pbr, irradiance = (to_display(clip.frames[name], clip.meta.exposure) for name in ("pbr", "irr"))
+    surfaces = np.clip(0.4 * pbr + 0.4 * irradiance + 0.05, 0, 1)
+    return np.where(region_mask(clip, "foreground")[..., None], surfaces, pbr).astype(np.float32)
+
+
+def as_photographed(clip: Clip, truth: np.ndarray) -> Clip:
+    clip.frames["rgb"] = truth
+    clip.meta.color_space["rgb"] = "display"
+    return clip
+
+
+@pytest.mark.parametrize("method", ["affine", "affine_ratio"])
+def test_a_blend_of_surfaces_leaves_the_sky_as_it_is(drawn_clip: MakeClip, method: str):
+    clips = [drawn_clip(light, seed) for light in ("noon", "grey") for seed in (0, 1)]
+    for clip in clips:
+        as_photographed(clip, where_sky_and_surface_differ(clip))
+    shown = Predictor(fit_baselines(clips, seed=0)).shown(clips[0])
+    truth = displayed_truth(clips[0])
+    inside = region_mask(clips[0], "foreground")
+    np.testing.assert_allclose(shown["foreground"][method][inside], truth[inside], atol=1e-4)
+    np.testing.assert_allclose(shown["frame"][method], truth, atol=1e-4)
+
+
+def test_half_a_surface_shows_half_of_pbr_in_full_frames_alone(drawn_clip: MakeClip):
+    clip = drawn_clip()
+    predictor = Predictor(
+        fit_baselines([clip], seed=0), {"pixel_mlp": lambda pbr, *_: np.full_like(pbr, 0.9)}
+    )
+    clip.frames["mask"] = np.full_like(clip.frames["mask"], 0.25)
+    shown = predictor.shown(clip)
+    assert np.all(shown["foreground"]["pixel_mlp"] == np.float32(0.9))
+    expected = 0.25 * 0.9 + 0.75 * shown["frame"]["pbr"]
+    np.testing.assert_allclose(shown["frame"]["pixel_mlp"], expected, atol=1e-6)
+
+
+def test_the_neural_renderer_draws_its_own_sky(drawn_clip: MakeClip):
+    clip = drawn_clip()
+    predictor = Predictor(fit_baselines([clip], seed=0), {"neural": lambda pbr, *_: np.full_like(pbr, 0.9)})
+    shown = predictor.shown(clip)
+    np.testing.assert_array_equal(shown["frame"]["neural"], shown["foreground"]["neural"])
 
 
 def test_the_network_is_given_linear_buffers_and_the_exposure(drawn_clip: MakeClip):

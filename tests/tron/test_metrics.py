@@ -27,6 +27,8 @@ def test_psnr_of_a_constant_error_is_its_closed_form():
     a = np.full((4, 5, 3), 0.5)
     assert metrics.psnr(a, a + 0.1) == pytest.approx(20)
     assert metrics.psnr(a, a) == float("inf")
+    assert metrics.capped_psnr(a, a) == metrics.PSNR_CAP
+    assert metrics.capped_psnr(a, a + 0.1) == metrics.psnr(a, a + 0.1)
 
 
 def test_psnr_looks_at_the_mask_alone():

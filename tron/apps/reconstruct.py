@@ -246,7 +246,7 @@ def _run(settings: Settings, capture: Capture, prior: Any, lpips: LPIPS | None) 
     report = _report(settings, capture, found, light, test, train, seconds)
     if curve is not None:
         report["curve"] = curve.points
-    write_atomic(out / "metrics.json", json.dumps(report, indent=1) + "\n")
+    write_atomic(out / "metrics.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
     _say(report, out)
 
 

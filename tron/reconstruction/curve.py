@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import torch
 
 from tron.captures import View
 from tron.errors import TronError
-from tron.metrics import psnr
+from tron.metrics import capped_psnr
 from tron.reconstruction.evaluation import BACKGROUND, picture, wanted_picture
 from tron.reconstruction.training import Progress, Stage
 from tron.storage import write_atomic
@@ -31,7 +30,8 @@ class Curve:
         every: steps between two scores.
 
     Attributes:
-        points: stage, step, seconds (since the run was set up, scores left out), test_psnr (dB), surfels.
+        points: stage, step, seconds (of the steps up to here, as :class:`Progress` has them: neither set-up,
+            scores nor checkpoints), test_psnr (dB), surfels.
 
     Raises:
         TronError: the file holds no curve.
@@ -46,16 +46,13 @@ class Curve:
                 self.points = [{name: point[name] for name in _POINT} for point in points]
             except (ValueError, TypeError, KeyError) as error:
                 raise TronError(f"not a curve: {error}", path, "remove it") from error
-        self._last = time.perf_counter()
         self._seconds: float | None = None
 
     def watch(self, progress: Progress, stage: Stage) -> None:
-        """Take note of a step; scores take no part in the seconds."""
+        """Take note of a step."""
         if self._seconds is None:
-            self._begin(progress)
-        now = time.perf_counter()
-        assert self._seconds is not None
-        self._seconds += now - self._last
+            self._seconds = self._begin(progress)
+        self._seconds += progress.seconds
         if stage.plan.weights.rgb and (progress.step % self.every == 0 or progress.step == progress.steps):
             self.points.append(
                 {
@@ -67,12 +64,11 @@ class Curve:
                 }
             )
             write_atomic(self.path, json.dumps(self.points, indent=1) + "\n")
-        self._last = time.perf_counter()
 
-    def _begin(self, progress: Progress) -> None:
-        """Forget what was scored after the checkpoint that the run goes on from."""
+    def _begin(self, progress: Progress) -> float:
+        """Forget what was scored after the checkpoint that the run goes on from; the seconds until there."""
         self.points = [p for p in self.points if p["stage"] != progress.stage or p["step"] < progress.step]
-        self._seconds = self.points[-1]["seconds"] if self.points else 0.0
+        return self.points[-1]["seconds"] if self.points else 0.0
 
     def _score(self, stage: Stage) -> float:
         behind = BACKGROUND[stage.plan.background]
@@ -84,5 +80,5 @@ class Curve:
                     surfels, view.camera, kernel_degree=stage.kernel_degree, sh_degree=stage.sh_degree
                 )
                 buffers = {name: seen[name].cpu().numpy() for name in ("rgb", "opacity")}
-                scores.append(psnr(picture(buffers, behind), wanted_picture(view, behind)))
+                scores.append(capped_psnr(picture(buffers, behind), wanted_picture(view, behind)))
         return float(np.mean(scores))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tron.captures import View
-from tron.metrics import LPIPS, angular_error_deg, psnr, scale_albedo, ssim
+from tron.metrics import LPIPS, angular_error_deg, capped_psnr, scale_albedo, ssim
 from tron.shading.guidance import ViewTracer
 
 _SUBJECT = 0.5
@@ -42,7 +42,7 @@ def score_views(
 
     Figures: ``psnr``, ``ssim``, ``lpips`` of the whole frame; ``psnr_subject`` where the view has a mask;
     ``normal_mae_deg``, ``base_color_psnr`` (linear, scaled), ``roughness_mae``, ``metallic_mae`` where the
-    view has the truth, over its subject.
+    view has the truth, over its subject. All are finite: a PSNR is at most PSNR_CAP of :mod:`tron.metrics`.
 
     Args:
         tracer: the surfels. views: display images. background: as trained with; random is judged on black.
@@ -84,7 +84,7 @@ def _figures(
     buffers: Mapping[str, np.ndarray], view: View, behind: float, lpips: LPIPS | None
 ) -> Iterator[tuple[str, float]]:
     seen, wanted = picture(buffers, behind), wanted_picture(view, behind)
-    yield "psnr", psnr(seen, wanted)
+    yield "psnr", capped_psnr(seen, wanted)
     if min(seen.shape[:2]) >= 6:
         yield "ssim", ssim(seen, wanted)
     if lpips is not None and min(seen.shape[:2]) >= _LPIPS_LEAST_SIDE:
@@ -93,7 +93,7 @@ def _figures(
     if not subject.any():
         return
     if view.has("mask"):
-        yield "psnr_subject", psnr(seen, wanted, subject)
+        yield "psnr_subject", capped_psnr(seen, wanted, subject)
     if view.has("normal"):
         normal = view.read("normal")
         known = subject & normal.any(axis=-1)
@@ -102,7 +102,7 @@ def _figures(
     if view.has("base_color"):
         truth = view.read("base_color")
         scaled = scale_albedo(buffers["base_color"], truth, subject)
-        yield "base_color_psnr", psnr(np.clip(scaled, 0, 1), truth, subject)
+        yield "base_color_psnr", capped_psnr(np.clip(scaled, 0, 1), truth, subject)
     for name in ("roughness", "metallic"):
         if view.has(name):
             yield f"{name}_mae", float(np.abs(buffers[name] - view.read(name))[subject].mean())

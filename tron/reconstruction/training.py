@@ -7,6 +7,7 @@ bit by bit with one Dr.Jit and one torch thread.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -36,6 +37,7 @@ class Progress:
         stage: its name. step, steps: done, and in all.
         loss: of the step. psnr: of recent steps' pictures, dB, NaN where the stage compares none.
         surfels: their number.
+        seconds: wall time of the step.
     """
 
     stage: str
@@ -44,6 +46,7 @@ class Progress:
     loss: float
     psnr: float
     surfels: int
+    seconds: float
 
 
 Watch = Callable[[Progress, "Stage"], None]
@@ -154,6 +157,7 @@ class Stage:
 
     def advance(self) -> Progress:
         """Take one step."""
+        began = time.perf_counter()
         plan, surfels, number = self.plan, self.surfels, self.step + 1
         view = self._view(self.step)
         target = targets(view, plan.weights.wanted(), surfels.device)
@@ -180,7 +184,8 @@ class Stage:
             plan.density.after(surfels, number)
         self.step = number
         self._remember(seen, target, background)
-        return Progress(plan.name, number, plan.steps, value, self.psnr, len(surfels))
+        seconds = time.perf_counter() - began
+        return Progress(plan.name, number, plan.steps, value, self.psnr, len(surfels), seconds)
 
     @property
     def sh_degree(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from tron.captures import View
 from tron.gaussians import GaussianScene
+from tron.metrics import PSNR_CAP
 from tron.reconstruction.evaluation import (
     ViewScore,
     mean_figures,
@@ -91,6 +93,14 @@ def test_what_lies_outside_the_mask_counts_for_no_map(tracer, painted_capture) -
         pixels[outside] = 1 / np.sqrt(3)
         spoiled[name] = pixels
     assert figures(tracer, replace(view, **spoiled)) == figures(tracer, view)
+
+
+def test_a_map_that_is_exactly_right_has_a_finite_figure(tracer, painted_capture) -> None:
+    """JSON has no infinity: metrics.json could not be read again."""
+    view = painted_capture.test_views[0]
+    found = figures(tracer, replace(view, base_color=np.zeros_like(view.read("base_color"))))
+    assert found["base_color_psnr"] == PSNR_CAP
+    json.dumps(found, allow_nan=False)
 
 
 def test_what_a_view_lacks_is_not_measured(tracer, painted_capture) -> None:

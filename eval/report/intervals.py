@@ -1,0 +1,29 @@
+"""What the brackets behind a figure are, in plain sentences."""
+
+from __future__ import annotations
+
+from eval.confidence import LEVEL
+
+FEW = 8
+"""Scenes under which an interval is said to be wide; from so many on it holds nearly what it claims."""
+
+
+def interval_note(scenes: int, observed: str) -> str:
+    """How to read the brackets of figures that are means over ``observed``, such as "60 frames", of so many
+    scenes.
+    """
+    if scenes < 2:
+        return (
+            f"{observed} of one scene say nothing about how much another scene would differ: no interval is "
+            "given."
+        )
+    text = (
+        f"Brackets are {LEVEL:.0%} bootstrap intervals over scenes: where the figure may lie for other "
+        f"scenes of the same kind. {observed} are {scenes} independent scenes"
+    )
+    if scenes >= FEW:
+        return text + "."
+    return (
+        f"{text}, and so few make the intervals wide: of a mean over four they go from the worst scene to "
+        "the best, and hold the truth about nine times in ten."
+    )
