@@ -34,6 +34,21 @@ _MAX_EXPANSION = 1000
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
+_HDR_MAGIC = (b"#?RADIANCE", b"#?RGBE")
+_BEGINNINGS = {
+    "a web page (HTML)": (b"<!doctype html", b"<html", b"<head"),
+    "an XML document": (b"<?xml",),
+    "a pointer of Git LFS": (b"version https://git-lfs",),
+    "JSON": (b"{", b"["),
+    "a PNG image": (b"\x89png",),
+    "a JPEG image": (b"\xff\xd8\xff",),
+    "an OpenEXR image": (_EXR_MAGIC,),
+    "a Radiance HDR image": tuple(magic.lower() for magic in _HDR_MAGIC),
+    "a ZIP archive": (b"pk\x03\x04",),
+    "gzip-compressed": (b"\x1f\x8b",),
+}
+"""What a file is that bears the wrong suffix, by the lower-case beginnings of such files."""
+_AGAIN = "copy or download it again"
 _HALF_MAX = 65504.0
 _JPEG_QUALITY = 95
 
@@ -117,13 +132,13 @@ def decode_exr(data: bytes) -> np.ndarray:
     import OpenEXR
 
     if not data.startswith(_EXR_MAGIC):
-        raise TronError("not an OpenEXR image")
+        raise _another_kind("an OpenEXR image", data)
     try:
         parts = OpenEXR.File(io.BytesIO(data), header_only=True).parts
         _check_exr_header(parts, len(data))
         decoded = OpenEXR.File(io.BytesIO(data))
         if not decoded.parts:  # the binding drops a part that it cannot decode
-            raise TronError("OpenEXR image is damaged or cut short")
+            raise TronError("OpenEXR image is damaged or cut short", mend=_AGAIN)
         pixels = {name: channel.pixels for name, channel in decoded.channels().items()}
     except TronError:
         raise
@@ -176,7 +191,7 @@ def decode_png(data: bytes) -> np.ndarray:
     except TronError:
         raise
     except UnidentifiedImageError as error:
-        raise TronError("not a PNG or JPEG image") from error
+        raise _another_kind("a PNG or JPEG image", data) from error
     except Exception as error:  # damaged files raise almost anything: OSError, SyntaxError, struct.error, ...
         raise TronError(f"not a readable PNG or JPEG image: {error}") from error
     return pixels.reshape(*pixels.shape[:2], -1)
@@ -196,11 +211,14 @@ def _encode_display(image: np.ndarray, file_format: str) -> bytes:
 def _decode_hdr(data: bytes) -> np.ndarray:
     import cv2
 
-    header = re.match(rb"#\?(?:RADIANCE|RGBE)\s.{0,65536}?\n\n-Y (\d{1,9}) \+X (\d{1,9})\n", data, re.DOTALL)
+    if not data.startswith(_HDR_MAGIC):
+        raise _another_kind("a Radiance HDR image", data)
+    header = re.match(rb"#\?\w+\s.{0,65536}?\n\n-Y (\d{1,9}) \+X (\d{1,9})\n", data, re.DOTALL)
     if not header:
-        raise TronError(
-            "not a readable Radiance HDR image", mend="rows must run from top to bottom (-Y H +X W)"
-        )
+        turned = re.match(rb"#\?\w+\s.{0,65536}?\n\n[-+][XY] \d+ [-+][XY] \d+\n", data, re.DOTALL)
+        if not turned:
+            raise TronError("Radiance HDR image is damaged or cut short in its header", mend=_AGAIN)
+        raise TronError("Radiance HDR image is turned", mend="rows must run from top to bottom (-Y H +X W)")
     height, width = int(header[1]), int(header[2])
     check_size(width, height, 3, len(data))
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # damage is ours to report
@@ -209,7 +227,7 @@ def _decode_hdr(data: bytes) -> np.ndarray:
     except cv2.error as error:
         raise TronError(f"not a readable Radiance HDR image: {error.err}") from error
     if pixels is None or pixels.shape != (height, width, 3):
-        raise TronError("Radiance HDR image is damaged")
+        raise TronError("Radiance HDR image is damaged or cut short", mend=_AGAIN)
     return np.ascontiguousarray(pixels[..., ::-1], dtype=np.float32)
 
 
@@ -219,6 +237,21 @@ def _encode_hdr(image: np.ndarray) -> bytes:
     image = _shaped(image, (1, 3)).astype(np.float32)
     rgb = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
     return cv2.imencode(".hdr", np.ascontiguousarray(rgb[..., ::-1]))[1].tobytes()
+
+
+def _another_kind(wanted: str, data: bytes) -> TronError:
+    """What to say of a file that is not what its suffix says."""
+    if not data.strip():
+        return TronError(f"not {wanted}: the file is empty", mend=_AGAIN)
+    start = data[:256].removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    found = next((kind for kind, starts in _BEGINNINGS.items() if start.startswith(starts)), None)
+    if found is None:
+        return TronError(f"not {wanted}")
+    if found in ("a PNG image", "a JPEG image") and "PNG" in wanted:
+        return TronError(f"{found[2:]} is damaged or cut short", mend=_AGAIN)
+    fetched = found.startswith(("a web page", "an XML", "a pointer", "JSON"))
+    mend = "fetch the image itself" if fetched else "give it the suffix of what it is, or convert it"
+    return TronError(f"not {wanted} but {found}", mend=mend)
 
 
 def _suffix(path: Path) -> str:

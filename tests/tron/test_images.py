@@ -201,6 +201,49 @@ def hostile() -> dict[str, bytes]:
     }
 
 
+@pytest.mark.parametrize(
+    "name, data, said",
+    [
+        (
+            "a.hdr",
+            b"<!DOCTYPE html>\n<html><title>404</title></html>",
+            "not a Radiance HDR image but a web page",
+        ),
+        ("a.hdr", b"\xef\xbb\xbf\n <HTML>", "not a Radiance HDR image but a web page"),
+        (
+            "a.hdr",
+            b"version https://git-lfs.github.com/spec/v1\noid",
+            "not a Radiance HDR image but a pointer",
+        ),
+        ("a.hdr", b"\x76\x2f\x31\x01\x02", "not a Radiance HDR image but an OpenEXR image"),
+        ("a.hdr", b"", "not a Radiance HDR image: the file is empty"),
+        ("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n", "cut short in its header"),
+        ("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n+Y 4 +X 8\n", "turned"),
+        ("a.exr", b"<html>", "not an OpenEXR image but a web page"),
+        ("a.exr", b"#?RADIANCE\n", "not an OpenEXR image but a Radiance HDR image"),
+        ("a.png", b'{"error": "not found"}', "not a PNG or JPEG image but JSON"),
+        ("a.jpg", b"\xff\xd8\xff\xe0 cut", "not a readable PNG or JPEG image"),
+    ],
+)
+def test_a_file_of_another_kind_is_called_what_it_is(tmp_path: Path, name: str, data: bytes, said: str):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(TronError) as caught:
+        images.read_image(tmp_path / name)
+    assert said in str(caught.value)
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.9, 1.0])
+def test_a_truncated_hdr_is_called_cut_short(tmp_path: Path, kept: float):
+    path = tmp_path / "a.hdr"
+    images.write_image(path, picture(3, 32, 64))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(kept * len(data)) - 1])
+    with pytest.raises(TronError, match="cut short"):
+        images.read_image(path)
+
+
 MEASURE = """
 import resource, sys, time
 from tron.errors import TronError

@@ -27,6 +27,8 @@ _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 _ORIENTATION_TAG = 0x0112
 _TAIL_BYTES = 4096
 _CHECK_SIDE = 64
+_BIT_DEPTH_AT = 24
+"""Byte of a PNG that holds its bit depth: behind signature, length and name of IHDR, width and height."""
 
 Decode = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """What a map's file means: stored values (H, W, 3) and alpha (H, W), both in [0, 1] -> the map."""
@@ -216,11 +218,31 @@ def _decode(path: Path, header: PhotoHeader) -> np.ndarray:
     if pixels.shape[:2] != (header.height, header.width):
         raise TronError("image has changed since the capture was loaded", path, "load the capture again")
     if pixels.ndim == 2:
-        return pixels[..., None]
+        return _with_hidden_grey(path, pixels) if header.alpha else pixels[..., None]
     if pixels.shape[2] == 2:
         return np.concatenate([np.repeat(pixels[..., :1], 3, axis=2), pixels[..., 1:]], axis=2)
     swapped = cv2.COLOR_BGRA2RGBA if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB
     return cv2.cvtColor(pixels, swapped)
+
+
+def _with_hidden_grey(path: Path, pixels: np.ndarray) -> np.ndarray:
+    """Grey (H, W) and the transparency that a PNG gives one of its values (chunk tRNS) -> RGBA, as stored.
+
+    OpenCV passes over that chunk of grey files.
+    """
+    with Image.open(path, formats=("PNG",)) as picture:
+        hidden = picture.info.get("transparency")
+    alpha = np.full_like(pixels, np.iinfo(pixels.dtype).max)
+    if isinstance(hidden, int):
+        alpha[pixels == hidden * _steps_of_grey(path)] = 0
+    return np.stack([pixels, pixels, pixels, alpha], axis=2)
+
+
+def _steps_of_grey(path: Path) -> int:
+    """What one step of a grey PNG of 1, 2 or 4 bits is of 8, to which it is decoded; else 1."""
+    with open(path, "rb") as file:
+        bits = file.read(_BIT_DEPTH_AT + 1)[_BIT_DEPTH_AT]
+    return 255 // (2**bits - 1) if bits < 8 else 1
 
 
 def _turned(pixels: np.ndarray, orientation: int) -> np.ndarray:

@@ -1,6 +1,8 @@
 """Photos are read when they are looked at, as they are stored, and only so many are kept."""
 
 import io
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +51,36 @@ def test_grey_is_repeated(tmp_path: Path, write, dtype: type) -> None:
     color = reader(tmp_path / "a.png").color()
     assert color.shape == (7, 9, 3)
     assert np.abs(color * np.iinfo(dtype).max - image[..., None]).max() < 0.01
+
+
+def grey_png(values: np.ndarray, bits: int, hidden: int) -> bytes:
+    """A grey PNG of 2, 8 or 16 bits whose chunk tRNS makes the value ``hidden`` transparent."""
+    rows = b""
+    for row in values.tolist():
+        packed = 0
+        for value in row:
+            packed = packed << bits | value
+        rows += b"\0" + packed.to_bytes(len(row) * bits // 8, "big")
+    height, width = values.shape
+    chunks = [
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)),
+        (b"tRNS", struct.pack(">H", hidden)),
+        (b"IDAT", zlib.compress(rows)),
+        (b"IEND", b""),
+    ]
+    body = (struct.pack(">I", len(d)) + t + d + struct.pack(">I", zlib.crc32(t + d)) for t, d in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(body)
+
+
+@pytest.mark.parametrize("bits, hidden", [(2, 1), (8, 200), (16, 40_000)])
+def test_a_grey_png_with_one_transparent_value_is_transparent_there(tmp_path: Path, bits: int, hidden: int):
+    values = generator(4, "grey").integers(0, 2**bits, (6, 8))
+    values[2, 3:5] = hidden
+    (tmp_path / "a.png").write_bytes(grey_png(values, bits, hidden))
+    read = reader(tmp_path / "a.png")
+    assert read.header.alpha
+    np.testing.assert_array_equal(read.alpha(), values != hidden)
+    np.testing.assert_allclose(read.color()[..., 1], values / (2**bits - 1), atol=1e-6)
 
 
 @pytest.mark.parametrize("mode", ["P", "LA", "CMYK", "1"])

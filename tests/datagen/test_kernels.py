@@ -1,0 +1,160 @@
+"""Kernels are compiled once: another view, light or scene of a kind brings none.
+
+Kernels are told apart by the hash of their code, which no cache of an earlier run can hide.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from datagen.build import Geometry, build
+from datagen.captures import captured
+from datagen.lights import bake, draw_light
+from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
+from datagen.plan import Sources, Work
+from datagen.run import make_scene
+from datagen.scene import draw_scene
+from datagen.settings import CaptureSettings, Settings
+from tron.aligned import ALIGNMENT, aligned
+from tron.apps.recipes import check, compose_recipe
+from tron.cameras import Camera
+from tron.seeds import generator
+from tron.shading.environment import EnvironmentMap
+from tron.shading.guidance import Lighting
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+SUN_KERNELS = 2
+"""What each sun costs: Mitsuba's sunsky writes its sun's size and place into the code."""
+
+
+def kernels_of(action: Callable[[], object]) -> set[str]:
+    """Hashes of the kernels that an action launches."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        action()
+        return {entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT}
+
+
+def geometry(index: int) -> Geometry:
+    lights = ["overcast"]
+    spec = draw_scene(0, "test", index, style="A", lights=lights, frames=1, path_frames=4, objects=(2, 2))
+    return build(spec, edge=0.2)
+
+
+def camera(angle: float, fov: float = 34.0, size: int = 16) -> Camera:
+    position = (4 * np.cos(angle), 4 * np.sin(angle), 2.5)
+    return Camera.look_at(position, (0, 0, 0.3), fov_deg=fov, width=size, height=size)
+
+
+def light(number: int, rotation: float) -> EnvironmentMap:
+    return bake(draw_light(generator(0, "kernels", number), "studio", []), 16).rotated(rotation)
+
+
+@pytest.mark.parametrize(
+    "shoot",
+    [
+        lambda meshes, scene, view, seed: direct_irradiance(meshes, scene, view, 8, seed),
+        lambda meshes, scene, view, seed: gbuffers(meshes, [view]),
+        lambda meshes, scene, view, seed: render_frames(scene, [view], 4, [seed]),
+        lambda meshes, scene, view, seed: render_frames(scene, [view], 4, [seed], transparent=True),
+    ],
+    ids=["irradiance", "gbuffers", "frames", "transparent"],
+)
+def test_another_view_seed_light_or_scene_is_traced_by_the_same_kernels(variant, shoot):
+    meshes = geometry(0)
+    scene = meshes.lit(light(0, 30.0))
+    first = kernels_of(lambda: shoot(meshes, scene, camera(0.3), 5))
+    assert first
+    assert kernels_of(lambda: shoot(meshes, scene, camera(1.1), 2**31 + 7)) <= first, "view and seed"
+    assert kernels_of(lambda: shoot(meshes, scene, camera(1.1, fov=41.0), 5)) <= first, "field of view"
+    del scene
+    scene = meshes.lit(light(1, 77.0))
+    assert kernels_of(lambda: shoot(meshes, scene, camera(0.3), 5)) <= first, "light"
+    del scene, meshes
+    meshes = geometry(1)
+    scene = meshes.lit(light(2, 121.0))
+    assert kernels_of(lambda: shoot(meshes, scene, camera(0.7), 5)) <= first, "scene"
+
+
+def test_the_number_of_rays_brings_no_kernel(variant):
+    meshes = geometry(0)
+    first = kernels_of(lambda: gbuffers(meshes, [camera(0.3)]))
+    assert kernels_of(lambda: gbuffers(meshes, [camera(0.3), camera(2.0, size=25)])) <= first
+
+
+def test_every_sum_of_irradiance_is_taken_in_one_pass_over_the_rays(variant):
+    """One kernel finds the surfaces, one traces the shadow rays: not one a channel."""
+    meshes = geometry(0)
+    scene = meshes.lit(light(0, 30.0))
+    direct_irradiance(meshes, scene, camera(0.3), 8, 1)
+    assert len(kernels_of(lambda: direct_irradiance(meshes, scene, camera(0.3), 8, 1))) == 2
+
+
+def test_another_light_is_prepared_by_the_same_kernels(variant):
+    def prepared(number: int) -> set[str]:
+        return kernels_of(lambda: Lighting(light(number, 0.0)))
+
+    prepared(0)  # the BRDF's table is made once
+    first = prepared(1)
+    for number in range(2, 10):  # NumPy's memory lies elsewhere each time
+        assert prepared(number) <= first
+
+
+def test_a_sun_brings_no_more_than_its_own_kernels(variant):
+    def baked(number: int) -> set[str]:
+        return kernels_of(lambda: bake(draw_light(generator(1, "kernels", number), "sun", []), 16))
+
+    first = baked(0)
+    assert len(baked(1) - first) <= SUN_KERNELS
+    assert len(baked(2) - first) <= SUN_KERNELS
+
+
+def test_a_second_scene_of_a_split_brings_no_kernel(variant, tmp_path: Path):
+    """Surfels, their refinement, guidance, frames, references: all of a scene."""
+    tiny = [f"test.{key}" for key in ("frames=2", "width=16", "height=16", "path_spp=4", "reference_spp=4")]
+    tiny += ["test.lights=[studio,overcast]", "test.guidance_spp=2", "cluster=null", "path_frames=8"]
+    tiny += ["views=6", "view_width=32", "view_height=32", "surfels=1500", "refine_steps=6", "mesh_edge=0.2"]
+    tiny += ["environment_height=16", "objects=[2,2]", f"output_dir={tmp_path}"]
+    settings = check(compose_recipe("conf.datagen", tiny), Settings)
+
+    def made(index: int) -> set[str]:
+        item = Work("test", index, f"test-{index:06d}", first_shard=index)
+        return kernels_of(lambda: make_scene(item, settings, Sources()))
+
+    first = made(0)
+    assert len(first) > 50
+    assert made(1) <= first
+
+
+def test_a_second_capture_brings_no_kernel(variant):
+    settings = CaptureSettings(views=3, width=16, height=16, path_spp=4, reference_spp=4)
+
+    def shot(index: int) -> set[str]:
+        families = ["studio"]
+        spec = draw_scene(
+            0, "test", index, style="A", lights=families, frames=1, path_frames=4, objects=(2, 2)
+        )
+        capture = captured(spec, build(spec, edge=0.2), bake(spec.lights[0], 16).baked(), settings)
+        return kernels_of(lambda: [view.read() for view in capture.views])
+
+    first = shot(0)
+    assert first
+    assert shot(1) <= first
+
+
+def test_memory_is_aligned_wherever_it_began():
+    room = np.arange(100, dtype=np.float32)
+    for start in range(20):
+        part = room[start : start + 70].reshape(7, 10)
+        moved = aligned(part)
+        assert moved.ctypes.data % ALIGNMENT == 0
+        np.testing.assert_array_equal(moved, part)
+    strided = aligned(room.reshape(10, 10)[:, 3])
+    assert strided.flags.c_contiguous
+    np.testing.assert_array_equal(strided, room[3::10])
+    there = aligned(room)
+    assert aligned(there) is there or there is room
