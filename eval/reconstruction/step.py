@@ -2,10 +2,11 @@
 
 A step renders a view, compares it with a photo by 0.8 L1 + 0.2 (1 - SSIM), differentiates by positions,
 rotations, scales, opacities and all harmonics, and updates them by Adam. Both sides hold the same tensors
-under the same Adam and call the same loss; they differ in what draws the picture. TRON's step is that of
-stage 1 (:class:`tron.reconstruction.training.Stage`), without priors and without density control. The peer's
-picture comes through ``dr.wrap``, as Mitsuba's documentation has it; that Mitsuba builds its hierarchy anew
-for the surfels that have moved is counted, because no step goes without it.
+under the same Adam and call the same loss; they differ in what draws the picture. The kernel is the same on
+both sides: of degree 2, as the peer ships, or of degree 4, with the peer's line of density replaced. TRON's
+step is that of stage 1 (:class:`tron.reconstruction.training.Stage`), without priors and without density
+control. The peer's picture comes through ``dr.wrap``, as Mitsuba's documentation has it; that Mitsuba builds
+its hierarchy anew for the surfels that have moved is counted, because no step goes without it.
 
 What stays unequal is said in :mod:`eval.tracing.volprim`: the peer composites radiance alone, of flat
 ellipsoids that are seen from both sides.
@@ -41,15 +42,21 @@ TRON, VOLPRIM, SHIPPED = "tron", "volprim", "volprim_as_shipped"
 class Steps:
     """Times of whole steps on one view of ``size`` x ``size`` pixels, contestant -> times.
 
-    ``agreement`` is the PSNR in dB between the two sides' pictures before the first step; ``shape`` is the
-    peer's plugin for its primitives, the faster of the two.
+    ``degree`` is the kernel's, on both sides. ``agreement`` is the PSNR in dB between the two sides' pictures
+    before the first step. ``shape`` is the peer's plugin for its primitives, the faster of the two.
     """
 
     count: int
     size: int
+    degree: int
     times: Mapping[str, Times]
     agreement: float
     shape: str
+
+    @property
+    def case(self) -> str:
+        """How metrics spell the case, such as degree4_128."""
+        return f"degree{self.degree}_{self.size}"
 
     def ratio(self, name: str = VOLPRIM) -> float:
         """How many times as long the peer's step takes."""
@@ -127,29 +134,29 @@ def measure_steps(
     slow_repetitions: int,
     shape: str | None = None,
 ) -> Steps:
-    """Time both sides in turns on one view; the peer stops rays where TRON does, and as shipped beside it.
+    """Time both sides in turns on one view; the peer has the scene's kernel and stops rays where TRON does.
+
+    Where the kernel is the one that the peer ships, the peer as shipped runs beside it.
 
     Args:
         scene: surfels, each side learns from there on. view: square, display values. extent: world units.
         shape: the peer's plugin for its primitives; None takes the one whose step is faster here.
     """
     plan = step_plan(extent, seed)
-    same_stop, shipped = volprim.load_integrator(volprim.OUR_STOP), volprim.load_integrator()
+    same_stop = volprim.load_integrator(volprim.OUR_STOP, scene.kernel_degree)
     agreement = _agreement(scene, view, same_stop)
     if shape is None:
         peers = {name: volprim_step(scene, view, plan, name, same_stop) for name in volprim.SHAPES}
         first = interleaved(peers, 1, 1)
         shape = min(first, key=lambda name: first[name].median)
-    times = interleaved(
-        {
-            TRON: surfel_step(scene, view, plan, seed),
-            VOLPRIM: volprim_step(scene, view, plan, shape, same_stop),
-            SHIPPED: volprim_step(scene, view, plan, shape, shipped),
-        },
-        repetitions,
-        slow_repetitions,
-    )
-    return Steps(len(scene), view.camera.width, times, agreement, shape)
+    contestants = {
+        TRON: surfel_step(scene, view, plan, seed),
+        VOLPRIM: volprim_step(scene, view, plan, shape, same_stop),
+    }
+    if scene.kernel_degree == 2:
+        contestants[SHIPPED] = volprim_step(scene, view, plan, shape, volprim.load_integrator())
+    times = interleaved(contestants, repetitions, slow_repetitions)
+    return Steps(len(scene), view.camera.width, scene.kernel_degree, times, agreement, shape)
 
 
 def measure_growth(scene: GaussianScene, view: View, extent: float, seed: int, repetitions: int) -> Times:

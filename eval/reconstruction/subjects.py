@@ -20,9 +20,8 @@ from tron.tracing import SurfelTracer
 _DIMMED = 0.8
 
 
-def trained(folder: Path, way: str, size: int) -> tuple[GaussianScene, View, float]:
-    """The first scene reconstructed in a way below the benchmark's folder, a held-out view of it resized to
-    ``size`` x ``size`` pixels, and its extent.
+def first_trained(folder: Path, way: str) -> str:
+    """Name of the first scene reconstructed in a way below the benchmark's folder.
 
     Raises:
         TronError: none is there.
@@ -32,14 +31,28 @@ def trained(folder: Path, way: str, size: int) -> tuple[GaussianScene, View, flo
         raise TronError(
             "no reconstructed scene to take steps on", folder, "measure part scenes too, or before"
         )
-    name = scenes[0].parent.parent.name
+    return scenes[0].parent.parent.name
+
+
+def trained(folder: Path, way: str, size: int) -> tuple[GaussianScene, View, float]:
+    """The first scene reconstructed in a way below the benchmark's folder, a held-out view of it resized to
+    ``size`` x ``size`` pixels, and its extent.
+
+    Raises:
+        TronError: none is there.
+    """
+    name = first_trained(folder, way)
     capture = read_capture_folder(folder / "dataset" / "captures" / name)
     view = middle_view(capture.test_views)
     photo = Image.fromarray(np.round(255 * wanted_picture(view)).astype(np.uint8))
     photo = photo.resize((size, size), Image.Resampling.BICUBIC)
     pixels = np.asarray(photo, np.float32) / 255
     resized = View(view.name, view.camera.resized(size, size), pixels, "display")
-    return GaussianScene.load(scenes[0]), resized, extent_of(capture.train_views)
+    return (
+        GaussianScene.load(folder / "scenes" / name / way / "scene.ply"),
+        resized,
+        extent_of(capture.train_views),
+    )
 
 
 def drawn(count: int, size: int, seed: int) -> tuple[GaussianScene, View, float]:

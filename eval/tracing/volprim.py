@@ -1,11 +1,11 @@
 """The peer for camera rays: Mitsuba's ``volprim_rf_basic`` on its ellipsoids, with the same surfels.
 
-The shipped integrator stops where transmittance falls below 0.01, with that number written in its loop. For
-equal work :func:`load_integrator` can run the shipped source with that one number replaced; nothing else of
-it changes. What cannot be made equal: its primitives are 3D Gaussians, here very flat ones, met in the order
-in which rays enter their hulls; they have no front side, so both sides are composited; it gathers radiance
-alone, no normals, materials or depths; and it starts again 1e-4 behind each hit, which skips primitives that
-nearly coincide.
+The shipped integrator stops where transmittance falls below 0.01, and its density is the Gaussian of degree
+2, both written in its source. For equal work :func:`load_integrator` can run that source with that number
+and the line of the density replaced; nothing else of it changes. What cannot be made equal: its primitives
+are 3D Gaussians, here very flat ones, met in the order in which rays enter their hulls; they have no front
+side, so both sides are composited; it gathers radiance alone, no normals, materials or depths; and it starts
+again 1e-4 behind each hit, which skips primitives that nearly coincide.
 """
 
 from __future__ import annotations
@@ -31,23 +31,37 @@ THINNESS = 0.02
 """Third scale over the smaller of the surfel's two: as flat as the peer's own arithmetic bears."""
 MAX_DEPTH = 128
 _STOP_LINE = "dr.max(β) > 0.01"
+_GAUSSIAN = "dr.exp(-0.5 * (p.x**2 / scale.x**2 + p.y**2 / scale.y**2 + p.z**2 / scale.z**2))"
+_DENSITIES = {
+    2: _GAUSSIAN,
+    # As in tron.tracing.kernel: both reach the same value at three sigma, where the hull ends.
+    4: "dr.exp(-(4.5 / 81) * dr.square(p.x**2 / scale.x**2 + p.y**2 / scale.y**2 + p.z**2 / scale.z**2))",
+}
+"""Kernel degree -> how the peer's source computes density."""
 
 
-def load_integrator(stop: float = SHIPPED_STOP) -> Any:
-    """The shipped integrator, or the same source with another stop; it takes colours as they are.
+def load_integrator(stop: float = SHIPPED_STOP, degree: int = 2) -> Any:
+    """The shipped integrator, or the same source with another stop or kernel; it takes colours as they are.
+
+    Args:
+        stop: transmittance below which a ray ends.
+        degree: of the kernel, 2 (as shipped) or 4.
 
     Raises:
-        TronError: this Mitsuba's source no longer holds the line to be replaced.
+        TronError: this Mitsuba's source no longer holds the lines to be replaced.
     """
     from mitsuba.ad.integrators import volprim_rf_basic as shipped  # pyright: ignore[reportMissingImports]
 
     name = "volprim_rf_basic"
-    if stop != SHIPPED_STOP:
-        name = f"volprim_rf_basic_{stop:g}"
+    if (stop, degree) != (SHIPPED_STOP, 2):
+        name = f"volprim_rf_basic_{stop:g}_degree{degree}"
         source = inspect.getsource(shipped)
-        if source.count(_STOP_LINE) != 1:
-            raise TronError("this Mitsuba's volprim_rf_basic ends rays in another way", shipped.__file__)
-        source = source.replace(_STOP_LINE, f"dr.max(β) > {stop:g}")
+        if source.count(_STOP_LINE) != 1 or source.count(_GAUSSIAN) != 1:
+            raise TronError(
+                "this Mitsuba's volprim_rf_basic ends rays, or computes density, in another way",
+                shipped.__file__,
+            )
+        source = source.replace(_STOP_LINE, f"dr.max(β) > {stop:g}").replace(_GAUSSIAN, _DENSITIES[degree])
         source = source.replace('register_integrator("volprim_rf_basic"', f'register_integrator("{name}"')
         _import_beside(shipped, source, name.replace(".", "_").replace("-", "_"))
     return mi.load_dict({"type": name, "max_depth": MAX_DEPTH, "srgb_primitives": False})

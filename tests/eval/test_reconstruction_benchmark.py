@@ -162,7 +162,11 @@ def test_a_step_changes_what_it_learns_and_is_timed(variant: str):
     scene, view, extent = drawn(200, 16, seed=0)
     found = step.measure_steps(scene, view, extent, 0, 2, 1, shape="ellipsoids")
     assert (found.count, found.size, found.shape) == (200, 16, "ellipsoids")
+    assert found.case == "degree2_16"
     assert set(found.times) == {step.TRON, step.VOLPRIM, step.SHIPPED}
+    other = step.measure_steps(replace(scene, kernel_degree=4), view, extent, 0, 1, 1, shape="ellipsoids")
+    assert other.case == "degree4_16"
+    assert set(other.times) == {step.TRON, step.VOLPRIM}
     assert len(found.times[step.TRON].seconds) == 2
     assert found.ratio() > 0
     assert found.agreement > 15
@@ -282,7 +286,7 @@ def test_every_scene_in_every_way_and_the_fox_are_run_once(stand_ins: Path, tmp_
     assert results.value("reconstruction.seconds") == stages[f"{SCENE} random"]["seconds"]
     for name, value in (("test_psnr", 33.0), ("ssim", 0.9), ("surfels", 300.0), ("views", 9.0)):
         assert results.value(f"fox.{name}") == value
-    assert results.find("step.ratio_to_volprim") is None
+    assert not [row.metric for row in results.rows if row.metric.startswith("step.")]
     assert results.find("fox.test_psnr").reference == "target: at least 22 dB"  # type: ignore[union-attr]
 
     page = (out / "report.html").read_text()
@@ -343,6 +347,7 @@ def test_the_whole_benchmark_with_the_real_commands(shared_data: Path, tmp_path:
                 "benchmark.hdris=[studio_small_03_1k.hdr]",
                 "benchmark.relit_views=2",
                 "benchmark.step_pixels=[16,32]",
+                'benchmark.step_degree2=["initial.kernel_degree=2"]',
                 "benchmark.growth_surfels=[200,400]",
                 "benchmark.growth_pixels=[32,64]",
                 "benchmark.growth_at=[200,32]",
@@ -355,10 +360,18 @@ def test_the_whole_benchmark_with_the_real_commands(shared_data: Path, tmp_path:
     found = {row.metric for row in results.rows}
     assert {f"reconstruction.{name}" for name in SCENE_FIGURES} <= found
     assert {"fox.test_psnr", "fox.seconds", "fox.ssim", "fox.surfels", "fox.relight_seconds"} <= found
-    assert {"step.ratio_to_volprim", "step.tron_ms.32", "step.volprim_ms.16"} <= found
+    for degree in ("degree2", "degree4"):
+        assert {f"step.ratio_to_volprim.{degree}", f"step.ratio_to_volprim.{degree}_32"} <= found
+        assert {f"step.tron_ms.{degree}_32", f"step.volprim_ms.{degree}_16"} <= found
+        assert results.value(f"step.ratio_to_volprim.{degree}") == results.value(
+            f"step.ratio_to_volprim.{degree}_16"
+        )
+        agreement = results.value(f"step.psnr_to_volprim.{degree}_32")
+        assert agreement is not None
+        assert agreement > 20
     assert {"step.seconds.200_32", "step.seconds.400_32", "step.seconds.200_64"} <= found
     assert results.value("fox.views") == 50
     page = (tmp_path / "report.html").read_text()
     for anchor in ("targets", "scenes", "views", "light", "fox", "steps", "limits", "stages"):
         assert f'id="{anchor}"' in page
-    assert len(json.loads((tmp_path / "times.json").read_text())["trained 600 32"]["tron"]) == 1
+    assert len(json.loads((tmp_path / "times.json").read_text())["trained 600 degree4_32"]["tron"]) == 1

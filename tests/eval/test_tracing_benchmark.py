@@ -1,7 +1,7 @@
 """The tracing benchmark at toy sizes: its rows, its two scenes, its peers, its yardsticks."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from eval.tracing.contenders import Contenders, spelled
 from eval.tracing.irradiance import block_correlation, independent_irradiance, relative_rmse
 from eval.tracing.timing import Times, interleaved
 from tron import metrics, seeds
+from tron.cameras import Camera
 from tron.shading import EnvironmentLight, irradiance
 from tron.tracing import reference
 
@@ -74,6 +75,19 @@ ROWS = [
     "shadow.max_error",
     "memory.peak_mb.500",
 ]
+
+
+ARRAYS = (
+    "means",
+    "quats",
+    "log_scales",
+    "opacity_logits",
+    "sh",
+    "base_color",
+    "roughness",
+    "metallic",
+    "object_id",
+)
 
 
 @pytest.mark.long
@@ -179,6 +193,39 @@ def test_the_peer_draws_the_same_picture():
     found = agreement.compare_images(contenders, 48, volprim.load_integrator(volprim.OUR_STOP))
     chance = metrics.psnr(found["tron"], np.broadcast_to(found["tron"].mean((0, 1)), found["tron"].shape))
     assert found["psnr"] > 20 > chance
+
+
+@pytest.mark.parametrize("degree", [2, 4])
+def test_the_peer_draws_the_kernel_that_it_is_given(degree, monkeypatch):
+    # One surfel seen from above: across it the picture is the kernel itself, whatever its thickness. A round
+    # one, because the peer meets a single flat one far away twice, or not at all: its float32 cancels.
+    monkeypatch.setattr(volprim, "THINNESS", 1.0)
+    made = scene.surfels(300, seed=0)
+    one = replace(
+        made,
+        **{f.name: getattr(made, f.name)[:1] for f in fields(made) if f.name in ARRAYS},
+        kernel_degree=degree,
+    )
+    sigma = 0.2
+    for name, value in {
+        "means": [[0.0, 0, 0]],
+        "quats": [[1.0, 0, 0, 0]],
+        "log_scales": np.log([[sigma, sigma]]),
+        "opacity_logits": [np.log(0.8 / 0.2)],
+        "sh": np.zeros((1, 16, 3)),
+    }.items():
+        setattr(one, name, np.asarray(value, np.float32))
+    view = Camera.look_at((0, 0, 4), (0, 0, 0), up=(0, 1, 0), fov_deg=16, width=33, height=33)
+    drawn = volprim.through_centres(
+        volprim.primitives(one, 0), volprim.load_integrator(volprim.OUR_STOP, degree), view
+    )
+    ours = Contenders(one).tracer.gbuffer(view).numpy()["rgb"]
+    radius = 4 * np.abs((np.arange(33) + 0.5 - view.cx) / view.fx) / sigma
+    expected = 0.5 * 0.8 * (np.exp(-(radius**2) / 2) if degree == 2 else np.exp(-(radius**4) / 18))
+    inside = radius < 2.5
+    assert inside.sum() > 20
+    np.testing.assert_allclose(drawn[16, inside, 0], expected[inside], atol=0.01)
+    np.testing.assert_allclose(ours[16, inside, 0], expected[inside], atol=1e-5)
 
 
 def test_the_peer_with_our_stop_goes_on_where_the_shipped_one_ends():
