@@ -103,6 +103,7 @@ def irradiance(
             directions.append(direction)
             active.append(counts)
             values.append(dr.select(counts, radiance * weight, 0))
+        dr.eval(directions, values, active)  # tracers look at the rays more than once
         visible = tracer.transmittances(points.origin, directions, active)
         unshadowed += sum(values)
         shadowed += sum(value * share for value, share in zip(values, visible, strict=True))

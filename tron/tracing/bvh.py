@@ -1,18 +1,25 @@
-"""A bounding volume hierarchy for arbitrary rays: perfectly balanced, threaded with skip links, no stack.
+"""A bounding volume hierarchy for arbitrary rays: perfectly balanced, four children a node, no stack.
 
 Built by median splits of the longest axis, round by round, all parts at once: the surfels of a part are
 neighbours in the order, a power of two of them, and one sort by (part, coordinate along the part's longest
 axis) splits them all. What is missing to a power of two stands at the end as empty places. Two rounds make
-the four children of a node: rays that meet a box meet most of its halves, so testing the quarters at once
-costs less. Then the shape of the tree is arithmetic: node i of level l of a tree with L levels below the root
-has the depth-first index l + (i 4^(L - l + 1) - s) / 3, s the sum of i's digits in base 4; its first child is
-the next node, and its skip link (where to go when the box is missed, or after a leaf) is itself plus the size
-of its subtree, (4^(L - l + 1) - 1) / 3.
+the four children of a node. Then the shape of the tree is arithmetic: with the root called 1, the children of
+node i are 4 i to 4 i + 3, and those from 4^levels on are leaves, in the order of their surfels.
 
 When surfels move, the order stays good for a while and the boxes alone are made anew (:func:`refit`).
 
-A node is four 32-bit words: six 16-bit bounds on a grid over the scene, rounded outwards, and the skip link
-or leaf word. Four words are one packet; float bounds took 2.7 times as long (tracer.md).
+A node holds its four children's boxes, not its own, so that one read decides about all four: 12 32-bit words
+(three packets) of
+
+    origin x, y, z; step x, y, z; and for each axis the four centres and the four half sizes, a byte each
+
+in steps of 1/250 of the node's own box, half sizes in half steps, rounded outwards, 0 for an empty child. A
+grid for each node, not one for the scene, costs nothing and is as fine as the node is small: a surfel that
+strayed far off coarsens no box but its ancestors' (compressed wide nodes: Ylitie et al. 2017, "Efficient
+Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs").
+
+Those ancestors are kept few: strays, farther from the bulk of the surfels than ``STRAY_SIZES`` times its size,
+come last in every part that they share with others, and so end together in the last subtree.
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
@@ -21,6 +28,7 @@ or leaf word. Four words are one packet; float bounds took 2.7 times as long (tr
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -31,8 +39,15 @@ LEAF_SIZE = 2
 CHILDREN = 4
 ROUNDS = 2
 """Rounds of splits to a level."""
-LEAF_BIT = 1 << 31
-_GRID = 65533.0
+NODE_PACKETS = 3
+STEPS = 250.0
+"""Steps of a node's own grid along each axis; with rounding and slack a byte holds them."""
+THICKNESS = 1 / 1024
+"""Every surfel's box is widened by this share of its largest extent: flat ones must survive float32."""
+STRAY_SIZES = 8.0
+STRAY_SHARE = 0.01
+"""Largest share of the surfels, at each end of each axis, that can be strays."""
+_SAMPLE = 4096
 _KEY_BITS = 32
 _COORDINATE_BITS = 24
 
@@ -42,24 +57,21 @@ class Bvh:
     """The hierarchy and its surfels.
 
     Attributes:
-        nodes: mi.UInt32, 4 words a node in depth-first order: (low | high << 16) for x, y, z, and the link.
-            The link of an inner node is the node to skip to; of a leaf, ``LEAF_BIT | first << 4 | count``.
-        node_count: opaque mi.UInt32 of one lane, so that scenes of any size share one kernel.
-        geometry: mi.Float, geometry records in leaf order.
+        nodes: mi.UInt32, ``4 * NODE_PACKETS`` words for each of nodes 0 to 4^levels - 1; some are never read.
+        first_above_leaves: opaque mi.UInt32 of one lane, 4^(levels - 1): the first node whose children are
+            leaves; opaque, so that scenes of any size share one kernel.
+        geometry: mi.Float, geometry records in leaf order, up to a whole leaf.
         order: mi.UInt32 (M,), leaf order -> scene order.
-        grid_origin, grid_scale: one lane each; world -> grid coordinates.
         area: mi.Float of one lane, summed half surface of all boxes over the root's: how many boxes a random
             ray that meets the root's is expected to meet (Goldsmith and Salmon 1987).
-        levels: levels below the root.
+        levels: levels below the root, 1 or more.
         degree: kernel degree.
     """
 
     nodes: mi.UInt32
-    node_count: mi.UInt32
+    first_above_leaves: mi.UInt32
     geometry: mi.Float
     order: mi.UInt32
-    grid_origin: mi.Point3f
-    grid_scale: mi.Vector3f
     area: mi.Float
     levels: int
     degree: int
@@ -70,7 +82,7 @@ def build_bvh(records: SurfelRecords) -> Bvh:
     leaves = -(-max(records.count, 1) // LEAF_SIZE)
     rounds = (leaves - 1).bit_length()
     # Where the root has two children of its four, the round that would make the others has nothing to split.
-    return refit(_median_order(records, rounds), -(-rounds // ROUNDS), records)
+    return refit(_median_order(records, rounds), max(1, -(-rounds // ROUNDS)), records)
 
 
 def refit(order: mi.UInt32, levels: int, records: SurfelRecords) -> Bvh:
@@ -90,40 +102,32 @@ def refit(order: mi.UInt32, levels: int, records: SurfelRecords) -> Bvh:
         boxes.append((low, high))
     boxes = boxes[::-ROUNDS][: levels + 1]
 
-    root_low, root_high = boxes[0]
-    size = root_high - root_low
-    # A flat scene needs cells wider than the rounding of its rays, a scene without surfels any cells at all.
-    pad = 0.03 * dr.maximum(dr.max(size), 1e-6)
-    origin = mi.Point3f(dr.select(size >= 0, root_low - pad, 0))
-    scale = dr.select(size >= 0, _GRID / (size + 2 * pad), 1)
-    dr.eval(origin, scale)
-
-    nodes = ((CHILDREN << (ROUNDS * levels)) - 1) // (CHILDREN - 1)
-    words = dr.empty(mi.UInt32, 4 * nodes)
+    words = dr.empty(mi.UInt32, 4 * NODE_PACKETS << (ROUNDS * levels))
     area = mi.Float(0)
     for level, (low, high) in enumerate(boxes):
-        _write_level(words, level, levels, records.count, low, high, origin, scale)
+        if level < levels:
+            _write_level(words, level, (low, high), boxes[level + 1])
         area += dr.sum(_half_area(low, high))
-    area /= dr.maximum(_half_area(root_low, root_high), 1e-30)
+    area /= dr.maximum(_half_area(*boxes[0]), 1e-30)
     dr.eval(words, area)
-    return Bvh(
-        words,
-        dr.opaque(mi.UInt32, nodes),
-        geometry,
-        order,
-        origin,
-        scale,
-        area,
-        levels,
-        records.degree,
-    )
+    first = dr.opaque(mi.UInt32, 1 << (ROUNDS * (levels - 1)))
+    return Bvh(words, first, geometry, order, area, levels, records.degree)
+
+
+Box: TypeAlias = "tuple[mi.Vector3f, mi.Vector3f]"
+"""Low and high corners of many boxes; low > high where a box is empty."""
 
 
 def _in_leaf_order(records: SurfelRecords, order: mi.UInt32) -> mi.Float:
-    geometry = dr.empty(mi.Float, max(dr.width(records.geometry), 4 * GEOMETRY_PACKETS))
-    place = dr.arange(mi.UInt32, records.count)
+    places = -(-max(records.count, 1) // LEAF_SIZE) * LEAF_SIZE
+    geometry = dr.empty(mi.Float, 4 * GEOMETRY_PACKETS * places)
+    place = dr.arange(mi.UInt32, places)
+    # The last leaf may hold the last surfel and nothing else: a record of negative radius, which no ray meets.
+    held = place < dr.opaque(mi.UInt32, records.count)
+    source = dr.gather(mi.UInt32, order, place, held)
     for packet in range(GEOMETRY_PACKETS):
-        value = dr.gather(mi.Vector4f, dr.detach(records.geometry), order * GEOMETRY_PACKETS + packet)
+        value = dr.gather(mi.Vector4f, dr.detach(records.geometry), source * GEOMETRY_PACKETS + packet)
+        value.w = dr.select(held, value.w, -1)
         dr.scatter(geometry, value, place * GEOMETRY_PACKETS + packet)
     dr.eval(geometry)
     return geometry
@@ -139,6 +143,7 @@ def _bounds(geometry: mi.Float, count: int, places: int) -> tuple[mi.Vector3f, m
     real &= v.w >= 0
     half_u, half_v = half_axes(mi.Vector3f(u.x, u.y, u.z), mi.Vector3f(v.x, v.y, v.z), v.w)
     extent = dr.sqrt(half_u * half_u + half_v * half_v)
+    extent += THICKNESS * dr.max(extent)
     middle = mi.Vector3f(centre.x, centre.y, centre.z)
     low, high = dr.select(real, middle - extent, dr.inf), dr.select(real, middle + extent, -dr.inf)
     dr.eval(low, high)
@@ -159,55 +164,83 @@ def _half_area(low: mi.Vector3f, high: mi.Vector3f) -> mi.Float:
     return size.x * size.y + size.y * size.z + size.z * size.x
 
 
-def _write_level(
-    words: mi.UInt32,
-    level: int,
-    levels: int,
-    count: int,
-    low: mi.Vector3f,
-    high: mi.Vector3f,
-    origin: mi.Point3f,
-    scale: mi.Vector3f,
-) -> None:
-    """Quantise the boxes of one level outwards and write its nodes."""
+def _write_level(words: mi.UInt32, level: int, box: Box, children: Box) -> None:
+    """Write the nodes of one level: the boxes of their children, quantised outwards."""
     node = dr.arange(mi.UInt32, 1 << (ROUNDS * level))
-    depth, below = dr.opaque(mi.UInt32, level), dr.opaque(mi.UInt32, levels - level)
-    digits = mi.UInt32(dr.popcnt(node & 0x55555555)) + 2 * mi.UInt32(dr.popcnt(node & 0xAAAAAAAA))
-    index = depth + ((node << (ROUNDS * (below + 1))) - digits) // 3
-    size = ((mi.UInt32(CHILDREN) << (ROUNDS * below)) - 1) // 3
-    # One cell of slack on each side covers the float32 rounding of the rays' grid coordinates.
-    first = mi.Vector3u(dr.clip(dr.floor((low - origin) * scale) - 1, 0, 65535))
-    last = mi.Vector3u(dr.clip(dr.ceil((high - origin) * scale) + 1, 0, 65535))
-    surfel = node * LEAF_SIZE
-    total = dr.opaque(mi.UInt32, count)
-    held = dr.select(surfel < total, dr.minimum(total - surfel, LEAF_SIZE), 0)
-    # An empty box is the grid's far corner, a point. One with low > high would be met by every ray: the slab
-    # test sorts the two bounds.
-    empty = ~(low.x <= high.x)
-    bounds = [dr.select(empty, mi.UInt32(0xFFFFFFFF), a | (b << 16)) for a, b in zip(first, last)]
-    link = dr.select(below == 0, mi.UInt32(LEAF_BIT) | (surfel << 4) | held, index + size)
-    dr.scatter(words, mi.Vector4u(*bounds, link), index)
+    low, high = box
+    real = low.x <= high.x
+    origin = dr.select(real, low, 0)
+    step = dr.select(real, (high - low) / STEPS, 1)
+    centres, halves = mi.Vector3u(0), mi.Vector3u(0)
+    for child in range(CHILDREN):
+        first, last = (
+            mi.Vector3f(*[dr.gather(mi.Float, v, CHILDREN * node + child) for v in bound])
+            for bound in children
+        )
+        filled = first.x <= last.x
+        middle = dr.select(filled, 0.5 * (first + last) - origin, 0)
+        centre = dr.clip(dr.round(middle / step), 0, 255)
+        reach = dr.maximum(0.5 * (last - first), 0) + dr.abs(middle - centre * step)
+        # Half a step of slack covers the float32 rounding of the rays' slopes and offsets.
+        half = dr.clip(dr.ceil(2 * reach / step) + 1, 1, 255)
+        centres |= mi.Vector3u(centre) << (8 * child)
+        halves |= dr.select(filled, mi.Vector3u(half), 0) << (8 * child)
+    origin, step = (dr.reinterpret_array(mi.Vector3u, v) for v in (origin, step))
+    record = (dr.opaque(mi.UInt32, 1 << (ROUNDS * level)) + node) * NODE_PACKETS
+    packets = (
+        mi.Vector4u(origin.x, origin.y, origin.z, step.x),
+        mi.Vector4u(step.y, step.z, centres.x, halves.x),
+        mi.Vector4u(centres.y, halves.y, centres.z, halves.z),
+    )
+    for packet, value in enumerate(packets):
+        dr.scatter(words, value, record + packet)
 
 
 def _median_order(records: SurfelRecords, rounds: int) -> mi.UInt32:
     """Leaf order -> scene order: ``rounds`` of median splits, all parts in one sort."""
     places = LEAF_SIZE << rounds
     order = dr.arange(mi.UInt32, places)
+    near_low, near_high = _bulk(records)
     for done in range(rounds):
         dr.eval(order)
         real = order < dr.opaque(mi.UInt32, records.count)
         centre = dr.gather(mi.Vector4f, dr.detach(records.geometry), order * GEOMETRY_PACKETS, real)
         centre = mi.Vector3f(centre.x, centre.y, centre.z)
-        low, high = dr.select(real, centre, dr.inf), dr.select(real, centre, -dr.inf)
-        dr.eval(centre, real, low, high)
+        stray = real & dr.any((centre < near_low) | (centre > near_high))
         size = places >> done
-        low, high = _reduce(dr.ReduceOp.Min, low, size), _reduce(dr.ReduceOp.Max, high, size)
+        ordinary, strays = (_extent(centre, which, size) for which in (real & ~stray, stray))
+        alone = ordinary[0].x > ordinary[1].x
+        low, high = (dr.select(alone, b, a) for a, b in zip(ordinary, strays))
+        dr.eval(centre, real, stray, alone, low, high)
         shift = dr.opaque(mi.UInt32, (places >> done).bit_length() - 1)
         bits = min(_KEY_BITS - done, _COORDINATE_BITS)
-        order = dr.gather(
-            mi.UInt32, order, dr.argsort(_keys(centre, real, low, high, shift, dr.opaque(mi.UInt32, bits)))
-        )
+        keys = _keys(centre, real, stray, alone, (low, high), shift, dr.opaque(mi.UInt32, bits))
+        order = dr.gather(mi.UInt32, order, dr.argsort(keys))
     return dr.gather(mi.UInt32, order, dr.arange(mi.UInt32, records.count))
+
+
+def _bulk(records: SurfelRecords) -> Box:
+    """Box outside which a surfel is a stray: far from where all but ``STRAY_SHARE`` of a sample are."""
+    count = min(max(records.count, 1), _SAMPLE)
+    sample = dr.arange(mi.UInt32, count) * dr.opaque(mi.UInt32, max(records.count, 1) // count)
+    centre = dr.gather(mi.Vector4f, dr.detach(records.geometry), sample * GEOMETRY_PACKETS)
+    ends = [dr.opaque(mi.UInt32, end) for end in (int(STRAY_SHARE * count), count - 1 - int(STRAY_SHARE * count))]
+    low, high = mi.Vector3f(0), mi.Vector3f(0)
+    for axis in range(3):
+        dr.eval(centre[axis])
+        ascending = dr.gather(mi.Float, centre[axis], dr.argsort(centre[axis]))
+        low[axis], high[axis] = (dr.gather(mi.Float, ascending, end) for end in ends)
+    margin = STRAY_SIZES * dr.max(high - low)
+    low, high = low - margin, high + margin
+    dr.eval(low, high)
+    return low, high
+
+
+def _extent(centre: mi.Vector3f, which: mi.Bool, size: int) -> Box:
+    """Boxes of some of the centres of each part of ``size`` places."""
+    low, high = dr.select(which, centre, dr.inf), dr.select(which, centre, -dr.inf)
+    dr.eval(low, high)
+    return _reduce(dr.ReduceOp.Min, low, size), _reduce(dr.ReduceOp.Max, high, size)
 
 
 def _reduce(op: dr.ReduceOp, values: mi.Vector3f, size: int) -> mi.Vector3f:
@@ -215,11 +248,23 @@ def _reduce(op: dr.ReduceOp, values: mi.Vector3f, size: int) -> mi.Vector3f:
 
 
 def _keys(
-    centre: mi.Vector3f, real: mi.Bool, low: mi.Vector3f, high: mi.Vector3f, shift: mi.UInt32, bits: mi.UInt32
+    centre: mi.Vector3f,
+    real: mi.Bool,
+    stray: mi.Bool,
+    alone: mi.Bool,
+    box: Box,
+    shift: mi.UInt32,
+    bits: mi.UInt32,
 ) -> mi.UInt32:
-    """Sort keys: the part in the high bits, the coordinate on its longest axis in the ``bits`` low ones."""
+    """Sort keys: the part in the high bits, the coordinate on its longest axis in the ``bits`` low ones.
+
+    Args:
+        centre: of the surfel at each place. real: there is one. stray: it lies far off.
+        alone: (parts,) strays are among themselves. box: (parts,) of the others, or of them.
+        shift: log2 of the places of a part.
+    """
     part = dr.arange(mi.UInt32, dr.width(centre)) >> shift
-    low, high = (mi.Vector3f(*[dr.gather(mi.Float, v, part) for v in bound]) for bound in (low, high))
+    low, high = (mi.Vector3f(*[dr.gather(mi.Float, v, part) for v in bound]) for bound in box)
     size = high - low
     on_x = (size.x >= size.y) & (size.x >= size.z)
     on_y = ~on_x & (size.y >= size.z)
@@ -227,8 +272,9 @@ def _keys(
     def pick(v: mi.Vector3f) -> mi.Float:
         return dr.select(on_x, v.x, dr.select(on_y, v.y, v.z))
 
-    steps = mi.Float((mi.UInt32(1) << bits) - 2)
+    most = (mi.UInt32(1) << bits) - 3
     share = dr.clip((pick(centre) - pick(low)) / dr.maximum(pick(size), 1e-30), 0, 1)
-    coordinate = dr.minimum(mi.UInt32(share * steps), mi.UInt32(steps))
-    # Empty places come last in their part.
-    return (part << bits) | dr.select(real, coordinate, (mi.UInt32(1) << bits) - 1)
+    coordinate = dr.minimum(mi.UInt32(share * mi.Float(most)), most)
+    # Strays come behind the others of their part, and empty places last.
+    coordinate = dr.select(stray & ~dr.gather(mi.Bool, alone, part), most + 1, coordinate)
+    return (part << bits) | dr.select(real, coordinate, most + 2)

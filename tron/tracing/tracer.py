@@ -16,6 +16,7 @@ from tron.tracing.kernel import SurfelRecords
 from tron.tracing.parameters import SurfelParameters, pack
 from tron.tracing.rays import trace_rays
 from tron.tracing.shadow_gradient import transmittance_by_opacity
+from tron.tracing.shadow_queue import queued_transmittance
 from tron.tracing.surface import Surface
 from tron.tracing.tiles import build_tiles
 from tron.tracing.transmittance import BACK_FACE_SPACINGS, transmittance
@@ -121,8 +122,13 @@ class SurfelTracer:
     def transmittances(
         self, origin: mi.Point3f, directions: Sequence[mi.Vector3f], active: Sequence[mi.Bool]
     ) -> list[mi.Float]:
-        """The same for a fan of rays from each origin: quicker together, the more so the closer they are."""
-        return transmittance(self.bvh, origin, directions, self._back_faces_from, active)
+        """The same for a fan of rays from each origin: quicker together, the more so the closer they are.
+
+        Evaluated at once, unless within a recorded loop.
+        """
+        recorded = dr.flag(dr.JitFlag.SymbolicScope)
+        trace = transmittance if recorded else queued_transmittance
+        return trace(self.bvh, origin, directions, self._back_faces_from, active)
 
     def transmittance_by_opacity(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True

@@ -10,7 +10,7 @@ only beyond two surfel spacings, where they can no longer belong to the surface 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -18,7 +18,7 @@ import mitsuba as mi
 
 from tron.tracing.bvh import Bvh
 from tron.tracing.kernel import SurfelHit, intersect
-from tron.tracing.traversal import walk
+from tron.tracing.traversal import any_of, walk
 
 OPAQUE_TRANSMITTANCE = 1e-2
 """Below this a ray counts as blocked: the result is exactly 0, whatever the order of the hits was."""
@@ -26,7 +26,7 @@ BACK_FACE_SPACINGS = 2.0
 
 
 @dataclass
-class _Products:
+class Products:
     """Transmittance so far of each ray of a fan; a blocked ray's interval is empty."""
 
     product: list[mi.Float]
@@ -34,9 +34,41 @@ class _Products:
     farthest: list[mi.Float]
 
 
+    @staticmethod
+    def clear(active: Sequence[mi.Bool]) -> Products:
+        """Nothing met yet, by the rays that are traced."""
+        return Products(
+            product=[mi.Float(1) for _ in active],
+            nearest=[mi.Float(0) for _ in active],
+            farthest=[dr.select(mi.Bool(lanes), mi.Float(dr.inf), -dr.inf) for lanes in active],
+        )
+
+
 def blocks(met: SurfelHit, back_faces_from: mi.Float) -> mi.Bool:
     """Whether a surfel stands in the ray's way: the rule of sidedness above."""
     return met.within & (met.t > dr.select(met.front, 0, back_faces_from))
+
+
+def remaining(product: mi.Float) -> mi.Float:
+    """A ray's product, or exactly 0 where it counts as blocked."""
+    return dr.select(product >= OPAQUE_TRANSMITTANCE, product, 0)
+
+
+def multiply(
+    bvh: Bvh, origin: mi.Point3f, directions: Sequence[mi.Vector3f], back_faces_from: mi.Float
+) -> Callable[[Products, mi.UInt32, mi.Bool], Products]:
+    """What a walk does at each surfel."""
+
+    def visit(state: Products, surfel: mi.UInt32, _: mi.Bool) -> Products:
+        for ray, direction in enumerate(directions):
+            met = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
+            before = state.product[ray]
+            product = dr.select(blocks(met, back_faces_from), before * (1 - met.alpha), before)
+            state.product[ray] = product
+            state.farthest[ray] = dr.select(product >= OPAQUE_TRANSMITTANCE, state.farthest[ray], -dr.inf)
+        return state
+
+    return visit
 
 
 def transmittance(
@@ -58,26 +90,8 @@ def transmittance(
         mi.Float in [0, 1] for each direction.
     """
 
-    def visit(state: _Products, surfel: mi.UInt32, _: mi.Bool) -> _Products:
-        for ray, direction in enumerate(directions):
-            met = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
-            product = dr.select(
-                blocks(met, back_faces_from), state.product[ray] * (1 - met.alpha), state.product[ray]
-            )
-            state.product[ray] = product
-            state.farthest[ray] = dr.select(product >= OPAQUE_TRANSMITTANCE, state.farthest[ray], -1)
-        return state
-
-    start = _Products(
-        product=[mi.Float(1) for _ in directions],
-        nearest=[mi.Float(0) for _ in directions],
-        farthest=[dr.select(mi.Bool(lanes), mi.Float(dr.inf), -1) for lanes in active],
-    )
-    anywhere = mi.Bool(active[0])
-    for lanes in active[1:]:
-        anywhere |= lanes
-    products = walk(bvh, origin, directions, start, visit, anywhere).product
-    return [
-        dr.select(lanes & (product >= OPAQUE_TRANSMITTANCE), product, dr.select(lanes, 0, mi.Float(1)))
-        for product, lanes in zip(products, active)
-    ]
+    start = Products.clear(active)
+    products = walk(
+        bvh, origin, directions, start, multiply(bvh, origin, directions, back_faces_from), any_of(active)
+    ).product
+    return [dr.select(lanes, remaining(product), 1) for product, lanes in zip(products, active)]

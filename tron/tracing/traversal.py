@@ -3,10 +3,11 @@
 A lane carries a fan of rays from one point. They share each node that is read, which is what a walk spends
 its time on: four rays of neighbouring directions together take little more than half the time of four alone.
 
-Lanes look for leaves at their own pace but meet the surfels of leaves together: a few nodes are passed first,
-until a leaf is found, and only then are the surfels of those that found one looked at. One lane in a leaf
-would otherwise keep fifteen waiting at nearly every node (1.4 times as fast with some nodes between; Aila and
-Laine 2009, "Understanding the Efficiency of Ray Traversal on GPUs").
+No stack is kept: a word of four bits a level says which nodes are still to be visited (:class:`Walk`).
+
+Lanes look for leaves at their own pace but meet the surfels of leaves together: each lane collects leaves for
+a few steps, and then all meet the surfels of a few of theirs. One lane in a leaf would otherwise keep fifteen
+waiting at nearly every node (Aila and Laine 2009, "Understanding the Efficiency of Ray Traversal on GPUs").
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false
@@ -15,22 +16,29 @@ Laine 2009, "Understanding the Efficiency of Ray Traversal on GPUs").
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
-from tron.tracing.bvh import LEAF_BIT, Bvh
+from tron.tracing.bvh import CHILDREN, LEAF_SIZE, NODE_PACKETS, Bvh
 
-NODES_BETWEEN_LEAVES = 6
+NODES_A_TURN = 6
+LEAVES_A_TURN = 4
+_GROUPS = 3
+"""Groups of leaves, each under one node, that a lane can hold."""
+_ROOT = 2
+"""What is pending at first: child 1 of a node 0 that does not exist."""
+_TINY = 1e-12
 
 
 class Intervals(Protocol):
     """What a walk carries along: at least the distances between which surfels can still matter.
 
     Attributes:
-        nearest, farthest: one of each a ray, world units along the unit ray; a ray is done once nearest >
-            farthest, and the walk once all are.
+        nearest, farthest: one of each a ray, world units along the unit ray; a ray is done once farthest is
+            minus infinity, and the walk once all are.
     """
 
     nearest: list[mi.Float]
@@ -48,15 +56,43 @@ def _larger(a: mi.Float, b: mi.Float) -> mi.Float:
     return dr.select(a > b, a, b)
 
 
-def _any(masks: Sequence[mi.Bool]) -> mi.Bool:
-    found = masks[0]
+def any_of(masks: Sequence[mi.Bool]) -> mi.Bool:
+    """Lanes where one of the masks is set."""
+    found = mi.Bool(masks[0])
     for mask in masks[1:]:
         found = found | mask
     return found
 
 
-def _unfinished(state: Intervals) -> list[mi.Bool]:
-    return [nearest <= farthest for nearest, farthest in zip(state.nearest, state.farthest)]
+@dataclass
+class Walk:
+    """Where a lane's walk stands.
+
+    Attributes:
+        node: the node visited last.
+        pending: four bits a level, those of ``node``'s children lowest, then of its siblings and so on upwards:
+            the nodes still to be visited. Seventeen levels fit.
+        groups: leaves found and not yet visited, last found first: the node above them, counted from the first
+            one above leaves, times 16, plus four bits for its children; 0 for none.
+    """
+
+    node: mi.UInt32
+    pending: mi.UInt64
+    groups: list[mi.UInt32]
+
+    @staticmethod
+    def begun() -> Walk:
+        """A walk about to visit the root."""
+        return Walk(mi.UInt32(0), mi.UInt64(_ROOT), [mi.UInt32(0) for _ in range(_GROUPS)])
+
+    def unfinished(self, state: Intervals) -> mi.Bool:
+        """Something is left to be visited, and a ray for which it matters."""
+        return ((self.pending != 0) | (self.groups[0] != 0)) & any_of([f > -dr.inf for f in state.farthest])
+
+
+def slopes_of(direction: mi.Vector3f) -> mi.Vector3f:
+    """1 / direction, finite."""
+    return dr.rcp(mi.Vector3f(*[dr.select(dr.abs(v) < _TINY, _TINY, v) for v in direction]))
 
 
 @dr.syntax
@@ -77,39 +113,98 @@ def walk(
         visit: called with the state, a surfel in the hierarchy's order, and the lanes that visit it.
         active: lanes that walk.
     """
-    tiny = 1e-12
-    inverses, offsets = [], []
-    for direction in directions:
-        slope = direction * bvh.grid_scale
-        inverse = dr.rcp(mi.Vector3f(*[dr.select(dr.abs(v) < tiny, tiny, v) for v in slope]))
-        inverses.append(inverse)
-        offsets.append(-((origin - bvh.grid_origin) * bvh.grid_scale) * inverse)
-    node = mi.UInt32(0)
+    slopes = [slopes_of(direction) for direction in directions]
+    at = Walk.begun()
     going = mi.Bool(active)
     while going:
-        leaf, passed, searching = mi.UInt32(0), mi.UInt32(0), mi.Bool(going)
-        while searching:
-            words = dr.gather(mi.Vector4u, bvh.nodes, node, searching)
-            hits = []
-            for ray in range(len(directions)):
-                entry, leave = state.nearest[ray], state.farthest[ray]
-                for axis in range(3):
-                    low, high = mi.Float(words[axis] & 0xFFFF), mi.Float(words[axis] >> 16)
-                    first = dr.fma(low, inverses[ray][axis], offsets[ray][axis])
-                    second = dr.fma(high, inverses[ray][axis], offsets[ray][axis])
-                    entry = _larger(entry, _smaller(first, second))
-                    leave = _smaller(leave, _larger(first, second))
-                hits.append(entry <= leave)
-            hit = _any(hits)
-            is_leaf = words[3] >= LEAF_BIT
-            leaf = dr.select(hit & is_leaf, words[3], 0)
-            node = dr.select(hit | is_leaf, node + 1, words[3])
-            passed += 1
-            searching &= (leaf == 0) & (node < bvh.node_count) & (passed < NODES_BETWEEN_LEAVES)
-        surfel = (leaf & (LEAF_BIT - 1)) >> 4
-        end = surfel + (leaf & 15)
-        while surfel < end:
-            state = visit(state, surfel, surfel < end)
-            surfel += 1
-        going &= (node < bvh.node_count) & _any(_unfinished(state))
+        at = search(bvh, origin, slopes, state, at, going)
+        at, state = look(at, state, visit, going)
+        going &= at.unfinished(state)
     return state
+
+
+@dr.syntax
+def search(
+    bvh: Bvh, origin: mi.Point3f, slopes: Sequence[mi.Vector3f], state: Intervals, at: Walk, active: mi.Bool
+) -> Walk:
+    """Collect leaves, for ``NODES_A_TURN`` nodes or until a lane can hold no more."""
+    passed = mi.UInt32(0)
+    searching = active & (at.groups[-1] == 0) & (at.pending != 0)
+    while searching:
+        lowest = mi.UInt32(dr.tzcnt(at.pending))
+        up = lowest >> 2
+        pending = at.pending >> mi.UInt64(up << 2)
+        at.node = ((at.node >> (up << 1)) << 2) | (lowest & 3)
+        children = _met_children(bvh, at.node, origin, slopes, state, searching)
+        leaves = dr.select(at.node >= bvh.first_above_leaves, children, 0)
+        at.pending = ((pending & (pending - 1)) << CHILDREN) | mi.UInt64(children - leaves)
+        group = ((at.node - bvh.first_above_leaves) << CHILDREN) | leaves
+        for k in range(_GROUPS - 1, 0, -1):
+            at.groups[k] = dr.select(leaves != 0, at.groups[k - 1], at.groups[k])
+        at.groups[0] = dr.select(leaves != 0, group, at.groups[0])
+        passed += 1
+        searching &= (at.groups[-1] == 0) & (at.pending != 0) & (passed < NODES_A_TURN)
+    return at
+
+
+@dr.syntax
+def look(
+    at: Walk, state: State, visit: Callable[[State, mi.UInt32, mi.Bool], State], active: mi.Bool
+) -> tuple[Walk, State]:
+    """Visit the surfels of up to ``LEAVES_A_TURN`` of the leaves collected."""
+    passed = mi.UInt32(0)
+    looking = active & (at.groups[0] != 0)
+    while looking:
+        group = at.groups[0]
+        leaf = ((group >> CHILDREN) << 2) + mi.UInt32(dr.tzcnt(group))
+        for k in range(LEAF_SIZE):
+            state = visit(state, LEAF_SIZE * leaf + k, looking)
+        left = group & (group - 1)
+        more = (left & 15) != 0
+        at.groups[0] = dr.select(more, left, at.groups[1])
+        for k in range(1, _GROUPS):
+            behind = at.groups[k + 1] if k + 1 < _GROUPS else mi.UInt32(0)
+            at.groups[k] = dr.select(more, at.groups[k], behind)
+        passed += 1
+        looking = (at.groups[0] != 0) & (passed < LEAVES_A_TURN)
+    return at, state
+
+
+def _met_children(
+    bvh: Bvh,
+    node: mi.UInt32,
+    origin: mi.Point3f,
+    slopes: Sequence[mi.Vector3f],
+    state: Intervals,
+    active: mi.Bool,
+) -> mi.UInt32:
+    """Which children's boxes any ray of the fan meets within its interval: four bits."""
+    packets = [
+        dr.gather(mi.Vector4u, bvh.nodes, node * NODE_PACKETS + packet, active)
+        for packet in range(NODE_PACKETS)
+    ]
+    words = [word for packet in packets for word in packet]
+    low = mi.Vector3f(*[dr.reinterpret_array(mi.Float, word) for word in words[:3]]) - origin
+    step = mi.Vector3f(*[dr.reinterpret_array(mi.Float, word) for word in words[3:6]])
+    boxes = [
+        [
+            mi.Vector3f(*[mi.Float((word >> (8 * child)) & 0xFF) for word in words[which::2]])
+            for which in (6, 7)
+        ]
+        for child in range(CHILDREN)
+    ]
+    hits: list[list[mi.Bool]] = [[] for _ in range(CHILDREN)]
+    for slope, nearest, farthest in zip(slopes, state.nearest, state.farthest):
+        offset, scale = low * slope, slope * step
+        reach = 0.5 * dr.abs(scale)
+        for found, (centre, half) in zip(hits, boxes):
+            middle, aside = dr.fma(centre, scale, offset), half * reach
+            first, last = middle - aside, middle + aside
+            enter = _larger(_larger(first.x, first.y), first.z)
+            leave = _smaller(_smaller(last.x, last.y), last.z)
+            # An empty box has no inside: the first test fails where it is met.
+            found.append((enter < leave) & (enter <= farthest) & (leave >= nearest))
+    bits = mi.UInt32(0)
+    for child, found in enumerate(hits):
+        bits |= dr.select(any_of(found), mi.UInt32(1 << child), 0)
+    return bits
