@@ -91,9 +91,9 @@ class GuidanceScores:
             rows.append(lowest.model_copy(update={"metric": "guidance.irradiance_psnr"}))
             rows += by_family.values()
             for name, counted in (("", self.shadows), ("_with_silhouettes", self.everywhere)):
-                rows += fractions(name, [counts for family in counted.values() for counts in family], seed)
+                rows += _fractions(name, [counts for family in counted.values() for counts in family], seed)
                 for family in by_family:
-                    rows += fractions(f"{name}.{family}", counted[family], seed)
+                    rows += _fractions(f"{name}.{family}", counted[family], seed)
         for metric, values, unit in (
             ("surfels.base_color_psnr", self.base_color_psnr, "dB"),
             ("surfels.normal_mae_deg", self.normal_error, "deg"),
@@ -109,14 +109,14 @@ def _mean(metric: str, unit: str, found: list[tuple[str, float]], seed: int) -> 
     return row.within(mean_interval(scenes, values, seed))
 
 
-def fractions(tail: str, counted: list[tuple[str, ShadowCounts]], seed: int) -> list[Row]:
-    """Rows of leaking and darkened pixels, ``tail`` behind their names, from (scene, counts) of frames."""
+def _fractions(tail: str, counted: list[tuple[str, ShadowCounts]], seed: int) -> list[Row]:
     rows = []
     for metric, bad, of in (
         ("guidance.shadow_leak", "leaking", "shadowed"),
         ("guidance.lit_darkened", "darkened", "lit"),
     ):
         pixels = np.array([[getattr(counts, bad), getattr(counts, of)] for _, counts in counted], float)
+        pixels = pixels.reshape(len(counted), 2)  # of no frames at all too
         per_scene = scene_sums([scene for scene, _ in counted], pixels)
         per_scene = per_scene[per_scene[:, 1] > 0]  # a scene without such pixels says nothing about them
         if len(per_scene):
