@@ -162,7 +162,6 @@ def test_a_scene_without_shadow_says_nothing_of_leaks():
     assert ends(darkened) == (0.0, 0.1)
     assert [row.metric for row in _fractions("", [("b", sunny)], seed=0)] == ["guidance.lit_darkened"]
     assert _fractions("", [], seed=0) == []
-    assert _fractions("", [], seed=0) == []
 
 
 def test_refinement_is_drawn_by_scene(tmp_path: Path):
