@@ -139,6 +139,7 @@ def _fractions(tail: str, counted: list[tuple[str, ShadowCounts]], seed: int) ->
         ("guidance.lit_darkened", "darkened", "lit"),
     ):
         pixels = np.array([[getattr(counts, bad), getattr(counts, of)] for _, counts in counted], float)
+        pixels = pixels.reshape(len(counted), 2)  # of no frames at all too
         per_scene = scene_sums([scene for scene, _ in counted], pixels)
         per_scene = per_scene[per_scene[:, 1] > 0]  # a scene without such pixels says nothing about them
         if len(per_scene):

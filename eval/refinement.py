@@ -56,7 +56,7 @@ def refinement(dataset: Path, seed: int) -> tuple[list[Row], list[Section]]:
             "What fitting the surfels gained",
             [
                 Table(caption, ["Figure", "as made", "fitted", "How"], table, words=[3]),
-                Text(interval_note(len(found), f"{len(found)} means")),
+                Text(interval_note(len(found))),
             ],
         )
     ]

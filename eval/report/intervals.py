@@ -8,18 +8,16 @@ FEW = 8
 """Scenes under which an interval is said to be wide; from so many on it holds nearly what it claims."""
 
 
-def interval_note(scenes: int, observed: str) -> str:
-    """How to read the brackets of figures that are means over ``observed``, such as "60 frames", of so many
-    scenes.
+def interval_note(scenes: int, observed: str = "") -> str:
+    """How to read the brackets of means over so many scenes; ``observed`` names what else was averaged over,
+    such as "60 frames".
     """
     if scenes < 2:
-        return (
-            f"{observed} of one scene say nothing about how much another scene would differ: no interval is "
-            "given."
-        )
+        return "One scene does not say how much another would differ: no interval is given."
+    counted = f"{observed} are {scenes} independent scenes" if observed else f"There are {scenes} scenes"
     text = (
         f"Brackets are {LEVEL:.0%} bootstrap intervals over scenes: where the figure may lie for other "
-        f"scenes of the same kind. {observed} are {scenes} independent scenes"
+        f"scenes of the same kind. {counted}"
     )
     if scenes >= FEW:
         return text + "."

@@ -64,7 +64,7 @@ def scenes_section(settings: Reconstruction, measured: Measured, found: Mapping[
             "values after one factor a view and channel; roughness and metallic are mean absolute errors."
         ),
         _means(measured, found),
-        Text(interval_note(len(first), f"{len(first)} means")),
+        Text(interval_note(len(first))),
     ]
     blocks += _curves(settings, measured)
     blocks += [

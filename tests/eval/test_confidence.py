@@ -9,12 +9,13 @@ import pytest
 import scipy.stats
 
 from eval.confidence import Interval, interval, mean_interval, quotient, scene_sums
-from eval.guidance import GuidanceScores
+from eval.guidance import GuidanceScores, _fractions
 from eval.refinement import refinement
 from eval.report.figures import with_interval
 from eval.report.intervals import interval_note
 from eval.results import Results, Row
 from eval.scores import Score, Scores
+from eval.shadows import ShadowCounts
 from tron.seeds import generator
 from tron.shards.schema import Clip
 
@@ -86,7 +87,7 @@ def test_one_scene_has_no_interval():
     assert mean_interval(["a"] * 20, [1.0] * 20, 0) == Interval(1)
     row = Row(metric="a.b", value=1.0, unit="dB", n=20).within(Interval(1))
     assert with_interval(row) == "1.00 dB"
-    assert "one scene" in interval_note(1, "20 frames")
+    assert "no interval is given" in interval_note(1, "20 frames")
 
 
 def test_the_seed_alone_decides():
@@ -152,6 +153,17 @@ def test_guidance_is_drawn_by_scene_too(drawn_clip: Callable[..., Clip]):
     assert rows["guidance.irradiance_psnr"].scenes == rows["surfels.normal_mae_deg"].scenes == 3
 
 
+def test_a_scene_without_shadow_says_nothing_of_leaks():
+    shadow, sunny = ShadowCounts(10, 4, 90, 0), ShadowCounts(0, 0, 100, 10)
+    rows = {row.metric: row for row in _fractions("", [("a", shadow), ("b", sunny), ("c", shadow)], seed=0)}
+    leak, darkened = rows["guidance.shadow_leak"], rows["guidance.lit_darkened"]
+    assert (leak.value, leak.scenes, leak.low, leak.high) == (0.4, 2, 0.4, 0.4)
+    assert darkened.scenes == 3
+    assert ends(darkened) == (0.0, 0.1)
+    assert [row.metric for row in _fractions("", [("b", sunny)], seed=0)] == ["guidance.lit_darkened"]
+    assert _fractions("", [], seed=0) == []
+
+
 def test_refinement_is_drawn_by_scene(tmp_path: Path):
     for number, psnr in enumerate((30.0, 31.0, 34.0, 36.0)):
         figures = {"base_color_psnr": psnr, "normal_mae_deg": 1.0, "silhouette_error": 0.01}
@@ -198,6 +210,7 @@ def test_intervals_are_written_in_the_unit_of_their_figure():
 def test_the_note_says_how_many_scenes_and_that_few_are_few():
     few, many = interval_note(4, "60 frames"), interval_note(30, "900 frames")
     assert "60 frames are 4 independent scenes" in few
+    assert "There are 4 scenes" in interval_note(4)
     assert "wide" in few
     assert "900 frames are 30 independent scenes" in many
     assert "wide" not in many

@@ -292,6 +292,7 @@ def test_every_scene_in_every_way_and_the_fox_are_run_once(stand_ins: Path, tmp_
     page = (out / "report.html").read_text()
     for anchor in ("targets", "scenes", "views", "light", "fox", "limits", "stages"):
         assert f'id="{anchor}"' in page
+    assert "no interval is given" in page
     assert "Under noon" in page
     assert "name and that are absent: 1." in page
     assert page.count("<svg") == 3

@@ -63,6 +63,10 @@ def test_every_row_of_the_issue_is_there(outcome: Outcome):
     assert len(rows) == len(outcome.rows)
     assert rows["neural.psnr"].n == 2 * 3 * 2  # scenes, lights, frames
     assert rows["neural.psnr.sun"].n == 2 * 2
+    averaged = [
+        row for row in outcome.rows if row.metric.startswith(("neural", "pbr", "guidance", "surfels"))
+    ]
+    assert all(row.scenes == 2 and row.low is not None for row in averaged)
 
 
 def test_networks_that_return_pbr_score_as_pbr(outcome: Outcome):
@@ -119,7 +123,13 @@ def test_the_command_writes_results_report_and_pictures(
     assert "null" not in json.dumps([row.value for row in results.rows])
     picture = read_image(next(path for path in (tmp_path / "pictures").glob("*-guidance.png")))
     assert picture.shape == (2 * 32, 4 * 32, 3)
+    page = (tmp_path / "report.html").read_text()
+    assert "12 frames are 2 independent scenes" in page
+    row = results.find("neural.psnr_full")
+    assert row is not None
+    assert f"{row.value:.2f} [{row.low:.2f}, {row.high:.2f}]" in page
     out = capsys.readouterr().out
+    assert f"{row.value:.2f} dB [{row.low:.2f}, {row.high:.2f}]" in out
     assert f"report: {tmp_path / 'report.html'}" in out
     assert "neural.psnr" in out
     assert "not measured" in out
