@@ -33,6 +33,7 @@ TOY = {
     "gradient": "[[300,32]]",
     "irradiance": "[300,32]",
     "noise": "[300,32]",
+    "few_rays": "[300,32]",
     "reference_spp": "64",
     "error_rays": "50",
     "memory_surfels": "500",
@@ -70,6 +71,10 @@ ROWS = [
     "irradiance.block_correlation_8x8",
     "irradiance.rmse_64spp.sun",
     "irradiance.rmse_64spp.soft",
+    "irradiance.shadowed_mean_over_reference.sun.2",
+    "irradiance.shadowed_mean_over_reference.soft.8.filtered",
+    "irradiance.few_rays_rmse.sun.4.filtered",
+    "irradiance.shadowed_mean_error",
     "primary.max_error",
     "primary.rays_at_a_threshold",
     "shadow.max_error",
@@ -118,6 +123,7 @@ def test_the_whole_benchmark_runs_and_every_promised_row_is_there(tmp_path: Path
         "gradient",
         "irradiance",
         "noise",
+        "few-rays",
         "exactness",
         "memory",
     ):
@@ -135,6 +141,7 @@ def test_a_part_alone_gives_its_rows_alone(tmp_path: Path):
         gradient=[],
         irradiance=(300, 32),
         noise=(300, 32),
+        few_rays=(300, 32),
         error_rays=20,
     )
     outcome = benchmark.run(tmp_path)
