@@ -15,6 +15,7 @@ from eval.report.figures import written
 from eval.report.page import Cell, Section, Table
 from eval.results import Row, Target
 from eval.stages import Child, Stages, script_path
+from tron.shards.manifest import Manifest
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 WORDS = {
@@ -70,6 +71,7 @@ class Demo(Benchmark):
         with stages.timed("eval", [["tron-eval", "benchmark=demo", f"output_dir={output_dir}"]]):
             outcome = evaluation.run(output_dir)
         rows, sections = refinement(dataset, self.relighting.seed)
+        rows.append(_seconds_per_scene(dataset, stages.records["datagen"].seconds))
         outcome = dataclasses.replace(
             outcome, rows=[*outcome.rows, *rows], sections=[*outcome.sections, *sections]
         )
@@ -117,3 +119,10 @@ class Demo(Benchmark):
                 f"# or, once installed: tron-eval benchmark=demo output_dir={output_dir}",
             ],
         )
+
+
+def _seconds_per_scene(dataset: Path, seconds: float) -> Row:
+    """Wall time of the data engine over the scenes it made; its workers make several at a time."""
+    keys = (key for entry in Manifest.load(dataset).shards for key in entry.keys)
+    scenes = len({key.rsplit("-", 1)[0] for key in keys})
+    return Row(metric="datagen.seconds_per_scene.demo", value=seconds / scenes, unit="s", n=scenes)

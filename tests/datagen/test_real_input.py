@@ -48,6 +48,7 @@ def dataset(shared_data: Path, variant: str, tmp_path_factory: pytest.TempPathFa
         "train.scenes=1",
         "train.lights=[any]",
         "train_b.scenes=0",
+        "validation.scenes=0",
         "test.scenes=1",
         "test.lights=[hdri,hdri]",
         "views=24",

@@ -36,6 +36,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 TINY = [
     "train.scenes=2",
     "train_b.scenes=1",
+    "validation.scenes=1",
     "test.scenes=1",
     "views=6",
     "view_width=32",
@@ -48,7 +49,7 @@ TINY = [
     "objects=[2,2]",
     "cluster=null",
 ]
-for _split in ("train", "train_b", "test"):
+for _split in ("train", "train_b", "validation", "test"):
     TINY += [
         f"{_split}.lights=[overcast,any]",
         f"{_split}.frames=2",
@@ -81,8 +82,8 @@ def test_a_dataset_is_whole_and_has_everything_beside_its_shards(dataset):
     assert verify(dataset) == []
     assert validate(dataset) == 0
     manifest = Manifest.load(dataset)
-    assert manifest.splits() == ["test", "train", "train_b"]
-    assert sum(entry.samples for entry in manifest.shards) == 8
+    assert manifest.splits() == ["test", "train", "train_b", "validation"]
+    assert sum(entry.samples for entry in manifest.shards) == 10
     for name in (
         "config.yaml",
         "index.html",
@@ -106,6 +107,14 @@ def test_clips_hold_consecutive_frames_with_true_metadata(dataset):
     assert clips[0].meta.light_family == "overcast"
     for clip in clips:
         assert set(clip.frames) == {*MEMBERS, *REFERENCE_MEMBERS}
+        seen = clip.frames["foreground"][..., 0] > 0
+        shadowed, unshadowed = (clip.frames[name][seen] for name in ("irr_ref", "unshadowed_ref"))
+        assert (shadowed <= unshadowed * 1.001).all()
+        assert (shadowed < 0.9 * unshadowed).any()
+        true, ours = (clip.frames[name][..., 0] for name in ("depth_ref", "depth"))
+        assert true[seen].min() > 3
+        assert (true[~seen] == 0).all()
+        assert np.median(np.abs(true - ours)[seen]) < 0.05
         assert len(clip.meta.cameras) == clip.meta.frames == 2
         assert clip.meta.exposure > 0
         foreground = clip.frames["foreground"]
@@ -114,8 +123,9 @@ def test_clips_hold_consecutive_frames_with_true_metadata(dataset):
         assert clip.frames["mask"][foreground > 0].mean() > 0.9
         normal = clip.frames["normal_ref"][foreground[..., 0] > 0]
         np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1.0, atol=1e-3)
-    for clip in read_clips(dataset, "train"):
-        assert set(clip.frames) == set(MEMBERS)
+    for split in ("train", "validation"):
+        for clip in read_clips(dataset, split):
+            assert set(clip.frames) == set(MEMBERS)
 
 
 def test_guidance_and_frames_see_the_same_light(dataset):
@@ -167,7 +177,7 @@ def test_a_scene_depends_on_nothing_else_that_is_made(dataset, tmp_path):
 
 
 def test_a_dataset_grows_without_making_the_old_scenes_again(tmp_path, monkeypatch):
-    small = ["train.scenes=1", "train_b.scenes=0", "test.scenes=0"]
+    small = ["train.scenes=1", "train_b.scenes=0", "validation.scenes=0", "test.scenes=0"]
     assert make(tiny(tmp_path, *small)) == 0
     names = []
     real = make_scene
@@ -178,6 +188,29 @@ def test_a_dataset_grows_without_making_the_old_scenes_again(tmp_path, monkeypat
     assert names == ["train-000001"]
     with pytest.raises(TronError, match="holds 2 scenes"):
         make(tiny(tmp_path, *small))
+    # A split that has no scenes yet may still become anything: so older datasets get a validation split.
+    names.clear()
+    made = ["train.scenes=2", "validation.scenes=1", "validation.lights=[studio]"]
+    before = tree(tmp_path)
+    assert make(tiny(tmp_path, *small, *made)) == 0
+    assert names == ["validation-000000"]
+    after = tree(tmp_path)
+    assert {path: after[path] for path in before if path.startswith(("scenes/", "train"))} == {
+        path: data for path, data in before.items() if path.startswith(("scenes/", "train"))
+    }
+
+
+def test_what_a_split_without_scenes_says_does_not_matter(tmp_path):
+    unused = ["validation.scenes=0", "validation.lights=[]", "validation.frames=99", "validation.width=1"]
+    settings = tiny(tmp_path, *unused, "test.scenes=0", "test.lights=[hdri]", "test.guidance_spp=3")
+    assert [item.split for item in plan(settings)] == ["train", "train", "train_b"]
+    assert settings.recipe() == tiny(tmp_path, "validation.scenes=0", "test.scenes=0").recipe()
+    with pytest.raises(TronError, match="lights"):
+        tiny(tmp_path, "validation.lights=[]")
+    with pytest.raises(TronError, match="path_frames"):
+        tiny(tmp_path, "test.frames=9")
+    with pytest.raises(TronError, match=r"path_frames"):
+        tiny(tmp_path, "mode=captures", "test.scenes=0", "test.frames=9")
 
 
 def test_another_recipe_is_refused_before_anything_is_written(dataset):
@@ -223,7 +256,7 @@ def test_values_that_are_not_finite_never_reach_a_shard(tmp_path, monkeypatch):
             yield meta, frames
 
     monkeypatch.setattr(datagen.run, "make_clips", spoilt)
-    settings = tiny(tmp_path, "train.scenes=0", "train_b.scenes=0")
+    settings = tiny(tmp_path, "train.scenes=0", "train_b.scenes=0", "validation.scenes=0")
     assert make(settings) == 1
     failure = json.loads((tmp_path / "failures.jsonl").read_text())
     assert failure["clip"] == "test-000000-l1"
@@ -250,7 +283,7 @@ def test_unknown_scenes_and_empty_datasets_are_refused(tmp_path):
     with pytest.raises(TronError, match="no such scene"):
         make(tiny(tmp_path, "only=[train-000009]"))
     with pytest.raises(TronError, match="no scenes"):
-        plan(tiny(tmp_path, "train.scenes=0", "train_b.scenes=0", "test.scenes=0"))
+        plan(tiny(tmp_path, *(f"{split}.scenes=0" for split in ("train", "train_b", "validation", "test"))))
 
 
 @pytest.mark.parametrize("cluster", [None, {"_target_": "dask_jobqueue.SLURMCluster", "cores": 8}])
@@ -278,7 +311,7 @@ def test_validation_finds_what_is_missing(dataset, tmp_path):
 
 def test_config_says_how_it_was_made_and_not_where(dataset):
     config = yaml.safe_load((dataset / "config.yaml").read_text())
-    assert config["scenes"] == {"train": 2, "train_b": 1, "test": 1}
+    assert config["scenes"] == {"train": 2, "train_b": 1, "validation": 1, "test": 1}
     assert str(dataset) not in (dataset / "config.yaml").read_text()
     assert str(dataset) not in (dataset / "card.md").read_text()
 

@@ -9,7 +9,7 @@ import pytest
 from tron.cameras import Camera
 from tron.seeds import generator
 from tron.shards.manifest import Manifest
-from tron.shards.schema import Clip, ClipMeta
+from tron.shards.schema import REFERENCE_MEMBERS, Clip, ClipMeta
 from tron.shards.writer import ShardWriter
 
 LIGHTS = {"noon": "sun", "softbox": "studio", "grey": "overcast", "dusk": "sun", "window": "studio"}
@@ -55,10 +55,13 @@ def draw_frame(size: int, seed: int, light: str, frame: int = 0) -> dict[str, np
         "mask": solid.astype(np.float32),
         "foreground": solid.astype(np.float32),
         "irr_ref": over(irradiance * (1 + 0.05 * noise.standard_normal(irradiance.shape))),
+        "unshadowed_ref": over(unshadowed),
         "base_color_ref": np.where(solid, base, 0).astype(np.float32),
         "normal_ref": np.where(solid, normal, 0).astype(np.float32),
         "base_color": np.where(solid, np.clip(base + 0.02, 0, 1), 0).astype(np.float32),
         "normal": np.where(solid, normal, 0).astype(np.float32),
+        "depth_ref": np.where(solid[..., 0], 4 - y, 0).astype(np.float32),
+        "depth": np.where(solid[..., 0], 4 - y + 0.01, 0).astype(np.float32),
     }
 
 
@@ -124,8 +127,7 @@ def write_dataset() -> Callable[..., Path]:
 
 
 def _without_references(frame: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    references = ("irr_ref", "base_color_ref", "normal_ref", "base_color", "normal")
-    return {name: image for name, image in frame.items() if name not in references}
+    return {name: image for name, image in frame.items() if name not in REFERENCE_MEMBERS}
 
 
 @pytest.fixture(scope="session")

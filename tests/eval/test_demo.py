@@ -61,6 +61,10 @@ def test_the_demo_goes_from_nothing_to_a_report_and_a_second_run_only_evaluates(
     parts = [results.value(f"demo.{stage}_seconds") for stage in ("datagen", "train", "eval")]
     assert all(parts)
     assert results.value("demo.seconds") == pytest.approx(sum(parts))  # type: ignore[arg-type]
+    scenes = results.find("datagen.seconds_per_scene.demo")
+    assert scenes is not None
+    assert scenes.n == 6, "two scenes of each of three splits"
+    assert scenes.value == pytest.approx(parts[0] / 6)  # type: ignore[operator]
     said = capfd.readouterr().out
     assert "[datagen] 12 clips" in said
     assert f"report: {out / 'report.html'}" in said

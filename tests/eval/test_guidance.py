@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from eval.guidance import GuidanceScores
-from eval.shadows import ShadowCounts, count_shadow_errors, same_surface
+from eval.shadows import DirectLight, ShadowCounts, count_shadow_errors, same_depth, same_normal
 from tron.color import agx
-from tron.shards.schema import Clip
+from tron.shards.schema import REFERENCE_MEMBERS, Clip
 
 MakeClip = Callable[..., Clip]
 
@@ -22,31 +22,63 @@ def test_leaks_and_darkening_follow_their_definitions():
     reference = grey([0.1, 0.1, 0.4, 0.7, 1.0, 1.0, 0.95])  # shadow, shadow, shadow, between, lit, lit, lit
     leak = 0.15 * reference.mean()
     ours = grey([0.1 + 1.01 * leak, 0.1 + 0.99 * leak, 0.0, 0.0, 0.74, 0.76, 2.0])
-    counts = count_shadow_errors(ours, unshadowed, reference, np.ones((1, 7), bool))
+    counts = count_shadow_errors(ours, DirectLight(reference, unshadowed), np.ones((1, 7), bool))
     assert counts == ShadowCounts(shadowed=3, leaking=1, lit=3, darkened=1)
 
 
 def test_only_judged_pixels_count():
-    unshadowed, reference, ours = grey([1, 1]), grey([0.1, 1]), grey([1, 0.1])
-    assert count_shadow_errors(ours, unshadowed, reference, np.array([[True, False]])).leaking == 1
-    assert count_shadow_errors(ours, unshadowed, reference, np.array([[True, False]])).lit == 0
-    assert count_shadow_errors(ours, unshadowed, reference, np.zeros((1, 2), bool)) == ShadowCounts(
-        0, 0, 0, 0
-    )
+    reference, ours = DirectLight(grey([0.1, 1]), grey([1, 1])), grey([1, 0.1])
+    first = count_shadow_errors(ours, reference, np.array([[True, False]]))
+    assert first == ShadowCounts(shadowed=1, leaking=1, lit=0, darkened=0)
+    assert count_shadow_errors(ours, reference, np.zeros((1, 2), bool)) == ShadowCounts(0, 0, 0, 0)
+
+
+def test_an_error_of_the_surfels_own_unshadowed_light_moves_no_pixel_between_classes(drawn_clip: MakeClip):
+    """Surfels that face the light too much have too much unshadowed light: that makes no shadow."""
+    clip = drawn_clip("noon")
+    before, after = GuidanceScores(), GuidanceScores()
+    before.add(clip)
+    clip.frames["unshadowed"] *= 3
+    after.add(clip)
+    assert [row for row in before.rows() if "shadow" in row.metric or "lit" in row.metric]
+    assert after.rows() == before.rows()
 
 
 def test_a_pixel_that_shows_another_surface_is_judged_only_with_silhouettes(drawn_clip: MakeClip):
     clip = drawn_clip("noon")
     clip.frames["irr_ref"] = clip.frames["irr"].copy()
     frame = {name: images[0] for name, images in clip.frames.items()}
-    assert same_surface(frame)[frame["foreground"][..., 0] > 0.5].all()
+    solid = frame["foreground"][..., 0] > 0.5
+    assert same_normal(frame)[solid].all()
+    assert same_depth(frame)[solid].all()
     clip.frames["irr"] = clip.frames["unshadowed"].copy()
-    clip.frames["normal"] = clip.frames["normal_ref"][..., ::-1].copy()  # x and z change places
+    for spoilt, gone, left in (
+        # x and z change places: the floor's shadow is on another surface now, by its normal
+        ({"normal": clip.frames["normal_ref"][..., ::-1].copy()}, "_same_normal", ""),
+        ({"depth": clip.frames["depth_ref"] + 0.04}, "", "_same_normal"),
+    ):
+        scores = GuidanceScores()
+        scores.add(Clip(clip.meta, clip.frames | spoilt))
+        rows = {row.metric: row.value for row in scores.rows()}
+        assert rows["guidance.shadow_leak_with_silhouettes"] == 1
+        assert rows[f"guidance.shadow_leak{left}"] == 1
+        assert f"guidance.shadow_leak{gone}" not in rows
+
+
+def test_clips_from_before_the_reference_light_was_stored_have_every_other_figure(
+    drawn_clip: MakeClip, caplog: pytest.LogCaptureFixture
+):
     scores = GuidanceScores()
-    scores.add(clip)
-    rows = {row.metric: row.value for row in scores.rows()}
-    assert rows["guidance.shadow_leak_with_silhouettes"] == 1
-    assert "guidance.shadow_leak" not in rows  # the floor's shadow is on another surface now
+    for light in ("noon", "softbox"):
+        clip = drawn_clip(light)
+        for name in ("unshadowed_ref", "depth", "depth_ref"):
+            del clip.frames[name]
+        scores.add(clip)
+    metrics = [row.metric for row in scores.rows()]
+    assert "guidance.irradiance_psnr" in metrics
+    assert "surfels.normal_mae_deg" in metrics
+    assert not [metric for metric in metrics if "shadow" in metric or "lit" in metric]
+    assert caplog.text.count("lack unshadowed_ref, depth, depth_ref") == 1
 
 
 def test_perfect_guidance_leaks_nowhere_and_its_psnr_is_capped(drawn_clip: MakeClip):
@@ -114,7 +146,7 @@ def test_normals_are_compared_where_both_exist(drawn_clip: MakeClip):
 
 def test_without_references_nothing_is_claimed(drawn_clip: MakeClip):
     clip = drawn_clip()
-    for name in ("irr_ref", "base_color_ref", "normal_ref", "base_color", "normal"):
+    for name in REFERENCE_MEMBERS:
         del clip.frames[name]
     scores = GuidanceScores()
     scores.add(clip)

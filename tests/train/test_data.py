@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from torch.utils.data import DataLoader
 
 from train import data as training_data
 from train.curriculum import Stage
 from train.data import Batches, TrainingData, developed, varied
 from train.processes import Processes
-from train.settings import DataSettings, ValidationSettings
+from train.settings import DataSettings, Settings, ValidationSettings
 from train.sources import BUFFERS, CachedSplit, Sample, display_video
 from tron import seeds
 from tron.color import luminance, to_display
@@ -224,6 +225,42 @@ def test_a_path_traced_second_split_stands_in_for_photographs_and_photographs_do
     )
     monkeypatch.setattr(training_data, "first_meta", lambda *_: photographs)
     assert not data.stands_in("train_b")
+def test_validation_is_on_its_own_split_and_the_test_split_is_never_opened(
+    dataset, tmp_path, make_settings, caplog
+):
+    """Without its shards the test split may as well not be there."""
+    folder = tmp_path / "copy"
+    shutil.copytree(dataset, folder)
+    for path in folder.glob("test-*.tar"):
+        path.unlink()
+    settings = Settings.model_validate(make_settings(folder, tmp_path / "out"))
+    data = TrainingData(folder, settings.data, 0, settings.validation)
+    data.open(settings.stages)
+    assert len(list(data.calibration(settings.stages))) > 0
+    data.begin(settings.stages[0], 0)
+    next(iter(data.train_dataloader()))
+    held_out = {clip.meta.split for clip in (list(data.val_dataloader()), data._held_out)[1] or []}
+    assert held_out == {"validation"}
+    for change in (
+        {"validation": {"split": "test"}},
+        {"stages": [{"name": "a", "split": "test", "steps": 1}]},
+    ):
+        with pytest.raises(ValidationError, match="kept for evaluation"):
+            Settings.model_validate(make_settings(folder, tmp_path / "out", **change))
+
+
+def test_a_dataset_without_a_validation_split_is_trained_on_without_validation(
+    make_dataset, tmp_path, caplog
+):
+    folder = make_dataset(tmp_path / "old", {"train": 2, "train_b": 1, "test": 1})
+    caplog.set_level("INFO")
+    data = TrainingData(folder, DataSettings(), 0, ValidationSettings())
+    assert caplog.text.count("No validation: this dataset has no split 'validation'") == 1
+    data.begin(STAGE, 0)
+    assert data.validation_split is None
+    assert data.val_dataloader() == []
+    with pytest.raises(TronError, match="no split 'mine'"):
+        TrainingData(folder, DataSettings(), 0, ValidationSettings(split="mine"))
 
 
 @pytest.mark.parametrize(
