@@ -21,6 +21,7 @@ import yaml
 
 from datagen.build import Geometry
 from datagen.capture_manifest import CaptureManifest
+from datagen.clusters import require_cluster
 from datagen.lights import bake
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.plan import Sources, Work, chosen, find_sources, require_same, write_if_changed
@@ -66,6 +67,7 @@ def make_captures(settings: Settings) -> int:
     wanted = settings.captures
     items = [Work("test", i, scene_name("test", i), first_shard=0) for i in range(wanted.scenes)]
     items = chosen(items, settings.only)
+    require_cluster(settings)
     activate(settings.variant, threads=1)
     sources = find_sources(settings)
     folder = settings.output_dir / CAPTURES

@@ -9,10 +9,10 @@ record.
 from __future__ import annotations
 
 import gc
+import hashlib
 import io
 import json
 import logging
-import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
@@ -25,6 +25,7 @@ import numpy as np
 from datagen.assets import for_split, load_models
 from datagen.build import Geometry, build
 from datagen.card import card_text, command_line
+from datagen.clusters import ours, require_cluster, workers
 from datagen.models import outline
 from datagen.plan import (
     RECORD_NAME,
@@ -71,6 +72,7 @@ def make(settings: Settings) -> int:
     """
     items = plan(settings)
     wanted = chosen(items, settings.only)
+    require_cluster(settings)
     activate(settings.variant, threads=1)
     sources = find_sources(settings)
     output = settings.output_dir
@@ -184,18 +186,16 @@ def outcomes(
         for item in items:
             yield item, attempt(task, item, settings, sources)
         return
-    from dask.distributed import Client, as_completed
-    from hydra.utils import instantiate
+    from dask.distributed import as_completed
 
-    logging.getLogger("distributed").setLevel(logging.WARNING)  # it reports every connection otherwise
-    options = dict(settings.cluster)
-    if str(options.get("_target_", "")).endswith("LocalCluster"):
-        options.setdefault("n_workers", min(settings.workers or _cores(), len(items)))
-    with instantiate(options) as cluster, Client(cluster) as client:
+    with workers(settings, len(items)) as client:
         queue = iter(items)
-        while wave := list(islice(queue, _workers(client) * settings.recycle_after)):
+        mine = ours(settings)
+        while wave := list(islice(queue, _count(client) * settings.recycle_after if mine else None)):
             futures = {
-                client.submit(attempt, task, item, settings, sources, key=item.name, pure=False): item
+                client.submit(
+                    attempt, task, item, settings, sources, key=_key(settings, item), pure=False
+                ): item
                 for item in wave
             }
             for future in as_completed(futures):
@@ -203,15 +203,16 @@ def outcomes(
                 # retries.
                 error = future.exception()
                 yield futures[future], f"worker lost: {error}" if error is not None else future.result()
-            if len(wave) < len(items):
+            if mine and len(wave) < len(items):
                 client.restart()  # Mitsuba's memory grows with every scene it loads
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _key(settings: Settings, item: Work) -> str:
+    """A task's name on a scheduler that may serve several runs."""
+    return f"{item.name}-{hashlib.sha256(str(settings.output_dir.absolute()).encode()).hexdigest()[:16]}"
 
 
-def _workers(client: Any) -> int:
+def _count(client: Any) -> int:
     return max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
 
 

@@ -21,7 +21,7 @@ from datagen.materials import Style
 
 LightChoice = Literal["any", "sun", "studio", "overcast", "hdri"]
 Split = Literal["train", "train_b", "validation", "test"]
-OUTSIDE = {"output_dir", "mode", "only", "workers", "recycle_after", "cluster", "captures"}
+OUTSIDE = {"output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "cluster", "captures"}
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
 CAPTURED = {
@@ -176,11 +176,20 @@ class Settings(_Model):
         "llvm_ad_rgb", description="Mitsuba variant; on cuda_ad_rgb bytes are not repeatable."
     )
     workers: int | None = Field(
-        None, ge=1, description="Worker processes of a local cluster; null: one a core."
+        None,
+        ge=1,
+        description="Worker processes of the cluster; null: one a core with cluster=local.",
     )
-    recycle_after: int = Field(50, ge=1, description="Scenes a worker makes before it is replaced.")
+    worker_timeout: float = Field(
+        600.0, gt=0, description="Seconds to wait for the cluster's first worker: jobs may queue for long."
+    )
+    recycle_after: int = Field(
+        50, ge=1, description="Scenes a worker makes before it is replaced; not with cluster=address."
+    )
     cluster: dict[str, Any] | None = Field(
-        None, description="Dask cluster by _target_; null makes scenes one by one in this process."
+        None,
+        description="Where scenes are made, see cluster=NAME below; `tron-datagen cluster=NAME --help` lists "
+        "its keys, conf/datagen/cluster says what they mean.",
     )
 
     @field_validator(*SPLITS, mode="wrap")
@@ -192,6 +201,13 @@ class Settings(_Model):
         captures = info.data.get("mode") == "captures"
         made = info.field_name == "test" if captures else not _without_scenes(value)
         return handler(value) if made else SplitSettings.model_construct(**dict(value))
+
+    @field_validator("cluster", mode="before")
+    @classmethod
+    def _no_cluster(cls, value: Any) -> Any:
+        if value and "_target_" not in value:
+            raise ValueError("a cluster has a _target_: choose one by cluster=NAME")
+        return value or None
 
     @model_validator(mode="after")
     def _consistent(self) -> Settings:

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 EDGE = 0.1
 TINY = [
     "mode=captures",
-    "cluster=null",
+    "cluster=none",
     "objects=[2,3]",
     f"mesh_edge={EDGE}",
     "environment_height=16",
@@ -350,6 +350,5 @@ def test_the_folder_says_what_it_was_made_from(folder, output):
 
 @pytest.mark.long
 def test_two_workers_make_the_bytes_of_one_process(output, tmp_path):
-    cluster = "cluster={_target_:dask.distributed.LocalCluster,threads_per_worker:1}"
-    assert make_captures(tiny(tmp_path, cluster, "workers=2")) == 0
+    assert make_captures(tiny(tmp_path, "cluster=local", "workers=2")) == 0
     assert tree(tmp_path) == tree(output)

@@ -43,7 +43,7 @@ def dataset(shared_data: Path, variant: str, tmp_path_factory: pytest.TempPathFa
         f"environments={shared_data / 'hdri'}",
         f"catalogue={catalogue}",
         "seed=4",
-        "cluster=null",
+        "cluster=none",
         "objects=[5,5]",
         "train.scenes=1",
         "train.lights=[any]",

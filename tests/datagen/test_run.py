@@ -47,7 +47,7 @@ TINY = [
     "environment_height=16",
     "path_frames=8",
     "objects=[2,2]",
-    "cluster=null",
+    "cluster=none",
 ]
 for _split in ("train", "train_b", "validation", "test"):
     TINY += [
@@ -316,12 +316,9 @@ def test_config_says_how_it_was_made_and_not_where(dataset):
     assert str(dataset) not in (dataset / "card.md").read_text()
 
 
-CLUSTER = "cluster={_target_:dask.distributed.LocalCluster,threads_per_worker:1}"
-
-
 @pytest.mark.long
 def test_two_workers_make_the_bytes_of_one_process(dataset, tmp_path):
-    assert make(tiny(tmp_path, CLUSTER, "workers=2", "recycle_after=1")) == 0
+    assert make(tiny(tmp_path, "cluster=local", "workers=2", "recycle_after=1")) == 0
     assert tree(tmp_path) == tree(dataset)
 
 
@@ -330,7 +327,7 @@ def test_kill_9_at_any_moment_and_again_gives_the_same_bytes(dataset, tmp_path):
     command = [sys.executable, "-m", "tests_run_tiny"]
     script = tmp_path / "tests_run_tiny.py"
     output = tmp_path / "out"
-    arguments = [*TINY, f"output_dir={output}", CLUSTER, "workers=2"]
+    arguments = [*TINY, f"output_dir={output}", "cluster=local", "workers=2"]
     script.write_text(f"from datagen.cli import cli\nif __name__ == '__main__':\n    cli({arguments!r})\n")
     for seconds in (6.0, 14.0):
         process = subprocess.Popen(

@@ -26,8 +26,9 @@ from tron.errors import TronError
 from tron.storage import locked
 
 LONGEST = 240.0  # seconds for a run of two processes on a machine that has other work
-TOLERANCE = 2e-6
-"""Largest difference of a weight; measured: see docs/training.md."""
+TOLERANCES = {"64-true": 1e-6, "32-true": 1e-4}
+"""Largest difference of a weight; the largest weight is 2. AdamW divides gradients by their own size, rounding
+and all, and some layers compute in float32 whatever they are told. Measured: 5e-8 and 1.4e-5."""
 
 two_cores = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="two processes need two cores")
 
@@ -64,21 +65,25 @@ def typed(make_settings, dataset, tmp_path) -> Callable[..., list[str]]:
 
 
 @pytest.fixture
-def alone(make_settings, dataset, tmp_path) -> Path:
+def alone(make_settings, dataset, tmp_path) -> Callable[[str], Path]:
     """A run of one process with batches of twice the size."""
-    stages = [stage | {"batch_size": 4} for stage in STAGES]
-    validation = {"every": 7, "clips": 3, "split": "train_b"}
-    settings = make_settings(dataset, tmp_path / "alone", stages=stages, validation=validation)
-    main(Settings.model_validate(settings | {"checkpoint_every": 10}))
-    return tmp_path / "alone"
+
+    def run(precision: str) -> Path:
+        stages = [stage | {"batch_size": 4} for stage in STAGES]
+        changes = {"validation": {"every": 7, "clips": 3, "split": "train_b"}, "precision": precision}
+        settings = make_settings(dataset, tmp_path / "alone", stages=stages, checkpoint_every=10, **changes)
+        main(Settings.model_validate(settings))
+        return tmp_path / "alone"
+
+    return run
 
 
-def require_equal(one: Path, several: Path) -> None:
+def require_equal(one: Path, several: Path, tolerance: float) -> None:
     a, b = (load_file(folder / "renderer.safetensors") for folder in (one, several))
     difference = max(float((a[name] - b[name]).abs().max()) for name in a)
     moved = max(float((a[name]).abs().max()) for name in a)
     print(f"largest difference of a weight {difference:.2e}, largest weight {moved:.2f}")
-    assert difference <= TOLERANCE
+    assert difference <= tolerance
     rows, others = (list(csv.DictReader((folder / "metrics.csv").open())) for folder in (one, several))
     assert [(row["stage"], row["step"]) for row in rows] == [(row["stage"], row["step"]) for row in others]
     for name, places in (("loss", 1e-5), ("learning_rate", 0), ("val_psnr", 2e-3), ("val_psnr_full", 2e-3)):
@@ -105,7 +110,8 @@ def free(folder: Path) -> bool:
 @pytest.mark.long
 def test_two_processes_killed_and_resumed_equal_one_with_twice_the_batch(alone, typed, tmp_path):
     output = tmp_path / "two"
-    process = subprocess.Popen(typed(output), stderr=subprocess.PIPE, text=True)
+    command = typed(output, precision="64-true")
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     wait_for(lambda: list((output / "checkpoints").glob("1-one-*0.ckpt")) or process.poll() is not None)
     process.send_signal(signal.SIGKILL)
     process.communicate()
@@ -113,11 +119,11 @@ def test_two_processes_killed_and_resumed_equal_one_with_twice_the_batch(alone, 
     position = find_position(output / "checkpoints", [Stage.model_validate(stage) for stage in STAGES])
     assert (position.stage, position.step % 10) == (0, 0)
     assert 0 < position.step < 40
-    again = subprocess.run(typed(output), stderr=subprocess.PIPE, text=True, timeout=LONGEST, check=False)
+    again = subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=LONGEST, check=False)
     assert again.returncode == 0, again.stderr
     assert f"from step {position.step}" in again.stderr
     assert again.stderr.count("Stage 2 of 2") == 1, "one process speaks"
-    require_equal(alone, output)
+    require_equal(alone("64-true"), output, TOLERANCES["64-true"])
 
 
 def torchrun(rank: int, ranks: int, port: int) -> dict[str, str]:
@@ -147,7 +153,7 @@ def test_processes_of_torchrun_on_two_machines_do_the_same_and_are_refused_toget
         return [(each.returncode, text) for each, text in zip(running, said)]
 
     assert [code for code, _ in ended()] == [0, 0]
-    require_equal(alone, tmp_path / "two")
+    require_equal(alone("32-true"), tmp_path / "two", TOLERANCES["32-true"])
     (first, said), (second, nothing) = ended(seed=1)
     assert (first, second) == (2, 2)
     assert said.startswith("tron-train: output_dir holds a run with another 'seed'")

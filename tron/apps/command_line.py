@@ -50,7 +50,7 @@ class Command(Generic[Settings]):
         try:
             options = _parser(self.name).parse_args(arguments)
             if options.help:
-                print(self._help(), end="")
+                print(self._help(options.overrides, options.config_dir), end="")
                 return 0
             if options.version:
                 print(f"{self.name} {tron.__version__}")
@@ -69,9 +69,10 @@ class Command(Generic[Settings]):
             print(f"{self.name}: interrupted", file=sys.stderr)
             return INTERRUPTED
 
-    def _help(self) -> str:
+    def _help(self, overrides: Sequence[str], config_dir: Path | None) -> str:
         groups = group_options(self.config_module)
-        defaults: Any = OmegaConf.to_container(compose_recipe(self.config_module, []), resolve=False)
+        recipe = compose_recipe(self.config_module, overrides, config_dir)
+        defaults: Any = OmegaConf.to_container(recipe, resolve=False)
         purpose = inspect.getdoc(self.main) or self.settings.__doc__ or self.name
         examples = self.examples or default_examples(self.name, groups)
         return render_help(self.name, purpose, self.settings, defaults, groups, examples)

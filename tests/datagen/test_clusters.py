@@ -1,0 +1,148 @@
+"""Clusters: what is missing is said before work starts, a scheduler that runs is used and left as it was."""
+
+import importlib.util
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from dask.distributed import Client, LocalCluster
+
+from datagen.captures import make_captures
+from datagen.run import make
+from datagen.settings import Settings
+from tron.apps.recipes import check, compose_recipe
+from tron.errors import TronError
+
+TINY = [
+    "train.scenes=2",
+    "train_b.scenes=0",
+    "test.scenes=0",
+    "train.lights=[overcast]",
+    "train.frames=1",
+    "train.width=16",
+    "train.height=12",
+    "train.path_spp=2",
+    "train.guidance_spp=2",
+    "views=4",
+    "view_width=24",
+    "view_height=24",
+    "surfels=500",
+    "refine_steps=0",
+    "mesh_edge=0.2",
+    "environment_height=16",
+    "objects=[1,1]",
+]
+
+
+def tiny(output: Path, *overrides: str) -> Settings:
+    return check(compose_recipe("conf.datagen", [*TINY, f"output_dir={output}", *overrides]), Settings)
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != ".tron.lock")
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in files}
+
+
+@pytest.fixture(scope="module")
+def empty_scheduler() -> Iterator[str]:
+    with LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as cluster:
+        yield cluster.scheduler_address
+
+
+def test_none_is_this_process_and_null_is_too(tmp_path):
+    assert tiny(tmp_path, "cluster=none").cluster is None
+    assert tiny(tmp_path, "cluster=null").cluster is None
+    cluster = tiny(tmp_path).cluster
+    assert cluster is not None
+    assert cluster["_target_"] == "dask.distributed.LocalCluster"
+
+
+def test_one_kind_of_cluster_keeps_no_key_of_another(tmp_path):
+    local = tiny(tmp_path).cluster
+    slurm = tiny(tmp_path, "cluster=slurm", "cluster.queue=long").cluster
+    assert local is not None
+    assert slurm is not None
+    assert slurm.keys() & local.keys() == {"_target_"}
+    assert (slurm["queue"], slurm["log_directory"]) == ("long", f"{tmp_path}/slurm")
+
+
+@pytest.mark.parametrize("work", [make, make_captures])
+@pytest.mark.parametrize(
+    ("overrides", "without", "message"),
+    [
+        (
+            ["cluster=slurm", "workers=2"],
+            "dask_jobqueue",
+            r"dask_jobqueue: pip install 'tron-relight\[cluster\]'",
+        ),
+        (
+            ["cluster=ssh", "cluster.hosts=[a,a]"],
+            "asyncssh",
+            r"asyncssh: pip install 'tron-relight\[cluster\]'",
+        ),
+        (["cluster=slurm", "workers=2"], "sbatch", "command sbatch not found"),
+        (["cluster=slurm"], None, "'workers' has no value .*: say how many to start: workers=N"),
+        (["cluster=address"], None, "cluster=address has no address"),
+        (["cluster._target_=nowhere.Cluster"], None, "needs the package nowhere"),
+        (["cluster._target_=dask.distributed.NoCluster"], None, "cannot be loaded"),
+    ],
+)
+def test_what_a_cluster_lacks_is_one_line_before_anything_is_written(
+    tmp_path, monkeypatch, work: Callable[[Settings], int], overrides, without, message
+):
+    find, which = importlib.util.find_spec, shutil.which
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == without else find(name))
+    sbatch = None if without == "sbatch" else "/usr/bin/sbatch"
+    monkeypatch.setattr(shutil, "which", lambda name: sbatch if name == "sbatch" else which(name))
+    with pytest.raises(TronError, match=message) as caught:
+        work(tiny(tmp_path / "out", *overrides))
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_ssh_needs_hosts(tmp_path):
+    with pytest.raises(TronError, match=r"'cluster\.hosts' has no value"):
+        tiny(tmp_path, "cluster=ssh")
+
+
+@pytest.mark.usefixtures("variant")
+def test_a_cluster_without_workers_is_not_waited_for_longer_than_told(tmp_path, empty_scheduler):
+    address = f"cluster.address={empty_scheduler.replace('inproc', 'inproc')}"
+    with pytest.raises(TronError, match=r"no worker came within worker_timeout=1 s"):
+        make(tiny(tmp_path, "cluster=address", f'"{address}"'.strip('"'), "worker_timeout=1"))
+
+
+@pytest.mark.usefixtures("variant")
+def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
+    address = ["cluster=address", "cluster.address=tcp://127.0.0.1:9", "cluster.timeout=1"]
+    with pytest.raises(TronError, match=r"cluster does not start: .*127\.0\.0\.1:9") as caught:
+        make(tiny(tmp_path, *address))
+    assert "\n" not in str(caught.value)
+
+
+def test_help_lists_the_keys_of_the_chosen_kind():
+    script = Path(sys.executable).with_name("tron-datagen")
+    page = subprocess.run(
+        [script, "cluster=slurm", "--help"], capture_output=True, text=True, check=True
+    ).stdout
+    for key in ("queue", "account", "walltime", "cores", "memory", "interface", "job_extra_directives"):
+        assert f"cluster.{key}=" in page
+    assert "cluster.dashboard_address" not in page
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("variant")
+def test_a_running_scheduler_makes_the_bytes_of_this_process_and_goes_on_running(tmp_path):
+    assert make(tiny(tmp_path / "here", "cluster=none")) == 0
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
+        Client(cluster) as client,
+    ):
+        (before,) = client.scheduler_info()["workers"]
+        address = ["cluster=address", f"cluster.address={cluster.scheduler_address}"]
+        assert make(tiny(tmp_path / "there", *address, "recycle_after=1")) == 0
+        assert list(client.scheduler_info()["workers"]) == [before], "another's workers are not restarted"
+    assert tree(tmp_path / "here") == tree(tmp_path / "there")
