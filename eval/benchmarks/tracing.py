@@ -19,6 +19,7 @@ from tron.storage import write_atomic
 if TYPE_CHECKING:
     from eval.tracing.camera_rays import CameraRays
     from eval.tracing.contenders import Contenders
+    from eval.tracing.few_rays import FewRays
     from eval.tracing.gradients import GradientStep
     from eval.tracing.irradiance import DirectTimes, Noise
     from eval.tracing.shadow_rays import ShadowRays
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("tron.eval")
 
-Part = Literal["camera", "growth", "shadow", "gradient", "irradiance", "noise", "error", "memory"]
+Part = Literal["camera", "growth", "shadow", "gradient", "irradiance", "noise", "few_rays", "error", "memory"]
 Case = tuple[PositiveInt, PositiveInt]
 
 
@@ -51,6 +52,7 @@ class Measured:
     gradient: list[GradientStep] = dataclasses.field(default_factory=list)
     direct: list[DirectTimes] = dataclasses.field(default_factory=list)
     noise: list[Noise] = dataclasses.field(default_factory=list)
+    few_rays: list[FewRays] = dataclasses.field(default_factory=list)
     error: list[Row] = dataclasses.field(default_factory=list)
     memory: dict[str, float] = dataclasses.field(default_factory=dict)
     hits: tuple[float, float, float] | None = None
@@ -89,6 +91,7 @@ class Tracing(Benchmark):
     gradient: list[Case] = Field(description="(surfels, pixels) of the gradient steps")
     irradiance: Case = Field(description="(surfels, pixels) of the comparison with Mitsuba's direct")
     noise: Case = Field(description="(surfels, pixels) of the error of irradiance")
+    few_rays: Case = Field(description="(surfels, pixels) of irradiance of few rays, filtered and not")
     reference_spp: PositiveInt = Field(default=4096, description="rays a pixel of the reference irradiance")
     error_rays: PositiveInt = Field(default=2000, description="rays held against float64")
     memory_surfels: PositiveInt = Field(default=1_000_000, description="scene whose peak memory is measured")
@@ -231,6 +234,17 @@ class Tracing(Benchmark):
             told = ", ".join(f"{name} {value:.5f}" for name, value in {**found.rmse, **found.blocks}.items())
             log.info("irradiance under %s: %s", light, told)
 
+    def _measure_few_rays(self, measured: Measured) -> None:
+        from eval.tracing.few_rays import few_rays_rows, measure_few_rays
+        from eval.tracing.lights import LIGHTS
+
+        count, size = self.few_rays
+        contenders = self._contenders(count)
+        for light in LIGHTS:
+            measured.few_rays.append(measure_few_rays(contenders, size, light, self.reference_spp, self.seed))
+        for row in few_rays_rows(measured.few_rays):
+            log.info("%s: %.4f", row.metric, row.value)
+
     def _measure_error(self, measured: Measured) -> None:
         from eval.tracing.accuracy import camera_errors, shadow_errors
 
@@ -251,6 +265,7 @@ class Tracing(Benchmark):
 def rows(measured: Measured, settings: Tracing) -> Iterator[Row]:
     """Every figure of a run."""
     from eval.tracing.contenders import spelled
+    from eval.tracing.few_rays import few_rays_rows
     from eval.tracing.irradiance import noise_rows
 
     for frame in measured.camera.values():
@@ -275,6 +290,8 @@ def rows(measured: Measured, settings: Tracing) -> Iterator[Row]:
         yield Row(metric=f"irradiance.seconds_64spp.{case}", value=seconds, unit="s", n=n)
     if measured.noise:
         yield from noise_rows(measured.noise)
+    if measured.few_rays:
+        yield from few_rays_rows(measured.few_rays)
     yield from measured.error
     for stage, value in measured.memory.items():
         metric = f"memory.{stage}_mb.{spelled(settings.memory_surfels)}"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from eval.benchmarks import Outcome
 from eval.report.figures import written
 from eval.report.page import Cell, Section, Table, Text
+from eval.report.tracing_few_rays import few_rays_section
 from eval.report.tracing_light import irradiance_section, noise_section
 from eval.report.tracing_rays import camera_section, family, gradient_section, growth_section, shadow_section
 from eval.results import Row
@@ -47,6 +48,7 @@ def outcome(settings: Tracing, measured: Measured, rows: Sequence[Row], output_d
         *gradient_section(measured),
         *irradiance_section(measured, output_dir),
         *noise_section(settings, measured, output_dir),
+        *few_rays_section(measured, output_dir),
         *_exactness(found),
         *_memory(settings, measured),
     ]

@@ -30,6 +30,7 @@ TOY = {
     "gradient": "[[300,32]]",
     "irradiance": "[300,32]",
     "noise": "[300,32]",
+    "few_rays": "[300,32]",
     "reference_spp": "64",
     "error_rays": "50",
     "memory_surfels": "500",
@@ -60,6 +61,10 @@ ROWS = [
     "irradiance.block_correlation_8x8",
     "irradiance.rmse_64spp.sun",
     "irradiance.rmse_64spp.soft",
+    "irradiance.shadowed_mean_over_reference.sun.2",
+    "irradiance.shadowed_mean_over_reference.soft.8.filtered",
+    "irradiance.few_rays_rmse.sun.4.filtered",
+    "irradiance.shadowed_mean_error",
     "primary.max_error",
     "primary.rays_at_a_threshold",
     "shadow.max_error",
@@ -87,7 +92,17 @@ def test_the_whole_benchmark_runs_and_every_promised_row_is_there(tmp_path: Path
     assert error < 1e-4
     assert len(json.loads((tmp_path / "times.json").read_text())["camera 300_32"]["tron"]) == 1
     page = (tmp_path / "report.html").read_text()
-    for anchor in ("camera", "growth", "shadow", "gradient", "irradiance", "noise", "exactness", "memory"):
+    for anchor in (
+        "camera",
+        "growth",
+        "shadow",
+        "gradient",
+        "irradiance",
+        "noise",
+        "few-rays",
+        "exactness",
+        "memory",
+    ):
         assert f'id="{anchor}"' in page
     assert (tmp_path / "pictures" / "camera.png").stat().st_size > 0
 
@@ -95,7 +110,13 @@ def test_the_whole_benchmark_runs_and_every_promised_row_is_there(tmp_path: Path
 def test_a_part_alone_gives_its_rows_alone(tmp_path: Path):
     settings = {"surfels": [300], "pixels": [32], "growth_surfels": [], "growth_pixels": []}
     benchmark = Tracing(
-        **settings, parts=["error"], gradient=[], irradiance=(300, 32), noise=(300, 32), error_rays=20
+        **settings,
+        parts=["error"],
+        gradient=[],
+        irradiance=(300, 32),
+        noise=(300, 32),
+        few_rays=(300, 32),
+        error_rays=20,
     )
     outcome = benchmark.run(tmp_path)
     assert {row.metric.split(".")[0] for row in outcome.rows} == {"primary", "shadow"}

@@ -1,13 +1,23 @@
-"""Edge-avoiding a-trous filter (Dammertz et al. 2010) for irradiance of few rays, guided by the G-buffer.
+"""Edge-avoiding a-trous filter (Dammertz et al. 2010) for irradiance of few rays, guided by the shadow.
 
-Three passes of the 5 x 5 B-spline kernel, its taps 1, 2 and 4 pixels apart. A tap counts as far as it lies
-on the same surface: its normal agrees and it is near the pixel's plane; after the first pass, which sees
-raw noise, also as far as its visibility is similar. The shadowed and the unshadowed estimate go through the
-same weights: guidance keeps their ratio, which then loses noise but not the shading of curved surfaces
-(Heitz et al. 2018, "Combining Analytic Direct Illumination and Stochastic Shadows").
+The shadowed and the unshadowed estimate go through the same weights and their ratio is kept: it loses
+noise but not the shading of curved surfaces (Heitz et al. 2018, "Combining Analytic Direct Illumination
+and Stochastic Shadows"), and of a neighbourhood's rays it is not biased as it is of a pixel's few.
 
-Measured on 20k surfels at 256 x 256 and 2 rays a pixel, relative RMSE of irradiance: sun 0.32 -> 0.05, studio
-0.37 -> 0.07, overcast 0.31 -> 0.05. At 64 rays it blurs more than it cleans.
+Weights that look at the noise they weigh choose by it, and without any the filter draws light into shadow.
+So they look at a guide: the share of light that arrives by :mod:`tron.shading.few_rays`, itself smoothed
+by three small passes, the last of them guided by what the first two left. Three passes of the filter
+follow, taps 1, 2 and 4 pixels apart, and the farther they reach, the more alike the guide must be.
+
+Measured at 128 x 128 on 20k surfels of a seed that no benchmark uses: mean over reference in shadowed
+pixels, and RMSE over an upward plane's light, before (weights by the noisy visibility itself) and now:
+
+    rays    sun: before     now             soft: before    now
+    2       1.17  0.040     1.04  0.030     1.04  0.035     1.00  0.038
+    4       1.17  0.037     1.04  0.025     1.07  0.028     1.03  0.028
+    8       1.16  0.036     1.03  0.023     1.06  0.025     1.03  0.022
+
+At 64 rays it blurs more than it cleans.
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
@@ -20,90 +30,35 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from tron.color import LUMINANCE
+from tron.shading.neighbours import neighbourhood_mean
 
 if TYPE_CHECKING:
     from tron.tracing import GBuffer
 
-VISIBILITY_STOPS = (0.0, 1.0, 2.0)
-"""One pass each: a tap's weight falls by e when log visibility differs by the inverse of this."""
-NORMAL_POWER = 32
-PLANE_SPACINGS = 1.0
-"""Distance from the pixel's plane, in surfel spacings, at which a tap's weight has fallen by e."""
-DARKEST = 0.05
-"""Visibilities below this count as equally dark."""
+GUIDE_PASSES = ((1, 0.0), (1, 0.0), (2, 4.0))
+"""Step in pixels and stop of each pass that smooths the guide; a stop is over the share of light, 0 to 1."""
+FILTER_PASSES = ((1, 4.0), (2, 8.0), (4, 12.0))
 
 
 def atrous(
-    shadowed: mi.Color3f, unshadowed: mi.Color3f, gbuffer: GBuffer, spacing: float
+    shadowed: mi.Color3f, unshadowed: mi.Color3f, share: mi.Float, gbuffer: GBuffer, spacing: float
 ) -> tuple[mi.Color3f, mi.Color3f]:
     """Filter both estimates of irradiance / pi with common weights; pixels of opacity 0 stay as they are.
 
     Args:
         shadowed, unshadowed: linear, row-major, from the same rays.
+        share: of the light that arrives, in [0, 1], to be smoothed and guide the weights.
         gbuffer: positions, unit normals and opacity of the same pixels.
         spacing: the scene's surfel spacing, world units.
     """
-    for step, stop in enumerate(VISIBILITY_STOPS):
-        shadowed, unshadowed = _pass(
-            shadowed,
-            unshadowed,
-            gbuffer,
-            dr.opaque(mi.Int, 1 << step),
-            dr.opaque(mi.Float, PLANE_SPACINGS * spacing),
-            dr.opaque(mi.Float, stop),
-        )
-        dr.eval(shadowed, unshadowed)
-    return shadowed, unshadowed
-
-
-def _log_visibility(shadowed: mi.Color3f, unshadowed: mi.Color3f) -> mi.Float:
-    grey = mi.Color3f(LUMINANCE)
-    light = dr.maximum(dr.dot(unshadowed, grey), 1e-12)
-    return dr.log(dr.dot(shadowed, grey) / light + DARKEST)
-
-
-@dr.syntax
-def _pass(
-    shadowed: mi.Color3f,
-    unshadowed: mi.Color3f,
-    gbuffer: GBuffer,
-    step: mi.Int,
-    plane: mi.Float,
-    stop: mi.Float,
-) -> tuple[mi.Color3f, mi.Color3f]:
-    width, height = dr.opaque(mi.Int, gbuffer.width), dr.opaque(mi.Int, gbuffer.height)
-    position, normal, surface = gbuffer.position, gbuffer.normal, gbuffer.opacity > 0
-    lane = mi.Int(dr.arange(mi.UInt32, gbuffer.width * gbuffer.height))
-    x, y = lane % width, lane // width
-    own = _log_visibility(shadowed, unshadowed)
-
-    def at(value: mi.Color3f, index: mi.UInt32, inside: mi.Bool) -> mi.Color3f:
-        return type(value)(*[dr.gather(mi.Float, channel, index, inside) for channel in value])
-
-    def spline(offset: mi.Int) -> mi.Float:
-        return dr.select(offset == 0, 6.0, dr.select(dr.abs(offset) == 1, 4.0, 1.0))
-
-    sum_shadowed, sum_unshadowed, weight = mi.Color3f(0), mi.Color3f(0), mi.Float(0)
-    tap = mi.Int(0)
-    while tap < 25:
-        dx, dy = tap % 5 - 2, tap // 5 - 2
-        tap_x, tap_y = x + dx * step, y + dy * step
-        inside = surface & (tap_x >= 0) & (tap_x < width) & (tap_y >= 0) & (tap_y < height)
-        index = mi.UInt32(tap_y * width + tap_x)
-        inside &= dr.gather(mi.Bool, surface, index, inside)
-        tap_shadowed, tap_unshadowed = at(shadowed, index, inside), at(unshadowed, index, inside)
-        agreement = dr.maximum(dr.dot(normal, at(normal, index, inside)), 0)
-        off_plane = dr.dot(normal, at(position, index, inside) - position) / plane
-        unlike = stop * dr.abs(_log_visibility(tap_shadowed, tap_unshadowed) - own)
-        w = spline(dx) * spline(dy) * agreement**NORMAL_POWER * dr.exp(-off_plane * off_plane - unlike)
-        w = dr.select(inside, w, 0)
-        sum_shadowed += w * tap_shadowed
-        sum_unshadowed += w * tap_unshadowed
-        weight += w
-        tap += 1
-    scale = dr.select(weight > 0, dr.rcp(weight), 0)
-    return (
-        dr.select(weight > 0, sum_shadowed * scale, shadowed),
-        dr.select(weight > 0, sum_unshadowed * scale, unshadowed),
-    )
+    dr.eval(share)
+    for step, stop in GUIDE_PASSES:
+        (smooth,), found = neighbourhood_mean([share], gbuffer, spacing, step=step, guide=share, stop=stop)
+        share = dr.select(found, smooth, share)
+        dr.eval(share)
+    values = [*shadowed, *unshadowed]
+    for step, stop in FILTER_PASSES:
+        means, found = neighbourhood_mean(values, gbuffer, spacing, step=step, guide=share, stop=stop)
+        values = [dr.select(found, mean, value) for mean, value in zip(means, values, strict=True)]
+        dr.eval(values)
+    return mi.Color3f(*values[:3]), mi.Color3f(*values[3:])
