@@ -43,7 +43,6 @@ BAD_FILES = [
     ("tron-relight", ["checkpoint={inputs}/text.safetensors"], ["text.safe"]),
     ("tron-relight", ["vae={inputs}/absent.pth"], ["absent.pth"]),
     ("tron-relight", ["cameras={inputs}/absent.json"], ["absent.json"]),
-    ("tron-reconstruct", ["capture={inputs}/walk.mp4"], ["a video", "ffmpeg", "capture=DIR"]),
     ("tron-train", ["dataset={inputs}/absent"], ["absent"]),
     ("tron-train", ["dataset={inputs}/empty"], ["empty"]),
     ("tron-train", ["dataset={inputs}/text.ply"], ["text.ply"]),

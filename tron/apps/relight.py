@@ -26,7 +26,7 @@ from tron.apps.relight_settings import QUALITY, Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
 from tron.errors import TronError
-from tron.foreign_files import refuse_foreign
+from tron.gaussians.foreign_files import refuse_foreign
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
 from tron.runtime import activate, describe_machine, set_torch_threads

@@ -12,7 +12,6 @@ from tron.captures.assembly import assemble
 from tron.captures.capture import Capture
 from tron.captures.settings import Format, LoadSettings
 from tron.errors import TronError
-from tron.foreign_files import refuse_foreign
 
 
 def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = None) -> Capture:
@@ -40,7 +39,6 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
     settings = settings or LoadSettings()
     if not path.exists():
         raise TronError("capture not found", path)
-    refuse_foreign(path)
     kind = _detected(path) if settings.format == "auto" else settings.format
     if kind == "tron":
         return _path_traced(path, settings)

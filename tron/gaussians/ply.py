@@ -24,7 +24,7 @@ import plyfile
 
 from tron.color import srgb_to_linear
 from tron.errors import TronError
-from tron.foreign_files import packed_splats, refuse_foreign
+from tron.gaussians.foreign_files import packed_splats, refuse_foreign
 from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
 from tron.gaussians.scene import GaussianScene, measure_spacing
 from tron.storage import atomic_path

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
+from mimetypes import guess_type
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,6 @@ from scipy import sparse
 from tron.aligned import aligned
 from tron.color import luminance
 from tron.errors import TronError
-from tron.foreign_files import VIDEOS
 from tron.images import read_image, write_image
 
 PDF_WIDTH = 512
@@ -71,7 +71,8 @@ class EnvironmentMap:
         """
         path = Path(path)
         if path.suffix.lower() not in (".hdr", ".exr"):
-            kind = "a video" if path.suffix.lower() in VIDEOS else path.suffix or "a file without suffix"
+            is_video = (guess_type(path.name)[0] or "").startswith("video/")
+            kind = "a video" if is_video else path.suffix or "a file without suffix"
             raise TronError(
                 f"{kind} cannot hold an environment map",
                 where=str(path),
