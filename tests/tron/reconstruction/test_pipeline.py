@@ -228,6 +228,21 @@ def test_bad_captures_are_refused_before_work(painted_capture: Capture) -> None:
         reconstruct(Capture(views), GroundTruth(), settings())
 
 
+@pytest.mark.parametrize(
+    ("source", "words"), [("points", "no points"), ("depth", "no training view has a depth")]
+)
+def test_a_source_that_is_not_there_is_told_before_a_prior_works(
+    painted_capture: Capture, source, words: str
+) -> None:
+    class Asked(GroundTruth):
+        def prepare(self, request):
+            raise AssertionError("the prior was asked first")
+
+    wanted = settings(initial=InitialSettings(source=source))
+    with pytest.raises(TronError, match=words):
+        reconstruct(without(painted_capture, "depth"), Asked(), wanted)
+
+
 def test_a_steps_scaler_shortens_both_stages(painted_capture: Capture) -> None:
     watch = CutAt()
     reconstruct(painted_capture, GroundTruth(), settings(steps_scaler=0.5), watch=watch)
