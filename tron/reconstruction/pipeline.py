@@ -89,8 +89,10 @@ def reconstruct(
         )
     run = _Run(settings, made_with(capture, prior, settings), checkpoint, device, watch)
     extent = extent_of(views)
-    source_of(capture, settings.initial)  # a source that is not there is told before a prior works for hours
-    radiance = settings.radiance.scaled(settings.steps_scaler)
+    source = source_of(
+        capture, settings.initial
+    )  # one that is not there is told before a prior works for hours
+    radiance = settings.radiance.scaled(settings.steps_scaler, placed=source == "depth")
     wanted = [] if radiance.normal == 0 else ["normal"]
     taught = apply_prior(capture, prior, fields=wanted, track=track) if wanted else capture
     plan = radiance_plan(radiance, extent, settings.seed)

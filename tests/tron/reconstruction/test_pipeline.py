@@ -249,6 +249,25 @@ def test_a_steps_scaler_shortens_both_stages(painted_capture: Capture) -> None:
     assert [sum(name == stage for name, _ in watch.steps) for stage in ("radiance", "materials")] == [7, 3]
 
 
+@pytest.mark.parametrize(("source", "faster"), [("random", 2.0), ("depth", 1.0)])
+def test_surfels_that_have_a_way_to_go_take_longer_steps_when_there_are_few(
+    painted_capture: Capture, source, faster: float
+) -> None:
+    rates: dict[float, dict[str, float]] = {}
+    for scaler in (1.0, 0.25):
+
+        def watch(_: Progress, stage: Stage, scaler: float = scaler) -> None:
+            rates.setdefault(scaler, stage.plan.rates)
+
+        initial = InitialSettings(source=source, count=100)
+        reconstruct(
+            painted_capture, GroundTruth(), settings(initial=initial, steps_scaler=scaler), watch=watch
+        )
+    for name in ("means", "quats"):
+        assert rates[0.25][name] == pytest.approx(faster * rates[1.0][name]), name
+    assert rates[0.25]["log_scales"] == rates[1.0]["log_scales"]
+
+
 def test_surfels_never_outnumber_the_cap(painted_capture: Capture) -> None:
     counts: list[int] = []
     many = settings(initial=InitialSettings(source="random", count=600))

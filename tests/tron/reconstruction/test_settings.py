@@ -83,6 +83,8 @@ def test_scaling_changes_step_numbers_and_the_rates_of_places(factor: float) -> 
         if name in RATES_OF_PLACES:
             continue
         assert after[name] == (round(value * factor) if name in STEP_NUMBERS else value), name
+    one, other = MaterialSettings(), MaterialSettings().scaled(factor)
+    assert other == one.model_copy(update={"steps": round(one.steps * factor)})
 
 
 @pytest.mark.parametrize("factor", [0.01, 0.1, 2.0])
@@ -93,8 +95,14 @@ def test_a_surfel_wanders_as_far_in_a_scaled_schedule(factor: float) -> None:
         reach = [getattr(each, name) * each.steps**0.5 for each in (before, after)]
         assert reach[1] == pytest.approx(reach[0], rel=1e-12), name
     assert RadianceSettings().scaled(1.0) == RadianceSettings()
-    one, other = MaterialSettings(), MaterialSettings().scaled(factor)
-    assert other == one.model_copy(update={"steps": round(one.steps * factor)})
+
+
+def test_surfels_that_begin_in_place_keep_their_rates() -> None:
+    before, after = RadianceSettings(), RadianceSettings().scaled(0.1, placed=True)
+    assert {name: getattr(after, name) for name in RATES_OF_PLACES} == {
+        name: getattr(before, name) for name in RATES_OF_PLACES
+    }
+    assert after.steps == RadianceSettings().scaled(0.1).steps
 
 
 def test_a_scaled_step_number_stays_one_and_one_that_was_off_stays_off() -> None:
