@@ -1,5 +1,6 @@
 """Every shipped recipe composes, holds only keys its command knows, and names classes that exist."""
 
+import inspect
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -64,6 +65,21 @@ def test_a_class_that_a_recipe_names_exists(folder: str, overrides: list[str]):
     for key, value in nested_items(values):
         if key.rpartition(".")[2] == "_target_":
             assert callable(get_object(value)), f"{key}={value}"
+
+
+@pytest.mark.parametrize(("folder", "overrides"), shipped_recipes())
+def test_every_seed_follows_the_seed_of_the_run(folder: str, overrides: list[str]):
+    """Seeds of parts are the run's unless they are set, and no class that takes one is left without."""
+    recipe = compose_recipe(
+        load_command(folder).config_module, [*with_required_values(load_command(folder), overrides), "seed=7"]
+    )
+    values = dict(nested_items(resolve(recipe)))
+    seeds = {key: value for key, value in values.items() if key.rpartition(".")[2] == "seed"}
+    for key, value in values.items():
+        if key.rpartition(".")[2] == "_target_" and "seed" in inspect.signature(get_object(value)).parameters:
+            parent = key.removesuffix("_target_")
+            seeds[f"{parent}seed"] = values.get(f"{parent}seed")
+    assert seeds == dict.fromkeys(seeds, 7)
 
 
 @pytest.mark.parametrize("folder", sorted(COMMANDS))

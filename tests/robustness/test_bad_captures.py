@@ -226,6 +226,71 @@ def test_nothing_there(tmp_path: Path) -> None:
     assert "transforms.json" in refusal(tmp_path / "notes.txt")
 
 
+FOREIGN = {
+    "biker.splat": ("splats", "tron-relight scene="),
+    "biker.spz": ("splats", "tron-relight scene="),
+    "biker.ply": ("splats or points", "tron-relight scene="),
+    "walk.MP4": ("a video", "ffmpeg"),
+    "walk.mov": ("a video", "matching=sequential"),
+    "photos.zip": ("an archive", "unpack"),
+    "venice.hdr": ("environment map", "tron-relight environment="),
+    "cameras.bin": ("COLMAP", "sparse/0"),
+    "a.jpg": ("one photo", "folder"),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_a_file_that_is_no_capture_is_called_what_it_is(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"\x1f\x8b" + bytes(64))
+    what, mend = FOREIGN[name]
+    for settings in (LoadSettings(), LoadSettings(format="photos")):
+        line = refusal(tmp_path / name, settings)
+        assert name in line
+        assert what in line
+        assert mend in line
+
+
+@pytest.mark.parametrize("inner", ["walk.mp4", "images/walk.mp4", "biker.spz", "images/a.HEIC"])
+def test_a_folder_without_photos_says_what_lies_in_it(tmp_path: Path, inner: str) -> None:
+    (tmp_path / inner).parent.mkdir(exist_ok=True)
+    (tmp_path / "notes.txt").write_text("x")
+    (tmp_path / inner).write_bytes(bytes(64))
+    line = refusal(tmp_path)
+    assert "neither poses nor photos" in line
+    assert inner in line
+
+
+@pytest.mark.parametrize("kind", ["auto", "transforms"])
+def test_nerfstudios_camera_path_is_called_what_it_is(tmp_path: Path, kind) -> None:
+    content = {"camera_type": "perspective", "render_height": 1080, "keyframes": [], "fps": 24, "seconds": 4,
+               "camera_path": [{"camera_to_world": pose(0).ravel().tolist(), "fov": 50}]}  # fmt: skip
+    path = tmp_path / "camera_path.json"
+    path.write_text(json.dumps(content))
+    line = refusal(path, LoadSettings(format=kind))
+    assert "camera path" in line
+    assert "transforms.json" in line
+
+
+def test_photos_that_max_side_reduces_are_told_in_one_line(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    Image.fromarray(pixels(48, 64)).save(folder / "images" / "2.png")
+    load_capture(folder, LoadSettings(max_side=32))
+    [record] = caplog.records
+    assert record.levelname == "WARNING"
+    assert record.getMessage().endswith(
+        "max_side=32 reduces 1 of 6 photos, 64 x 48 to 32 x 24; max_side=null keeps their size"
+    )
+
+
+@pytest.mark.parametrize("settings", [LoadSettings(max_side=64), LoadSettings(), LoadSettings(downscale=2)])
+def test_nothing_is_told_of_sizes_that_are_kept_or_asked_for(
+    folder: Path, settings: LoadSettings, caplog: pytest.LogCaptureFixture
+) -> None:
+    load_capture(folder, settings)
+    assert not caplog.records
+
+
 @pytest.mark.parametrize("kind", ["transforms", "colmap", "tensoir", "photos"])
 def test_a_format_that_the_folder_does_not_have(tmp_path: Path, kind) -> None:
     (tmp_path / "notes.txt").write_text("x")

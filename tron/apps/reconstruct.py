@@ -101,15 +101,16 @@ def main(settings: Settings) -> None:
     """
     prior = _make_prior(settings)
     lpips = _load_lpips(settings)
+    require_free_space(settings.output_dir, settings.radiance.density.most * SURFEL_BYTES)
+    activate(settings.variant, settings.threads)
+    # Photos without poses take minutes to load: whatever can be refused without them is refused by now.
     capture = load_capture(settings.capture, _load_settings(settings))
     log.info(
         "%d views, %d of them held out, %d x %d, %d skipped",
         len(capture.views), len(capture.test), capture.views[0].camera.width,
         capture.views[0].camera.height, len(capture.skipped),
     )  # fmt: skip
-    require_free_space(settings.output_dir, settings.radiance.density.most * SURFEL_BYTES)
     prior.fields(capture)  # what cannot be had is said before long work
-    activate(settings.variant, settings.threads)
     # Dr.Jit has the cores; the loss is small, and torch's threads would wait for theirs.
     set_torch_threads(1)
     with locked(settings.output_dir):

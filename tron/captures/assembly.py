@@ -86,17 +86,19 @@ def assemble(posed: PosedPhotos, settings: LoadSettings) -> Capture:
     splits: dict[str, str | None] = {}
     claimed: set[str | Path] = set()
     lost_maps: list[str] = []
+    reduced: list[tuple[tuple[int, int], tuple[int, int]]] = []
     names = posed.names or view_names([photo.name for photo in posed.photos])
     for name, photo in zip(names, posed.photos):
         try:
             if name in claimed or photo.path in claimed:
                 raise TronError("named more than once")
             claimed |= {name} if photo.path is None else {name, photo.path}
-            views[name] = _view(name, photo, posed.upright, settings, cache, lost_maps)
+            views[name] = _view(name, photo, posed.upright, settings, cache, lost_maps, reduced)
             splits[name] = photo.split
         except TronError as error:
             skipped[_free(name, skipped, views)] = error.what + (f": {error.mend}" if error.mend else "")
     _report(posed, skipped, len(views), lost_maps)
+    _tell_reduced(posed.source, len(views), reduced, settings)
     ordered = tuple(views[name] for name in sorted(views))
     up = (
         estimate_up([view.camera for view in ordered])
@@ -121,6 +123,7 @@ def _view(
     settings: LoadSettings,
     cache: PhotoCache,
     lost_maps: list[str],
+    reduced: list[tuple[tuple[int, int], tuple[int, int]]],
 ) -> View:
     if photo.refused:
         raise TronError(photo.refused)
@@ -149,6 +152,8 @@ def _view(
             lost_maps.append(f"{field_name} of {name} ({error.what})")
     if header.alpha:
         maps["mask"] = photo_reader.alpha
+    if size != (width, height):
+        reduced.append(((width, height), size))
     return View(name, camera, photo_reader.color, "display", **maps)
 
 
@@ -227,3 +232,16 @@ def _report(posed: PosedPhotos, skipped: Mapping[str, str], usable: int, lost_ma
         log.warning("%s: %d of %d photos skipped: %s%s", posed.source, len(skipped), total, shown, rest)
     if lost_maps:
         log.warning("%s: %d maps left out, first %s", posed.source, len(lost_maps), lost_maps[0])
+
+
+def _tell_reduced(
+    source: Path, count: int, reduced: list[tuple[tuple[int, int], tuple[int, int]]], settings: LoadSettings
+) -> None:
+    """Say what ``max_side`` cost; ``downscale`` is asked for, so that it needs no line."""
+    if settings.max_side is None or not reduced:
+        return
+    (width, height), (small_width, small_height) = max(reduced)
+    log.warning(
+        "%s: max_side=%d reduces %d of %d photos, %d x %d to %d x %d; max_side=null keeps their size",
+        source, settings.max_side, len(reduced), count, width, height, small_width, small_height,
+    )  # fmt: skip

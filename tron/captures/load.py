@@ -10,6 +10,7 @@ import numpy as np
 
 from tron.captures.assembly import assemble
 from tron.captures.capture import Capture
+from tron.captures.not_a_capture import refusal
 from tron.captures.settings import Format, LoadSettings
 from tron.errors import TronError
 
@@ -39,6 +40,8 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
     settings = settings or LoadSettings()
     if not path.exists():
         raise TronError("capture not found", path)
+    if path.is_file() and path.suffix.lower() != ".json":
+        raise refusal(path)
     kind = _detected(path) if settings.format == "auto" else settings.format
     if kind == "tron":
         return _path_traced(path, settings)
@@ -83,8 +86,6 @@ def _detected(path: Path) -> Format:
 
     poses = path / "transforms.json" if path.is_dir() else path
     if poses.is_file():
-        if poses.suffix.lower() != ".json":
-            raise TronError("a capture is a folder or a transforms.json", path)
         return "tron" if "tron" in read_json(poses) else "transforms"
     if (path / "transforms_train.json").is_file():
         return "transforms"
@@ -94,11 +95,7 @@ def _detected(path: Path) -> Format:
         return "tensoir"
     if photos_in(path / "images") or photos_in(path):
         return "photos"
-    raise TronError(
-        "neither poses nor photos",
-        path,
-        "a capture has transforms.json, sparse/0, TensoIR's view folders, or photos",
-    )
+    raise refusal(path)
 
 
 def _photo_folder(path: Path, images: str | Path | None) -> Path:

@@ -29,6 +29,7 @@ from tron.cameras import opengl_to_opencv
 from tron.captures.assembly import PosedPhoto, PosedPhotos, rigid_pose
 from tron.captures.distortion import Lens, opencv_lens
 from tron.captures.image_folder import ImageFolder, relative_parts
+from tron.captures.not_a_capture import require_poses_of_photos
 from tron.errors import TronError
 
 log = logging.getLogger(__name__)
@@ -63,6 +64,7 @@ def read_transforms(path: Path, images: str | Path | None = None) -> PosedPhotos
     for file, split in files:
         meta = read_json(file)
         transform = _to_original(meta, file)
+        require_poses_of_photos(meta, file)
         frames = meta.get("frames")
         if not isinstance(frames, list) or not frames:
             raise TronError("JSON holds no list of frames", file, "is this a transforms.json?")

@@ -54,7 +54,7 @@ class Precomputed:
             refused, since they may as well be cropped.
 
     Raises:
-        TronError: an option that there is not.
+        TronError: an option that there is not, or no such folder.
     """
 
     folder: str
@@ -74,6 +74,7 @@ class Precomputed:
             raise TronError(f"match is {self.match!r}", mend="use name or order")
         if not (np.isfinite(self.irradiance_scale) and self.irradiance_scale > 0):
             raise TronError(f"irradiance_scale is {self.irradiance_scale}", mend="give a positive number")
+        find_maps(Path(self.folder))  # a folder that is not there is told before photos are posed
 
     @property
     def needs_geometry(self) -> frozenset[str]:
@@ -93,7 +94,7 @@ class Precomputed:
         """The fields that any training view has a file of, and for how many.
 
         Raises:
-            TronError: the folder is missing, or holds no map of any training view.
+            TronError: the folder holds no map of any training view.
         """
         matched = self._matched(capture)
         train = [matched[view.name] for view in capture.train_views]

@@ -61,7 +61,7 @@ class RgbX:
         longest_side: photos are brought to this many pixels along their longer side, as the authors do.
 
     Raises:
-        TronError: an option out of its range.
+        TronError: an option out of its range, no checkpoint, or one that lacks a part.
     """
 
     checkpoint: str | None = None
@@ -79,6 +79,7 @@ class RgbX:
             raise TronError(f"longest_side is {self.longest_side}", mend=f"give at least {_MULTIPLE}")
         if self.dtype not in get_args(Dtype):
             raise TronError(f"dtype is {self.dtype!r}", mend=f"use {', '.join(get_args(Dtype))}")
+        check_checkpoint(self.checkpoint)  # told before photos are posed
 
     @property
     def needs_geometry(self) -> frozenset[str]:
@@ -86,12 +87,7 @@ class RgbX:
         return frozenset()
 
     def fields(self, capture: Capture) -> Mapping[str, str]:  # noqa: ARG002 (the protocol's)
-        """All but a sky mask; the checkpoint's files are looked for, not loaded.
-
-        Raises:
-            TronError: no checkpoint, or one that lacks a part.
-        """
-        check_checkpoint(self.checkpoint)
+        """All but a sky mask; nothing is loaded."""
         how = dict.fromkeys(PROMPTS, f"RGB->X, {self.steps} steps")
         how["irradiance"] += ", at most 1 and of unknown scale"
         return how

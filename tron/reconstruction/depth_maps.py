@@ -6,7 +6,6 @@ import numpy as np
 
 from tron.captures import Capture, View
 from tron.color import srgb_to_linear
-from tron.errors import TronError
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.gaussians.scene import GaussianScene
 from tron.reconstruction.settings import InitialSettings
@@ -26,11 +25,9 @@ def surfels_from_depth(capture: Capture, settings: InitialSettings, seed: int) -
     own, else the picture's, decoded from sRGB.
 
     Raises:
-        TronError: no training view has a depth map, or none holds a surface.
+        TronError: no depth map holds a surface.
     """
     views = [view for view in capture.train_views if view.has("depth")]
-    if not views:
-        raise TronError("no training view has a depth map", mend="start from points or random points")
     per_view = max(settings.count * _PIXELS_PER_SURFEL // len(views), 64)
     samples = [_gbuffer(view, per_view, seed) for view in views]
     return surfels_from_gbuffers(

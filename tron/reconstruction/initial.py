@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from scipy.special import logit
@@ -19,6 +20,8 @@ from tron.gaussians.scene import (
 )
 from tron.reconstruction.settings import InitialSettings
 from tron.seeds import generator
+
+Source = Literal["points", "depth", "random"]
 
 _EXTENT_MARGIN = 1.1
 _SAME_PLACE = 1e-9  # rounding moves cameras that turn on the spot by about 1e-16
@@ -40,6 +43,22 @@ def extent_of(views: Sequence[View]) -> float:
     return extent
 
 
+def source_of(capture: Capture, settings: InitialSettings) -> Source:
+    """Where the first surfels of a capture come from.
+
+    Raises:
+        TronError: the source asked for is not there.
+    """
+    has_depth = any(view.has("depth") for view in capture.train_views)
+    if settings.source == "auto":
+        return "points" if capture.points is not None else "depth" if has_depth else "random"
+    if settings.source == "points" and capture.points is None:
+        raise TronError("the capture has no points", mend="start from depth maps or random points")
+    if settings.source == "depth" and not has_depth:
+        raise TronError("no training view has a depth map", mend="start from points or random points")
+    return settings.source
+
+
 def initial_surfels(
     capture: Capture, settings: InitialSettings, seed: int, most: int | None = None
 ) -> GaussianScene:
@@ -52,13 +71,8 @@ def initial_surfels(
     Raises:
         TronError: the source asked for is not there.
     """
-    source = settings.source
-    if source == "auto":
-        has_depth = any(view.has("depth") for view in capture.train_views)
-        source = "points" if capture.points is not None else "depth" if has_depth else "random"
+    source = source_of(capture, settings)
     if source == "points":
-        if capture.points is None:
-            raise TronError("the capture has no points", mend="start from depth maps or random points")
         points, colors = capture.points, capture.point_colors
         if most is not None and len(points) > most:
             draw = generator(seed, "reconstruction", "points")

@@ -23,7 +23,7 @@ from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
 from tron.priors import Prior, apply_prior
 from tron.reconstruction.checkpoint import Checkpoint, save_checkpoint
-from tron.reconstruction.initial import extent_of, initial_surfels
+from tron.reconstruction.initial import extent_of, initial_surfels, source_of
 from tron.reconstruction.settings import ReconstructionSettings
 from tron.reconstruction.supervision import MATERIALS
 from tron.reconstruction.surfels import LearntSurfels
@@ -88,10 +88,13 @@ def reconstruct(
             "surfels are learnt from display values and an image is linear", f"view {linear[0]}", "develop it"
         )
     run = _Run(settings, made_with(capture, prior, settings), checkpoint, device, watch)
-    radiance = settings.radiance.scaled(settings.steps_scaler)
+    extent = extent_of(views)
+    source = source_of(
+        capture, settings.initial
+    )  # one that is not there is told before a prior works for hours
+    radiance = settings.radiance.scaled(settings.steps_scaler, placed=source == "depth")
     wanted = [] if radiance.normal == 0 else ["normal"]
     taught = apply_prior(capture, prior, fields=wanted, track=track) if wanted else capture
-    extent = extent_of(views)
     plan = radiance_plan(radiance, extent, settings.seed)
     most = radiance.density.most
     surfels = run.stage(

@@ -183,6 +183,6 @@ def test_wrong_options_are_refused(tmp_path: Path, change: dict) -> None:
 
 def test_a_missing_or_empty_folder_is_refused(tmp_path: Path, plain) -> None:
     with pytest.raises(TronError, match="folder of prior maps not found"):
-        apply_prior(plain(), Precomputed(str(tmp_path / "none")))
+        Precomputed(str(tmp_path / "none"))  # at once: photos may take minutes to load
     with pytest.raises(TronError, match="no maps for 2 views such as frame_0"):
         apply_prior(plain(), Precomputed(str(tmp_path)))

@@ -10,7 +10,6 @@ import pytest
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.color import srgb_to_linear
-from tron.errors import TronError
 from tron.gaussians.harmonics import SH_C0
 from tron.reconstruction.depth_maps import normals_of_depth, surfels_from_depth
 from tron.reconstruction.settings import InitialSettings
@@ -151,9 +150,3 @@ def test_surfels_from_depth_repeat_by_seed() -> None:
     one, again, other = (surfels_from_depth(capture, InitialSettings(count=40), seed=s) for s in (0, 0, 1))
     np.testing.assert_array_equal(one.means, again.means)
     assert one.means.shape != other.means.shape or (one.means != other.means).any()
-
-
-def test_a_capture_without_depth_says_so() -> None:
-    without = tuple(replace(view, depth=None) for view in views(16))
-    with pytest.raises(TronError, match="no training view has a depth map"):
-        surfels_from_depth(Capture(without), InitialSettings(), 0)

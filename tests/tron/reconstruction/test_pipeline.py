@@ -228,10 +228,44 @@ def test_bad_captures_are_refused_before_work(painted_capture: Capture) -> None:
         reconstruct(Capture(views), GroundTruth(), settings())
 
 
+@pytest.mark.parametrize(
+    ("source", "words"), [("points", "no points"), ("depth", "no training view has a depth")]
+)
+def test_a_source_that_is_not_there_is_told_before_a_prior_works(
+    painted_capture: Capture, source, words: str
+) -> None:
+    class Asked(GroundTruth):
+        def prepare(self, request):
+            raise AssertionError("the prior was asked first")
+
+    wanted = settings(initial=InitialSettings(source=source))
+    with pytest.raises(TronError, match=words):
+        reconstruct(without(painted_capture, "depth"), Asked(), wanted)
+
+
 def test_a_steps_scaler_shortens_both_stages(painted_capture: Capture) -> None:
     watch = CutAt()
     reconstruct(painted_capture, GroundTruth(), settings(steps_scaler=0.5), watch=watch)
     assert [sum(name == stage for name, _ in watch.steps) for stage in ("radiance", "materials")] == [7, 3]
+
+
+@pytest.mark.parametrize(("source", "faster"), [("random", 2.0), ("depth", 1.0)])
+def test_surfels_that_have_a_way_to_go_take_longer_steps_when_there_are_few(
+    painted_capture: Capture, source, faster: float
+) -> None:
+    rates: dict[float, dict[str, float]] = {}
+    for scaler in (1.0, 0.25):
+
+        def watch(_: Progress, stage: Stage, scaler: float = scaler) -> None:
+            rates.setdefault(scaler, stage.plan.rates)
+
+        initial = InitialSettings(source=source, count=100)
+        reconstruct(
+            painted_capture, GroundTruth(), settings(initial=initial, steps_scaler=scaler), watch=watch
+        )
+    for name in ("means", "quats"):
+        assert rates[0.25][name] == pytest.approx(faster * rates[1.0][name]), name
+    assert rates[0.25]["log_scales"] == rates[1.0]["log_scales"]
 
 
 def test_surfels_never_outnumber_the_cap(painted_capture: Capture) -> None:

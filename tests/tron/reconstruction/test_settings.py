@@ -1,14 +1,13 @@
-"""The defaults are the paper's, wherever they are written; scaling a schedule changes step numbers alone."""
+"""The defaults are the paper's, wherever they are written; a scaled schedule reaches as far in its steps."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import pytest
-from omegaconf import OmegaConf
 from pydantic import ValidationError
 
-from tron.apps.recipes import compose_recipe
+from tron.apps.recipes import compose_recipe, resolve
 from tron.reconstruction.settings import (
     DensitySettings,
     FitSettings,
@@ -18,11 +17,13 @@ from tron.reconstruction.settings import (
     ReconstructionSettings,
 )
 
+PATHS = ["capture=in", "output_dir=out"]
 STEP_NUMBERS = {
     "steps",
     "sh_every",
     *("density.start", "density.end", "density.every", "density.prune_every", "density.reset_every"),
 }
+RATES_OF_PLACES = {"position_rate", "position_rate_final", "rotation_rate"}
 
 
 def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -50,7 +51,7 @@ def test_the_defaults_are_those_of_the_facts() -> None:
 
 
 def test_the_papers_experiment_is_the_defaults() -> None:
-    recipe: Any = OmegaConf.to_container(compose_recipe("conf.reconstruct", ["experiment=paper"]))
+    recipe: Any = resolve(compose_recipe("conf.reconstruct", ["experiment=paper", *PATHS]))
     defaults = ReconstructionSettings().model_dump(mode="json")
     for name in ("initial", "radiance", "materials", "steps_scaler", "checkpoint_every", "seed"):
         assert recipe[name] == defaults[name], name
@@ -59,7 +60,7 @@ def test_the_papers_experiment_is_the_defaults() -> None:
 
 
 def test_the_commands_own_numbers_are_the_papers_but_for_those_that_are_named() -> None:
-    recipe: Any = OmegaConf.to_container(compose_recipe("conf.reconstruct", []))
+    recipe: Any = resolve(compose_recipe("conf.reconstruct", PATHS))
     own, paper = (
         flat({name: values[name] for name in ("radiance", "materials")})
         for values in (recipe, ReconstructionSettings().model_dump(mode="json"))
@@ -75,13 +76,33 @@ def test_the_commands_own_numbers_are_the_papers_but_for_those_that_are_named() 
 
 
 @pytest.mark.parametrize("factor", [0.1, 0.5, 2.0])
-def test_scaling_changes_step_numbers_and_nothing_else(factor: float) -> None:
+def test_scaling_changes_step_numbers_and_the_rates_of_places(factor: float) -> None:
     before, after = (flat(s.model_dump()) for s in (RadianceSettings(), RadianceSettings().scaled(factor)))
     assert before.keys() == after.keys()
     for name, value in before.items():
+        if name in RATES_OF_PLACES:
+            continue
         assert after[name] == (round(value * factor) if name in STEP_NUMBERS else value), name
     one, other = MaterialSettings(), MaterialSettings().scaled(factor)
     assert other == one.model_copy(update={"steps": round(one.steps * factor)})
+
+
+@pytest.mark.parametrize("factor", [0.01, 0.1, 2.0])
+def test_a_surfel_wanders_as_far_in_a_scaled_schedule(factor: float) -> None:
+    """n steps of one length and random direction reach length x sqrt(n); the paper's own schedule stays."""
+    before, after = RadianceSettings(), RadianceSettings().scaled(factor)
+    for name in RATES_OF_PLACES:
+        reach = [getattr(each, name) * each.steps**0.5 for each in (before, after)]
+        assert reach[1] == pytest.approx(reach[0], rel=1e-12), name
+    assert RadianceSettings().scaled(1.0) == RadianceSettings()
+
+
+def test_surfels_that_begin_in_place_keep_their_rates() -> None:
+    before, after = RadianceSettings(), RadianceSettings().scaled(0.1, placed=True)
+    assert {name: getattr(after, name) for name in RATES_OF_PLACES} == {
+        name: getattr(before, name) for name in RATES_OF_PLACES
+    }
+    assert after.steps == RadianceSettings().scaled(0.1).steps
 
 
 def test_a_scaled_step_number_stays_one_and_one_that_was_off_stays_off() -> None:
