@@ -1,10 +1,10 @@
 """Screen tiles: which surfels can touch which 4x4 block of pixels, nearest first.
 
 A tile's 16 pixels fill one 16-lane packet, so every lane of a packet walks the same list. A surfel is a
-candidate for a tile where the exact screen-space bounds of its (cut) ellipse overlap the tile's pixel
-centres; of one that crosses the camera's plane, the bounds of the part in front. Lists are sorted by
-``near = |c - o| - r``, a lower bound of the distance to any point of the surfel, which lets traversal stop
-early without being wrong.
+candidate for a tile where the exact screen-space bounds of its (cut) ellipse, across, down and along both
+diagonals, overlap the tile's pixel centres; of one that crosses the camera's plane, the bounds of the part in
+front. Lists are sorted by ``near = |c - o| - r``, a lower bound of the distance to any point of the surfel,
+which lets traversal stop early without being wrong.
 
 Surfels are ordered by ``near`` first and written out tile by tile, so one stable sort by tile orders both.
 All of it runs in Dr.Jit; only the number of entries comes back to Python, because arrays need a size.
@@ -77,12 +77,21 @@ def lanes_of_pixels(width: int, height: int) -> mi.UInt32:
 
 
 @dataclass
-class _Axis:
-    """One image axis: focal length, principal point and size, in pixels; opaque."""
+class _Touched:
+    """Tiles that each surfel's bounds touch, one lane a surfel.
 
-    focal: mi.Float
-    principal: mi.Float
-    pixels: mi.Float
+    Attributes:
+        first_x, across, first_y: first tile, number of tiles across, first tile down. count: of them all.
+        diagonals: mi.Float, four a surfel: lowest and highest pixel x + y, lowest and highest x - y.
+        near: lower bound of distance.
+    """
+
+    first_x: mi.UInt32
+    across: mi.UInt32
+    first_y: mi.UInt32
+    count: mi.UInt32
+    diagonals: mi.Float
+    near: mi.Float
 
 
 def build_tiles(records: SurfelRecords, camera: Camera) -> TileLists:
@@ -92,9 +101,9 @@ def build_tiles(records: SurfelRecords, camera: Camera) -> TileLists:
         TronError: more entries than 32-bit indices can address.
     """
     tiles_x, tiles_y = tile_counts(camera.width, camera.height)
-    first_x, across, first_y, touched, near = _touched_tiles(records, camera)
-    order = dr.argsort(near)
-    touched = dr.gather(mi.UInt32, touched, order)
+    bounds = _touched_tiles(records, camera)
+    order = dr.argsort(bounds.near)
+    touched = dr.gather(mi.UInt32, bounds.count, order)
     offset = dr.prefix_sum(touched)  # exclusive
     total = int(dr.sum(mi.UInt64(touched))[0])
     if total >= 1 << 32:
@@ -103,8 +112,7 @@ def build_tiles(records: SurfelRecords, camera: Camera) -> TileLists:
             mend="render the image in parts, or without surfels as large as the view",
         )
     if total == 0:
-        empty = dr.zeros(mi.UInt32, tiles_x * tiles_y)
-        return TileLists(empty, empty, dr.zeros(mi.UInt32, 1), tiles_x, tiles_y)
+        return _no_lists(tiles_x, tiles_y)
 
     # Each surfel marks its first entry with its rank; a running maximum gives every entry its surfel.
     rank = dr.zeros(mi.UInt32, total)
@@ -112,10 +120,17 @@ def build_tiles(records: SurfelRecords, camera: Camera) -> TileLists:
     rank = dr.prefix_reduce(dr.ReduceOp.Max, rank, exclusive=False)
     surfel = dr.gather(mi.UInt32, order, rank)
     within = dr.arange(mi.UInt32, total) - dr.gather(mi.UInt32, offset, rank)
-    width = dr.gather(mi.UInt32, across, surfel)
+    width = dr.gather(mi.UInt32, bounds.across, surfel)
     width = dr.select(width > 0, width, 1)  # idle lanes of the last packet: LLVM divides there too
-    tile = (dr.gather(mi.UInt32, first_y, surfel) + within // width) * dr.opaque(mi.UInt32, tiles_x)
-    tile += dr.gather(mi.UInt32, first_x, surfel) + within % width
+    x = dr.gather(mi.UInt32, bounds.first_x, surfel) + within % width
+    y = dr.gather(mi.UInt32, bounds.first_y, surfel) + within // width
+    tile = y * dr.opaque(mi.UInt32, tiles_x) + x
+    meets = _meets_diagonals(dr.gather(mi.Vector4f, bounds.diagonals, surfel), x, y)
+    dr.eval(tile, surfel, meets)
+    kept = dr.compress(meets)
+    if dr.width(kept) == 0:
+        return _no_lists(tiles_x, tiles_y)
+    tile, surfel = dr.gather(mi.UInt32, tile, kept), dr.gather(mi.UInt32, surfel, kept)
     dr.eval(tile, surfel)
     position = dr.argsort(tile)
     start, count = _runs(dr.gather(mi.UInt32, tile, position), tiles_x * tiles_y)
@@ -124,14 +139,16 @@ def build_tiles(records: SurfelRecords, camera: Camera) -> TileLists:
     return TileLists(start, count, entries, tiles_x, tiles_y)
 
 
-def _touched_tiles(
-    records: SurfelRecords, camera: Camera
-) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32, mi.UInt32, mi.Float]:
-    """Per surfel: first tile and number of tiles across, first tile down, tiles in all, and ``near``."""
+def _no_lists(tiles_x: int, tiles_y: int) -> TileLists:
+    empty = dr.zeros(mi.UInt32, tiles_x * tiles_y)
+    return TileLists(empty, empty, dr.zeros(mi.UInt32, 1), tiles_x, tiles_y)
+
+
+def _touched_tiles(records: SurfelRecords, camera: Camera) -> _Touched:
     position = mi.Point3f([float(v) for v in camera.position])
     right, down, forward = (mi.Vector3f([float(v) for v in row]) for row in camera.world_to_camera[:3, :3])
-    horizontal = _Axis(*_opaque(camera.fx, camera.cx, camera.width))
-    vertical = _Axis(*_opaque(camera.fy, camera.cy, camera.height))
+    fx, fy, cx, cy = _opaque(camera.fx, camera.fy, camera.cx, camera.cy)
+    columns, rows = _opaque(camera.width, camera.height)
     dr.make_opaque(position, right, down, forward)
 
     record = dr.arange(mi.UInt32, records.count) * GEOMETRY_PACKETS
@@ -143,16 +160,20 @@ def _touched_tiles(
     u, v = half_axes(u, v, q_cut)
 
     def seen(vector: mi.Vector3f) -> mi.Vector3f:
-        return mi.Vector3f(dr.dot(right, vector), dr.dot(down, vector), dr.dot(forward, vector))
+        return mi.Vector3f(fx * dr.dot(right, vector), fy * dr.dot(down, vector), dr.dot(forward, vector))
 
     c, a, b = seen(to_centre), seen(u), seen(v)
     ahead = c.z + dr.sqrt(a.z * a.z + b.z * b.z) > 0
-    first_x, across = _tile_range(*_screen_bounds(c, a, b, 0, horizontal), horizontal)
-    first_y, down_count = _tile_range(*_screen_bounds(c, a, b, 1, vertical), vertical)
-    touched = dr.select(facing & ahead & (q_cut >= 0), across * down_count, 0)
+    first_x, across = _tile_range(*_screen_bounds(c, a, b, (1, 0), cx), columns)
+    first_y, down_count = _tile_range(*_screen_bounds(c, a, b, (0, 1), cy), rows)
+    count = dr.select(facing & ahead & (q_cut >= 0), across * down_count, 0)
     near = dr.norm(to_centre) - axis_u.w
-    dr.eval(first_x, across, first_y, touched, near)
-    return first_x, across, first_y, touched, near
+    falling, rising = (_screen_bounds(c, a, b, (1, sign), cx + sign * cy) for sign in (1, -1))
+    diagonals = dr.zeros(mi.Float, 4 * records.count)
+    dr.scatter(diagonals, mi.Vector4f(*falling, *rising), dr.arange(mi.UInt32, records.count))
+    touched = _Touched(first_x, across, first_y, count, diagonals, near)
+    dr.eval(touched)
+    return touched
 
 
 def _opaque(*numbers: float) -> tuple[mi.Float, ...]:
@@ -161,9 +182,12 @@ def _opaque(*numbers: float) -> tuple[mi.Float, ...]:
 
 
 def _screen_bounds(
-    c: mi.Vector3f, a: mi.Vector3f, b: mi.Vector3f, k: int, axis: _Axis
+    c: mi.Vector3f, a: mi.Vector3f, b: mi.Vector3f, weights: tuple[int, int], principal: mi.Float
 ) -> tuple[mi.Float, mi.Float]:
-    """Pixel range along image axis k of the part in front (z > 0) of the disk within ``c + a cos + b sin``.
+    """Range of a sum of pixel x and y over the part in front (z > 0) of the disk in ``c + a cos + b sin``.
+
+    Vectors are in camera space, x and y times the focal lengths. ``weights`` are the sum's, ``principal`` is
+    its value at the principal point; below, x stands for the weighted sum.
 
     The half axes are turned first, until ``b_z = 0`` and ``a_z >= 0``: then ``c + a`` lies furthest ahead and
     is seen at ``m = (c_x + a_x) / (c_z + a_z)``. The bounds of x/z are sought as offsets d from there. With
@@ -178,28 +202,41 @@ def _screen_bounds(
     longest = dr.sqrt(a.z * a.z + b.z * b.z)
     tilted = longest > 0
     cos, sin = dr.select(tilted, a.z / longest, 1), dr.select(tilted, b.z / longest, 0)
-    a_x, b_x = a[k] * cos + b[k] * sin, b[k] * cos - a[k] * sin
+    c_x, a_x, b_x = (weights[0] * vector.x + weights[1] * vector.y for vector in (c, a, b))
+    a_x, b_x = a_x * cos + b_x * sin, b_x * cos - a_x * sin
     ahead, behind = c.z + longest, c.z - longest
-    m = (c[k] + a_x) / ahead
-    e = c[k] - m * c.z
+    m = (c_x + a_x) / ahead
+    e = c_x - m * c.z
     squared = ahead * (ahead * e * e + behind * b_x * b_x)
     reach = dr.abs(e) * ahead + dr.sqrt(dr.maximum(squared, 0))
-    rounding = ROUNDING * (dr.abs(c[k]) + dr.abs(a_x) + dr.abs(m) * (dr.abs(c.z) + longest)) / ahead
+    rounding = ROUNDING * (dr.abs(c_x) + dr.abs(a_x) + dr.abs(m) * (dr.abs(c.z) + longest)) / ahead
     near = rounding + dr.select(squared >= 0, b_x * b_x / dr.maximum(reach, TINY), dr.inf)
     # Where the ellipse all but touches the camera's plane this root is ill-conditioned, and far out anyway.
     far = reach / (behind * ahead) * (1 + ROUNDING * ahead / behind)
     far = rounding + dr.select(behind > TOUCHING * ahead, far, dr.inf)
     low, high = m - dr.select(e > 0, near, far), m + dr.select(e > 0, far, near)
-    return axis.focal * low + axis.principal, axis.focal * high + axis.principal
+    return low + principal, high + principal
 
 
-def _tile_range(low: mi.Float, high: mi.Float, axis: _Axis) -> tuple[mi.UInt32, mi.UInt32]:
+def _tile_range(low: mi.Float, high: mi.Float, pixels: mi.Float) -> tuple[mi.UInt32, mi.UInt32]:
     """First tile with pixel centres (i + 0.5) in [low, high], and the number of such tiles; 0 for none."""
-    first = dr.maximum(dr.ceil(dr.minimum(low - 0.5 - MARGIN, axis.pixels)), 0)
-    last = dr.floor(dr.minimum(dr.maximum(high - 0.5 + MARGIN, -1), axis.pixels - 1))
+    first = dr.maximum(dr.ceil(dr.minimum(low - 0.5 - MARGIN, pixels)), 0)
+    last = dr.floor(dr.minimum(dr.maximum(high - 0.5 + MARGIN, -1), pixels - 1))
     first_tile = mi.Int(first) // TILE
     tiles = mi.Int(dr.maximum(last, 0)) // TILE - first_tile + 1
     return mi.UInt32(first_tile), mi.UInt32(dr.select(first > last, 0, tiles))
+
+
+def _meets_diagonals(bounds: mi.Vector4f, x: mi.UInt32, y: mi.UInt32) -> mi.Bool:
+    """Whether pixel centres of tile (x, y) lie within bounds of pixel x + y and x - y: cuts corners off."""
+    left, top, reach = mi.Float(x * TILE) + TILE / 2, mi.Float(y * TILE) + TILE / 2, TILE - 1 + 2 * MARGIN
+    falling, rising = left + top, left - top
+    return (
+        (bounds[0] <= falling + reach)
+        & (bounds[1] >= falling - reach)
+        & (bounds[2] <= rising + reach)
+        & (bounds[3] >= rising - reach)
+    )
 
 
 def _runs(keys: mi.UInt32, size: int) -> tuple[mi.UInt32, mi.UInt32]:
