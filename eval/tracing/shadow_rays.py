@@ -35,6 +35,8 @@ from tron.tracing.bvh import build_bvh, refit
 
 MOVED = 0.1
 """Share of the surfels that move between two frames, for the refit."""
+STRAYS, STRAY_DISTANCE = 20, 10_000.0
+"""Surfels that a reconstruction left far outside, and how far, world units."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ class ShadowRays:
             "shadow.embree_closest_hit_mrays_irradiance": (self.pass_rays / closest / 1e6, "Mrays/s"),
             "shadow.embree_any_hit_mrays_random": (self.rays / times["random any"].median / 1e6, "Mrays/s"),
             "shadow.embree_any_hit_mrays_irradiance": (self.pass_rays / anything / 1e6, "Mrays/s"),
+            "shadow.stray_slowdown": (times["random strays"].over(times["random tron"]), "x"),
             "bvh.build_ms": (1e3 * build, "ms"),
             "bvh.refit_ms": (1e3 * times["refit"].median, "ms"),
             "bvh.embree_build_ms": (1e3 * times["embree build"].median, "ms"),
@@ -174,6 +177,7 @@ def measure_shadow_rays(
     moved.tracer.bvh = rebuilt
     after = Contenders(moved.scene)
     after.tracer.bvh = refitted
+    strayed = Contenders(stray_surfels(scene, seed)).tracer
 
     def shaded(occluder: Any) -> Any:
         return irradiance(occluder, gbuffer, light, spp, seed)
@@ -181,6 +185,7 @@ def measure_shadow_rays(
     times = interleaved(
         {
             "random tron": lambda: tracer.transmittance(origin, direction),
+            "random strays": lambda: strayed.transmittance(origin, direction),
             "random restart": lambda: restarted.transmittance(origin, direction),
             "random closest": lambda: embree.closest_hit(contenders.quads, origin, direction, coherent=False),
             "random any": lambda: embree.any_hit(contenders.quads, origin, direction),
@@ -234,3 +239,13 @@ def moved_surfels(contenders: Contenders, seed: int) -> Contenders:
     step = seeds.generator(seed, "tracing", "step").normal(size=3)
     means[nearest] += 5 * scene.spacing * step / np.linalg.norm(step)
     return Contenders(replace(scene, means=means), contenders.sh_degree, contenders.shape)
+
+
+def stray_surfels(scene: GaussianScene, seed: int) -> GaussianScene:
+    """The scene with ``STRAYS`` of its surfels ``STRAY_DISTANCE`` away, each in a direction of its own."""
+    rng = seeds.generator(seed, "tracing", "strays")
+    chosen = rng.choice(len(scene), min(STRAYS, len(scene)), replace=False)
+    away = rng.normal(size=(len(chosen), 3))
+    means = scene.means.copy()
+    means[chosen] += STRAY_DISTANCE * away / np.linalg.norm(away, axis=1, keepdims=True)
+    return replace(scene, means=means)

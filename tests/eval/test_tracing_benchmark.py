@@ -58,6 +58,7 @@ ROWS = [
     "shadow.ratio_to_embree_closest_hit.300",
     "shadow.ratio_to_embree_any_hit.300",
     "shadow.ratio_to_embree_any_hit_random.300",
+    "shadow.stray_slowdown.300",
     "bvh.build_ms.300",
     "bvh.refit_ms.300",
     "gradient.ratio_to_volprim.300_32",

@@ -18,8 +18,8 @@ grid for each node, not one for the scene, costs nothing and is as fine as the n
 strayed far off coarsens no box but its ancestors' (compressed wide nodes: Ylitie et al. 2017, "Efficient
 Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs").
 
-Those ancestors are kept few: strays, farther from the bulk of the surfels than ``STRAY_SIZES`` times its size,
-come last in every part that they share with others, and so end together in the last subtree.
+Those ancestors are kept few: strays, farther from the bulk of the surfels than ``STRAY_SIZES`` times its
+size, come last in every part that they share with others, and so end together in the last subtree.
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
@@ -27,8 +27,9 @@ come last in every part that they share with others, and so end together in the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -122,7 +123,7 @@ def _in_leaf_order(records: SurfelRecords, order: mi.UInt32) -> mi.Float:
     places = -(-max(records.count, 1) // LEAF_SIZE) * LEAF_SIZE
     geometry = dr.empty(mi.Float, 4 * GEOMETRY_PACKETS * places)
     place = dr.arange(mi.UInt32, places)
-    # The last leaf may hold the last surfel and nothing else: a record of negative radius, which no ray meets.
+    # A last leaf of one surfel is filled up with a record of negative radius, which no ray meets.
     held = place < dr.opaque(mi.UInt32, records.count)
     source = dr.gather(mi.UInt32, order, place, held)
     for packet in range(GEOMETRY_PACKETS):
@@ -150,7 +151,7 @@ def _bounds(geometry: mi.Float, count: int, places: int) -> tuple[mi.Vector3f, m
     return low, high
 
 
-def _pairs(values: mi.Vector3f, reduce: object) -> mi.Vector3f:
+def _pairs(values: mi.Vector3f, reduce: Callable[..., Any]) -> mi.Vector3f:
     """Reduce neighbours two by two."""
     even = 2 * dr.arange(mi.UInt32, dr.width(values) // 2)
     left, right = (mi.Vector3f(*[dr.gather(mi.Float, v, even + side) for v in values]) for side in (0, 1))
@@ -160,7 +161,7 @@ def _pairs(values: mi.Vector3f, reduce: object) -> mi.Vector3f:
 
 
 def _half_area(low: mi.Vector3f, high: mi.Vector3f) -> mi.Float:
-    size = dr.maximum(high - low, 0)
+    size = mi.Vector3f(dr.maximum(high - low, 0))
     return size.x * size.y + size.y * size.z + size.z * size.x
 
 
@@ -224,7 +225,9 @@ def _bulk(records: SurfelRecords) -> Box:
     count = min(max(records.count, 1), _SAMPLE)
     sample = dr.arange(mi.UInt32, count) * dr.opaque(mi.UInt32, max(records.count, 1) // count)
     centre = dr.gather(mi.Vector4f, dr.detach(records.geometry), sample * GEOMETRY_PACKETS)
-    ends = [dr.opaque(mi.UInt32, end) for end in (int(STRAY_SHARE * count), count - 1 - int(STRAY_SHARE * count))]
+    ends = [
+        dr.opaque(mi.UInt32, end) for end in (int(STRAY_SHARE * count), count - 1 - int(STRAY_SHARE * count))
+    ]
     low, high = mi.Vector3f(0), mi.Vector3f(0)
     for axis in range(3):
         dr.eval(centre[axis])

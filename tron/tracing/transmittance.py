@@ -33,7 +33,6 @@ class Products:
     nearest: list[mi.Float]
     farthest: list[mi.Float]
 
-
     @staticmethod
     def clear(active: Sequence[mi.Bool]) -> Products:
         """Nothing met yet, by the rays that are traced."""

@@ -3,7 +3,7 @@
 A lane carries a fan of rays from one point. They share each node that is read, which is what a walk spends
 its time on: four rays of neighbouring directions together take little more than half the time of four alone.
 
-No stack is kept: a word of four bits a level says which nodes are still to be visited (:class:`Walk`).
+No stack is kept: a word of four bits a level says which nodes are still to be visited (:class:`Descent`).
 
 Lanes look for leaves at their own pace but meet the surfels of leaves together: each lane collects leaves for
 a few steps, and then all meet the surfels of a few of theirs. One lane in a leaf would otherwise keep fifteen
@@ -65,15 +65,15 @@ def any_of(masks: Sequence[mi.Bool]) -> mi.Bool:
 
 
 @dataclass
-class Walk:
+class Descent:
     """Where a lane's walk stands.
 
     Attributes:
         node: the node visited last.
-        pending: four bits a level, those of ``node``'s children lowest, then of its siblings and so on upwards:
-            the nodes still to be visited. Seventeen levels fit.
-        groups: leaves found and not yet visited, last found first: the node above them, counted from the first
-            one above leaves, times 16, plus four bits for its children; 0 for none.
+        pending: nodes still to be visited, four bits a level: ``node``'s children lowest, then its siblings,
+            and so on upwards. Seventeen levels fit.
+        groups: leaves found and not yet visited, last found first: the node above them, counted from the
+            first one above leaves, times 16, plus four bits for its children; 0 for none.
     """
 
     node: mi.UInt32
@@ -81,9 +81,9 @@ class Walk:
     groups: list[mi.UInt32]
 
     @staticmethod
-    def begun() -> Walk:
+    def begun() -> Descent:
         """A walk about to visit the root."""
-        return Walk(mi.UInt32(0), mi.UInt64(_ROOT), [mi.UInt32(0) for _ in range(_GROUPS)])
+        return Descent(mi.UInt32(0), mi.UInt64(_ROOT), [mi.UInt32(0) for _ in range(_GROUPS)])
 
     def unfinished(self, state: Intervals) -> mi.Bool:
         """Something is left to be visited, and a ray for which it matters."""
@@ -114,7 +114,7 @@ def walk(
         active: lanes that walk.
     """
     slopes = [slopes_of(direction) for direction in directions]
-    at = Walk.begun()
+    at = Descent.begun()
     going = mi.Bool(active)
     while going:
         at = search(bvh, origin, slopes, state, at, going)
@@ -125,8 +125,13 @@ def walk(
 
 @dr.syntax
 def search(
-    bvh: Bvh, origin: mi.Point3f, slopes: Sequence[mi.Vector3f], state: Intervals, at: Walk, active: mi.Bool
-) -> Walk:
+    bvh: Bvh,
+    origin: mi.Point3f,
+    slopes: Sequence[mi.Vector3f],
+    state: Intervals,
+    at: Descent,
+    active: mi.Bool,
+) -> Descent:
     """Collect leaves, for ``NODES_A_TURN`` nodes or until a lane can hold no more."""
     passed = mi.UInt32(0)
     searching = active & (at.groups[-1] == 0) & (at.pending != 0)
@@ -149,8 +154,8 @@ def search(
 
 @dr.syntax
 def look(
-    at: Walk, state: State, visit: Callable[[State, mi.UInt32, mi.Bool], State], active: mi.Bool
-) -> tuple[Walk, State]:
+    at: Descent, state: State, visit: Callable[[State, mi.UInt32, mi.Bool], State], active: mi.Bool
+) -> tuple[Descent, State]:
     """Visit the surfels of up to ``LEAVES_A_TURN`` of the leaves collected."""
     passed = mi.UInt32(0)
     looking = active & (at.groups[0] != 0)
