@@ -121,7 +121,9 @@ class _Compositing(dr.CustomOp):
         # Those that nobody asked for, such as the geometry's once it is frozen, cost nothing.
         out = _Gradients(
             **{
-                name: dr.zeros(mi.Float, dr.width(getattr(records, name))) if name in replay.wanted else None
+                name: dr.zeros(mi.Float, _room(dr.width(getattr(records, name))))
+                if name in replay.wanted
+                else None
                 for name in _RECORDS
             }
         )
@@ -141,9 +143,19 @@ class _Compositing(dr.CustomOp):
                 dr.scatter(target, value, hits.ray, hits.count > 0)
         dr.eval(out, by_basis)
         for name in replay.wanted:
-            self.set_grad_in(name, getattr(out, name))
+            width = dr.width(getattr(records, name))
+            self.set_grad_in(name, dr.reshape(mi.Float, getattr(out, name), width, shrink=True))
         if by_basis:
             self.set_grad_in("basis", by_basis)
+
+
+def _room(numbers: int) -> int:
+    """Room for ``numbers`` numbers that other numbers share: a quarter of their octave is rounded up.
+
+    Dr.Jit writes the width of what is added to by copies into the kernel, and each width is compiled anew.
+    """
+    step = max(1, (1 << (numbers - 1).bit_length()) >> 3)
+    return -(-numbers // step) * step
 
 
 def _silent(gradients: list[mi.Float]) -> bool:

@@ -150,7 +150,8 @@ def _constant_radiance(sh: mi.Float, surfel: mi.UInt32) -> list[mi.Float]:
 def _column(values: mi.Float, index: mi.UInt32) -> mi.Float:
     # Each number is read once, yet the adjoint must not be told so: Dr.Jit 1.5 then overwrites (Permute, and
     # NoConflicts in part) what other uses of the parameters have added, such as a regulariser of the loss.
-    return dr.gather(mi.Float, values, index)
+    # Nor may it make copies for each thread, whose kernel knows how many surfels there are.
+    return dr.gather(mi.Float, values, index, mode=dr.ReduceMode.Direct)
 
 
 def _interleave(columns: list[mi.Float], count: int) -> mi.Float:
