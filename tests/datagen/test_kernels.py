@@ -95,13 +95,18 @@ def test_every_sum_of_irradiance_is_taken_in_one_pass_over_the_rays(variant):
 
 
 def test_another_light_is_prepared_by_the_same_kernels(variant):
+    kept = []
+
     def prepared(number: int) -> set[str]:
-        return kernels_of(lambda: Lighting(light(number, 0.0)))
+        return kernels_of(lambda: kept.append(Lighting(light(number, 0.0))))
 
     prepared(0)  # the BRDF's table is made once
     first = prepared(1)
     for number in range(2, 10):  # NumPy's memory lies elsewhere each time
         assert prepared(number) <= first
+    if variant.startswith("llvm"):
+        texels = [lighting.light._texels.numpy() for lighting in kept]  # the very memory
+        assert {array.ctypes.data % ALIGNMENT for array in texels} == {0}
 
 
 def test_a_sun_brings_no_more_than_its_own_kernels(variant):
