@@ -130,6 +130,11 @@ def test_a_plain_3dgs_file_is_relit_with_a_warning(relight, scene_path, light_pa
     assert json.loads((tmp_path / "plain" / "relight.json").read_text())["scene"]["materials_guessed"] is True
     # Whichever way its normals point, the surface is there; kernel degree 2 is softer than the scene's 4.
     assert np.abs(masks[0] - masks[1]).mean() < 0.1
+    assert "which way is up" not in caplog.text
+    silent = tmp_path / "silent"
+    assert relight(f"scene={path}", f"environment={light_path}", f"output_dir={silent}", "frames=1") == 0
+    assert "does not say which way is up: -y is taken" in caplog.text
+    assert json.loads((silent / "frames" / "settings.json").read_text())["up"] == [0, -1, 0]
 
 
 def test_a_new_renderer_shows_the_pbr_buffer(relight, scene_path, light_path, tmp_path):
