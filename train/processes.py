@@ -117,7 +117,10 @@ def _outer_launcher() -> Any:
     """Lightning's view of torchrun or Slurm, where one of them has started this process."""
     if TorchElasticEnvironment.detect():
         return TorchElasticEnvironment()
-    return SLURMEnvironment() if SLURMEnvironment.detect() else None
+    try:
+        return SLURMEnvironment() if SLURMEnvironment.detect() else None
+    except RuntimeError as error:  # srun options that Lightning does not follow
+        raise TronError("cannot train under this srun", mend=str(error)) from error
 
 
 def _devices(settings: Settings, outer: Any) -> int:

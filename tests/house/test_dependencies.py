@@ -7,6 +7,8 @@ import tomllib
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
+import yaml
+
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("tron", "datagen", "train", "eval", "conf")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -44,6 +46,7 @@ def imported(*folders: str) -> set[str]:
 DECLARED = {canonical(each) for each in PROJECT["dependencies"]}
 DEV = {canonical(each) for each in PROJECT["optional-dependencies"]["dev"]}
 PEERS = {canonical(each) for each in PROJECT["optional-dependencies"]["gpu-peers"]}
+CLUSTER = {canonical(each) for each in PROJECT["optional-dependencies"]["cluster"]}
 
 
 def test_what_the_packages_import_is_declared():
@@ -59,8 +62,17 @@ def test_no_dependency_is_declared_in_vain():
     assert DEV - imported("tests") - TOOLS == set()
 
 
+def test_the_extra_of_clusters_is_what_their_configuration_names():
+    targets = {
+        yaml.safe_load(path.read_text()).get("_target_", "dask")
+        for path in (ROOT / "conf" / "datagen" / "cluster").glob("*.yaml")
+    }
+    named = {canonical(target.partition(".")[0].replace("_", "-")) for target in targets}
+    assert named - DECLARED | {"asyncssh"} == CLUSTER  # dask.distributed's SSHCluster imports asyncssh
+
+
 def test_every_dependency_is_pinned():
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
-    assert {canonical(name) for name in pins} >= DECLARED | DEV | PEERS
+    assert {canonical(name) for name in pins} >= DECLARED | DEV | PEERS | CLUSTER
     assert pins["torch"] == "2.13.0", "no local version: a CPU build is taken where one is offered"

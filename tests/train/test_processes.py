@@ -1,6 +1,7 @@
 """Several devices: gloo processes on the CPU train what one does; none waits for one that has ended."""
 
 import csv
+import importlib
 import os
 import signal
 import subprocess
@@ -27,8 +28,8 @@ from tron.storage import locked
 
 LONGEST = 240.0  # seconds for a run of two processes on a machine that has other work
 TOLERANCES = {"64-true": 1e-6, "32-true": 1e-4}
-"""Largest difference of a weight; the largest weight is 2. AdamW divides gradients by their own size, rounding
-and all, and some layers compute in float32 whatever they are told. Measured: 5e-8 and 1.4e-5."""
+"""Largest difference of a weight; the largest weight is 2. AdamW divides gradients by their own size, with
+their rounding, and some layers compute in float32 whatever they are told. Measured: 5e-8 and 1.4e-5."""
 
 two_cores = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="two processes need two cores")
 
@@ -185,12 +186,17 @@ from tron.errors import TronError
 from tron.neural.pixel_mlp import PixelMLP
 
 
-class Watched(PixelMLP):
-    def forward(self, pbr, irradiance):
-        weights = torch.cat([p.detach().flatten() for p in self.parameters()])
+def watched():
+    # Writes down the weights it is asked with, in a file for each process.
+    renderer = PixelMLP()
+
+    def note(module, _inputs):
+        weights = torch.cat([p.detach().flatten() for p in module.parameters()])
         with open(Path(os.environ["WATCHED"]) / os.environ["LOCAL_RANK"], "a") as file:
-            file.write(f"{self.training} {weights.double().sum().item()!r}\\n")
-        return super().forward(pbr, irradiance)
+            file.write(f"{weights.double().sum().item()!r}\\n")
+
+    renderer.register_forward_pre_hook(note)
+    return renderer
 
 
 def refuse():
@@ -227,10 +233,9 @@ def work(tmp_path, monkeypatch):
     """A module that spawned processes can import too."""
     (tmp_path / "work_of_ranks.py").write_text(WORK)
     monkeypatch.syspath_prepend(tmp_path)
-    import work_of_ranks  # type: ignore[import-not-found]
-
-    yield work_of_ranks
-    del sys.modules["work_of_ranks"]
+    name = "work_of_ranks"
+    yield importlib.import_module(name)
+    del sys.modules[name]
 
 
 @two_cores
@@ -264,7 +269,7 @@ def test_processes_that_train_for_a_time_keep_the_same_weights_and_stop_together
     stages = [{"name": "one", "split": "train", "steps": 10**6, "batch_size": 1, "crop": 16}]
     changes = {"max_seconds": 2.0, "stages": stages, "validation": {"split": None}}
     settings = make_settings(dataset, tmp_path / "run", devices=2, checkpoint_every=10**6, **changes)
-    main(Settings.model_validate(settings | {"renderer": {"_target_": "work_of_ranks.Watched"}}))
+    main(Settings.model_validate(settings | {"renderer": {"_target_": "work_of_ranks.watched"}}))
     seen = [(tmp_path / str(rank)).read_text().splitlines() for rank in range(2)]
     assert len(seen[0]) > 5
     assert len(set(seen[0])) > 5

@@ -50,6 +50,9 @@ def compose_recipe(
     search = [] if config_dir is None else [f'hydra.searchpath=["file://{config_dir.resolve()}"]']
     with _loader(config_module) as loader:
         groups = {name: _options(loader, name, config_dir) for name in _groups(loader)}
+        for index, each in enumerate(parsed):
+            if each.key_or_group in groups and each.value() is None and not each.is_delete():
+                parsed[index] = _parse(f"{each.key_or_group}=none")  # null says the same of a single key
         selections = [each for each in parsed if each.key_or_group in groups]
         for each in selections:
             _require_option(each, groups[each.key_or_group])
@@ -59,7 +62,7 @@ def compose_recipe(
             for each in parsed:
                 if not each.is_add() and not each.is_force_add() and each.key_or_group not in known:
                     raise unknown_key(each.key_or_group, known)
-            return compose("config", overrides=[*search, *overrides])
+            return compose("config", overrides=[*search, *(str(each.input_line) for each in parsed)])
         except (HydraException, OmegaConfBaseException) as error:
             raise TronError(_first_line(error), where=config_module) from error
 

@@ -125,6 +125,8 @@ def run(toy_conf: str, capsys: pytest.CaptureFixture[str], monkeypatch, tmp_path
         (["expriment=demo"], ["'expriment'", "did you mean 'experiment'?"]),
         (["experiment=dem"], ["experiment 'dem'", "did you mean 'demo'?"]),
         (["lens=fisheye"], ["lens 'fisheye'", "tele, wide"]),
+        (["lens=null"], ["lens 'none'", "tele, wide"]),
+        (["lens={fov_deg: 3}"], ["unknown lens", "tele, wide"]),
         (["output_dir=o", "frames=three"], ["'frames'", "'three'", "integer"]),
         (["output_dir=o", "frames=0"], ["'frames'", "greater than or equal to 1"]),
         (["output_dir=o", "stages.0.stepz=1"], ["'stages.0.stepz'", "did you mean 'stages.0.steps'?"]),
@@ -240,6 +242,7 @@ def test_help_teaches_purpose_keys_defaults_recipes_and_examples(run: Run, monke
     ):
         assert text in out
     assert "_target_" not in out
+    assert "lens.fov_deg=20 " in run("lens=tele", "--help")[1], "the keys of the option that is asked about"
     assert max(map(len, out.splitlines())) <= 72
 
 
