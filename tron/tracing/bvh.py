@@ -182,7 +182,7 @@ def _write_level(words: mi.UInt32, level: int, box: Box, children: Box) -> None:
         middle = dr.select(filled, 0.5 * (first + last) - origin, 0)
         centre = dr.clip(dr.round(middle / step), 0, 255)
         reach = dr.maximum(0.5 * (last - first), 0) + dr.abs(middle - centre * step)
-        # Half a step of slack covers the float32 rounding of the rays' slopes and offsets.
+        # Half a step of slack covers the float32 rounding of this very quantisation.
         half = dr.clip(dr.ceil(2 * reach / step) + 1, 1, 255)
         centres |= mi.Vector3u(centre) << (8 * child)
         halves |= dr.select(filled, mi.Vector3u(half), 0) << (8 * child)

@@ -31,6 +31,8 @@ _GROUPS = 3
 _ROOT = 2
 """What is pending at first: child 1 of a node 0 that does not exist."""
 _TINY = 1e-12
+_ROUNDING = 1 + 2.0**-21
+"""Covers the float32 rounding of distances (Ize 2013, "Robust BVH Ray Traversal")."""
 
 
 class Intervals(Protocol):
@@ -206,10 +208,9 @@ def _met_children(
             middle, aside = dr.fma(centre, scale, offset), half * reach
             first, last = middle - aside, middle + aside
             enter = _larger(_larger(first.x, first.y), first.z)
-            leave = _smaller(_smaller(last.x, last.y), last.z)
-            # An empty box has no inside: the first test fails where it is met.
-            found.append((enter < leave) & (enter <= farthest) & (leave >= nearest))
+            leave = _ROUNDING * _smaller(_smaller(last.x, last.y), last.z)
+            found.append((enter <= leave) & (enter <= farthest) & (leave >= nearest))
     bits = mi.UInt32(0)
-    for child, found in enumerate(hits):
-        bits |= dr.select(any_of(found), mi.UInt32(1 << child), 0)
+    for child, (found, (_, half)) in enumerate(zip(hits, boxes)):
+        bits |= dr.select(any_of(found) & (half.x > 0), mi.UInt32(1 << child), 0)
     return bits

@@ -1,4 +1,4 @@
-"""Surfels that strayed far from all others: rays that meet them are exact, and the other rays do not notice."""
+"""Surfels that strayed far from all others: rays that meet them are exact, other rays do not notice them."""
 
 from __future__ import annotations
 
