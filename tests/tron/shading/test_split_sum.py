@@ -200,10 +200,11 @@ def test_one_preparation_serves_every_rotation(variant: str) -> None:
     image, d = random_map().image, unit(500)
     anew = Lighting(EnvironmentMap(image, 130), 64)
     turned = Lighting(EnvironmentMap(image, 20), 64).turned_to(130)
+    rough = mi.Float(0.3)
     u = mi.Point2f(np.linspace(0.01, 0.99, 500), np.linspace(0.99, 0.01, 500))
     for one, other in (
         (anew.split_sum.diffuse(vector(d)), turned.split_sum.diffuse(vector(d))),
-        (anew.split_sum.prefiltered(vector(d), 0.3), turned.split_sum.prefiltered(vector(d), 0.3)),
+        (anew.split_sum.prefiltered(vector(d), rough), turned.split_sum.prefiltered(vector(d), rough)),
         (anew.light.radiance(vector(d)), turned.light.radiance(vector(d))),
         (anew.light.sample(u)[0], turned.light.sample(u)[0]),
     ):
