@@ -72,7 +72,7 @@ def initial_surfels(
         TronError: the source asked for is not there.
     """
     source = source_of(capture, settings)
-    if source == "points":
+    if source == "points" and capture.points is not None:
         points, colors = capture.points, capture.point_colors
         if most is not None and len(points) > most:
             draw = generator(seed, "reconstruction", "points")
