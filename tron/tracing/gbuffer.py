@@ -95,7 +95,7 @@ def trace_tiles(
         out = HitList.empty(dr.arange(mi.UInt32, dr.width(rays.tile)), room)
     sums, crowded, kept_hits = stream(
         # Not how many surfels there are, which would be one more thing to record the kernel anew for.
-        replace(records, count=0), lists.entries, start, count, rays.origin, rays.direction,
+        replace(records, count=0), lists.entries, lists.near, start, count, rays.origin, rays.direction,
         None if out is None else out.rows(),
     )  # fmt: skip
     known: list[Iterable[HitList]] = []
@@ -111,7 +111,7 @@ def trace_tiles(
     def search(lane: mi.UInt32) -> Search:
         first, length = (dr.gather(mi.UInt32, values, lane) for values in (start, count))
         along = dr.gather(mi.Vector3f, direction, lane)
-        return partial(search_list, records, lists.entries, first, length, rays.origin, along)
+        return partial(search_list, records, lists.entries, lists.near, first, length, rays.origin, along)
 
     room = min(int(dr.max(count)[0]), MOST_HITS)
     fits = keep_hits and room * dr.width(again) <= LISTED_IDS

@@ -18,10 +18,6 @@ MAX_HITS = 64
 """Hits that a ray keeps at a time until they are composited."""
 
 
-NEAR_SLACK = 0.9999
-"""Lists are sorted by a ``near`` that may differ from the one recomputed at a ray by rounding."""
-
-
 @dataclass
 class LocalHits:
     """Hits of each lane in thread-local memory; alive inside one kernel only.
@@ -101,8 +97,8 @@ def odd_even_merge_network(size: int) -> tuple[tuple[int, int], ...]:
 
 @dr.syntax
 def collect(
-    records: SurfelRecords, entries: mi.UInt32, origin: mi.Point3f, direction: mi.Vector3f, stop: float,
-    walk: Walk, hits: LocalHits,
+    records: SurfelRecords, entries: mi.UInt32, near: mi.Float, origin: mi.Point3f, direction: mi.Vector3f,
+    stop: float, walk: Walk, hits: LocalHits,
 ) -> tuple[Walk, LocalHits]:  # fmt: skip
     """Walk on through each lane's candidates, adding its front-facing hits, until there is no room for more.
 
@@ -112,7 +108,7 @@ def collect(
 
     Args:
         records: the surfels.
-        entries: tile lists' ids.
+        entries, near: tile lists' ids, and their lower bounds of t.
         origin, direction: world rays, unit directions.
         stop: transmittance at which compositing ends.
         walk: where each lane stands. hits: what it has kept.
@@ -130,8 +126,8 @@ def collect(
         walk.product = dr.select(valid, walk.product * (1 - hit.alpha), walk.product)
         walk.farthest = dr.select(valid & (hit.t > walk.farthest), hit.t, walk.farthest)
         walk.t_cut = dr.select((walk.product < stop) & (walk.t_cut == dr.inf), walk.farthest, walk.t_cut)
-        walk.near = NEAR_SLACK * hit.near
         walk.cursor += 1
+        walk.near = dr.gather(mi.Float, near, walk.cursor, walk.cursor < walk.end)
         walk.open &= (walk.cursor < walk.end) & (walk.near <= walk.t_cut)
         active &= walk.open & (hits.count < MAX_HITS)
     return walk, hits

@@ -22,7 +22,7 @@ import mitsuba as mi
 from tron.gaussians.harmonics import sh_basis
 from tron.tracing.bvh import Bvh
 from tron.tracing.compositing import STOP_TRANSMITTANCE, Composite, HitList, composite
-from tron.tracing.hits import NEAR_SLACK, LocalHits
+from tron.tracing.hits import LocalHits
 from tron.tracing.kernel import T_MIN, SurfelHit, SurfelRecords, intersect
 from tron.tracing.traversal import walk
 
@@ -97,7 +97,7 @@ def search_hierarchy(bvh: Bvh, origin: mi.Point3f, direction: mi.Vector3f) -> Se
 
 @dr.syntax
 def search_list(
-    records: SurfelRecords, entries: mi.UInt32, start: mi.UInt32, count: mi.UInt32,
+    records: SurfelRecords, entries: mi.UInt32, near: mi.Float, start: mi.UInt32, count: mi.UInt32,
     origin: mi.Point3f, direction: mi.Vector3f, kept: _Nearest, active: mi.Bool,
 ) -> _Nearest:  # fmt: skip
     """Look for hits of camera rays in their tiles' lists (all but the last two as in ``hits.collect``)."""
@@ -108,7 +108,8 @@ def search_list(
         met = intersect(records.geometry, index, origin, direction, records.degree)
         kept = _insert(kept, met, index, going)
         cursor += 1
-        going &= (cursor < end) & (NEAR_SLACK * met.near <= kept.farthest[0])
+        going &= cursor < end
+        going &= dr.gather(mi.Float, near, cursor, going) <= kept.farthest[0]
     return kept
 
 

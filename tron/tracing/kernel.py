@@ -110,7 +110,6 @@ class SurfelHit:
         alpha: opacity at the hit, clipped to 0.99.
         within: the hit lies where the kernel counts (alpha >= 1/255, response >= 0.0113).
         front: the ray meets the side that the normal points to.
-        near: lower bound of the distance from the ray's origin to any counted point of the surfel.
         unclipped: opacity before clipping. response: the kernel's value.
         u_axis, v_axis: t_u / s_u and t_v / s_v. normal: their cross product. facing: normal . direction.
         offset: p - c. u, v: its coordinates in standard deviations.
@@ -120,7 +119,6 @@ class SurfelHit:
     alpha: mi.Float
     within: mi.Bool
     front: mi.Bool
-    near: mi.Float
     unclipped: mi.Float
     response: mi.Float
     u_axis: mi.Vector3f
@@ -162,7 +160,6 @@ def intersect(
         alpha=dr.select(unclipped < MAX_ALPHA, unclipped, MAX_ALPHA),
         within=q <= axis_v[3],
         front=facing < 0.0,
-        near=dr.norm(to_centre) - axis_u[3],
         unclipped=unclipped,
         response=value,
         u_axis=u_axis,

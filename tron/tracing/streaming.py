@@ -25,14 +25,14 @@ from tron.tracing.kernel import SurfelRecords
 # arguments: degrees, whether hits are kept, and if so for how many. Other sizes are free.
 @dr.freeze(limit=64, warn_after=1000)
 def stream(
-    records: SurfelRecords, entries: mi.UInt32, start: mi.UInt32, count: mi.UInt32,
+    records: SurfelRecords, entries: mi.UInt32, near: mi.Float, start: mi.UInt32, count: mi.UInt32,
     origin: mi.Point3f, direction: mi.Vector3f, out: HitRows | None,
 ) -> tuple[Composite, mi.Bool, mi.UInt32]:  # fmt: skip
     """Composite the front-facing hits of each ray, in one kernel.
 
     Args:
         records: the surfels, detached.
-        entries: tile lists' ids; start, count: each ray's slice of them.
+        entries, near: tile lists' ids and lower bounds of t; start, count: each ray's slice of them.
         origin, direction: world rays, unit directions.
         out: receives the composited ids, list r from lane r, as many as it has room for.
 
@@ -40,7 +40,7 @@ def stream(
         All evaluated: the sums of each ray; whether it was not finished, or has more hits than there is room
         for; and how many ids it has in ``out``, none where that is so.
     """
-    sums, crowded = _rounds(records, entries, Walk.along(start, count), origin, direction, out)
+    sums, crowded = _rounds(records, entries, near, Walk.along(start, count), origin, direction, out)
     if out is not None:
         crowded |= sums.count > out.room
     return sums, crowded, dr.select(crowded, 0, sums.count)
@@ -48,14 +48,14 @@ def stream(
 
 @dr.syntax
 def _rounds(
-    records: SurfelRecords, entries: mi.UInt32, walk: Walk, origin: mi.Point3f, direction: mi.Vector3f,
-    out: HitRows | None,
+    records: SurfelRecords, entries: mi.UInt32, near: mi.Float, walk: Walk,
+    origin: mi.Point3f, direction: mi.Vector3f, out: HitRows | None,
 ) -> tuple[Composite, mi.Bool]:  # fmt: skip
     basis = sh_basis(direction.x, direction.y, direction.z)
     hits, sums, full = LocalHits.none(), Composite.start(), mi.Bool(False)
     going = mi.Bool(walk.open)
     while going:
-        walk, hits = collect(records, entries, origin, direction, STOP_TRANSMITTANCE, walk, hits)
+        walk, hits = collect(records, entries, near, origin, direction, STOP_TRANSMITTANCE, walk, hits)
         hits = sort(hits)
         walk, hits, final = settle(walk, hits, sums.transmittance, STOP_TRANSMITTANCE)
         ready = LocalHits(hits.t, hits.index, hits.alpha, final)

@@ -22,7 +22,7 @@ import mitsuba as mi
 
 from tron.cameras import Camera
 from tron.errors import TronError
-from tron.tracing.kernel import GEOMETRY_PACKETS, SurfelRecords, half_axes
+from tron.tracing.kernel import GEOMETRY_PACKETS, T_MIN, SurfelRecords, half_axes
 
 TILE = 4
 LANES = TILE * TILE
@@ -33,6 +33,8 @@ TOUCHING = 1e-4
 ROUNDING = 1e-6
 """Some units in the last place of a float32, by which bounds are widened."""
 TINY = 1e-30
+SLACK = 0.9999
+"""Bounds of t are less by rounding than a ray's own t, which may be ill-conditioned."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +43,14 @@ class TileLists:
 
     Attributes:
         start, count: mi.UInt32, one entry a tile (row-major): where its list lies in ``entries``.
-        entries: mi.UInt32, surfel ids.
+        entries: mi.UInt32, surfel ids. near: mi.Float, lower bounds of t for the tile's rays; ascending.
         tiles_x, tiles_y: tiles across and down; the last ones may hang over the image's edge.
     """
 
     start: mi.UInt32
     count: mi.UInt32
     entries: mi.UInt32
+    near: mi.Float
     tiles_x: int
     tiles_y: int
 
@@ -83,7 +86,8 @@ class _Touched:
     Attributes:
         first_x, across, first_y: first tile, number of tiles across, first tile down. count: of them all.
         diagonals: mi.Float, four a surfel: lowest and highest pixel x + y, lowest and highest x - y.
-        near: lower bound of distance.
+        planes: mi.Float, four a surfel: its normal in camera space, and the camera's height over its plane.
+        near, far: bounds of the distance to any point of the surfel.
     """
 
     first_x: mi.UInt32
@@ -91,7 +95,9 @@ class _Touched:
     first_y: mi.UInt32
     count: mi.UInt32
     diagonals: mi.Float
+    planes: mi.Float
     near: mi.Float
+    far: mi.Float
 
 
 def build_tiles(records: SurfelRecords, camera: Camera) -> TileLists:
@@ -102,10 +108,8 @@ def build_tiles(records: SurfelRecords, camera: Camera) -> TileLists:
     """
     tiles_x, tiles_y = tile_counts(camera.width, camera.height)
     bounds = _touched_tiles(records, camera)
-    order = dr.argsort(bounds.near)
-    touched = dr.gather(mi.UInt32, bounds.count, order)
-    offset = dr.prefix_sum(touched)  # exclusive
-    total = int(dr.sum(mi.UInt64(touched))[0])
+    offset = dr.prefix_sum(bounds.count)  # exclusive
+    total = int(dr.sum(mi.UInt64(bounds.count))[0])
     if total >= 1 << 32:
         raise TronError(
             f"{records.count:,} surfels touch {total:,} tiles of 4 x 4 pixels, too many to list",
@@ -114,34 +118,40 @@ def build_tiles(records: SurfelRecords, camera: Camera) -> TileLists:
     if total == 0:
         return _no_lists(tiles_x, tiles_y)
 
-    # Each surfel marks its first entry with its rank; a running maximum gives every entry its surfel.
-    rank = dr.zeros(mi.UInt32, total)
-    dr.scatter(rank, dr.arange(mi.UInt32, records.count), offset, touched > 0)
-    rank = dr.prefix_reduce(dr.ReduceOp.Max, rank, exclusive=False)
-    surfel = dr.gather(mi.UInt32, order, rank)
-    within = dr.arange(mi.UInt32, total) - dr.gather(mi.UInt32, offset, rank)
+    # Each surfel marks its first entry; a running maximum gives every entry its surfel.
+    surfel = dr.zeros(mi.UInt32, total)
+    dr.scatter(surfel, dr.arange(mi.UInt32, records.count), offset, bounds.count > 0)
+    surfel = dr.prefix_reduce(dr.ReduceOp.Max, surfel, exclusive=False)
+    within = dr.arange(mi.UInt32, total) - dr.gather(mi.UInt32, offset, surfel)
     width = dr.gather(mi.UInt32, bounds.across, surfel)
     width = dr.select(width > 0, width, 1)  # idle lanes of the last packet: LLVM divides there too
     x = dr.gather(mi.UInt32, bounds.first_x, surfel) + within % width
     y = dr.gather(mi.UInt32, bounds.first_y, surfel) + within // width
     tile = y * dr.opaque(mi.UInt32, tiles_x) + x
     meets = _meets_diagonals(dr.gather(mi.Vector4f, bounds.diagonals, surfel), x, y)
-    dr.eval(tile, surfel, meets)
+    near = _near_in_tile(bounds, surfel, x, y, camera)
+    dr.eval(tile, surfel, meets, near)
     kept = dr.compress(meets)
     if dr.width(kept) == 0:
         return _no_lists(tiles_x, tiles_y)
     tile, surfel = dr.gather(mi.UInt32, tile, kept), dr.gather(mi.UInt32, surfel, kept)
-    dr.eval(tile, surfel)
-    position = dr.argsort(tile)
-    start, count = _runs(dr.gather(mi.UInt32, tile, position), tiles_x * tiles_y)
-    entries = dr.gather(mi.UInt32, surfel, position)
-    dr.eval(start, count, entries)
-    return TileLists(start, count, entries, tiles_x, tiles_y)
+    # One sort orders tiles and, within each, bounds, which take what bits of a key the tiles leave.
+    levels = min((1 << 32) // (tiles_x * tiles_y), 1 << 31)
+    scale = _Levels.of(dr.gather(mi.Float, near, kept), levels)
+    levels = dr.opaque(mi.UInt32, levels)
+    key = tile * levels + scale.level(dr.gather(mi.Float, near, kept))
+    dr.eval(key, surfel)
+    position = dr.argsort(key)
+    key = dr.gather(mi.UInt32, key, position)
+    start, count = _runs(key // levels, tiles_x * tiles_y)
+    entries, near = dr.gather(mi.UInt32, surfel, position), scale.near(key % levels)
+    dr.eval(start, count, entries, near)
+    return TileLists(start, count, entries, near, tiles_x, tiles_y)
 
 
 def _no_lists(tiles_x: int, tiles_y: int) -> TileLists:
     empty = dr.zeros(mi.UInt32, tiles_x * tiles_y)
-    return TileLists(empty, empty, dr.zeros(mi.UInt32, 1), tiles_x, tiles_y)
+    return TileLists(empty, empty, dr.zeros(mi.UInt32, 1), dr.zeros(mi.Float, 1), tiles_x, tiles_y)
 
 
 def _touched_tiles(records: SurfelRecords, camera: Camera) -> _Touched:
@@ -167,11 +177,18 @@ def _touched_tiles(records: SurfelRecords, camera: Camera) -> _Touched:
     first_x, across = _tile_range(*_screen_bounds(c, a, b, (1, 0), cx), columns)
     first_y, down_count = _tile_range(*_screen_bounds(c, a, b, (0, 1), cy), rows)
     count = dr.select(facing & ahead & (q_cut >= 0), across * down_count, 0)
-    near = dr.norm(to_centre) - axis_u.w
+    distance = dr.norm(to_centre)
+    normal = dr.normalize(dr.cross(u, v))
+    normal = mi.Vector3f(dr.dot(right, normal), dr.dot(down, normal), dr.dot(forward, normal))
+    height = dr.abs(dr.dot(normal, mi.Vector3f(c.x / fx, c.y / fy, c.z)))
+    height = dr.maximum(height - ROUNDING * distance, 0)
+    planes = dr.zeros(mi.Float, 4 * records.count)
+    dr.scatter(planes, mi.Vector4f(*normal, height), dr.arange(mi.UInt32, records.count))
     falling, rising = (_screen_bounds(c, a, b, (1, sign), cx + sign * cy) for sign in (1, -1))
     diagonals = dr.zeros(mi.Float, 4 * records.count)
     dr.scatter(diagonals, mi.Vector4f(*falling, *rising), dr.arange(mi.UInt32, records.count))
-    touched = _Touched(first_x, across, first_y, count, diagonals, near)
+    reach = axis_u.w
+    touched = _Touched(first_x, across, first_y, count, diagonals, planes, distance - reach, distance + reach)
     dr.eval(touched)
     return touched
 
@@ -237,6 +254,57 @@ def _meets_diagonals(bounds: mi.Vector4f, x: mi.UInt32, y: mi.UInt32) -> mi.Bool
         & (bounds[2] <= rising + reach)
         & (bounds[3] >= rising - reach)
     )
+
+
+def _near_in_tile(
+    bounds: _Touched, surfel: mi.UInt32, x: mi.UInt32, y: mi.UInt32, camera: Camera
+) -> mi.Float:
+    """Lower bound of t at which rays of tile (x, y) meet the front of a surfel.
+
+    With unit normal n and height h over the plane, a pixel's ray ``d = (d_x, d_y, 1)`` meets it at depth
+    ``h / -(n . d)``. The denominator is linear in the pixel, so its maximum lies at a corner of the tile.
+    """
+    fx, fy, cx, cy = _opaque(camera.fx, camera.fy, camera.cx, camera.cy)
+    plane = dr.gather(mi.Vector4f, bounds.planes, surfel)
+    dx, dy = (mi.Float(x * TILE) + TILE / 2 - cx) / fx, (mi.Float(y * TILE) + TILE / 2 - cy) / fy
+    wide, high = (TILE - 1) / 2 / fx, (TILE - 1) / 2 / fy
+    steepest = dr.abs(plane[0]) * wide + dr.abs(plane[1]) * high - plane[0] * dx - plane[1] * dy - plane[2]
+    steepest += ROUNDING * (1 + dr.abs(dx) + dr.abs(dy))
+    dx, dy = dr.maximum(dr.abs(dx) - wide, 0), dr.maximum(dr.abs(dy) - high, 0)
+    on_plane = plane[3] / dr.maximum(steepest, TINY) * dr.sqrt(1 + dx * dx + dy * dy)
+    near = dr.minimum(on_plane, dr.gather(mi.Float, bounds.far, surfel))
+    return SLACK * dr.maximum(dr.maximum(near, dr.gather(mi.Float, bounds.near, surfel)), T_MIN)
+
+
+@dataclass
+class _Levels:
+    """Positive numbers as few integers: the leading bits of a float above the smallest, rounded down.
+
+    Attributes:
+        lowest: mi.UInt32, bits of the smallest number. shift: mi.UInt32, how many of the last are left out.
+    """
+
+    lowest: mi.UInt32
+    shift: mi.UInt32
+
+    @staticmethod
+    def of(numbers: mi.Float, levels: int) -> _Levels:
+        """For ``numbers`` (positive floats are ordered as their bits are), so that ``levels`` are enough."""
+        bits = dr.reinterpret_array(mi.UInt32, numbers)
+        lowest, highest = dr.min(bits), dr.max(bits)
+        dr.eval(lowest, highest)
+        shift = mi.UInt32(0)
+        for k in range(32):
+            shift += dr.select(((highest - lowest) >> k) >= dr.opaque(mi.UInt32, levels), mi.UInt32(1), 0)
+        return _Levels(lowest, shift)
+
+    def level(self, numbers: mi.Float) -> mi.UInt32:
+        """The integer of each number, no more than it."""
+        return (dr.reinterpret_array(mi.UInt32, numbers) - self.lowest) >> self.shift
+
+    def near(self, level: mi.UInt32) -> mi.Float:
+        """The smallest number of each integer."""
+        return dr.reinterpret_array(mi.Float, (level << self.shift) + self.lowest)
 
 
 def _runs(keys: mi.UInt32, size: int) -> tuple[mi.UInt32, mi.UInt32]:

@@ -69,7 +69,7 @@ def crossing(scene: GaussianScene, camera: Camera) -> np.ndarray:
 
 
 def seen(scene: GaussianScene, camera: Camera) -> np.ndarray:
-    """(pixels, M) bool, float64: surfels whose front the pixel's ray clearly meets."""
+    """(pixels, M) float64: t at which the pixel's ray clearly meets a surfel's front; infinite elsewhere."""
     directions = camera.rays().reshape(-1, 3).astype(np.float64)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     to_centre = scene.means.astype(np.float64) - camera.position
@@ -84,16 +84,18 @@ def seen(scene: GaussianScene, camera: Camera) -> np.ndarray:
             squared += (across / scene.scales()[:, k]) ** 2
     clear = np.abs(height) > EDGE * np.linalg.norm(to_centre, axis=1)
     within = squared < (1 - EDGE) * cut_radii(scene) ** 2
-    return clear & (height < 0) & (facing < 0) & (t > T_MIN) & within
+    return np.where(clear & (height < 0) & (facing < 0) & (t > T_MIN) & within, t, np.inf)
 
 
 def listed(tracer: SurfelTracer, camera: Camera) -> np.ndarray:
-    """(pixels, M) bool: surfels on the list of the pixel's tile."""
+    """(pixels, M) float: the bound of t of surfels on the list of the pixel's tile; infinite elsewhere."""
     lists = build_tiles(tracer.records, camera)
-    start, count, entries = (np.array(a) for a in (lists.start, lists.count, lists.entries))
-    on_list = np.zeros((len(start), tracer.records.count), bool)
+    start, count, entries, near = (np.array(a) for a in (lists.start, lists.count, lists.entries, lists.near))
+    on_list = np.full((len(start), tracer.records.count), np.inf)
     for tile in range(len(start)):
-        on_list[tile, entries[start[tile] : start[tile] + count[tile]]] = True
+        part = slice(start[tile], start[tile] + count[tile])
+        on_list[tile, entries[part]] = near[part]
+        assert (np.diff(near[part]) >= 0).all()
     y, x = np.mgrid[: camera.height, : camera.width] // TILE
     return on_list[(y * lists.tiles_x + x).ravel()]
 
@@ -121,9 +123,10 @@ def test_what_is_seen_of_surfels_across_the_camera_plane_is_listed_and_drawn(
     means = camera.position + spread * rng.normal(size=(count, 3))
     scene = scene_of(means, rng.normal(size=(count, 3)), np.log(scales), rng.uniform(0.1, 0.7, count))
     tracer = SurfelTracer(scene)
-    met = seen(scene, camera)
-    missing = met & ~listed(tracer, camera)
-    assert not missing.any(), f"{missing.sum()} of {met.sum()}"
+    t, near = seen(scene, camera), listed(tracer, camera)
+    met = np.isfinite(t)
+    assert not (met & ~np.isfinite(near)).any()
+    assert (near[met] <= t[met]).all()
     tally.update(met=met.sum(), across=met[:, crossing(scene, camera)].sum())
 
     directions = camera.rays().reshape(-1, 3)
@@ -146,19 +149,34 @@ def test_surfels_beside_the_camera_join_no_list():
     scene = room(3000, 0.04)
     camera = Camera.look_at((0.1, -0.2, 0.05), (1, 0.3, 0.1), fov_deg=70, width=64, height=64)
     across = crossing(scene, camera)
-    on_list = listed(SurfelTracer(scene), camera)
+    on_list = np.isfinite(listed(SurfelTracer(scene), camera))
     assert across.sum() > 100
     assert not on_list[:, across].any()
-    assert on_list.sum() < 4 * seen(scene, camera).sum()
+    assert on_list.sum() < 4 * np.isfinite(seen(scene, camera)).sum()
 
 
 def test_a_ground_that_goes_on_behind_the_camera_is_listed_below_its_horizon():
     scene = scene_of([[0.0, 0, 0]], [[0, 0, 1]], [[0.0, 0.0]], opacity=0.99)
     camera = Camera.look_at((0, 0, 0.5), (1, 0, 0.5), fov_deg=90, width=64, height=64)
     # The far edge of the disk lies at x = 3, half a unit below the eye: 32 * 0.5 / 3 pixels below the middle.
-    rows = listed(SurfelTracer(scene), camera).reshape(64, 64).any(1)
+    rows = np.isfinite(listed(SurfelTracer(scene), camera)).reshape(64, 64).any(1)
     first = 4 * ((32 + round(32 * 0.5 / cut_radii(scene)[0])) // 4)
     np.testing.assert_array_equal(rows, np.arange(64) >= first)
+
+
+def test_lists_are_in_the_order_in_which_a_tile_meets_large_slanted_surfels():
+    rng = seeds.generator(0, "tests", "slanted")
+    normals = rng.normal(size=(200, 3)) + np.array([0, 0, 3])
+    scene = scene_of(rng.uniform(-0.5, 0.5, (200, 3)), normals, np.log(rng.uniform(0.1, 1, (200, 2))))
+    camera = Camera.look_at((0, 0.5, 3), (0, 0, 0), fov_deg=30, width=64, height=64)
+    t, near = seen(scene, camera), listed(SurfelTracer(scene), camera)
+    met = np.isfinite(t)
+    # What is left is how much the depths differ at which the rays of a tile meet a surfel.
+    assert np.median(t[met] - near[met]) < 0.05
+    sphere = np.linalg.norm(scene.means - camera.position, axis=1) - (
+        cut_radii(scene) * scene.scales().max(1)
+    )
+    assert np.median((t - sphere)[met]) > 0.5
 
 
 def test_more_entries_than_indices_are_one_clear_line():
