@@ -30,8 +30,8 @@ from tron import seeds
 from tron.cameras import mitsuba_sensor
 from tron.color import luminance
 from tron.shading import EnvironmentLight, Lighting, irradiance, render_guidance
-from tron.shading.guidance import shade
-from tron.shading.irradiance import ORIGIN_OFFSET, visible_share
+from tron.shading.guidance import reaching_share, shade
+from tron.shading.irradiance import ORIGIN_OFFSET
 from tron.tracing import GBuffer, SurfelTracer
 from tron.tracing.tiles import lanes_of_pixels, tile_pixels
 
@@ -117,7 +117,8 @@ def measure_noise(contenders: Contenders, size: int, light: str, reference_spp: 
 
     def independent(spp: int, trial: int) -> np.ndarray:
         shadowed, unshadowed = independent_irradiance(tracer, gbuffer, lighting.light, spp, seed + trial)
-        return shade(gbuffer, visible_share(shadowed, unshadowed), lighting).irradiance
+        share = reaching_share(shadowed, unshadowed, gbuffer, lighting, tracer.scene.spacing, spp)
+        return shade(gbuffer, share, lighting).irradiance
 
     times = interleaved(
         {

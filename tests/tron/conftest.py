@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,3 +97,21 @@ def _transform() -> Any:
 @pytest.fixture
 def dense_surfels(variant: str) -> DenseSurfels:
     return DenseSurfels()
+
+
+@pytest.fixture
+def kernels_of(variant: str) -> Callable[[Callable[[], object]], set[str]]:
+    """Texts of the kernels that some work launches, but for their names and for the alignment of what they
+    read, which is the allocator's chance. Dr.Jit's own ``cache_hit`` is true as well for a kernel that an
+    earlier run left on disk, and so false where a machine is new.
+    """
+    import drjit as dr
+
+    def texts(work: Callable[[], object]) -> set[str]:
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            work()
+            kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
+        return {re.sub(r"drjit_[0-9a-f]+|align \d+", "", kernel["ir"].getvalue()) for kernel in kernels}
+
+    return texts

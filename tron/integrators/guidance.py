@@ -7,7 +7,7 @@
                                   without either, the Mitsuba scene's own environment emitter
     buffer              string    main channels: pbr (default), irradiance, unshadowed or shadowed
     shadow_rays         integer   for each camera ray, even (default: 64); of many camera rays a pixel, each
-                                  may have fewer: 2 darken penumbrae by a hundredth or two, 16 by nothing
+                                  may have fewer: 2 lighten shadows by a hundredth or two, 8 by nothing
     two_sided           boolean   whether back faces block shadow rays (default: true)
     cubemap_resolution  integer   of the prefiltered environment
 

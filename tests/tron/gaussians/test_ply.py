@@ -213,10 +213,10 @@ def test_lower_degrees_fill_the_low_bands(scene, tmp_path, rest, bands):
 
 
 def refuse(path, words):
-    started = time.perf_counter()
+    started = time.process_time()
     with pytest.raises(TronError, match=words) as caught:
         read_ply(path)
-    assert time.perf_counter() - started < 1
+    assert time.process_time() - started < 1
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
