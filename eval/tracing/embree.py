@@ -19,7 +19,7 @@ import numpy as np
 from tron.gaussians.scene import GaussianScene
 from tron.tracing.kernel import GEOMETRY_PACKETS, intersect
 from tron.tracing.parameters import SurfelParameters, pack
-from tron.tracing.transmittance import BACK_FACE_SPACINGS, OPAQUE_TRANSMITTANCE
+from tron.tracing.transmittance import OPAQUE_TRANSMITTANCE, BackFaces, blocks
 
 RESTART_OFFSET = 1e-4
 """How far behind a hit the next query starts, world units: what Mitsuba's volprim integrators use too."""
@@ -70,9 +70,10 @@ class RestartedShadows:
 
     def __init__(self, scene: GaussianScene, traced: mi.Scene) -> None:
         self._traced = traced
-        self._geometry = _geometry(scene)
+        records = pack(SurfelParameters.from_scene(scene))
+        self._geometry = records.geometry
         self._degree = scene.kernel_degree
-        self._back_faces_from = dr.opaque(mi.Float, BACK_FACE_SPACINGS * scene.spacing)
+        self._back_faces = BackFaces.of(records, scene.spacing)
         dr.eval(self._geometry)
 
     @dr.syntax
@@ -86,8 +87,8 @@ class RestartedShadows:
             going &= found.is_valid()
             surfel = dr.select(going, found.prim_index >> 1, 0)
             met = intersect(self._geometry, surfel, origin, direction, self._degree)
-            blocks = going & met.within & (met.t > dr.select(met.front, 0, self._back_faces_from))
-            product = dr.select(blocks, product * (1 - met.alpha), product)
+            counts = going & blocks(met, self._back_faces)
+            product = dr.select(counts, product * (1 - met.alpha), product)
             travelled = dr.select(going, travelled + found.t + RESTART_OFFSET, travelled)
             queries += 1
             going &= (product >= OPAQUE_TRANSMITTANCE) & (queries < MAX_RESTARTS)

@@ -186,7 +186,7 @@ def _write_level(words: mi.UInt32, level: int, box: Box, children: Box) -> None:
         half = dr.clip(dr.ceil(2 * reach / step) + 1, 1, 255)
         centres |= mi.Vector3u(centre) << (8 * child)
         halves |= dr.select(filled, mi.Vector3u(half), 0) << (8 * child)
-    origin, step = (dr.reinterpret_array(mi.Vector3u, v) for v in (origin, step))
+    origin, step = (mi.Vector3u(dr.reinterpret_array(mi.Vector3u, v)) for v in (origin, step))
     record = (dr.opaque(mi.UInt32, 1 << (ROUNDS * level)) + node) * NODE_PACKETS
     packets = (
         mi.Vector4u(origin.x, origin.y, origin.z, step.x),

@@ -32,6 +32,8 @@ T_MIN = 1e-3
 
 GEOMETRY_PACKETS = 3
 """A geometry record is 12 floats: centre, opacity | t_u / s_u, radius | t_v / s_v, q_cut."""
+RADIUS = 7
+"""Where a geometry record holds the radius."""
 FEATURE_PACKETS = 3
 """A feature record is 12 floats: normal, roughness | base color, metallic | radiance of SH degree 0, 0."""
 SH_PACKETS = 12
@@ -110,6 +112,7 @@ class SurfelHit:
         alpha: opacity at the hit, clipped to 0.99.
         within: the hit lies where the kernel counts (alpha >= 1/255, response >= 0.0113).
         front: the ray meets the side that the normal points to.
+        radius: of the disk within which the surfel counts, along its longer axis, world units.
         unclipped: opacity before clipping. response: the kernel's value.
         u_axis, v_axis: t_u / s_u and t_v / s_v. normal: their cross product. facing: normal . direction.
         offset: p - c. u, v: its coordinates in standard deviations.
@@ -119,6 +122,7 @@ class SurfelHit:
     alpha: mi.Float
     within: mi.Bool
     front: mi.Bool
+    radius: mi.Float
     unclipped: mi.Float
     response: mi.Float
     u_axis: mi.Vector3f
@@ -160,6 +164,7 @@ def intersect(
         alpha=dr.select(unclipped < MAX_ALPHA, unclipped, MAX_ALPHA),
         within=q <= axis_v[3],
         front=facing < 0.0,
+        radius=axis_u[3],
         unclipped=unclipped,
         response=value,
         u_axis=u_axis,

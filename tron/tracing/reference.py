@@ -74,16 +74,18 @@ def rotation_matrices(quats: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Meetings:
-    """P rays against all M surfels, each array (P, M).
+    """P rays against all M surfels, each array (P, M) unless said.
 
     Attributes:
         t: distance to the surfel's plane. alpha: opacity there, clipped.
+        radius: (M,), of the disk within which the kernel counts, along its longer axis.
         counted: the kernel counts there, on whichever side. front: the ray meets the front.
         margin: distance of response and opacity to their cuts.
     """
 
     t: np.ndarray
     alpha: np.ndarray
+    radius: np.ndarray
     counted: np.ndarray
     front: np.ndarray
     margin: np.ndarray
@@ -108,11 +110,19 @@ def _meet(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> _Meeting
     return _Meetings(
         t=np.nan_to_num(t),
         alpha=np.minimum(raw, MAX_ALPHA),
+        radius=scales.max(1) * _cut(opacities, scene.kernel_degree),
         counted=(response >= MIN_RESPONSE) & (raw >= MIN_ALPHA) & np.isfinite(t),
         front=facing < 0,
         # A surfel is cut by whichever threshold it falls below first; the other one decides nothing.
         margin=np.abs(np.minimum(response - MIN_RESPONSE, raw - MIN_ALPHA)),
     )
+
+
+def _cut(opacities: np.ndarray, degree: int) -> np.ndarray:
+    """Distance in standard deviations up to which a surfel counts, 0 where it never does."""
+    faintest = np.minimum(np.maximum(MIN_RESPONSE, MIN_ALPHA / np.maximum(opacities, 1e-12)), 1)
+    exponent = -np.log(faintest)
+    return np.sqrt(2 * exponent) if degree == 2 else (81 / 4.5 * exponent) ** 0.25
 
 
 def composite(
@@ -192,10 +202,14 @@ def transmittance(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Transmittance of shadow rays and its margin to a threshold, both (P,) float64.
 
-    Front faces count from t = 0, back faces beyond ``BACK_FACE_SPACINGS`` spacings (never, if one-sided).
+    Front faces count from t = 0, back faces beyond ``BACK_FACE_SPACINGS`` spacings (never, if one-sided),
+    which are the scene's, and larger by as much as the surfel's radius is larger than the median.
     """
     origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
-    met, reach = _meet(scene, origins, directions), BACK_FACE_SPACINGS * scene.spacing
+    met = _meet(scene, origins, directions)
+    seen = met.radius[met.radius > 0]
+    larger = np.maximum(met.radius / (np.median(seen) if len(seen) else 1.0), 1)
+    reach = BACK_FACE_SPACINGS * scene.spacing * larger
     blocks = met.counted & np.where(met.front, met.t > 0, two_sided & (met.t > reach))
     product = np.where(blocks, 1 - met.alpha, 1.0).prod(1)
     starts = np.where(met.front, np.abs(met.t), np.abs(met.t - reach))

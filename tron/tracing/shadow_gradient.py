@@ -22,7 +22,7 @@ import mitsuba as mi
 
 from tron.tracing.bvh import Bvh
 from tron.tracing.kernel import GEOMETRY_PACKETS, MAX_ALPHA, SurfelRecords, intersect
-from tron.tracing.transmittance import blocks, transmittance
+from tron.tracing.transmittance import BackFaces, blocks, transmittance
 from tron.tracing.traversal import walk
 
 _OPACITY = 3
@@ -36,7 +36,7 @@ class _Shadow:
     bvh: Bvh
     origin: mi.Point3f
     direction: mi.Vector3f
-    back_faces_from: mi.Float
+    back_faces: BackFaces
     active: mi.Bool
 
 
@@ -53,7 +53,7 @@ def transmittance_by_opacity(
     bvh: Bvh,
     origin: mi.Point3f,
     direction: mi.Vector3f,
-    back_faces_from: mi.Float,
+    back_faces: BackFaces,
     active: mi.Bool,
 ) -> mi.Float:
     """:func:`tron.tracing.transmittance.transmittance` of one ray a lane, differentiable by opacities.
@@ -62,7 +62,7 @@ def transmittance_by_opacity(
         records: the surfels, whose gradients the opacities receive.
         bvh: their hierarchy. The other arguments are those of ``transmittance``.
     """
-    shadow = _Shadow(bvh, dr.detach(origin), dr.detach(direction), back_faces_from, active)
+    shadow = _Shadow(bvh, dr.detach(origin), dr.detach(direction), back_faces, active)
     return dr.custom(_Transmittance, records.geometry, shadow)
 
 
@@ -72,7 +72,7 @@ class _Transmittance(dr.CustomOp):
     def eval(self, geometry: Any, shadow: _Shadow) -> Any:
         self.width, self.shadow = dr.width(geometry), shadow
         (self.result,) = transmittance(
-            shadow.bvh, shadow.origin, [shadow.direction], shadow.back_faces_from, [shadow.active]
+            shadow.bvh, shadow.origin, [shadow.direction], shadow.back_faces, [shadow.active]
         )
         dr.eval(self.result)
         return mi.Float(self.result)
@@ -84,7 +84,7 @@ class _Transmittance(dr.CustomOp):
 
         def visit(state: _Whole, surfel: mi.UInt32, lanes: mi.Bool) -> _Whole:
             met = intersect(shadow.bvh.geometry, surfel, shadow.origin, shadow.direction, shadow.bvh.degree)
-            counts = lanes & blocks(met, shadow.back_faces_from) & (met.unclipped < MAX_ALPHA)
+            counts = lanes & blocks(met, shadow.back_faces) & (met.unclipped < MAX_ALPHA)
             by_opacity = -outer * met.response / (1 - met.alpha)
             index = dr.gather(mi.UInt32, shadow.bvh.order, surfel, counts)
             dr.scatter_reduce(

@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.tracing.bvh import Bvh
-from tron.tracing.transmittance import Products, multiply, remaining
+from tron.tracing.transmittance import BackFaces, Products, multiply, remaining
 from tron.tracing.traversal import Descent, look, search, slopes_of
 
 _NO_FAN = 0xFFFFFFFF
@@ -38,7 +38,7 @@ def queued_transmittance(
     bvh: Bvh,
     origin: mi.Point3f,
     directions: Sequence[mi.Vector3f],
-    back_faces_from: mi.Float,
+    back_faces: BackFaces,
     active: Sequence[mi.Bool],
 ) -> list[mi.Float]:
     """:func:`tron.tracing.transmittance.transmittance`, evaluated at once; not inside a recorded loop."""
@@ -50,7 +50,7 @@ def queued_transmittance(
     found = [dr.zeros(mi.Float, fans) for _ in directions]
     line = Line(dr.arange(mi.UInt32, fans), dr.opaque(mi.UInt32, fans), dr.opaque(mi.UInt32, 0))
     dr.make_opaque(found, line)
-    found = _trace_recorded(bvh, origin, directions, back_faces_from, active, line, found)
+    found = _trace_recorded(bvh, origin, directions, back_faces, active, line, found)
     return [dr.select(lanes, value, 1) for value, lanes in zip(found, active)]
 
 
@@ -68,12 +68,12 @@ def _trace_recorded(
     bvh: Bvh,
     origins: mi.Point3f,
     directions: Sequence[mi.Vector3f],
-    back_faces_from: mi.Float,
+    back_faces: BackFaces,
     active: Sequence[mi.Bool],
     line: Line,
     found: Sequence[mi.Float],
 ) -> Sequence[mi.Float]:
-    _trace(bvh, origins, directions, back_faces_from, active, line, found)
+    _trace(bvh, origins, directions, back_faces, active, line, found)
     return found
 
 
@@ -82,7 +82,7 @@ def _trace(
     bvh: Bvh,
     origins: mi.Point3f,
     directions: Sequence[mi.Vector3f],
-    back_faces_from: mi.Float,
+    back_faces: BackFaces,
     active: Sequence[mi.Bool],
     line: Line,
     found: Sequence[mi.Float],
@@ -105,4 +105,4 @@ def _trace(
             at = Descent.begun()
             state = Products.clear([dr.gather(mi.Bool, lanes, fan, going) for lanes in active])
         at = search(bvh, origin, slopes, state, at, going)
-        at, state = look(at, state, multiply(bvh, origin, along, back_faces_from), going)
+        at, state = look(at, state, multiply(bvh, origin, along, back_faces), going)

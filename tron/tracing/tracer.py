@@ -19,7 +19,7 @@ from tron.tracing.shadow_gradient import transmittance_by_opacity
 from tron.tracing.shadow_queue import queued_transmittance
 from tron.tracing.surface import Surface
 from tron.tracing.tiles import build_tiles
-from tron.tracing.transmittance import BACK_FACE_SPACINGS, transmittance
+from tron.tracing.transmittance import BackFaces, transmittance
 
 if TYPE_CHECKING:
     from tron.cameras import Camera
@@ -52,8 +52,7 @@ class SurfelTracer:
         # Not built when first needed: that may be inside a recorded loop, where nothing can be evaluated.
         self.bvh = build_bvh(self.records)
         self._sorted_area = self.bvh.area
-        reach = BACK_FACE_SPACINGS * scene.spacing if two_sided else float("inf")
-        self._back_faces_from = dr.opaque(mi.Float, reach)
+        self._back_faces = BackFaces.of(self.records, scene.spacing, two_sided)
 
     def moved(self, scene: GaussianScene) -> SurfelTracer:
         """A tracer of the same surfels where they are now; this one goes on tracing where they were.
@@ -128,12 +127,12 @@ class SurfelTracer:
         """
         recorded = dr.flag(dr.JitFlag.SymbolicScope)
         trace = transmittance if recorded else queued_transmittance
-        return trace(self.bvh, origin, directions, self._back_faces_from, active)
+        return trace(self.bvh, origin, directions, self._back_faces, active)
 
     def transmittance_by_opacity(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
     ) -> mi.Float:
         """:meth:`transmittance`, differentiable by the opacities; not inside a recorded loop."""
         return transmittance_by_opacity(
-            self._attached(), self.bvh, origin, direction, self._back_faces_from, mi.Bool(active)
+            self._attached(), self.bvh, origin, direction, self._back_faces, mi.Bool(active)
         )

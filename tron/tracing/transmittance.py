@@ -2,7 +2,8 @@
 
 Sidedness (measured in guidance.md): one-sided surfels leak, because undersides that no camera saw do not
 exist; naive two-sided surfels darken their own surface. So front faces block from t = 0, and back faces
-only beyond two surfel spacings, where they can no longer belong to the surface that the ray left.
+only beyond two surfel spacings, where they can no longer belong to the surface that the ray left. Where
+surfels are larger than the scene's median, their spacing is larger by as much (:class:`BackFaces`).
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false
@@ -15,9 +16,10 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from tron.tracing.bvh import Bvh
-from tron.tracing.kernel import SurfelHit, intersect
+from tron.tracing.kernel import GEOMETRY_PACKETS, RADIUS, SurfelHit, SurfelRecords, intersect
 from tron.tracing.traversal import any_of, walk
 
 OPAQUE_TRANSMITTANCE = 1e-2
@@ -43,9 +45,32 @@ class Products:
         )
 
 
-def blocks(met: SurfelHit, back_faces_from: mi.Float) -> mi.Bool:
+@dataclass
+class BackFaces:
+    """From where on back faces block: one lane each.
+
+    Attributes:
+        distance: from the ray's origin, world units, for surfels up to the median size.
+        radii: from the ray's origin, in radii of the surfel, for larger ones; infinity in both for never.
+    """
+
+    distance: mi.Float
+    radii: mi.Float
+
+    @staticmethod
+    def of(records: SurfelRecords, spacing: float, two_sided: bool = True) -> BackFaces:
+        """Two spacings, which are ``spacing`` (world units) where surfels have their median size."""
+        radii = np.array(dr.detach(records.geometry)).reshape(-1, 4 * GEOMETRY_PACKETS)[:, RADIUS]
+        median = float(np.median(radii[radii > 0])) if (radii > 0).any() else 1.0
+        reach = BACK_FACE_SPACINGS * spacing if two_sided else float("inf")
+        return BackFaces(dr.opaque(mi.Float, reach), dr.opaque(mi.Float, reach / median))
+
+
+def blocks(met: SurfelHit, back_faces: BackFaces) -> mi.Bool:
     """Whether a surfel stands in the ray's way: the rule of sidedness above."""
-    return met.within & (met.t > dr.select(met.front, 0, back_faces_from))
+    local = back_faces.radii * met.radius
+    far = dr.select(local > back_faces.distance, local, back_faces.distance)
+    return met.within & (met.t > dr.select(met.front, 0, far))
 
 
 def remaining(product: mi.Float) -> mi.Float:
@@ -54,7 +79,7 @@ def remaining(product: mi.Float) -> mi.Float:
 
 
 def multiply(
-    bvh: Bvh, origin: mi.Point3f, directions: Sequence[mi.Vector3f], back_faces_from: mi.Float
+    bvh: Bvh, origin: mi.Point3f, directions: Sequence[mi.Vector3f], back_faces: BackFaces
 ) -> Callable[[Products, mi.UInt32, mi.Bool], Products]:
     """What a walk does at each surfel."""
 
@@ -62,7 +87,7 @@ def multiply(
         for ray, direction in enumerate(directions):
             met = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
             before = state.product[ray]
-            product = dr.select(blocks(met, back_faces_from), before * (1 - met.alpha), before)
+            product = dr.select(blocks(met, back_faces), before * (1 - met.alpha), before)
             state.product[ray] = product
             state.farthest[ray] = dr.select(product >= OPAQUE_TRANSMITTANCE, state.farthest[ray], -dr.inf)
         return state
@@ -74,7 +99,7 @@ def transmittance(
     bvh: Bvh,
     origin: mi.Point3f,
     directions: Sequence[mi.Vector3f],
-    back_faces_from: mi.Float,
+    back_faces: BackFaces,
     active: Sequence[mi.Bool],
 ) -> list[mi.Float]:
     """Product of (1 - alpha) over the surfels that block each ray; exactly 0 below ``OPAQUE_TRANSMITTANCE``.
@@ -82,7 +107,7 @@ def transmittance(
     Args:
         bvh: the hierarchy.
         origin: world. directions: unit, world, of the rays that leave it: close to each other, for speed.
-        back_faces_from: distance beyond which back faces block, world units; infinity for one-sided surfels.
+        back_faces: from where on they block.
         active: the lanes of each direction to trace; the others get 1.
 
     Returns:
@@ -91,6 +116,6 @@ def transmittance(
 
     start = Products.clear(active)
     products = walk(
-        bvh, origin, directions, start, multiply(bvh, origin, directions, back_faces_from), any_of(active)
+        bvh, origin, directions, start, multiply(bvh, origin, directions, back_faces), any_of(active)
     ).product
     return [dr.select(lanes, remaining(product), 1) for product, lanes in zip(products, active)]

@@ -12,6 +12,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial.transform import Rotation
 
 from tron.cameras import Camera, mitsuba_sensor
+from tron.gaussians.scene import measure_spacing
 from tron.seeds import generator
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
@@ -89,20 +90,41 @@ def test_sidedness_darkens_no_lit_plane(
         np.testing.assert_allclose(np.array(shadowed), np.array(unshadowed), rtol=2e-3)
 
 
+def uneven(plane: Any, spacing: float, degrees: float, height: float) -> Any:
+    """A plane as reconstructions have it: normals off by some degrees, centres off by some of a spacing."""
+    rng = generator(0, "tests", "uneven")
+    shape = plane.points.shape
+    normals = plane.normals + np.tan(np.radians(degrees)) * rng.normal(size=shape) * [1, 1, 0]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = plane.points + spacing * rng.normal(size=shape) * [0.15, 0.15, height]
+    return SimpleNamespace(points=points, normals=normals)
+
+
+def test_coarse_surfels_beside_fine_ones_darken_little(dense_surfels, white) -> None:
+    """The spacing of most surfels, which the scene's is, is a tenth of the plane's."""
+    coarse, fine = 2.5 * SPACING, 0.25 * SPACING
+    plane = uneven(dense_surfels.plane(coarse, 1.5), coarse, 5.0, 0.05)
+    patch = dense_surfels.plane(fine, 0.5)
+    patch = SimpleNamespace(points=patch.points + np.array([9.0, 0, 0]), normals=patch.normals)
+    sizes = np.repeat([coarse, fine], [len(plane.points), len(patch.points)])
+    scales = np.log(0.5 * sizes)[:, None].repeat(2, 1)
+    scene = dense_surfels.scene(plane, patch, spacing=measure_spacing(patch.points), log_scales=scales)
+    assert measure_spacing(scene.means) < 0.11 * coarse
+    guidance = render_guidance(SurfelTracer(scene), VIEWS[0], white, 64)
+    inner = away_from_silhouettes(guidance)
+    assert inner.sum() > 400
+    assert guidance.irradiance[inner].mean() > 0.98
+
+
 @pytest.mark.parametrize(
     ("degrees", "height", "least"), [(1.0, 0.0, 0.995), (3.0, 0.02, 0.99), (5.0, 0.05, 0.98)]
 )
 def test_uneven_surfels_darken_little(
     dense_surfels, white, degrees: float, height: float, least: float
 ) -> None:
-    """A plane as reconstructions have it: normals off by some degrees, centres off by some of a spacing."""
-    plane = dense_surfels.plane(SPACING, 1.5)
-    rng = generator(0, "tests", "uneven")
-    shape = plane.points.shape
-    normals = plane.normals + np.tan(np.radians(degrees)) * rng.normal(size=shape) * [1, 1, 0]
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    points = plane.points + SPACING * rng.normal(size=shape) * [0.15, 0.15, height]
-    tracer = SurfelTracer(dense_surfels.scene(SimpleNamespace(points=points, normals=normals)))
+    tracer = SurfelTracer(
+        dense_surfels.scene(uneven(dense_surfels.plane(SPACING, 1.5), SPACING, degrees, height))
+    )
     guidance = render_guidance(tracer, VIEWS[0], white, 64)
     inner = away_from_silhouettes(guidance)
     assert inner.sum() > 400
