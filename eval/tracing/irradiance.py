@@ -51,7 +51,7 @@ class DirectTimes:
 
     @property
     def ratio(self) -> float:
-        """TRON's time, its hierarchy's build and its camera rays included, over Mitsuba's faster setting's."""
+        """TRON's time, its hierarchy's build and its camera rays included, over Mitsuba's faster time."""
         direct = min(t.median for name, t in self.times.items() if name.startswith("direct"))
         return sum(self.times[name].median for name in ("tron", "build", "gbuffer")) / direct
 
