@@ -148,10 +148,11 @@ def _constant_radiance(sh: mi.Float, surfel: mi.UInt32) -> list[mi.Float]:
 
 
 def _column(values: mi.Float, index: mi.UInt32) -> mi.Float:
-    # Each number is read once, yet the adjoint must not be told so: Dr.Jit 1.5 then overwrites (Permute, and
-    # NoConflicts in part) what other uses of the parameters have added, such as a regulariser of the loss.
-    # Nor may it make copies for each thread, whose kernel knows how many surfels there are.
-    return dr.gather(mi.Float, values, index, mode=dr.ReduceMode.Direct)
+    # Each number is read once, yet the adjoint must not be told so, nor any other mode: Dr.Jit 1.5 then
+    # overwrites (Permute, Direct, Local, and NoConflicts in part) what other uses of the parameters have
+    # added, such as a regulariser of the loss. Left to itself it makes copies for each thread; their kernel
+    # is compiled for each number of surfels.
+    return dr.gather(mi.Float, values, index)
 
 
 def _interleave(columns: list[mi.Float], count: int) -> mi.Float:

@@ -13,8 +13,8 @@ One step of a reconstruction reads::
 
 Nothing is copied on the way in: Dr.Jit reads the tensors' own memory, so they may be changed in place between
 steps, as optimisers do, but not between a rendering and its backward pass. Kernels are compiled at the first
-step and for no later view; another number of surfels compiles none either, but one for the gradients when it
-has grown by a quarter of its octave.
+step and for no later view. Another number of surfels compiles the small one that unpacks gradients, and the
+one that replays hits when it has grown by a quarter of its octave.
 """
 
 from __future__ import annotations
