@@ -12,7 +12,7 @@ import pytest
 
 from datagen.build import Geometry, build
 from datagen.captures import captured
-from datagen.lights import bake, draw_light
+from datagen.lights import Family, bake, draw_light
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.plan import Sources, Work
 from datagen.run import make_scene
@@ -40,7 +40,7 @@ def kernels_of(action: Callable[[], object]) -> set[str]:
 
 
 def geometry(index: int) -> Geometry:
-    lights = ["overcast"]
+    lights: list[Family] = ["overcast"]
     spec = draw_scene(0, "test", index, style="A", lights=lights, frames=1, path_frames=4, objects=(2, 2))
     return build(spec, edge=0.2)
 
@@ -136,10 +136,12 @@ def test_a_second_scene_of_a_split_brings_no_kernel(variant, tmp_path: Path):
 
 
 def test_a_second_capture_brings_no_kernel(variant):
-    settings = CaptureSettings(views=3, width=16, height=16, path_spp=4, reference_spp=4)
+    settings = CaptureSettings.model_validate(
+        {"views": 3, "width": 16, "height": 16, "path_spp": 4, "reference_spp": 4}
+    )
 
     def shot(index: int) -> set[str]:
-        families = ["studio"]
+        families: list[Family] = ["studio"]
         spec = draw_scene(
             0, "test", index, style="A", lights=families, frames=1, path_frames=4, objects=(2, 2)
         )
