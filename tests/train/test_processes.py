@@ -113,7 +113,7 @@ def free(folder: Path) -> bool:
 @pytest.mark.long
 def test_two_processes_killed_and_resumed_equal_one_with_twice_the_batch(alone, typed, tmp_path):
     output = tmp_path / "two"
-    # float64 all through; the tiny renderer has layers in float32 whatever it is told.
+    # In float64, but for the samples; the tiny renderer has layers in float32 whatever it is told.
     command = typed(output, "renderer=pixel_mlp", precision="64-true", stages=LONGER)
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     wait_for(lambda: list((output / "checkpoints").glob("1-one-*0.ckpt")) or process.poll() is not None)
@@ -128,7 +128,8 @@ def test_two_processes_killed_and_resumed_equal_one_with_twice_the_batch(alone, 
     assert f"from step {position.step}" in again.stderr
     assert again.stderr.count("Stage 2 of 2") == 1, "one process speaks"
     pixels = {"_target_": "tron.neural.pixel_mlp.PixelMLP"}
-    require_equal(alone(renderer=pixels, precision="64-true", stages=LONGER), output, 1e-12)
+    # Measured: 1.6e-8, of 0.4. Samples are float32, some pixels a rounding apart in other batches.
+    require_equal(alone(renderer=pixels, precision="64-true", stages=LONGER), output, 1e-6)
 
 
 def torchrun(rank: int, ranks: int, port: int) -> dict[str, str]:
