@@ -16,10 +16,11 @@ A node holds its four children's boxes, not its own, so that one read decides ab
 in steps of 1/250 of the node's own box, half sizes in half steps, rounded outwards, 0 for an empty child. A
 grid for each node, not one for the scene, costs nothing and is as fine as the node is small: a surfel that
 strayed far off coarsens no box but its ancestors' (compressed wide nodes: Ylitie et al. 2017, "Efficient
-Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs").
+Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs"). Nor do those coarsen their siblings': a child
+much larger than all the others together is visited by every ray, and the grid spans the others.
 
-Those ancestors are kept few: strays, farther from the bulk of the surfels than ``STRAY_SIZES`` times its
-size, come last in every part that they share with others, and so end together in the last subtree.
+The ancestors of strays are kept few: strays, farther from the bulk of the surfels than ``STRAY_SIZES`` times
+its size, come last in every part that they share with others, and so end together in the last subtree.
 """
 
 # pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
@@ -43,6 +44,9 @@ ROUNDS = 2
 NODE_PACKETS = 3
 STEPS = 250.0
 """Steps of a node's own grid along each axis; with rounding and slack a byte holds them."""
+EVERYWHERE = 255
+"""Half size of a child that every ray visits: one ``ALOOF`` times as large as all the others together."""
+ALOOF = 32.0
 THICKNESS = 1 / 1024
 """Every surfel's box is widened by this share of its largest extent: flat ones must survive float32."""
 STRAY_SIZES = 8.0
@@ -168,22 +172,35 @@ def _half_area(low: mi.Vector3f, high: mi.Vector3f) -> mi.Float:
 def _write_level(words: mi.UInt32, level: int, box: Box, children: Box) -> None:
     """Write the nodes of one level: the boxes of their children, quantised outwards."""
     node = dr.arange(mi.UInt32, 1 << (ROUNDS * level))
+    inner = [
+        tuple(
+            mi.Vector3f(*[dr.gather(mi.Float, v, CHILDREN * node + child) for v in bound])
+            for bound in children
+        )
+        for child in range(CHILDREN)
+    ]
     low, high = box
+    aloof = [mi.Bool(False)] * CHILDREN
+    for child in range(CHILDREN):
+        others = inner[:child] + inner[child + 1 :]
+        rest_low, rest_high = others[0]
+        for first, last in others[1:]:
+            rest_low, rest_high = dr.minimum(rest_low, first), dr.maximum(rest_high, last)
+        size = dr.max(inner[child][1] - inner[child][0])
+        aloof[child] = (rest_low.x <= rest_high.x) & (size > ALOOF * dr.max(rest_high - rest_low))
+        low, high = dr.select(aloof[child], rest_low, low), dr.select(aloof[child], rest_high, high)
     real = low.x <= high.x
     origin = dr.select(real, low, 0)
     step = dr.select(real, (high - low) / STEPS, 1)
     centres, halves = mi.Vector3u(0), mi.Vector3u(0)
-    for child in range(CHILDREN):
-        first, last = (
-            mi.Vector3f(*[dr.gather(mi.Float, v, CHILDREN * node + child) for v in bound])
-            for bound in children
-        )
+    for child, (first, last) in enumerate(inner):
         filled = first.x <= last.x
         middle = dr.select(filled, 0.5 * (first + last) - origin, 0)
         centre = dr.clip(dr.round(middle / step), 0, 255)
         reach = dr.maximum(0.5 * (last - first), 0) + dr.abs(middle - centre * step)
         # Half a step of slack covers the float32 rounding of this very quantisation.
-        half = dr.clip(dr.ceil(2 * reach / step) + 1, 1, 255)
+        half = dr.clip(dr.ceil(2 * reach / step) + 1, 1, EVERYWHERE - 1)
+        half = dr.select(aloof[child], EVERYWHERE, half)
         centres |= mi.Vector3u(centre) << (8 * child)
         halves |= dr.select(filled, mi.Vector3u(half), 0) << (8 * child)
     origin, step = (mi.Vector3u(dr.reinterpret_array(mi.Vector3u, v)) for v in (origin, step))

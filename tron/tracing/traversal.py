@@ -22,7 +22,7 @@ from typing import Protocol, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from tron.tracing.bvh import CHILDREN, LEAF_SIZE, NODE_PACKETS, Bvh
+from tron.tracing.bvh import CHILDREN, EVERYWHERE, LEAF_SIZE, NODE_PACKETS, Bvh
 
 NODES_A_TURN = 6
 LEAVES_A_TURN = 4
@@ -212,5 +212,6 @@ def _met_children(
             found.append((enter <= leave) & (enter <= farthest) & (leave >= nearest))
     bits = mi.UInt32(0)
     for child, (found, (_, half)) in enumerate(zip(hits, boxes)):
-        bits |= dr.select(any_of(found) & (half.x > 0), mi.UInt32(1 << child), 0)
+        visited = (any_of(found) & (half.x > 0)) | (half.x == EVERYWHERE)
+        bits |= dr.select(visited, mi.UInt32(1 << child), 0)
     return bits
