@@ -225,6 +225,8 @@ def test_a_path_traced_second_split_stands_in_for_photographs_and_photographs_do
     )
     monkeypatch.setattr(training_data, "first_meta", lambda *_: photographs)
     assert not data.stands_in("train_b")
+
+
 def test_validation_is_on_its_own_split_and_the_test_split_is_never_opened(
     dataset, tmp_path, make_settings, caplog
 ):
