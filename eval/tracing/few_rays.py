@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from eval.results import Row
-from eval.shadows import shadow_classes
+from eval.shadows import DirectLight, shadow_classes
 from eval.tracing.contenders import Contenders
 from eval.tracing.irradiance import REFERENCE_SEED, relative_rmse
 from eval.tracing.lights import LIGHTS
@@ -55,7 +55,7 @@ def measure_few_rays(contenders: Contenders, size: int, light: str, reference_sp
     spp = min(reference_spp, REFERENCE_SPP)
     truth = render_guidance(tracer, view, lighting, spp, REFERENCE_SEED)
     surface = truth.mask > 0
-    shadowed, _ = shadow_classes(truth.unshadowed, truth.irradiance, surface)
+    shadowed, _ = shadow_classes(DirectLight(truth.irradiance, truth.unshadowed), surface)
     plane = float(luminance(environment.unoccluded_upward()))
     mean, rmse, images = {}, {}, {}
     for way in [(rays, filtered) for rays in RAYS for filtered in (False, True)]:
