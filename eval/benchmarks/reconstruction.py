@@ -235,12 +235,11 @@ class Reconstruction(Benchmark):
         from eval.reconstruction.step import measure_steps
         from eval.reconstruction.subjects import trained
 
-        shape, rounds = None, (self.repetitions, self.slow_repetitions)
+        rounds = self.repetitions, self.slow_repetitions
         for way in (DEGREE2, next(iter(self.ways))):
             for size in self.step_pixels:
                 scene, view, extent = trained(folder, way, size)
-                found = measure_steps(scene, view, extent, self.seed, *rounds, shape)
-                shape = found.shape
+                found = measure_steps(scene, view, extent, self.seed, *rounds)
                 measured.steps.append(found)
                 told = ", ".join(f"{name} {times.median:.3f} s" for name, times in found.times.items())
                 ratio = found.ratio()

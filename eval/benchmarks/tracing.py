@@ -171,13 +171,14 @@ class Tracing(Benchmark):
 
     def _measure_inside(self, measured: Measured) -> None:
         from eval.tracing import volprim
-        from eval.tracing.camera_rays import SHIPPED, VOLPRIM
+        from eval.tracing.camera_rays import SHIPPED, VOLPRIM, faster_shape
         from eval.tracing.scene import GROUND, ROOM
 
-        integrators = {VOLPRIM: volprim.load_integrator(volprim.OUR_STOP), SHIPPED: volprim.load_integrator()}
+        same_stop, shipped = volprim.load_integrator(volprim.OUR_STOP), volprim.load_integrator()
+        integrators = {VOLPRIM: same_stop, SHIPPED: shipped}
         for place, (count, size) in ((ROOM, self.room), (GROUND, self.ground)):
             contenders = self._contenders(count, place)
-            contenders.shape = measured.shape
+            contenders.shape, _ = faster_shape(contenders, self.pixels[0], same_stop)
             usual = self._contenders(count) if place is ROOM else None
             measured.inside.append(self._frame(contenders, size, integrators, usual))
             picture = contenders.tracer.gbuffer(place.camera(size)).numpy()["rgb"]

@@ -31,14 +31,14 @@ def _milliseconds(steps: Steps, name: str) -> Cell:
 def _beside_the_peer(settings: Reconstruction, measured: Measured, found: Mapping[str, Row]) -> list[Block]:
     from eval.reconstruction.step import SHIPPED, TRON, VOLPRIM
 
-    shape = measured.steps[0].shape
+    shapes = " or ".join(dict.fromkeys(steps.shape for steps in measured.steps))
     intro = Text(
         "A step renders one view, compares it with the photo by 0.8 L1 + 0.2 (1 - SSIM), differentiates by "
         "positions, rotations, scales, opacities and harmonics up to degree 3, and updates them all by Adam. "
         "Both sides hold the same tensors in torch, under the same Adam and the same loss, on a scene "
         "that was reconstructed from photos; they differ in what renders and differentiates: TRON, or "
-        f"Mitsuba's volprim_rf_basic on {shape} (the faster of its two plugins here) through dr.wrap. Both "
-        "draw the same kernel. That of degree 2 is the peer's own; the scene is the first of those above, "
+        f"Mitsuba's volprim_rf_basic on {shapes} (in each case the faster of its two plugins) through dr.wrap. "
+        "Both draw the same kernel. That of degree 2 is the peer's own; the scene is the first of those above, "
         f"reconstructed once more with {' '.join(settings.step_degree2)}. With degree 4, the kernel of the "
         "scene above, the peer's line of density is replaced, and it takes longer: fewer surfels are faint. "
         "The peer stops a ray where TRON does; its own limit, ten times as high, ends rays sooner and is "

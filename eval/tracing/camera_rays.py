@@ -18,7 +18,6 @@ import numpy as np
 from eval.results import Row
 from eval.tracing import embree, gsplat_peer, volprim
 from eval.tracing.contenders import Contenders, spelled
-from eval.tracing.scene import camera
 from eval.tracing.timing import Times, interleaved
 from tron.cameras import Camera
 from tron.tracing.tiles import TILE, build_tiles
@@ -132,8 +131,8 @@ def tile_rays(view: Camera) -> tuple[mi.Point3f, mi.Vector3f]:
 
 
 def faster_shape(contenders: Contenders, size: int, integrator: Any) -> tuple[str, dict[str, Times]]:
-    """Which of the peer's two plugins for its primitives renders faster here, and both times."""
-    sensor = volprim.sensor(camera(size))
+    """Which of the peer's two plugins for its primitives renders this place faster, and both times."""
+    sensor = volprim.sensor(contenders.place.camera(size))
     scenes = {
         shape: volprim.primitives(contenders.scene, contenders.sh_degree, shape) for shape in volprim.SHAPES
     }

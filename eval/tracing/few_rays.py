@@ -78,7 +78,7 @@ def mean_over_reference(images: list[np.ndarray], truth: np.ndarray, chosen: np.
 
 
 def few_rays_rows(measured: list[FewRays]) -> list[Row]:
-    """Means and errors of every light and way, and the mean that is farthest from the reference's."""
+    """Means and errors of every light and way, and the least and the greatest mean."""
     rows = []
     for found in measured:
         for figure, unit, values in (
@@ -88,6 +88,8 @@ def few_rays_rows(measured: list[FewRays]) -> list[Row]:
             for (rays, filtered), value in values.items():
                 name = f"irradiance.{figure}.{found.light}.{rays}{'.filtered' if filtered else ''}"
                 rows.append(Row(metric=name, value=value, unit=unit, n=TRIALS))
-    worst = max(abs(value - 1) for found in measured for value in found.mean.values())
-    n = TRIALS * sum(len(found.mean) for found in measured)
-    return [*rows, Row(metric="irradiance.shadowed_mean_error", value=worst, unit="fraction", n=n)]
+    means = [value for found in measured for value in found.mean.values()]
+    for name, value in (("least", min(means)), ("greatest", max(means))):
+        metric = f"irradiance.shadowed_mean_over_reference.{name}"
+        rows.append(Row(metric=metric, value=value, unit="x", n=TRIALS * len(means)))
+    return rows

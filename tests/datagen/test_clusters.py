@@ -18,6 +18,7 @@ from tron.errors import TronError
 TINY = [
     "train.scenes=2",
     "train_b.scenes=0",
+    "validation.scenes=0",
     "test.scenes=0",
     "train.lights=[overcast]",
     "train.frames=1",

@@ -12,6 +12,7 @@ from eval.cli import cli
 from eval.results import Results
 from eval.tracing import agreement, embree, scene, volprim
 from eval.tracing.contenders import Contenders, spelled
+from eval.tracing.few_rays import RAYS, few_rays_rows, measure_few_rays
 from eval.tracing.irradiance import block_correlation, independent_irradiance, relative_rmse
 from eval.tracing.timing import Times, interleaved
 from tron import metrics, seeds
@@ -75,7 +76,8 @@ ROWS = [
     "irradiance.shadowed_mean_over_reference.sun.2",
     "irradiance.shadowed_mean_over_reference.soft.8.filtered",
     "irradiance.few_rays_rmse.sun.4.filtered",
-    "irradiance.shadowed_mean_error",
+    "irradiance.shadowed_mean_over_reference.least",
+    "irradiance.shadowed_mean_over_reference.greatest",
     "primary.max_error",
     "primary.rays_at_a_threshold",
     "shadow.max_error",
@@ -148,6 +150,16 @@ def test_a_part_alone_gives_its_rows_alone(tmp_path: Path):
     outcome = benchmark.run(tmp_path)
     assert {row.metric.split(".")[0] for row in outcome.rows} == {"primary", "shadow"}
     assert [section.name for section in outcome.sections] == ["exactness"]
+
+
+def test_few_rays_are_held_to_many_in_every_way():
+    found = measure_few_rays(Contenders(scene.surfels(500, seed=1)), 16, "soft", 64, seed=0)
+    rows = {row.metric.removeprefix("irradiance."): row.value for row in few_rays_rows([found])}
+    assert len(rows) == 2 * 2 * len(RAYS) + 2
+    means = [value for name, value in rows.items() if name.startswith("shadowed_mean_over_reference.soft")]
+    assert rows["shadowed_mean_over_reference.least"] == min(means) > 0
+    assert rows["shadowed_mean_over_reference.greatest"] == max(means)
+    assert rows["few_rays_rmse.soft.8"] < rows["few_rays_rmse.soft.2"], "more rays, less noise"
 
 
 def test_surfels_lie_on_the_mesh_that_stands_for_them():

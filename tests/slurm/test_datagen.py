@@ -13,6 +13,7 @@ LONGEST = 500.0
 TINY = [
     "train.scenes=3",
     "train_b.scenes=0",
+    "validation.scenes=0",
     "test.scenes=0",
     "train.lights=[overcast]",
     "train.frames=1",

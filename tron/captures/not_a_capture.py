@@ -8,13 +8,9 @@ from typing import Any
 
 from tron.captures.photographs import SUFFIXES
 from tron.errors import TronError
+from tron.gaussians.foreign_files import PACKED_SPLATS, VIDEOS, packed_splats, photos_of_video
 
 _PHOTO = ("one photo", "give the folder of all photos of the scene")
-_SPLATS = (
-    "compressed splats, not photos",
-    "nothing is left to reconstruct: save them as a 3DGS PLY (SuperSplat does) and give it to "
-    "tron-relight scene=FILE.ply",
-)
 _ARCHIVE = ("an archive", "unpack it and give the folder")
 _ENVIRONMENT = ("an environment map, not a capture", "tron-relight environment=FILE takes it")
 _MODEL = (
@@ -24,19 +20,10 @@ _MODEL = (
 _KINDS: dict[str, tuple[str, str]] = {
     **dict.fromkeys(SUFFIXES, _PHOTO),
     ".heic": ("a photo in HEIC", "save all photos of the scene as JPEG and give their folder"),
-    **dict.fromkeys((".splat", ".spz", ".ksplat", ".sog"), _SPLATS),
     ".ply": ("a PLY of splats or points, not photos", "tron-relight scene=FILE takes splats"),
     **dict.fromkeys((".zip", ".tar", ".gz", ".tgz", ".7z"), _ARCHIVE),
     **dict.fromkeys((".hdr", ".exr"), _ENVIRONMENT),
     **dict.fromkeys((".obj", ".glb", ".gltf", ".fbx", ".stl"), _MODEL),
-    **dict.fromkeys(
-        (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"),
-        (
-            "a video",
-            "take photos out of it, two a second: mkdir photos; ffmpeg -i VIDEO -vf fps=2 -q:v 2 "
-            "photos/%04d.jpg; then capture=photos matching=sequential",
-        ),
-    ),
     **dict.fromkeys(
         (".bin", ".db"), ("a part of a COLMAP model", "give the folder that holds sparse/0 and the photos")
     ),
@@ -47,19 +34,32 @@ _CAMERA_PATH = "camera_path"
 def refusal(path: Path) -> TronError:
     """Error for a file other than ``.json``, or a folder without poses and photos: what there is instead."""
     if not path.is_dir():
-        if path.suffix.lower() not in _KINDS:
+        kind = _kind(path)
+        if kind is None:
             return TronError("a capture is a folder or a transforms.json", path)
-        what, mend = _KINDS[path.suffix.lower()]
-        return TronError(f"a capture is a folder or a transforms.json, this is {what}", path, mend)
+        return TronError(f"a capture is a folder or a transforms.json, this is {kind[0]}", path, kind[1])
     for file in (*_files(path), *_files(path / "images")):
-        if file.suffix.lower() in _KINDS:
-            what, mend = _KINDS[file.suffix.lower()]
-            return TronError(f"neither poses nor photos, but {what}", file, mend)
+        kind = _kind(file)
+        if kind is not None:
+            return TronError(f"neither poses nor photos, but {kind[0]}", file, kind[1])
     return TronError(
         "neither poses nor photos",
         path,
         "a capture has transforms.json, sparse/0, TensoIR's view folders, or photos",
     )
+
+
+def _kind(file: Path) -> tuple[str, str] | None:
+    """What a file is by its name, and what to do with it; None of an unknown kind."""
+    suffix = file.suffix.lower()
+    if suffix in VIDEOS:
+        return "a video", f"{photos_of_video(file)}; then capture=photos matching=sequential"
+    if suffix in PACKED_SPLATS:
+        mend = (
+            f"they are a scene already, for tron-relight scene=FILE.ply: {packed_splats(file, suffix).mend}"
+        )
+        return "packed splats, not photos", mend
+    return _KINDS.get(suffix)
 
 
 def _files(folder: Path) -> list[Path]:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from tron.errors import TronError
 
-_VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".insv")
-_PACKED_SPLATS = {
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".insv")
+PACKED_SPLATS = {
     ".splat": "antimatter15's .splat",
     ".ksplat": "mkkellogg's .ksplat",
     ".spz": "Niantic's .spz",
@@ -18,13 +18,16 @@ _PACKED_SPLATS = {
 def refuse_foreign(path: Path) -> None:
     """Raise TronError if the name is that of a file that needs a step before it is a scene."""
     suffix = path.suffix.lower()
-    if suffix in _VIDEOS:
-        steps = (
-            f"mkdir photos; ffmpeg -i {path.name} -vf fps=2 photos/%04d.jpg; tron-reconstruct capture=photos"
-        )
-        raise TronError("a video is no scene, its frames can become one", path, f"{steps} output_dir=OUT")
-    if suffix in _PACKED_SPLATS:
-        raise packed_splats(path, _PACKED_SPLATS[suffix])
+    if suffix in VIDEOS:
+        mend = f"{photos_of_video(path)}; tron-reconstruct capture=photos matching=sequential output_dir=OUT"
+        raise TronError("a video is no scene, its frames can become one", path, mend)
+    if suffix in PACKED_SPLATS:
+        raise packed_splats(path, PACKED_SPLATS[suffix])
+
+
+def photos_of_video(path: Path) -> str:
+    """Shell line that takes two photos a second out of a video, into the folder ``photos``."""
+    return f"mkdir photos; ffmpeg -i {path.name} -vf fps=2 -q:v 2 photos/%04d.jpg"
 
 
 def packed_splats(path: Path, kind: str) -> TronError:
