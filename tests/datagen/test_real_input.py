@@ -3,6 +3,7 @@ map.
 """
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -33,13 +34,16 @@ def dataset(shared_data: Path, variant: str, tmp_path_factory: pytest.TempPathFa
     if missing or len(maps) < 4:
         pytest.skip(f"no real data: {', '.join(missing) or 'environment maps'} absent from {shared_data}")
     folder = tmp_path_factory.mktemp("real")
+    for model in MODELS:  # the folder may hold others, of which this test knows no licence
+        kept = Path(model).parent
+        shutil.copytree(shared_data / "assets" / kept, folder / "assets" / kept)
     catalogue = folder / "catalogue.json"
     entries = [{"path": path, "licence": licence} for path, licence in zip(MODELS, LICENCES)]
     entries += [{"path": name, "licence": "CC0-1.0", "source": "Poly Haven"} for name in maps]
     catalogue.write_text(json.dumps(entries))
     overrides = [
         f"output_dir={folder / 'dataset'}",
-        f"assets={shared_data / 'assets'}",
+        f"assets={folder / 'assets'}",
         f"environments={shared_data / 'hdri'}",
         f"catalogue={catalogue}",
         "seed=4",
