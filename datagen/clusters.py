@@ -8,6 +8,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
 from datagen.settings import Settings
@@ -35,6 +36,9 @@ def require_cluster(settings: Settings) -> None:
             "cluster=address has no address",
             mend="give cluster.address=tcp://HOST:PORT or cluster.scheduler_file",
         )
+    file = options.get("scheduler_file")
+    if file and not Path(file).is_file():  # Dask would wait for it without end
+        raise TronError("cluster.scheduler_file not found", file, "start the scheduler first")
     command = _submit_command(target)
     if command is None:
         return

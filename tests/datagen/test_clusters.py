@@ -88,6 +88,7 @@ def test_one_kind_of_cluster_keeps_no_key_of_another(tmp_path):
         (["cluster=slurm", "workers=2"], "sbatch", "command sbatch not found"),
         (["cluster=slurm"], None, "'workers' has no value .*: say how many to start: workers=N"),
         (["cluster=address"], None, "cluster=address has no address"),
+        (["cluster=address", "cluster.scheduler_file=absent.json"], None, r"not found \(absent.json\)"),
         (["cluster._target_=nowhere.Cluster"], None, "needs the package nowhere"),
         (["cluster._target_=dask.distributed.NoCluster"], None, "cannot be loaded"),
     ],

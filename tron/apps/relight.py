@@ -53,8 +53,8 @@ def main(settings: Settings) -> None:
     size = settings.width, settings.height
     given = None if settings.cameras is None else read_cameras(settings.cameras, *size)
     environments = [_load_environment(light) for light in lights]
-    scene = _load_scene(settings)
     renderer = _load_renderer(settings)
+    scene = _load_scene(settings)
     turn = upright(scene.up)  # to +z, which is up in environment maps
     scene = scene if np.allclose(turn, np.eye(3)) else scene.rotated(turn)
     cameras = _plan(scene, settings) if given is None else turn_cameras(given, turn)
@@ -104,7 +104,11 @@ def _check_paths(settings: Settings, lights: Sequence[Settings]) -> None:
     for path in (settings.scene, *maps, settings.cameras, settings.checkpoint, settings.vae):
         assert path is None or isinstance(path, Path)
         if path is not None and not path.is_file():
-            raise TronError("cannot read: is a folder" if path.is_dir() else "file not found", path)
+            if path.is_dir():
+                raise TronError("cannot read: is a folder", path, "give one file of it")
+            raise TronError("file not found", path)
+    if settings.output_dir.exists() and not settings.output_dir.is_dir():
+        raise TronError("output_dir is a file", settings.output_dir, "give a folder, which need not exist")
     refuse_foreign(settings.scene)
     check_header(settings.scene)
 
@@ -117,10 +121,7 @@ def _load_scene(settings: Settings) -> GaussianScene:
             settings.scene,
         )
     if settings.up is not None:
-        length = float(np.linalg.norm(settings.up))
-        if not (np.isfinite(length) and length > 0):
-            raise TronError("wrong value for 'up'", str(settings.up), "give a direction, such as [0,0,1]")
-        scene.up = np.array(settings.up) / length
+        scene.up = np.array(settings.up) / np.linalg.norm(settings.up)
     elif scene.up_guessed:
         log.warning(
             "%s does not say which way is up: -y is taken, as in most 3DGS files; up=[0,0,1] (or another "

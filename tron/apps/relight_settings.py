@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from tron.apps.framing import TrajectoryName
 from tron.apps.relit import Background
@@ -95,6 +96,13 @@ class Settings(BaseModel):
         "llvm_ad_rgb", description="Mitsuba variant: processor or NVIDIA GPU"
     )
     threads: int | None = Field(None, ge=1, description="threads of renderer and network; null: all")
+
+    @field_validator("up")
+    @classmethod
+    def _is_a_direction(cls, up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if up is not None and not 0 < math.hypot(*up) < math.inf:
+            raise ValueError("a direction has a length: give three numbers that are not all 0")
+        return up
 
     @model_validator(mode="after")
     def _has_radiance(self) -> Settings:

@@ -201,6 +201,13 @@ def test_a_scene_lying_on_its_side_is_stood_up(relight, ball_on_floor, light_pat
     assert np.abs(shots[0] - shots[1]).mean() < 0.05 * shots[0].mean()
 
 
+def test_a_file_in_place_of_the_output_folder_is_one_line(relight, scene_path, light_path, tmp_path, capsys):
+    (tmp_path / "out.mp4").write_text("kept")
+    assert relight(f"scene={scene_path}", f"environment={light_path}", f"output_dir={tmp_path}/out.mp4") == 2
+    assert "output_dir is a file" in capsys.readouterr().err
+    assert (tmp_path / "out.mp4").read_text() == "kept"
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -211,7 +218,7 @@ def test_a_scene_lying_on_its_side_is_stood_up(relight, ball_on_floor, light_pat
         ({"checkpoint": "absent.safetensors"}, "absent.safetensors"),
         ({"cameras": "absent.json"}, "absent.json"),
         ({"quality": "best"}, "'quality'"),
-        ({"up": "[0,0,0]"}, "'up'"),
+        ({"up": "[0,0,0]"}, "a direction has a length"),
         ({"exposure": "-1"}, "'exposure'"),
         ({"buffers": "pbr"}, "a list is written buffers=[pbr]"),
         ({"up": "0,0,1"}, "write 'up=[0,0,1]'"),
