@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datagen.captures import make_captures
+from datagen.capture_export import make_captures
 from datagen.run import make
 from datagen.settings import Settings
 from datagen.validate import validate

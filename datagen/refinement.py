@@ -14,7 +14,7 @@ from tron.color import linear_to_srgb
 from tron.gaussians.initialize import GBufferView
 from tron.gaussians.scene import GaussianScene
 from tron.reconstruction.evaluation import mean_figures, score_views
-from tron.reconstruction.refinement import RefinementSettings, refine
+from tron.reconstruction.gbuffer_fitting import RefinementSettings, refine
 from tron.runtime import set_torch_threads
 from tron.tracing import SurfelTracer
 

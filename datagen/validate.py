@@ -7,8 +7,8 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
+from datagen.capture_export import CAPTURES
 from datagen.capture_manifest import verify_captures
-from datagen.captures import CAPTURES
 from tron.shards.manifest import MANIFEST_NAME, Manifest, verify
 
 log = logging.getLogger(__name__)

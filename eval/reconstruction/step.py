@@ -8,7 +8,7 @@ step is that of stage 1 (:class:`tron.reconstruction.training.Stage`), without p
 control. The peer's picture comes through ``dr.wrap``, as Mitsuba's documentation has it; that Mitsuba builds
 its hierarchy anew for the surfels that have moved is counted, because no step goes without it.
 
-What stays unequal is said in :mod:`eval.tracing.volprim`: the peer composites radiance alone, of flat
+What stays unequal is said in :mod:`eval.peers.volprim`: the peer composites radiance alone, of flat
 ellipsoids that are seen from both sides.
 """
 
@@ -24,8 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eval.tracing import volprim
-from eval.tracing.timing import Times, interleaved
+from eval.peers import volprim
+from eval.peers.timing import Times, interleaved
 from tron import metrics
 from tron.captures import View
 from tron.gaussians.scene import GaussianScene

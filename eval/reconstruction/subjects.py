@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from eval.peers.scene import camera, surfels
 from eval.reconstruction.pictures import middle_view
-from eval.tracing.scene import camera, surfels
 from tron.captures import View
 from tron.captures.folder import read_capture_folder
 from tron.errors import TronError

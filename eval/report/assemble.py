@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from eval.benchmarks import Outcome
+from eval.benchmark import Outcome
 from eval.report.figures import bound, verdict, with_interval
 from eval.report.page import Cell, Code, Page, Section, Table, Text, Tile
 from eval.results import Results, Target

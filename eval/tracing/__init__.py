@@ -1,4 +1,4 @@
 """Measuring the tracer: a scene in two forms, the peers, interleaved timing, errors and memory.
 
-:mod:`eval.benchmarks.tracing` runs it all; :mod:`eval.report.tracing` writes the page.
+:mod:`eval.tracing.benchmark` runs it all; :mod:`eval.tracing.page` writes the page.
 """

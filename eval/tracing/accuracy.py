@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from eval.peers.contenders import Contenders
+from eval.peers.scene import camera
 from eval.results import Row
-from eval.tracing.contenders import Contenders
-from eval.tracing.scene import camera
 from eval.tracing.shadow_rays import random_rays
 from tron import seeds
 from tron.tracing import reference
@@ -56,7 +56,7 @@ def camera_errors(contenders: Contenders, size: int, rays: int, seed: int) -> li
 
 def shadow_errors(contenders: Contenders, size: int, rays: int, seed: int) -> list[Row]:
     """Largest error of transmittance over ``rays`` random shadow rays, and of the restarting peer."""
-    from eval.tracing.embree import RestartedShadows
+    from eval.peers.embree import RestartedShadows
 
     scene = contenders.scene
     gbuffer = contenders.tracer.gbuffer(camera(size))

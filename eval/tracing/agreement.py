@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from eval.tracing import volprim
-from eval.tracing.contenders import Contenders
-from eval.tracing.scene import camera
+from eval.peers import volprim
+from eval.peers.contenders import Contenders
+from eval.peers.scene import camera
 from tron import metrics, seeds
 from tron.gaussians.scene import GaussianScene
 from tron.tracing import reference

@@ -15,10 +15,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from eval.peers import embree, volprim
+from eval.peers import gsplat as gsplat_peer
+from eval.peers.contenders import Contenders, spelled
+from eval.peers.timing import Times, interleaved
 from eval.results import Row
-from eval.tracing import embree, gsplat_peer, volprim
-from eval.tracing.contenders import Contenders, spelled
-from eval.tracing.timing import Times, interleaved
 from tron.cameras import Camera
 from tron.tracing.tiles import TILE, build_tiles
 

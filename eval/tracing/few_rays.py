@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from eval.peers.contenders import Contenders
+from eval.peers.scene import camera
+from eval.relighting.shadows import DirectLight, shadow_classes
 from eval.results import Row
-from eval.shadows import DirectLight, shadow_classes
-from eval.tracing.contenders import Contenders
 from eval.tracing.irradiance import REFERENCE_SEED, relative_rmse
 from eval.tracing.lights import LIGHTS
-from eval.tracing.scene import camera
 from tron.color import luminance
 from tron.shading import Lighting, render_guidance
 

@@ -7,7 +7,6 @@ harmonics. The peer's hierarchy stands still: that it would have to be built ane
 counted.
 """
 
-# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
 # (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from eval.peers import volprim
+from eval.peers.contenders import Contenders, spelled
+from eval.peers.scene import camera
+from eval.peers.timing import Times, interleaved
 from eval.results import Row
-from eval.tracing import volprim
-from eval.tracing.contenders import Contenders, spelled
-from eval.tracing.scene import camera
-from eval.tracing.timing import Times, interleaved
 from tron.tracing.gbuffer import trace_gbuffer
 from tron.tracing.parameters import PARAMETERS, SurfelParameters, pack
 from tron.tracing.tiles import build_tiles

@@ -8,7 +8,6 @@ Errors may be noise, never blocks. For pairs of pixels at one offset, errors cor
 aligned block as across its border, unless pixels of a block share something: that excess is measured.
 """
 
-# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
 # (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from eval.peers.contenders import Contenders
+from eval.peers.scene import camera, mitsuba_mesh
+from eval.peers.timing import Times, interleaved
 from eval.results import Row
-from eval.tracing.contenders import Contenders
 from eval.tracing.lights import LIGHTS
-from eval.tracing.scene import camera, mitsuba_mesh
-from eval.tracing.timing import Times, interleaved
 from tron import seeds
 from tron.cameras import mitsuba_sensor
 from tron.color import luminance

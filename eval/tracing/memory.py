@@ -56,7 +56,7 @@ def main(count: int, size: int, variant: str, seed: int) -> None:
     activate(variant)
     import drjit as dr
 
-    from eval.tracing.scene import camera, surfels
+    from eval.peers.scene import camera, surfels
     from eval.tracing.shadow_rays import random_rays
     from tron.tracing import SurfelTracer
 

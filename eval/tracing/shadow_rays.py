@@ -6,7 +6,6 @@ pass itself with something else in the way of the light; what is not tracing is 
 and taken off both sides.
 """
 
-# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
 # (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from eval.peers import embree
+from eval.peers.contenders import Contenders, spelled
+from eval.peers.scene import camera
+from eval.peers.timing import Times, interleaved
 from eval.results import Row
-from eval.tracing import embree
-from eval.tracing.contenders import Contenders, spelled
 from eval.tracing.lights import soft
-from eval.tracing.scene import camera
-from eval.tracing.timing import Times, interleaved
 from tron import seeds
 from tron.gaussians.scene import GaussianScene
 from tron.shading.environment import EnvironmentLight

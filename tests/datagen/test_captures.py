@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import datagen.captures
+import datagen.capture_export
 from datagen.build import build
-from datagen.captures import develop, make_capture, make_captures
+from datagen.capture_export import develop, make_capture, make_captures
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.plan import Work
 from datagen.scene import SceneSpec
@@ -185,7 +185,7 @@ def test_nothing_that_is_not_finite_is_stored(tmp_path, monkeypatch):
         frames[3, 2, 1] = np.inf
         return frames
 
-    monkeypatch.setattr(datagen.captures, "render_frames", spoilt)
+    monkeypatch.setattr(datagen.capture_export, "render_frames", spoilt)
     assert make_captures(tiny(tmp_path, "captures.scenes=1", "captures.path_spp=1")) == 1
     listed = tmp_path / "captures" / "failures.jsonl"
     assert {path.name for path in (tmp_path / "captures").iterdir()} == {
@@ -250,7 +250,7 @@ def test_captures_of_an_older_engine_are_recorded_by_the_next_run(output, tmp_pa
 
 def test_captures_repeat_byte_by_byte_in_any_groups_and_company(output, tmp_path, monkeypatch):
     """Views rendered two at a time, one scene alone: the bytes do not depend on it."""
-    monkeypatch.setattr(datagen.captures, "GROUP_PIXELS", 2 * 28 * 20)
+    monkeypatch.setattr(datagen.capture_export, "GROUP_PIXELS", 2 * 28 * 20)
     assert make_captures(tiny(tmp_path, "only=[test-000001]")) == 0
     whole = tree(output / "captures" / "test-000001")
     assert tree(tmp_path / "captures" / "test-000001") == whole
@@ -268,7 +268,7 @@ def test_a_finished_capture_is_not_made_again_and_a_damaged_one_is(output, monke
         made.append(item.name)
         return make_capture(item, *rest)
 
-    monkeypatch.setattr(datagen.captures, "make_capture", watched)
+    monkeypatch.setattr(datagen.capture_export, "make_capture", watched)
     assert make_captures(tiny(output)) == 0
     assert made == []
     (output / "captures/test-000000/normal/view_00003.exr").unlink()

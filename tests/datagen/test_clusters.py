@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from dask.distributed import Client, LocalCluster
 
-from datagen.captures import make_captures
+from datagen.capture_export import make_captures
 from datagen.cli import cli
 from datagen.run import make
 from datagen.settings import Settings

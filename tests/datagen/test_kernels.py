@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from datagen.build import Geometry, build
-from datagen.captures import captured
+from datagen.capture_export import captured
 from datagen.lights import Family, bake, draw_light
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.plan import Sources, Work

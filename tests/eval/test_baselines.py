@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from eval.baselines import RATIO_FLOOR, AffineFit, ProductTerms, ScaleFit, product_terms, shadow_ratio
+from eval.relighting.baselines import (
+    RATIO_FLOOR,
+    AffineFit,
+    ProductTerms,
+    ScaleFit,
+    product_terms,
+    shadow_ratio,
+)
 from tron.color import agx
 from tron.seeds import generator
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from eval.benchmarks.relighting import Relighting
+from eval.relighting.benchmark import Relighting
 from eval.report.assemble import assemble
 from eval.report.render import write_report
 from eval.results import Results

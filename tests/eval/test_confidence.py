@@ -9,13 +9,13 @@ import pytest
 import scipy.stats
 
 from eval.confidence import Interval, interval, mean_interval, quotient, scene_sums
-from eval.guidance import GuidanceScores, _fractions
-from eval.refinement import refinement
+from eval.demo.refinement import refinement
+from eval.relighting.guidance import GuidanceScores, _fractions
+from eval.relighting.scores import Score, Scores
+from eval.relighting.shadows import ShadowCounts
 from eval.report.figures import with_interval
 from eval.report.intervals import interval_note
 from eval.results import Results, Row
-from eval.scores import Score, Scores
-from eval.shadows import ShadowCounts
 from tron.seeds import generator
 from tron.shards.schema import Clip
 

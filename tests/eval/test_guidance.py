@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from eval.guidance import GuidanceScores
-from eval.shadows import DirectLight, ShadowCounts, count_shadow_errors, same_depth, same_normal
+from eval.relighting.guidance import GuidanceScores
+from eval.relighting.shadows import DirectLight, ShadowCounts, count_shadow_errors, same_depth, same_normal
 from tron.color import agx
 from tron.shards.schema import REFERENCE_MEMBERS, Clip
 

@@ -11,12 +11,12 @@ import torch
 
 from eval import stages as stages_module
 from eval.cli import cli
+from eval.peers import volprim
 from eval.reconstruction import step
 from eval.reconstruction.light import irradiance, light_errors
 from eval.reconstruction.runs import Report, Run, read_report, rows_of
 from eval.reconstruction.subjects import drawn
 from eval.results import Results
-from eval.tracing import volprim
 from tron.captures import Capture, View
 from tron.captures.folder import write_capture
 from tron.errors import TronError

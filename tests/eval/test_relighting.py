@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eval.benchmarks import Outcome
-from eval.benchmarks.relighting import Relighting, choose_clips
+from eval.benchmark import Outcome
 from eval.cli import cli
+from eval.relighting.benchmark import Relighting, choose_clips
+from eval.relighting.scores import Score, Scores
 from eval.report.page import Pictures
 from eval.results import Results
-from eval.scores import Score, Scores
 from tron.images import read_image
 
 REQUIRED = [

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eval.benchmarks import Outcome
+from eval.benchmark import Outcome
 from eval.report.assemble import assemble
 from eval.report.charts import read_metrics, training_curves
 from eval.report.figures import verdict, written

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from eval.predictions import Predictor, displayed_truth, fit_baselines, region_mask
-from eval.scores import Scores
+from eval.relighting.predictions import Predictor, displayed_truth, fit_baselines, region_mask
+from eval.relighting.scores import Scores
 from tron.color import to_display
 from tron.errors import TronError
 from tron.metrics import PSNR_CAP

@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eval.benchmarks.tracing import Tracing
 from eval.cli import cli
+from eval.peers import embree, scene, volprim
+from eval.peers.contenders import Contenders, spelled
+from eval.peers.timing import Times, interleaved
 from eval.results import Results
-from eval.tracing import agreement, embree, scene, volprim
-from eval.tracing.contenders import Contenders, spelled
+from eval.tracing import agreement
+from eval.tracing.benchmark import Tracing
 from eval.tracing.few_rays import RAYS, few_rays_rows, measure_few_rays
 from eval.tracing.irradiance import block_correlation, independent_irradiance, relative_rmse
-from eval.tracing.timing import Times, interleaved
 from tron import metrics, seeds
 from tron.cameras import Camera
 from tron.shading import EnvironmentLight, irradiance
@@ -322,7 +323,7 @@ def test_contestants_take_turns_and_slow_ones_sit_out(monkeypatch: pytest.Monkey
 
         return work
 
-    monkeypatch.setattr("eval.tracing.timing.seconds_of", timed)
+    monkeypatch.setattr("eval.peers.timing.seconds_of", timed)
     times = interleaved({name: contestant(name) for name in seconds}, repetitions=4, slow_repetitions=2)
     assert calls == ["quick", "slow"] * 3 + ["quick"] * 2  # the first round warms up
     assert times["slow"].over(times["quick"]) == pytest.approx(20)

@@ -4,7 +4,6 @@ What rays show is decided by an :class:`Appearance`, one a plugin. Mitsuba's bas
 variants, so the class that Mitsuba knows is made for the active one, around an appearance.
 """
 
-# pyright: reportOperatorIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
 # (Mitsuba's type stubs know neither arithmetic between its own array types nor what a variant brings.)
 
 from __future__ import annotations

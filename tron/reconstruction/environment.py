@@ -1,6 +1,6 @@
 """The light of a capture: an environment map from irradiance priors and photos (paper, Algorithm 2).
 
-Stage 3a (:mod:`tron.reconstruction.environment_refinement`) fits a cubemap to the priors' irradiance, stage
+Stage 3a (:mod:`tron.reconstruction.cubemap_fitting`) fits a cubemap to the priors' irradiance, stage
 3b (:mod:`tron.reconstruction.light_scale`) one scale to the photos; the scene is frozen in both.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from tron.captures import Capture
 from tron.errors import TronError
 from tron.gaussians import GaussianScene
-from tron.reconstruction.environment_refinement import refine
+from tron.reconstruction.cubemap_fitting import refine
 from tron.reconstruction.light_scale import LightScale, choose_photos, fit_scale
 from tron.reconstruction.settings import FitSettings
 from tron.reconstruction.surface_points import SurfacePoints

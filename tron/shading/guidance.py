@@ -16,7 +16,6 @@ with the share of :mod:`tron.shading.background`, exactly 0 behind opaque surfel
 exposure and AgX are applied when a buffer is looked at or loaded.
 """
 
-# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
 # (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations

@@ -14,7 +14,6 @@ for every pixel and is launched again for the next, so memory does not grow with
 rays inside the kernel was three times as slow.)
 """
 
-# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
 # (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations

@@ -7,7 +7,6 @@ densities. Memory grows with pixels x rays;
 where no gradient is wanted, :func:`tron.shading.irradiance` stores nothing.
 """
 
-# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
 # (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations

@@ -23,7 +23,6 @@ The ancestors of strays are kept few: strays, farther from the bulk of the surfe
 its size, come last in every part that they share with others, and so end together in the last subtree.
 """
 
-# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
 # (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations

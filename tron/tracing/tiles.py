@@ -10,7 +10,6 @@ Surfels are ordered by ``near`` first and written out tile by tile, so one stabl
 All of it runs in Dr.Jit; only the number of entries comes back to Python, because arrays need a size.
 """
 
-# pyright: reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportReturnType=false
 # (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
 
 from __future__ import annotations

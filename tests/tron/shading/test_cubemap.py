@@ -1,6 +1,5 @@
 """Laws of the cubemap: continuous on the sphere, one with the lat-long map, and its gradients are honest."""
 
-# pyright: reportOperatorIssue=false, reportArgumentType=false, reportReturnType=false
 # (Mitsuba's type stubs know no arithmetic between its own array types.)
 
 import drjit as dr

@@ -1,6 +1,5 @@
 """Laws of the sample points: uniform, stratified in every pixel and block of pixels, blue in the image."""
 
-# pyright: reportOperatorIssue=false, reportArgumentType=false
 # (Mitsuba's type stubs know no arithmetic between its own array types.)
 
 import drjit as dr

@@ -1,6 +1,5 @@
 """Laws of transport: it is irradiance, linear in the light, and finite differences confirm its gradients."""
 
-# pyright: reportOperatorIssue=false, reportArgumentType=false
 # (Mitsuba's type stubs know no arithmetic between its own array types.)
 
 import drjit as dr

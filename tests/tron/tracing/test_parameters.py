@@ -1,6 +1,5 @@
 """Laws of packing: gradients through it add to whatever else a loss asks of the parameters."""
 
-# pyright: reportOperatorIssue=false, reportArgumentType=false
 # (Mitsuba's type stubs know no arithmetic between its own array types.)
 
 import drjit as dr

@@ -12,7 +12,7 @@ from eval.results import Row
 from tron.images import read_image
 
 if TYPE_CHECKING:
-    from eval.benchmarks.reconstruction import Measured, Reconstruction
+    from eval.reconstruction.benchmark import Measured, Reconstruction
     from eval.reconstruction.relit import Fox
 
 WORDS = {

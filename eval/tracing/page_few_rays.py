@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eval.report.gallery import write_strips
+from eval.relighting.gallery import write_strips
 from eval.report.page import Block, Cell, Picture, Pictures, Section, Table, Text
 from tron.color import to_display
 
 if TYPE_CHECKING:
-    from eval.benchmarks.tracing import Measured
+    from eval.tracing.benchmark import Measured
     from eval.tracing.few_rays import FewRays, Way
 
 

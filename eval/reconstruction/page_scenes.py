@@ -14,7 +14,7 @@ from eval.report.page import Block, Cell, Chart, Picture, Pictures, Section, Tab
 from eval.results import Row
 
 if TYPE_CHECKING:
-    from eval.benchmarks.reconstruction import Measured, Reconstruction
+    from eval.reconstruction.benchmark import Measured, Reconstruction
     from eval.reconstruction.pictures import Compared
     from eval.reconstruction.runs import Run
 

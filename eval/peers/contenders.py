@@ -7,8 +7,8 @@ from functools import cached_property
 
 import mitsuba as mi
 
-from eval.tracing import embree, volprim
-from eval.tracing.scene import OUTSIDE, Place
+from eval.peers import embree, volprim
+from eval.peers.scene import OUTSIDE, Place
 from tron.gaussians.scene import GaussianScene
 from tron.tracing import SurfelTracer
 from tron.tracing.kernel import SurfelRecords

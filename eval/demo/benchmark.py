@@ -8,9 +8,9 @@ from typing import ClassVar
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from eval.benchmarks import Benchmark, Outcome
-from eval.benchmarks.relighting import Relighting
-from eval.refinement import refinement
+from eval.benchmark import Benchmark, Outcome
+from eval.demo.refinement import refinement
+from eval.relighting.benchmark import Relighting
 from eval.report.figures import written
 from eval.report.page import Cell, Section, Table
 from eval.results import Row, Target

@@ -1,6 +1,6 @@
 """Closed-form surfaces on the unit square: every map preserves area, so even points stay even.
 
-One definition serves both forms of the benchmark's scene (:mod:`eval.tracing.scene`): surfels stand where a
+One definition serves both forms of the benchmark's scene (:mod:`eval.peers.scene`): surfels stand where a
 low-discrepancy sequence falls, and the triangles of the equivalent mesh join a lattice of the same map.
 """
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from eval.relighting.shadows import MEMBERS as SHADOW_MEMBERS
+from eval.relighting.shadows import direct_light, same_depth, shadow_errors
 from eval.report.page import Picture, Pictures
-from eval.shadows import MEMBERS as SHADOW_MEMBERS
-from eval.shadows import direct_light, same_depth, shadow_errors
 from tron import metrics
 from tron.color import linear_to_srgb, luminance, to_display
 from tron.images import write_image

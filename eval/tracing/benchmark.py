@@ -11,20 +11,20 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field, PositiveInt
 
-from eval.benchmarks import Benchmark, Outcome
+from eval.benchmark import Benchmark, Outcome
 from eval.results import Row
 from tron.errors import TronError
 from tron.storage import write_atomic
 
 if TYPE_CHECKING:
+    from eval.peers.contenders import Contenders
+    from eval.peers.scene import Place
+    from eval.peers.timing import Times
     from eval.tracing.camera_rays import CameraRays
-    from eval.tracing.contenders import Contenders
     from eval.tracing.few_rays import FewRays
     from eval.tracing.gradients import GradientStep
     from eval.tracing.irradiance import DirectTimes, Noise
-    from eval.tracing.scene import Place
     from eval.tracing.shadow_rays import ShadowRays
-    from eval.tracing.timing import Times
 
 log = logging.getLogger("tron.eval")
 
@@ -129,7 +129,7 @@ class Tracing(Benchmark):
         from tron.runtime import activate
 
         activate(self.variant)
-        from eval.report import tracing as page
+        from eval.tracing import page
 
         measured = Measured()
         for part in self.parts:
@@ -138,17 +138,17 @@ class Tracing(Benchmark):
         return page.outcome(self, measured, list(rows(measured, self)), output_dir)
 
     def _contenders(self, count: int, place: Place | None = None, **recipe: Any) -> Contenders:
-        from eval.tracing.contenders import Contenders
-        from eval.tracing.scene import OUTSIDE, STUDY, surfels
+        from eval.peers.contenders import Contenders
+        from eval.peers.scene import OUTSIDE, STUDY, surfels
 
         made, place = dataclasses.replace(STUDY, **{"sh_degree": self.sh_degree, **recipe}), place or OUTSIDE
         return Contenders(surfels(count, self.seed, made, place), made.sh_degree, place=place)
 
     def _measure_camera(self, measured: Measured) -> None:
-        from eval.tracing import volprim
+        from eval.peers import volprim
+        from eval.peers.scene import FROM_GBUFFERS
         from eval.tracing.agreement import compare_images, hits_a_ray
         from eval.tracing.camera_rays import SHIPPED, VOLPRIM, faster_shape
-        from eval.tracing.scene import FROM_GBUFFERS
 
         same_stop, shipped = volprim.load_integrator(volprim.OUR_STOP), volprim.load_integrator()
         integrators = {VOLPRIM: same_stop, SHIPPED: shipped}
@@ -170,9 +170,9 @@ class Tracing(Benchmark):
         measured.from_gbuffers = self._frame(flat, size, {})
 
     def _measure_inside(self, measured: Measured) -> None:
-        from eval.tracing import volprim
+        from eval.peers import volprim
+        from eval.peers.scene import GROUND, ROOM
         from eval.tracing.camera_rays import SHIPPED, VOLPRIM, faster_shape
-        from eval.tracing.scene import GROUND, ROOM
 
         same_stop, shipped = volprim.load_integrator(volprim.OUR_STOP), volprim.load_integrator()
         integrators = {VOLPRIM: same_stop, SHIPPED: shipped}
@@ -190,7 +190,7 @@ class Tracing(Benchmark):
         return self.surfels[min(1, len(self.surfels) - 1)], self.pixels[-1]
 
     def _measure_growth(self, measured: Measured) -> None:
-        from eval.tracing import volprim
+        from eval.peers import volprim
         from eval.tracing.camera_rays import VOLPRIM
 
         integrators = {VOLPRIM: volprim.load_integrator(volprim.OUR_STOP)}
@@ -305,7 +305,7 @@ class Tracing(Benchmark):
 
 def rows(measured: Measured, settings: Tracing) -> Iterator[Row]:
     """Every figure of a run."""
-    from eval.tracing.contenders import spelled
+    from eval.peers.contenders import spelled
     from eval.tracing.few_rays import few_rays_rows
     from eval.tracing.irradiance import noise_rows
 

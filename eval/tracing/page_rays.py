@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from eval.relighting.gallery import write_strips
 from eval.report.charts import growth_chart
 from eval.report.figures import written
-from eval.report.gallery import write_strips
 from eval.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
 from eval.results import Row
 
 if TYPE_CHECKING:
-    from eval.benchmarks.tracing import Measured, Tracing
+    from eval.tracing.benchmark import Measured, Tracing
     from eval.tracing.camera_rays import CameraRays
 
 NAMES = {

@@ -6,17 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from eval.baselines import SEVEN, THREE
-from eval.benchmarks import Outcome
-from eval.guidance import GuidanceScores
-from eval.predictions import Region
-from eval.report.figures import MINUS, with_interval
-from eval.report.gallery import Shown, comparison, guidance, write_strips
-from eval.report.intervals import interval_note
-from eval.report.page import Block, Cell, Chart, Section, Table, Text, Tone
-from eval.results import Row
-from eval.scores import GROUPS, REGIONS, SUFFIX, Scores
-from eval.shadows import (
+from eval.benchmark import Outcome
+from eval.relighting.baselines import SEVEN, THREE
+from eval.relighting.gallery import Shown, comparison, guidance, write_strips
+from eval.relighting.guidance import GuidanceScores
+from eval.relighting.predictions import Region
+from eval.relighting.scores import GROUPS, REGIONS, SUFFIX, Scores
+from eval.relighting.shadows import (
     DARKENED_BELOW,
     LEAK_OVER_MEAN,
     LIT_ABOVE,
@@ -24,6 +20,10 @@ from eval.shadows import (
     SAME_NORMAL_DEG,
     SHADOWED_BELOW,
 )
+from eval.report.figures import MINUS, with_interval
+from eval.report.intervals import interval_note
+from eval.report.page import Block, Cell, Chart, Section, Table, Text, Tone
+from eval.results import Row
 from tron.shards.schema import ClipMeta
 
 WHAT = {

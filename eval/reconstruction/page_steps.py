@@ -11,7 +11,7 @@ from eval.report.page import Block, Cell, Chart, Section, Table, Text
 from eval.results import Row
 
 if TYPE_CHECKING:
-    from eval.benchmarks.reconstruction import Measured, Reconstruction
+    from eval.reconstruction.benchmark import Measured, Reconstruction
     from eval.reconstruction.step import Steps
 
 

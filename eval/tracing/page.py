@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eval.benchmarks import Outcome
+from eval.benchmark import Outcome
 from eval.report.figures import written
 from eval.report.page import Cell, Section, Table, Text
-from eval.report.tracing_few_rays import few_rays_section
-from eval.report.tracing_light import irradiance_section, noise_section
-from eval.report.tracing_rays import (
+from eval.results import Row
+from eval.tracing.page_few_rays import few_rays_section
+from eval.tracing.page_light import irradiance_section, noise_section
+from eval.tracing.page_rays import (
     camera_section,
     family,
     gradient_section,
@@ -19,10 +20,9 @@ from eval.report.tracing_rays import (
     inside_section,
     shadow_section,
 )
-from eval.results import Row
 
 if TYPE_CHECKING:
-    from eval.benchmarks.tracing import Measured, Tracing
+    from eval.tracing.benchmark import Measured, Tracing
 
 LEAD = (
     "TRON holds a captured scene as surfels: small flat disks whose opacity falls off like a Gaussian, with "

@@ -29,7 +29,7 @@ def available() -> bool:
 def renderer(scene: GaussianScene, camera: Camera) -> Callable[[], Any]:
     """A call that renders one frame with harmonics of degree 0 and waits for the device."""
     import torch
-    from gsplat import rasterization_2dgs  # pyright: ignore[reportMissingImports]
+    from gsplat import rasterization_2dgs  # pyright: ignore
 
     def device(values: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values, np.float32)).cuda()

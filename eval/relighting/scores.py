@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from eval.baselines import SEVEN, THREE
 from eval.confidence import Interval, interval, mean_interval, scene_sums
-from eval.predictions import REGIONS, Region, region_mask
+from eval.relighting.baselines import SEVEN, THREE
+from eval.relighting.predictions import REGIONS, Region, region_mask
 from eval.results import Row
 from tron import metrics
 from tron.shards.schema import Clip

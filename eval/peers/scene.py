@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logit
 
-from eval.tracing.surfaces import Box, Floor, Sphere, Surface, Torus
+from eval.peers.surfaces import Box, Floor, Sphere, Surface, Torus
 from tron import seeds
 from tron.cameras import Camera
 from tron.gaussians.harmonics import SH_COUNT, rgb_to_dc

@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eval.benchmarks import Outcome
+from eval.benchmark import Outcome
+from eval.reconstruction.page_fox import fox_section
+from eval.reconstruction.page_scenes import light_section, scenes_section, views_section
+from eval.reconstruction.page_steps import steps_section
 from eval.report.figures import with_interval, written
 from eval.report.page import Cell, Section, Table, Text
-from eval.report.reconstruction_fox import fox_section
-from eval.report.reconstruction_scenes import light_section, scenes_section, views_section
-from eval.report.reconstruction_steps import steps_section
 from eval.results import Row
 
 if TYPE_CHECKING:
-    from eval.benchmarks.reconstruction import Measured, Reconstruction
+    from eval.reconstruction.benchmark import Measured, Reconstruction
     from eval.stages import Stages
 
 LEAD = (

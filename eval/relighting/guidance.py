@@ -13,9 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from eval.confidence import interval, mean_interval, quotient, scene_sums
-from eval.results import Row
-from eval.shadows import MEMBERS as SHADOW_MEMBERS
-from eval.shadows import (
+from eval.relighting.shadows import MEMBERS as SHADOW_MEMBERS
+from eval.relighting.shadows import (
     ShadowCounts,
     both_have_surface,
     count_shadow_errors,
@@ -23,6 +22,7 @@ from eval.shadows import (
     same_depth,
     same_normal,
 )
+from eval.results import Row
 from tron import metrics
 from tron.color import to_display
 from tron.shards.schema import Clip

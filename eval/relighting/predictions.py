@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from eval.baselines import (
+from eval.relighting.baselines import (
     AffineBlend,
     AffineFit,
     ScaleFit,

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eval.report.gallery import write_strips
+from eval.relighting.gallery import write_strips
 from eval.report.page import Block, Cell, Picture, Pictures, Section, Table, Text
 from tron.color import to_display
 
 if TYPE_CHECKING:
-    from eval.benchmarks.tracing import Measured, Tracing
+    from eval.tracing.benchmark import Measured, Tracing
     from eval.tracing.irradiance import Noise
 
 

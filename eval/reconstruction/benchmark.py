@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from eval.benchmarks import Benchmark, Outcome
+from eval.benchmark import Benchmark, Outcome
 from eval.results import Row
 from eval.stages import Child, Stages, script_path
 from tron.errors import TronError
 from tron.storage import write_atomic
 
 if TYPE_CHECKING:
+    from eval.peers.timing import Times
     from eval.reconstruction.pictures import Compared
     from eval.reconstruction.relit import Fox
     from eval.reconstruction.runs import Run
     from eval.reconstruction.step import Steps
-    from eval.tracing.timing import Times
     from tron.captures import View
 
 log = logging.getLogger("tron.eval")
@@ -142,7 +142,7 @@ class Reconstruction(Benchmark):
             self._measure_steps(folder, measured)
             self._measure_growth(measured)
             write_atomic(folder / "times.json", json.dumps(measured.seconds(), indent=1) + "\n")
-        from eval.report import reconstruction as page
+        from eval.reconstruction import page
 
         return page.outcome(self, measured, list(rows(measured, self.seed)), stages, output_dir)
 
@@ -297,8 +297,8 @@ def _fox_rows(measured: Measured) -> Iterator[Row]:
 
 
 def _step_rows(measured: Measured) -> Iterator[Row]:
+    from eval.peers.contenders import spelled
     from eval.reconstruction.step import SHIPPED, VOLPRIM
-    from eval.tracing.contenders import spelled
 
     told = set()
     for steps in measured.steps:

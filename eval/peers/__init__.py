@@ -1,0 +1,1 @@
+"""Other renderers that ours is timed against, and the scenes on which."""
