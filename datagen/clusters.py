@@ -7,12 +7,17 @@ import logging
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from datagen.settings import Settings
 from tron.errors import TronError
+
+log = logging.getLogger(__name__)
+
+RECYCLE_SECONDS = 60.0
+"""Seconds that a worker has to come back with a new process before the others go on without it."""
 
 LOCAL = "dask.distributed.LocalCluster"
 ADDRESS = "dask.distributed.Client"
@@ -100,6 +105,22 @@ def workers(settings: Settings, most: int) -> Iterator[Any]:
                 "look at the queue and the workers' logs, or wait longer",
             ) from error
         yield made
+
+
+def recycle(client: Any, seconds: float) -> None:
+    """Replace the workers' processes: Mitsuba's memory grows with every scene it loads.
+
+    Dask's own wait ends the run where one worker of many does not come back; here the others go on.
+    """
+    count = len(client.scheduler_info(n_workers=-1)["workers"])
+    with suppress(TimeoutError):  # a process that does not end by itself is no longer the scheduler's
+        client.restart(wait_for_workers=False)
+    try:
+        client.wait_for_workers(count, timeout=min(seconds, RECYCLE_SECONDS))
+    except TimeoutError:
+        client.wait_for_workers(1, timeout=seconds)
+        back = len(client.scheduler_info(n_workers=-1)["workers"])
+        log.warning("%d of %d workers have come back after their scenes; going on with them", back, count)
 
 
 def ours(settings: Settings) -> bool:

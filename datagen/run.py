@@ -25,7 +25,7 @@ import numpy as np
 from datagen.assets import for_split, load_models
 from datagen.build import Geometry, build
 from datagen.card import card_text, command_line
-from datagen.clusters import ours, require_cluster, workers
+from datagen.clusters import ours, recycle, require_cluster, workers
 from datagen.models import outline
 from datagen.plan import (
     RECORD_NAME,
@@ -204,7 +204,7 @@ def outcomes(
                 error = future.exception()
                 yield futures[future], f"worker lost: {error}" if error is not None else future.result()
             if mine and len(wave) < len(items):
-                client.restart()  # Mitsuba's memory grows with every scene it loads
+                recycle(client, settings.worker_timeout)
 
 
 def _key(settings: Settings, item: Work) -> str:

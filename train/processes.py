@@ -11,7 +11,8 @@ import os
 import signal
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -106,7 +107,8 @@ def launch(work: Callable[[Processes, Settings], None], settings: Settings) -> N
                 f"{devices * settings.nodes}",
                 mend="start one process for each device (torchrun --nproc-per-node, srun --ntasks-per-node)",
             )
-        work(_joined(settings, devices), settings)
+        with _joined(settings, devices) as processes:
+            work(processes, settings)
     elif devices * settings.nodes == 1:
         work(Processes(), settings)
     else:
@@ -152,10 +154,12 @@ def _fabric(settings: Settings, devices: int | str, nodes: int, **more: Any) -> 
         raise TronError(f"cannot train on {asked}", mend=str(error)) from error
 
 
-def _joined(settings: Settings, devices: int) -> Processes:
-    """Join the other processes of the run, which do the same."""
+@contextmanager
+def _joined(settings: Settings, devices: int) -> Iterator[Processes]:
+    """Join the other processes of the run, which do the same; the process group ends with the block."""
     if devices * settings.nodes == 1:
-        return Processes()
+        yield Processes()
+        return
     if settings.threads is not None:  # else Lightning would share all cores among this machine's processes
         os.environ["OMP_NUM_THREADS"] = str(settings.threads)
     fabric = _fabric(settings, devices, settings.nodes, strategy="ddp")
@@ -166,7 +170,10 @@ def _joined(settings: Settings, devices: int) -> Processes:
     else:  # it would only say again what the first one says
         logging.getLogger().setLevel(logging.ERROR)
         warnings.simplefilter("ignore")
-    return processes
+    try:
+        yield processes
+    finally:  # gloo's threads, left running, abort the interpreter as it ends
+        distributed.destroy_process_group()
 
 
 def _spawn(work: Callable[[Processes, Settings], None], settings: Settings, devices: int) -> None:
@@ -225,8 +232,8 @@ def _spawned(
     os.environ.update(environment, LOCAL_RANK=str(local_rank))
     _quiet_lightning()
     try:
-        processes = _joined(settings, devices)
-        work(processes, settings)
+        with _joined(settings, devices) as processes:
+            work(processes, settings)
     except TronError as error:
         errors.put(error)
         raise SystemExit(USER_ERROR) from error
