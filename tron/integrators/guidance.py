@@ -19,8 +19,6 @@ Gradients reach the surfels through what camera rays see, as shading has it; wha
 constant, and so is the light.
 """
 
-# (Mitsuba's type stubs do not know arithmetic between its own array types.)
-
 from __future__ import annotations
 
 from dataclasses import fields

@@ -16,8 +16,6 @@ with the share of :mod:`tron.shading.background`, exactly 0 behind opaque surfel
 exposure and AgX are applied when a buffer is looked at or loaded.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence
