@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from eval.report.charts import progress_chart
-from eval.report.figures import written
+from eval.report.figures import format_value
 from eval.report.page import Block, Cell, Picture, Pictures, Section, Table, Text
 from eval.results import Row
 from tron.images import read_image
@@ -55,7 +55,7 @@ def fox_section(settings: Reconstruction, measured: Measured, found: Mapping[str
             "What was measured.",
             ["Figure", "Measured"],
             [
-                [Cell(text), Cell(written(found[metric].value, found[metric].unit), "strong")]
+                [Cell(text), Cell(format_value(found[metric].value, found[metric].unit), "strong")]
                 for metric, text in WORDS.items()
                 if metric in found
             ],

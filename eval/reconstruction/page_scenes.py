@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eval.report.charts import progress_chart
-from eval.report.figures import with_interval, written
+from eval.report.figures import format_value, with_interval
 from eval.report.intervals import interval_note
 from eval.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
 from eval.results import Row
@@ -191,8 +191,8 @@ def light_section(measured: Measured) -> list[Section]:
             Cell(run.name),
             Cell(run.family or "—"),
             Cell(way_title(way)),
-            Cell(written(run.light["irradiance_error"], "fraction"), "strong"),
-            Cell(written(run.light["scaled_error"], "fraction")),
+            Cell(format_value(run.light["irradiance_error"], "fraction"), "strong"),
+            Cell(format_value(run.light["scaled_error"], "fraction")),
         ]
         for way, runs in measured.runs.items()
         for run in runs

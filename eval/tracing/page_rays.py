@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eval.relighting.gallery import write_strips
 from eval.report.charts import growth_chart
-from eval.report.figures import written
+from eval.report.figures import format_value
 from eval.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
+from eval.report.strips import write_strips
 from eval.results import Row
 
 if TYPE_CHECKING:
@@ -279,9 +279,9 @@ def shadow_section(measured: Measured, found: dict[str, Row]) -> list[Section]:
     if wrong is not None:
         blocks.append(
             Text(
-                f"Restarting is not exact: {written(wrong.value, 'fraction')} of its rays are off by more "
-                f"than 0.001, by up to {found['shadow.embree_restart_max_error'].value:.2f}, because hits "
-                "within 0.0001 of one another are skipped."
+                f"Restarting is not exact: {format_value(wrong.value, 'fraction')} of its rays are off by "
+                f"more than 0.001, by up to {found['shadow.embree_restart_max_error'].value:.2f}, because "
+                "hits within 0.0001 of one another are skipped."
             )
         )
     return [Section("shadow", "Shadow rays", blocks)]
