@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from eval.report.charts import progress_chart
+from eval.report.charts import line_chart
 from eval.report.figures import format_value
 from eval.report.page import Block, Cell, Picture, Pictures, Section, Table, Text
 from eval.results import Row
@@ -64,7 +64,7 @@ def fox_section(settings: Reconstruction, measured: Measured, found: Mapping[str
     if len(fox.run.curve()) > 1:
         target = next((t for t in settings.targets if t.metric == "fox.test_psnr"), None)
         blocks.append(
-            progress_chart(
+            line_chart(
                 {"fox": fox.run.curve()},
                 "seconds of training",
                 "held-out PSNR in dB",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from eval.report.charts import growth_chart
+from eval.report.charts import line_chart
 from eval.report.figures import format_value
 from eval.report.page import Block, Cell, Chart, Section, Table, Text
 from eval.results import Row
@@ -92,8 +92,8 @@ def _growth(settings: Reconstruction, measured: Measured) -> list[Chart]:
     charts = []
     if len(by_count) > 1:
         caption = f"Seconds a step as surfels grow, {pixels}² pixels, on the tracing benchmark's scene."
-        charts.append(growth_chart({"a step": by_count}, "surfels", "seconds", caption))
+        charts.append(line_chart({"a step": by_count}, "surfels", "seconds", caption, logarithmic=True))
     if len(by_size) > 1:
         caption = f"Seconds a step as pixels grow, {surfels:,} surfels, on the same scene."
-        charts.append(growth_chart({"a step": by_size}, "pixels", "seconds", caption))
+        charts.append(line_chart({"a step": by_size}, "pixels", "seconds", caption, logarithmic=True))
     return charts

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eval.report.charts import growth_chart
+from eval.report.charts import line_chart
 from eval.report.figures import format_value
 from eval.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
 from eval.report.strips import write_strips
@@ -211,7 +211,8 @@ def growth_section(settings: Tracing, measured: Measured) -> list[Section]:
             for name in names
         }
         caption = f"Seconds a frame as {axis} grow, {where}."
-        charts.append(growth_chart({k: v for k, v in lines.items() if len(v) > 1}, axis, "seconds", caption))
+        lines = {name: points for name, points in lines.items() if len(points) > 1}
+        charts.append(line_chart(lines, axis, "seconds", caption, logarithmic=True))
     return [Section("growth", "Growth with surfels and pixels", charts)] if charts else []
 
 
