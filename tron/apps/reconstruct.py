@@ -14,9 +14,9 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 import tron
-from tron.apps.command_line import command
-from tron.apps.progress import StepBar, track
 from tron.captures import Capture, LoadSettings, PosingSettings, load_capture
+from tron.cli.command_line import command
+from tron.cli.progress import StepBar, track
 from tron.errors import TronError
 from tron.images import write_image
 from tron.reconstruction.settings import FitSettings, ReconstructionSettings
