@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tron.cameras import Camera
+from tron.shading.cubemap import CubemapLight, texel_directions
 from tron.shading.environment import EnvironmentMap
 from tron.tracing import GBuffer
 
@@ -87,6 +88,18 @@ def sun_map() -> EnvironmentMap:
     image[33:] = 0.1
     image[11:13, 30:32] = (1500.0, 1300.0, 1000.0)
     return EnvironmentMap(image)
+
+
+@pytest.fixture
+def cubemap_of(variant: str) -> Callable[[EnvironmentMap, int], CubemapLight]:
+    """A map as a cubemap whose texels are means over 8 x 8 of its values."""
+
+    def make(environment: EnvironmentMap, resolution: int) -> CubemapLight:
+        directions = np.array(texel_directions(8 * resolution)).T
+        fine = environment.lookup(directions).reshape(6, resolution, 8, resolution, 8, 3)
+        return CubemapLight(mi.Float(fine.mean((2, 4)).ravel()), resolution)
+
+    return make
 
 
 @pytest.fixture
