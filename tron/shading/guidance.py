@@ -196,10 +196,6 @@ def shade(
 ) -> Guidance:
     """Guidance from a G-buffer and the share of the unshadowed irradiance that reaches each pixel."""
     colors = shade_surface(gbuffer, visibility, lighting, background)
-
-    def image(color: mi.Color3f) -> np.ndarray:
-        return np.ascontiguousarray(np.array(color).T.reshape(gbuffer.height, gbuffer.width, 3))
-
     buffers = gbuffer.numpy()
-    images = {name: image(color) for name, color in colors.items()}
+    images = {name: gbuffer.image(color) for name, color in colors.items()}
     return Guidance(**images, mask=buffers["opacity"], gbuffer=buffers)

@@ -13,7 +13,7 @@ import pytest
 from tron.cameras import Camera
 from tron.shading.cubemap import CubemapLight, texel_directions
 from tron.shading.environment import EnvironmentMap
-from tron.tracing import GBuffer
+from tron.tracing import GBuffer, Surface
 
 CENTRE, RADIUS = np.array([0.0, 0.0, 0.8]), 0.5
 
@@ -56,7 +56,7 @@ class SphereOverPlane:
         centre = mi.Point3f(*map(float, CENTRE))
         normal = dr.select(sphere < plane, dr.normalize(position - centre), mi.Vector3f(0, 0, 1))
         one = dr.select(seen, mi.Float(1), 0)
-        return GBuffer(
+        seen = Surface(
             position=position,
             depth=dr.select(seen, t, 0),
             normal=mi.Normal3f(dr.select(seen, normal, 0)),
@@ -66,9 +66,8 @@ class SphereOverPlane:
             rgb=mi.Color3f(0) * one,
             opacity=one,
             direction=direction,
-            width=camera.width,
-            height=camera.height,
         )
+        return GBuffer.of_rows(seen, camera.width, camera.height)
 
 
 @pytest.fixture
@@ -112,6 +111,7 @@ def points_gbuffer() -> Callable[[np.ndarray, np.ndarray], SimpleNamespace]:
             position=mi.Point3f(columns[0]),
             normal=mi.Normal3f(columns[1]),
             opacity=dr.ones(mi.Float, len(positions)),
+            pixel=dr.arange(mi.UInt32, len(positions)),
             width=len(positions),
             height=1,
         )
