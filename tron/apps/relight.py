@@ -22,6 +22,7 @@ from tron.apps.clip import GUIDANCE, Clip, trace
 from tron.apps.command_line import command
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.framing import plan_cameras, turn_cameras, upright
+from tron.apps.installation import require_extra
 from tron.apps.relight_settings import QUALITY, Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
@@ -142,6 +143,7 @@ def _load_renderer(settings: Settings) -> Any:
     """The network, before any frame is traced, so that a wrong file is found at once; None without one."""
     if settings.checkpoint is None:
         return None
+    require_extra("checkpoint", "train")
     from tron.neural.weights import load_renderer
 
     if settings.threads is not None:
