@@ -21,7 +21,7 @@ from tron.apps.camera_files import read_cameras
 from tron.apps.clip import GUIDANCE, Clip, trace
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.framing import plan_cameras, turn_cameras, upright
-from tron.apps.installation import require_extra
+from tron.cli.installation import require_extra
 from tron.apps.relight_settings import QUALITY, Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera

@@ -21,7 +21,7 @@ import tron
 from tron.errors import TronError
 
 if TYPE_CHECKING:
-    from tron.apps.command_line import Command
+    from tron.cli.command_line import Command
 
 DISTRIBUTION = "tron-relight"
 PACKAGES = ("conf", "datagen", "train", "eval")
