@@ -17,6 +17,7 @@ from datagen.refinement import refine_surfels
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from tron.cameras import Camera
+from tron.estimation import Estimation
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.gaussians.scene import GaussianScene
 from tron.seeds import integer
@@ -92,7 +93,7 @@ def make_clip(
     frames: list[Frame] = []
     for i, (camera, truth) in enumerate(zip(cameras, gbuffers(geometry, cameras))):
         guidance = render_guidance(
-            tracer, camera, lighting, spp=recipe.guidance_spp, seed=seeds["guidance"][i]
+            tracer, camera, lighting, Estimation(rays=recipe.guidance_spp), seeds["guidance"][i]
         )
         frame = {
             "pbr": guidance.pbr,

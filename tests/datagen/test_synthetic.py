@@ -10,6 +10,7 @@ from datagen.scene import draw_scene
 from datagen.synthetic import first_bad_value
 from tron import metrics
 from tron.color import luminance, to_display
+from tron.estimation import Estimation
 from tron.gaussians.initialize import surfels_from_gbuffers
 from tron.shading.guidance import Lighting, render_guidance
 from tron.tracing import SurfelTracer
@@ -39,7 +40,7 @@ def test_20k_surfels_and_their_irradiance_on_held_out_views_of_textured_scenes(i
         environment = bake(light, 128)
         camera = spec.clip(number, 5, SIZE, SIZE)[2]
         truth = gbuffers(geometry, [camera])[0]
-        ours = render_guidance(tracer, camera, Lighting(environment), spp=64, seed=number)
+        ours = render_guidance(tracer, camera, Lighting(environment), Estimation(rays=64), seed=number)
         direct = direct_irradiance(geometry, geometry.lit(environment), camera, 256, seed=number)
 
         seen = truth.valid

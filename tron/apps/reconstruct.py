@@ -287,6 +287,7 @@ def _write_sheet(path: Path, tracer: SurfelTracer, capture: Capture, light: Envi
     """Held-out views (training views, if none is) with every channel of the G-buffer and the guidance."""
     from tron.apps.labelled_sheet import labelled_sheet
     from tron.color import to_display
+    from tron.estimation import Estimation
     from tron.reconstruction.evaluation import picture, wanted_picture
     from tron.shading.guidance import Lighting, render_guidance
 
@@ -311,9 +312,8 @@ def _write_sheet(path: Path, tracer: SurfelTracer, capture: Capture, light: Envi
         }.items():
             rows.setdefault(name, []).append(image)
         if lighting is not None:
-            guidance = render_guidance(
-                tracer, view.camera, lighting, spp=SHADOW_RAYS, seed=number, denoise=True
-            )
+            estimation = Estimation(rays=SHADOW_RAYS, filtered=True)
+            guidance = render_guidance(tracer, view.camera, lighting, estimation, number)
             for name, image in (("pbr", guidance.pbr), ("irradiance", guidance.irradiance)):
                 rows.setdefault(name, []).append(to_display(image, capture.exposure))
     write_image(path, labelled_sheet(rows, [view.name for view in views]))

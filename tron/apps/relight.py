@@ -69,8 +69,7 @@ def main(settings: Settings) -> None:
     with locked(settings.output_dir):
         for light, clip in zip(lights, clips):
             clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite)
-        spp, denoise = QUALITY[settings.quality]
-        trace(scene, cameras, clips, spp=spp, denoise=denoise, seed=settings.seed)
+        trace(scene, cameras, clips, estimation=QUALITY[settings.quality], seed=settings.seed)
         clock.lap("guidance")
         if renderer is not None:
             for clip in clips:
