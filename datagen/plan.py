@@ -22,6 +22,7 @@ from datagen.scene import scene_name
 from datagen.settings import SPLITS, Settings
 from tron.errors import TronError
 from tron.shards.manifest import ShardEntry
+from tron.shards.schema import SCHEMA_VERSION, require_schema
 from tron.storage import write_atomic
 
 RECORD_NAME = "record.json"
@@ -163,9 +164,10 @@ def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
 
 
 def config_text(settings: Settings) -> str:
-    """config.yaml of the dataset: the recipe and the numbers of scenes, without where and by whom."""
+    """config.yaml of the dataset: schema, recipe and numbers of scenes, without where and by whom."""
     counts = {split: settings.split(split).scenes for split in SPLITS}
-    return yaml.safe_dump({"scenes": counts, "recipe": settings.recipe()}, sort_keys=True, allow_unicode=True)
+    described = {"schema": SCHEMA_VERSION, "scenes": counts, "recipe": settings.recipe()}
+    return yaml.safe_dump(described, sort_keys=True, allow_unicode=True)
 
 
 def config_sha256(settings: Settings) -> str:
@@ -179,18 +181,19 @@ def adopt(settings: Settings) -> None:
     More scenes may be added to a dataset; any other change would mix two datasets in one folder.
 
     Raises:
-        TronError: the folder holds a dataset of another recipe, or more scenes than are asked for; names the
-        key.
+        TronError: the folder holds a dataset of another schema or recipe (names the key), or more scenes
+            than are asked for.
     """
     path, text = settings.output_dir / CONFIG_NAME, config_text(settings)
     if path.is_file():
         try:
             old = yaml.safe_load(path.read_text("utf-8"))
-            before, scenes = dict(old["recipe"]), dict(old["scenes"])
+            before, scenes, schema = dict(old["recipe"]), dict(old["scenes"]), old.get("schema", 1)
         except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
             raise TronError(
                 "config.yaml of the dataset is damaged", path, "choose another output_dir"
             ) from error
+        require_schema(schema, settings.output_dir)
         now = settings.recipe()
         for split in SPLITS:
             if not scenes.get(split):  # there is nothing of it yet, so it may be anything from now on

@@ -29,9 +29,11 @@ from tron.tracing import SurfelTracer
 Frame = dict[str, np.ndarray]
 ColorSpace = Literal["linear", "display"]
 
-COLOR_SPACE: dict[str, ColorSpace] = dict.fromkeys(("pbr", "irr", "rgb", "unshadowed", "shadowed"), "linear")
+COLOR_SPACE: dict[str, ColorSpace] = dict.fromkeys(
+    ("pbr", "irradiance", "rgb", "unshadowed", "shadowed"), "linear"
+)
 REFERENCE_COLOR_SPACE: dict[str, ColorSpace] = dict.fromkeys(
-    ("irr_ref", "unshadowed_ref", "base_color_ref", "base_color"), "linear"
+    ("irradiance_ref", "unshadowed_ref", "base_color_ref", "base_color"), "linear"
 )
 
 
@@ -97,7 +99,7 @@ def make_clip(
         )
         frame = {
             "pbr": guidance.pbr,
-            "irr": guidance.irradiance,
+            "irradiance": guidance.irradiance,
             "rgb": rgb[i],
             "unshadowed": guidance.unshadowed,
             "shadowed": guidance.shadowed,
@@ -161,7 +163,7 @@ def _reference(
     seen = truth.valid[..., None]
     behind = environment.lookup(camera.rays())
     return {
-        "irr_ref": np.where(seen, direct.shadowed, behind),
+        "irradiance_ref": np.where(seen, direct.shadowed, behind),
         "unshadowed_ref": np.where(seen, direct.unshadowed, behind),
         "depth_ref": np.where(truth.valid, np.linalg.norm(truth.position - camera.position, axis=-1), 0.0),
         "base_color_ref": np.where(seen, truth.base_color, 0.0),
