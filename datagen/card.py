@@ -14,7 +14,7 @@ import tron
 from datagen.assets import Asset
 from datagen.plan import Figures, Refinement, Sources, config_sha256
 from datagen.settings import OUTSIDE, SPLITS, Settings
-from tron.apps.recipes import compose_recipe
+from tron.cli.recipes import compose_recipe
 from tron.runtime import describe_machine
 from tron.shards.manifest import Manifest
 from tron.shards.schema import SCHEMA_VERSION

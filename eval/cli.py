@@ -9,7 +9,7 @@ from typing import Any
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
-from tron.apps.command_line import command
+from tron.cli.command_line import command
 from tron.errors import TronError
 from tron.storage import locked
 

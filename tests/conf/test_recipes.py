@@ -11,8 +11,8 @@ from hydra.utils import get_object
 from omegaconf import OmegaConf
 from pydantic import BaseModel
 
-from tron.apps.command_line import Command
-from tron.apps.recipes import (
+from tron.cli.command_line import Command
+from tron.cli.recipes import (
     check,
     compose_recipe,
     field_keys,

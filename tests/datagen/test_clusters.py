@@ -12,7 +12,7 @@ from datagen.capture_export import make_captures
 from datagen.cli import cli
 from datagen.run import make
 from datagen.settings import Settings
-from tron.apps.recipes import check, compose_recipe
+from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
 
 TINY = [

@@ -13,8 +13,8 @@ from datagen.run import make
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from tron import metrics
-from tron.apps.recipes import check, compose_recipe
 from tron.cameras import Camera
+from tron.cli.recipes import check, compose_recipe
 from tron.gaussians.scene import GaussianScene
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Lighting, render_guidance

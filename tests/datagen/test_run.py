@@ -22,7 +22,7 @@ from datagen.run import make, make_scene
 from datagen.settings import Settings
 from datagen.synthetic import make_clips
 from datagen.validate import validate
-from tron.apps.recipes import check, compose_recipe
+from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.images import read_image

@@ -22,7 +22,7 @@ from train.cli import main
 from train.curriculum import Stage
 from train.processes import Processes, launch
 from train.settings import Settings
-from tron.apps.recipes import check, compose_recipe
+from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
 from tron.storage import locked
 

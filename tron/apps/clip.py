@@ -12,9 +12,9 @@ import numpy as np
 
 from tron import seeds
 from tron.apps.frame_folder import FrameFolder
-from tron.apps.progress import track
 from tron.apps.relit import RelitPicture, surfels_alone
 from tron.cameras import Camera
+from tron.cli.progress import track
 from tron.color import to_display
 from tron.gaussians.scene import GaussianScene
 

@@ -65,7 +65,7 @@ def fit_environment(
         capture: its training views with an irradiance map feed stage 3a, all training views stage 3b.
         scene: frozen surfels, or a tracer that the caller has already.
         settings: sizes, rates, seed.
-        track: wraps long loops as ``track(items, label)``, such as :func:`tron.apps.progress.track`.
+        track: wraps long loops as ``track(items, label)``, such as :func:`tron.cli.progress.track`.
 
     Raises:
         TronError: no training view has an irradiance map, maps are wrong, nothing of the scene is visible, or

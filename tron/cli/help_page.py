@@ -11,7 +11,7 @@ import pydantic
 import yaml
 from pydantic.fields import FieldInfo
 
-from tron.apps.recipes import nested_model
+from tron.cli.recipes import nested_model
 
 OPTIONS = {
     "-h, --help": "print this page",
