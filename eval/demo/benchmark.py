@@ -8,10 +8,11 @@ from typing import ClassVar
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from eval.benchmark import Benchmark, Outcome
+from eval.benchmark import Benchmark
 from eval.demo.refinement import refinement
 from eval.relighting.benchmark import Relighting
-from eval.report.figures import written
+from eval.report.figures import format_value
+from eval.report.outcome import Outcome
 from eval.report.page import Cell, Section, Table
 from eval.results import Row, Target
 from eval.stages import Child, Stages, script_path
@@ -93,14 +94,14 @@ class Demo(Benchmark):
         table = [
             [
                 Cell(name),
-                Cell(written(record.seconds, "s"), "strong"),
+                Cell(format_value(record.seconds, "s"), "strong"),
                 Cell(WORDS.get(name, "")),
                 Cell(record.commit or "unknown"),
                 Cell("; ".join(" ".join(command) for command in record.commands), "faint"),
             ]
             for name, record in stages.records.items()
         ]
-        caption = f"Wall time of the stages, {written(sum(seconds.values()), 's')} in all."
+        caption = f"Wall time of the stages, {format_value(sum(seconds.values()), 's')} in all."
         if any(record.attempts > 1 for record in stages.records.values()):
             caption += " Interrupted attempts are counted."
         section = Section(

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eval.benchmark import Outcome
 from eval.reconstruction.page_fox import fox_section
 from eval.reconstruction.page_scenes import light_section, scenes_section, views_section
 from eval.reconstruction.page_steps import steps_section
-from eval.report.figures import with_interval, written
+from eval.report.figures import format_value, with_interval
+from eval.report.outcome import Outcome
 from eval.report.page import Cell, Section, Table, Text
 from eval.results import Row
 
@@ -124,7 +124,7 @@ def _stages(stages: Stages) -> list[Section]:
     table = [
         [
             Cell(name),
-            Cell(written(record.seconds, "s"), "strong"),
+            Cell(format_value(record.seconds, "s"), "strong"),
             Cell(str(record.attempts)),
             Cell(record.commit or "unknown"),
             Cell("; ".join(" ".join(command) for command in record.commands), "faint"),

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +11,6 @@ from eval.relighting.shadows import direct_light, same_depth, shadow_errors
 from eval.report.page import Picture, Pictures
 from tron import metrics
 from tron.color import linear_to_srgb, luminance, to_display
-from tron.images import write_image
 from tron.shards.schema import Clip, ClipMeta
 
 METHOD_TITLES = {
@@ -133,15 +130,3 @@ def guidance(shown: Shown) -> Pictures:
     where = f"scene {shown.meta.scene} under light {shown.meta.light}"
     pictures = [Picture(image, name, f"{name}, {where}") for name, image in shown.guidance.items()]
     return Pictures(shown.title, pictures)
-
-
-def write_strips(groups: Sequence[Pictures], names: Sequence[str], folder: Path) -> None:
-    """Write each group of equally large pictures as one PNG, in the page's order and number of columns."""
-    for group, name in zip(groups, names):
-        images = [picture.image for picture in group.pictures]
-        blank = np.zeros_like(images[0])
-        images += [blank] * (-len(images) % group.columns)
-        rows = [
-            np.concatenate(images[i : i + group.columns], 1) for i in range(0, len(images), group.columns)
-        ]
-        write_image(folder / f"{name}.png", np.concatenate(rows, 0))

@@ -7,8 +7,6 @@ harmonics. The peer's hierarchy stands still: that it would have to be built ane
 counted.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping

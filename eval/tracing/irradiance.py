@@ -8,8 +8,6 @@ Errors may be noise, never blocks. For pairs of pixels at one offset, errors cor
 aligned block as across its border, unless pixels of a block share something: that excess is measured.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Mapping

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 import tron
-from tron.captures import Capture, LoadSettings, PosingSettings, load_capture
+from tron.captures import Capture, LoadSettings, load_capture
+from tron.captures.load import CaptureSettings
 from tron.cli.command_line import command
 from tron.cli.instantiation import make
 from tron.cli.progress import Progress, track
@@ -41,40 +42,18 @@ RESULTS = ("scene.ply", "environment.exr", "metrics.json", "curve.json", "light.
 SURFEL_BYTES = 1600  # PLY, checkpoint with Adam's moments, and their temporary copies
 
 
-class CaptureSettings(BaseModel):
-    """What is reconstructed, and where it goes."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+class Paths(BaseModel):
+    """Capture that is reconstructed, and the folder that the files go to."""
 
     capture: Path = Field(description="folder of photos, with or without poses, or of path-traced views")
     output_dir: Path = Field(description="folder for scene.ply, environment.exr, metrics.json and pictures")
-    format: Literal["auto", "transforms", "colmap", "tensoir", "tron", "photos"] = Field(
-        "auto", description="what the folder holds; photos: poses are found by structure from motion"
-    )
-    images: str | None = Field(None, description="folder of the photos, where it is not the one poses name")
-    max_side: int | None = Field(
-        400, ge=16, description="photos are reduced to at most so many pixels a side; null keeps their size"
-    )
-    downscale: float | None = Field(
-        None, ge=1, description="or made so many times smaller; wins over max_side"
-    )
-    test_every: int = Field(
-        8, ge=0, description="every n-th photo is held out, unless the capture says itself which are"
-    )
-    up: tuple[float, float, float] | None = Field(
-        None, description="up direction in the capture's world; null: estimated from the cameras"
-    )
-    tensoir_light: str = Field("sunset", description="which light of a TensoIR scene is reconstructed")
-    matching: Literal["auto", "exhaustive", "sequential"] = Field(
-        "auto", description="how photos without poses are matched: sequential suits videos"
-    )
-    prior: Any = Field(description="source of normals, materials and irradiance, by _target_ (prior=NAME)")
 
 
 # Bases are listed the other way round than their keys: pydantic collects fields from the last base first.
-class Settings(ReconstructionSettings, CaptureSettings):
+class Settings(ReconstructionSettings, CaptureSettings, Paths):
     """Everything that tron-reconstruct can be told."""
 
+    prior: Any = Field(description="source of normals, materials and irradiance, by _target_ (prior=NAME)")
     light: FitSettings | None = Field(
         default_factory=lambda: FitSettings(), description="environment map and scale; null fits none"
     )
@@ -134,19 +113,10 @@ def _load_lpips(settings: Settings) -> LPIPS | None:
 
 def _load_settings(settings: Settings) -> LoadSettings:
     return LoadSettings(
-        format=settings.format,
-        images=settings.images,
-        downscale=settings.downscale or 1.0,
-        max_side=None if settings.downscale is not None else settings.max_side,
-        test_every=settings.test_every,
-        up=settings.up,
-        light=settings.tensoir_light,
-        posing=PosingSettings(
-            workspace=settings.output_dir / "structure_from_motion",
-            matching=settings.matching,
-            threads=settings.threads or 0,
-            seed=settings.seed,
-        ),
+        **{name: getattr(settings, name) for name in CaptureSettings.model_fields},
+        workspace=settings.output_dir / "structure_from_motion",
+        threads=settings.threads or 0,
+        seed=settings.seed,
     )
 
 

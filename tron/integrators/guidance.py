@@ -19,8 +19,6 @@ Gradients reach the surfels through what camera rays see, as shading has it; wha
 constant, and so is the light.
 """
 
-# (Mitsuba's type stubs do not know arithmetic between its own array types.)
-
 from __future__ import annotations
 
 from dataclasses import fields
@@ -34,11 +32,11 @@ from tron.integrators.environment import environment_of, light_state
 from tron.integrators.plugin import Shown
 from tron.integrators.surfels import Surfels, unwrap
 from tron.shading.environment import EnvironmentMap
-from tron.shading.guidance import Lighting, Shaded, shade_surface, visibility
+from tron.shading.guidance import Guidance, Lighting, shade_surface, visibility
 from tron.shading.split_sum import CUBEMAP_RESOLUTION
 from tron.tracing import GBuffer, Surface
 
-BUFFERS = tuple(f.name for f in fields(Shaded))
+BUFFERS = tuple(name for name in Guidance.BUFFERS if name != "mask")
 
 
 class GuidanceAppearance:
@@ -67,8 +65,8 @@ class GuidanceAppearance:
             dr.eval(*fixed.values())
             reaching = visibility(self.surfels.tracer, rays, lighting, self.shadow_rays, seed)
         shaded = shade_surface(seen, reaching, lighting)
-        extra = [part for name in self.others for part in getattr(shaded, name)]
-        return Shown(getattr(shaded, self.buffer), seen.opacity, [*extra, seen.opacity])
+        extra = [part for name in self.others for part in shaded[name]]
+        return Shown(shaded[self.buffer], seen.opacity, [*extra, seen.opacity])
 
     def _lighting(self, scene: mi.Scene) -> Lighting:
         """Prepared once, and again when the scene's light has changed."""

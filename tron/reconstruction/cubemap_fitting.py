@@ -13,8 +13,6 @@ of irradiance over all normals: a studio of soft lights 10 % plain and 0.8 % by 
 and 0.6 % at 64 and 32; a sun of six degrees 14 % and 1.6 % at 16 rays.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable

@@ -1,7 +1,5 @@
 """The surface points of a capture's views and the irradiance that a prior wants there, on the device."""
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 import math

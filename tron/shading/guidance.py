@@ -16,14 +16,12 @@ with the share of :mod:`tron.shading.background`, exactly 0 behind opaque surfel
 exposure and AgX are applied when a buffer is looked at or loaded.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -73,7 +71,9 @@ class Lighting:
 
 @dataclass
 class Guidance:
-    """Buffers of one frame, NumPy float32, linear, in front of the environment.
+    """Buffers of one frame, NumPy float32, linear, in front of the environment; also by name.
+
+    A new buffer is a field here and a formula in :func:`shade_surface`.
 
     Attributes:
         pbr: (H, W, 3) unshadowed split-sum radiance.
@@ -81,7 +81,7 @@ class Guidance:
         unshadowed: (H, W, 3) the same with nothing in the way.
         shadowed: (H, W, 3) radiance: shadowed diffuse plus split-sum specular.
         mask: (H, W) opacity of the surfels in [0, 1].
-        gbuffer: ``GBuffer.numpy()``.
+        gbuffer: ``GBuffer.numpy()``, which is no buffer of its own.
     """
 
     pbr: np.ndarray
@@ -90,6 +90,16 @@ class Guidance:
     shadowed: np.ndarray
     mask: np.ndarray
     gbuffer: dict[str, np.ndarray]
+    BUFFERS: ClassVar[tuple[str, ...]]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """(H, W, C) float32 of one of :attr:`BUFFERS`: C is 1 for the mask, 3 for the others."""
+        if name not in self.BUFFERS:
+            raise KeyError(name)
+        return np.atleast_3d(getattr(self, name))
+
+
+Guidance.BUFFERS = tuple(field.name for field in fields(Guidance) if field.name != "gbuffer")
 
 
 def render_guidance(
@@ -152,22 +162,13 @@ def _normal(seen: Surface) -> mi.Vector3f:
     return dr.select(seen.opacity > 0, mi.Vector3f(seen.normal), mi.Vector3f(0, 0, 1))
 
 
-@dataclass
-class Shaded:
-    """The buffers of :class:`Guidance` on the device, one lane a ray."""
-
-    pbr: mi.Color3f
-    irradiance: mi.Color3f
-    unshadowed: mi.Color3f
-    shadowed: mi.Color3f
-
-
 def shade_surface(
     seen: Surface, visibility: mi.Color3f, lighting: Lighting, background: Sequence[float] | None = None
-) -> Shaded:
+) -> dict[str, mi.Color3f]:
     """Shade what rays see, given the share of the unshadowed irradiance that reaches each of them.
 
-    ``background`` as of :func:`render_guidance`.
+    ``background`` as of :func:`render_guidance`. Returns the colours of :class:`Guidance` by name, on the
+    device, one lane a ray.
     """
     normal = _normal(seen)
     diffuse_color = seen.base_color * (1 - seen.metallic)
@@ -180,16 +181,14 @@ def shade_surface(
     else:
         behind = mi.Color3f(*(dr.opaque(mi.Float, float(channel)) for channel in background))
 
-    def shown(shaded: mi.Color3f) -> mi.Color3f:
-        return over_background(shaded, behind, seen.opacity)
-
-    buffers = Shaded(
-        pbr=shown(diffuse_color * unshadowed + specular),
-        irradiance=shown(shadowed),
-        unshadowed=shown(unshadowed),
-        shadowed=shown(diffuse_color * shadowed + specular),
-    )
-    dr.eval(buffers.pbr, buffers.irradiance, buffers.unshadowed, buffers.shadowed)
+    buffers = {
+        "pbr": diffuse_color * unshadowed + specular,
+        "irradiance": shadowed,
+        "unshadowed": unshadowed,
+        "shadowed": diffuse_color * shadowed + specular,
+    }
+    buffers = {name: over_background(color, behind, seen.opacity) for name, color in buffers.items()}
+    dr.eval(buffers)
     return buffers
 
 
@@ -197,17 +196,11 @@ def shade(
     gbuffer: GBuffer, visibility: mi.Color3f, lighting: Lighting, background: Sequence[float] | None = None
 ) -> Guidance:
     """Guidance from a G-buffer and the share of the unshadowed irradiance that reaches each pixel."""
-    shaded = shade_surface(gbuffer, visibility, lighting, background)
+    colors = shade_surface(gbuffer, visibility, lighting, background)
 
     def image(color: mi.Color3f) -> np.ndarray:
         return np.ascontiguousarray(np.array(color).T.reshape(gbuffer.height, gbuffer.width, 3))
 
     buffers = gbuffer.numpy()
-    return Guidance(
-        pbr=image(shaded.pbr),
-        irradiance=image(shaded.irradiance),
-        unshadowed=image(shaded.unshadowed),
-        shadowed=image(shaded.shadowed),
-        mask=buffers["opacity"],
-        gbuffer=buffers,
-    )
+    images = {name: image(color) for name, color in colors.items()}
+    return Guidance(**images, mask=buffers["opacity"], gbuffer=buffers)

@@ -5,8 +5,6 @@ harmonics and materials by ordinary automatic differentiation. The kernel's cut 
 decides what is visible and is not differentiated.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 import math

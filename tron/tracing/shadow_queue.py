@@ -6,8 +6,6 @@ that all lanes share, until none is left (persistent threads: Aila and Laine 200
 written at its own place, so the result does not depend on who traced it.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -7,8 +7,6 @@ fails only where as many hits as fit wait for candidates that might lie before a
 larger than the distances between them.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 import drjit as dr

@@ -6,8 +6,6 @@ only beyond two surfel spacings, where they can no longer belong to the surface 
 surfels are larger than the scene's median, their spacing is larger by as much (:class:`BackFaces`).
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence

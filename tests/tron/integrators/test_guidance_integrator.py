@@ -1,7 +1,5 @@
 """Laws of ``tron_guidance``: the library's guidance by Mitsuba's sensors, under its scene's own light."""
 
-# (Mitsuba's type stubs know no arithmetic between its own array types.)
-
 from __future__ import annotations
 
 from typing import Any

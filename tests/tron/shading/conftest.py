@@ -1,7 +1,5 @@
 """A scene in closed form: a white sphere above a plane, traced exactly; the witness of every shadow test."""
 
-# (Mitsuba's type stubs know no arithmetic between its own array types.)
-
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence

@@ -8,7 +8,7 @@ from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
 from tron.shading.irradiance import irradiance
 
-BUFFERS = ("pbr", "irradiance", "unshadowed", "shadowed")
+BUFFERS = [name for name in Guidance.BUFFERS if name != "mask"]
 
 
 def blurry_map() -> EnvironmentMap:
@@ -30,12 +30,16 @@ def test_constant_light_with_nothing_in_the_way_is_returned_exactly(
 def test_buffers_are_finite_float32_images(variant: str, sphere_over_plane, camera, sun_map) -> None:
     guidance = render_guidance(sphere_over_plane(), camera, Lighting(sun_map), spp=4)
     for name in BUFFERS:
-        buffer = getattr(guidance, name)
+        buffer = guidance[name]
         assert buffer.shape == (48, 48, 3)
         assert buffer.dtype == np.float32
         assert np.isfinite(buffer).all()
         assert buffer.min() >= 0
-    assert guidance.mask.shape == (48, 48)
+    assert set(Guidance.BUFFERS) == {"pbr", "irradiance", "unshadowed", "shadowed", "mask"}
+    assert guidance["mask"].shape == (48, 48, 1)
+    np.testing.assert_array_equal(guidance["mask"][..., 0], guidance.mask)
+    with pytest.raises(KeyError):
+        guidance["gbuffer"]
     assert (guidance.irradiance <= guidance.unshadowed * (1 + 1e-5)).all()
 
 

@@ -1,7 +1,5 @@
 """Gradients from pixels to every parameter of a scene, against differences of the float64 reference."""
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Laws of packing: gradients through it add to whatever else a loss asks of the parameters."""
 
-# (Mitsuba's type stubs know no arithmetic between its own array types.)
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -1,7 +1,5 @@
 """Laws of the gradient of shadows by opacity: float64 differences, and zeros where zeros are due."""
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 import dataclasses
