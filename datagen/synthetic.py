@@ -20,6 +20,7 @@ from tron.cameras import Camera
 from tron.estimation import Estimation
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.gaussians.scene import GaussianScene
+from tron.runtime import torch_device
 from tron.seeds import integer
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
@@ -51,7 +52,7 @@ def make_surfels(
         return surfels, None
     recipe = settings.split(spec.split)
     held_out = gbuffers(geometry, spec.clip(0, recipe.frames, recipe.width, recipe.height))
-    device = "cuda" if settings.variant.startswith("cuda") else "cpu"
+    device = torch_device(settings.variant)
     seed = integer(spec.seed, spec.split, spec.index, "refinement")
     return refine_surfels(surfels, seen, held_out, settings.refine_steps, seed, device)
 
