@@ -30,7 +30,7 @@ from tron.errors import TronError
 from tron.gaussians.foreign_files import refuse_foreign
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
-from tron.runtime import activate, describe_machine, set_torch_threads
+from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
 from tron.storage import locked, require_free_space, sha256, write_atomic
 
 if TYPE_CHECKING:
@@ -69,8 +69,7 @@ def main(settings: Settings) -> None:
     with locked(settings.output_dir):
         for light, clip in zip(lights, clips):
             clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite)
-        spp, denoise = QUALITY[settings.quality]
-        trace(scene, cameras, clips, spp=spp, denoise=denoise, seed=settings.seed)
+        trace(scene, cameras, clips, estimation=QUALITY[settings.quality], seed=settings.seed)
         clock.lap("guidance")
         if renderer is not None:
             for clip in clips:
@@ -148,10 +147,7 @@ def _load_renderer(settings: Settings) -> Any:
 
     if settings.threads is not None:
         set_torch_threads(settings.threads)
-    renderer = load_renderer(settings.checkpoint, settings.vae)
-    if settings.variant.startswith("cuda"):
-        renderer = renderer.to("cuda")
-    return renderer
+    return load_renderer(settings.checkpoint, settings.vae).to(torch_device(settings.variant))
 
 
 def _plan(scene: GaussianScene, settings: Settings) -> list[Camera]:
