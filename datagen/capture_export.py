@@ -24,7 +24,7 @@ from datagen.capture_manifest import CaptureManifest
 from datagen.clusters import require_cluster
 from datagen.lights import bake
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
-from datagen.plan import Sources, Work, chosen, find_sources, require_same, write_if_changed
+from datagen.plan import Sources, Work, chosen, find_sources, require_same
 from datagen.progress import Progress
 from datagen.run import FAILURES_NAME, draw_and_build, failure, outcomes, write_failures
 from datagen.scene import SceneSpec, scene_name
@@ -38,7 +38,7 @@ from tron.images import encode_exr
 from tron.runtime import activate
 from tron.seeds import generator, integer
 from tron.shading.environment import EnvironmentMap
-from tron.storage import locked, require_free_space
+from tron.storage import locked, require_free_space, write_if_changed
 
 log = logging.getLogger(__name__)
 

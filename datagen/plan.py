@@ -22,7 +22,7 @@ from datagen.scene import scene_name
 from datagen.settings import SPLITS, Settings
 from tron.errors import TronError
 from tron.shards.manifest import ShardEntry
-from tron.storage import write_atomic
+from tron.storage import write_if_changed
 
 RECORD_NAME = "record.json"
 CONFIG_NAME = "config.yaml"
@@ -233,12 +233,6 @@ def _leaves(value: object, prefix: str = "") -> dict[str, object]:
             for k, v in _leaves(inner, f"{prefix}.{name}".strip(".")).items()
         }
     return {prefix: value}
-
-
-def write_if_changed(path: Path, text: str) -> None:
-    """Write a text file atomically unless it says that already: a finished dataset is not touched."""
-    if not path.is_file() or path.read_bytes() != text.encode():
-        write_atomic(path, text)
 
 
 def clear_temporaries(output: Path) -> None:
