@@ -29,7 +29,7 @@ Maps = Callable[[View], Mapping[str, Pixels]]
 """The maps of one view: field -> array, or what reads the array when it is asked for."""
 
 Track = Callable[[Iterable, str], Iterable]
-"""Wraps long loops as ``track(items, label)``, such as :func:`tron.apps.progress.track`."""
+"""Wraps long loops as ``track(items, label)``, such as :func:`tron.cli.progress.track`."""
 
 
 def untracked(items: Iterable, _label: str) -> Iterable:

@@ -55,7 +55,7 @@ def fit_environment(
         capture: its training views with an irradiance map feed stage 3a, all training views stage 3b.
         scene: frozen surfels, or a tracer that the caller has already.
         settings: sizes, rates, seed.
-        track: wraps long loops as ``track(items, label)``, such as :func:`tron.apps.progress.track`.
+        track: wraps long loops as ``track(items, label)``, such as :func:`tron.cli.progress.track`.
 
     Raises:
         TronError: no training view has an irradiance map, maps are wrong, nothing of the scene is visible, or
@@ -72,7 +72,7 @@ def fit_environment(
     # Photos are read before the long work, so that a bad file is told at once.
     photos = choose_photos(capture.train_views, settings, capture.exposure) if settings.scale_steps else []
     points = SurfacePoints(tracer, views, settings.points_per_view, settings.seed, track)
-    cubemap = fit_cubemap(tracer, points, settings, track)
+    cubemap = fit_cubemap(tracer.sided(settings.two_sided), points, settings, track)
     environment = CubemapLight(mi.Float(cubemap.texels.ravel()), settings.resolution).to_environment()
     scale = LightScale(1.0, np.zeros(0), np.zeros(0))
     if photos:

@@ -19,6 +19,7 @@ from tron.cameras import Camera
 from tron.captures import View
 from tron.color import agx
 from tron.errors import TronError
+from tron.estimation import Estimation
 from tron.priors import Track, untracked
 from tron.reconstruction.losses import photometric_loss
 from tron.reconstruction.settings import FitSettings
@@ -98,10 +99,13 @@ def fit_scale(
         TronError: no photo shows a surface of the scene, or the loss is not finite.
     """
     steps, seed = settings.scale_steps, settings.seed
+    estimation = Estimation(
+        rays=settings.scale_rays, estimator=settings.estimator, two_sided=settings.two_sided
+    )
     pairs = []
     for photo in track(photos, "Scale: views"):
         ray_seed = integer(seed, "environment", "scale", photo.view.name)
-        guidance = render_guidance(tracer, photo.camera, lighting, settings.scale_rays, ray_seed)
+        guidance = render_guidance(tracer, photo.camera, lighting, estimation, ray_seed)
         counts = reduced(surface_mask_of(photo), photo.factor) > 0.5
         counts &= guidance.mask > 0.5
         if counts.any():

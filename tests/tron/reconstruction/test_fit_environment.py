@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from tron.captures import Capture
 from tron.errors import TronError
+from tron.estimation import Estimation
 from tron.reconstruction import EnvironmentFit, FitSettings, fit_environment
 from tron.reconstruction.light_scale import choose_photos, fit_scale
 from tron.reconstruction.log_pyramid import LogPyramid
@@ -92,7 +93,11 @@ def test_sigma_is_a_known_scale_within_a_hundredth(tracer, captured, studio) -> 
 def test_linear_photos_ask_for_the_same_scale(tracer, captured, studio) -> None:
     capture, lighting = captured(studio, views=3), Lighting(studio, 64)
     linear = [
-        replace(view, image=render_guidance(tracer, view.camera, lighting, 64, 9).shadowed, space="linear")
+        replace(
+            view,
+            image=render_guidance(tracer, view.camera, lighting, Estimation(rays=64), 9).shadowed,
+            space="linear",
+        )
         for view in capture.views
     ]
     one, other = (choose_photos(views, SCALE, capture.exposure) for views in (capture.views, linear))

@@ -22,8 +22,8 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 import tron
-from tron.apps.help_page import default_examples, render_help
-from tron.apps.recipes import check, compose_recipe, group_options, resolve
+from tron.cli.help_page import default_examples, render_help
+from tron.cli.recipes import check, compose_recipe, group_options, resolve
 from tron.errors import TronError
 
 Settings = TypeVar("Settings", bound=pydantic.BaseModel)
