@@ -26,9 +26,10 @@ from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.images import read_image
-from tron.shards.manifest import Manifest, verify
+from tron.shards.manifest import Manifest
 from tron.shards.reader import read_clips
 from tron.shards.schema import MEMBERS, REFERENCE_MEMBERS
+from tron.shards.verify import verify
 from tron.storage import locked
 
 pytestmark = pytest.mark.usefixtures("variant")
