@@ -1,8 +1,8 @@
-"""How figures and verdicts are written, in tables, tiles and on the terminal."""
+"""Figures and verdicts as text: in tables, in tiles and on the terminal."""
 
 from __future__ import annotations
 
-from eval.report.page import Tone
+from eval.report.page import Cell, Tone
 from eval.results import Row, Target
 
 MINUS = "\N{MINUS SIGN}"
@@ -42,6 +42,12 @@ def with_interval(row: Row, signed: bool = False) -> str:
     suffix = _STYLES.get(row.unit, (1, 2, f" {row.unit}"))[2]
     low, high = (format_value(end, row.unit, signed).removesuffix(suffix) for end in (row.low, row.high))
     return f"{figure} [{low}, {high}]"
+
+
+def row_cell(row: Row | None, tone: Tone = "plain", unit: bool = True) -> Cell:
+    """A row's figure and interval as a cell, a dash if it was not measured; ``unit`` False leaves dB out."""
+    text = "—" if row is None else with_interval(row)
+    return Cell(text if unit else text.replace(" dB", ""), tone)
 
 
 def verdict(target: Target, measured: float | None, unit: str) -> tuple[str, Tone]:

@@ -110,4 +110,6 @@ def test_another_map_relights_them_and_shows_behind_them(dataset: Path, shared_d
     np.testing.assert_allclose(
         guidance.pbr[empty], environment.lookup(camera.rays())[empty], rtol=0.02, atol=1e-3
     )
-    assert np.abs(guidance.irradiance - clip.frames["irr"][0]).mean() > 0.05 * guidance.irradiance.mean()
+    assert (
+        np.abs(guidance.irradiance - clip.frames["irradiance"][0]).mean() > 0.05 * guidance.irradiance.mean()
+    )

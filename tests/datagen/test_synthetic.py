@@ -20,10 +20,10 @@ LEAST_DB: dict[Family, float] = {"sun": 26.0, "studio": 26.0, "overcast": 28.0}
 
 
 def test_values_that_are_not_finite_are_found_where_they_are():
-    frames = [{"pbr": np.zeros((2, 3, 3)), "irr": np.ones((2, 3, 3))} for _ in range(3)]
+    frames = [{"pbr": np.zeros((2, 3, 3)), "irradiance": np.ones((2, 3, 3))} for _ in range(3)]
     assert first_bad_value(frames) is None
-    frames[2]["irr"][1, 1] = (np.inf, 0, np.nan)
-    assert first_bad_value(frames) == "frame 2: irr has 2 values that are not finite"
+    frames[2]["irradiance"][1, 1] = (np.inf, 0, np.nan)
+    assert first_bad_value(frames) == "frame 2: irradiance has 2 values that are not finite"
 
 
 @pytest.mark.long

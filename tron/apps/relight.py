@@ -25,11 +25,12 @@ from tron.apps.relight_settings import QUALITY, Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
 from tron.cli.command_line import command
+from tron.cli.installation import require_extra
 from tron.errors import TronError
 from tron.gaussians.foreign_files import refuse_foreign
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
-from tron.runtime import activate, describe_machine, set_torch_threads
+from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
 from tron.storage import locked, require_free_space, sha256, write_atomic
 
 if TYPE_CHECKING:
@@ -141,14 +142,12 @@ def _load_renderer(settings: Settings) -> Any:
     """The network, before any frame is traced, so that a wrong file is found at once; None without one."""
     if settings.checkpoint is None:
         return None
+    require_extra("checkpoint", "train")
     from tron.neural.weights import load_renderer
 
     if settings.threads is not None:
         set_torch_threads(settings.threads)
-    renderer = load_renderer(settings.checkpoint, settings.vae)
-    if settings.variant.startswith("cuda"):
-        renderer = renderer.to("cuda")
-    return renderer
+    return load_renderer(settings.checkpoint, settings.vae).to(torch_device(settings.variant))
 
 
 def _plan(scene: GaussianScene, settings: Settings) -> list[Camera]:
