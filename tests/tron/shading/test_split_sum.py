@@ -211,7 +211,7 @@ def test_one_preparation_serves_every_rotation(variant: str) -> None:
         (anew.light.sample(u)[0], turned.light.sample(u)[0]),
     ):
         np.testing.assert_array_equal(rows(one), rows(other))
-    assert turned.environment.rotation_deg == 130
+    assert turned.light.environment.rotation_deg == 130
 
 
 def monte_carlo_albedo(cosine: float, alpha: float, n: int = 400_000) -> tuple[float, float]:
