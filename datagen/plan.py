@@ -19,10 +19,11 @@ from datagen.assets import Asset, find_assets, find_environments
 from datagen.lights import HdriSpec
 from datagen.scene import scene_name
 from datagen.settings import SPLITS, Settings
-from tron.claim import CHOOSE_ANOTHER, read_recipe, require_same, write_if_changed
+from tron.claim import CHOOSE_ANOTHER, read_recipe, require_same
 from tron.errors import TronError
 from tron.shards.manifest import ShardEntry
 from tron.shards.schema import MEMBERS, SCHEMA_VERSION, clip_members, require_schema
+from tron.storage import write_if_changed
 
 RECORD_NAME = "record.json"
 CONFIG_NAME = "config.yaml"

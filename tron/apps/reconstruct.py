@@ -262,7 +262,7 @@ def _report(
         "albedo_scaling": "per view and channel, least squares on the subject",
         "light": None
         if light is None
-        else {"sigma": light.sigma, "irradiance_l1": float(np.mean(light.irradiance_loss[-50:]))},
+        else {"sigma": light.scale.sigma, "irradiance_l1": float(np.mean(light.cubemap.loss[-50:]))},
         "seconds": seconds,
         "settings": {**settings.model_dump(mode="json"), "overwrite": False},
         "machine": describe_machine(),

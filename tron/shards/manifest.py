@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tron.errors import TronError
 from tron.shards.schema import SCHEMA_VERSION, SHARD_PATTERN, require_schema
-from tron.storage import write_atomic
+from tron.storage import write_if_changed
 
 MANIFEST_NAME = "manifest.json"
 LARGEST_MANIFEST = 256 * 2**20
@@ -67,9 +67,9 @@ class Manifest(BaseModel):
         return manifest
 
     def save(self, folder: str | Path) -> None:
-        """Write folder/manifest.json atomically, the shards in order of name."""
+        """Write folder/manifest.json atomically, the shards in order of name, unless it is there already."""
         ordered = self.model_copy(update={"shards": sorted(self.shards, key=lambda entry: entry.name)})
-        write_atomic(Path(folder) / MANIFEST_NAME, ordered.model_dump_json(indent=1) + "\n")
+        write_if_changed(Path(folder) / MANIFEST_NAME, ordered.model_dump_json(indent=1) + "\n")
 
     def splits(self) -> list[str]:
         """Names of the splits, in order."""
