@@ -15,7 +15,7 @@ from eval.tracing.irradiance import REFERENCE_SEED, relative_rmse
 from eval.tracing.lights import LIGHTS
 from eval.tracing.measured import FewRays, LitImages
 from tron.color import luminance
-from tron.shading import Lighting, render_guidance
+from tron.shading import Estimation, Lighting, render_guidance
 
 RAYS = (2, 4, 8)
 TRIALS = 4
@@ -28,7 +28,7 @@ def measure_few_rays(contenders: Contenders, size: int, light: str, reference_sp
     environment = LIGHTS[light]()
     view, lighting, tracer = camera(size), Lighting(environment), contenders.tracer
     spp = min(reference_spp, REFERENCE_SPP)
-    truth = render_guidance(tracer, view, lighting, spp, REFERENCE_SEED)
+    truth = render_guidance(tracer, view, lighting, Estimation(rays=spp), REFERENCE_SEED)
     surface = truth.mask > 0
     shadowed, _ = shadow_classes(DirectLight(truth.irradiance, truth.unshadowed), surface)
     plane = float(luminance(environment.unoccluded_upward()))
@@ -36,10 +36,8 @@ def measure_few_rays(contenders: Contenders, size: int, light: str, reference_sp
     for rays in RAYS:
         for filtered in (False, True):
             way = f"{rays}.filtered" if filtered else f"{rays}"
-            found = [
-                render_guidance(tracer, view, lighting, rays, seed + k, denoise=filtered).irradiance
-                for k in range(TRIALS)
-            ]
+            how = Estimation(rays=rays, filtered=filtered)
+            found = [render_guidance(tracer, view, lighting, how, seed + k).irradiance for k in range(TRIALS)]
             mean[way] = mean_over_reference(found, truth.irradiance, shadowed)
             rmse[way] = relative_rmse(found, truth.irradiance, surface, plane)
             images[way] = found[0]

@@ -21,8 +21,9 @@ from eval.peers.contenders import Contenders
 from eval.peers.scene import camera
 from eval.peers.timing import Rounds, interleaved
 from eval.tracing.measured import GradientStep
+from tron.gaussians.fields import PARAMETERS
 from tron.tracing.gbuffer import trace_gbuffer
-from tron.tracing.parameters import PARAMETERS, SurfelParameters, pack
+from tron.tracing.parameters import SurfelParameters, pack
 from tron.tracing.tiles import build_tiles
 
 TARGET = 0.5
