@@ -127,7 +127,7 @@ def rows_of(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
             if unit in ("s", "surfels"):
                 yield Row(metric=name, value=max(values.values()), unit=unit, n=len(values))
             else:
-                yield mean_row(name, unit, [*values], [*values.values()], seed)
+                yield mean_row(name, unit, values.items(), seed)
         for run in runs:
             if run.name in values:
                 n = 1 if unit in ("s", "surfels") else max(len(run.report.capture.held_out), 1)

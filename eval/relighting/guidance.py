@@ -1,4 +1,4 @@
-"""How good the surfels and their irradiance are, before any network: measured against the path tracer.
+"""Quality of the surfels and their irradiance, before any network: measured against the path tracer.
 
 A tracer that leaks would make a network look good, so its errors are quoted beside the network's gain.
 Irradiance is judged against Mitsuba's direct irradiance, never through the final image: leaks fake bounce
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from eval.confidence import interval, mean_interval, quotient, scene_sums
+from eval.confidence import interval, quotient, scene_sums
 from eval.relighting.shadows import MEMBERS as SHADOW_MEMBERS
 from eval.relighting.shadows import (
     ShadowCounts,
@@ -22,7 +22,7 @@ from eval.relighting.shadows import (
     same_depth,
     same_normal,
 )
-from eval.results import Row
+from eval.results import Row, mean_row
 from tron import metrics
 from tron.color import to_display
 from tron.shards.schema import Clip
@@ -35,9 +35,13 @@ JUDGED = {"": same_depth, "_same_normal": same_normal, "_with_silhouettes": both
 
 @dataclass
 class GuidanceScores:
-    """Gathers the measurements of test clips, each with its scene, those of irradiance by the light's family.
+    """Measurements of test clips; a clip without the reference members adds nothing.
 
-    A clip without the reference members adds nothing.
+    Attributes:
+        irradiance_psnr: family of lights -> (scene, dB) of each frame.
+        shadows: key of JUDGED -> family of lights -> (scene, pixels) of each frame.
+        base_color_psnr: (scene, dB) of each view.
+        normal_error: (scene, degrees) of each view.
     """
 
     irradiance_psnr: dict[str, list[tuple[str, float]]] = field(default_factory=dict)
@@ -47,7 +51,7 @@ class GuidanceScores:
     base_color_psnr: list[tuple[str, float]] = field(default_factory=list)
     normal_error: list[tuple[str, float]] = field(default_factory=list)
     _views: set[str] = field(default_factory=set)
-    _told: bool = False
+    _warned: bool = False
 
     def add(self, clip: Clip) -> None:
         """Measure every frame of a clip, on the ground-truth foreground.
@@ -85,12 +89,12 @@ class GuidanceScores:
     def _count_shadows(self, clip: Clip, k: int) -> None:
         missing = [name for name in SHADOW_MEMBERS if name not in clip.frames]
         if missing:
-            if not self._told:
+            if not self._warned:
                 log.warning(
                     "no shadow figures: clips of this dataset lack %s; make it again with this tron-datagen",
                     ", ".join(missing),
                 )
-            self._told = True
+            self._warned = True
             return
         frame = {name: images[k] for name, images in clip.frames.items()}
         for tail, judged in JUDGED.items():
@@ -109,7 +113,7 @@ class GuidanceScores:
         rows: list[Row] = []
         if self.irradiance_psnr:
             by_family = {
-                family: _mean(f"guidance.irradiance_psnr.{family}", "dB", values, seed)
+                family: mean_row(f"guidance.irradiance_psnr.{family}", "dB", values, seed)
                 for family, values in sorted(self.irradiance_psnr.items())
             }
             lowest = min(by_family.values(), key=lambda row: row.value)
@@ -124,14 +128,8 @@ class GuidanceScores:
             ("surfels.normal_mae_deg", self.normal_error, "deg"),
         ):
             if values:
-                rows.append(_mean(metric, unit, values, seed))
+                rows.append(mean_row(metric, unit, values, seed))
         return rows
-
-
-def _mean(metric: str, unit: str, found: list[tuple[str, float]], seed: int) -> Row:
-    scenes, values = zip(*found)
-    row = Row(metric=metric, value=float(np.mean(values)), unit=unit, n=len(values))
-    return row.within(mean_interval(scenes, values, seed))
 
 
 def _fractions(tail: str, counted: list[tuple[str, ShadowCounts]], seed: int) -> list[Row]:
