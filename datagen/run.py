@@ -42,13 +42,13 @@ from datagen.plan import (
     plan,
     read_record,
     scene_folder,
-    write_if_changed,
 )
 from datagen.preview import contact_row, index_html, sheet_name, write_sheet
-from datagen.progress import Progress
 from datagen.scene import SceneSpec, draw_scene
 from datagen.settings import SPLITS, LightChoice, Settings
 from datagen.synthetic import first_bad_value, make_clips, make_surfels
+from tron.claim import write_if_changed
+from tron.cli.progress import Progress
 from tron.errors import TronError
 from tron.runtime import activate
 from tron.shards.manifest import Manifest
@@ -84,16 +84,13 @@ def make(settings: Settings) -> int:
         if missing:
             require_free_space(output, estimate_bytes(settings, missing))
             log.info("%d of %d scenes to make in %s", len(missing), len(items), output)
-            with Progress(
-                len(missing), sum(len(settings.split(i.split).lights) for i in missing)
-            ) as progress:
+            clips = {item: len(settings.split(item.split).lights) for item in missing}
+            with Progress("scenes", sum(clips.values()), unit="clips") as progress:
                 for item, outcome in outcomes(make_scene, missing, settings, sources):
-                    clips = len(settings.split(item.split).lights)
                     if isinstance(outcome, str):
                         reasons[item.name] = outcome
-                        progress.failed(item.name, outcome, clips)
-                    else:
-                        progress.done(item.name, clips)
+                        log.error("%s failed: %s", item.name, outcome)
+                    progress.advance(clips[item], item.name)
         failures = _account(settings, items, sources, reasons)
     if failures:
         log.error("%d failures, listed in %s", failures, output / FAILURES_NAME)

@@ -12,7 +12,7 @@ from tron.shards.schema import Clip
 
 Region = Literal["foreground", "frame"]
 REGIONS: tuple[Region, Region] = ("foreground", "frame")
-MEMBERS = ("pbr", "irr", "rgb", "unshadowed", "shadowed", "mask", "foreground")
+MEMBERS = ("pbr", "irradiance", "rgb", "unshadowed", "shadowed", "mask", "foreground")
 """Members of a clip that predictions and their scores need."""
 
 
@@ -40,7 +40,7 @@ class Buffers:
     @classmethod
     def of(cls, clip: Clip) -> Buffers:
         """The buffers of all frames of a clip: (K, H, W, C)."""
-        members = ("pbr", "irr", "unshadowed", "shadowed", "mask")
+        members = ("pbr", "irradiance", "unshadowed", "shadowed", "mask")
         return cls(*(clip.frames[name] for name in members), exposure=clip.meta.exposure)
 
     def at(self, pixels: Any) -> Buffers:

@@ -65,11 +65,12 @@ def middle_frame(clip: Clip, shown: dict[str, np.ndarray], truth: np.ndarray) ->
 
 def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
     frames = {name: images[k] for name, images in clip.frames.items()}
-    if not {"irr_ref", "base_color", "base_color_ref", "normal", "normal_ref"} <= frames.keys():
+    if not {"irradiance_ref", "base_color", "base_color_ref", "normal", "normal_ref"} <= frames.keys():
         return {}
     foreground = frames["foreground"] > 0.5
     ours, truth = (
-        np.where(foreground, to_display(frames[name], clip.meta.exposure), 0) for name in ("irr", "irr_ref")
+        np.where(foreground, to_display(frames[name], clip.meta.exposure), 0)
+        for name in ("irradiance", "irradiance_ref")
     )
     pictures = {
         "irradiance, surfels": ours,
@@ -91,7 +92,7 @@ def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
 
 def _shadow_error_picture(frames: dict[str, np.ndarray], truth: np.ndarray) -> np.ndarray:
     """The true irradiance in faint grey, leaking pixels orange, darkened pixels blue."""
-    leaking, darkened = shadow_errors(frames["irr"], direct_light(frames), same_depth(frames))
+    leaking, darkened = shadow_errors(frames["irradiance"], direct_light(frames), same_depth(frames))
     picture = np.repeat(luminance(truth)[..., None] * 0.6, 3, axis=-1)
     picture[leaking] = (1.0, 0.5, 0.05)
     picture[darkened] = (0.2, 0.6, 1.0)

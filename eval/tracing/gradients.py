@@ -22,8 +22,9 @@ from eval.peers.contenders import Contenders, spelled
 from eval.peers.scene import camera
 from eval.peers.timing import Times, interleaved
 from eval.results import Row
+from tron.gaussians.fields import PARAMETERS
 from tron.tracing.gbuffer import trace_gbuffer
-from tron.tracing.parameters import PARAMETERS, SurfelParameters, pack
+from tron.tracing.parameters import SurfelParameters, pack
 from tron.tracing.tiles import build_tiles
 
 TARGET = 0.5

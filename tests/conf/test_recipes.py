@@ -36,7 +36,7 @@ def shipped_recipes() -> Iterator[Any]:
 
 
 def load_command(folder: str) -> Command:
-    return get_object(COMMANDS[folder].replace(":", "."))
+    return get_object(COMMANDS[folder].replace(":", ".")).load()
 
 
 def with_required_values(command: Command, overrides: list[str]) -> list[str]:

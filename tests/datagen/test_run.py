@@ -108,7 +108,7 @@ def test_clips_hold_consecutive_frames_with_true_metadata(dataset):
     for clip in clips:
         assert set(clip.frames) == {*MEMBERS, *REFERENCE_MEMBERS}
         seen = clip.frames["foreground"][..., 0] > 0
-        shadowed, unshadowed = (clip.frames[name][seen] for name in ("irr_ref", "unshadowed_ref"))
+        shadowed, unshadowed = (clip.frames[name][seen] for name in ("irradiance_ref", "unshadowed_ref"))
         assert (shadowed <= unshadowed * 1.001).all()
         assert (shadowed < 0.9 * unshadowed).any()
         true, ours = (clip.frames[name][..., 0] for name in ("depth_ref", "depth"))

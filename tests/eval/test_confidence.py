@@ -144,9 +144,9 @@ def test_guidance_is_drawn_by_scene_too(drawn_clip: Callable[..., Clip]):
     for seed in range(3):
         for light in ("noon", "softbox"):
             clip = drawn_clip(light, seed)
-            clip.frames["irr_ref"] = clip.frames["irr"].copy()
+            clip.frames["irradiance_ref"] = clip.frames["irradiance"].copy()
             if seed != 1:
-                clip.frames["irr"] = clip.frames["unshadowed"].copy()
+                clip.frames["irradiance"] = clip.frames["unshadowed"].copy()
             scores.add(clip)
     rows = {row.metric: row for row in scores.rows()}
     leak = rows["guidance.shadow_leak.sun"]

@@ -17,13 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from tron.errors import TronError
+from tron.estimation import Estimator
 from tron.reconstruction.log_pyramid import LogPyramid
 from tron.reconstruction.surface_points import PointBatch, SurfacePoints
 from tron.seeds import generator, integer
@@ -31,8 +31,6 @@ from tron.shading.cubemap import CubemapLight
 from tron.shading.irradiance import Occluder, visible_share
 from tron.shading.prefilter import unoccluded_irradiance
 from tron.shading.transport import Transport
-
-Estimator = Literal["ratio", "plain"]
 
 DARKEST = 1e-4
 """The first light is at least this bright, relative to its brightest channel: a logarithm needs light."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from tron.captures import Capture
 from tron.errors import TronError
+from tron.estimation import Estimation
 from tron.gaussians import GaussianScene
 from tron.reconstruction.cubemap_fitting import refine
 from tron.reconstruction.light_scale import LightScale, choose_photos, fit_scale
@@ -92,7 +93,7 @@ def fit_environment(
         )
     points = SurfacePoints(tracer, views, settings.points_per_view, settings.seed, track)
     refined = refine(
-        tracer,
+        tracer.sided(settings.two_sided),
         points,
         resolution=settings.resolution,
         steps=settings.steps,
@@ -115,7 +116,9 @@ def fit_environment(
             Lighting(environment, settings.split_sum_resolution),
             exposure=capture.exposure,
             steps=settings.scale_steps,
-            rays=settings.scale_rays,
+            estimation=Estimation(
+                rays=settings.scale_rays, estimator=settings.estimator, two_sided=settings.two_sided
+            ),
             learning_rate=settings.scale_learning_rate,
             seed=settings.seed,
             track=track,

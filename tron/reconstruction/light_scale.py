@@ -19,6 +19,7 @@ from tron.cameras import Camera
 from tron.captures import View
 from tron.color import agx
 from tron.errors import TronError
+from tron.estimation import Estimation
 from tron.reconstruction.losses import photometric_loss
 from tron.reconstruction.surface_points import surface_mask
 from tron.seeds import generator, integer
@@ -81,7 +82,7 @@ def fit_scale(
     *,
     exposure: float,
     steps: int,
-    rays: int,
+    estimation: Estimation,
     learning_rate: float,
     seed: int,
     track: Callable[[Iterable, str], Iterable],
@@ -94,7 +95,7 @@ def fit_scale(
         lighting: the environment of factor 1.
         exposure: of the capture.
         steps: updates, each on one random photo.
-        rays: shadow rays a pixel, even.
+        estimation: of the shadows.
         learning_rate: first step in log sigma.
         seed: root of the rays and of the photos' order.
         track: wraps the long loops, to show progress.
@@ -105,7 +106,7 @@ def fit_scale(
     pairs = []
     for photo in track(photos, "Scale: views"):
         ray_seed = integer(seed, "environment", "scale", photo.view.name)
-        guidance = render_guidance(tracer, photo.camera, lighting, rays, ray_seed)
+        guidance = render_guidance(tracer, photo.camera, lighting, estimation, ray_seed)
         counts = reduced(surface_mask_of(photo), photo.factor) > 0.5
         counts &= guidance.mask > 0.5
         if counts.any():

@@ -143,7 +143,7 @@ class _Run:
         self.before = self.found.seconds if self.found else 0.0
         self.started = time.perf_counter()
         if self.found is not None:
-            require_same(self.found, self.values)
+            self.found.require(self.values)
             log.info("going on from step %d of stage %s", self.found.step, self.found.stage)
 
     def seconds(self) -> float:
@@ -180,29 +180,6 @@ class _Run:
     def _save(self, stage: Stage) -> None:
         if self.path is not None:
             save_checkpoint(self.path, stage, self.values, self.seconds())
-
-
-def require_same(found: Checkpoint, values: Mapping[str, Any]) -> None:
-    """Raise TronError naming the first key in which a checkpoint differs from ``values`` (``made_with``)."""
-    key = _first_difference(found.made_with, values)
-    if key is not None:
-        raise TronError(
-            f"the checkpoint was made with another {key}",
-            found.path,
-            "give the same settings, another output_dir, or overwrite=true",
-        )
-
-
-def _first_difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> str | None:
-    for key in dict.fromkeys((*other, *one)):
-        a, b = one.get(key), other.get(key)
-        if isinstance(a, Mapping) and isinstance(b, Mapping):
-            inner = _first_difference(a, b)
-            if inner is not None:
-                return f"{key}.{inner}"
-        elif a != b:
-            return key
-    return None
 
 
 _ORDER = ("radiance", "materials")

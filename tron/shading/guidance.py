@@ -9,7 +9,7 @@ estimates of shadowed and unshadowed irradiance share their rays, so the share t
 and sheds the noise of the light, and U, which has none, puts the light back (Heitz et al. 2018). From 16 rays
 it is their ratio, below a regression that is not biased in shadow (:mod:`tron.shading.few_rays`). At 64 rays
 under a sun this takes the relative error from 0.13 to 0.04; irradiance over unshadowed is exactly 1 where
-nothing is in the way.
+nothing is in the way. :class:`tron.estimation.Estimation` chooses, also the paper's plain mean.
 
 Every buffer shows the environment where surfels are absent: (1 - share) x shaded + share x radiance seen,
 with the share of :mod:`tron.shading.background`, exactly 0 behind opaque surfels. All of it is linear;
@@ -27,6 +27,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from tron.estimation import Estimation
 from tron.shading.background import over_background
 from tron.shading.denoise import atrous
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
@@ -39,12 +40,15 @@ if TYPE_CHECKING:
     from tron.tracing import GBuffer, Surface
 
 DIELECTRIC_F0 = 0.04
+FINAL = Estimation()
 
 
 class ViewTracer(Occluder, Protocol):
-    """What sees and blocks: :class:`tron.tracing.SurfelTracer`, or a closed form in a test."""
+    """Camera rays and shadow rays: :class:`tron.tracing.SurfelTracer`, or a closed form in a test."""
 
     def gbuffer(self, camera: Camera) -> GBuffer: ...
+
+    def sided(self, two_sided: bool) -> Occluder: ...
 
 
 class Lighting:
@@ -106,9 +110,8 @@ def render_guidance(
     tracer: ViewTracer,
     camera: Camera,
     lighting: Lighting,
-    spp: int = 64,
+    estimation: Estimation = FINAL,
     seed: int = 0,
-    denoise: bool = False,
     background: Sequence[float] | None = None,
 ) -> Guidance:
     """Trace ``camera``'s view of the surfels and shade it under ``lighting``.
@@ -117,24 +120,21 @@ def render_guidance(
         tracer: the scene.
         camera: the view.
         lighting: the prepared environment.
-        spp: shadow rays a pixel, even; 64 for final frames, 2 for previews.
+        estimation: of the shadows.
         seed: root of the shadow rays' random numbers.
-        denoise: filter the visibility over the image; for previews.
-        background: linear RGB radiance that is seen behind the surfels; None: the environment.
-
-    Raises:
-        TronError: ``spp`` is odd or not positive.
+        background: linear RGB radiance behind the surfels; None: the environment.
     """
     gbuffer = tracer.gbuffer(camera)
-    return shade(gbuffer, visibility(tracer, gbuffer, lighting, spp, seed, denoise), lighting, background)
+    return shade(gbuffer, visibility(tracer, gbuffer, lighting, estimation, seed), lighting, background)
 
 
 def visibility(
-    tracer: Occluder, gbuffer: GBuffer, lighting: Lighting, spp: int, seed: int, denoise: bool = False
+    tracer: ViewTracer, gbuffer: GBuffer, lighting: Lighting, estimation: Estimation, seed: int
 ) -> mi.Color3f:
     """Share of the unshadowed irradiance that reaches each pixel; arguments as of :func:`render_guidance`."""
-    shadowed, unshadowed = irradiance(tracer, gbuffer, lighting.light, spp, seed)
-    return reaching_share(shadowed, unshadowed, gbuffer, lighting, tracer.scene.spacing, spp, denoise)
+    occluder = tracer.sided(estimation.two_sided)
+    found = irradiance(occluder, gbuffer, lighting.light, estimation.rays, seed)
+    return reaching_share(*found, gbuffer, lighting, occluder.scene.spacing, estimation)
 
 
 def reaching_share(
@@ -143,18 +143,19 @@ def reaching_share(
     gbuffer: GBuffer,
     lighting: Lighting,
     spacing: float,
-    spp: int,
-    denoise: bool = False,
+    estimation: Estimation,
 ) -> mi.Color3f:
-    """The same from what ``spp`` rays a pixel found: :func:`tron.shading.irradiance`'s two estimates."""
-    if spp >= RATIO_FROM_RAYS and not denoise:
+    """The same from what the rays found: :func:`tron.shading.irradiance`'s two estimates."""
+    plain, many = estimation.estimator == "plain", estimation.rays >= RATIO_FROM_RAYS
+    if many and not (plain or estimation.filtered):
         return visible_share(shadowed, unshadowed)
     known = lighting.split_sum.diffuse(_normal(gbuffer))
-    share = regressed_share(shadowed, unshadowed, known, gbuffer, spacing)
-    if not denoise:
-        return share
-    filtered = atrous(shadowed, unshadowed, grey(share), gbuffer, spacing)
-    return visible_share(*filtered)
+    if estimation.filtered or not plain:
+        share = regressed_share(shadowed, unshadowed, known, gbuffer, spacing)
+        if not estimation.filtered:
+            return share
+        shadowed, unshadowed = atrous(shadowed, unshadowed, grey(share), gbuffer, spacing)
+    return visible_share(shadowed, known if plain else unshadowed)
 
 
 def _normal(seen: Surface) -> mi.Vector3f:

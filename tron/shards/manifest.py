@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tron.errors import TronError
-from tron.shards.schema import MEMBERS, SCHEMA_VERSION, SHARD_PATTERN
+from tron.shards.schema import MEMBERS, SCHEMA_VERSION, SHARD_PATTERN, require_schema
 from tron.storage import sha256, write_atomic
 
 MANIFEST_NAME = "manifest.json"
@@ -53,12 +53,7 @@ class Manifest(BaseModel):
             first = error.errors()[0]
             field = ".".join(str(part) for part in first["loc"])
             raise TronError(f"manifest is damaged at '{field}': {first['msg']}", str(path), mend) from error
-        if manifest.schema_version != SCHEMA_VERSION:
-            raise TronError(
-                f"dataset has schema version {manifest.schema_version}, this program reads {SCHEMA_VERSION}",
-                str(path),
-                "make the dataset again with this version of tron-datagen",
-            )
+        require_schema(manifest.schema_version, folder)
         return manifest
 
     def save(self, folder: str | Path) -> None:

@@ -55,11 +55,16 @@ class BackFaces:
     radii: mi.Float
 
     @staticmethod
-    def of(records: SurfelRecords, spacing: float, two_sided: bool = True) -> BackFaces:
+    def never() -> BackFaces:
+        """Back faces that block nowhere: one-sided surfels."""
+        return BackFaces(dr.opaque(mi.Float, dr.inf), dr.opaque(mi.Float, dr.inf))
+
+    @staticmethod
+    def of(records: SurfelRecords, spacing: float) -> BackFaces:
         """Two spacings, which are ``spacing`` (world units) where surfels have their median size."""
         radii = np.array(dr.detach(records.geometry)).reshape(-1, 4 * GEOMETRY_PACKETS)[:, RADIUS]
         median = float(np.median(radii[radii > 0])) if (radii > 0).any() else 1.0
-        reach = BACK_FACE_SPACINGS * spacing if two_sided else float("inf")
+        reach = BACK_FACE_SPACINGS * spacing
         return BackFaces(dr.opaque(mi.Float, reach), dr.opaque(mi.Float, reach / median))
 
 

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from tron.captures import Capture
 from tron.errors import TronError
+from tron.estimation import Estimation
 from tron.reconstruction import EnvironmentFit, FitSettings, fit_environment
 from tron.reconstruction.light_scale import choose_photos, fit_scale
 from tron.reconstruction.log_pyramid import LogPyramid
@@ -90,7 +91,7 @@ def test_sigma_is_a_known_scale_within_a_hundredth(tracer, captured, studio) -> 
             dimmed,
             exposure=capture.exposure,
             steps=150,
-            rays=32,
+            estimation=Estimation(rays=32),
             learning_rate=0.1,
             seed=0,
             track=lambda items, _: items,
@@ -101,7 +102,11 @@ def test_sigma_is_a_known_scale_within_a_hundredth(tracer, captured, studio) -> 
 def test_linear_photos_ask_for_the_same_scale(tracer, captured, studio) -> None:
     capture, lighting = captured(studio, views=3), Lighting(studio, 64)
     linear = [
-        replace(view, image=render_guidance(tracer, view.camera, lighting, 64, 9).shadowed, space="linear")
+        replace(
+            view,
+            image=render_guidance(tracer, view.camera, lighting, Estimation(rays=64), 9).shadowed,
+            space="linear",
+        )
         for view in capture.views
     ]
     one, other = (choose_photos(views, 3, 10**6, capture.exposure, 0) for views in (capture.views, linear))

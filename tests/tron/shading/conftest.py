@@ -24,6 +24,9 @@ class SphereOverPlane:
         self.sphere, self.base_color, self.metallic = sphere, base_color, metallic
         self.scene = SimpleNamespace(spacing=0.02)
 
+    def sided(self, two_sided: bool) -> SphereOverPlane:
+        return self
+
     def _sphere_hit(self, origin: mi.Point3f, direction: mi.Vector3f) -> mi.Float:
         """Distance to the sphere, infinite if missed."""
         to = mi.Vector3f(origin) - mi.Vector3f(*map(float, CENTRE))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tron import seeds
-from tron.tracing.parameters import PARAMETERS, SurfelParameters, pack
+from tron.gaussians.fields import PARAMETERS
+from tron.tracing.parameters import SurfelParameters, pack
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -10,13 +10,18 @@ import importlib
 import importlib.metadata
 import importlib.util
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from packaging.requirements import Requirement
 
 import tron
 from tron.errors import TronError
+
+if TYPE_CHECKING:
+    from tron.cli.command_line import Command
 
 DISTRIBUTION = "tron-relight"
 PACKAGES = ("conf", "datagen", "train", "eval")
@@ -76,23 +81,35 @@ def _is_installed(distribution: str) -> bool:
     return True
 
 
-def _console_script(name: str, module: str) -> Callable[[], None]:
-    """Entry point of a command whose extra is named as it is: `tron-train` needs `train`."""
+@dataclass(frozen=True)
+class ConsoleScript:
+    """A command as its script starts it: checked first, imported then.
 
-    def run() -> None:
+    Attributes:
+        name: as typed. Its extra is named as it is: `tron-train` needs `train`.
+        module: holds the command as `cli`.
+    """
+
+    name: str
+    module: str
+
+    def load(self) -> Command[Any]:
+        """The command itself."""
+        return importlib.import_module(self.module).cli
+
+    def __call__(self, arguments: Sequence[str] | None = None) -> NoReturn:
+        """Run on `arguments`, those of the process where None; ends in `SystemExit`."""
         try:
             require_own_packages()
-            require_extra(name, name.removeprefix("tron-"))
+            require_extra(self.name, self.name.removeprefix("tron-"))
         except TronError as error:
-            print(f"{name}: {error}", file=sys.stderr)
+            print(f"{self.name}: {error}", file=sys.stderr)
             sys.exit(2)
-        importlib.import_module(module).cli()
-
-    return run
+        self.load()(arguments)
 
 
-relight = _console_script("tron-relight", "tron.apps.relight")
-reconstruct = _console_script("tron-reconstruct", "tron.apps.reconstruct")
-datagen = _console_script("tron-datagen", "datagen.cli")
-train = _console_script("tron-train", "train.cli")
-evaluate = _console_script("tron-eval", "eval.cli")
+relight = ConsoleScript("tron-relight", "tron.apps.relight")
+reconstruct = ConsoleScript("tron-reconstruct", "tron.apps.reconstruct")
+datagen = ConsoleScript("tron-datagen", "datagen.cli")
+train = ConsoleScript("tron-train", "train.cli")
+evaluate = ConsoleScript("tron-eval", "eval.cli")
