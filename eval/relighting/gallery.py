@@ -8,7 +8,6 @@ import numpy as np
 
 from eval.relighting.baselines import BASELINES, NEURAL
 from eval.relighting.buffers import Buffers
-from eval.relighting.shadows import MEMBERS as SHADOW_MEMBERS
 from eval.relighting.shadows import direct_light, same_depth, shadow_errors
 from eval.report.page import Picture, Pictures
 from tron import metrics
@@ -64,9 +63,9 @@ def middle_frame(clip: Clip, shown: dict[str, np.ndarray], truth: np.ndarray) ->
 
 
 def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
-    frames = {name: images[k] for name, images in clip.frames.items()}
-    if not {"irradiance_ref", "base_color", "base_color_ref", "normal", "normal_ref"} <= frames.keys():
+    if not clip.has_reference:
         return {}
+    frames = {name: images[k] for name, images in clip.frames.items()}
     foreground = frames["foreground"] > 0.5
     ours, truth = (
         np.where(foreground, to_display(frames[name], clip.meta.exposure), 0)
@@ -77,8 +76,7 @@ def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
         "irradiance, path-traced": truth,
         f"difference ×{ERROR_GAIN}": np.clip(np.abs(ours - truth) * ERROR_GAIN, 0, 1),
     }
-    if set(SHADOW_MEMBERS) <= frames.keys():
-        pictures["shadow errors"] = _shadow_error_picture(frames, truth)
+    pictures["shadow errors"] = _shadow_error_picture(frames, truth)
     for name, title in (("base_color", "base color"), ("normal", "normals")):
         for member, whose in ((name, "surfels"), (f"{name}_ref", "true")):
             image = frames[member]

@@ -7,13 +7,11 @@ light.
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from eval.confidence import interval, quotient, scene_sums
-from eval.relighting.shadows import MEMBERS as SHADOW_MEMBERS
 from eval.relighting.shadows import (
     ShadowCounts,
     both_have_surface,
@@ -26,8 +24,6 @@ from eval.results import Row, mean_row
 from tron import metrics
 from tron.color import to_display
 from tron.shards.schema import Clip
-
-log = logging.getLogger("tron.eval")
 
 JUDGED = {"": same_depth, "_same_normal": same_normal, "_with_silhouettes": both_have_surface}
 """Tail of a row's name -> which pixels of a frame shadows are judged on."""
@@ -51,7 +47,6 @@ class GuidanceScores:
     base_color_psnr: list[tuple[str, float]] = field(default_factory=list)
     normal_error: list[tuple[str, float]] = field(default_factory=list)
     _views: set[str] = field(default_factory=set)
-    _warned: bool = False
 
     def add(self, clip: Clip) -> None:
         """Measure every frame of a clip, on the ground-truth foreground.
@@ -59,43 +54,33 @@ class GuidanceScores:
         Geometry does not depend on the light: a view (scene and camera) seen under several lights counts
         once for base color and normals.
         """
+        if not clip.has_reference:
+            return
         frames, meta = clip.frames, clip.meta
         for k, foreground in enumerate(frames["foreground"][..., 0] > 0.5):
             if not foreground.any():
                 continue
-            if "irradiance_ref" in frames:
-                shown, truth = (
-                    to_display(frames[name][k], meta.exposure) for name in ("irradiance", "irradiance_ref")
-                )
-                psnr = metrics.capped_psnr(shown, truth, foreground)
-                self.irradiance_psnr.setdefault(meta.light_family, []).append((meta.scene, psnr))
-                self._count_shadows(clip, k)
+            shown, truth = (
+                to_display(frames[name][k], meta.exposure) for name in ("irradiance", "irradiance_ref")
+            )
+            psnr = metrics.capped_psnr(shown, truth, foreground)
+            self.irradiance_psnr.setdefault(meta.light_family, []).append((meta.scene, psnr))
+            self._count_shadows(clip, k)
             view = f"{meta.scene} {sorted(meta.cameras[k].items())}"
             if view in self._views:
                 continue
             self._views.add(view)
-            if {"base_color", "base_color_ref"} <= frames.keys():
-                ours, truth = (np.clip(frames[name][k], 0, 1) for name in ("base_color", "base_color_ref"))
-                psnr = metrics.capped_psnr(ours, truth, foreground)
-                self.base_color_psnr.append((meta.scene, psnr))
-            if {"normal", "normal_ref"} <= frames.keys():
-                ours, truth = frames["normal"][k], frames["normal_ref"][k]
-                lengths = np.minimum(*(np.linalg.norm(n, axis=-1) for n in (ours, truth)))
-                both = foreground & (lengths > 0.5)
-                if both.any():
-                    error = float(metrics.angular_error_deg(ours, truth, both))
-                    self.normal_error.append((meta.scene, error))
+            ours, truth = (np.clip(frames[name][k], 0, 1) for name in ("base_color", "base_color_ref"))
+            psnr = metrics.capped_psnr(ours, truth, foreground)
+            self.base_color_psnr.append((meta.scene, psnr))
+            ours, truth = frames["normal"][k], frames["normal_ref"][k]
+            lengths = np.minimum(*(np.linalg.norm(n, axis=-1) for n in (ours, truth)))
+            both = foreground & (lengths > 0.5)
+            if both.any():
+                error = float(metrics.angular_error_deg(ours, truth, both))
+                self.normal_error.append((meta.scene, error))
 
     def _count_shadows(self, clip: Clip, k: int) -> None:
-        missing = [name for name in SHADOW_MEMBERS if name not in clip.frames]
-        if missing:
-            if not self._warned:
-                log.warning(
-                    "no shadow figures: clips of this dataset lack %s; make it again with this tron-datagen",
-                    ", ".join(missing),
-                )
-            self._warned = True
-            return
         frame = {name: images[k] for name, images in clip.frames.items()}
         for tail, judged in JUDGED.items():
             counts = count_shadow_errors(frame["irradiance"], direct_light(frame), judged(frame))
