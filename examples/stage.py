@@ -1,4 +1,4 @@
-"""What the examples share: their arguments, and a scene and a light made by formulas for those who give none.
+"""Arguments of the examples, and a scene and a light made by formulas for those who give none.
 
 A red ball and a metal ring on a chequered floor, under a low sun; z is up, lengths are metres.
 """
@@ -75,10 +75,12 @@ def make_scene(spacing: float) -> GaussianScene:
     ball = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
     around, across = np.arange(0, 2 * np.pi, spacing / 0.5), np.arange(0, 2 * np.pi, spacing / 0.13)
     a, b = (each.ravel() for each in np.meshgrid(around, across))
-    ring = np.stack([np.cos(a) * np.cos(b), np.sin(b), np.sin(a) * np.cos(b)], axis=1)
-    ring_centre = 0.37 * np.stack([np.cos(a), 0 * a, np.sin(a)], axis=1) + [0.45, 0.35, 0.5]
+    across_ring = np.array([-0.5, 0.87, 0])  # the ring stands upright and faces the first camera aslant
+    outward = np.cos(a)[:, None] * across_ring + np.sin(a)[:, None] * [0, 0, 1]
+    ring = np.cos(b)[:, None] * outward + np.sin(b)[:, None] * [0.87, 0.5, 0]
+    ring_centre = [-0.1, 0.5, 0.5] + 0.37 * outward
 
-    means = np.concatenate([floor, [-0.35, -0.2, 0.4] + 0.4 * ball, ring_centre + 0.13 * ring])
+    means = np.concatenate([floor, [0.1, -0.4, 0.4] + 0.4 * ball, ring_centre + 0.13 * ring])
     normals = np.concatenate([np.broadcast_to([0.0, 0.0, 1.0], floor.shape), ball, ring])
     which = np.repeat([FLOOR, BALL, RING], [len(floor), len(ball), len(ring)])
     color = np.concatenate(
@@ -109,7 +111,7 @@ def make_light(height: int = 128) -> EnvironmentMap:
     level = np.sin(polar)
     towards = np.stack([level * np.sin(azimuth), level * np.cos(azimuth), np.cos(polar) + 0 * azimuth], -1)
     up = towards[..., 2:]
-    sky = np.where(up > 0, [0.9, 1.0, 1.1] - np.maximum(up, 0) ** 0.5 * [0.7, 0.6, 0.35], [0.14, 0.11, 0.09])
+    sky = np.where(up > 0, [0.9, 1.0, 1.1] - np.maximum(up, 0) ** 0.5 * [0.7, 0.6, 0.35], [0.3, 0.26, 0.22])
     sun = np.array([0.5, -0.7, 0.51])
     within = np.clip((towards @ sun - np.cos(0.09)) / 0.001, 0, 1)[..., None]
     return EnvironmentMap((sky + within * [150.0, 115.0, 75.0]).astype(np.float32))
