@@ -119,8 +119,8 @@ def trace_tiles(
     out = None
     if keep_hits:
         # One of two sizes only: the kernel is recorded anew for each size of memory that is not written yet.
-        room = FEW_HITS if int(dr.max(lists.count)[0]) <= FEW_HITS else KEPT_HITS
-        out = HitList.empty(dr.arange(mi.UInt32, dr.width(rays.tile)), room)
+        capacity = FEW_HITS if int(dr.max(lists.count)[0]) <= FEW_HITS else KEPT_HITS
+        out = HitList.empty(dr.arange(mi.UInt32, dr.width(rays.tile)), capacity)
     sums, crowded, kept_hits = stream(
         # Not how many surfels there are, which would be one more thing to record the kernel anew for.
         replace(records, count=0), lists.entries, lists.near, start, count, rays.origin, rays.direction,
@@ -141,9 +141,9 @@ def trace_tiles(
         along = dr.gather(mi.Vector3f, direction, lane)
         return partial(search_list, records, lists.entries, lists.near, first, length, rays.origin, along)
 
-    room = min(int(dr.max(count)[0]), MOST_HITS)
-    fits = keep_hits and room * dr.width(again) <= LISTED_IDS
-    more = HitList.empty(again, room) if fits else None
+    capacity = min(int(dr.max(count)[0]), MOST_HITS)
+    fits = keep_hits and capacity * dr.width(again) <= LISTED_IDS
+    more = HitList.empty(again, capacity) if fits else None
     every = dr.arange(mi.UInt32, dr.width(again))
     traced = composite_rounds(records, search(every), direction, mi.Bool(True), more)
     dr.eval(traced, more)
