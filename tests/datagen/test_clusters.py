@@ -38,7 +38,9 @@ TINY = [
 
 
 def tiny(output: Path, *overrides: str) -> Settings:
-    return check(compose_recipe("conf.datagen", [*TINY, f"output_dir={output}", *overrides]), Settings)
+    return check(
+        compose_recipe("conf.datagen", Settings, [*TINY, f"output_dir={output}", *overrides]), Settings
+    )
 
 
 def tree(folder: Path) -> dict[str, bytes]:

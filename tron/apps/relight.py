@@ -21,11 +21,11 @@ from tron.apps.camera_files import read_cameras
 from tron.apps.clip import GUIDANCE, Clip, trace
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.framing import plan_cameras, turn_cameras, upright
-from tron.cli.installation import require_extra
 from tron.apps.relight_settings import QUALITY, Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
 from tron.cli.command_line import command
+from tron.cli.installation import require_extra
 from tron.errors import TronError
 from tron.gaussians.foreign_files import refuse_foreign
 from tron.gaussians.ply import check_header

@@ -23,7 +23,7 @@ from rich.logging import RichHandler
 
 import tron
 from tron.cli.help_page import default_examples, render_help
-from tron.cli.recipes import check, compose_recipe, group_options, resolve
+from tron.cli.recipes import check, complete, compose_recipe, group_options, resolve
 from tron.errors import TronError
 
 Settings = TypeVar("Settings", bound=pydantic.BaseModel)
@@ -55,9 +55,9 @@ class Command(Generic[Settings]):
             if options.version:
                 print(f"{self.name} {tron.__version__}")
                 return 0
-            recipe = compose_recipe(self.config_module, options.overrides, options.config_dir)
+            recipe = compose_recipe(self.config_module, self.settings, options.overrides, options.config_dir)
             if options.cfg:
-                print(yaml.safe_dump(resolve(recipe), sort_keys=False), end="")
+                print(yaml.safe_dump(resolve(complete(recipe)), sort_keys=False), end="")
                 return 0
             settings = check(recipe, self.settings)
             configure_logging()
@@ -71,7 +71,7 @@ class Command(Generic[Settings]):
 
     def _help(self, overrides: Sequence[str], config_dir: Path | None) -> str:
         groups = group_options(self.config_module)
-        recipe = compose_recipe(self.config_module, overrides, config_dir)
+        recipe = complete(compose_recipe(self.config_module, self.settings, overrides, config_dir))
         defaults: Any = OmegaConf.to_container(recipe, resolve=False)
         purpose = inspect.getdoc(self.main) or self.settings.__doc__ or self.name
         examples = self.examples or default_examples(self.name, groups)
