@@ -31,7 +31,7 @@ from datagen.settings import CaptureSettings, Settings
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder, write_capture
-from tron.claim import read_recipe, require_same, write_if_changed
+from tron.claim import read_recipe, require_same
 from tron.cli.progress import Progress
 from tron.color import to_display
 from tron.errors import TronError
@@ -39,7 +39,7 @@ from tron.images import encode_exr
 from tron.runtime import activate
 from tron.seeds import generator, integer
 from tron.shading.environment import EnvironmentMap
-from tron.storage import locked, require_free_space
+from tron.storage import locked, require_free_space, write_if_changed
 
 log = logging.getLogger(__name__)
 

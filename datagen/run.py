@@ -47,13 +47,12 @@ from datagen.preview import contact_row, index_html, sheet_name, write_sheet
 from datagen.scene import SceneSpec, draw_scene
 from datagen.settings import SPLITS, LightChoice, Settings
 from datagen.synthetic import first_bad_value, make_clips, make_surfels
-from tron.claim import write_if_changed
 from tron.cli.progress import Progress
 from tron.errors import TronError
 from tron.runtime import activate
 from tron.shards.manifest import Manifest
 from tron.shards.writer import ShardWriter
-from tron.storage import locked, require_free_space, write_atomic
+from tron.storage import locked, require_free_space, write_atomic, write_if_changed
 
 log = logging.getLogger(__name__)
 
@@ -242,7 +241,7 @@ def _account(settings: Settings, items: Sequence[Work], sources: Sources, reason
     refinements = [record.refinement for record in made if record.refinement is not None]
     write_if_changed(output / "card.md", card_text(settings, manifest, sources, lights, refinements))
     write_if_changed(output / "index.html", index_html("TRON dataset", shards))
-    write_if_changed(output / "manifest.json", manifest.model_dump_json(indent=1) + "\n")
+    manifest.save(output)
     return len(failures)
 
 

@@ -73,8 +73,8 @@ class SplitSettings(_Model):
     )
     reference_buffers: bool = Field(
         False,
-        description="Also store Mitsuba's direct irradiance, with and without shadows, base color, normals "
-        "and depth, and the surfels' own.",
+        description="Also store Mitsuba's direct irradiance, with and without shadows, base color, normals, "
+        "depth, roughness and metallic, and the surfels' own.",
     )
     reference_spp: int = Field(128, ge=2, description="Shadow rays a pixel of Mitsuba's direct irradiance.")
 

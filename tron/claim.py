@@ -14,7 +14,6 @@ import yaml
 
 from tron.errors import TronError
 from tron.nested import leaves
-from tron.storage import write_atomic
 
 CHOOSE_ANOTHER = "choose another output_dir, or delete that one"
 SHOWN_CHARACTERS = 60
@@ -70,12 +69,6 @@ def read_recipe(path: Path) -> dict[str, Any] | None:
     if not isinstance(recipe, dict):
         raise TronError(f"{path.name} is damaged: it holds no settings", path, CHOOSE_ANOTHER)
     return recipe
-
-
-def write_if_changed(path: Path, text: str) -> None:
-    """Write a text file atomically unless it says that already: a finished folder is not touched."""
-    if not path.is_file() or path.read_bytes() != text.encode():
-        write_atomic(path, text)
 
 
 def _shown(value: Any) -> str:

@@ -75,6 +75,13 @@ def write_atomic(path: str | os.PathLike[str], data: bytes | str) -> None:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
+def write_if_changed(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text file atomically unless it says that already: a finished dataset is not touched."""
+    path = Path(path)
+    if not path.is_file() or path.read_bytes() != text.encode():
+        write_atomic(path, text)
+
+
 @contextmanager
 def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give an empty folder beside ``path``; it becomes ``path`` when the block succeeds.

@@ -10,8 +10,7 @@ aligned block as across its border, unless pixels of a block share something: th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import drjit as dr
@@ -20,16 +19,17 @@ import numpy as np
 
 from eval.peers.contenders import Contenders
 from eval.peers.scene import camera, mitsuba_mesh
-from eval.peers.timing import Times, interleaved
-from eval.results import Row
+from eval.peers.timing import Rounds, interleaved
 from eval.tracing.lights import LIGHTS
+from eval.tracing.measured import DirectTimes, LitImages, Noise
 from tron import seeds
 from tron.cameras import mitsuba_sensor
 from tron.color import luminance
 from tron.shading import EnvironmentLight, Estimation, Lighting, irradiance, render_guidance
-from tron.shading.guidance import reaching_share, shade
+from tron.shading.guidance import Guidance, reaching_share, shade
 from tron.shading.irradiance import ORIGIN_OFFSET
 from tron.tracing import GBuffer, SurfelTracer
+from tron.tracing.bvh import build_bvh
 from tron.tracing.tiles import lanes_of_pixels, tile_pixels
 
 FEW, MANY = 2, 64
@@ -37,29 +37,11 @@ FAN = 4
 REFERENCE_SEED, TRIALS = 1_000_003, 8
 
 
-@dataclass(frozen=True)
-class DirectTimes:
-    """The 64-ray pass and Mitsuba's ``direct`` under one light; ``images`` (H, W, 3) of both, linear."""
-
-    light: str
-    times: Mapping[str, Times]
-    images: Mapping[str, np.ndarray]
-    exposure: float
-
-    @property
-    def ratio(self) -> float:
-        """TRON's time, its hierarchy's build and its camera rays included, over Mitsuba's faster time."""
-        direct = min(t.median for name, t in self.times.items() if name.startswith("direct"))
-        return sum(self.times[name].median for name in ("tron", "build", "gbuffer")) / direct
-
-
-def measure_direct(contenders: Contenders, size: int, light: str, seed: int, repetitions: int) -> DirectTimes:
+def measure_direct(contenders: Contenders, size: int, light: str, seed: int, rounds: Rounds) -> DirectTimes:
     """Time the pass on the surfels and Mitsuba on the mesh: as many shadow rays, the same camera and light.
 
     Mitsuba's 64 rays are tried in both ways it offers: all from one camera ray, and two from each of 32.
     """
-    from tron.tracing.bvh import build_bvh
-
     view, environment = camera(size), LIGHTS[light]()
     prepared = EnvironmentLight(environment)
     tracer = contenders.tracer
@@ -69,7 +51,7 @@ def measure_direct(contenders: Contenders, size: int, light: str, seed: int, rep
     ways = {"direct at once": (1, half), "direct by camera rays": (half, 1)}
     contestants: dict[str, Any] = {
         "tron": lambda: irradiance(tracer, gbuffer, prepared, MANY, seed),
-        "build": lambda: build_bvh(contenders.records).nodes,
+        "build": lambda: build_bvh(tracer.records).nodes,
         "gbuffer": lambda: tracer.gbuffer(view),
     }
     for name, (spp, samples) in ways.items():
@@ -80,109 +62,99 @@ def measure_direct(contenders: Contenders, size: int, light: str, seed: int, rep
         contestants[name] = lambda i=integrator, s=sensor, n=spp: mi.render(
             scene, sensor=s, integrator=i, spp=n
         )
-    times = interleaved(contestants, repetitions, repetitions)
+    times = interleaved(contestants, rounds)
     shadowed, _ = contestants["tron"]()
     images = {
         "tron": np.array(shadowed).T.reshape(size, size, 3),
         "direct": np.array(contestants["direct by camera rays"]()),
     }
-    return DirectTimes(light, times, images, environment.exposure())
+    lit = LitImages(light, environment.exposure(), images)
+    return DirectTimes(len(contenders.scene), size, times, lit)
 
 
-@dataclass(frozen=True)
-class Noise:
-    """Errors under one light; ``images`` are linear, ``rmse`` shares of an upward plane's light."""
+class LitView:
+    """The benchmark's view of the surfels under one light, beside a rendering of many rays per pixel.
 
-    light: str
-    rmse: Mapping[str, float]
-    blocks: Mapping[str, float]
-    equal_time_spp: int
-    images: Mapping[str, np.ndarray]
-    exposure: float
+    Attributes:
+        tracer: of the surfels.
+        lighting: the prepared light.
+        truth: the rendering of many rays.
+        surface: (H, W) bool, pixels with a surface.
+    """
+
+    def __init__(self, contenders: Contenders, size: int, light: str, reference_spp: int, seed: int) -> None:
+        environment = LIGHTS[light]()
+        self.tracer, self.lighting = contenders.tracer, Lighting(environment)
+        self._light, self._exposure = light, environment.exposure()
+        self._plane = float(luminance(environment.unoccluded_upward()))
+        self._view, self._seed = camera(size), seed
+        self.truth = self._render(Estimation(rays=reference_spp), REFERENCE_SEED)
+        self.surface = self.truth.mask > 0
+
+    def _render(self, estimation: Estimation, seed: int) -> Guidance:
+        return render_guidance(self.tracer, self._view, self.lighting, estimation, seed)
+
+    def trials(self, count: int, rays: int, filtered: bool = False) -> list[np.ndarray]:
+        """Irradiance of few rays, (H, W, 3) each."""
+        estimation = Estimation(rays=rays, filtered=filtered)
+        return [self._render(estimation, self._seed + k).irradiance for k in range(count)]
+
+    def rmse(self, trials: Sequence[np.ndarray]) -> float:
+        """Error of trials as a share of an upward plane's light."""
+        return relative_rmse(trials, self.truth.irradiance, self.surface, self._plane)
+
+    def images(self, trials: Mapping[str, Sequence[np.ndarray]]) -> LitImages:
+        """The first trial of each way, and the reference."""
+        firsts = {way: images[0] for way, images in trials.items()}
+        return LitImages(self._light, self._exposure, {"reference": self.truth.irradiance, **firsts})
 
 
 def measure_noise(contenders: Contenders, size: int, light: str, reference_spp: int, seed: int) -> Noise:
     """Errors of TRON's and of independent sampling at 2 and 64 rays, and at the time of TRON's 64."""
-    environment = LIGHTS[light]()
-    view, lighting, tracer = camera(size), Lighting(environment), contenders.tracer
-    gbuffer = tracer.gbuffer(view)
-    surface = gbuffer.numpy()["opacity"] > 0
-    plane = float(luminance(environment.unoccluded_upward()))
-    truth = render_guidance(tracer, view, lighting, Estimation(rays=reference_spp), REFERENCE_SEED).irradiance
+    lit = LitView(contenders, size, light, reference_spp, seed)
+    tracer, lighting, gbuffer = lit.tracer, lit.lighting, lit.tracer.gbuffer(camera(size))
 
-    def ours(spp: int, trial: int, denoise: bool = False) -> np.ndarray:
-        return render_guidance(
-            tracer, view, lighting, Estimation(rays=spp, filtered=denoise), seed + trial
-        ).irradiance
-
-    def independent(spp: int, trial: int) -> np.ndarray:
-        shadowed, unshadowed = independent_irradiance(tracer, gbuffer, lighting.light, spp, seed + trial)
-        share = reaching_share(
-            shadowed, unshadowed, gbuffer, lighting, tracer.scene.spacing, Estimation(rays=spp)
-        )
-        return shade(gbuffer, share, lighting).irradiance
+    def independent(rays: int) -> list[np.ndarray]:
+        images = []
+        for k in range(TRIALS):
+            sums = independent_irradiance(tracer, gbuffer, lighting.light, rays, seed + k)
+            estimation = Estimation(rays=rays)
+            share = reaching_share(*sums, gbuffer, lighting, tracer.scene.spacing, estimation)
+            images.append(shade(gbuffer, share, lighting).irradiance)
+        return images
 
     times = interleaved(
         {
             "tron": lambda: irradiance(tracer, gbuffer, lighting.light, MANY, seed),
             "independent": lambda: independent_irradiance(tracer, gbuffer, lighting.light, MANY, seed),
         },
-        3,
+        Rounds(3),
     )
     equal = max(2, 2 * round(MANY / 2 * times["tron"].over(times["independent"])))
-    few, many = ([ours(spp, k) for k in range(TRIALS)] for spp in (FEW, MANY))
-    alone_few, alone_many = ([independent(spp, k) for k in range(TRIALS)] for spp in (FEW, MANY))
-    estimates = {
-        "rmse_2spp": few,
-        "rmse_64spp": many,
-        "rmse_2spp_denoised": [ours(FEW, k, denoise=True) for k in range(TRIALS)],
-        "independent_rmse_2spp": alone_few,
-        "independent_rmse_64spp": alone_many,
-        "independent_rmse_equal_time": [independent(equal, k) for k in range(TRIALS)],
+    trials = {
+        "rmse_2spp": lit.trials(TRIALS, FEW),
+        "independent_rmse_2spp": independent(FEW),
+        "rmse_2spp_denoised": lit.trials(TRIALS, FEW, filtered=True),
+        "rmse_64spp": lit.trials(TRIALS, MANY),
+        "independent_rmse_64spp": independent(MANY),
+        "independent_rmse_equal_time": independent(equal),
     }
-    rmse = {name: relative_rmse(images, truth, surface, plane) for name, images in estimates.items()}
     blocks = {}
     for side in (4, 8):
-        for whose, images in (("", many), ("independent_", alone_many)):
-            errors = luminance(np.stack(images) - truth)
+        for whose in ("", "independent_"):
+            errors = luminance(np.stack(trials[f"{whose}rmse_64spp"]) - lit.truth.irradiance)
             name = f"{whose}block_correlation_{side}x{side}"
-            blocks[name] = block_correlation(errors, surface, side)
-    images = {
-        "reference": truth,
-        "tron 2": few[0],
-        "independent 2": alone_few[0],
-        "denoised 2": estimates["rmse_2spp_denoised"][0],
-        "tron 64": many[0],
-        "independent 64": alone_many[0],
-    }
-    return Noise(light, rmse, blocks, equal, images, environment.exposure())
+            blocks[name] = block_correlation(errors, lit.surface, side)
+    rmse = {name: lit.rmse(images) for name, images in trials.items()}
+    return Noise(lit.images(trials), TRIALS, rmse, blocks, equal)
 
 
-def relative_rmse(images: list[np.ndarray], truth: np.ndarray, surface: np.ndarray, plane: float) -> float:
+def relative_rmse(
+    images: Sequence[np.ndarray], truth: np.ndarray, surface: np.ndarray, plane: float
+) -> float:
     """Root mean square over trials, pixels with a surface and channels, over an upward plane's light."""
     squares = [((image - truth)[surface].astype(np.float64) ** 2).mean() for image in images]
     return float(np.sqrt(np.mean(squares)) / plane)
-
-
-def noise_rows(noises: list[Noise]) -> list[Row]:
-    """Rows of every light, and over the lights: root mean square errors, worst block correlation."""
-    rows = [
-        Row(metric=f"irradiance.{name}.{noise.light}", value=value, unit="fraction", n=TRIALS)
-        for noise in noises
-        for name, value in noise.rmse.items()
-    ]
-    rows += [
-        Row(metric=f"irradiance.{name}.{noise.light}", value=value, unit="correlation", n=TRIALS)
-        for noise in noises
-        for name, value in noise.blocks.items()
-    ]
-    for name in noises[0].rmse:
-        value = float(np.sqrt(np.mean([noise.rmse[name] ** 2 for noise in noises])))
-        rows.append(Row(metric=f"irradiance.{name}", value=value, unit="fraction", n=TRIALS * len(noises)))
-    for name in noises[0].blocks:
-        worst = max((noise.blocks[name] for noise in noises), key=abs)
-        rows.append(Row(metric=f"irradiance.{name}", value=worst, unit="correlation", n=TRIALS * len(noises)))
-    return rows
 
 
 def block_correlation(errors: np.ndarray, surface: np.ndarray, side: int) -> float:

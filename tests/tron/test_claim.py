@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tron.claim import first_difference, read_recipe, require_same, write_if_changed
+from tron.claim import first_difference, read_recipe, require_same
 from tron.errors import TronError
 from tron.nested import leaves, nested_items
+from tron.storage import write_if_changed
 
 RECIPE = {"seed": 0, "train": {"scenes": 2, "lights": ["sun"]}, "rate": 1e-05, "none": None, "empty": {}}
 

@@ -23,6 +23,7 @@ from rich.logging import RichHandler
 
 import tron
 from tron.cli.help_page import default_examples, render_help
+from tron.cli.installation import require_own_packages
 from tron.cli.recipes import check, complete, compose_recipe, group_options, resolve
 from tron.errors import TronError
 
@@ -46,8 +47,13 @@ class Command(Generic[Settings]):
         """Run on `arguments`, those of the process where None."""
         sys.exit(self._run(sys.argv[1:] if arguments is None else arguments))
 
+    def compose(self, *overrides: str) -> Settings:
+        """Checked settings from `key=value` overrides, for `main` called from Python; TronError if wrong."""
+        return check(compose_recipe(self.config_module, self.settings, overrides), self.settings)
+
     def _run(self, arguments: Sequence[str]) -> int:
         try:
+            require_own_packages()
             options = _parser(self.name).parse_args(arguments)
             if options.help:
                 print(self._help(options.overrides, options.config_dir), end="")

@@ -13,15 +13,12 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from packaging.requirements import Requirement
 
 import tron
 from tron.errors import TronError
-
-if TYPE_CHECKING:
-    from tron.cli.command_line import Command
 
 DISTRIBUTION = "tron-relight"
 PACKAGES = ("conf", "datagen", "train", "eval")
@@ -93,8 +90,8 @@ class ConsoleScript:
     name: str
     module: str
 
-    def load(self) -> Command[Any]:
-        """The command itself."""
+    def load(self) -> Any:
+        """The command itself, a tron.cli.command_line.Command."""
         return importlib.import_module(self.module).cli
 
     def __call__(self, arguments: Sequence[str] | None = None) -> NoReturn:

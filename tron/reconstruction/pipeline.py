@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,16 +21,14 @@ from tron.color import srgb_to_linear
 from tron.errors import TronError
 from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
-from tron.priors import Prior, apply_prior
+from tron.priors import Prior, Track, apply_prior, untracked
 from tron.reconstruction.checkpoint import Checkpoint, save_checkpoint
 from tron.reconstruction.initial import extent_of, initial_surfels, source_of
 from tron.reconstruction.settings import ReconstructionSettings
 from tron.reconstruction.supervision import MATERIALS
 from tron.reconstruction.surfels import LearntSurfels
-from tron.reconstruction.training import Plan, Progress, Stage, Watch, materials_plan, radiance_plan
+from tron.reconstruction.training import Plan, Stage, StepSummary, Watch, materials_plan, radiance_plan
 from tron.tracing import SurfelTracer
-
-Track = Callable[[Iterable, str], Iterable]
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +58,7 @@ def reconstruct(
     checkpoint: Path | None = None,
     device: str = "cpu",
     watch: Watch | None = None,
-    track: Track | None = None,
+    track: Track = untracked,
 ) -> Reconstruction:
     """Find the surfels of a capture, whose images are display values.
 
@@ -171,7 +169,7 @@ class _Run:
         self._save(stage)
         return stage.surfels
 
-    def _after(self, progress: Progress, stage: Stage) -> None:
+    def _after(self, progress: StepSummary, stage: Stage) -> None:
         if progress.step % self.settings.checkpoint_every == 0 and progress.step < progress.steps:
             self._save(stage)
         if self.watch is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -13,6 +13,7 @@ import numpy as np
 from tron.aligned import aligned
 from tron.captures import View
 from tron.errors import TronError
+from tron.priors import Track, untracked
 from tron.seeds import generator
 from tron.shading.guidance import ViewTracer
 
@@ -66,7 +67,7 @@ class SurfacePoints:
         views: Sequence[View],
         per_view: int,
         seed: int,
-        track: Callable[[Iterable[View], str], Iterable[View]],
+        track: Track = untracked,
     ) -> None:
         parts: list[np.ndarray] = []
         for view in track(views, "G-buffers"):
