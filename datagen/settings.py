@@ -53,37 +53,44 @@ class SplitSettings(_Model):
     """One split: how many scenes of which kind, and how they are rendered."""
 
     scenes: int = Field(ge=0, le=1_000_000, description="Number of scenes.")
-    style: Style = Field("A", description="Distribution of shapes, patterns, object counts and floor.")
+    style: Style = Field(
+        default="A", description="Distribution of shapes, patterns, object counts and floor."
+    )
     lights: list[LightChoice] = Field(
-        ["any"] * 4,
+        default=["any"] * 4,
         min_length=1,
         max_length=64,
         description="Light family of each clip of a scene; any draws one of families.",
     )
-    frames: int = Field(5, ge=1, le=1000, description="Consecutive frames of a clip.")
-    width: int = Field(256, ge=8, le=8192, description="Frame width in pixels.")
-    height: int = Field(256, ge=8, le=8192, description="Frame height in pixels.")
+    frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
+    width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
+    height: int = Field(default=256, ge=8, le=8192, description="Frame height in pixels.")
     path_spp: int = Field(
-        256,
+        default=256,
         ge=1,
         description="Paths a pixel of path-traced frames; rounded up to a product of near numbers.",
     )
     guidance_spp: int = Field(
-        64, ge=2, multiple_of=2, description="Shadow rays a pixel of the surfels' irradiance, even."
+        default=64, ge=2, multiple_of=2, description="Shadow rays a pixel of the surfels' irradiance, even."
     )
     reference_buffers: bool = Field(
-        False,
+        default=False,
         description="Also store Mitsuba's direct irradiance, with and without shadows, base color, normals, "
         "depth, roughness and metallic, and the surfels' own.",
     )
-    reference_spp: int = Field(128, ge=2, description="Shadow rays a pixel of Mitsuba's direct irradiance.")
+    reference_spp: int = Field(
+        default=128, ge=2, description="Shadow rays a pixel of Mitsuba's direct irradiance."
+    )
 
 
 class CaptureSettings(_Model):
     """Scenes of the test split as captures: spiral views under one light, path-traced, with true maps."""
 
     scenes: int = Field(
-        4, ge=1, le=1_000_000, description="Captures that mode=captures makes, of as many test scenes."
+        default=4,
+        ge=1,
+        le=1_000_000,
+        description="Captures that mode=captures makes, of as many test scenes.",
     )
     lights: list[LightChoice] = Field(
         default=["overcast", "studio", "sun"],
@@ -92,16 +99,19 @@ class CaptureSettings(_Model):
         description="Light family of each capture, in rotation; any draws one of families.",
     )
     views: int = Field(
-        64, ge=2, le=100_000, description="Spiral views of a capture; each 8th is held out, from the first."
+        default=64,
+        ge=2,
+        le=100_000,
+        description="Spiral views of a capture; each 8th is held out, from the first.",
     )
-    width: int = Field(128, ge=8, le=8192, description="View width in pixels.")
-    height: int = Field(128, ge=8, le=8192, description="View height in pixels.")
+    width: int = Field(default=128, ge=8, le=8192, description="View width in pixels.")
+    height: int = Field(default=128, ge=8, le=8192, description="View height in pixels.")
     path_spp: int = Field(
-        64, ge=1, description="Paths a pixel; rounded up to a product of near numbers, such as 8 x 8."
+        default=64, ge=1, description="Paths a pixel; rounded up to a product of near numbers, such as 8 x 8."
     )
-    reference_spp: int = Field(32, ge=2, description="Shadow rays a pixel of the irradiance maps.")
+    reference_spp: int = Field(default=32, ge=2, description="Shadow rays a pixel of the irradiance maps.")
     points: int | None = Field(
-        None,
+        default=None,
         ge=1,
         le=10_000_000,
         description="Also store about so many points on surfaces, with their colours, as photos would give.",

@@ -69,7 +69,7 @@ def compose_recipe(
             _require_option(each, groups[each.key_or_group])
         try:
             shipped = compose("config", overrides=[*search, *(str(each.input_line) for each in selections)])
-            recipe = OmegaConf.create(_merged(model_defaults(settings), OmegaConf.to_container(shipped)))
+            recipe = DictConfig(_merged(model_defaults(settings), OmegaConf.to_container(shipped)))
             keys = [each for each in parsed if each.key_or_group not in groups]
             changed = {each.key_or_group for each in keys if not each.is_add() and not each.is_force_add()}
             if not changed <= _keys(recipe):
@@ -143,7 +143,7 @@ def complete(recipe: DictConfig) -> DictConfig:
 
     An object made of such objects alone has no settings of its own, and is not looked into.
     """
-    return OmegaConf.create(_completed(OmegaConf.to_container(recipe)))
+    return DictConfig(_completed(OmegaConf.to_container(recipe)))
 
 
 def check(recipe: DictConfig, settings: type[Settings]) -> Settings:
