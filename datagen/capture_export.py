@@ -24,21 +24,22 @@ from datagen.capture_manifest import CaptureManifest
 from datagen.clusters import require_cluster
 from datagen.lights import bake
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
-from datagen.plan import Sources, Work, chosen, find_sources, require_same, write_if_changed
-from datagen.progress import Progress
+from datagen.plan import Sources, Work, chosen, find_sources
 from datagen.run import FAILURES_NAME, draw_and_build, failure, outcomes, write_failures
 from datagen.scene import SceneSpec, scene_name
 from datagen.settings import CaptureSettings, Settings
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder, write_capture
+from tron.claim import read_recipe, require_same
+from tron.cli.progress import Progress
 from tron.color import to_display
 from tron.errors import TronError
 from tron.images import encode_exr
 from tron.runtime import activate
 from tron.seeds import generator, integer
 from tron.shading.environment import EnvironmentMap
-from tron.storage import locked, require_free_space
+from tron.storage import locked, require_free_space, write_if_changed
 
 log = logging.getLogger(__name__)
 
@@ -77,14 +78,14 @@ def make_captures(settings: Settings) -> int:
         manifest = CaptureManifest.load(folder)
         missing = [item for item in items if not _finished(folder / item.name, wanted)]
         require_free_space(folder, len(missing) * _estimate_bytes(settings))
-        with Progress(len(missing), len(missing) * wanted.views, "views") as progress:
+        with Progress("captures", len(missing) * wanted.views, unit="views") as progress:
             for item, outcome in outcomes(make_capture, missing, settings, sources):
                 if isinstance(outcome, str):
                     reasons[item.name] = outcome
-                    progress.failed(item.name, outcome, wanted.views)
+                    log.error("%s failed: %s", item.name, outcome)
                 else:
                     manifest.record(outcome)
-                    progress.done(item.name, wanted.views)
+                progress.advance(wanted.views, item.name)
         for item in items:  # those that an older or an interrupted run has finished
             if item.name not in manifest.captures and item.name not in reasons:
                 manifest.record(folder / item.name)
@@ -245,13 +246,8 @@ def develop(frame: np.ndarray, exposure: float, where: str) -> tuple[np.ndarray,
 def _adopt(settings: Settings, folder: Path) -> None:
     """Make the folder of captures this recipe's, or make sure that it is already."""
     path, recipe = folder / CONFIG_NAME, settings.capture_recipe()
-    if path.is_file():
-        try:
-            before = dict(yaml.safe_load(path.read_text("utf-8")))
-        except (yaml.YAMLError, TypeError, ValueError) as error:
-            raise TronError(
-                "config.yaml of the captures is damaged", path, "choose another output_dir"
-            ) from error
+    before = read_recipe(path)
+    if before is not None:
         require_same(before, recipe, folder, "captures")
     elif folder.is_dir() and any(folder.iterdir()):
         raise TronError(

@@ -8,10 +8,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from datagen.plan import write_if_changed
 from tron.captures.folder import read_capture_folder
 from tron.errors import TronError
-from tron.storage import sha256
+from tron.storage import sha256, write_if_changed
 
 MANIFEST_NAME = "manifest.json"
 NOT_PIXELS = ("name", "camera", "space")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import shlex
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
 
 from omegaconf import OmegaConf
 
@@ -14,7 +14,8 @@ import tron
 from datagen.assets import Asset
 from datagen.plan import Figures, Refinement, Sources, config_sha256
 from datagen.settings import OUTSIDE, SPLITS, Settings
-from tron.apps.recipes import compose_recipe
+from tron.cli.recipes import compose_recipe
+from tron.nested import leaves
 from tron.runtime import describe_machine
 from tron.shards.manifest import Manifest
 from tron.shards.schema import SCHEMA_VERSION
@@ -28,12 +29,12 @@ def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), 
     It does not lean on recipes, whose content may change. ``output_dir`` and ``only`` are the caller's;
     without ``machine`` it leaves out what decides nothing of the content: cluster and workers.
     """
-    shipped = OmegaConf.to_container(compose_recipe("conf.datagen", []), resolve=False)
+    shipped = cast(dict, OmegaConf.to_container(compose_recipe("conf.datagen", []), resolve=False))
     values = settings.model_dump(mode="json") | {"output_dir": output_dir, "only": list(only)}
     if not machine:
         values = {key: value for key, value in values.items() if key not in OUTSIDE}
         values |= {"output_dir": output_dir}
-    defaults, wanted = dict(_leaves(shipped)), dict(_leaves(values))
+    defaults, wanted = leaves(shipped), leaves(values)
     parents = {key.rsplit(".", 1)[0] for key in defaults if "." in key}
     words = ["tron-datagen"]
     for key, value in wanted.items():
@@ -45,14 +46,6 @@ def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), 
     inside = {key.rsplit(".", 1)[0] for key in wanted if "." in key}
     words += [f"~{key}" for key in defaults if key not in wanted and key.rsplit(".", 1)[0] in inside]
     return " ".join(shlex.quote(word) for word in words)
-
-
-def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping) and value:
-        for name, inner in value.items():
-            yield from _leaves(inner, f"{prefix}.{name}" if prefix else str(name))
-    else:
-        yield prefix, value
 
 
 def _hydra(value: Any) -> str:

@@ -6,7 +6,7 @@ from datagen.capture_export import make_captures
 from datagen.run import make
 from datagen.settings import Settings
 from datagen.validate import validate
-from tron.apps.command_line import command
+from tron.cli.command_line import command
 
 
 def main(settings: Settings) -> int:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.settings import Settings
+from tron.cli.instantiation import make
 from tron.errors import TronError
 
 log = logging.getLogger(__name__)
@@ -73,8 +74,6 @@ def workers(settings: Settings, most: int) -> Iterator[Any]:
         TronError: the cluster does not start, or no worker has come within `settings.worker_timeout`.
     """
     from dask.distributed import Client
-    from hydra.errors import HydraException
-    from hydra.utils import instantiate
 
     logging.getLogger("distributed").setLevel(logging.WARNING)  # it reports every connection otherwise
     assert settings.cluster is not None
@@ -83,13 +82,7 @@ def workers(settings: Settings, most: int) -> Iterator[Any]:
     if target == LOCAL:
         options.setdefault("n_workers", min(settings.workers or cores(), most))
     with ExitStack() as stack:
-        try:
-            made = stack.enter_context(instantiate(options, _convert_="all"))
-        except (HydraException, OSError, ValueError, RuntimeError) as error:
-            cause = error.__cause__ or error
-            raise TronError(
-                f"cluster does not start: {cause}", _where(options), "see conf/datagen/cluster"
-            ) from error
+        made = stack.enter_context(make(options, "cluster", _where(options)))
         if not isinstance(made, Client):
             if not made.worker_spec:
                 # Not scale: a job that ends, by its time limit or a dead node, is then replaced.

@@ -8,8 +8,6 @@ cross between NumPy and Dr.Jit a coordinate at a time, for interleaved ones name
 """
 
 # pyright: reportArgumentType=false, reportCallIssue=false
-# (Mitsuba's type stubs do not know its own aliases of Dr.Jit's array types.)
-
 from __future__ import annotations
 
 import math

@@ -8,10 +8,9 @@ record exists, which is written last.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -20,9 +19,11 @@ from datagen.assets import Asset, find_assets, find_environments
 from datagen.lights import HdriSpec
 from datagen.scene import scene_name
 from datagen.settings import SPLITS, Settings
+from tron.claim import CHOOSE_ANOTHER, read_recipe, require_same
 from tron.errors import TronError
 from tron.shards.manifest import ShardEntry
-from tron.storage import write_atomic
+from tron.shards.schema import SCHEMA_VERSION, require_schema
+from tron.storage import write_if_changed
 
 RECORD_NAME = "record.json"
 CONFIG_NAME = "config.yaml"
@@ -163,9 +164,10 @@ def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
 
 
 def config_text(settings: Settings) -> str:
-    """config.yaml of the dataset: the recipe and the numbers of scenes, without where and by whom."""
+    """config.yaml of the dataset: schema, recipe and numbers of scenes, without where and by whom."""
     counts = {split: settings.split(split).scenes for split in SPLITS}
-    return yaml.safe_dump({"scenes": counts, "recipe": settings.recipe()}, sort_keys=True, allow_unicode=True)
+    described = {"schema": SCHEMA_VERSION, "scenes": counts, "recipe": settings.recipe()}
+    return yaml.safe_dump(described, sort_keys=True, allow_unicode=True)
 
 
 def config_sha256(settings: Settings) -> str:
@@ -179,18 +181,17 @@ def adopt(settings: Settings) -> None:
     More scenes may be added to a dataset; any other change would mix two datasets in one folder.
 
     Raises:
-        TronError: the folder holds a dataset of another recipe, or more scenes than are asked for; names the
-        key.
+        TronError: the folder holds a dataset of another schema or recipe (names the key), or more scenes
+            than are asked for.
     """
     path, text = settings.output_dir / CONFIG_NAME, config_text(settings)
-    if path.is_file():
+    old = read_recipe(path)
+    if old is not None:
         try:
-            old = yaml.safe_load(path.read_text("utf-8"))
-            before, scenes = dict(old["recipe"]), dict(old["scenes"])
-        except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
-            raise TronError(
-                "config.yaml of the dataset is damaged", path, "choose another output_dir"
-            ) from error
+            before, scenes, schema = dict(old["recipe"]), dict(old["scenes"]), old.get("schema", 1)
+        except (KeyError, TypeError, ValueError) as error:
+            raise TronError("config.yaml is damaged", path, CHOOSE_ANOTHER) from error
+        require_schema(schema, settings.output_dir)
         now = settings.recipe()
         for split in SPLITS:
             if not scenes.get(split):  # there is nothing of it yet, so it may be anything from now on
@@ -204,41 +205,13 @@ def adopt(settings: Settings) -> None:
                 raise TronError(
                     f"output_dir holds {scenes[split]} scenes of {split}, more than {split}.scenes asks for",
                     settings.output_dir,
-                    "choose another output_dir, or delete that one",
+                    CHOOSE_ANOTHER,
                 )
     elif any(settings.output_dir.glob("*.tar")):
         raise TronError(
             "output_dir holds shards of something else", settings.output_dir, "choose an empty folder"
         )
     write_if_changed(path, text)
-
-
-def require_same(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path, what: str) -> None:
-    """TronError, naming the first key that differs, unless two recipes (nested plain values) are one."""
-    old, new = _leaves(before), _leaves(now)
-    for key in sorted(old.keys() | new.keys()):
-        if old.get(key) != new.get(key):
-            raise TronError(
-                f"output_dir holds {what} made with {key}={old.get(key)}, not {new.get(key)}",
-                folder,
-                "choose another output_dir, or delete that one",
-            )
-
-
-def _leaves(value: object, prefix: str = "") -> dict[str, object]:
-    if isinstance(value, Mapping):
-        return {
-            k: v
-            for name, inner in value.items()
-            for k, v in _leaves(inner, f"{prefix}.{name}".strip(".")).items()
-        }
-    return {prefix: value}
-
-
-def write_if_changed(path: Path, text: str) -> None:
-    """Write a text file atomically unless it says that already: a finished dataset is not touched."""
-    if not path.is_file() or path.read_bytes() != text.encode():
-        write_atomic(path, text)
 
 
 def clear_temporaries(output: Path) -> None:

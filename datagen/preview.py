@@ -13,9 +13,9 @@ from tron.images import write_image
 from tron.shards.manifest import ShardEntry
 from tron.shards.schema import ClipMeta
 
-LIT = ("rgb", "pbr", "irr", "unshadowed", "shadowed")
+LIT = ("rgb", "pbr", "irradiance", "unshadowed", "shadowed")
 COLUMNS = (*LIT, "mask")
-REFERENCE_COLUMNS = ("irr_ref", "base_color_ref", "base_color", "normal_ref", "normal")
+REFERENCE_COLUMNS = ("irradiance_ref", "base_color_ref", "base_color", "normal_ref", "normal")
 LARGEST_TILE = 160
 GUTTER = 2
 
@@ -32,7 +32,7 @@ def contact_row(meta: ClipMeta, frame: dict[str, np.ndarray]) -> np.ndarray:
         image = image if image.ndim == 3 else image[..., None]
         step = -(-max(image.shape[:2]) // LARGEST_TILE)
         image = np.broadcast_to(image[::step, ::step], (*image[::step, ::step].shape[:2], 3))
-        if member in LIT or member == "irr_ref":
+        if member in LIT or member == "irradiance_ref":
             image = np.asarray(to_display(image, meta.exposure), np.float32)
         elif member.startswith("base_color"):
             image = np.sqrt(np.clip(image, 0.0, 1.0))
@@ -62,7 +62,7 @@ def index_html(title: str, entries: Sequence[ShardEntry]) -> str:
         "<style>body{font:15px/1.5 system-ui,sans-serif;margin:2rem;background:#fafafa;color:#222}",
         "img{max-width:100%;image-rendering:pixelated;border:1px solid #ccc}code{background:#eee}</style>",
         f"<h1>{escape(title)}</h1><p>First frame of every clip, AgX at the clip's exposure: {columns} ",
-        "(from irr_ref on in test splits only). See also <a href='card.md'>card.md</a>.</p>",
+        "(from irradiance_ref on in test splits only). See also <a href='card.md'>card.md</a>.</p>",
     ]
     for entry in entries:
         parts.append(

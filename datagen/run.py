@@ -42,18 +42,17 @@ from datagen.plan import (
     plan,
     read_record,
     scene_folder,
-    write_if_changed,
 )
 from datagen.preview import contact_row, index_html, sheet_name, write_sheet
-from datagen.progress import Progress
 from datagen.scene import SceneSpec, draw_scene
 from datagen.settings import SPLITS, LightChoice, Settings
 from datagen.synthetic import first_bad_value, make_clips, make_surfels
+from tron.cli.progress import Progress
 from tron.errors import TronError
 from tron.runtime import activate
 from tron.shards.manifest import Manifest
 from tron.shards.writer import ShardWriter
-from tron.storage import locked, require_free_space, write_atomic
+from tron.storage import locked, require_free_space, write_atomic, write_if_changed
 
 log = logging.getLogger(__name__)
 
@@ -84,16 +83,13 @@ def make(settings: Settings) -> int:
         if missing:
             require_free_space(output, estimate_bytes(settings, missing))
             log.info("%d of %d scenes to make in %s", len(missing), len(items), output)
-            with Progress(
-                len(missing), sum(len(settings.split(i.split).lights) for i in missing)
-            ) as progress:
+            clips = {item: len(settings.split(item.split).lights) for item in missing}
+            with Progress("scenes", sum(clips.values()), unit="clips") as progress:
                 for item, outcome in outcomes(make_scene, missing, settings, sources):
-                    clips = len(settings.split(item.split).lights)
                     if isinstance(outcome, str):
                         reasons[item.name] = outcome
-                        progress.failed(item.name, outcome, clips)
-                    else:
-                        progress.done(item.name, clips)
+                        log.error("%s failed: %s", item.name, outcome)
+                    progress.advance(clips[item], item.name)
         failures = _account(settings, items, sources, reasons)
     if failures:
         log.error("%d failures, listed in %s", failures, output / FAILURES_NAME)
@@ -245,7 +241,7 @@ def _account(settings: Settings, items: Sequence[Work], sources: Sources, reason
     refinements = [record.refinement for record in made if record.refinement is not None]
     write_if_changed(output / "card.md", card_text(settings, manifest, sources, lights, refinements))
     write_if_changed(output / "index.html", index_html("TRON dataset", shards))
-    write_if_changed(output / "manifest.json", manifest.model_dump_json(indent=1) + "\n")
+    manifest.save(output)
     return len(failures)
 
 

@@ -17,8 +17,10 @@ from datagen.refinement import refine_surfels
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from tron.cameras import Camera
+from tron.estimation import Estimation
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.gaussians.scene import GaussianScene
+from tron.runtime import torch_device
 from tron.seeds import integer
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
@@ -28,9 +30,11 @@ from tron.tracing import SurfelTracer
 Frame = dict[str, np.ndarray]
 ColorSpace = Literal["linear", "display"]
 
-COLOR_SPACE: dict[str, ColorSpace] = dict.fromkeys(("pbr", "irr", "rgb", "unshadowed", "shadowed"), "linear")
+COLOR_SPACE: dict[str, ColorSpace] = dict.fromkeys(
+    ("pbr", "irradiance", "rgb", "unshadowed", "shadowed"), "linear"
+)
 REFERENCE_COLOR_SPACE: dict[str, ColorSpace] = dict.fromkeys(
-    ("irr_ref", "unshadowed_ref", "base_color_ref", "base_color"), "linear"
+    ("irradiance_ref", "unshadowed_ref", "base_color_ref", "base_color"), "linear"
 )
 
 
@@ -48,7 +52,7 @@ def make_surfels(
         return surfels, None
     recipe = settings.split(spec.split)
     held_out = gbuffers(geometry, spec.clip(0, recipe.frames, recipe.width, recipe.height))
-    device = "cuda" if settings.variant.startswith("cuda") else "cpu"
+    device = torch_device(settings.variant)
     seed = integer(spec.seed, spec.split, spec.index, "refinement")
     return refine_surfels(surfels, seen, held_out, settings.refine_steps, seed, device)
 
@@ -92,11 +96,11 @@ def make_clip(
     frames: list[Frame] = []
     for i, (camera, truth) in enumerate(zip(cameras, gbuffers(geometry, cameras))):
         guidance = render_guidance(
-            tracer, camera, lighting, spp=recipe.guidance_spp, seed=seeds["guidance"][i]
+            tracer, camera, lighting, Estimation(rays=recipe.guidance_spp), seeds["guidance"][i]
         )
         frame = {
             "pbr": guidance.pbr,
-            "irr": guidance.irradiance,
+            "irradiance": guidance.irradiance,
             "rgb": rgb[i],
             "unshadowed": guidance.unshadowed,
             "shadowed": guidance.shadowed,
@@ -160,7 +164,7 @@ def _reference(
     seen = truth.valid[..., None]
     behind = environment.lookup(camera.rays())
     return {
-        "irr_ref": np.where(seen, direct.shadowed, behind),
+        "irradiance_ref": np.where(seen, direct.shadowed, behind),
         "unshadowed_ref": np.where(seen, direct.unshadowed, behind),
         "depth_ref": np.where(truth.valid, np.linalg.norm(truth.position - camera.position, axis=-1), 0.0),
         "base_color_ref": np.where(seen, truth.base_color, 0.0),

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from datagen.capture_export import CAPTURES
 from datagen.capture_manifest import verify_captures
-from tron.shards.manifest import MANIFEST_NAME, Manifest, verify
+from tron.shards.manifest import MANIFEST_NAME, Manifest
+from tron.shards.verify import verify
 
 log = logging.getLogger(__name__)
 
@@ -17,7 +18,7 @@ log = logging.getLogger(__name__)
 def validate(folder: Path) -> int:
     """Log every problem of a dataset and of the captures beside it, one line each, and return their number.
 
-    Beside what ``tron.shards.manifest.verify`` finds in the shards, every scene that has clips must still
+    Beside what ``tron.shards.verify`` finds in the shards, every scene that has clips must still
     have its specification and its surfels. A folder may hold captures alone.
 
     Raises:

@@ -8,39 +8,13 @@ same.
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from eval.report.page import Section
-from eval.results import Row, Target
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a benchmark found.
-
-    Attributes:
-        rows: the figures, in the order in which they are read.
-        headline: metrics that become tiles on top of the page, with a label each.
-        verdict: the finding in one or two sentences.
-        lead: paragraphs for a reader who has never seen TRON.
-        sections: the body of the page.
-        reproduce: command lines that measure it again.
-        inputs: what was measured (data set, weights, their hashes); joins the environment in results.json.
-    """
-
-    rows: Sequence[Row]
-    title: str
-    verdict: str
-    lead: Sequence[str]
-    sections: Sequence[Section]
-    headline: dict[str, str] = field(default_factory=dict)
-    reproduce: Sequence[str] = ()
-    inputs: dict[str, Any] = field(default_factory=dict)
+from eval.report.outcome import Outcome
+from eval.results import Target
 
 
 class Benchmark(BaseModel, abc.ABC):

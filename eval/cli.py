@@ -6,11 +6,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import pydantic
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
-from tron.apps.command_line import command
-from tron.errors import TronError
+from tron.cli.command_line import command
+from tron.cli.instantiation import make
 from tron.storage import locked
 
 
@@ -40,7 +39,7 @@ def main(settings: Settings) -> int:
     from eval.stages import StageFailed
     from tron.runtime import describe_machine
 
-    benchmark = make_benchmark(settings.benchmark)
+    benchmark = make(settings.benchmark, "benchmark")
     benchmark.check()
     with locked(settings.output_dir):
         try:
@@ -56,22 +55,6 @@ def main(settings: Settings) -> int:
         write_report(assemble(outcome, results, benchmark.bounds()), report)
         print_results(results, benchmark.bounds(), report)
     return 0
-
-
-def make_benchmark(config: dict[str, Any]) -> Any:
-    """Instantiate the class that ``_target_`` names; TronError for a wrong setting."""
-    import hydra.utils
-    from hydra.errors import InstantiationException
-
-    try:
-        return hydra.utils.instantiate(config, _convert_="all")
-    except InstantiationException as error:
-        cause = error.__cause__
-        if isinstance(cause, pydantic.ValidationError):
-            first = cause.errors()[0]
-            key = ".".join(["benchmark", *map(str, first["loc"])])
-            raise TronError(first["msg"], key, "--cfg job shows the composed configuration") from error
-        raise TronError(str(error).splitlines()[0], "benchmark") from error
 
 
 cli = command(

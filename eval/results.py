@@ -1,4 +1,4 @@
-"""results.json: the figures of one benchmark on one machine, and the targets they are held to.
+"""Figures of one benchmark on one machine (results.json), and the targets they are held to.
 
 The file is ``{"benchmark", "environment", "rows": [{"metric", "value", "unit", "reference", "ratio",
 "n"}]}``. Metric names are unique; a figure that was not measured has no row, and a row never holds NaN or
@@ -11,14 +11,15 @@ and ``"high"``, the ends of its confidence interval (:mod:`eval.confidence`); ot
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt
 
-from eval.confidence import Interval
+from eval.confidence import Interval, mean_interval
 from tron.errors import TronError
 from tron.storage import write_atomic
 
@@ -26,20 +27,18 @@ METRIC_PATTERN = r"^[a-z][a-z0-9_]*(\.[a-z0-9][a-z0-9_]*)+$"
 
 
 class Row(BaseModel):
-    """One figure. ``n`` counts what it was averaged over; ``ratio`` is ``value`` over the reference's
-    number.
-    """
+    """One figure."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     metric: str = Field(pattern=METRIC_PATTERN, description="what was measured, e.g. neural.psnr_full.sun")
-    value: FiniteFloat
-    unit: str = Field(min_length=1)
+    value: FiniteFloat = Field(description="the figure, in its unit")
+    unit: str = Field(min_length=1, description="dB, s, deg, x (times), fraction, abs (error) or 1")
     reference: str | None = Field(default=None, description="what the value is held against, in words")
-    ratio: FiniteFloat | None = None
-    n: PositiveInt
+    ratio: FiniteFloat | None = Field(default=None, description="the value over the reference's number")
+    n: PositiveInt = Field(description="number of things that it was averaged over")
     low: FiniteFloat | None = Field(default=None, description="lower end of the interval over scenes")
-    high: FiniteFloat | None = None
+    high: FiniteFloat | None = Field(default=None, description="upper end")
     scenes: PositiveInt | None = Field(default=None, description="independent scenes behind the n")
 
     @pydantic.model_validator(mode="after")
@@ -63,14 +62,23 @@ class Row(BaseModel):
         return {name: value for name, value in plain(self).items() if name not in absent}
 
 
+def mean_row(metric: str, unit: str, scenes: Sequence[str], values: Sequence[float], seed: int) -> Row:
+    """The mean of ``values`` with its interval over the scenes that ``scenes`` names for each of them.
+
+    ``seed`` draws the scenes of the interval.
+    """
+    row = Row(metric=metric, value=float(np.mean(values)), unit=unit, n=len(values))
+    return row.within(mean_interval(scenes, values, seed))
+
+
 class Target(BaseModel):
     """A bound on one metric: a row of the small table of targets in ``conf/eval``."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    metric: str = Field(pattern=METRIC_PATTERN)
-    bound: Literal["at least", "at most"]
-    value: FiniteFloat
+    metric: str = Field(pattern=METRIC_PATTERN, description="the row that it holds")
+    bound: Literal["at least", "at most"] = Field(description="the good side")
+    value: FiniteFloat = Field(description="in the row's unit")
     what: str = Field(default="", description="the metric in words, for the report")
 
     def margin(self, measured: float) -> float:

@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
-import logging
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import lightning
 from lightning.pytorch.callbacks import Callback
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from train.curriculum import Pace, Stage
 from train.processes import Processes
+from tron.cli.progress import Progress
 from tron.storage import write_atomic
 
-log = logging.getLogger(__name__)
-
-LINE_SECONDS = 20.0  # between lines of progress where there is no terminal
 SMOOTHING = 0.98
 
 
@@ -78,28 +71,19 @@ class TrainingLog(Callback):
 
     def __init__(self, path: Path, stage: Stage, pace: Pace, every: int = 50, first_step: int = 0):
         self.path, self.stage, self.pace, self.every = path, stage, pace, every
+        self._total = pace.seconds_limit or float(stage.steps)
         self.loss = float("nan")
         self.validated: dict[str, float] = {}
-        self._last_line = time.monotonic()
         self._rows = earlier_rows(path, stage.name, first_step)
-        self._bar: Progress | None = None
-        self._task: Any = None
+        self._progress: Progress | None = None
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Open the bar on a terminal."""
+        """Open the bar."""
         del pl_module
-        if trainer.is_global_zero and sys.stderr.isatty():
-            self._bar = Progress(
-                TextColumn("{task.description}"),
-                BarColumn(),
-                TextColumn("{task.fields[text]}"),
-                TimeElapsedColumn(),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
-                refresh_per_second=2,
-            )
-            self._task = self._bar.add_task(self.stage.name, total=1.0, text="")
-            self._bar.start()
+        if trainer.is_global_zero:
+            done = self._total * self.pace.progress(trainer.global_step)
+            unit = "steps" if self.pace.seconds_limit is None else "s"
+            self._progress = Progress(self.stage.name, self._total, done, unit)
 
     def on_train_batch_end(
         self,
@@ -135,7 +119,7 @@ class TrainingLog(Callback):
             return
         self._note(trainer)
         self._write()
-        self._show(trainer, last=True)
+        self._show(trainer)
         self._close()
 
     def on_exception(
@@ -187,26 +171,18 @@ class TrainingLog(Callback):
         writer.writerows(self._rows)
         write_atomic(self.path, table.getvalue())
 
-    def _show(self, trainer: lightning.Trainer, last: bool = False) -> None:
-        progress = self.pace.progress(trainer.global_step)
+    def _show(self, trainer: lightning.Trainer) -> None:
         validated = self.validated.get("val_psnr")
         text = f"step {trainer.global_step} loss {self.loss:.5f}"
         if validated is not None:
             text += f" validation {validated:.2f} dB"
-        if self._bar is not None:
-            self._bar.update(self._task, completed=progress, text=text)
-        elif last or time.monotonic() - self._last_line > LINE_SECONDS:
-            self._last_line = time.monotonic()
-            seconds = self.pace.seconds()
-            left = seconds / progress - seconds if progress > 0 else 0.0
-            log.info(
-                "%s %3.0f%% %s, %.0f s, %.0f s to go", self.stage.name, 100 * progress, text, seconds, left
-            )
+        if self._progress is not None:
+            self._progress.update(self._total * self.pace.progress(trainer.global_step), text)
 
     def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
+        if self._progress is not None:
+            self._progress.close()
+            self._progress = None
 
 
 def earlier_rows(path: Path, stage: str, first_step: int) -> list[dict[str, Any]]:

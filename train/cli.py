@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from train.settings import Settings
-from tron.apps.command_line import command
+from tron.cli.command_line import command
 
 
 def main(settings: Settings) -> None:

@@ -50,7 +50,7 @@ SEGMENT = 500  # batches after which a stream starts anew, so that resuming skip
 
 
 class Batches(IterableDataset):
-    """Endless batches {"pbr", "irr", "rgb": (B, 3, K, h, w)} of one stage, from step `first_step` on.
+    """Endless batches {"pbr", "irradiance", "rgb": (B, 3, K, h, w)} of one stage, from step `first_step` on.
 
     Batch s is a function of (seed, stage, s), so a resumed run sees what it would have seen. Ranks share it:
     together the batches of R ranks are the batch of R times the size that one process would have. A streamed
@@ -304,7 +304,7 @@ class HeldOut(IterableDataset):
 
 
 def windows_of(clip: Clip, frames: int) -> dict[str, Tensor]:
-    """A clip as windows: pbr, irr, rgb (B, 3, K, H, W) in [-1, 1], mask (B, 1, K, H, W) the foreground."""
+    """A clip as windows: pbr, irradiance, rgb (B, 3, K, H, W) in [-1, 1], mask (B, 1, K, H, W) in {0, 1}."""
     count = clip.meta.frames // frames
     result = {}
     for name in (*BUFFERS, "mask"):

@@ -15,7 +15,7 @@ from tron.neural.losses import RendererLoss, psnr_per_frame
 
 
 class RendererModule(lightning.LightningModule):
-    """Trains a renderer on {"pbr", "irr", "rgb"}, each (B, 3, K, H, W) display-encoded in [-1, 1]."""
+    """Trains a renderer on {"pbr", "irradiance", "rgb"}, each (B, 3, K, H, W) display-encoded in [-1, 1]."""
 
     def __init__(self, renderer: nn.Module, loss: RendererLoss, optimizer: OptimizerSettings):
         super().__init__()
@@ -32,11 +32,11 @@ class RendererModule(lightning.LightningModule):
 
     def training_step(self, batch: dict[str, Tensor], _index: int) -> Tensor:
         """The loss of one batch."""
-        return self.loss(self.renderer(batch["pbr"], batch["irr"]), batch["rgb"])
+        return self.loss(self.renderer(batch["pbr"], batch["irradiance"]), batch["rgb"])
 
     def validation_step(self, batch: dict[str, Tensor], _index: int) -> None:
         """PSNR of held-out windows, of the foreground and of the full frame: sums over frames and counts."""
-        shown = self.renderer(batch["pbr"], batch["irr"])
+        shown = self.renderer(batch["pbr"], batch["irradiance"])
         for row, mask in enumerate((batch["mask"], None)):
             psnr = psnr_per_frame(shown, batch["rgb"], mask)
             psnr = psnr[~psnr.isnan()]  # frames without foreground

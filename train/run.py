@@ -11,11 +11,8 @@ from typing import Any
 import lightning
 import torch
 import yaml
-from hydra.errors import HydraException
-from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging
 from lightning.pytorch.strategies import DDPStrategy
-from pydantic import ValidationError
 from torch import nn
 
 from train.callbacks import Clock, TrainingLog
@@ -33,6 +30,8 @@ from train.module import RendererModule
 from train.processes import Processes, launch
 from train.settings import Settings
 from tron import seeds
+from tron.claim import read_recipe, require_same
+from tron.cli.instantiation import make
 from tron.errors import TronError
 from tron.neural.codecs import BlockDCT
 from tron.neural.losses import RendererLoss
@@ -113,19 +112,7 @@ def _fitted(codec: BlockDCT, data: TrainingData, stages: list[Stage]) -> dict[st
 
 def build_renderer(recipe: dict[str, Any]) -> nn.Module:
     """Make the renderer that a recipe's `_target_` names; TronError where the recipe does not fit it."""
-    try:
-        renderer = instantiate(recipe, _convert_="all")
-    except HydraException as error:
-        cause = error.__cause__ or error
-        if isinstance(cause, TronError):
-            raise cause from error
-        if isinstance(cause, ValidationError):
-            first = cause.errors()[0]
-            key = ".".join(str(part) for part in ("renderer", "config", *first["loc"]))
-            raise TronError(f"wrong value for '{key}'", repr(first["input"])[:80], first["msg"]) from error
-        raise TronError(
-            f"the renderer's recipe does not fit: {cause}", mend="see conf/train/renderer"
-        ) from error
+    renderer = make(recipe, "renderer")
     if not isinstance(renderer, nn.Module):
         raise TronError(f"renderer._target_ makes a {type(renderer).__name__}, not a torch module")
     return renderer
@@ -226,25 +213,14 @@ def _claim_settings(settings: Settings, processes: int) -> None:
     described = yaml.safe_load(yaml.safe_dump(settings.model_dump(mode="json")))
     described["dataset_sha256"] = sha256(settings.dataset / MANIFEST_NAME)
     described["processes"] = processes
-    if path.is_file():
-        try:
-            earlier = yaml.safe_load(path.read_text())
-        except yaml.YAMLError:
-            earlier = None
-        if not isinstance(earlier, dict):
-            raise TronError("config.yaml of an earlier run is damaged", str(path), "remove the folder")
-        earlier.setdefault("processes", 1)
-        # A run may move; its data are known by their hash.
-        free = {"output_dir", "dataset", "devices", "nodes"}
-        changed = [key for key in described if key not in free and described[key] != earlier.get(key)]
-        if changed:
-            raise TronError(
-                f"output_dir holds a run with another '{changed[0]}'",
-                str(settings.output_dir),
-                "give another output_dir, or remove this one",
-            )
+    earlier = read_recipe(path)
+    if earlier is None:
+        write_atomic(path, yaml.safe_dump(described, sort_keys=False))
         return
-    write_atomic(path, yaml.safe_dump(described, sort_keys=False))
+    # A run may move; its data are known by their hash.
+    kept = [key for key in described if key not in ("output_dir", "dataset", "devices", "nodes")]
+    before, now = ({key: each.get(key) for key in kept} for each in ({"processes": 1} | earlier, described))
+    require_same(before, now, settings.output_dir, "a run")
 
 
 def _take_weights(renderer: nn.Module, path: Path) -> None:

@@ -24,7 +24,7 @@ from tron.shards.manifest import Manifest
 from tron.shards.reader import decode_clip, decode_meta, group_clips, read_clips, tar_files
 from tron.shards.schema import META_SUFFIX, Clip, ClipMeta
 
-BUFFERS = ("pbr", "irr", "rgb")
+BUFFERS = ("pbr", "irradiance", "rgb")
 
 
 def exposed_video(clip: Clip, member: str) -> np.ndarray:

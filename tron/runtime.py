@@ -158,6 +158,11 @@ def set_torch_threads(n: int) -> None:
     torch.set_num_threads(n)
 
 
+def torch_device(variant: str) -> str:
+    """The torch device that a Mitsuba variant shares its arrays with: "cuda" or "cpu"."""
+    return "cuda" if variant.startswith("cuda") else "cpu"
+
+
 def describe_machine() -> dict[str, Any]:
     """Describe hardware, software and commit, as plain values for reports and manifests of measurements.
 

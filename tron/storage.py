@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import shutil
@@ -32,32 +31,34 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     final = Path(path)
     temporary = final.with_name(f".{final.stem}.part{final.suffix}")
-    try:
-        final.parent.mkdir(parents=True, exist_ok=True)
-        with _claimed(temporary):
-            try:
-                yield temporary
-                _flush(temporary)
-                os.replace(temporary, final)
-                _flush(final.parent)
-            finally:
-                temporary.unlink(missing_ok=True)
-    except BlockingIOError as error:
-        raise TronError("file is being written by another run", final, "wait for it") from error
-    except OSError as error:
-        raise TronError(f"cannot write: {error.strerror or error}", final) from error
+    with _written_by_one_run(final, "file"):
+        try:
+            temporary.write_bytes(b"")
+            yield temporary
+            _flush(temporary)
+            os.replace(temporary, final)
+            _flush(final.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
-def _claimed(path: Path) -> Iterator[None]:
-    """Make an empty file, or empty one that was left behind, and lock it; BlockingIOError if it is locked."""
-    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+def _written_by_one_run(final: Path, kind: str) -> Iterator[None]:
+    """Hold ``.NAME.lock`` beside a file or folder while it is written; an OSError becomes a TronError."""
+    lock = filelock.FileLock(final.with_name(f".{final.name}.lock"))
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.ftruncate(handle, 0)
-        yield
-    finally:
-        os.close(handle)
+        final.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=0)
+        try:
+            yield
+        finally:
+            # While it is held: whoever had opened the file before finds that its lock guards no name.
+            Path(lock.lock_file).unlink(missing_ok=True)
+            lock.release()
+    except filelock.Timeout as error:
+        raise TronError(f"{kind} is being written by another run", final, "wait for it") from error
+    except OSError as error:
+        raise TronError(f"cannot write: {error.strerror or error}", final) from error
 
 
 def _flush(path: Path) -> None:
@@ -74,6 +75,13 @@ def write_atomic(path: str | os.PathLike[str], data: bytes | str) -> None:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
+def write_if_changed(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text file atomically unless it says that already: a finished dataset is not touched."""
+    path = Path(path)
+    if not path.is_file() or path.read_bytes() != text.encode():
+        write_atomic(path, text)
+
+
 @contextmanager
 def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give an empty folder beside ``path``; it becomes ``path`` when the block succeeds.
@@ -88,40 +96,21 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     final = Path(path).absolute()
     temporary, old = (final.with_name(f".{final.name}.{state}") for state in ("part", "old"))
-    try:
-        temporary.mkdir(parents=True, exist_ok=True)
-        with _claimed_folder(temporary):
-            try:
-                yield temporary
-                for inner in (*temporary.rglob("*"), temporary):
-                    _flush(inner)
-                _remove(old)
-                if final.exists():
-                    os.replace(final, old)
-                os.replace(temporary, final)
-                _flush(final.parent)
-                _remove(old)
-            finally:
-                _remove(temporary)
-    except BlockingIOError as error:
-        raise TronError("folder is being written by another run", final, "wait for it") from error
-    except OSError as error:
-        raise TronError(f"cannot write: {error.strerror or error}", final) from error
-
-
-@contextmanager
-def _claimed_folder(path: Path) -> Iterator[None]:
-    """Lock a folder and empty it; BlockingIOError if it is locked or was renamed meanwhile."""
-    handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if not (path.exists() and os.path.samestat(os.fstat(handle), path.stat())):
-            raise BlockingIOError("renamed by the run that held it")
-        for inner in path.iterdir():
-            _remove(inner)
-        yield
-    finally:
-        os.close(handle)
+    with _written_by_one_run(final, "folder"):
+        try:
+            _remove(temporary)
+            temporary.mkdir()
+            yield temporary
+            for inner in (*temporary.rglob("*"), temporary):
+                _flush(inner)
+            _remove(old)
+            if final.exists():
+                os.replace(final, old)
+            os.replace(temporary, final)
+            _flush(final.parent)
+            _remove(old)
+        finally:
+            _remove(temporary)
 
 
 def _remove(path: Path) -> None:

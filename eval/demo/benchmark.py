@@ -8,11 +8,11 @@ from typing import ClassVar
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from eval.benchmark import Benchmark, Outcome
+from eval.benchmark import Benchmark
 from eval.demo.refinement import refinement
 from eval.relighting.benchmark import Relighting
-from eval.report.figures import written
-from eval.report.page import Cell, Section, Table
+from eval.report.outcome import Outcome
+from eval.report.stage_table import stage_section
 from eval.results import Row, Target
 from eval.stages import Child, Stages, script_path
 from tron.shards.manifest import Manifest
@@ -71,11 +71,25 @@ class Demo(Benchmark):
         with stages.timed("eval", [["tron-eval", "benchmark=demo", f"output_dir={output_dir}"]]):
             outcome = evaluation.run(output_dir)
         rows, sections = refinement(dataset, self.relighting.seed)
-        rows.append(_seconds_per_scene(dataset, stages.records["datagen"].seconds))
-        outcome = dataclasses.replace(
-            outcome, rows=[*outcome.rows, *rows], sections=[*outcome.sections, *sections]
+        seconds = {f"{name}_seconds": record.seconds for name, record in stages.records.items()}
+        rows += [
+            _seconds_per_scene(dataset, seconds["datagen_seconds"]),
+            *(
+                Row(metric=f"demo.{name}", value=value, unit="s", n=1)
+                for name, value in {"seconds": sum(seconds.values()), **seconds}.items()
+            ),
+        ]
+        return dataclasses.replace(
+            outcome,
+            rows=[*outcome.rows, *rows],
+            title="Demo: from path-traced scenes to an evaluated neural renderer",
+            sections=[*outcome.sections, *sections, *stage_section(stages.records, WORDS)],
+            headline={**outcome.headline, "demo.seconds": "The whole demo, after set-up"},
+            reproduce=[
+                "make demo",
+                f"# or, once installed: tron-eval benchmark=demo output_dir={output_dir}",
+            ],
         )
-        return self._with_stages(outcome, stages, output_dir)
 
     def _training(self, name: str, dataset: Path, folder: Path) -> Child:
         arguments = [*self.train, f"renderer={name}", f"dataset={dataset}", f"output_dir={folder}"]
@@ -83,42 +97,6 @@ class Demo(Benchmark):
             arguments.append(f"max_seconds={self.max_seconds:g}")
         threads = {variable: str(self.train_threads) for variable in ONE_THREAD}
         return Child(name, "tron-train", arguments, threads)
-
-    def _with_stages(self, outcome: Outcome, stages: Stages, output_dir: Path) -> Outcome:
-        seconds = {name: record.seconds for name, record in stages.records.items()}
-        rows = [Row(metric="demo.seconds", value=sum(seconds.values()), unit="s", n=1)]
-        rows += [
-            Row(metric=f"demo.{name}_seconds", value=value, unit="s", n=1) for name, value in seconds.items()
-        ]
-        table = [
-            [
-                Cell(name),
-                Cell(written(record.seconds, "s"), "strong"),
-                Cell(WORDS.get(name, "")),
-                Cell(record.commit or "unknown"),
-                Cell("; ".join(" ".join(command) for command in record.commands), "faint"),
-            ]
-            for name, record in stages.records.items()
-        ]
-        caption = f"Wall time of the stages, {written(sum(seconds.values()), 's')} in all."
-        if any(record.attempts > 1 for record in stages.records.values()):
-            caption += " Interrupted attempts are counted."
-        section = Section(
-            "stages",
-            "Where the time went",
-            [Table(caption, ["Stage", "Time", "What", "Commit", "Command"], table, words=[2, 4])],
-        )
-        return dataclasses.replace(
-            outcome,
-            rows=[*outcome.rows, *rows],
-            title="Demo: from path-traced scenes to an evaluated neural renderer",
-            sections=[*outcome.sections, section],
-            headline={**outcome.headline, "demo.seconds": "The whole demo, after set-up"},
-            reproduce=[
-                "make demo",
-                f"# or, once installed: tron-eval benchmark=demo output_dir={output_dir}",
-            ],
-        )
 
 
 def _seconds_per_scene(dataset: Path, seconds: float) -> Row:

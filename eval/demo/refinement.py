@@ -1,18 +1,14 @@
-"""What fitting a dataset's surfels to their G-buffers gained, as the data engine recorded it."""
+"""Quality of a dataset's surfels before and after fitting to G-buffers, from the data engine's records."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
-from eval.confidence import mean_interval
-from eval.report.figures import with_interval
+from eval.report.figures import row_cell
 from eval.report.intervals import interval_note
 from eval.report.page import Cell, Section, Table, Text
-from eval.results import Row
+from eval.results import Row, mean_row
 from tron.errors import TronError
 
 FIGURES = {
@@ -40,29 +36,19 @@ def refinement(dataset: Path, seed: int) -> tuple[list[Row], list[Section]]:
             found.append(record)
     if not found:
         return [], []
+    scenes = [str(k) for k in range(len(found))]
     rows, table = [], []
-    for name, (label, unit, how) in FIGURES.items():
-        before, after = (_mean(found, when, name, unit, seed) for when in ("before", "after"))
+    for name, (label, unit, measured_by) in FIGURES.items():
+        before, after = (
+            mean_row(f"refinement.{name}.{when}", unit, scenes, [each[when][name] for each in found], seed)
+            for when in ("before", "after")
+        )
         rows += [before, after]
-        cells = [Cell(with_interval(before)), Cell(with_interval(after), "strong")]
-        table.append([Cell(label), *cells, Cell(how, "faint")])
+        table.append([label, row_cell(before), row_cell(after, "strong"), Cell(measured_by, "faint")])
     caption = (
         f"Surfels before and after {found[0]['steps']} steps that fit them to their scene's G-buffers, at "
         f"cameras that they were not fitted to: means over {len(found)} scenes."
     )
-    return rows, [
-        Section(
-            "refinement",
-            "What fitting the surfels gained",
-            [
-                Table(caption, ["Figure", "as made", "fitted", "How"], table, words=[3]),
-                Text(interval_note(len(found))),
-            ],
-        )
-    ]
-
-
-def _mean(records: Sequence[dict], when: str, name: str, unit: str, seed: int) -> Row:
-    values = [record[when][name] for record in records]
-    row = Row(metric=f"refinement.{name}.{when}", value=float(np.mean(values)), unit=unit, n=len(values))
-    return row.within(mean_interval([str(k) for k in range(len(values))], values, seed))
+    headings = ["Figure", "as made", "fitted", "Measured"]
+    blocks = [Table(caption, headings, table, words=[3]), Text(interval_note(len(found)))]
+    return rows, [Section("refinement", "What fitting the surfels gained", blocks)]

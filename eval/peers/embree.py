@@ -7,8 +7,6 @@ and Dr.Jit offer no program to be run at each hit, so whoever wants all hits alo
 again behind each: :class:`RestartedShadows`.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 import drjit as dr

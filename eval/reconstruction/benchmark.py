@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from eval.benchmark import Benchmark, Outcome
+from eval.benchmark import Benchmark
+from eval.report.outcome import Outcome
 from eval.results import Row
 from eval.stages import Child, Stages, script_path
 from tron.errors import TronError

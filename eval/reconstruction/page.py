@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eval.benchmark import Outcome
 from eval.reconstruction.page_fox import fox_section
 from eval.reconstruction.page_scenes import light_section, scenes_section, views_section
 from eval.reconstruction.page_steps import steps_section
-from eval.report.figures import with_interval, written
-from eval.report.page import Cell, Section, Table, Text
+from eval.report.figures import with_interval
+from eval.report.outcome import Outcome
+from eval.report.page import Section, Text
+from eval.report.stage_table import stage_section
 from eval.results import Row
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def outcome(
         *fox_section(settings, measured, found),
         *steps_section(settings, measured, found),
         _limits(settings, measured),
-        *_stages(stages),
+        *stage_section(stages.records),
     ]
     overrides = [f"output_dir={output_dir}"]
     if settings.variant != "llvm_ad_rgb":
@@ -116,24 +117,3 @@ def _limits(settings: Reconstruction, measured: Measured) -> Section:
     if not all(part in settings.parts for part in ("scenes", "fox", "steps")):
         texts.append(f"Only these parts were run: {', '.join(settings.parts)}.")
     return Section("limits", "What these figures do not say", [Text(text) for text in texts])
-
-
-def _stages(stages: Stages) -> list[Section]:
-    if not stages.records:
-        return []
-    table = [
-        [
-            Cell(name),
-            Cell(written(record.seconds, "s"), "strong"),
-            Cell(str(record.attempts)),
-            Cell(record.commit or "unknown"),
-            Cell("; ".join(" ".join(command) for command in record.commands), "faint"),
-        ]
-        for name, record in stages.records.items()
-    ]
-    caption = (
-        "Wall time of the commands, from start to end; a command that was interrupted counts all its "
-        "attempts. What was finished before is not run again: the commit is that of the code that made it."
-    )
-    headings = ["Stage", "Time", "Attempts", "Commit", "Command"]
-    return [Section("stages", "The commands", [Table(caption, headings, table, words=[4])])]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from eval.report.charts import progress_chart
-from eval.report.figures import written
+from eval.report.charts import line_chart
+from eval.report.figures import format_value
 from eval.report.page import Block, Cell, Picture, Pictures, Section, Table, Text
 from eval.results import Row
 from tron.images import read_image
@@ -55,7 +55,7 @@ def fox_section(settings: Reconstruction, measured: Measured, found: Mapping[str
             "What was measured.",
             ["Figure", "Measured"],
             [
-                [Cell(text), Cell(written(found[metric].value, found[metric].unit), "strong")]
+                [Cell(text), Cell(format_value(found[metric].value, found[metric].unit), "strong")]
                 for metric, text in WORDS.items()
                 if metric in found
             ],
@@ -64,7 +64,7 @@ def fox_section(settings: Reconstruction, measured: Measured, found: Mapping[str
     if len(fox.run.curve()) > 1:
         target = next((t for t in settings.targets if t.metric == "fox.test_psnr"), None)
         blocks.append(
-            progress_chart(
+            line_chart(
                 {"fox": fox.run.curve()},
                 "seconds of training",
                 "held-out PSNR in dB",

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eval.report.charts import progress_chart
-from eval.report.figures import with_interval, written
+from eval.report.charts import line_chart
+from eval.report.figures import format_value, with_interval
 from eval.report.intervals import interval_note
 from eval.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
 from eval.results import Row
@@ -118,11 +118,11 @@ def _curves(settings: Reconstruction, measured: Measured) -> list[Chart]:
     axes = "seconds of training", "held-out PSNR in dB"
     if means:
         caption = "Held-out PSNR while surfels are learnt, mean over the scenes."
-        charts.append(progress_chart(means, *axes, caption, bound))
+        charts.append(line_chart(means, *axes, caption, bound))
     way, runs = next(iter(measured.runs.items()))
     lines = {run.name: run.curve() for run in runs if len(run.curve()) > 1}
     if lines:
-        charts.append(progress_chart(lines, *axes, f"The same for each scene: {way_title(way)}.", bound))
+        charts.append(line_chart(lines, *axes, f"The same for each scene: {way_title(way)}.", bound))
     return charts
 
 
@@ -191,8 +191,8 @@ def light_section(measured: Measured) -> list[Section]:
             Cell(run.name),
             Cell(run.family or "—"),
             Cell(way_title(way)),
-            Cell(written(run.light["irradiance_error"], "fraction"), "strong"),
-            Cell(written(run.light["scaled_error"], "fraction")),
+            Cell(format_value(run.light["irradiance_error"], "fraction"), "strong"),
+            Cell(format_value(run.light["scaled_error"], "fraction")),
         ]
         for way, runs in measured.runs.items()
         for run in runs

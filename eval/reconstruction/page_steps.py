@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from eval.report.charts import growth_chart
-from eval.report.figures import written
+from eval.report.charts import line_chart
+from eval.report.figures import format_value
 from eval.report.page import Block, Cell, Chart, Section, Table, Text
 from eval.results import Row
 
@@ -25,7 +25,7 @@ def steps_section(settings: Reconstruction, measured: Measured, found: Mapping[s
 
 
 def _milliseconds(steps: Steps, name: str) -> Cell:
-    return Cell(written(1e3 * steps.times[name].median, "ms") if name in steps.times else "—")
+    return Cell(format_value(1e3 * steps.times[name].median, "ms") if name in steps.times else "—")
 
 
 def _beside_the_peer(settings: Reconstruction, measured: Measured, found: Mapping[str, Row]) -> list[Block]:
@@ -69,10 +69,10 @@ def _beside_the_peer(settings: Reconstruction, measured: Measured, found: Mappin
                 Cell(f"{steps.count:,}"),
                 Cell(f"{steps.size}²"),
                 *(_milliseconds(steps, name) for name in (TRON, VOLPRIM, SHIPPED)),
-                Cell(written(steps.ratio(), "x"), "strong"),
+                Cell(format_value(steps.ratio(), "x"), "strong"),
                 Cell(f"{low:.1f}–{high:.1f}", "faint"),
-                Cell(written(steps.ratio(SHIPPED), "x") if SHIPPED in times else "—"),
-                Cell(written(found[f"step.psnr_to_volprim.{steps.case}"].value, "dB")),
+                Cell(format_value(steps.ratio(SHIPPED), "x") if SHIPPED in times else "—"),
+                Cell(format_value(found[f"step.psnr_to_volprim.{steps.case}"].value, "dB")),
             ]
         )
     caption = (
@@ -92,8 +92,8 @@ def _growth(settings: Reconstruction, measured: Measured) -> list[Chart]:
     charts = []
     if len(by_count) > 1:
         caption = f"Seconds a step as surfels grow, {pixels}² pixels, on the tracing benchmark's scene."
-        charts.append(growth_chart({"a step": by_count}, "surfels", "seconds", caption))
+        charts.append(line_chart({"a step": by_count}, "surfels", "seconds", caption, logarithmic=True))
     if len(by_size) > 1:
         caption = f"Seconds a step as pixels grow, {surfels:,} surfels, on the same scene."
-        charts.append(growth_chart({"a step": by_size}, "pixels", "seconds", caption))
+        charts.append(line_chart({"a step": by_size}, "pixels", "seconds", caption, logarithmic=True))
     return charts

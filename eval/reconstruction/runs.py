@@ -10,8 +10,7 @@ from pathlib import Path
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from eval.confidence import mean_interval
-from eval.results import Row
+from eval.results import Row, mean_row
 from tron.errors import TronError
 
 FIGURES = {
@@ -124,10 +123,11 @@ def rows_of(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
     """
     for metric, unit, values in _figures(runs):
         if len(values) == len(runs):
-            worst = unit in ("s", "surfels")
-            value = max(values.values()) if worst else sum(values.values()) / len(values)
-            row = Row(metric=f"{prefix}.{metric}", value=value, unit=unit, n=len(values))
-            yield row if worst else row.within(mean_interval([*values], [*values.values()], seed))
+            name = f"{prefix}.{metric}"
+            if unit in ("s", "surfels"):
+                yield Row(metric=name, value=max(values.values()), unit=unit, n=len(values))
+            else:
+                yield mean_row(name, unit, [*values], [*values.values()], seed)
         for run in runs:
             if run.name in values:
                 n = 1 if unit in ("s", "surfels") else max(len(run.report.capture.held_out), 1)

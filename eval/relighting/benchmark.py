@@ -10,13 +10,14 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveInt
 
-from eval.benchmark import Benchmark, Outcome
+from eval.benchmark import Benchmark
 from eval.relighting import page
 from eval.relighting.gallery import Shown, middle_frame
 from eval.relighting.guidance import GuidanceScores
 from eval.relighting.predictions import MEMBERS, Predictor, Render, displayed_truth, fit_baselines
 from eval.relighting.scores import Scores
 from eval.report.charts import training_curves
+from eval.report.outcome import Outcome
 from eval.report.page import Chart
 from tron.errors import TronError
 from tron.runtime import set_torch_threads

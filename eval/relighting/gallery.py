@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +11,6 @@ from eval.relighting.shadows import direct_light, same_depth, shadow_errors
 from eval.report.page import Picture, Pictures
 from tron import metrics
 from tron.color import linear_to_srgb, luminance, to_display
-from tron.images import write_image
 from tron.shards.schema import Clip, ClipMeta
 
 METHOD_TITLES = {
@@ -63,7 +60,7 @@ def middle_frame(clip: Clip, shown: dict[str, np.ndarray], truth: np.ndarray) ->
     k = clip.meta.frames // 2
     frames, exposure = clip.frames, clip.meta.exposure
     methods = {name: images[k] for name, images in shown.items()}
-    methods["irradiance"] = to_display(frames["irr"][k], exposure)
+    methods["irradiance"] = to_display(frames["irradiance"][k], exposure)
     foreground = frames["foreground"][k, ..., 0] > 0.5
     where = foreground if foreground.any() else None
     psnr = {
@@ -76,11 +73,12 @@ def middle_frame(clip: Clip, shown: dict[str, np.ndarray], truth: np.ndarray) ->
 
 def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
     frames = {name: images[k] for name, images in clip.frames.items()}
-    if not {"irr_ref", "base_color", "base_color_ref", "normal", "normal_ref"} <= frames.keys():
+    if not {"irradiance_ref", "base_color", "base_color_ref", "normal", "normal_ref"} <= frames.keys():
         return {}
     foreground = frames["foreground"] > 0.5
     ours, truth = (
-        np.where(foreground, to_display(frames[name], clip.meta.exposure), 0) for name in ("irr", "irr_ref")
+        np.where(foreground, to_display(frames[name], clip.meta.exposure), 0)
+        for name in ("irradiance", "irradiance_ref")
     )
     pictures = {
         "irradiance, surfels": ours,
@@ -102,7 +100,7 @@ def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
 
 def _shadow_error_picture(frames: dict[str, np.ndarray], truth: np.ndarray) -> np.ndarray:
     """The true irradiance in faint grey, leaking pixels orange, darkened pixels blue."""
-    leaking, darkened = shadow_errors(frames["irr"], direct_light(frames), same_depth(frames))
+    leaking, darkened = shadow_errors(frames["irradiance"], direct_light(frames), same_depth(frames))
     picture = np.repeat(luminance(truth)[..., None] * 0.6, 3, axis=-1)
     picture[leaking] = (1.0, 0.5, 0.05)
     picture[darkened] = (0.2, 0.6, 1.0)
@@ -133,15 +131,3 @@ def guidance(shown: Shown) -> Pictures:
     where = f"scene {shown.meta.scene} under light {shown.meta.light}"
     pictures = [Picture(image, name, f"{name}, {where}") for name, image in shown.guidance.items()]
     return Pictures(shown.title, pictures)
-
-
-def write_strips(groups: Sequence[Pictures], names: Sequence[str], folder: Path) -> None:
-    """Write each group of equally large pictures as one PNG, in the page's order and number of columns."""
-    for group, name in zip(groups, names):
-        images = [picture.image for picture in group.pictures]
-        blank = np.zeros_like(images[0])
-        images += [blank] * (-len(images) % group.columns)
-        rows = [
-            np.concatenate(images[i : i + group.columns], 1) for i in range(0, len(images), group.columns)
-        ]
-        write_image(folder / f"{name}.png", np.concatenate(rows, 0))

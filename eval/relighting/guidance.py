@@ -59,8 +59,10 @@ class GuidanceScores:
         for k, foreground in enumerate(frames["foreground"][..., 0] > 0.5):
             if not foreground.any():
                 continue
-            if "irr_ref" in frames:
-                shown, truth = (to_display(frames[name][k], meta.exposure) for name in ("irr", "irr_ref"))
+            if "irradiance_ref" in frames:
+                shown, truth = (
+                    to_display(frames[name][k], meta.exposure) for name in ("irradiance", "irradiance_ref")
+                )
                 psnr = metrics.capped_psnr(shown, truth, foreground)
                 self.irradiance_psnr.setdefault(meta.light_family, []).append((meta.scene, psnr))
                 self._count_shadows(clip, k)
@@ -92,7 +94,7 @@ class GuidanceScores:
             return
         frame = {name: images[k] for name, images in clip.frames.items()}
         for tail, judged in JUDGED.items():
-            counts = count_shadow_errors(frame["irr"], direct_light(frame), judged(frame))
+            counts = count_shadow_errors(frame["irradiance"], direct_light(frame), judged(frame))
             self.shadows[tail].setdefault(clip.meta.light_family, []).append((clip.meta.scene, counts))
 
     def rows(self, seed: int = 0) -> list[Row]:

@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from eval.benchmark import Outcome
 from eval.relighting.baselines import SEVEN, THREE
-from eval.relighting.gallery import Shown, comparison, guidance, write_strips
+from eval.relighting.gallery import Shown, comparison, guidance
 from eval.relighting.guidance import GuidanceScores
 from eval.relighting.predictions import Region
 from eval.relighting.scores import GROUPS, REGIONS, SUFFIX, Scores
@@ -22,7 +21,9 @@ from eval.relighting.shadows import (
 )
 from eval.report.figures import MINUS, with_interval
 from eval.report.intervals import interval_note
+from eval.report.outcome import Outcome
 from eval.report.page import Block, Cell, Chart, Section, Table, Text, Tone
+from eval.report.strips import write_strips
 from eval.results import Row
 from tron.shards.schema import ClipMeta
 

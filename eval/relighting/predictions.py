@@ -25,7 +25,7 @@ Region = Literal["foreground", "frame"]
 REGIONS: tuple[Region, Region] = ("foreground", "frame")
 SURFACES = ("affine", "affine_ratio", "pixel_mlp")
 """Methods that know surfaces alone, and get pbr's sky on full frames."""
-MEMBERS = ("pbr", "irr", "rgb", "unshadowed", "shadowed", "mask", "foreground")
+MEMBERS = ("pbr", "irradiance", "rgb", "unshadowed", "shadowed", "mask", "foreground")
 """Members of a clip that predictions and their scores need."""
 
 
@@ -67,11 +67,11 @@ def fit_baselines(clips: Iterable[Clip], seed: int, scale_pixels: int = 512) -> 
     scale, affine, affine_ratio, n_frames = ScaleFit(), AffineFit(2), AffineFit(3), 0
     for clip in clips:
         truth, frames, exposure = displayed_truth(clip), clip.frames, clip.meta.exposure
-        pbr, irradiance = (to_display(frames[name], exposure) for name in ("pbr", "irr"))
+        pbr, irradiance = (to_display(frames[name], exposure) for name in ("pbr", "irradiance"))
         ratio = to_display(
-            shadow_ratio(frames["pbr"], frames["irr"], frames["unshadowed"], exposure), exposure
+            shadow_ratio(frames["pbr"], frames["irradiance"], frames["unshadowed"], exposure), exposure
         )
-        terms = product_terms(frames["pbr"], frames["irr"], frames["mask"], exposure)
+        terms = product_terms(frames["pbr"], frames["irradiance"], frames["mask"], exposure)
         n_frames += len(truth)
         inside = region_mask(clip, "foreground")
         affine.add([pbr[inside], irradiance[inside]], truth[inside])
@@ -110,7 +110,7 @@ class Predictor:
         The images differ between regions only for SURFACES, which full frames show over the environment.
         """
         frames, exposure = clip.frames, clip.meta.exposure
-        pbr, irradiance, mask = frames["pbr"], frames["irr"], frames["mask"]
+        pbr, irradiance, mask = frames["pbr"], frames["irradiance"], frames["mask"]
         displayed = [to_display(image, exposure) for image in (pbr, irradiance)]
         ratio = to_display(shadow_ratio(pbr, irradiance, frames["unshadowed"], exposure), exposure)
         foreground = {

@@ -32,7 +32,7 @@ hundredth of a scene's width, the study's value."""
 SAME_NORMAL_DEG = 20.0
 """The same by normals: where they differ by less than this."""
 
-MEMBERS = ("irr", "irr_ref", "unshadowed_ref", "depth", "depth_ref", "normal", "normal_ref")
+MEMBERS = ("irradiance", "irradiance_ref", "unshadowed_ref", "depth", "depth_ref", "normal", "normal_ref")
 """Members of a clip that the judgement needs, beside ``foreground`` and ``mask``."""
 
 
@@ -91,8 +91,8 @@ def count_shadow_errors(irradiance: np.ndarray, reference: DirectLight, judged: 
 
 
 def direct_light(frames: dict[str, np.ndarray]) -> DirectLight:
-    """The path tracer's, from ``irr_ref`` and ``unshadowed_ref``."""
-    return DirectLight(frames["irr_ref"], frames["unshadowed_ref"])
+    """The path tracer's, from ``irradiance_ref`` and ``unshadowed_ref``."""
+    return DirectLight(frames["irradiance_ref"], frames["unshadowed_ref"])
 
 
 def both_have_surface(frames: dict[str, np.ndarray]) -> np.ndarray:

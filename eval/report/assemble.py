@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from eval.benchmark import Outcome
 from eval.report.figures import bound, verdict, with_interval
+from eval.report.outcome import Outcome
 from eval.report.page import Cell, Code, Page, Section, Table, Text, Tile
 from eval.results import Results, Target
 

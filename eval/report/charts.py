@@ -20,13 +20,17 @@ INK = "#123456"
 LINE_COLOURS = ("#3d85c6", "#d9822b", "#4a9d5f", "#a064c8", "#c0504d", "#7f7f7f")
 CLOCK = "seconds"
 
+Points = Sequence[tuple[float, float]]
+"""(x, y) of a line, ascending in x."""
+
 
 @dataclass(frozen=True)
 class Curves:
-    """What a metrics.csv holds: column -> (seconds of training, value), (n,) float64 each, and where stages
-    begin.
+    """Columns of a metrics.csv over the time of training.
 
-    ``stages`` are (name, seconds at which it begins), in order.
+    Attributes:
+        columns: name -> (seconds of training, value), (n,) float64 each.
+        stages: (name, seconds at which it begins), in order.
     """
 
     columns: dict[str, tuple[np.ndarray, np.ndarray]]
@@ -34,8 +38,7 @@ class Curves:
 
 
 def read_metrics(path: str | Path) -> Curves:
-    """Read the metrics.csv of tron-train: ``stage``, ``step``, ``seconds`` (of the stage) and columns of
-    figures.
+    """Read the metrics.csv of tron-train: ``stage``, ``step``, ``seconds`` (of the stage) and figures.
 
     The stages' clocks are put one behind the other. A value that is only repeated (a validation's, until the
     next) stands once, where it is new. Columns without two numbers are left out, and so is a file without a
@@ -67,110 +70,86 @@ def _number(text: str | None) -> float:
 
 
 def training_curves(runs: Mapping[str, Path]) -> list[Chart]:
-    """One chart a kind of curve (loss, PSNR) with a line for each run's column.
+    """One chart a kind of curve (loss, PSNR) with a line for each run's column; full frames are dashed.
 
     Args:
         runs: label of a run -> its metrics.csv; files that do not exist are left out.
     """
     read = {label: read_metrics(path) for label, path in runs.items() if path.is_file()}
-    lines = [
-        (f"{label}, {column}", *curve)
-        for label, curves in read.items()
-        for column, curve in curves.columns.items()
-    ]
     stages = next((curves.stages for curves in read.values()), [])
     charts = []
     for word, title in (("loss", "Loss"), ("psnr", "PSNR in dB")):
-        chosen = [line for line in lines if word in line[0].lower()]
-        if chosen:
-            ends = "; ".join(f"{label} ends at {y[-1]:.3g}" for label, _, y in chosen)
-            svg = _draw(
-                chosen, stages, title, logarithmic=word == "loss" and all((y > 0).all() for *_, y in chosen)
-            )
-            charts.append(Chart(svg, f"{title} during training.", f"Line chart of {title.lower()}: {ends}."))
+        lines = [
+            (label, column, *curve, colour)
+            for (label, curves), colour in zip(read.items(), LINE_COLOURS * len(read))
+            for column, curve in curves.columns.items()
+            if word in column.lower()
+        ]
+        if not lines:
+            continue
+        with _canvas(title) as (axes, svg):
+            for label, column, x, y, colour in lines:
+                style = "--" if column.endswith("_full") else "-"
+                axes.plot(x, y, style, color=colour, label=f"{label}, {column}", linewidth=1.6)
+            for name, begin in stages:
+                axes.axvline(begin, color=INK, linewidth=0.8, linestyle=":")
+                axes.annotate(
+                    f" {name}", (begin, 1.0), xycoords=("data", "axes fraction"), va="top", fontsize=9
+                )
+            if word == "loss" and all((y > 0).all() for _, _, _, y, _ in lines):
+                axes.set_yscale("log")
+            axes.set(xlabel="seconds of training", ylabel=title)
+        ends = "; ".join(f"{label}, {column} ends at {y[-1]:.3g}" for label, column, _, y, _ in lines)
+        charts.append(Chart(svg(), f"{title} during training.", f"Line chart of {title.lower()}: {ends}."))
     return charts
 
 
-def _draw(
-    lines: list[tuple[str, np.ndarray, np.ndarray]],
-    stages: list[tuple[str, float]],
-    title: str,
-    logarithmic: bool,
-) -> str:
-    with _canvas(title) as (figure, axes):
-        runs = list(dict.fromkeys(label.partition(",")[0] for label, *_ in lines))
-        for label, x, y in lines:
-            colour = LINE_COLOURS[runs.index(label.partition(",")[0]) % len(LINE_COLOURS)]
-            style = "--" if label.endswith("_full") else "-"
-            axes.plot(x, y, style, color=colour, label=label, linewidth=1.6)
-        for name, begin in stages:
-            axes.axvline(begin, color=INK, linewidth=0.8, linestyle=":")
-            axes.annotate(f" {name}", (begin, 1.0), xycoords=("data", "axes fraction"), va="top", fontsize=9)
-        if logarithmic:
-            axes.set_yscale("log")
-        axes.set_xlabel("seconds of training")
-        axes.set_ylabel(title)
-        return _finished(figure, axes)
-
-
-def growth_chart(
-    lines: Mapping[str, Sequence[tuple[float, float]]], x_label: str, y_label: str, caption: str
-) -> Chart:
-    """A chart with both axes logarithmic; ``lines`` maps a label to its (x, y) points, ascending in x.
-
-    Straight lines are powers: where x is ten times as large and y is too, growth is linear.
-    """
-    from matplotlib.ticker import LogLocator
-
-    with _canvas(caption) as (figure, axes):
-        for (label, points), colour in zip(lines.items(), LINE_COLOURS):
-            x, y = zip(*points)
-            axes.plot(x, y, "o-", color=colour, label=label, linewidth=1.6, markersize=4)
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        ticks = sorted({x for points in lines.values() for x, _ in points})
-        axes.set_xticks(ticks, [f"{x:,.0f}" for x in ticks])
-        axes.minorticks_off()
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # a decade may hold them all
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.set_xlabel(x_label)
-        axes.set_ylabel(y_label)
-        svg = _finished(figure, axes)
-    ends = "; ".join(
-        f"{label} from {points[0][1]:.3g} to {points[-1][1]:.3g}" for label, points in lines.items()
-    )
-    return Chart(svg, caption, f"Line chart, {y_label} over {x_label}: {ends}.")
-
-
-def progress_chart(
-    lines: Mapping[str, Sequence[tuple[float, float]]],
+def line_chart(
+    lines: Mapping[str, Points],
     x_label: str,
     y_label: str,
     caption: str,
     bound: tuple[str, float] | None = None,
+    logarithmic: bool = False,
 ) -> Chart:
-    """A chart with both axes linear; ``lines`` maps a label to its (x, y) points, ascending in x.
+    """A chart with a line for each label.
 
-    ``bound`` is (name, y) of a dotted line across, such as a target.
+    Args:
+        lines: label -> its points.
+        x_label, y_label, caption: the words around it.
+        bound: (name, y) of a dotted line across, such as a target.
+        logarithmic: both axes are. Straight lines are powers then: where x is ten times as large and y is
+            too, growth is linear. The ticks of x stand where points are.
     """
-    with _canvas(caption) as (figure, axes):
+    from matplotlib.ticker import LogLocator
+
+    with _canvas(caption) as (axes, svg):
         for (label, points), colour in zip(lines.items(), LINE_COLOURS):
-            x, y = zip(*points)
-            axes.plot(x, y, "o-", color=colour, label=label, linewidth=1.6, markersize=3)
+            axes.plot(*zip(*points), "o-", color=colour, label=label, linewidth=1.6, markersize=3.5)
         if bound is not None:
-            name, height = bound
-            axes.axhline(height, color=INK, linewidth=0.8, linestyle=":", label=name)
-        axes.set_xlim(left=0)
-        axes.set_xlabel(x_label)
-        axes.set_ylabel(y_label)
-        svg = _finished(figure, axes)
-    ends = "; ".join(f"{label} ends at {points[-1][1]:.3g}" for label, points in lines.items())
-    return Chart(svg, caption, f"Line chart, {y_label} over {x_label}: {ends}.")
+            axes.axhline(bound[1], color=INK, linewidth=0.8, linestyle=":", label=bound[0])
+        axes.set(xlabel=x_label, ylabel=y_label)
+        if logarithmic:
+            axes.set(xscale="log", yscale="log")
+            ticks = sorted({x for points in lines.values() for x, _ in points})
+            axes.set_xticks(ticks, [f"{x:,.0f}" for x in ticks])
+            axes.minorticks_off()
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # a decade may hold them all
+            axes.yaxis.set_major_formatter("{x:g}")
+        else:
+            axes.set_xlim(left=0)
+    ends = "; ".join(
+        f"{label} from {points[0][1]:.3g} to {points[-1][1]:.3g}" for label, points in lines.items()
+    )
+    return Chart(svg(), caption, f"Line chart, {y_label} over {x_label}: {ends}.")
 
 
 @contextmanager
 def _canvas(name: str) -> Iterator[tuple[Any, Any]]:
-    """A figure and its axes in the page's style; ``name`` makes the chart's ids its own."""
+    """Axes in the page's style, and a function that gives their SVG afterwards.
+
+    The ink of the SVG is the page's text colour; ``name`` makes its ids its own.
+    """
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -184,20 +163,20 @@ def _canvas(name: str) -> Iterator[tuple[Any, Any]]:
         "axes.edgecolor": INK,
         "axes.labelcolor": INK,
     }
+    buffer = io.StringIO()
+
+    def svg() -> str:
+        text = buffer.getvalue()
+        text = text[text.index("<svg") :].replace(INK, "currentColor")
+        text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+        return re.sub(r'\s(xmlns(:\w+)?|width|height)="[^"]*"', "", text, count=4)
+
     with rc_context(settings):
         figure = Figure(figsize=(9, 3.4), layout="constrained")
         FigureCanvasSVG(figure)
-        yield figure, figure.add_subplot()
-
-
-def _finished(figure: Any, axes: Any) -> str:
-    """The figure as SVG whose ink is the page's text colour."""
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(alpha=0.25, color=INK)
-    axes.legend(frameon=False)
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-    svg = buffer.getvalue()
-    svg = svg[svg.index("<svg") :].replace(INK, "currentColor")
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    return re.sub(r'\s(xmlns(:\w+)?|width|height)="[^"]*"', "", svg, count=4)
+        axes = figure.add_subplot()
+        yield axes, svg
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.25, color=INK)
+        axes.legend(frameon=False)
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})

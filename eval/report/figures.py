@@ -1,8 +1,8 @@
-"""How figures and verdicts are written, in tables, tiles and on the terminal."""
+"""Figures and verdicts as text: in tables, in tiles and on the terminal."""
 
 from __future__ import annotations
 
-from eval.report.page import Tone
+from eval.report.page import Cell, Tone
 from eval.results import Row, Target
 
 MINUS = "\N{MINUS SIGN}"
@@ -18,10 +18,10 @@ _STYLES = {
 """Unit -> factor, decimals, what is written behind the number."""
 
 
-def written(value: float, unit: str, signed: bool = False) -> str:
+def format_value(value: float, unit: str, signed: bool = False) -> str:
     """A figure with its unit: fractions as percent, seconds beyond a minute as minutes too, factors with ×.
 
-    >>> written(0.0123, "fraction"), written(31.456, "dB"), written(754, "s")
+    >>> format_value(0.0123, "fraction"), format_value(31.456, "dB"), format_value(754, "s")
     ('1.23%', '31.46 dB', '12 min 34 s')
     """
     if unit == "s" and not signed and abs(value) >= 60:
@@ -36,12 +36,18 @@ def written(value: float, unit: str, signed: bool = False) -> str:
 
 def with_interval(row: Row, signed: bool = False) -> str:
     """A row's figure with its unit, and its interval over scenes behind it: ``34.10 dB [32.85, 35.20]``."""
-    figure = written(row.value, row.unit, signed)
+    figure = format_value(row.value, row.unit, signed)
     if row.low is None or row.high is None:
         return figure
     suffix = _STYLES.get(row.unit, (1, 2, f" {row.unit}"))[2]
-    low, high = (written(end, row.unit, signed).removesuffix(suffix) for end in (row.low, row.high))
+    low, high = (format_value(end, row.unit, signed).removesuffix(suffix) for end in (row.low, row.high))
     return f"{figure} [{low}, {high}]"
+
+
+def row_cell(row: Row | None, tone: Tone = "plain", unit: bool = True) -> Cell:
+    """A row's figure and interval as a cell, a dash if it was not measured; ``unit`` False leaves dB out."""
+    text = "—" if row is None else with_interval(row)
+    return Cell(text if unit else text.replace(" dB", ""), tone)
 
 
 def verdict(target: Target, measured: float | None, unit: str) -> tuple[str, Tone]:
@@ -49,7 +55,7 @@ def verdict(target: Target, measured: float | None, unit: str) -> tuple[str, Ton
     if measured is None:
         return "not measured", "bad"
     margin = target.margin(measured)
-    amount = written(abs(margin), unit) if unit != "s" else f"{abs(margin):.0f} s"
+    amount = format_value(abs(margin), unit) if unit != "s" else f"{abs(margin):.0f} s"
     if target.reached(measured):
         return f"reached, {amount} to spare", "good"
     return f"missed by {amount}", "bad"
@@ -57,4 +63,4 @@ def verdict(target: Target, measured: float | None, unit: str) -> tuple[str, Ton
 
 def bound(target: Target, unit: str) -> str:
     """The bound itself: ``at least 3.00 dB``."""
-    return f"{target.bound} {written(target.value, unit)}"
+    return f"{target.bound} {format_value(target.value, unit)}"

@@ -1,4 +1,4 @@
-"""What a report is made of: plain blocks that a benchmark fills in, without a word of HTML."""
+"""Blocks that a report is made of; a benchmark fills them in without a word of HTML."""
 
 from __future__ import annotations
 
@@ -39,22 +39,37 @@ class Cell:
 class Table:
     """Rows of cells under headings; the first column names the row, the others hold figures.
 
-    ``groups`` are headings over several columns: (text, number of columns), from the left. Columns in
-    ``words`` hold text instead of figures, and may break into lines.
+    Attributes:
+        caption: what the table shows.
+        headings: of the columns.
+        rows: cells from the left; a string is a plain one.
+        groups: headings over several columns: (text, number of columns), from the left.
+        words: columns that hold text instead of figures, and may break into lines.
     """
 
     kind: ClassVar[str] = "table"
     caption: str
     headings: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
+    rows: Sequence[Sequence[Cell | str]]
     groups: Sequence[tuple[str, int]] = ()
     words: Sequence[int] = ()
+
+    @property
+    def cells(self) -> list[list[Cell]]:
+        """The rows with every string as a cell."""
+        return [[Cell(cell) if isinstance(cell, str) else cell for cell in row] for row in self.rows]
 
 
 @dataclass(frozen=True)
 class Picture:
-    """image (H, W, 3) display values in [0, 1]; ``figure`` is a short number under the title, such as "24.1
-    dB".
+    """A picture with its title.
+
+    Attributes:
+        image: (H, W, 3) display values in [0, 1].
+        title: words under it.
+        alt: words in its place.
+        figure: a short number behind the title, such as "24.1 dB".
+        strong: drawn with a frame, as the one that the others are held against.
     """
 
     image: np.ndarray
@@ -99,7 +114,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Tile:
-    """One headline figure: what, how much, and the verdict on it in words."""
+    """One headline figure: its name, its value, and the verdict on it in words."""
 
     label: str
     value: str

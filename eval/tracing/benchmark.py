@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field, PositiveInt
 
-from eval.benchmark import Benchmark, Outcome
+from eval.benchmark import Benchmark
+from eval.report.outcome import Outcome
 from eval.results import Row
 from tron.errors import TronError
 from tron.storage import write_atomic

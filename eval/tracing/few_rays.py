@@ -18,7 +18,7 @@ from eval.results import Row
 from eval.tracing.irradiance import REFERENCE_SEED, relative_rmse
 from eval.tracing.lights import LIGHTS
 from tron.color import luminance
-from tron.shading import Lighting, render_guidance
+from tron.shading import Estimation, Lighting, render_guidance
 
 RAYS = (2, 4, 8)
 TRIALS = 4
@@ -53,14 +53,16 @@ def measure_few_rays(contenders: Contenders, size: int, light: str, reference_sp
     environment = LIGHTS[light]()
     view, lighting, tracer = camera(size), Lighting(environment), contenders.tracer
     spp = min(reference_spp, REFERENCE_SPP)
-    truth = render_guidance(tracer, view, lighting, spp, REFERENCE_SEED)
+    truth = render_guidance(tracer, view, lighting, Estimation(rays=spp), REFERENCE_SEED)
     surface = truth.mask > 0
     shadowed, _ = shadow_classes(DirectLight(truth.irradiance, truth.unshadowed), surface)
     plane = float(luminance(environment.unoccluded_upward()))
     mean, rmse, images = {}, {}, {}
     for way in [(rays, filtered) for rays in RAYS for filtered in (False, True)]:
         found = [
-            render_guidance(tracer, view, lighting, way[0], seed + k, denoise=way[1]).irradiance
+            render_guidance(
+                tracer, view, lighting, Estimation(rays=way[0], filtered=way[1]), seed + k
+            ).irradiance
             for k in range(TRIALS)
         ]
         mean[way] = mean_over_reference(found, truth.irradiance, shadowed)

@@ -7,8 +7,6 @@ harmonics. The peer's hierarchy stands still: that it would have to be built ane
 counted.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
@@ -24,8 +22,9 @@ from eval.peers.contenders import Contenders, spelled
 from eval.peers.scene import camera
 from eval.peers.timing import Times, interleaved
 from eval.results import Row
+from tron.gaussians.fields import PARAMETERS
 from tron.tracing.gbuffer import trace_gbuffer
-from tron.tracing.parameters import PARAMETERS, SurfelParameters, pack
+from tron.tracing.parameters import SurfelParameters, pack
 from tron.tracing.tiles import build_tiles
 
 TARGET = 0.5

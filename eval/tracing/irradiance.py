@@ -8,8 +8,6 @@ Errors may be noise, never blocks. For pairs of pixels at one offset, errors cor
 aligned block as across its border, unless pixels of a block share something: that excess is measured.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -28,7 +26,7 @@ from eval.tracing.lights import LIGHTS
 from tron import seeds
 from tron.cameras import mitsuba_sensor
 from tron.color import luminance
-from tron.shading import EnvironmentLight, Lighting, irradiance, render_guidance
+from tron.shading import EnvironmentLight, Estimation, Lighting, irradiance, render_guidance
 from tron.shading.guidance import reaching_share, shade
 from tron.shading.irradiance import ORIGIN_OFFSET
 from tron.tracing import GBuffer, SurfelTracer
@@ -110,14 +108,18 @@ def measure_noise(contenders: Contenders, size: int, light: str, reference_spp: 
     gbuffer = tracer.gbuffer(view)
     surface = gbuffer.numpy()["opacity"] > 0
     plane = float(luminance(environment.unoccluded_upward()))
-    truth = render_guidance(tracer, view, lighting, reference_spp, REFERENCE_SEED).irradiance
+    truth = render_guidance(tracer, view, lighting, Estimation(rays=reference_spp), REFERENCE_SEED).irradiance
 
     def ours(spp: int, trial: int, denoise: bool = False) -> np.ndarray:
-        return render_guidance(tracer, view, lighting, spp, seed + trial, denoise).irradiance
+        return render_guidance(
+            tracer, view, lighting, Estimation(rays=spp, filtered=denoise), seed + trial
+        ).irradiance
 
     def independent(spp: int, trial: int) -> np.ndarray:
         shadowed, unshadowed = independent_irradiance(tracer, gbuffer, lighting.light, spp, seed + trial)
-        share = reaching_share(shadowed, unshadowed, gbuffer, lighting, tracer.scene.spacing, spp)
+        share = reaching_share(
+            shadowed, unshadowed, gbuffer, lighting, tracer.scene.spacing, Estimation(rays=spp)
+        )
         return shade(gbuffer, share, lighting).irradiance
 
     times = interleaved(

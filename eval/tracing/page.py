@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eval.benchmark import Outcome
-from eval.report.figures import written
+from eval.report.figures import format_value
+from eval.report.outcome import Outcome
 from eval.report.page import Cell, Section, Table, Text
 from eval.results import Row
 from eval.tracing.page_few_rays import few_rays_section
@@ -111,7 +111,11 @@ def _exactness(found: dict[str, Row]) -> list[Section]:
         "shadow.rays_off": "shadow rays off by more than 1e-4, of all",
     }
     rows = [
-        [Cell(text), Cell(written(found[name].value, found[name].unit), "strong"), Cell(str(found[name].n))]
+        [
+            Cell(text),
+            Cell(format_value(found[name].value, found[name].unit), "strong"),
+            Cell(str(found[name].n)),
+        ]
         for name, text in words.items()
         if name in found
     ]

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eval.relighting.gallery import write_strips
 from eval.report.page import Block, Cell, Picture, Pictures, Section, Table, Text
+from eval.report.strips import write_strips
 from tron.color import to_display
 
 if TYPE_CHECKING:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eval.relighting.gallery import write_strips
-from eval.report.charts import growth_chart
-from eval.report.figures import written
+from eval.report.charts import line_chart
+from eval.report.figures import format_value
 from eval.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
+from eval.report.strips import write_strips
 from eval.results import Row
 
 if TYPE_CHECKING:
@@ -211,7 +211,8 @@ def growth_section(settings: Tracing, measured: Measured) -> list[Section]:
             for name in names
         }
         caption = f"Seconds a frame as {axis} grow, {where}."
-        charts.append(growth_chart({k: v for k, v in lines.items() if len(v) > 1}, axis, "seconds", caption))
+        lines = {name: points for name, points in lines.items() if len(points) > 1}
+        charts.append(line_chart(lines, axis, "seconds", caption, logarithmic=True))
     return [Section("growth", "Growth with surfels and pixels", charts)] if charts else []
 
 
@@ -279,9 +280,9 @@ def shadow_section(measured: Measured, found: dict[str, Row]) -> list[Section]:
     if wrong is not None:
         blocks.append(
             Text(
-                f"Restarting is not exact: {written(wrong.value, 'fraction')} of its rays are off by more "
-                f"than 0.001, by up to {found['shadow.embree_restart_max_error'].value:.2f}, because hits "
-                "within 0.0001 of one another are skipped."
+                f"Restarting is not exact: {format_value(wrong.value, 'fraction')} of its rays are off by "
+                f"more than 0.001, by up to {found['shadow.embree_restart_max_error'].value:.2f}, because "
+                "hits within 0.0001 of one another are skipped."
             )
         )
     return [Section("shadow", "Shadow rays", blocks)]

@@ -6,8 +6,6 @@ pass itself with something else in the way of the light; what is not tracing is 
 and taken off both sides.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 import abc

@@ -11,8 +11,8 @@ from hydra.utils import get_object
 from omegaconf import OmegaConf
 from pydantic import BaseModel
 
-from tron.apps.command_line import Command
-from tron.apps.recipes import (
+from tron.cli.command_line import Command
+from tron.cli.recipes import (
     check,
     compose_recipe,
     field_keys,
@@ -36,7 +36,7 @@ def shipped_recipes() -> Iterator[Any]:
 
 
 def load_command(folder: str) -> Command:
-    return get_object(COMMANDS[folder].replace(":", "."))
+    return get_object(COMMANDS[folder].replace(":", ".")).load()
 
 
 def with_required_values(command: Command, overrides: list[str]) -> list[str]:

@@ -16,9 +16,9 @@ from datagen.plan import Work
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from datagen.validate import validate
-from tron.apps.recipes import check, compose_recipe
 from tron.captures import Capture
 from tron.captures.folder import read_capture_folder
+from tron.cli.recipes import check, compose_recipe
 from tron.color import to_display
 from tron.errors import TronError
 from tron.shading.environment import EnvironmentMap

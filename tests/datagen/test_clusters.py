@@ -12,7 +12,7 @@ from datagen.capture_export import make_captures
 from datagen.cli import cli
 from datagen.run import make
 from datagen.settings import Settings
-from tron.apps.recipes import check, compose_recipe
+from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
 
 TINY = [
@@ -120,7 +120,7 @@ def test_a_cluster_without_workers_is_not_waited_for_longer_than_told(tmp_path, 
 @pytest.mark.usefixtures("variant")
 def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
     address = ["cluster=address", "cluster.address=tcp://127.0.0.1:9", "cluster.timeout=1"]
-    with pytest.raises(TronError, match=r"cluster does not start: .*127\.0\.0\.1:9") as caught:
+    with pytest.raises(TronError, match=r"cluster cannot be made: .*127\.0\.0\.1:9") as caught:
         make(tiny(tmp_path, *address))
     assert "\n" not in str(caught.value)
 

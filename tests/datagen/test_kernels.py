@@ -19,8 +19,8 @@ from datagen.run import make_scene
 from datagen.scene import draw_scene
 from datagen.settings import CaptureSettings, Settings
 from tron.aligned import ALIGNMENT, aligned
-from tron.apps.recipes import check, compose_recipe
 from tron.cameras import Camera
+from tron.cli.recipes import check, compose_recipe
 from tron.seeds import generator
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Lighting

@@ -13,8 +13,9 @@ from datagen.run import make
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from tron import metrics
-from tron.apps.recipes import check, compose_recipe
 from tron.cameras import Camera
+from tron.cli.recipes import check, compose_recipe
+from tron.estimation import Estimation
 from tron.gaussians.scene import GaussianScene
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Lighting, render_guidance
@@ -101,7 +102,7 @@ def test_another_map_relights_them_and_shows_behind_them(dataset: Path, shared_d
     surfels = GaussianScene.load(dataset / "scenes" / clip.meta.scene / "surfels.ply")
     camera = Camera.from_dict(clip.meta.cameras[0])
     environment = EnvironmentMap.load(shared_data / "hdri" / "venice_sunset_1k.hdr").resized(64)
-    guidance = render_guidance(SurfelTracer(surfels), camera, Lighting(environment), spp=16)
+    guidance = render_guidance(SurfelTracer(surfels), camera, Lighting(environment), Estimation(rays=16))
     for image in (guidance.pbr, guidance.irradiance, guidance.shadowed):
         assert np.isfinite(image).all()
         assert image.min() >= 0
@@ -109,4 +110,6 @@ def test_another_map_relights_them_and_shows_behind_them(dataset: Path, shared_d
     np.testing.assert_allclose(
         guidance.pbr[empty], environment.lookup(camera.rays())[empty], rtol=0.02, atol=1e-3
     )
-    assert np.abs(guidance.irradiance - clip.frames["irr"][0]).mean() > 0.05 * guidance.irradiance.mean()
+    assert (
+        np.abs(guidance.irradiance - clip.frames["irradiance"][0]).mean() > 0.05 * guidance.irradiance.mean()
+    )

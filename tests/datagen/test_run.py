@@ -22,13 +22,14 @@ from datagen.run import make, make_scene
 from datagen.settings import Settings
 from datagen.synthetic import make_clips
 from datagen.validate import validate
-from tron.apps.recipes import check, compose_recipe
+from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.images import read_image
-from tron.shards.manifest import Manifest, verify
+from tron.shards.manifest import Manifest
 from tron.shards.reader import read_clips
 from tron.shards.schema import MEMBERS, REFERENCE_MEMBERS
+from tron.shards.verify import verify
 from tron.storage import locked
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -108,7 +109,7 @@ def test_clips_hold_consecutive_frames_with_true_metadata(dataset):
     for clip in clips:
         assert set(clip.frames) == {*MEMBERS, *REFERENCE_MEMBERS}
         seen = clip.frames["foreground"][..., 0] > 0
-        shadowed, unshadowed = (clip.frames[name][seen] for name in ("irr_ref", "unshadowed_ref"))
+        shadowed, unshadowed = (clip.frames[name][seen] for name in ("irradiance_ref", "unshadowed_ref"))
         assert (shadowed <= unshadowed * 1.001).all()
         assert (shadowed < 0.9 * unshadowed).any()
         true, ours = (clip.frames[name][..., 0] for name in ("depth_ref", "depth"))

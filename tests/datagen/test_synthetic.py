@@ -10,6 +10,7 @@ from datagen.scene import draw_scene
 from datagen.synthetic import first_bad_value
 from tron import metrics
 from tron.color import luminance, to_display
+from tron.estimation import Estimation
 from tron.gaussians.initialize import surfels_from_gbuffers
 from tron.shading.guidance import Lighting, render_guidance
 from tron.tracing import SurfelTracer
@@ -19,10 +20,10 @@ LEAST_DB: dict[Family, float] = {"sun": 26.0, "studio": 26.0, "overcast": 28.0}
 
 
 def test_values_that_are_not_finite_are_found_where_they_are():
-    frames = [{"pbr": np.zeros((2, 3, 3)), "irr": np.ones((2, 3, 3))} for _ in range(3)]
+    frames = [{"pbr": np.zeros((2, 3, 3)), "irradiance": np.ones((2, 3, 3))} for _ in range(3)]
     assert first_bad_value(frames) is None
-    frames[2]["irr"][1, 1] = (np.inf, 0, np.nan)
-    assert first_bad_value(frames) == "frame 2: irr has 2 values that are not finite"
+    frames[2]["irradiance"][1, 1] = (np.inf, 0, np.nan)
+    assert first_bad_value(frames) == "frame 2: irradiance has 2 values that are not finite"
 
 
 @pytest.mark.long
@@ -39,7 +40,7 @@ def test_20k_surfels_and_their_irradiance_on_held_out_views_of_textured_scenes(i
         environment = bake(light, 128)
         camera = spec.clip(number, 5, SIZE, SIZE)[2]
         truth = gbuffers(geometry, [camera])[0]
-        ours = render_guidance(tracer, camera, Lighting(environment), spp=64, seed=number)
+        ours = render_guidance(tracer, camera, Lighting(environment), Estimation(rays=64), seed=number)
         direct = direct_irradiance(geometry, geometry.lit(environment), camera, 256, seed=number)
 
         seen = truth.valid

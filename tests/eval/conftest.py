@@ -48,13 +48,13 @@ def draw_frame(size: int, seed: int, light: str, frame: int = 0) -> dict[str, np
     noise = generator(seed, "noise", light, frame)
     return {
         "pbr": over(base * unshadowed + gloss),
-        "irr": over(irradiance),
+        "irradiance": over(irradiance),
         "rgb": over(base * irradiance * (1 + 0.25 * base) + gloss * visible),
         "unshadowed": over(unshadowed),
         "shadowed": over(base * irradiance + gloss),
         "mask": solid.astype(np.float32),
         "foreground": solid.astype(np.float32),
-        "irr_ref": over(irradiance * (1 + 0.05 * noise.standard_normal(irradiance.shape))),
+        "irradiance_ref": over(irradiance * (1 + 0.05 * noise.standard_normal(irradiance.shape))),
         "unshadowed_ref": over(unshadowed),
         "base_color_ref": np.where(solid, base, 0).astype(np.float32),
         "normal_ref": np.where(solid, normal, 0).astype(np.float32),
@@ -81,7 +81,7 @@ def describe_clip(key: str, split: str, scene: str, light: str, frames: int, siz
         height=size,
         cameras=[camera.to_dict() for camera in cameras],
         exposure=0.4,
-        color_space=dict.fromkeys(("pbr", "irr", "rgb", "unshadowed", "shadowed"), "linear"),
+        color_space=dict.fromkeys(("pbr", "irradiance", "rgb", "unshadowed", "shadowed"), "linear"),
     )
 
 

@@ -142,9 +142,9 @@ def test_guidance_is_drawn_by_scene_too(drawn_clip: Callable[..., Clip]):
     for seed in range(3):
         for light in ("noon", "softbox"):
             clip = drawn_clip(light, seed)
-            clip.frames["irr_ref"] = clip.frames["irr"].copy()
+            clip.frames["irradiance_ref"] = clip.frames["irradiance"].copy()
             if seed != 1:
-                clip.frames["irr"] = clip.frames["unshadowed"].copy()
+                clip.frames["irradiance"] = clip.frames["unshadowed"].copy()
             scores.add(clip)
     rows = {row.metric: row for row in scores.rows()}
     leak = rows["guidance.shadow_leak.sun"]
@@ -175,7 +175,7 @@ def test_refinement_is_drawn_by_scene(tmp_path: Path):
     after = next(row for row in rows if row.metric == "refinement.base_color_psnr.after")
     assert (after.value, after.low, after.high, after.scenes) == (32.75, 30.0, 36.0, 4)
     table = sections[0].blocks[0]
-    assert "32.75 dB [30.00, 36.00]" in [cell.text for cell in table.rows[0]]  # type: ignore[union-attr]
+    assert "32.75 dB [30.00, 36.00]" in [cell.text for cell in table.cells[0]]  # type: ignore[union-attr]
 
 
 def test_results_keep_an_interval_and_lack_its_keys_without_one(tmp_path: Path):

@@ -46,12 +46,12 @@ def test_an_error_of_the_surfels_own_unshadowed_light_moves_no_pixel_between_cla
 
 def test_a_pixel_that_shows_another_surface_is_judged_only_with_silhouettes(drawn_clip: MakeClip):
     clip = drawn_clip("noon")
-    clip.frames["irr_ref"] = clip.frames["irr"].copy()
+    clip.frames["irradiance_ref"] = clip.frames["irradiance"].copy()
     frame = {name: images[0] for name, images in clip.frames.items()}
     solid = frame["foreground"][..., 0] > 0.5
     assert same_normal(frame)[solid].all()
     assert same_depth(frame)[solid].all()
-    clip.frames["irr"] = clip.frames["unshadowed"].copy()
+    clip.frames["irradiance"] = clip.frames["unshadowed"].copy()
     for spoilt, gone, left in (
         # x and z change places: the floor's shadow is on another surface now, by its normal
         ({"normal": clip.frames["normal_ref"][..., ::-1].copy()}, "_same_normal", ""),
@@ -83,7 +83,7 @@ def test_clips_from_before_the_reference_light_was_stored_have_every_other_figur
 
 def test_perfect_guidance_leaks_nowhere_and_its_psnr_is_capped(drawn_clip: MakeClip):
     clip = drawn_clip()
-    clip.frames["irr_ref"] = clip.frames["irr"].copy()
+    clip.frames["irradiance_ref"] = clip.frames["irradiance"].copy()
     scores = GuidanceScores()
     scores.add(clip)
     rows = {row.metric: row.value for row in scores.rows()}
@@ -95,8 +95,8 @@ def test_perfect_guidance_leaks_nowhere_and_its_psnr_is_capped(drawn_clip: MakeC
 
 def test_unshadowed_irradiance_leaks_in_every_shadow_of_the_sun(drawn_clip: MakeClip):
     clip = drawn_clip("noon")
-    clip.frames["irr_ref"] = clip.frames["irr"].copy()
-    clip.frames["irr"] = clip.frames["unshadowed"].copy()
+    clip.frames["irradiance_ref"] = clip.frames["irradiance"].copy()
+    clip.frames["irradiance"] = clip.frames["unshadowed"].copy()
     scores = GuidanceScores()
     scores.add(clip)
     assert {row.metric: row.value for row in scores.rows()}["guidance.shadow_leak.sun"] == 1
@@ -106,8 +106,8 @@ def test_the_headline_irradiance_is_that_of_the_worst_light(drawn_clip: MakeClip
     scores = GuidanceScores()
     for light, error in (("noon", 0.05), ("softbox", 0.2), ("grey", 0.1)):
         clip = drawn_clip(light, frames=2)
-        clip.frames["irr"] = np.full_like(clip.frames["irr"], 0.5)
-        clip.frames["irr_ref"] = np.full_like(clip.frames["irr"], 0.5 * (1 + error))
+        clip.frames["irradiance"] = np.full_like(clip.frames["irradiance"], 0.5)
+        clip.frames["irradiance_ref"] = np.full_like(clip.frames["irradiance"], 0.5 * (1 + error))
         scores.add(clip)
     rows = {row.metric: row for row in scores.rows()}
     expected = -20 * np.log10(abs(agx(np.full(3, 0.4 * 0.5 * 1.2)) - agx(np.full(3, 0.4 * 0.5)))[0])

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eval.benchmark import Outcome
 from eval.cli import cli
 from eval.relighting.benchmark import Relighting, choose_clips
 from eval.relighting.scores import Score, Scores
+from eval.report.outcome import Outcome
 from eval.report.page import Pictures
 from eval.results import Results
 from tron.images import read_image

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eval.benchmark import Outcome
 from eval.report.assemble import assemble
 from eval.report.charts import read_metrics, training_curves
-from eval.report.figures import verdict, written
+from eval.report.figures import format_value, verdict
+from eval.report.outcome import Outcome
 from eval.report.page import Cell, Page, Picture, Pictures, Section, Table, Text, Tile
 from eval.report.render import data_uri, render
 from eval.results import Results, Row, Target
@@ -135,11 +135,11 @@ def test_a_log_without_curves_gives_no_chart(tmp_path: Path, text: str):
 
 
 def test_figures_are_written_with_their_units():
-    assert written(0.0123, "fraction") == "1.23%"
-    assert written(-3.456, "dB", signed=True) == "\N{MINUS SIGN}3.46 dB"
-    assert written(-0.0001, "dB", signed=True) == "0.00 dB"
-    assert written(754.4, "s") == "12 min 34 s"
-    assert written(4.2, "deg") == "4.20°"
+    assert format_value(0.0123, "fraction") == "1.23%"
+    assert format_value(-3.456, "dB", signed=True) == "\N{MINUS SIGN}3.46 dB"
+    assert format_value(-0.0001, "dB", signed=True) == "0.00 dB"
+    assert format_value(754.4, "s") == "12 min 34 s"
+    assert format_value(4.2, "deg") == "4.20°"
 
 
 def test_verdicts_say_by_how_much():

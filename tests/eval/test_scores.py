@@ -112,7 +112,7 @@ def test_a_frame_without_foreground_has_no_foreground_score(drawn_clip: MakeClip
 
 def test_without_shadows_and_bounces_every_product_is_the_truth(drawn_clip: MakeClip):
     clip = drawn_clip()
-    clip.frames["irr"] = clip.frames["unshadowed"].copy()
+    clip.frames["irradiance"] = clip.frames["unshadowed"].copy()
     clip.frames["rgb"] = clip.frames["shadowed"] = clip.frames["pbr"].copy()
     shown = Predictor(fit_baselines([clip], seed=0)).shown(clip)
     truth = displayed_truth(clip)
@@ -123,7 +123,7 @@ def test_without_shadows_and_bounces_every_product_is_the_truth(drawn_clip: Make
 
 def where_sky_and_surface_differ(clip: Clip) -> np.ndarray:
     """Truth in which surfaces are a blend of pbr and irradiance, and the sky is as pbr shows it."""
-    pbr, irradiance = (to_display(clip.frames[name], clip.meta.exposure) for name in ("pbr", "irr"))
+    pbr, irradiance = (to_display(clip.frames[name], clip.meta.exposure) for name in ("pbr", "irradiance"))
     surfaces = np.clip(0.4 * pbr + 0.4 * irradiance + 0.05, 0, 1)
     return np.where(region_mask(clip, "foreground")[..., None], surfaces, pbr).astype(np.float32)
 
@@ -169,7 +169,7 @@ def test_the_network_is_given_linear_buffers_and_the_exposure(drawn_clip: MakeCl
     clip = drawn_clip()
 
     def network(pbr: np.ndarray, irradiance: np.ndarray, exposure: float) -> np.ndarray:
-        np.testing.assert_array_equal(irradiance, clip.frames["irr"])
+        np.testing.assert_array_equal(irradiance, clip.frames["irradiance"])
         return to_display(pbr, exposure)
 
     shown = Predictor(fit_baselines([clip], seed=0), {"neural": network}).shown(clip)

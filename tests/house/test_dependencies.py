@@ -1,4 +1,4 @@
-"""What is imported is declared, what is declared is imported, and all of it is pinned."""
+"""Every command's extra holds what the command imports and nothing in vain; all of it is pinned."""
 
 import ast
 import re
@@ -7,6 +7,8 @@ import tomllib
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
+import grimp
+import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -21,6 +23,61 @@ def canonical(requirement: str) -> str:
     name = re.match(r"[A-Za-z0-9._-]+", requirement)
     assert name
     return re.sub(r"[-_.]+", "-", name[0]).lower()
+
+
+def names(requirements: list[str]) -> set[str]:
+    """Distributions, those of the extras that `tron-relight[...]` includes too."""
+    found: set[str] = set()
+    for each in requirements:
+        included = re.match(r"tron-relight\[(.+)\]$", each)
+        for extra in included[1].split(",") if included else ():
+            found |= names(EXTRAS[extra])
+        found |= set() if included else {canonical(each)}
+    return found
+
+
+EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
+BASE = names(PROJECT["dependencies"])
+OF_COMMANDS = {"relight", "reconstruct", "datagen", "train", "eval"}
+DECLARED = BASE | names(EXTRAS["all"])
+DEV, PEERS, CLUSTER = (names(EXTRAS[extra]) for extra in ("dev", "gpu-peers", "cluster"))
+# A network is loaded where a checkpoint is given: tron-relight then asks for the extra `train`.
+ASKED_FOR = {("tron.apps.relight", "tron.neural.weights"), ("tron.apps.clip", "tron.neural.renderer")}
+# Called by those alone that import torch or Mitsuba themselves.
+OF_THE_CALLER = {("tron.runtime", "torch"), ("tron.runtime", "mitsuba"), ("tron.runtime", "drjit")}
+# python-fcl is imported by trimesh, gsplat by whoever installed it.
+UNSEEN = {"python-fcl"}
+
+
+@pytest.fixture(scope="module")
+def imports() -> grimp.ImportGraph:
+    """Who imports whom, in functions too."""
+    return grimp.build_graph(*PACKAGES, include_external_packages=True)
+
+
+def reached(imports: grimp.ImportGraph, command: str) -> set[str]:
+    """Distributions that a command may import, through our modules and their packages' __init__.py."""
+    start = f"tron.apps.{command}" if command in ("relight", "reconstruct") else command
+    own = {name for name in imports.modules if name.partition(".")[0] in PACKAGES}
+    todo, foreign = {start} | ({each for each in own if each.startswith(f"{start}.")}), set()
+    if command == "reconstruct":  # chosen by prior=NAME
+        todo |= {each for each in own if each.startswith("tron.priors")}
+    seen: set[str] = set()
+    while todo:
+        module = todo.pop()
+        seen.add(module)
+        parents = {module.rsplit(".", depth)[0] for depth in range(1, module.count(".") + 1)}
+        for target in imports.find_modules_directly_imported_by(module) | parents:
+            if (module, target) in ASKED_FOR | OF_THE_CALLER or target in seen:
+                continue
+            (todo if target in own else foreign).add(target)
+    return distributions(foreign)
+
+
+def distributions(modules: set[str]) -> set[str]:
+    known = packages_distributions()
+    foreign = {name.partition(".")[0] for name in modules} - set(sys.stdlib_module_names) - set(PACKAGES)
+    return {canonical(known.get(module, [module])[0]) for module in foreign}
 
 
 def imported(*folders: str) -> set[str]:
@@ -38,15 +95,7 @@ def imported(*folders: str) -> set[str]:
                 and isinstance(node.args[0], ast.Constant)
             ):
                 modules.add(str(node.args[0].value).partition(".")[0])
-    known = packages_distributions()
-    foreign = modules - set(sys.stdlib_module_names) - set(PACKAGES)
-    return {canonical(known.get(module, [module])[0]) for module in foreign}
-
-
-DECLARED = {canonical(each) for each in PROJECT["dependencies"]}
-DEV = {canonical(each) for each in PROJECT["optional-dependencies"]["dev"]}
-PEERS = {canonical(each) for each in PROJECT["optional-dependencies"]["gpu-peers"]}
-CLUSTER = {canonical(each) for each in PROJECT["optional-dependencies"]["cluster"]}
+    return distributions(modules)
 
 
 def test_what_the_packages_import_is_declared():
@@ -57,8 +106,22 @@ def test_what_the_tests_import_is_declared():
     assert imported("tests") - DECLARED - DEV == set()
 
 
+@pytest.mark.parametrize("command", sorted(OF_COMMANDS))
+def test_a_commands_extra_holds_what_it_imports_and_nothing_else(imports: grimp.ImportGraph, command: str):
+    installed, used = BASE | names(EXTRAS[command]), reached(imports, command)
+    assert used - installed - PEERS == set()
+    if command != "eval":  # which runs the others too
+        assert installed - BASE - used - UNSEEN == set()
+
+
+def test_the_base_is_what_all_commands_share(imports: grimp.ImportGraph):
+    assert set.intersection(*(reached(imports, command) for command in OF_COMMANDS)) <= BASE
+    assert not {"torch", "lightning", "dask", "diffusers"} & (BASE | names(EXTRAS["relight"]))
+    assert names(EXTRAS["all"]) == names(EXTRAS["eval"])
+
+
 def test_no_dependency_is_declared_in_vain():
-    assert (DECLARED | PEERS) - imported(*PACKAGES) - {"python-fcl"} == set()  # trimesh imports python-fcl
+    assert (DECLARED | PEERS) - imported(*PACKAGES) - UNSEEN == set()
     assert DEV - imported("tests") - TOOLS == set()
 
 

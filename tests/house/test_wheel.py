@@ -1,5 +1,6 @@
-"""The wheel carries our five packages and nothing else; its commands import ours, whatever lies around."""
+"""The wheel carries our packages and nothing else; its commands import ours, and need their extras alone."""
 
+import importlib.metadata
 import os
 import shutil
 import subprocess
@@ -10,7 +11,14 @@ import venv
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from tron.gaussians.scene import GaussianScene, quats_from_normals
+from tron.images import read_image
+from tron.shading.environment import EnvironmentMap
 
 pytestmark = pytest.mark.long
 
@@ -37,12 +45,56 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A clean environment with the wheel alone in it: its folder."""
-    folder = tmp_path_factory.mktemp("clean")
+    """A clean environment with the wheel alone; dependencies come from this one, behind it: its folder."""
+    folder = make_environment(wheel, tmp_path_factory.mktemp("clean"))
+    dependencies = sysconfig.get_path("purelib")
+    (packages_of(folder) / "dependencies.pth").write_text(f"import sys; sys.path.append({dependencies!r})\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def smallest(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clean environment after `pip install tron-relight[relight]`, without the network: its folder.
+
+    What pip would bring is linked from this environment: the extra's requirements and theirs, as the wheels'
+    metadata name them. What nothing asks for is not there.
+    """
+    folder = make_environment(wheel, tmp_path_factory.mktemp("smallest"))
+    (own,) = importlib.metadata.distributions(name="tron-relight", path=[str(packages_of(folder))])
+    for distribution in required(own, "relight"):
+        for name in {file.parts[0] for file in distribution.files or ()} - {"..", "__pycache__"}:
+            link = packages_of(folder) / name
+            if not link.exists():
+                link.symlink_to(Path(str(distribution.locate_file(name))))
+    return folder
+
+
+def make_environment(wheel: Path, folder: Path) -> Path:
     venv.create(folder, with_pip=False)
     python = folder / "bin" / "python"
     _run(sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", wheel)
     return folder
+
+
+def packages_of(environment: Path) -> Path:
+    return environment / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
+
+
+def required(own: importlib.metadata.Distribution, extra: str) -> list[importlib.metadata.Distribution]:
+    """Distributions that pip installs for an extra, found among those installed here."""
+    found: dict[str, importlib.metadata.Distribution] = {}
+    done, todo = set(), [(own, extra), (own, "")]
+    while todo:
+        distribution, chosen = todo.pop()
+        for each in map(Requirement, distribution.requires or ()):
+            if each.marker is None or each.marker.evaluate({"extra": chosen}):
+                name = canonicalize_name(each.name)
+                found.setdefault(name, importlib.metadata.distribution(name))
+                for inner in {"", *each.extras}:
+                    if (name, inner) not in done:
+                        done.add((name, inner))
+                        todo.append((found[name], inner))
+    return list(found.values())
 
 
 def test_the_wheel_holds_every_module_and_data_file_and_nothing_else(wheel: Path):
@@ -56,22 +108,115 @@ def test_the_wheel_holds_every_module_and_data_file_and_nothing_else(wheel: Path
 def test_a_command_imports_ours_beside_decoys(installed: Path, tmp_path: Path, command: str):
     for name in PACKAGES:
         (tmp_path / f"{name}.py").write_text("raise SystemExit('a decoy was imported')\n")
-    # The dependencies come from this environment, behind the clean one's own packages; PYTHONSAFEPATH and
-    # the like are dropped: the user's shell has none of them.
-    (dependencies,) = {sysconfig.get_path("purelib")}
-    own = installed / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
-    (own / "dependencies.pth").write_text(f"import sys; sys.path.append({dependencies!r})\n")
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
-    shown = subprocess.run(
-        [installed / "bin" / command, "--help"], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
+    shown = start(installed, command, "--help", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
     assert f"usage: {command}" in shown.stdout
-    module = COMMANDS[command].partition(":")[0]
     where = _run(
-        installed / "bin" / "python", "-P", "-c", f"import {module} as m; print(m.__file__)", cwd=tmp_path
+        installed / "bin" / "python", "-P", "-c", "import train.cli as m; print(m.__file__)", cwd=tmp_path
     )
     assert Path(where.strip()).is_relative_to(installed)
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+@pytest.mark.parametrize("decoy", ["train.py", "eval.py", "datagen.py", "conf.py", "conf/__init__.py"])
+def test_a_foreign_file_of_one_of_our_names_is_one_clear_line(
+    installed: Path, tmp_path: Path, command: str, decoy: str
+):
+    (tmp_path / decoy).parent.mkdir(exist_ok=True)
+    (tmp_path / decoy).write_text("raise SystemExit('a decoy was imported')\n")
+    (tmp_path / "data").mkdir()  # a folder without __init__.py hides nothing
+    refused = start(installed, command, "--help", cwd=tmp_path, PYTHONPATH=str(tmp_path))
+    hidden = decoy.partition("/")[0]
+    assert refused.returncode == 2
+    assert refused.stdout == ""
+    (line,) = refused.stderr.splitlines()
+    assert line.startswith(f"{command}: this file hides TRON's own package '{hidden.removesuffix('.py')}'")
+    assert str(tmp_path / hidden) in line
+    assert "rename it" in line
+
+
+def test_a_module_run_beside_a_foreign_conf_says_so_too(installed: Path, tmp_path: Path):
+    """`python -m` puts the current folder first on the path."""
+    (tmp_path / "conf.py").touch()
+    refused = start(installed, "python", "-m", "tron.apps.relight", "--help", cwd=tmp_path)
+    assert refused.returncode == 2
+    (line,) = refused.stderr.splitlines()
+    assert line.startswith("tron-relight: this file hides TRON's own package 'conf'")
+
+
+def test_a_scene_is_relit_without_torch_and_lightning(smallest: Path, tmp_path: Path):
+    absent = ("torch", "lightning", "dask", "webdataset", "diffusers", "transformers", "pycolmap", "trimesh")
+    found = _run(
+        smallest / "bin" / "python", "-P", "-c",
+        f"from importlib.util import find_spec; print([n for n in {absent} if find_spec(n)])", cwd=tmp_path
+    )  # fmt: skip
+    assert found.strip() == "[]"
+    make_ball().save(tmp_path / "ball.ply")
+    EnvironmentMap.constant(1.0).save(tmp_path / "white.hdr")
+    arguments = ["scene=ball.ply", "environment=white.hdr", "output_dir=out", "frames=2"]
+    done = start(smallest, "tron-relight", *arguments, "width=32", "height=32", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    picture = read_image(tmp_path / "out" / "frames" / "0000.relit.png")
+    middle, corner = picture[14:18, 14:18].mean(axis=(0, 1)), picture[0, 0]
+    assert middle[0] > middle[2] + 0.1, "the ball is red"
+    assert np.ptp(corner) < 0.02, "the sky is white"
+    assert (tmp_path / "out" / "relit.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "words"),
+    [
+        ("tron-train", ["--help"], ["lightning", "torch", "pip install 'tron-relight[train]'"]),
+        ("tron-datagen", [], ["trimesh", "dask", "pip install 'tron-relight[datagen]'"]),
+        ("tron-reconstruct", [], ["pycolmap", "pip install 'tron-relight[reconstruct]'"]),
+        ("tron-eval", [], ["matplotlib", "pip install 'tron-relight[eval]'"]),
+        (
+            "tron-relight",
+            ["scene=ball.ply", "environment=white.hdr", "checkpoint=ball.ply", "output_dir=out"],
+            ["checkpoint needs", "torch", "pip install 'tron-relight[train]'"],
+        ),
+    ],
+)
+def test_a_command_whose_extra_is_missing_says_so(smallest: Path, tmp_path: Path, command, arguments, words):
+    make_ball().save(tmp_path / "ball.ply")
+    EnvironmentMap.constant(1.0).save(tmp_path / "white.hdr")
+    refused = start(smallest, command, *arguments, cwd=tmp_path)
+    assert refused.returncode == 2, refused.stderr
+    (line,) = [each for each in refused.stderr.splitlines() if each.startswith(f"{command}: ")]
+    assert [word for word in words if word not in line] == []
+    assert "Traceback" not in refused.stderr
+
+
+def make_ball() -> GaussianScene:
+    """A red sphere of surfels."""
+    angle, z = np.pi * (3 - 5**0.5) * np.arange(400), 1 - (2 * np.arange(400) + 1) / 400
+    level = np.sqrt(1 - z**2)
+    normals = np.stack([level * np.cos(angle), level * np.sin(angle), z], axis=1)
+    color = np.tile([0.8, 0.1, 0.1], (400, 1))
+    return GaussianScene(
+        means=normals,
+        quats=quats_from_normals(normals),
+        log_scales=np.full((400, 2), np.log(0.1)),
+        opacity_logits=np.full(400, 4.0),
+        sh=np.zeros((400, 16, 3)),
+        base_color=color,
+        roughness=np.full(400, 0.8),
+        metallic=np.zeros(400),
+        object_id=np.zeros(400, np.int32),
+        spacing=0.17,
+    ).validate()
+
+
+def start(environment: Path, command: str, *arguments: str, cwd: Path, **variables: str):
+    """A console script as a user starts it: of this shell's PYTHON... variables it has none."""
+    inherited = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    return subprocess.run(
+        [environment / "bin" / command, *arguments],
+        cwd=cwd,
+        env={**inherited, **variables},
+        capture_output=True,
+        text=True,
+    )
 
 
 def _run(*command: str | Path, cwd: Path | None = None) -> str:

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from pydantic import ValidationError
 
-from tron.captures import LoadSettings, PosingSettings, load_capture
+from tron.captures import LoadSettings, load_capture
 from tron.errors import TronError
 from tron.seeds import generator
 
@@ -314,7 +315,7 @@ def test_two_photos_without_poses(tmp_path: Path) -> None:
 def test_photos_without_features(tmp_path: Path) -> None:
     for index in range(3):
         Image.fromarray(np.full((64, 64, 3), 40 * index, np.uint8)).save(tmp_path / f"{index}.jpg")
-    settings = LoadSettings(posing=PosingSettings(workspace=tmp_path / "work", threads=1))
+    settings = LoadSettings(workspace=tmp_path / "work", threads=1)
     assert "none of 3 photos could be posed" in refusal(tmp_path, settings)
 
 
@@ -382,11 +383,17 @@ def test_a_nan_pose_in_colmaps_binary(colmap: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "entries",
     [{"format": "nerf"}, {"downscale": 0.5}, {"downscale": float("nan")}, {"max_side": 0}, {"test_every": -1},
-     {"max_side": 100, "downscale": 2}, {"up": (0, 0, 0)}, {"up": (1, float("nan"), 0)}, {"cache_bytes": -1}],
+     {"matching": "random"}, {"feature_side": 1}, {"nerf": 1}, {"cache_bytes": -1}, {"up": (0, 0, 0)},
+     {"up": (1, float("nan"), 0)}],
 )  # fmt: skip
 def test_settings_outside_their_range(entries: dict) -> None:
-    with pytest.raises(TronError):
+    with pytest.raises(ValidationError, match=next(iter(entries))):
         LoadSettings(**entries)
+
+
+def test_downscale_wins_over_max_side() -> None:
+    assert LoadSettings(max_side=100, downscale=2).size_of(800, 600) == (400, 300)
+    assert LoadSettings(max_side=100).size_of(800, 600) == (100, 75)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")

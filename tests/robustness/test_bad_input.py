@@ -139,3 +139,38 @@ def test_a_word_that_is_no_setting_is_explained(run, name):
 def test_a_bad_file_is_named(run, variant, name, arguments, named):
     line = run(name, *COMPLETE[name], *arguments)
     assert [each for each in named if each not in line] == [], line
+
+
+@pytest.mark.parametrize(
+    "name, kept",
+    [
+        ("tron-train", ["manifest.json"]),
+        ("tron-eval", ["manifest.json"]),
+        ("tron-datagen validate", ["manifest.json"]),
+        ("tron-datagen make", ["config.yaml", "manifest.json"]),
+        ("tron-datagen make", ["config.yaml"]),
+    ],
+)
+def test_a_dataset_of_schema_1_is_refused_by_its_name(variant, name, kept, tmp_path, capsys):
+    """Its files, as the version before this one wrote them; config.yaml alone is a run killed half-way."""
+    old = tmp_path / "old"
+    old.mkdir()
+    if "manifest.json" in kept:
+        (old / "manifest.json").write_text('{"schema_version": 1, "config_sha256": "", "shards": []}')
+    if "config.yaml" in kept:
+        (old / "config.yaml").write_text("recipe: {}\nscenes: {test: 1}\n")
+    command, _, mode = name.partition(" ")
+    arguments = {
+        "": [f"dataset={old}", f"output_dir={tmp_path / 'out'}"],
+        "validate": ["mode=validate", f"output_dir={old}"],
+        "make": ["experiment=demo", f"output_dir={old}"],
+    }[mode]
+    with pytest.raises(SystemExit) as stop:
+        get_object(SCRIPTS[command].replace(":", "."))(arguments)
+    out, err = capsys.readouterr()
+    assert (stop.value.code, out) == (2, "")
+    assert err == (
+        f"{command}: dataset of schema 1, this program reads schema 2 ({old}): "
+        "make it again in a new folder with the tron-datagen command of its card.md\n"
+    )
+    assert sorted(path.name for path in old.iterdir() if path.name != ".tron.lock") == kept

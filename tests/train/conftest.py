@@ -33,7 +33,7 @@ def write_dataset(
                     height=size,
                     cameras=[{}] * frames,
                     exposure=1.0,
-                    color_space={"pbr": "linear", "irr": "linear", "rgb": "linear"},
+                    color_space={"pbr": "linear", "irradiance": "linear", "rgb": "linear"},
                 )
                 writer.write(meta, [_frame(random, size) for _ in range(frames)])
         entries += writer.entries
@@ -44,13 +44,13 @@ def write_dataset(
 def _frame(random: np.random.Generator, size: int) -> dict[str, np.ndarray]:
     ramp = np.linspace(0, 1, size, dtype=np.float32)
     pbr = 0.1 + random.random(3) * ramp[:, None, None] + np.zeros((size, size, 3))
-    irr = 0.2 + random.random(3) * ramp[None, :, None] + np.zeros((size, size, 3))
+    irradiance = 0.2 + random.random(3) * ramp[None, :, None] + np.zeros((size, size, 3))
     one = np.ones((size, size, 1))
     return {
         "pbr": pbr,
-        "irr": irr,
-        "rgb": pbr * irr,
-        "unshadowed": irr,
+        "irradiance": irradiance,
+        "rgb": pbr * irradiance,
+        "unshadowed": irradiance,
         "shadowed": pbr,
         "mask": one,
         "foreground": one,

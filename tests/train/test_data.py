@@ -153,7 +153,7 @@ def test_a_tint_scales_the_light_and_keeps_the_luminance_of_white():
     assert 0.2 < torch.stack(gains).log().std() < 0.4
     picture = torch.rand(3, 1, 4, 4)
     out = varied(sample_of(picture), seeds.generator(0, 7), None, settings).buffers
-    torch.testing.assert_close(out["irr"], picture * gains[7])
+    torch.testing.assert_close(out["irradiance"], picture * gains[7])
 
 
 def test_colours_of_photos_are_left_alone():
@@ -166,7 +166,7 @@ def test_colours_of_photos_are_left_alone():
 
 def test_exposure_and_agx_are_applied_to_linear_members_and_not_to_photos(dataset):
     clip = next(iter(read_clips(dataset, "test")))
-    spaces = {"rgb": "display", "pbr": "linear", "irr": "linear"}
+    spaces = {"rgb": "display", "pbr": "linear", "irradiance": "linear"}
     clip.meta = clip.meta.model_copy(update={"exposure": 0.3, "color_space": spaces})
     as_stored = clip.frames["rgb"]
     for name, expected in (("pbr", to_display(clip.frames["pbr"], 0.3)), ("rgb", as_stored)):

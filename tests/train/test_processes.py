@@ -22,7 +22,7 @@ from train.cli import main
 from train.curriculum import Stage
 from train.processes import Processes, launch
 from train.settings import Settings
-from tron.apps.recipes import check, compose_recipe
+from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
 from tron.storage import locked
 
@@ -163,7 +163,7 @@ def test_processes_of_torchrun_on_two_machines_do_the_same_and_are_refused_toget
     require_equal(alone(), tmp_path / "two", 1e-4)
     (first, said), (second, nothing) = ended(seed=1)
     assert (first, second) == (2, 2)
-    assert said.startswith("tron-train: output_dir holds a run with another 'seed'")
+    assert said.startswith("tron-train: output_dir holds a run made with seed=")
     assert len(said.splitlines()) == 1
     assert nothing == ""
 

@@ -125,13 +125,13 @@ def test_a_finished_run_is_left_as_it_is(train, dataset, finished):
 
 
 def test_a_folder_with_another_run_is_refused(train, dataset, finished):
-    with pytest.raises(TronError, match="another 'seed'"):
+    with pytest.raises(TronError, match="a run made with seed=0, not"):
         train(dataset, finished, seed=5)
 
 
 def test_other_data_under_the_same_settings_is_another_run(train, make_dataset, finished, tmp_path):
     other = make_dataset(tmp_path / "other", {"train": 4, "train_b": 3, "test": 2})
-    with pytest.raises(TronError, match="another 'dataset_sha256'"):
+    with pytest.raises(TronError, match="a run made with dataset_sha256="):
         train(other, finished)
 
 
@@ -177,8 +177,8 @@ def test_stages_without_steps_are_left_out(train, dataset, tmp_path):
 @pytest.mark.parametrize(
     ("recipe", "message"),
     [
-        ({"_target_": "tron.neural.renderer.Nothing"}, "recipe does not fit"),
-        ({"_target_": "tron.neural.pixel_mlp.PixelMLP", "wide": 1}, "recipe does not fit"),
+        ({"_target_": "tron.neural.renderer.Nothing"}, "renderer cannot be made"),
+        ({"_target_": "tron.neural.pixel_mlp.PixelMLP", "wide": 1}, "renderer cannot be made"),
         ({"_target_": "builtins.dict"}, "not a torch module"),
         (
             {"_target_": "tron.neural.weights.load_cosmos", "transformer_path": None, "vae_path": None},

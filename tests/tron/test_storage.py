@@ -1,11 +1,13 @@
 """Files appear whole or not at all, folders are held by one process, and the disk is asked first."""
 
+import errno
 import hashlib
 import os
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import pytest
@@ -97,6 +99,22 @@ def test_a_folder_is_written_by_one_run_and_what_a_killed_one_left_is_emptied(tm
     with storage.atomic_folder(tmp_path / "b"):
         pass
     assert list((tmp_path / "b").iterdir()) == []
+
+
+def test_on_a_file_system_without_locks_files_are_written_by_one_run_too(tmp_path: Path, monkeypatch):
+    """Lustre mounted without `flock` answers ENOSYS: the lock's file itself is then the mark."""
+
+    def missing(*_):
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    monkeypatch.setattr("fcntl.flock", missing)
+    monkeypatch.setattr(warnings, "warn", lambda *_, **__: None)  # filelock tells of it
+    with storage.atomic_folder(tmp_path / "a") as first:
+        (first / "1.txt").write_text("1")
+        with pytest.raises(TronError, match="another run"), storage.atomic_folder(tmp_path / "a"):
+            pass
+    storage.write_atomic(tmp_path / "b", "whole")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["1.txt", "a", "b"]
 
 
 def test_new_files_follow_the_umask(tmp_path: Path):

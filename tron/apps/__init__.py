@@ -1,1 +1,1 @@
-"""Entry points of the library; the only place in `tron` that knows Hydra."""
+"""Commands of the library: tron-relight and tron-reconstruct, with what belongs to one of them."""

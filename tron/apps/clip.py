@@ -12,10 +12,11 @@ import numpy as np
 
 from tron import seeds
 from tron.apps.frame_folder import FrameFolder
-from tron.apps.progress import track
 from tron.apps.relit import RelitPicture, surfels_alone
 from tron.cameras import Camera
+from tron.cli.progress import track
 from tron.color import to_display
+from tron.estimation import Estimation
 from tron.gaussians.scene import GaussianScene
 
 if TYPE_CHECKING:
@@ -95,15 +96,14 @@ def trace(
     cameras: Sequence[Camera],
     clips: Sequence[Clip],
     *,
-    spp: int,
-    denoise: bool,
+    estimation: Estimation,
     seed: int,
 ) -> None:
     """Trace the frames that are missing, each view once for all lights, and develop all of them.
 
     Args:
         scene: the surfels. cameras: one a frame.
-        spp, denoise: shadow rays a pixel, and whether they are filtered.
+        estimation: of the shadows.
         seed: root of their random numbers; a frame's do not depend on the light.
     """
     tracer_for = _tracers(scene)
@@ -120,7 +120,7 @@ def trace(
                     seen = camera, tracer, tracer.gbuffer(camera)
                 lighting = prepared[number].turned_to(clip.rotations[index])
                 ray_seed = seeds.integer(seed, "relight", index)
-                buffers = _shade(*seen[1:], lighting, clip.folder.buffers, spp, ray_seed, denoise)
+                buffers = _shade(*seen[1:], lighting, clip.folder.buffers, estimation, ray_seed)
                 clip.seconds.append(time.perf_counter() - started)
                 clip.folder.write(index, buffers)
             clip.develop(index)
@@ -147,14 +147,13 @@ def _shade(
     gbuffer: GBuffer,
     lighting: Lighting,
     names: Sequence[str],
-    spp: int,
+    estimation: Estimation,
     seed: int,
-    denoise: bool,
 ) -> dict[str, np.ndarray]:
     """The buffers ``names`` of one frame."""
     from tron.shading.guidance import shade, visibility
 
-    reaching = visibility(tracer, gbuffer, lighting, spp, seed, denoise)
+    reaching = visibility(tracer, gbuffer, lighting, estimation, seed)
     guidance = shade(gbuffer, reaching, lighting)
     made = guidance.gbuffer | vars(guidance)
     if "foreground" in names:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from tron.claim import first_difference, read_recipe, require_same
 from tron.errors import TronError
 from tron.images import read_image, write_image
 from tron.storage import write_atomic
@@ -45,17 +46,13 @@ class FrameFolder:
         Raises TronError if it holds frames made with others, unless `overwrite` deletes them.
         """
         record = self.folder / SETTINGS_NAME
-        if record.exists():
-            different = _first_difference(_read_json(record), made_with)
-            if different and not overwrite:
-                raise TronError(
-                    f"there are frames made with {different}",
-                    self.folder,
-                    "choose another output_dir, or replace them with overwrite=true",
-                )
-            if different:
-                for path in (*self.folder.glob("*.exr"), *self.folder.glob("*.png")):
-                    path.unlink()
+        before = read_recipe(record)
+        if before is not None and not overwrite:
+            mend = "choose another output_dir, or replace them with overwrite=true"
+            require_same(before, made_with, self.folder, "frames", mend)
+        elif before is not None and first_difference(before, made_with) is not None:
+            for path in (*self.folder.glob("*.exr"), *self.folder.glob("*.png")):
+                path.unlink()
         write_atomic(record, json.dumps(made_with, indent=1) + "\n")
 
     def path(self, index: int, name: str, suffix: str) -> Path:
@@ -117,21 +114,3 @@ def _thumbnail(display: np.ndarray) -> np.ndarray:
     size = (_SHEET_WIDTH, max(1, round(height * _SHEET_WIDTH / width)))
     picture = Image.fromarray(np.round(np.clip(display, 0, 1) * 255).astype(np.uint8))
     return np.asarray(picture.resize(size, Image.Resampling.LANCZOS), dtype=np.float32) / 255
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise TronError(f"cannot read: {error}", path, "delete the folder of frames") from error
-    if not isinstance(content, dict):
-        raise TronError("holds no settings", path, "delete the folder of frames")
-    return content
-
-
-def _first_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
-    """The first setting that differs, in words; None if all agree."""
-    for key in {**now, **before}:
-        if before.get(key) != now.get(key):
-            return f"{key}={before.get(key)}, not {now.get(key)}"
-    return None

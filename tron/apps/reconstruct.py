@@ -11,23 +11,25 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 import tron
-from tron.apps.command_line import command
-from tron.apps.progress import StepBar, track
-from tron.captures import Capture, LoadSettings, PosingSettings, load_capture
-from tron.errors import TronError
+from tron.captures import Capture, LoadSettings, load_capture
+from tron.captures.load import CaptureSettings
+from tron.cli.command_line import command
+from tron.cli.instantiation import make
+from tron.cli.progress import Progress, track
 from tron.images import write_image
 from tron.reconstruction.settings import FitSettings, ReconstructionSettings
-from tron.runtime import activate, describe_machine, set_torch_threads
+from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
 from tron.storage import locked, require_free_space, write_atomic
 
 if TYPE_CHECKING:
     from tron.metrics import LPIPS
     from tron.reconstruction import EnvironmentFit, Reconstruction
     from tron.reconstruction.evaluation import ViewScore
-    from tron.reconstruction.training import Progress, Stage
+    from tron.reconstruction.training import Progress as StageProgress
+    from tron.reconstruction.training import Stage
     from tron.tracing import SurfelTracer
 
 log = logging.getLogger(__name__)
@@ -40,40 +42,18 @@ RESULTS = ("scene.ply", "environment.exr", "metrics.json", "curve.json", "light.
 SURFEL_BYTES = 1600  # PLY, checkpoint with Adam's moments, and their temporary copies
 
 
-class CaptureSettings(BaseModel):
-    """What is reconstructed, and where it goes."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+class Paths(BaseModel):
+    """Capture that is reconstructed, and the folder that the files go to."""
 
     capture: Path = Field(description="folder of photos, with or without poses, or of path-traced views")
     output_dir: Path = Field(description="folder for scene.ply, environment.exr, metrics.json and pictures")
-    format: Literal["auto", "transforms", "colmap", "tensoir", "tron", "photos"] = Field(
-        "auto", description="what the folder holds; photos: poses are found by structure from motion"
-    )
-    images: str | None = Field(None, description="folder of the photos, where it is not the one poses name")
-    max_side: int | None = Field(
-        400, ge=16, description="photos are reduced to at most so many pixels a side; null keeps their size"
-    )
-    downscale: float | None = Field(
-        None, ge=1, description="or made so many times smaller; wins over max_side"
-    )
-    test_every: int = Field(
-        8, ge=0, description="every n-th photo is held out, unless the capture says itself which are"
-    )
-    up: tuple[float, float, float] | None = Field(
-        None, description="up direction in the capture's world; null: estimated from the cameras"
-    )
-    tensoir_light: str = Field("sunset", description="which light of a TensoIR scene is reconstructed")
-    matching: Literal["auto", "exhaustive", "sequential"] = Field(
-        "auto", description="how photos without poses are matched: sequential suits videos"
-    )
-    prior: Any = Field(description="source of normals, materials and irradiance, by _target_ (prior=NAME)")
 
 
 # Bases are listed the other way round than their keys: pydantic collects fields from the last base first.
-class Settings(ReconstructionSettings, CaptureSettings):
+class Settings(ReconstructionSettings, CaptureSettings, Paths):
     """Everything that tron-reconstruct can be told."""
 
+    prior: Any = Field(description="source of normals, materials and irradiance, by _target_ (prior=NAME)")
     light: FitSettings | None = Field(
         default_factory=lambda: FitSettings(), description="environment map and scale; null fits none"
     )
@@ -99,7 +79,7 @@ def main(settings: Settings) -> None:
     and training views), contact_sheet.png (held-out views and every channel), light.png and config.yaml. A
     run that was interrupted goes on where it stopped when it is started again.
     """
-    prior = _make_prior(settings)
+    prior = make(settings.prior, "prior")
     lpips = _load_lpips(settings)
     require_free_space(settings.output_dir, settings.radiance.density.most * SURFEL_BYTES)
     activate(settings.variant, settings.threads)
@@ -123,20 +103,6 @@ def main(settings: Settings) -> None:
             _say(report, settings.output_dir)
 
 
-def _make_prior(settings: Settings) -> Any:
-    from hydra.errors import InstantiationException
-    from hydra.utils import instantiate
-
-    try:
-        return instantiate(settings.prior, _convert_="all")
-    except InstantiationException as error:
-        if isinstance(error.__cause__, TronError):
-            raise error.__cause__ from None
-        raise TronError(
-            f"prior cannot be made: {str(error).splitlines()[0]}", mend="see prior=NAME in --help"
-        ) from error
-
-
 def _load_lpips(settings: Settings) -> LPIPS | None:
     if settings.lpips_weights is None:
         return None
@@ -147,19 +113,10 @@ def _load_lpips(settings: Settings) -> LPIPS | None:
 
 def _load_settings(settings: Settings) -> LoadSettings:
     return LoadSettings(
-        format=settings.format,
-        images=settings.images,
-        downscale=settings.downscale or 1.0,
-        max_side=None if settings.downscale is not None else settings.max_side,
-        test_every=settings.test_every,
-        up=settings.up,
-        light=settings.tensoir_light,
-        posing=PosingSettings(
-            workspace=settings.output_dir / "structure_from_motion",
-            matching=settings.matching,
-            threads=settings.threads or 0,
-            seed=settings.seed,
-        ),
+        **{name: getattr(settings, name) for name in CaptureSettings.model_fields},
+        workspace=settings.output_dir / "structure_from_motion",
+        threads=settings.threads or 0,
+        seed=settings.seed,
     )
 
 
@@ -170,14 +127,14 @@ def _claim(settings: Settings, capture: Capture, prior: Any) -> None:
         TronError: the folder holds another run; nothing in it is changed.
     """
     from tron.reconstruction.checkpoint import Checkpoint
-    from tron.reconstruction.pipeline import made_with, require_same
+    from tron.reconstruction.pipeline import made_with
 
     if settings.overwrite:
         for name in (CHECKPOINT, *RESULTS):
             (settings.output_dir / name).unlink(missing_ok=True)
     checkpoint = settings.output_dir / CHECKPOINT
     if checkpoint.exists():
-        require_same(Checkpoint(checkpoint), made_with(capture, prior, _only_reconstruction(settings)))
+        Checkpoint(checkpoint).require(made_with(capture, prior, _only_reconstruction(settings)))
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False)
     write_atomic(settings.output_dir / "config.yaml", text)
 
@@ -207,13 +164,12 @@ def _run(settings: Settings, capture: Capture, prior: Any, lpips: LPIPS | None) 
     from tron.tracing import SurfelTracer
 
     out = settings.output_dir
-    device = "cuda" if settings.variant.startswith("cuda") else "cpu"
     bars = _Bars()
     curve = None
     if settings.score_every and capture.test:
         curve = Curve(out / "curve.json", capture.test_views, settings.score_every)
 
-    def watch(progress: Progress, stage: Stage) -> None:
+    def watch(progress: StageProgress, stage: Stage) -> None:
         bars.watch(progress)
         if curve is not None:
             curve.watch(progress, stage)
@@ -221,7 +177,7 @@ def _run(settings: Settings, capture: Capture, prior: Any, lpips: LPIPS | None) 
     try:
         found = reconstruct(
             capture, prior, _only_reconstruction(settings),
-            checkpoint=out / CHECKPOINT, device=device, watch=watch, track=track,
+            checkpoint=out / CHECKPOINT, device=torch_device(settings.variant), watch=watch, track=track,
         )  # fmt: skip
     finally:
         bars.close()
@@ -262,11 +218,11 @@ class _Bars:
     def __init__(self) -> None:
         self._stage, self._bar = "", None
 
-    def watch(self, progress: Progress) -> None:
+    def watch(self, progress: StageProgress) -> None:
         if progress.stage != self._stage:
             self.close()
             self._stage = progress.stage
-            self._bar = StepBar(progress.stage, progress.steps, progress.step - 1)
+            self._bar = Progress(progress.stage, progress.steps, progress.step - 1, "steps")
         if self._bar is not None:
             quality = "" if np.isnan(progress.psnr) else f"{progress.psnr:.1f} dB, "
             self._bar.update(progress.step, f"{quality}{progress.surfels:,} surfels")
@@ -306,7 +262,7 @@ def _report(
         "albedo_scaling": "per view and channel, least squares on the subject",
         "light": None
         if light is None
-        else {"sigma": light.sigma, "irradiance_l1": float(np.mean(light.irradiance_loss[-50:]))},
+        else {"sigma": light.scale.sigma, "irradiance_l1": float(np.mean(light.cubemap.loss[-50:]))},
         "seconds": seconds,
         "settings": {**settings.model_dump(mode="json"), "overwrite": False},
         "machine": describe_machine(),
@@ -317,6 +273,7 @@ def _write_sheet(path: Path, tracer: SurfelTracer, capture: Capture, light: Envi
     """Held-out views (training views, if none is) with every channel of the G-buffer and the guidance."""
     from tron.apps.labelled_sheet import labelled_sheet
     from tron.color import to_display
+    from tron.estimation import Estimation
     from tron.reconstruction.evaluation import picture, wanted_picture
     from tron.shading.guidance import Lighting, render_guidance
 
@@ -341,9 +298,8 @@ def _write_sheet(path: Path, tracer: SurfelTracer, capture: Capture, light: Envi
         }.items():
             rows.setdefault(name, []).append(image)
         if lighting is not None:
-            guidance = render_guidance(
-                tracer, view.camera, lighting, spp=SHADOW_RAYS, seed=number, denoise=True
-            )
+            estimation = Estimation(rays=SHADOW_RAYS, filtered=True)
+            guidance = render_guidance(tracer, view.camera, lighting, estimation, number)
             for name, image in (("pbr", guidance.pbr), ("irradiance", guidance.irradiance)):
                 rows.setdefault(name, []).append(to_display(image, capture.exposure))
     write_image(path, labelled_sheet(rows, [view.name for view in views]))

@@ -19,17 +19,18 @@ import numpy as np
 import tron
 from tron.apps.camera_files import read_cameras
 from tron.apps.clip import GUIDANCE, Clip, trace
-from tron.apps.command_line import command
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.framing import plan_cameras, turn_cameras, upright
 from tron.apps.relight_settings import QUALITY, Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
+from tron.cli.command_line import command
+from tron.cli.installation import require_extra
 from tron.errors import TronError
 from tron.gaussians.foreign_files import refuse_foreign
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
-from tron.runtime import activate, describe_machine, set_torch_threads
+from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
 from tron.storage import locked, require_free_space, sha256, write_atomic
 
 if TYPE_CHECKING:
@@ -68,8 +69,7 @@ def main(settings: Settings) -> None:
     with locked(settings.output_dir):
         for light, clip in zip(lights, clips):
             clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite)
-        spp, denoise = QUALITY[settings.quality]
-        trace(scene, cameras, clips, spp=spp, denoise=denoise, seed=settings.seed)
+        trace(scene, cameras, clips, estimation=QUALITY[settings.quality], seed=settings.seed)
         clock.lap("guidance")
         if renderer is not None:
             for clip in clips:
@@ -142,14 +142,12 @@ def _load_renderer(settings: Settings) -> Any:
     """The network, before any frame is traced, so that a wrong file is found at once; None without one."""
     if settings.checkpoint is None:
         return None
+    require_extra("checkpoint", "train")
     from tron.neural.weights import load_renderer
 
     if settings.threads is not None:
         set_torch_threads(settings.threads)
-    renderer = load_renderer(settings.checkpoint, settings.vae)
-    if settings.variant.startswith("cuda"):
-        renderer = renderer.to("cuda")
-    return renderer
+    return load_renderer(settings.checkpoint, settings.vae).to(torch_device(settings.variant))
 
 
 def _plan(scene: GaussianScene, settings: Settings) -> list[Camera]:

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from tron.apps.framing import TrajectoryName
 from tron.apps.relit import Background
 from tron.errors import TronError
+from tron.estimation import Estimation
 
 BufferName = Literal[
     "pbr",
@@ -28,8 +29,7 @@ BufferName = Literal[
     "rgb",
     "relit",
 ]
-# Shadow rays a pixel, and whether they are denoised: guidance.md measured both.
-QUALITY = {"preview": (2, True), "final": (64, False)}
+QUALITY = {"preview": Estimation(rays=2, filtered=True), "final": Estimation(rays=64)}
 
 Side = Annotated[int, Field(ge=8, le=8192)]
 

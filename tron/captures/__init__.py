@@ -1,8 +1,7 @@
 """Captures: posed views of a scene, photographed or path-traced; the same type for both."""
 
 from tron.captures.capture import Capture
-from tron.captures.load import load_capture
-from tron.captures.settings import LoadSettings, PosingSettings
+from tron.captures.load import LoadSettings, load_capture
 from tron.captures.view import View
 
-__all__ = ["Capture", "LoadSettings", "PosingSettings", "View", "load_capture"]
+__all__ = ["Capture", "LoadSettings", "View", "load_capture"]

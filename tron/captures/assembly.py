@@ -17,7 +17,7 @@ from tron.captures.distortion import Lens
 from tron.captures.image_folder import view_names
 from tron.captures.orientation import estimate_up
 from tron.captures.photographs import Decode, PhotoCache, PhotoHeader, PhotoReader, inspect_photo
-from tron.captures.settings import LoadSettings
+from tron.captures.settings import PhotoSettings
 from tron.captures.view import View
 from tron.errors import TronError
 
@@ -70,17 +70,18 @@ class PosedPhotos:
     names: Sequence[str] | None = None
 
 
-def assemble(posed: PosedPhotos, settings: LoadSettings) -> Capture:
+def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> Capture:
     """Make a capture of the photos that can be used.
 
-    Photos are read lazily and are display-referred. Of several entries for one image the first is taken.
+    Photos are read lazily and are display-referred, and ``cache_bytes`` of them are kept. Of several entries
+    for one image the first is taken.
 
     Raises:
         TronError: fewer than two photos can be used; the line says why for the most of them.
     """
     if not posed.photos:
         raise TronError("the file names no photos", posed.source)
-    cache = PhotoCache(settings.cache_bytes)
+    cache = PhotoCache(cache_bytes)
     skipped = dict(posed.skipped)
     views: dict[str, View] = {}
     splits: dict[str, str | None] = {}
@@ -120,7 +121,7 @@ def _view(
     name: str,
     photo: PosedPhoto,
     upright: bool,
-    settings: LoadSettings,
+    settings: PhotoSettings,
     cache: PhotoCache,
     lost_maps: list[str],
     reduced: list[tuple[tuple[int, int], tuple[int, int]]],
@@ -235,10 +236,10 @@ def _report(posed: PosedPhotos, skipped: Mapping[str, str], usable: int, lost_ma
 
 
 def _tell_reduced(
-    source: Path, count: int, reduced: list[tuple[tuple[int, int], tuple[int, int]]], settings: LoadSettings
+    source: Path, count: int, reduced: list[tuple[tuple[int, int], tuple[int, int]]], settings: PhotoSettings
 ) -> None:
     """Say what ``max_side`` cost; ``downscale`` is asked for, so that it needs no line."""
-    if settings.max_side is None or not reduced:
+    if settings.max_side is None or settings.downscale is not None or not reduced:
         return
     (width, height), (small_width, small_height) = max(reduced)
     log.warning(

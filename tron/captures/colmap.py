@@ -11,6 +11,7 @@ from tron.captures.assembly import PosedPhoto, PosedPhotos
 from tron.captures.colmap_files import require_whole
 from tron.captures.distortion import Lens
 from tron.captures.image_folder import ImageFolder, photos_in, view_names
+from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
 
 if TYPE_CHECKING:
@@ -30,13 +31,13 @@ def model_folder(path: Path) -> Path | None:
     return None
 
 
-def read_colmap(path: Path, images: str | Path | None = None) -> PosedPhotos:
+def read_colmap(path: Path, settings: PhotoSettings) -> PosedPhotos:
     """Read a capture posed by COLMAP; its world is COLMAP's.
 
     Args:
         path: folder with a model (see :func:`model_folder`) and ``images`` or a reduced copy, ``images_4``.
             For a folder that is ``sparse/0`` itself the images lie beside ``sparse``.
-        images: as in :class:`ImageFolder`.
+        settings: ``images`` as in :class:`ImageFolder`.
 
     Raises:
         TronError: no model, or one that pycolmap cannot read.
@@ -48,7 +49,7 @@ def read_colmap(path: Path, images: str | Path | None = None) -> PosedPhotos:
     root = path
     if folder.resolve() == path.resolve():
         root = path.parent.parent if path.parent.name == "sparse" else path.parent
-    found = ImageFolder(root, images or ("." if images is None and _beside(root, model) else None))
+    found = ImageFolder(root, settings.images or ("." if _beside(root, model) else None))
     prefix = "" if found.images is not None else "images/"
     posed = posed_by(model)
     photos = []

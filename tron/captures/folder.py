@@ -17,6 +17,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal, NamedTuple
@@ -26,6 +27,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from tron.cameras import Camera, opencv_to_opengl, opengl_to_opencv
 from tron.captures.capture import Capture
+from tron.captures.settings import PhotoSettings
+from tron.captures.transforms import read_json
 from tron.captures.view import ColorSpace, View
 from tron.errors import TronError
 from tron.images import MAX_SIDE, encode_exr, encode_png, read_image
@@ -211,6 +214,32 @@ def read_capture_folder(path: str | os.PathLike[str]) -> Capture:
             transform=np.array(tron.transform),
             skipped=tron.skipped,
         )
+
+
+def is_capture_folder(path: Path) -> bool:
+    """Whether a path is a folder of :func:`write_capture`, or the transforms.json in it."""
+    file = path / TRANSFORMS_NAME if path.is_dir() else path
+    return file.is_file() and "tron" in read_json(file)
+
+
+def load_traced(path: Path, settings: PhotoSettings) -> Capture:
+    """Read a capture folder as it is: its maps hold values that resizing must not mix.
+
+    Args:
+        path: as in :func:`read_capture_folder`.
+        settings: ``up`` replaces the capture's own.
+
+    Raises:
+        TronError: as :func:`read_capture_folder`, or the settings ask for smaller views.
+    """
+    capture = read_capture_folder(path)
+    for view in capture.views:
+        size = (view.camera.width, view.camera.height)
+        if settings.size_of(*size) != size:
+            raise TronError("path-traced views cannot be reduced", path, "render them smaller")
+    if settings.up is None:
+        return capture
+    return replace(capture, up=np.array(settings.up) / np.linalg.norm(settings.up))
 
 
 def _require_ours(path: Path, overwrite: bool) -> None:

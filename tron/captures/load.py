@@ -1,30 +1,83 @@
-"""One door for every kind of capture."""
+"""One door for every kind of capture, and the table of the formats it knows."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
+from pydantic import ConfigDict, Field
 
-from tron.captures.assembly import assemble
+from tron.captures.assembly import PosedPhotos, assemble
 from tron.captures.capture import Capture
+from tron.captures.colmap import model_folder, read_colmap
+from tron.captures.folder import is_capture_folder, load_traced
 from tron.captures.not_a_capture import refusal
-from tron.captures.settings import Format, LoadSettings
+from tron.captures.settings import PhotoSettings
+from tron.captures.structure_from_motion import MatchingSettings, PosingSettings, has_photos, pose_photos
+from tron.captures.tensoir import TensoirSettings, is_tensoir, read_tensoir
+from tron.captures.transforms import has_transforms, read_transforms
 from tron.errors import TronError
 
 
+@dataclass(frozen=True)
+class CaptureFormat:
+    """Kind of folder that a capture is read from.
+
+    Attributes:
+        holds: what lies in the folder, for help and errors.
+        detect: whether a folder (or a file, where ``from_file``) is of this format.
+        read: the photos that a path names, with their poses, or a whole capture; takes the
+            :class:`LoadSettings`. A format's own settings are a model of its file that
+            :class:`CaptureSettings` inherits.
+        from_file: whether a single ``.json`` file is taken in place of a folder.
+    """
+
+    holds: str
+    detect: Callable[[Path], object]
+    read: Callable[[Path, Any], PosedPhotos | Capture]
+    from_file: bool = False
+
+
+FORMATS = {
+    "tron": CaptureFormat("tron-datagen's views", is_capture_folder, load_traced, from_file=True),
+    "transforms": CaptureFormat(
+        "transforms.json of NeRF, instant-ngp, nerfstudio, DL3DV", has_transforms, read_transforms, True
+    ),
+    "colmap": CaptureFormat("COLMAP's sparse/0", model_folder, read_colmap),
+    "tensoir": CaptureFormat("TensoIR's folders train_000, ...", is_tensoir, read_tensoir),
+    "photos": CaptureFormat("photos, posed by structure from motion", has_photos, pose_photos),
+}
+"""Formats by the names that ``format=`` takes, in the order in which ``auto`` looks for them."""
+
+HOLDS = "; ".join(f"{name}: {each.holds}" for name, each in FORMATS.items())
+
+if TYPE_CHECKING:
+    FormatName = str
+else:
+    FormatName = Literal[("auto", *FORMATS)]
+
+
+class CaptureSettings(MatchingSettings, TensoirSettings, PhotoSettings):
+    """Choices of how a capture is read; path-traced views (``tron``) have their own split and heed ``up``."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    format: FormatName = Field(
+        default="auto", description=f"what the folder holds. {HOLDS}; auto: looks, in this order"
+    )
+
+
+class LoadSettings(CaptureSettings, PosingSettings):
+    """All that :func:`load_capture` can be told: what users say, and what the calling program knows."""
+
+    cache_bytes: int = Field(default=1_000_000_000, ge=0, description="decoded image data kept in memory")
+
+
 def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = None) -> Capture:
-    """Load a capture; photos are decoded when they are looked at.
-
-    Formats, in the order in which ``auto`` looks for them:
-
-    - ``tron``: our own path-traced views, a ``transforms.json`` with the key ``tron``;
-    - ``transforms``: ``transforms.json`` or ``transforms_train.json`` (NeRF, instant-ngp, nerfstudio, DL3DV);
-    - ``colmap``: ``sparse/0``, binary or text;
-    - ``tensoir``: folders ``train_000``, ... with ``metadata.json``;
-    - ``photos``: no poses, but photos in ``images`` or the folder itself; structure from motion poses them.
+    """Load a capture of one of the :data:`FORMATS`; photos are decoded when they are looked at.
 
     What the files name and cannot be used is in ``Capture.skipped`` and is logged in one line.
 
@@ -41,66 +94,16 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
     if not path.exists():
         raise TronError("capture not found", path)
     if path.is_file() and path.suffix.lower() != ".json":
-        raise refusal(path)
-    kind = _detected(path) if settings.format == "auto" else settings.format
-    if kind == "tron":
-        return _path_traced(path, settings)
-    if kind == "transforms":
-        from tron.captures.transforms import read_transforms
-
-        return assemble(read_transforms(path, settings.images), settings)
-    if not path.is_dir():
-        raise TronError(f"a capture of format {kind} is a folder", path)
-    if kind == "colmap":
-        from tron.captures.colmap import read_colmap
-
-        return assemble(read_colmap(path, settings.images), settings)
-    if kind == "tensoir":
-        from tron.captures.tensoir import read_tensoir
-
-        return assemble(read_tensoir(path, settings.light), settings)
-    from tron.captures.structure_from_motion import pose_photos
-
-    return assemble(pose_photos(_photo_folder(path, settings.images), settings.posing), settings)
+        raise refusal(path, HOLDS)
+    name = _detected(path) if settings.format == "auto" else settings.format
+    if not (path.is_dir() or FORMATS[name].from_file):
+        raise TronError(f"a capture of format {name} is a folder", path)
+    found = FORMATS[name].read(path, settings)
+    return found if isinstance(found, Capture) else assemble(found, settings, settings.cache_bytes)
 
 
-def _path_traced(path: Path, settings: LoadSettings) -> Capture:
-    """Our own views, read as they are: their maps hold values that resizing must not mix."""
-    from tron.captures.folder import read_capture_folder
-
-    capture = read_capture_folder(path)
-    for view in capture.views:
-        size = (view.camera.width, view.camera.height)
-        if settings.size_of(*size) != size:
-            raise TronError("path-traced views cannot be reduced", path, "render them smaller")
-    if settings.up is None:
-        return capture
-    return replace(capture, up=np.array(settings.up, float) / np.linalg.norm(settings.up))
-
-
-def _detected(path: Path) -> Format:
-    from tron.captures.colmap import model_folder
-    from tron.captures.image_folder import photos_in
-    from tron.captures.tensoir import is_tensoir
-    from tron.captures.transforms import read_json
-
-    poses = path / "transforms.json" if path.is_dir() else path
-    if poses.is_file():
-        return "tron" if "tron" in read_json(poses) else "transforms"
-    if (path / "transforms_train.json").is_file():
-        return "transforms"
-    if model_folder(path):
-        return "colmap"
-    if is_tensoir(path):
-        return "tensoir"
-    if photos_in(path / "images") or photos_in(path):
-        return "photos"
-    raise refusal(path)
-
-
-def _photo_folder(path: Path, images: str | Path | None) -> Path:
-    from tron.captures.image_folder import photos_in
-
-    if images is not None:
-        return path / images
-    return path / "images" if photos_in(path / "images") else path
+def _detected(path: Path) -> str:
+    for name, each in FORMATS.items():
+        if (path.is_dir() or each.from_file) and each.detect(path):
+            return name
+    raise refusal(path, HOLDS)

@@ -31,8 +31,13 @@ _KINDS: dict[str, tuple[str, str]] = {
 _CAMERA_PATH = "camera_path"
 
 
-def refusal(path: Path) -> TronError:
-    """Error for a file other than ``.json``, or a folder without poses and photos: what there is instead."""
+def refusal(path: Path, captures: str) -> TronError:
+    """Error for a file other than ``.json``, or a folder without poses and photos: what there is instead.
+
+    Args:
+        path: the file or folder.
+        captures: what there might be, for the line's end.
+    """
     if not path.is_dir():
         kind = _kind(path)
         if kind is None:
@@ -42,11 +47,7 @@ def refusal(path: Path) -> TronError:
         kind = _kind(file)
         if kind is not None:
             return TronError(f"neither poses nor photos, but {kind[0]}", file, kind[1])
-    return TronError(
-        "neither poses nor photos",
-        path,
-        "a capture has transforms.json, sparse/0, TensoIR's view folders, or photos",
-    )
+    return TronError("neither poses nor photos", path, f"give a folder of one of these: {captures}")
 
 
 def _kind(file: Path) -> tuple[str, str] | None:

@@ -13,15 +13,16 @@ import os
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from PIL import Image, ImageOps
+from pydantic import BaseModel, Field
 
 from tron.captures.assembly import PosedPhoto, PosedPhotos
 from tron.captures.colmap import points_of, posed_by, read_model
 from tron.captures.image_folder import photos_in
 from tron.captures.photographs import inspect_photo
-from tron.captures.settings import PosingSettings
+from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
 from tron.storage import locked, sha256, write_atomic
 
@@ -43,20 +44,53 @@ _FEWEST = 3
 _QUALITY = 95
 
 
-def pose_photos(folder: Path, settings: PosingSettings, progress: Progress = log.info) -> PosedPhotos:
+class MatchingSettings(BaseModel):
+    """Order of the photos, as the user knows it."""
+
+    matching: Literal["auto", "exhaustive", "sequential"] = Field(
+        default="auto",
+        description="how photos without poses are matched: exhaustive compares every pair, sequential each "
+        "with the ten after it by name, as suits videos; auto: exhaustive up to 200 photos",
+    )
+
+
+class PosingSettings(MatchingSettings, PhotoSettings):
+    """Structure from motion of photos without poses."""
+
+    workspace: Path | None = Field(
+        default=None, description="folder that keeps the poses; null: structure_from_motion beside the photos"
+    )
+    feature_side: int = Field(
+        default=1600, ge=64, description="features are sought in copies of at most so many pixels a side"
+    )
+    threads: int = Field(
+        default=0,
+        ge=0,
+        description="threads; 0: all cores; 1 gives the same poses bit by bit, more nearly so",
+    )
+    seed: int = Field(default=0, description="root of the random samples that poses are estimated from")
+
+
+def has_photos(path: Path) -> bool:
+    """Whether a folder, or ``images`` in it, holds photos."""
+    return bool(photos_in(path / "images") or photos_in(path))
+
+
+def pose_photos(path: Path, settings: PosingSettings, progress: Progress = log.info) -> PosedPhotos:
     """Pose the photos of a folder; the world's scale and axes are arbitrary.
 
     The result is kept in the workspace and taken from there while photos and settings stay the same. Of
     several models that do not connect the largest is taken; photos outside of it are skipped.
 
     Args:
-        folder: holds the photos themselves.
-        settings: see :class:`PosingSettings`.
+        path: holds the photos, itself or in ``images``.
+        settings: ``images`` names another folder in it.
         progress: told in a line what begins.
 
     Raises:
         TronError: fewer than three usable photos, or none that could be posed.
     """
+    folder = path / (settings.images or ("images" if photos_in(path / "images") else "."))
     workspace = settings.workspace or folder / WORKSPACE
     skipped: dict[str, str] = {}
     photos: list[Path] = []
@@ -94,7 +128,7 @@ def _posed_copies(
         "version": _VERSION,
         "photos": {path.name: sha256(path) for path in photos},
         "matching": settings.matching,
-        "max_side": settings.max_side,
+        "max_side": settings.feature_side,
         "seed": settings.seed,
     }
     kept = _kept(record)
@@ -107,7 +141,7 @@ def _posed_copies(
     for stale in workspace.glob("database.db*"):
         stale.unlink()
     progress(f"copying {len(photos)} photos for feature extraction")
-    copies = _copy(photos, workspace / "images", settings.max_side)
+    copies = _copy(photos, workspace / "images", settings.feature_side)
     _map(workspace, len(photos), settings, progress)
     write_atomic(record, json.dumps({"wanted": wanted, "copies": copies}, indent=1))
     shutil.rmtree(workspace / "images", ignore_errors=True)

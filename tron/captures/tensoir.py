@@ -11,6 +11,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from tron.cameras import opengl_to_opencv
 from tron.captures.assembly import PosedPhoto, PosedPhotos, rigid_pose
@@ -24,21 +25,30 @@ _CURVE = 2.2
 _FOLDER = re.compile(r"(train|test)_\d+")
 
 
+class TensoirSettings(BaseModel):
+    """Light of a TensoIR scene: its photos are ``rgba_{light}.png``, or ``rgba.png`` for that of training."""
+
+    tensoir_light: str = Field(
+        default=TRAIN_LIGHT, description="which light of a TensoIR scene is reconstructed"
+    )
+
+
 def is_tensoir(path: Path) -> bool:
     """Whether a folder looks like one of TensoIR's scenes."""
     return path.is_dir() and any((each / "metadata.json").is_file() for each in _view_folders(path))
 
 
-def read_tensoir(path: Path, light: str = TRAIN_LIGHT) -> PosedPhotos:
+def read_tensoir(path: Path, settings: TensoirSettings) -> PosedPhotos:
     """Read a scene; its world is Blender's, z up.
 
     Args:
         path: the scene's folder, such as ``lego``.
-        light: which photos to take: ``rgba_{light}.png``, and ``rgba.png`` for the light of training.
+        settings: which photos to take.
 
     Raises:
         TronError: no view folders, no view with a photo under this light, unreadable metadata.
     """
+    light = settings.tensoir_light
     relative_parts(light)
     folders = _view_folders(path)
     if not folders:

@@ -30,6 +30,7 @@ from tron.captures.assembly import PosedPhoto, PosedPhotos, rigid_pose
 from tron.captures.distortion import Lens, opencv_lens
 from tron.captures.image_folder import ImageFolder, relative_parts
 from tron.captures.not_a_capture import require_poses_of_photos
+from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
 
 log = logging.getLogger(__name__)
@@ -43,20 +44,25 @@ _SPLITS = ("train", "val", "test")
 Split = Literal["train", "test"]
 
 
-def read_transforms(path: Path, images: str | Path | None = None) -> PosedPhotos:
+def has_transforms(path: Path) -> bool:
+    """Whether a path is, or a folder holds, a file of poses that :func:`read_transforms` reads."""
+    return path.is_file() or any((path / f"transforms{end}.json").is_file() for end in ("", "_train"))
+
+
+def read_transforms(path: Path, settings: PhotoSettings) -> PosedPhotos:
     """Read the poses of a capture.
 
     Args:
         path: a ``.json`` file, or a folder with ``transforms.json`` or ``transforms_train.json`` (and
             ``transforms_test.json``, which is held out; ``transforms_val.json`` is left alone).
-        images: as in :class:`ImageFolder`.
+        settings: ``images`` as in :class:`ImageFolder`.
 
     Raises:
         TronError: unreadable JSON, JSON of another shape, an image name that leads out of the folder.
     """
     files = _files(path)
     root = path if path.is_dir() else path.parent
-    folder = ImageFolder(root, images)
+    folder = ImageFolder(root, settings.images)
     photos: list[PosedPhoto] = []
     skipped: dict[str, str] = {}
     points = colors = None

@@ -16,30 +16,31 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plyfile
 
 from tron.color import srgb_to_linear
 from tron.errors import TronError
+from tron.gaussians.fields import FIELDS, MATERIALS
 from tron.gaussians.foreign_files import packed_splats, refuse_foreign
 from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
-from tron.gaussians.scene import GaussianScene, measure_spacing
 from tron.storage import atomic_path
 
 log = logging.getLogger(__name__)
 
-POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
-DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 REST = tuple(f"f_rest_{i}" for i in range(3 * (SH_COUNT - 1)))
-SCALES = ("scale_0", "scale_1", "scale_2")
-ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-BASE_COLOR = ("base_color_0", "base_color_1", "base_color_2")
-MATERIALS = (*BASE_COLOR, "roughness", "metallic")
-REQUIRED = (*POSITION, *DC, "opacity", *SCALES[:2], *ROTATION)
+THIRD_SCALE = "scale_2"
+MATERIAL_PROPERTIES = tuple(name for material in MATERIALS for name in FIELDS[material].properties)
+REQUIRED = tuple(
+    name
+    for field in ("means", "sh", "opacity_logits", "log_scales", "quats")
+    for name in FIELDS[field].properties
+)
 
 # The third scale of a surfel, as a fraction of its smaller one: flat, yet far from underflow in any reader.
 FLATNESS = 1e-3
@@ -61,21 +62,28 @@ _TYPE_BYTES = {
 _EXPORT = "is it a Gaussian scene? export it as an uncompressed 3DGS or 2DGS PLY"
 
 
-def write_ply(path: str | Path, scene: GaussianScene) -> None:
-    """Write a scene, atomically. Raises TronError if the scene is not whole or the file cannot be written."""
-    scene.validate()
+def write_ply(path: str | Path, scene: Mapping[str, Any]) -> None:
+    """Write what a valid scene holds, by the names of GaussianScene's attributes, and its ``normals`` (M, 3).
+
+    Raises:
+        TronError: the file cannot be written.
+    """
+    sh, log_scales = scene["sh"], scene["log_scales"]
     columns: dict[str, np.ndarray] = {}
-    columns.update(zip(POSITION, scene.means.T))
-    columns.update(zip(NORMAL, scene.normals().T))
-    columns.update(zip(DC, scene.sh[:, 0].T))
-    columns.update(zip(REST, scene.sh[:, 1:].transpose(2, 1, 0).reshape(len(REST), len(scene))))
-    columns["opacity"] = scene.opacity_logits
-    columns.update(zip(SCALES, scene.log_scales.T))
-    columns[SCALES[2]] = scene.log_scales.min(axis=1) + np.float32(np.log(FLATNESS))
-    columns.update(zip(ROTATION, scene.quats.T))
-    columns.update(zip(BASE_COLOR, scene.base_color.T))
-    columns.update(roughness=scene.roughness, metallic=scene.metallic, object_id=scene.object_id)
-    rows = np.empty(len(scene), dtype=[(name, "<i4" if name == "object_id" else "<f4") for name in columns])
+
+    def add(names: Sequence[str], values: np.ndarray) -> None:
+        columns.update(zip(names, values.reshape(len(sh), -1).T))
+
+    add(FIELDS["means"].properties, scene["means"])
+    add(NORMAL, scene["normals"])
+    add(FIELDS["sh"].properties, sh[:, 0])
+    add(REST, sh[:, 1:].transpose(0, 2, 1))
+    add(FIELDS["opacity_logits"].properties, scene["opacity_logits"])
+    add(FIELDS["log_scales"].properties, log_scales)
+    add([THIRD_SCALE], log_scales.min(axis=1) + np.float32(np.log(FLATNESS)))
+    for name in ("quats", *MATERIALS, "object_id"):
+        add(FIELDS[name].properties, scene[name])
+    rows = np.empty(len(sh), dtype=[(name, "<i4" if name == "object_id" else "<f4") for name in columns])
     for name, values in columns.items():
         rows[name] = values
     element = plyfile.PlyElement.describe(rows, "vertex")
@@ -83,19 +91,20 @@ def write_ply(path: str | Path, scene: GaussianScene) -> None:
         plyfile.PlyData([element], byte_order="<", comments=_constants(scene)).write(str(temporary))
 
 
-def read_ply(path: str | Path) -> GaussianScene:
-    """Read a TRON, 2DGS or 3DGS PLY, binary or ascii.
+def read_ply(path: str | Path) -> dict[str, Any]:
+    """Attributes of the GaussianScene in a TRON, 2DGS or 3DGS PLY; ``spacing`` only if the file says it.
 
     Of three scales the smallest is dropped and the rotation permuted, so that the surfel's normal is the axis
     along which the Gaussian was thinnest; quaternions are normalised. f_rest of degree 0 to 3 is accepted. A
     file without materials gets guessed ones (base colour from the mean colour, rough, not metallic) and says
-    so in `materials_guessed`; a file that is not TRON's has unoriented normals (`oriented` is False), kernel
-    degree 2 and a measured spacing. Up is what a comment says, TRON's or nerfstudio's ("Vertical Axis: z");
-    where none does it is -y, and `up_guessed` is True. An opacity logit of +infinity means opaque; surfels
-    whose logit is -infinity or NaN are left out, with one line in the log that counts both.
+    so in `materials_guessed`; a file that is not TRON's has unoriented normals (`oriented` is False) and
+    kernel degree 2. Up is what a comment says, TRON's or nerfstudio's ("Vertical Axis: z"); where none does
+    it is -y, and `up_guessed` is True. An opacity logit of +infinity means opaque; surfels whose logit is
+    -infinity or NaN are left out, with one line in the log that counts both.
 
-    Raises TronError, one line, for files that are missing, are no PLY or a packed one, lack properties
-    (named), declare more than they hold, or hold NaN, infinities or zero quaternions elsewhere.
+    Raises:
+        TronError: files that are missing, are no PLY or a packed one, lack properties (named), declare more
+            than they hold, or hold NaN, infinities or zero quaternions elsewhere.
     """
     path = Path(path)
     check_header(path)
@@ -111,38 +120,37 @@ def read_ply(path: str | Path) -> GaussianScene:
     columns = _with_finite_opacity(columns, path)
     up, up_guessed = _up(constants, data.comments)
 
-    def stack(names: tuple[str, ...]) -> np.ndarray:
+    def stack(names: Sequence[str]) -> np.ndarray:
         return np.stack([np.asarray(columns[name], dtype=np.float32) for name in names], axis=-1)
 
-    means = stack(POSITION)
+    def field(name: str) -> np.ndarray:
+        values = stack(FIELDS[name].properties)
+        return values if FIELDS[name].shape else values[:, 0]
+
+    means = field("means")
     if not len(means):
         raise TronError("the scene has no surfels", path)
     if not np.isfinite(means).all():
         raise TronError("a position is not finite", path)
-    quats, log_scales = _flatten(stack(ROTATION), stack(tuple(n for n in SCALES if n in columns)), path)
+    scales = [name for name in (*FIELDS["log_scales"].properties, THIRD_SCALE) if name in columns]
+    quats, log_scales = _flatten(field("quats"), stack(scales), path)
     sh = _harmonics(columns, stack, path)
-    guessed = MATERIALS[0] not in columns
-    base_color, roughness, metallic = (
-        _guess(sh) if guessed else map(stack, (BASE_COLOR, ("roughness",), ("metallic",)))
-    )
-    scene = GaussianScene(
-        means=means,
-        quats=quats,
-        log_scales=log_scales,
-        opacity_logits=stack(("opacity",))[:, 0],
-        sh=sh,
-        base_color=base_color,
-        roughness=roughness[:, 0],
-        metallic=metallic[:, 0],
-        object_id=_object_id(columns, len(means), path),
-        kernel_degree=int(constants.get("kernel_degree", [2])[0]),
-        spacing=constants["spacing"][0] if "spacing" in constants else measure_spacing(means),
-        up=np.array(up),
-        up_guessed=up_guessed,
-        materials_guessed=guessed or bool(constants.get("materials_guessed", [0])[0]),
-        oriented=bool(constants.get("oriented", [0])[0]),
-    )
-    return scene.validate(path)
+    guessed = MATERIAL_PROPERTIES[0] not in columns
+    return {
+        "means": means,
+        "quats": quats,
+        "log_scales": log_scales,
+        "opacity_logits": field("opacity_logits"),
+        "sh": sh,
+        **(_guess(sh) if guessed else {name: field(name) for name in MATERIALS}),
+        "object_id": _object_id(columns, len(means), path),
+        "kernel_degree": int(constants.get("kernel_degree", [2])[0]),
+        **({"spacing": constants["spacing"][0]} if "spacing" in constants else {}),
+        "up": np.array(up),
+        "up_guessed": up_guessed,
+        "materials_guessed": guessed or bool(constants.get("materials_guessed", [0])[0]),
+        "oriented": bool(constants.get("oriented", [0])[0]),
+    }
 
 
 def check_header(path: Path) -> None:
@@ -162,16 +170,14 @@ def check_header(path: Path) -> None:
     _check_sizes(head, size, path)
 
 
-def _constants(scene: GaussianScene) -> list[str]:
-    up = " ".join(repr(float(v)) for v in scene.up)
-    guessed = ["tron up_guessed 1"] if scene.up_guessed else []
+def _constants(scene: Mapping[str, Any]) -> list[str]:
     return [
-        *guessed,
-        f"tron kernel_degree {scene.kernel_degree}",
-        f"tron spacing {scene.spacing!r}",
-        f"tron up {up}",
-        f"tron oriented {int(scene.oriented)}",
-        f"tron materials_guessed {int(scene.materials_guessed)}",
+        *(["tron up_guessed 1"] if scene["up_guessed"] else []),
+        f"tron kernel_degree {scene['kernel_degree']}",
+        f"tron spacing {scene['spacing']!r}",
+        f"tron up {' '.join(repr(float(v)) for v in scene['up'])}",
+        f"tron oriented {int(scene['oriented'])}",
+        f"tron materials_guessed {int(scene['materials_guessed'])}",
     ]
 
 
@@ -247,11 +253,17 @@ def _check_properties(columns: dict[str, np.ndarray], path: Path) -> None:
     if missing:
         raise TronError(f"the PLY lacks {', '.join(missing)}", path, _EXPORT)
     for name, values in columns.items():
-        if values.dtype == object and name in (*REQUIRED, *REST, *MATERIALS, SCALES[2], "object_id"):
+        if values.dtype == object and name in (
+            *REQUIRED,
+            *REST,
+            *MATERIAL_PROPERTIES,
+            THIRD_SCALE,
+            "object_id",
+        ):
             raise TronError(f"property {name} is a list", path, _EXPORT)
-    present = [name for name in MATERIALS if name in columns]
-    if present and len(present) < len(MATERIALS):
-        absent = ", ".join(name for name in MATERIALS if name not in columns)
+    present = [name for name in MATERIAL_PROPERTIES if name in columns]
+    if present and len(present) < len(MATERIAL_PROPERTIES):
+        absent = ", ".join(name for name in MATERIAL_PROPERTIES if name not in columns)
         raise TronError(f"the PLY has {present[0]} but lacks {absent}", path, "write all materials or none")
 
 
@@ -269,17 +281,20 @@ def _with_finite_opacity(columns: dict[str, np.ndarray], path: Path) -> dict[str
     return {name: values[~absent] for name, values in columns.items()}
 
 
-def _guess(sh: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Base colour (M, 3) linear, roughness and metallic (M, 1) of Gaussians known by colour alone."""
-    base_color = srgb_to_linear(np.clip(dc_to_rgb(sh[:, 0]), 0, 1))
-    return base_color, np.full((len(sh), 1), GUESSED_ROUGHNESS), np.full((len(sh), 1), GUESSED_METALLIC)
+def _guess(sh: np.ndarray) -> dict[str, np.ndarray]:
+    """Materials of Gaussians known by colour alone."""
+    return {
+        "base_color": srgb_to_linear(np.clip(dc_to_rgb(sh[:, 0]), 0, 1)),
+        "roughness": np.full(len(sh), GUESSED_ROUGHNESS),
+        "metallic": np.full(len(sh), GUESSED_METALLIC),
+    }
 
 
 def _harmonics(
-    columns: dict[str, np.ndarray], stack: Callable[[tuple[str, ...]], np.ndarray], path: Path
+    columns: dict[str, np.ndarray], stack: Callable[[Sequence[str]], np.ndarray], path: Path
 ) -> np.ndarray:
     """(M, 16, 3) coefficients; degrees that the file does not have are zero."""
-    dc = stack(DC)
+    dc = stack(FIELDS["sh"].properties)
     sh = np.zeros((len(dc), SH_COUNT, 3), np.float32)
     sh[:, 0] = dc
     count = sum(name.startswith("f_rest_") for name in columns)

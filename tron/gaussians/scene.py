@@ -16,25 +16,15 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from tron.errors import TronError
-from tron.gaussians.harmonics import SH_COUNT, rotate_sh
+from tron.gaussians.fields import FIELDS, MATERIALS
+from tron.gaussians.harmonics import rotate_sh
+from tron.gaussians.ply import read_ply, write_ply
 
 KERNEL_DEGREES = (2, 4)
 # Densities are measured on at most this many surfels: the median does not move, a million queries take
 # seconds.
 SPACING_QUERIES = 50_000
 
-_SHAPES: dict[str, tuple[int, ...]] = {
-    "means": (3,),
-    "quats": (4,),
-    "log_scales": (2,),
-    "opacity_logits": (),
-    "sh": (SH_COUNT, 3),
-    "base_color": (3,),
-    "roughness": (),
-    "metallic": (),
-    "object_id": (),
-}
-_UNIT_INTERVAL = ("base_color", "roughness", "metallic")
 _TOLERANCE = 1e-3
 # Scales beyond e^+-40 overflow float32 once they are squared.
 _LOG_SCALE_LIMIT = 40.0
@@ -46,23 +36,23 @@ class GaussianScene:
 
     Arrays are float32 (object_id int32); other dtypes are converted on construction.
 
-    means           (M, 3)     centres, world units
-    quats           (M, 4)     unit quaternions (w, x, y, z); the columns of R are tangent u, tangent v,
-    normal log_scales      (M, 2)     natural logarithm of the standard deviations along u and v, world units
-    opacity_logits  (M,)       opacity = 1 / (1 + exp(-logit))
-    sh              (M, 16, 3) degree-3 harmonics of the radiance in *display* space: colour = max(0, SH +
-    0.5) base_color      (M, 3)     linear, in [0, 1]
-    roughness       (M,)       in [0, 1]; GGX alpha is its square
-    metallic        (M,)       in [0, 1]
-    object_id       (M,)       which object a surfel belongs to; 0 where nothing is known
-    kernel_degree              2: exp(-d^2 / 2), as in 2DGS; 4: exp(-4.5/81 d^4), flatter and sharper
-    spacing                    distance between neighbouring surfels, world units (see measure_spacing)
-    up              (3,)       unit up direction
-    up_guessed                 True where nobody has said which way is up
-    materials_guessed          True where the materials were derived from colours, not measured
-    oriented                   False where the sign of the normals means nothing, as in files of 3DGS: camera
-    rays
-                               skip back faces, so such scenes are turned towards each camera first (`facing`)
+    Attributes:
+        means: (M, 3) centres, world units.
+        quats: (M, 4) unit quaternions (w, x, y, z); the columns of R are tangent u, tangent v, normal.
+        log_scales: (M, 2) natural logarithm of the standard deviations along u and v, world units.
+        opacity_logits: (M,) opacity = 1 / (1 + exp(-logit)).
+        sh: (M, 16, 3) degree-3 harmonics of the radiance in *display* space: colour = max(0, SH + 0.5).
+        base_color: (M, 3) linear, in [0, 1].
+        roughness: (M,) in [0, 1]; GGX alpha is its square.
+        metallic: (M,) in [0, 1].
+        object_id: (M,) which object a surfel belongs to; 0 where nothing is known.
+        kernel_degree: 2 for exp(-d^2 / 2), as in 2DGS; 4 for exp(-4.5/81 d^4), flatter and sharper.
+        spacing: distance between neighbouring surfels, world units (see :func:`measure_spacing`).
+        up: (3,) unit up direction.
+        up_guessed: True where nobody has said which way is up.
+        materials_guessed: True where the materials were derived from colours, not measured.
+        oriented: False where the sign of the normals means nothing, as in files of 3DGS: camera rays skip
+            back faces, so such scenes are turned towards each camera first (:meth:`facing`).
     """
 
     means: np.ndarray
@@ -82,8 +72,8 @@ class GaussianScene:
     oriented: bool = True
 
     def __post_init__(self) -> None:
-        for name in _SHAPES:
-            dtype = np.int32 if name == "object_id" else np.float32
+        for name, described in FIELDS.items():
+            dtype = np.float32 if described.trained else np.int32
             setattr(self, name, np.ascontiguousarray(getattr(self, name), dtype=dtype))
         self.up = np.asarray(self.up, dtype=np.float64)
         self.kernel_degree = int(self.kernel_degree)
@@ -159,16 +149,16 @@ class GaussianScene:
         count = len(self.means)
         if count == 0:
             raise TronError("the scene has no surfels")
-        for name, shape in _SHAPES.items():
-            values = getattr(self, name)
-            if values.shape != (count, *shape):
-                raise TronError(f"{name} has shape {values.shape}, expected {(count, *shape)}")
+        for name, described in FIELDS.items():
+            values, expected = getattr(self, name), (count, *described.shape)
+            if values.shape != expected:
+                raise TronError(f"{name} has shape {values.shape}, expected {expected}")
             bad = ~np.isfinite(values.reshape(count, -1)).all(axis=1)
             if bad.any():
                 raise TronError(
                     f"{name} of {bad.sum()} of {count} surfels is not finite (first: {bad.argmax()})"
                 )
-        for name in _UNIT_INTERVAL:
+        for name in MATERIALS:
             values = getattr(self, name).reshape(count, -1)
             bad = ((values < -_TOLERANCE) | (values > 1 + _TOLERANCE)).any(axis=1)
             if bad.any():
@@ -193,17 +183,26 @@ class GaussianScene:
             raise TronError(f"up is {self.up.tolist()}", mend="give a unit vector of three numbers")
 
     def save(self, path: str | Path) -> None:
-        """Write a PLY that 3DGS readers open too (tron.gaussians.ply.write_ply)."""
-        from tron.gaussians.ply import write_ply
+        """Write a PLY that 3DGS readers open too (:mod:`tron.gaussians.ply`), atomically.
 
-        write_ply(path, self)
+        Raises:
+            TronError: the scene is not whole, or the file cannot be written.
+        """
+        write_ply(path, vars(self.validate()) | {"normals": self.normals()})
 
     @classmethod
     def load(cls, path: str | Path) -> GaussianScene:
-        """Read a TRON, 2DGS or 3DGS PLY (tron.gaussians.ply.read_ply)."""
-        from tron.gaussians.ply import read_ply
+        """Read a TRON, 2DGS or 3DGS PLY; what files leave out: :func:`tron.gaussians.ply.read_ply`.
 
-        return read_ply(path)
+        A file that says no spacing has it measured.
+
+        Raises:
+            TronError: no such file, or no scene in it.
+        """
+        values = read_ply(path)
+        if "spacing" not in values:
+            values["spacing"] = measure_spacing(values["means"])
+        return cls(**values).validate(path)
 
 
 def rotation_matrices(quats: np.ndarray) -> np.ndarray:

@@ -5,8 +5,6 @@ texel by texel. Any other emitter (tilted, mirrored, of another shape, ``constan
 its radiance on a grid finer than the map, and averaged.
 """
 
-# (Mitsuba's type stubs do not know arithmetic between its own array types.)
-
 from __future__ import annotations
 
 import math

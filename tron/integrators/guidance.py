@@ -8,7 +8,8 @@
     buffer              string    main channels: pbr (default), irradiance, unshadowed or shadowed
     shadow_rays         integer   for each camera ray, even (default: 64); of many camera rays a pixel, each
                                   may have fewer: 2 lighten shadows by a hundredth or two, 8 by nothing
-    two_sided           boolean   whether back faces block shadow rays (default: true)
+    estimator           string    ratio (default) or plain: see tron.estimation
+    two_sided           boolean   back faces block shadow rays beyond two spacings (default: true)
     cubemap_resolution  integer   of the prefiltered environment
 
 Buffers are those of :mod:`tron.shading.guidance`: linear, in front of the environment, which is not seen
@@ -19,8 +20,6 @@ Gradients reach the surfels through what camera rays see, as shading has it; wha
 constant, and so is the light.
 """
 
-# (Mitsuba's type stubs do not know arithmetic between its own array types.)
-
 from __future__ import annotations
 
 from dataclasses import fields
@@ -30,15 +29,16 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.errors import TronError
+from tron.estimation import Estimation
 from tron.integrators.environment import environment_of, light_state
 from tron.integrators.plugin import Shown
 from tron.integrators.surfels import Surfels, unwrap
 from tron.shading.environment import EnvironmentMap
-from tron.shading.guidance import Lighting, Shaded, shade_surface, visibility
+from tron.shading.guidance import Guidance, Lighting, shade_surface, visibility
 from tron.shading.split_sum import CUBEMAP_RESOLUTION
 from tron.tracing import GBuffer, Surface
 
-BUFFERS = tuple(f.name for f in fields(Shaded))
+BUFFERS = tuple(name for name in Guidance.BUFFERS if name != "mask")
 
 
 class GuidanceAppearance:
@@ -52,7 +52,7 @@ class GuidanceAppearance:
             raise TronError(f"tron_guidance has no buffer {self.buffer!r}", mend=mend)
         self.others = [name for name in BUFFERS if name != self.buffer]
         self.channels = [f"{name}.{part}" for name in self.others for part in "RGB"] + ["opacity.Y"]
-        self.shadow_rays = int(properties.get("shadow_rays", 64))
+        self.estimation = _estimation(properties)
         self._resolution = int(properties.get("cubemap_resolution", CUBEMAP_RESOLUTION))
         self._environment = _given_environment(properties)
         self._prepared: tuple[Any, Lighting] | None = None
@@ -65,10 +65,10 @@ class GuidanceAppearance:
             fixed = {f.name: dr.detach(getattr(seen, f.name)) for f in fields(Surface)}
             rays = GBuffer(**fixed, width=width, height=dr.width(seen.opacity) // width)
             dr.eval(*fixed.values())
-            reaching = visibility(self.surfels.tracer, rays, lighting, self.shadow_rays, seed)
+            reaching = visibility(self.surfels.tracer, rays, lighting, self.estimation, seed)
         shaded = shade_surface(seen, reaching, lighting)
-        extra = [part for name in self.others for part in getattr(shaded, name)]
-        return Shown(getattr(shaded, self.buffer), seen.opacity, [*extra, seen.opacity])
+        extra = [part for name in self.others for part in shaded[name]]
+        return Shown(shaded[self.buffer], seen.opacity, [*extra, seen.opacity])
 
     def _lighting(self, scene: mi.Scene) -> Lighting:
         """Prepared once, and again when the scene's light has changed."""
@@ -77,6 +77,16 @@ class GuidanceAppearance:
             environment = self._environment or environment_of(scene)
             self._prepared = state, Lighting(environment, self._resolution)
         return self._prepared[1]
+
+
+def _estimation(properties: mi.Properties) -> Estimation:
+    rays = int(properties.get("shadow_rays", 64))
+    if rays < 2 or rays % 2:
+        raise TronError(f"shadow_rays is {rays}", mend="give an even number of shadow rays, 2 or more")
+    estimator = properties.get("estimator", "ratio")
+    if estimator not in ("ratio", "plain"):
+        raise TronError(f"tron_guidance has no estimator {estimator!r}", mend="choose ratio or plain")
+    return Estimation(rays=rays, estimator=estimator, two_sided=bool(properties.get("two_sided", True)))
 
 
 def _given_environment(properties: mi.Properties) -> EnvironmentMap | None:

@@ -4,8 +4,6 @@ What rays show is decided by an :class:`Appearance`, one a plugin. Mitsuba's bas
 variants, so the class that Mitsuba knows is made for the active one, around an appearance.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor what a variant brings.)
-
 from __future__ import annotations
 
 from collections.abc import Callable

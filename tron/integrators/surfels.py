@@ -14,9 +14,10 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.errors import TronError
+from tron.gaussians.fields import PARAMETERS
 from tron.gaussians.scene import GaussianScene
 from tron.tracing import Surface, SurfelTracer
-from tron.tracing.parameters import PARAMETERS, SurfelParameters
+from tron.tracing.parameters import SurfelParameters
 
 MAX_SH_DEGREE = 3
 
@@ -58,8 +59,7 @@ class Surfels:
     """The surfels that a plugin renders, and their parameters.
 
     Args:
-        properties: of the plugin; ``filename`` (a PLY) or ``surfels`` (of :func:`embed`), and ``two_sided``,
-            whether back faces block shadow rays.
+        properties: of the plugin; ``filename`` (a PLY) or ``surfels`` (of :func:`embed`).
         plugin: its name, for messages.
 
     Raises:
@@ -78,8 +78,7 @@ class Surfels:
         else:
             self.scene = unwrap(properties, "surfels", GaussianScene, plugin).validate()
         self.parameters = SurfelParameters.from_scene(self.scene)
-        two_sided = bool(properties.get("two_sided", True))
-        self.tracer = SurfelTracer(self.scene, two_sided=two_sided, parameters=self.parameters)
+        self.tracer = SurfelTracer(self.scene, parameters=self.parameters)
 
     def traverse(self, callback: Any) -> None:
         """Expose the parameters, all differentiable."""

@@ -6,9 +6,8 @@ torch before it needs it.
 
 from tron.priors.classical import Classical
 from tron.priors.ground_truth import GroundTruth
-from tron.priors.point_normals import estimate_point_normals
 from tron.priors.precomputed import Precomputed
-from tron.priors.prior import FIELDS, Prior, apply_prior
+from tron.priors.prior import FIELDS, Prior, Track, apply_prior, untracked
 from tron.priors.rgbx import RgbX
 
 __all__ = [
@@ -18,6 +17,7 @@ __all__ = [
     "Precomputed",
     "Prior",
     "RgbX",
+    "Track",
     "apply_prior",
-    "estimate_point_normals",
+    "untracked",
 ]

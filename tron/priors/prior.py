@@ -29,7 +29,13 @@ Maps = Callable[[View], Mapping[str, Pixels]]
 """The maps of one view: field -> array, or what reads the array when it is asked for."""
 
 Track = Callable[[Iterable, str], Iterable]
-"""Wraps long loops as ``track(items, label)``, such as :func:`tron.apps.progress.track`."""
+"""Wraps long loops as ``track(items, label)``, such as :func:`tron.cli.progress.track`."""
+
+
+def untracked(items: Iterable, _label: str) -> Iterable:
+    """The items, without any word of how far the work on them has come."""
+    return items
+
 
 log = logging.getLogger(__name__)
 
@@ -81,7 +87,7 @@ def apply_prior(
     prior: Prior,
     fields: Collection[str] | None = None,
     gbuffers: GBuffers | None = None,
-    track: Track | None = None,
+    track: Track = untracked,
 ) -> Capture:
     """A capture whose training views carry the maps of a prior, and of no one else.
 
@@ -104,7 +110,6 @@ def apply_prior(
     unknown = sorted(set(wanted) - set(FIELDS))
     if unknown:
         raise TronError(f"{unknown[0]!r} is no field of a prior", mend=f"use {', '.join(FIELDS)}")
-    track = track or (lambda items, _: items)
     name = type(prior).__name__
     offered = prior.fields(capture)
     reasons = {field: f"not available from {name}" for field in wanted if field not in offered}

@@ -16,6 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from tron.claim import require_same
 from tron.errors import TronError
 from tron.reconstruction.surfels import LearntSurfels
 from tron.reconstruction.training import Stage
@@ -71,6 +72,11 @@ class Checkpoint:
         self.step: int = about["step"]
         self.psnr: float = about["psnr"]
         self.seconds: float = about["seconds"]
+
+    def require(self, values: Mapping[str, Any]) -> None:
+        """Raise TronError, naming the first key that differs, unless the checkpoint was made with these."""
+        mend = "give the same settings, another output_dir, or overwrite=true"
+        require_same(self.made_with, values, self.path, "a checkpoint", mend)
 
     def surfels(self, rates: Mapping[str, float], device: str | torch.device) -> LearntSurfels:
         """The surfels as they were, moments of Adam included."""

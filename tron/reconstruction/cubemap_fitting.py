@@ -2,7 +2,7 @@
 
 The parameter is the logarithm of radiance, so light is positive and suns are within reach; it is a sum of
 levels (:mod:`tron.reconstruction.log_pyramid`). Each step takes one view, draws rays by multiple importance
-sampling from the cubemap as it stands, traces their visibility and moves the texels they met along the
+sampling from the cubemap as it stands, traces their visibility and moves the texels they hit along the
 gradient of the mean absolute error (paper, Algorithm 2). With a new light comes a new density to draw from.
 
 The "plain" estimator, the paper's, sums what the rays bring. Its noise is shared by the sign of the error
@@ -13,20 +13,18 @@ of irradiance over all normals: a studio of soft lights 10 % plain and 0.8 % by 
 and 0.6 % at 64 and 32; a sun of six degrees 14 % and 1.6 % at 16 rays.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from tron.errors import TronError
+from tron.priors import Track, untracked
 from tron.reconstruction.log_pyramid import LogPyramid
+from tron.reconstruction.settings import FitSettings
 from tron.reconstruction.surface_points import PointBatch, SurfacePoints
 from tron.seeds import generator, integer
 from tron.shading.cubemap import CubemapLight
@@ -34,82 +32,62 @@ from tron.shading.irradiance import Occluder, visible_share
 from tron.shading.prefilter import unoccluded_irradiance
 from tron.shading.transport import Transport
 
-Estimator = Literal["ratio", "plain"]
-
 DARKEST = 1e-4
 """The first light is at least this bright, relative to its brightest channel: a logarithm needs light."""
 
 
 @dataclass
-class Refinement:
+class CubemapFit:
     """A fitted cubemap.
 
     Attributes:
         texels: (6, R, R, 3) float32 linear radiance.
-        seen: (6, R, R) bool, texels with a gradient of their own in any step; the others have what coarser
-            levels give them, and without such levels their initial radiance.
+        has_gradient: (6, R, R) bool, texels with a gradient of their own in any step; the others have what
+            coarser levels give them, and without such levels their initial radiance.
         loss: (steps,) float64, the mean absolute error of each step's view, in the unit of the prior.
     """
 
     texels: np.ndarray
-    seen: np.ndarray
+    has_gradient: np.ndarray
     loss: np.ndarray
 
 
-def refine(
-    tracer: Occluder,
-    points: SurfacePoints,
-    *,
-    resolution: int,
-    steps: int,
-    rays: int,
-    pixels: int,
-    learning_rate: float,
-    final_learning_rate: float,
-    seed: int,
-    estimator: Estimator,
-    coarsest: int,
-    track: Callable[[Iterable[int], str], Iterable[int]],
-) -> Refinement:
+def fit_cubemap(
+    tracer: Occluder, points: SurfacePoints, settings: FitSettings, track: Track = untracked
+) -> CubemapFit:
     """Fit the cubemap, beginning with the constant whose unshadowed irradiance is the prior's mean.
 
     Args:
         tracer: what blocks light.
         points: surface points with the irradiance / pi that is wanted there.
-        resolution: texels along a face edge.
-        steps: updates.
-        rays: shadow rays a point, even.
-        pixels: points a step.
-        learning_rate, final_learning_rate: Adam's steps in log radiance, which fall exponentially.
-        coarsest: of the levels that log radiance is a sum of, see :class:`LogPyramid`.
-        seed: root of views, points and rays.
-        estimator: see the module.
+        settings: sizes, rates and seed; Adam's rate falls exponentially.
         track: wraps the steps, to show progress.
 
     Raises:
         TronError: the loss is not finite; the message names the step.
     """
+    resolution, steps, seed = settings.resolution, settings.steps, settings.seed
     mean = np.maximum(points.mean_target, DARKEST * points.mean_target.max())
-    pyramid = LogPyramid(np.broadcast_to(mean, (6, resolution, resolution, 3)), coarsest)
-    optimizer = mi.ad.Adam(learning_rate, pyramid.levels, epsilon=1e-15)
-    decay = (final_learning_rate / learning_rate) ** (1 / max(1, steps - 1))
+    pyramid = LogPyramid(np.broadcast_to(mean, (6, resolution, resolution, 3)), settings.coarsest)
+    optimizer = mi.ad.Adam(settings.learning_rate, pyramid.levels, epsilon=1e-15)
+    decay = (settings.final_learning_rate / settings.learning_rate) ** (1 / max(1, steps - 1))
     draw = generator(seed, "environment", "steps")
     loss_curve = np.empty(steps)
-    seen = dr.zeros(mi.Bool, 18 * resolution**2)
+    has_gradient = dr.zeros(mi.Bool, 18 * resolution**2)
     for step in track(range(steps), "Environment"):
         view = int(draw.integers(points.views))
-        batch = points.batch(view, pixels, draw)
+        batch = points.batch(view, settings.pixels, draw)
         log_radiance = pyramid.compose(optimizer)
         light = CubemapLight(dr.exp(log_radiance), resolution)
         ray_seed = integer(seed, "environment", "rays", step)
-        transport = Transport.trace(tracer, batch, light, rays, ray_seed)
-        error = dr.abs(_estimate(transport, light, batch, estimator) - batch.target)
+        transport = Transport.trace(tracer, batch, light, settings.rays, ray_seed)
+        error = dr.abs(_estimate(transport, light, batch, settings.estimator) - batch.target)
         loss = dr.mean((error.x + error.y + error.z) / 3)
         dr.backward(loss)
-        seen |= dr.grad(optimizer[pyramid.finest]) != 0
-        dr.schedule(seen)
+        has_gradient |= dr.grad(optimizer[pyramid.finest]) != 0
+        dr.schedule(has_gradient)
         for name in pyramid.levels:
-            rate = learning_rate * decay**step * pyramid.rate(name)
+            rate = settings.learning_rate * decay**step * pyramid.rate(name)
             optimizer.set_learning_rate({name: dr.opaque(mi.Float, rate)})
         optimizer.step()
         loss_curve[step] = float(loss[0])
@@ -119,13 +97,11 @@ def refine(
                 mend="lower the learning rate, or look at the irradiance prior",
             )
     texels = np.array(dr.exp(pyramid.compose(optimizer))).reshape(6, resolution, resolution, 3)
-    met = np.array(seen).reshape(6, resolution, resolution, 3).any(-1)
-    return Refinement(texels, met, loss_curve)
+    own = np.array(has_gradient).reshape(6, resolution, resolution, 3).any(-1)
+    return CubemapFit(texels, own, loss_curve)
 
 
-def _estimate(
-    transport: Transport, light: CubemapLight, batch: PointBatch, estimator: Estimator
-) -> mi.Color3f:
+def _estimate(transport: Transport, light: CubemapLight, batch: PointBatch, estimator: str) -> mi.Color3f:
     shadowed, unshadowed = transport.irradiance(light)
     if estimator == "plain":
         return shadowed

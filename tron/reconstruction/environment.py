@@ -6,7 +6,6 @@ Stage 3a (:mod:`tron.reconstruction.cubemap_fitting`) fits a cubemap to the prio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -15,7 +14,8 @@ import numpy as np
 from tron.captures import Capture
 from tron.errors import TronError
 from tron.gaussians import GaussianScene
-from tron.reconstruction.cubemap_fitting import refine
+from tron.priors import Track, untracked
+from tron.reconstruction.cubemap_fitting import CubemapFit, fit_cubemap
 from tron.reconstruction.light_scale import LightScale, choose_photos, fit_scale
 from tron.reconstruction.settings import FitSettings
 from tron.reconstruction.surface_points import SurfacePoints
@@ -24,37 +24,27 @@ from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Lighting, ViewTracer
 from tron.tracing import SurfelTracer
 
-Track = Callable[[Iterable, str], Iterable]
-
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentFit:
-    """What was found.
+    """Light of a capture, and how it was found.
 
     Attributes:
-        environment: the light, sigma included, as a lat-long map.
-        sigma: the scale of stage 3b, already in ``environment``; 1 if it was not fitted.
-        texels: (6, R, R, 3) float32 cubemap of stage 3a, sigma not included.
-        seen: (6, R, R) bool, texels with a gradient of their own in any step; the others have what coarser
-            levels give them, and without such levels the initial constant radiance.
-        irradiance_loss: (steps,) mean absolute error of stage 3a, in the unit of the priors.
-        scale_loss, scale_curve: (scale_steps,) photometric loss, and sigma, in stage 3b.
+        environment: the light, as a lat-long map, the scale of stage 3b included.
+        cubemap: of stage 3a, the scale not included.
+        scale: of stage 3b; 1 if it was not fitted.
     """
 
     environment: EnvironmentMap
-    sigma: float
-    texels: np.ndarray
-    seen: np.ndarray
-    irradiance_loss: np.ndarray
-    scale_loss: np.ndarray
-    scale_curve: np.ndarray
+    cubemap: CubemapFit
+    scale: LightScale
 
 
 def fit_environment(
     capture: Capture,
     scene: GaussianScene | ViewTracer,
     settings: FitSettings | None = None,
-    track: Track | None = None,
+    track: Track = untracked,
 ) -> EnvironmentFit:
     """Find the environment map under which the scene looks as the capture's training views do.
 
@@ -65,14 +55,13 @@ def fit_environment(
         capture: its training views with an irradiance map feed stage 3a, all training views stage 3b.
         scene: frozen surfels, or a tracer that the caller has already.
         settings: sizes, rates, seed.
-        track: wraps long loops as ``track(items, label)``, such as :func:`tron.apps.progress.track`.
+        track: wraps long loops as ``track(items, label)``, such as :func:`tron.cli.progress.track`.
 
     Raises:
         TronError: no training view has an irradiance map, maps are wrong, nothing of the scene is visible, or
             the loss is not finite.
     """
     settings = settings or FitSettings()
-    track = track or (lambda items, _: items)
     views = [view for view in capture.train_views if view.has("irradiance")]
     if not views:
         raise TronError(
@@ -81,54 +70,15 @@ def fit_environment(
         )
     tracer = _tracer(scene)
     # Photos are read before the long work, so that a bad file is told at once.
-    photos = []
-    if settings.scale_steps:
-        photos = choose_photos(
-            capture.train_views,
-            settings.scale_views,
-            settings.scale_pixels,
-            capture.exposure,
-            settings.seed,
-        )
+    photos = choose_photos(capture.train_views, settings, capture.exposure) if settings.scale_steps else []
     points = SurfacePoints(tracer, views, settings.points_per_view, settings.seed, track)
-    refined = refine(
-        tracer,
-        points,
-        resolution=settings.resolution,
-        steps=settings.steps,
-        rays=settings.rays,
-        pixels=settings.pixels,
-        learning_rate=settings.learning_rate,
-        final_learning_rate=settings.final_learning_rate,
-        estimator=settings.estimator,
-        coarsest=settings.coarsest,
-        seed=settings.seed,
-        track=track,
-    )
-    light = CubemapLight(mi.Float(refined.texels.ravel()), settings.resolution)
-    environment = light.to_environment()
+    cubemap = fit_cubemap(tracer.sided(settings.two_sided), points, settings, track)
+    environment = CubemapLight(mi.Float(cubemap.texels.ravel()), settings.resolution).to_environment()
     scale = LightScale(1.0, np.zeros(0), np.zeros(0))
     if photos:
-        scale = fit_scale(
-            tracer,
-            photos,
-            Lighting(environment, settings.split_sum_resolution),
-            exposure=capture.exposure,
-            steps=settings.scale_steps,
-            rays=settings.scale_rays,
-            learning_rate=settings.scale_learning_rate,
-            seed=settings.seed,
-            track=track,
-        )
-    return EnvironmentFit(
-        environment=EnvironmentMap(environment.image * np.float32(scale.sigma)),
-        sigma=scale.sigma,
-        texels=refined.texels,
-        seen=refined.seen,
-        irradiance_loss=refined.loss,
-        scale_loss=scale.loss,
-        scale_curve=scale.curve,
-    )
+        lighting = Lighting(environment, settings.split_sum_resolution)
+        scale = fit_scale(tracer, photos, lighting, settings, capture.exposure, track)
+    return EnvironmentFit(EnvironmentMap(environment.image * np.float32(scale.sigma)), cubemap, scale)
 
 
 def _tracer(scene: GaussianScene | ViewTracer) -> ViewTracer:

@@ -7,13 +7,14 @@ by least squares on the subject, as the TRON paper does (facts.md section 1).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from tron.captures import View
 from tron.metrics import LPIPS, angular_error_deg, capped_psnr, scale_albedo, ssim
+from tron.priors import Track, untracked
 from tron.shading.guidance import ViewTracer
 
 _SUBJECT = 0.5
@@ -36,7 +37,7 @@ def score_views(
     views: Sequence[View],
     background: str = "black",
     lpips: LPIPS | None = None,
-    track: Callable[[Iterable[View], str], Iterable[View]] | None = None,
+    track: Track = untracked,
 ) -> list[ViewScore]:
     """Score what the surfels show from each view.
 
@@ -48,7 +49,6 @@ def score_views(
         tracer: the surfels. views: display images. background: as trained with; random is judged on black.
         lpips: the metric, where its weights are given. track: shows progress.
     """
-    track = track or (lambda items, _: items)
     scores = []
     for view in track(views, "scores"):
         buffers = tracer.gbuffer(view.camera).numpy()

@@ -9,7 +9,7 @@ the photo as stored. Exposure and sigma appear as a product only: the exposure s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +19,10 @@ from tron.cameras import Camera
 from tron.captures import View
 from tron.color import agx
 from tron.errors import TronError
+from tron.estimation import Estimation
+from tron.priors import Track, untracked
 from tron.reconstruction.losses import photometric_loss
+from tron.reconstruction.settings import FitSettings
 from tron.reconstruction.surface_points import surface_mask
 from tron.seeds import generator, integer
 from tron.shading.guidance import Lighting, ViewTracer, render_guidance
@@ -57,16 +60,16 @@ class LightScale:
     curve: np.ndarray
 
 
-def choose_photos(views: Sequence[View], count: int, pixels: int, exposure: float, seed: int) -> list[Photo]:
-    """Read at most ``count`` views, drawn at random, reduced by averaging to at most ``pixels`` pixels each.
+def choose_photos(views: Sequence[View], settings: FitSettings, exposure: float) -> list[Photo]:
+    """Read some views, drawn at random, reduced by averaging to at most ``scale_pixels`` pixels each.
 
     Linear images are exposed and tone-mapped by AgX, display images are taken as they are.
     """
-    draw = generator(seed, "environment", "photos")
-    chosen = np.sort(draw.permutation(len(views))[:count])
+    draw = generator(settings.seed, "environment", "photos")
+    chosen = np.sort(draw.permutation(len(views))[: settings.scale_views])
     photos = []
     for view in (views[i] for i in chosen):
-        factor = max(1, int(np.ceil(np.sqrt(view.camera.width * view.camera.height / pixels))))
+        factor = max(1, int(np.ceil(np.sqrt(view.camera.width * view.camera.height / settings.scale_pixels))))
         shown = view.read()
         if view.space == "linear":
             shown = agx(exposure * shown)
@@ -78,13 +81,9 @@ def fit_scale(
     tracer: ViewTracer,
     photos: Sequence[Photo],
     lighting: Lighting,
-    *,
+    settings: FitSettings,
     exposure: float,
-    steps: int,
-    rays: int,
-    learning_rate: float,
-    seed: int,
-    track: Callable[[Iterable, str], Iterable],
+    track: Track = untracked,
 ) -> LightScale:
     """Fit the factor by Adam; the learning rate falls to a hundredth, exponentially.
 
@@ -92,20 +91,21 @@ def fit_scale(
         tracer: the scene.
         photos: what to compare with.
         lighting: the environment of factor 1.
+        settings: steps, each on one random photo; rays, first rate in log sigma, seed.
         exposure: of the capture.
-        steps: updates, each on one random photo.
-        rays: shadow rays a pixel, even.
-        learning_rate: first step in log sigma.
-        seed: root of the rays and of the photos' order.
         track: wraps the long loops, to show progress.
 
     Raises:
         TronError: no photo shows a surface of the scene, or the loss is not finite.
     """
+    steps, seed = settings.scale_steps, settings.seed
+    estimation = Estimation(
+        rays=settings.scale_rays, estimator=settings.estimator, two_sided=settings.two_sided
+    )
     pairs = []
     for photo in track(photos, "Scale: views"):
         ray_seed = integer(seed, "environment", "scale", photo.view.name)
-        guidance = render_guidance(tracer, photo.camera, lighting, rays, ray_seed)
+        guidance = render_guidance(tracer, photo.camera, lighting, estimation, ray_seed)
         counts = reduced(surface_mask_of(photo), photo.factor) > 0.5
         counts &= guidance.mask > 0.5
         if counts.any():
@@ -113,7 +113,7 @@ def fit_scale(
     if not pairs:
         raise TronError("no photo shows a surface of the scene", mend="check cameras and masks")
     log_sigma = torch.zeros((), requires_grad=True)
-    optimizer = torch.optim.Adam([log_sigma], lr=learning_rate)
+    optimizer = torch.optim.Adam([log_sigma], lr=settings.scale_learning_rate)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.01 ** (1 / steps))
     draw = generator(seed, "environment", "scale steps")
     loss_curve, curve = np.empty(steps), np.empty(steps)

@@ -9,8 +9,6 @@ loss prefers one: this is a preconditioner, not a regulariser. (Measured on a wa
 two spheres: the same error of irradiance, 1.6 %, and a picture without the noise.)
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Mapping

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from tron.color import srgb_to_linear
 from tron.errors import TronError
 from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
-from tron.priors import Prior, apply_prior
+from tron.priors import Prior, Track, apply_prior, untracked
 from tron.reconstruction.checkpoint import Checkpoint, save_checkpoint
 from tron.reconstruction.initial import extent_of, initial_surfels, source_of
 from tron.reconstruction.settings import ReconstructionSettings
@@ -29,8 +29,6 @@ from tron.reconstruction.supervision import MATERIALS
 from tron.reconstruction.surfels import LearntSurfels
 from tron.reconstruction.training import Plan, Progress, Stage, Watch, materials_plan, radiance_plan
 from tron.tracing import SurfelTracer
-
-Track = Callable[[Iterable, str], Iterable]
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +58,7 @@ def reconstruct(
     checkpoint: Path | None = None,
     device: str = "cpu",
     watch: Watch | None = None,
-    track: Track | None = None,
+    track: Track = untracked,
 ) -> Reconstruction:
     """Find the surfels of a capture, whose images are display values.
 
@@ -143,7 +141,7 @@ class _Run:
         self.before = self.found.seconds if self.found else 0.0
         self.started = time.perf_counter()
         if self.found is not None:
-            require_same(self.found, self.values)
+            self.found.require(self.values)
             log.info("going on from step %d of stage %s", self.found.step, self.found.stage)
 
     def seconds(self) -> float:
@@ -180,29 +178,6 @@ class _Run:
     def _save(self, stage: Stage) -> None:
         if self.path is not None:
             save_checkpoint(self.path, stage, self.values, self.seconds())
-
-
-def require_same(found: Checkpoint, values: Mapping[str, Any]) -> None:
-    """Raise TronError naming the first key in which a checkpoint differs from ``values`` (``made_with``)."""
-    key = _first_difference(found.made_with, values)
-    if key is not None:
-        raise TronError(
-            f"the checkpoint was made with another {key}",
-            found.path,
-            "give the same settings, another output_dir, or overwrite=true",
-        )
-
-
-def _first_difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> str | None:
-    for key in dict.fromkeys((*other, *one)):
-        a, b = one.get(key), other.get(key)
-        if isinstance(a, Mapping) and isinstance(b, Mapping):
-            inner = _first_difference(a, b)
-            if inner is not None:
-                return f"{key}.{inner}"
-        elif a != b:
-            return key
-    return None
 
 
 _ORDER = ("radiance", "materials")

@@ -12,6 +12,8 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from tron.estimation import Estimator
+
 Model = TypeVar("Model", bound="Settings")
 
 _RATES_OF_PLACE = ("position_rate", "position_rate_final", "rotation_rate")
@@ -156,8 +158,12 @@ class FitSettings(Settings):
     pixels: int = Field(default=1024, ge=1, description="Surface points a step, all of one view.")
     learning_rate: float = Field(default=0.1, gt=0, description="Adam's first rate, in log radiance.")
     final_learning_rate: float = Field(default=0.01, gt=0, description="Its last rate; falls exponentially.")
-    estimator: Literal["ratio", "plain"] = Field(
+    estimator: Estimator = Field(
         default="ratio", description="ratio, or plain, the paper's sum, which needs far more rays."
+    )
+    two_sided: bool = Field(
+        default=True,
+        description="Back faces block shadow rays beyond two spacings; false: never, as in the paper.",
     )
     coarsest: int = Field(
         default=4,

@@ -1,11 +1,9 @@
 """The surface points of a capture's views and the irradiance that a prior wants there, on the device."""
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -15,6 +13,7 @@ import numpy as np
 from tron.aligned import aligned
 from tron.captures import View
 from tron.errors import TronError
+from tron.priors import Track, untracked
 from tron.seeds import generator
 from tron.shading.guidance import ViewTracer
 
@@ -68,7 +67,7 @@ class SurfacePoints:
         views: Sequence[View],
         per_view: int,
         seed: int,
-        track: Callable[[Iterable[View], str], Iterable[View]],
+        track: Track = untracked,
     ) -> None:
         parts: list[np.ndarray] = []
         for view in track(views, "G-buffers"):

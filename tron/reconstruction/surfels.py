@@ -14,22 +14,15 @@ import torch
 from torch import Tensor
 
 from tron.errors import TronError
+from tron.gaussians.fields import FIELDS, MATERIALS, PARAMETERS
+from tron.gaussians.harmonics import SH_COUNT
 from tron.gaussians.scene import GaussianScene, measure_spacing
 
 ADAM_EPSILON = 1e-15
-ROWS: dict[str, tuple[int, ...]] = {
-    "means": (3,),
-    "quats": (4,),
-    "log_scales": (2,),
-    "opacity_logits": (),
-    "sh_dc": (1, 3),
-    "sh_rest": (15, 3),
-    "base_color": (3,),
-    "roughness": (),
-    "metallic": (),
-}
+HARMONICS = {"sh_dc": (1, 3), "sh_rest": (SH_COUNT - 1, 3)}
+SAME = tuple(name for name in PARAMETERS if name != "sh")
+ROWS: dict[str, tuple[int, ...]] = {name: FIELDS[name].shape for name in SAME} | HARMONICS
 """Tensors by name and the shape of a row; as in :class:`GaussianScene`, but for the harmonics."""
-UNIT_INTERVAL = ("base_color", "roughness", "metallic")
 _UNIT_WITHIN = 1e-6
 
 
@@ -59,9 +52,8 @@ class LearntSurfels:
     @staticmethod
     def of_scene(scene: GaussianScene, rates: Mapping[str, float], device: str = "cpu") -> LearntSurfels:
         """The surfels of a scene."""
-        arrays = {name: torch.tensor(getattr(scene, name)) for name in ROWS if not name.startswith("sh_")}
-        sh = torch.tensor(scene.sh)
-        arrays |= {"sh_dc": sh[:, :1], "sh_rest": sh[:, 1:]}
+        arrays = {name: torch.tensor(getattr(scene, name)) for name in PARAMETERS}
+        arrays["sh_dc"], arrays["sh_rest"] = arrays["sh"][:, :1], arrays["sh"][:, 1:]
         return LearntSurfels({name: array.to(device) for name, array in arrays.items()}, rates)
 
     def __len__(self) -> int:
@@ -77,14 +69,14 @@ class LearntSurfels:
 
     def rendered(self) -> dict[str, Tensor]:
         """The tensors under the names and shapes that :func:`tron.tracing.torch_bridge.render` takes."""
-        tensors = {name: value for name, value in self.tensors.items() if not name.startswith("sh_")}
-        return tensors | {"sh": torch.cat([self.tensors["sh_dc"], self.tensors["sh_rest"]], dim=1)}
+        harmonics = torch.cat([self.tensors[name] for name in HARMONICS], dim=1)
+        return {name: self.tensors[name] for name in SAME} | {"sh": harmonics}
 
     def step(self) -> None:
         """Update what has a gradient; materials are brought back into [0, 1]."""
         self._adam.step()
         with torch.no_grad():
-            for name in UNIT_INTERVAL:
+            for name in MATERIALS:
                 if name in self.rates:
                     self.tensors[name].clamp_(0, 1)
 
@@ -170,20 +162,14 @@ class LearntSurfels:
 
     def scene(self, kernel_degree: int, up: np.ndarray) -> GaussianScene:
         """The surfels at rest, with unit quaternions."""
-        arrays = {name: values.detach().cpu().numpy() for name, values in self.tensors.items()}
+        arrays = {name: values.detach().cpu().numpy() for name, values in self.rendered().items()}
         quats = arrays["quats"].astype(np.float64)
         lengths = np.linalg.norm(quats, axis=1, keepdims=True)
         # What is a unit quaternion already stays as it is, bit by bit, however often a scene is learnt from.
         lengths = np.where(np.abs(lengths - 1) < _UNIT_WITHIN, 1, lengths)
+        arrays["quats"] = np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1), (1.0, 0, 0, 0))
         return GaussianScene(
-            means=arrays["means"],
-            quats=np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1), (1.0, 0, 0, 0)),
-            log_scales=arrays["log_scales"],
-            opacity_logits=arrays["opacity_logits"],
-            sh=np.concatenate([arrays["sh_dc"], arrays["sh_rest"]], axis=1),
-            base_color=arrays["base_color"],
-            roughness=arrays["roughness"],
-            metallic=arrays["metallic"],
+            **arrays,
             object_id=np.zeros(len(self), np.int32),
             kernel_degree=kernel_degree,
             spacing=measure_spacing(arrays["means"]),

@@ -5,6 +5,7 @@ it once, and :func:`render_guidance` turns a camera into the buffers the neural 
 Everything here is linear and scene-referred; exposure and AgX come at the very end, elsewhere.
 """
 
+from tron.estimation import Estimation
 from tron.shading.background import background_share
 from tron.shading.cubemap import CubemapLight
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
@@ -16,6 +17,7 @@ __all__ = [
     "CubemapLight",
     "EnvironmentLight",
     "EnvironmentMap",
+    "Estimation",
     "Guidance",
     "Lighting",
     "SplitSum",

@@ -12,8 +12,6 @@ is smooth and monotone. What is shaded has the weight 1 - share, so that opaque 
 Opacity itself, which is the mask, stays 1 - T.
 """
 
-# (Mitsuba's type stubs know no arithmetic between its own array types.)
-
 from __future__ import annotations
 
 from typing import TypeVar

@@ -10,8 +10,6 @@ Everything here is differentiable with respect to the texels, except the density
 from, which is a choice and no result.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from typing import Any

@@ -20,8 +20,6 @@ pixels, and RMSE over an upward plane's light, before (weights by the noisy visi
 At 64 rays it blurs more than it cleans.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from typing import TYPE_CHECKING

@@ -10,8 +10,6 @@ on half texels (column j at u = (j + 1/2) / W, periodic), rows stand *on* the po
 Between those samples radiance is bilinear in (u, v), and every integral below is of that bilinear function.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from copy import copy

@@ -23,8 +23,6 @@ surfels of a seed that no benchmark uses):
     8       1.04  0.038     1.00  0.036     1.01  0.087     1.01  0.084
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from typing import TYPE_CHECKING

@@ -9,26 +9,25 @@ estimates of shadowed and unshadowed irradiance share their rays, so the share t
 and sheds the noise of the light, and U, which has none, puts the light back (Heitz et al. 2018). From 16 rays
 it is their ratio, below a regression that is not biased in shadow (:mod:`tron.shading.few_rays`). At 64 rays
 under a sun this takes the relative error from 0.13 to 0.04; irradiance over unshadowed is exactly 1 where
-nothing is in the way.
+nothing is in the way. :class:`tron.estimation.Estimation` chooses, also the paper's plain mean.
 
 Every buffer shows the environment where surfels are absent: (1 - share) x shaded + share x radiance seen,
 with the share of :mod:`tron.shading.background`, exactly 0 behind opaque surfels. All of it is linear;
 exposure and AgX are applied when a buffer is looked at or loaded.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from tron.estimation import Estimation
 from tron.shading.background import over_background
 from tron.shading.denoise import atrous
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
@@ -41,12 +40,15 @@ if TYPE_CHECKING:
     from tron.tracing import GBuffer, Surface
 
 DIELECTRIC_F0 = 0.04
+FINAL = Estimation()
 
 
 class ViewTracer(Occluder, Protocol):
-    """What sees and blocks: :class:`tron.tracing.SurfelTracer`, or a closed form in a test."""
+    """Camera rays and shadow rays: :class:`tron.tracing.SurfelTracer`, or a closed form in a test."""
 
     def gbuffer(self, camera: Camera) -> GBuffer: ...
+
+    def sided(self, two_sided: bool) -> Occluder: ...
 
 
 class Lighting:
@@ -73,7 +75,9 @@ class Lighting:
 
 @dataclass
 class Guidance:
-    """Buffers of one frame, NumPy float32, linear, in front of the environment.
+    """Buffers of one frame, NumPy float32, linear, in front of the environment; also by name.
+
+    A new buffer is a field here and a formula in :func:`shade_surface`.
 
     Attributes:
         pbr: (H, W, 3) unshadowed split-sum radiance.
@@ -81,7 +85,7 @@ class Guidance:
         unshadowed: (H, W, 3) the same with nothing in the way.
         shadowed: (H, W, 3) radiance: shadowed diffuse plus split-sum specular.
         mask: (H, W) opacity of the surfels in [0, 1].
-        gbuffer: ``GBuffer.numpy()``.
+        gbuffer: ``GBuffer.numpy()``, which is no buffer of its own.
     """
 
     pbr: np.ndarray
@@ -90,15 +94,24 @@ class Guidance:
     shadowed: np.ndarray
     mask: np.ndarray
     gbuffer: dict[str, np.ndarray]
+    BUFFERS: ClassVar[tuple[str, ...]]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """(H, W, C) float32 of one of :attr:`BUFFERS`: C is 1 for the mask, 3 for the others."""
+        if name not in self.BUFFERS:
+            raise KeyError(name)
+        return np.atleast_3d(getattr(self, name))
+
+
+Guidance.BUFFERS = tuple(field.name for field in fields(Guidance) if field.name != "gbuffer")
 
 
 def render_guidance(
     tracer: ViewTracer,
     camera: Camera,
     lighting: Lighting,
-    spp: int = 64,
+    estimation: Estimation = FINAL,
     seed: int = 0,
-    denoise: bool = False,
     background: Sequence[float] | None = None,
 ) -> Guidance:
     """Trace ``camera``'s view of the surfels and shade it under ``lighting``.
@@ -107,24 +120,21 @@ def render_guidance(
         tracer: the scene.
         camera: the view.
         lighting: the prepared environment.
-        spp: shadow rays a pixel, even; 64 for final frames, 2 for previews.
+        estimation: of the shadows.
         seed: root of the shadow rays' random numbers.
-        denoise: filter the visibility over the image; for previews.
-        background: linear RGB radiance that is seen behind the surfels; None: the environment.
-
-    Raises:
-        TronError: ``spp`` is odd or not positive.
+        background: linear RGB radiance behind the surfels; None: the environment.
     """
     gbuffer = tracer.gbuffer(camera)
-    return shade(gbuffer, visibility(tracer, gbuffer, lighting, spp, seed, denoise), lighting, background)
+    return shade(gbuffer, visibility(tracer, gbuffer, lighting, estimation, seed), lighting, background)
 
 
 def visibility(
-    tracer: Occluder, gbuffer: GBuffer, lighting: Lighting, spp: int, seed: int, denoise: bool = False
+    tracer: ViewTracer, gbuffer: GBuffer, lighting: Lighting, estimation: Estimation, seed: int
 ) -> mi.Color3f:
     """Share of the unshadowed irradiance that reaches each pixel; arguments as of :func:`render_guidance`."""
-    shadowed, unshadowed = irradiance(tracer, gbuffer, lighting.light, spp, seed)
-    return reaching_share(shadowed, unshadowed, gbuffer, lighting, tracer.scene.spacing, spp, denoise)
+    occluder = tracer.sided(estimation.two_sided)
+    found = irradiance(occluder, gbuffer, lighting.light, estimation.rays, seed)
+    return reaching_share(*found, gbuffer, lighting, occluder.scene.spacing, estimation)
 
 
 def reaching_share(
@@ -133,18 +143,19 @@ def reaching_share(
     gbuffer: GBuffer,
     lighting: Lighting,
     spacing: float,
-    spp: int,
-    denoise: bool = False,
+    estimation: Estimation,
 ) -> mi.Color3f:
-    """The same from what ``spp`` rays a pixel found: :func:`tron.shading.irradiance`'s two estimates."""
-    if spp >= RATIO_FROM_RAYS and not denoise:
+    """The same from what the rays found: :func:`tron.shading.irradiance`'s two estimates."""
+    plain, many = estimation.estimator == "plain", estimation.rays >= RATIO_FROM_RAYS
+    if many and not (plain or estimation.filtered):
         return visible_share(shadowed, unshadowed)
     known = lighting.split_sum.diffuse(_normal(gbuffer))
-    share = regressed_share(shadowed, unshadowed, known, gbuffer, spacing)
-    if not denoise:
-        return share
-    filtered = atrous(shadowed, unshadowed, grey(share), gbuffer, spacing)
-    return visible_share(*filtered)
+    if estimation.filtered or not plain:
+        share = regressed_share(shadowed, unshadowed, known, gbuffer, spacing)
+        if not estimation.filtered:
+            return share
+        shadowed, unshadowed = atrous(shadowed, unshadowed, grey(share), gbuffer, spacing)
+    return visible_share(shadowed, known if plain else unshadowed)
 
 
 def _normal(seen: Surface) -> mi.Vector3f:
@@ -152,22 +163,13 @@ def _normal(seen: Surface) -> mi.Vector3f:
     return dr.select(seen.opacity > 0, mi.Vector3f(seen.normal), mi.Vector3f(0, 0, 1))
 
 
-@dataclass
-class Shaded:
-    """The buffers of :class:`Guidance` on the device, one lane a ray."""
-
-    pbr: mi.Color3f
-    irradiance: mi.Color3f
-    unshadowed: mi.Color3f
-    shadowed: mi.Color3f
-
-
 def shade_surface(
     seen: Surface, visibility: mi.Color3f, lighting: Lighting, background: Sequence[float] | None = None
-) -> Shaded:
+) -> dict[str, mi.Color3f]:
     """Shade what rays see, given the share of the unshadowed irradiance that reaches each of them.
 
-    ``background`` as of :func:`render_guidance`.
+    ``background`` as of :func:`render_guidance`. Returns the colours of :class:`Guidance` by name, on the
+    device, one lane a ray.
     """
     normal = _normal(seen)
     diffuse_color = seen.base_color * (1 - seen.metallic)
@@ -180,16 +182,14 @@ def shade_surface(
     else:
         behind = mi.Color3f(*(dr.opaque(mi.Float, float(channel)) for channel in background))
 
-    def shown(shaded: mi.Color3f) -> mi.Color3f:
-        return over_background(shaded, behind, seen.opacity)
-
-    buffers = Shaded(
-        pbr=shown(diffuse_color * unshadowed + specular),
-        irradiance=shown(shadowed),
-        unshadowed=shown(unshadowed),
-        shadowed=shown(diffuse_color * shadowed + specular),
-    )
-    dr.eval(buffers.pbr, buffers.irradiance, buffers.unshadowed, buffers.shadowed)
+    buffers = {
+        "pbr": diffuse_color * unshadowed + specular,
+        "irradiance": shadowed,
+        "unshadowed": unshadowed,
+        "shadowed": diffuse_color * shadowed + specular,
+    }
+    buffers = {name: over_background(color, behind, seen.opacity) for name, color in buffers.items()}
+    dr.eval(buffers)
     return buffers
 
 
@@ -197,17 +197,11 @@ def shade(
     gbuffer: GBuffer, visibility: mi.Color3f, lighting: Lighting, background: Sequence[float] | None = None
 ) -> Guidance:
     """Guidance from a G-buffer and the share of the unshadowed irradiance that reaches each pixel."""
-    shaded = shade_surface(gbuffer, visibility, lighting, background)
+    colors = shade_surface(gbuffer, visibility, lighting, background)
 
     def image(color: mi.Color3f) -> np.ndarray:
         return np.ascontiguousarray(np.array(color).T.reshape(gbuffer.height, gbuffer.width, 3))
 
     buffers = gbuffer.numpy()
-    return Guidance(
-        pbr=image(shaded.pbr),
-        irradiance=image(shaded.irradiance),
-        unshadowed=image(shaded.unshadowed),
-        shadowed=image(shaded.shadowed),
-        mask=buffers["opacity"],
-        gbuffer=buffers,
-    )
+    images = {name: image(color) for name, color in colors.items()}
+    return Guidance(**images, mask=buffers["opacity"], gbuffer=buffers)

@@ -14,8 +14,6 @@ for every pixel and is launched again for the next, so memory does not grow with
 rays inside the kernel was three times as slow.)
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

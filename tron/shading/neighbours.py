@@ -4,8 +4,6 @@ A neighbour's weight is the B-spline kernel's (1 4 6 4 1), its taps ``step`` pix
 2010), times how far it lies on the same surface: its normal agrees and it is near the pixel's plane; on
 request also how alike a guide is there: exp(-(stop x difference)^2)."""
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

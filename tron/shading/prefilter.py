@@ -11,8 +11,6 @@ The filter is differentiable with respect to the light's texels, centroids inclu
 be sums (``max_iterations=-1``): Dr.Jit then differentiates them by walking once more, with nothing stored.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from dataclasses import dataclass

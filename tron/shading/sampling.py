@@ -14,8 +14,6 @@ send rays in neighbouring directions, and so do four consecutive points of one l
 2^k points a pixel; other numbers take what comes next in the sequence, and are merely well spread.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ is 1. Between levels, texels and faces the lookup is linear. Diffuse light is th
 more, at 32 texels a face: its kink at the terminator shows at 16 (4 % off at worst, against 0.4 %).
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from copy import copy

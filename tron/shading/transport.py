@@ -7,8 +7,6 @@ densities. Memory grows with pixels x rays;
 where no gradient is wanted, :func:`tron.shading.irradiance` stores nothing.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from dataclasses import dataclass

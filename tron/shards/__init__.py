@@ -1,12 +1,13 @@
 """Neutral ground between the data engine, training and evaluation: what a dataset folder holds.
 
 `schema` names the members of a clip, `writer` makes byte-identical tar shards, `manifest` accounts for
-them and finds damage, `reader` opens them again without ever unpickling anything.
+them, `reader` opens them again without ever unpickling anything, `verify` finds damage.
 """
 
-from tron.shards.manifest import Manifest, ShardEntry, verify
+from tron.shards.manifest import Manifest, ShardEntry
 from tron.shards.reader import read_clips
 from tron.shards.schema import MEMBERS, REFERENCE_MEMBERS, SCHEMA_VERSION, Clip, ClipMeta
+from tron.shards.verify import verify
 from tron.shards.writer import ShardWriter
 
 __all__ = [

@@ -12,7 +12,15 @@ from pydantic import ValidationError
 from tron.errors import TronError
 from tron.images import decode_exr, decode_png
 from tron.shards.manifest import Manifest
-from tron.shards.schema import ALL_MEMBERS, META_SUFFIX, REFERENCE_MEMBERS, Clip, ClipMeta, parse_name
+from tron.shards.schema import (
+    ALL_MEMBERS,
+    META_SUFFIX,
+    REFERENCE_MEMBERS,
+    Clip,
+    ClipMeta,
+    parse_name,
+    require_schema,
+)
 
 LARGEST_MEMBER = 256 * 2**20
 LARGEST_META = 16 * 2**20
@@ -68,10 +76,12 @@ def decode_meta(data: bytes) -> ClipMeta:
     if len(data) > LARGEST_META:
         raise TronError("a clip's meta.json is too large to be one")
     try:
-        return ClipMeta.model_validate_json(data)
+        meta = ClipMeta.model_validate_json(data)
     except ValidationError as error:
         first = error.errors()[0]
         raise TronError(f"meta.json is damaged at {first['loc']}: {first['msg']}") from error
+    require_schema(meta.schema_version, f"clip {meta.key}")
+    return meta
 
 
 def decode_clip(

@@ -1,14 +1,15 @@
 """What a clip is on disk: members, their files, and the metadata that travels with them.
 
 A clip is L consecutive frames of one scene, light and trajectory. In a tar shard frame i's members are
-`KEY.f00.pbr.exr`, `KEY.f00.irr.exr`, ... and the clip ends with `KEY.meta.json`; the key holds no dot, so
-webdataset groups a clip's files by it.
+`KEY.f00.pbr.exr`, `KEY.f00.irradiance.exr`, ... and the clip ends with `KEY.meta.json`; the key holds no
+dot, so webdataset groups a clip's files by it.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from tron.errors import TronError
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 LightFamily = Literal["sun", "studio", "overcast", "hdri", "capture"]
 
@@ -34,17 +35,17 @@ class Member(NamedTuple):
 
 MEMBERS: dict[str, Member] = {
     "pbr": Member("exr", 3, True),  # split-sum shading of the surfels, linear
-    "irr": Member("exr", 3, True),  # shadowed irradiance / pi, linear
+    "irradiance": Member("exr", 3, True),  # shadowed irradiance / pi, linear
     "rgb": Member("exr", 3, True),  # what the network must produce: path-traced radiance, linear
     "unshadowed": Member("exr", 3, True),  # irradiance / pi without visibility, linear
-    "shadowed": Member("exr", 3, True),  # base_color (1 - metallic) irr + split-sum specular, linear
+    "shadowed": Member("exr", 3, True),  # base_color (1 - metallic) irradiance + split-sum specular, linear
     "mask": Member("exr", 1, True),  # the surfels' opacity in [0, 1]
     "foreground": Member("png", 1, False),  # 1 where the pixel-centre ray meets true geometry
 }
 """Members that every frame has."""
 
 REFERENCE_MEMBERS: dict[str, Member] = {
-    "irr_ref": Member("exr", 3, True),  # Mitsuba's direct irradiance / pi, linear
+    "irradiance_ref": Member("exr", 3, True),  # Mitsuba's direct irradiance / pi, linear
     "unshadowed_ref": Member("exr", 3, True),  # the same with nothing in the way
     "base_color_ref": Member("exr", 3, True),  # true base color, linear
     "normal_ref": Member("exr", 3, False),  # true unit normals, world (x, y, z)
@@ -94,13 +95,6 @@ class ClipMeta(BaseModel):
     spp: dict[str, int] = Field(default_factory=dict)
     extra: dict[str, Any] = Field(default_factory=dict)
 
-    @field_validator("schema_version")
-    @classmethod
-    def _known_version(cls, value: int) -> int:
-        if value != SCHEMA_VERSION:
-            raise ValueError(f"schema version {value}, this program reads {SCHEMA_VERSION}")
-        return value
-
     @field_validator("key")
     @classmethod
     def _key_without_dots(cls, value: str) -> str:
@@ -122,6 +116,16 @@ class Clip:
 
     meta: ClipMeta
     frames: dict[str, np.ndarray]
+
+
+def require_schema(version: int, where: str | Path) -> None:
+    """TronError unless this program reads datasets of that schema version."""
+    if version != SCHEMA_VERSION:
+        raise TronError(
+            f"dataset of schema {version}, this program reads schema {SCHEMA_VERSION}",
+            str(where),
+            "make it again in a new folder with the tron-datagen command of its card.md",
+        )
 
 
 def member_name(key: str, frame: int, member: str) -> str:

@@ -13,8 +13,6 @@ second list nor a backward walk is needed. Which surfels are met, and the median
 where alpha is clipped its derivative is zero.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Iterable

@@ -23,8 +23,6 @@ The ancestors of strays are kept few: strays, farther from the bulk of the surfe
 its size, come last in every part that they share with others, and so end together in the last subtree.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Callable

@@ -4,8 +4,6 @@
 composited hits are written out in order, so that the adjoint can replay exactly this list.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from dataclasses import dataclass

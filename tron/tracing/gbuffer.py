@@ -1,7 +1,5 @@
 """Camera + scene -> GBuffer: one traced, composited and normalised surface point a pixel."""
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Iterable

@@ -6,8 +6,6 @@ rays that :mod:`tron.tracing.streaming` has no room for look in the list of thei
 overflows.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Callable

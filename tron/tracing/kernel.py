@@ -11,8 +11,6 @@ degree 4 (3DGRT's generalised Gaussian, Moenne-Loccoz et al. 2024). Both reach t
 sigma. Nothing else evaluates this formula, except the float64 oracle in :mod:`tron.tracing.reference`.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ harmonics and materials by ordinary automatic differentiation. The kernel's cut 
 decides what is visible and is not differentiated.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 import math
@@ -18,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from tron.aligned import aligned
+from tron.gaussians.fields import PARAMETERS
 from tron.gaussians.harmonics import SH_C0
 from tron.tracing.kernel import SH_PACKETS, SurfelRecords, cut_radius_squared
 
@@ -70,19 +69,6 @@ class SurfelParameters:
     def differentiable(self) -> bool:
         """Whether any of them has gradients enabled."""
         return dr.grad_enabled(*[getattr(self, name) for name in PARAMETERS])
-
-
-PARAMETERS = (
-    "means",
-    "quats",
-    "log_scales",
-    "opacity_logits",
-    "sh",
-    "base_color",
-    "roughness",
-    "metallic",
-)
-"""The arrays of :class:`SurfelParameters`, in order; :class:`GaussianScene` has the same names."""
 
 
 def highest_sh_degree(scene: GaussianScene) -> int:

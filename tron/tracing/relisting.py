@@ -4,8 +4,6 @@ The adjoint replays each ray's hits. Where many rays meet many surfels, their id
 between the forward and the backward pass; the backward pass composites such rays once more, in batches.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator

@@ -9,8 +9,6 @@ order, and adds this up at each. Opacity alone is differentiated. The derivative
 is blocked (T below 0.01 counts as 0) and where alpha is clipped.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from dataclasses import dataclass

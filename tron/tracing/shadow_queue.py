@@ -6,8 +6,6 @@ that all lanes share, until none is left (persistent threads: Aila and Laine 200
 written at its own place, so the result does not depend on who traced it.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -18,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.tracing.bvh import Bvh
+from tron.tracing.recording import recorded
 from tron.tracing.transmittance import BackFaces, Products, multiply, remaining
 from tron.tracing.traversal import Descent, look, search, slopes_of
 
@@ -62,7 +61,7 @@ def _spread(value: Any, width: int) -> Any:
 
 # Tracing the walk takes Python as long as tracing 10,000 rays takes a core, so it is recorded once for each
 # kind of arguments: kernel degree, levels, rays in a fan. Other sizes are free.
-@dr.freeze(limit=64, warn_after=1000)
+@recorded
 def _trace_recorded(
     bvh: Bvh,
     origins: mi.Point3f,

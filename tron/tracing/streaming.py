@@ -7,8 +7,6 @@ fails only where as many hits as fit wait for candidates that might lie before a
 larger than the distances between them.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 import drjit as dr
@@ -18,11 +16,12 @@ from tron.gaussians.harmonics import sh_basis
 from tron.tracing.compositing import STOP_TRANSMITTANCE, Composite, HitRows, composite
 from tron.tracing.hits import MAX_HITS, LocalHits, Walk, collect, drop, settle, sort
 from tron.tracing.kernel import SurfelRecords
+from tron.tracing.recording import recorded
 
 
 # Tracing the sorting networks takes as long as 16,000 rays, so the kernel is recorded once for each kind of
 # arguments: degrees, whether hits are kept, and if so for how many. Other sizes are free.
-@dr.freeze(limit=64, warn_after=1000)
+@recorded
 def stream(
     records: SurfelRecords, entries: mi.UInt32, near: mi.Float, start: mi.UInt32, count: mi.UInt32,
     origin: mi.Point3f, direction: mi.Vector3f, out: HitRows | None,

@@ -5,8 +5,6 @@ back to unit length (facts.md 4b). The surface point is at the median depth; whe
 below one half there is no median, and the alpha-weighted mean depth stands in where opacity is not zero.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from dataclasses import dataclass

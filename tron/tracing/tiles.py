@@ -10,8 +10,6 @@ Surfels are ordered by ``near`` first and written out tile by tile, so one stabl
 All of it runs in Dr.Jit; only the number of entries comes back to Python, because arrays need a size.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from dataclasses import dataclass

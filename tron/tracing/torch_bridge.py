@@ -27,24 +27,15 @@ import mitsuba as mi
 import torch
 
 from tron.errors import TronError
+from tron.gaussians.fields import FIELDS, PARAMETERS
 from tron.tracing.gbuffer import trace_gbuffer
-from tron.tracing.parameters import PARAMETERS, SurfelParameters, pack
+from tron.tracing.parameters import SurfelParameters, pack
 from tron.tracing.tiles import build_tiles
 
 if TYPE_CHECKING:
     from tron.cameras import Camera
     from tron.gaussians.scene import GaussianScene
 
-_ROW_SHAPES: dict[str, tuple[int, ...]] = {
-    "means": (3,),
-    "quats": (4,),
-    "log_scales": (2,),
-    "opacity_logits": (),
-    "sh": (16, 3),
-    "base_color": (3,),
-    "roughness": (),
-    "metallic": (),
-}
 IMAGES = ("rgb", "opacity", "normal", "base_color", "roughness", "metallic", "depth", "position")
 
 
@@ -108,7 +99,7 @@ def _check(surfels: Mapping[str, torch.Tensor]) -> int:
             raise TronError(f"the surfels have no {name}")
     count = len(surfels["means"])
     for name in PARAMETERS:
-        tensor, shape = surfels[name], (count, *_ROW_SHAPES[name])
+        tensor, shape = surfels[name], (count, *FIELDS[name].shape)
         if tuple(tensor.shape) != shape:
             raise TronError(f"{name} has shape {tuple(tensor.shape)}, expected {shape}")
         if tensor.dtype != torch.float32 or not tensor.is_contiguous():

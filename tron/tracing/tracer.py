@@ -36,7 +36,6 @@ class SurfelTracer:
     Args:
         scene: the surfels; must be valid (``scene.validate()``), and must not change while the tracer lives:
             for surfels that move there is :meth:`moved`.
-        two_sided: let back faces block shadow rays beyond two spacings; False is the paper's rule.
         parameters: traced instead of the scene's own arrays; results are differentiable by those of them that
             have gradients enabled, as often as they are asked for. After new values, :meth:`update`.
 
@@ -44,15 +43,13 @@ class SurfelTracer:
         records: the surfels as every kernel reads them, without gradients. bvh: their hierarchy.
     """
 
-    def __init__(
-        self, scene: GaussianScene, *, two_sided: bool = True, parameters: SurfelParameters | None = None
-    ) -> None:
+    def __init__(self, scene: GaussianScene, *, parameters: SurfelParameters | None = None) -> None:
         self.scene, self._parameters = scene, parameters
         self.records = pack(parameters or SurfelParameters.from_scene(scene)).detached()
         # Not built when first needed: that may be inside a recorded loop, where nothing can be evaluated.
         self.bvh = build_bvh(self.records)
         self._sorted_area = self.bvh.area
-        self._back_faces = BackFaces.of(self.records, scene.spacing, two_sided)
+        self._two_sided, self._beyond = True, BackFaces.of(self.records, scene.spacing)
 
     def moved(self, scene: GaussianScene) -> SurfelTracer:
         """A tracer of the same surfels where they are now; this one goes on tracing where they were.
@@ -78,6 +75,17 @@ class SurfelTracer:
         other._take(pack(SurfelParameters.from_scene(scene)))
         return other
 
+    def sided(self, two_sided: bool) -> SurfelTracer:
+        """The same surfels for shadow rays of other sides: back faces block beyond two spacings, or never.
+
+        A new tracer lets them block; that they never do is the paper's rule. Ask again after :meth:`update`.
+        """
+        if two_sided == self._two_sided:
+            return self
+        other = copy(self)
+        other._two_sided = two_sided
+        return other
+
     def update(self) -> None:
         """Take the new values of ``parameters``: as many surfels, which may have moved."""
         if self._parameters is not None:
@@ -99,6 +107,10 @@ class SurfelTracer:
         if self._parameters is None or not self._parameters.differentiable():
             return self.records
         return pack(self._parameters)
+
+    @property
+    def _back_faces(self) -> BackFaces:
+        return self._beyond if self._two_sided else BackFaces.never()
 
     def gbuffer(self, camera: Camera) -> GBuffer:
         """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it."""

@@ -6,8 +6,6 @@ only beyond two surfel spacings, where they can no longer belong to the surface 
 surfels are larger than the scene's median, their spacing is larger by as much (:class:`BackFaces`).
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -57,11 +55,16 @@ class BackFaces:
     radii: mi.Float
 
     @staticmethod
-    def of(records: SurfelRecords, spacing: float, two_sided: bool = True) -> BackFaces:
+    def never() -> BackFaces:
+        """Back faces that block nowhere: one-sided surfels."""
+        return BackFaces(dr.opaque(mi.Float, dr.inf), dr.opaque(mi.Float, dr.inf))
+
+    @staticmethod
+    def of(records: SurfelRecords, spacing: float) -> BackFaces:
         """Two spacings, which are ``spacing`` (world units) where surfels have their median size."""
         radii = np.array(dr.detach(records.geometry)).reshape(-1, 4 * GEOMETRY_PACKETS)[:, RADIUS]
         median = float(np.median(radii[radii > 0])) if (radii > 0).any() else 1.0
-        reach = BACK_FACE_SPACINGS * spacing if two_sided else float("inf")
+        reach = BACK_FACE_SPACINGS * spacing
         return BackFaces(dr.opaque(mi.Float, reach), dr.opaque(mi.Float, reach / median))
 
 

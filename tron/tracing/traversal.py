@@ -10,8 +10,6 @@ a few steps, and then all meet the surfels of a few of theirs. One lane in a lea
 waiting at nearly every node (Aila and Laine 2009, "Understanding the Efficiency of Ray Traversal on GPUs").
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence

@@ -251,7 +251,7 @@ def test_other_settings_are_refused_and_change_nothing_unless_told_to(
     assert reconstruct(out, "radiance.sh_rate=0.01") == 2
     error = capsys.readouterr().err.strip()
     assert error.startswith("tron-reconstruct: ")
-    assert "another radiance.sh_rate" in error
+    assert "a checkpoint made with radiance.sh_rate=" in error
     assert "overwrite=true" in error
     assert "\n" not in error
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tron.captures import LoadSettings, PosingSettings, load_capture
+from tron.captures import LoadSettings, load_capture
 
 COUNT = 12
 
@@ -44,7 +44,7 @@ def test_the_fox_is_posed_as_its_file_says(fox: Path, tmp_path: Path) -> None:
             exif[0x0112] = 6
             picture.transpose(Image.Transpose.ROTATE_90).save(folder / path.name, quality=95, exif=exif)
     said: list[str] = []
-    settings = LoadSettings(downscale=8, posing=PosingSettings(max_side=800, threads=1))
+    settings = LoadSettings(downscale=8, feature_side=800, threads=1)
     capture = load_capture(folder, settings)
     assert len(capture.views) >= COUNT - 1
 
@@ -66,7 +66,7 @@ def test_the_fox_is_posed_as_its_file_says(fox: Path, tmp_path: Path) -> None:
     # What was posed is kept: a second load neither repeats it nor differs.
     from tron.captures.structure_from_motion import pose_photos
 
-    posed = pose_photos(folder, settings.posing, said.append)
+    posed = pose_photos(folder, settings, said.append)
     assert len(said) == 1
     assert "taken from" in said[0]
     assert posed.points is not None

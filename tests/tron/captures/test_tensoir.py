@@ -46,11 +46,11 @@ def test_albedo_is_linear_and_normals_are_the_worlds(scene: Path, downscale: int
 
 
 def test_another_light_can_be_chosen(scene: Path) -> None:
-    assert load_capture(scene, LoadSettings(light="city")).views[0].read()[..., 2].mean() > 0.9
+    assert load_capture(scene, LoadSettings(tensoir_light="city")).views[0].read()[..., 2].mean() > 0.9
     with pytest.raises(TronError, match=r"no view has a photo under the light 'night'.*"):
-        load_capture(scene, LoadSettings(light="night"))
+        load_capture(scene, LoadSettings(tensoir_light="night"))
     with pytest.raises(TronError, match="leads out"):
-        load_capture(scene, LoadSettings(light="../../x"))
+        load_capture(scene, LoadSettings(tensoir_light="../../x"))
 
 
 def test_a_damaged_map_is_left_out_and_said(scene: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tron.color import srgb_to_linear
 from tron.errors import TronError
-from tron.gaussians.ply import MATERIALS, read_ply
+from tron.gaussians.ply import MATERIAL_PROPERTIES
 from tron.gaussians.scene import GaussianScene, quats_from_matrices
 from tron.seeds import generator
 
@@ -89,7 +89,7 @@ def test_every_encoding_gives_the_same_scene(scene, tmp_path, text, order):
     path = tmp_path / "a.ply"
     scene.save(path)
     rewrite(path, text=text, order=order)
-    back = read_ply(path)
+    back = GaussianScene.load(path)
     np.testing.assert_allclose(back.means, scene.means, rtol=1e-6)
     np.testing.assert_allclose(back.sh, scene.sh, rtol=1e-6)
     np.testing.assert_array_equal(back.object_id, scene.object_id)
@@ -98,8 +98,8 @@ def test_every_encoding_gives_the_same_scene(scene, tmp_path, text, order):
 def test_a_plain_3dgs_file_gets_guessed_materials(scene, tmp_path):
     path = tmp_path / "a.ply"
     scene.save(path)
-    rewrite(path, drop=(*MATERIALS, "object_id"))
-    back = read_ply(path)
+    rewrite(path, drop=(*MATERIAL_PROPERTIES, "object_id"))
+    back = GaussianScene.load(path)
     assert back.materials_guessed
     assert not back.oriented
     assert back.kernel_degree == 2
@@ -116,7 +116,7 @@ def test_infinite_opacities_are_opaque_and_absent_surfels_are_counted(scene, tmp
     logits = scene.opacity_logits.copy()
     logits[[3, 4]], logits[7], logits[[11, 24]] = np.inf, -np.inf, np.nan
     rewrite(path, change={"opacity": logits})
-    back = read_ply(path)
+    back = GaussianScene.load(path)
     kept = np.setdiff1d(np.arange(len(scene)), [7, 11, 24])
     np.testing.assert_array_equal(back.means, scene.means[kept])
     np.testing.assert_array_equal(back.object_id, scene.object_id[kept])
@@ -148,18 +148,18 @@ def test_up_is_what_the_file_says_or_minus_y(scene, tmp_path, comments, up, gues
     path = tmp_path / "a.ply"
     scene.save(path)
     rewrite(path, comments=comments)
-    back = read_ply(path)
+    back = GaussianScene.load(path)
     assert (back.up.tolist(), back.up_guessed) == (list(up), guessed)
     turn = Rotation.from_euler("xyz", [0.3, 0.2, 0.1]).as_matrix()
     back.rotated(turn).save(path)
-    again = read_ply(path)  # a guess stays a guess, in the world as it now is
+    again = GaussianScene.load(path)  # a guess stays a guess, in the world as it now is
     np.testing.assert_allclose(again.up, turn @ up, atol=1e-12)
     assert again.up_guessed is guessed
 
 
 @pytest.mark.parametrize("name", ["biker", "guitar"])
 def test_real_scans_load_and_stand_upright(shared_data, name):
-    scene = read_ply(shared_data / "splats" / f"{name}.ply")
+    scene = GaussianScene.load(shared_data / "splats" / f"{name}.ply")
     assert scene.opacities().max() < 1
     low, high = scene.bounds(0.01)
     assert (high - low).argmax() == np.abs(scene.up).argmax(), "taller than wide, along up"
@@ -173,8 +173,8 @@ def test_packed_splats_are_named_with_the_way_out(shared_data, name):
 def test_a_2dgs_file_with_two_scales_loads(scene, tmp_path):
     path = tmp_path / "a.ply"
     scene.save(path)
-    rewrite(path, drop=(*MATERIALS, "object_id", "scale_2"))
-    back = read_ply(path)
+    rewrite(path, drop=(*MATERIAL_PROPERTIES, "object_id", "scale_2"))
+    back = GaussianScene.load(path)
     np.testing.assert_array_equal(back.log_scales, scene.log_scales)
     np.testing.assert_array_equal(back.quats, scene.quats)
 
@@ -188,7 +188,7 @@ def test_dropping_the_thin_axis_keeps_the_gaussian(scene, tmp_path):
     change = {f"scale_{k}": scales[:, k] for k in range(3)} | {f"rot_{k}": quats[:, k] for k in range(4)}
     rewrite(path, change=change)
     assert len(np.unique(scales.argmin(axis=1))) == 3
-    back = read_ply(path)
+    back = GaussianScene.load(path)
     rotation = Rotation.from_quat(scene.quats, scalar_first=True).as_matrix()
     variances = np.exp(2 * scales.astype(np.float64))
     variances[np.arange(len(scene)), scales.argmin(axis=1)] = 0
@@ -206,7 +206,7 @@ def test_lower_degrees_fill_the_low_bands(scene, tmp_path, rest, bands):
     scene.save(path)
     values = {f"f_rest_{i}": np.full(len(scene), i, np.float32) for i in range(rest)}
     rewrite(path, drop=[f"f_rest_{i}" for i in range(rest, 45)], change=values)
-    back = read_ply(path)
+    back = GaussianScene.load(path)
     assert (back.sh[:, bands + 1 :] == 0).all()
     if bands:
         np.testing.assert_array_equal(back.sh[0, 1 : bands + 1, 1], np.arange(bands, 2 * bands))
@@ -215,7 +215,7 @@ def test_lower_degrees_fill_the_low_bands(scene, tmp_path, rest, bands):
 def refuse(path, words):
     started = time.process_time()
     with pytest.raises(TronError, match=words) as caught:
-        read_ply(path)
+        GaussianScene.load(path)
     assert time.process_time() - started < 1
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)

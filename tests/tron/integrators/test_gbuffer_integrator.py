@@ -1,7 +1,5 @@
 """Laws of ``tron_gbuffer``: the tracer's G-buffer by Mitsuba's sensors, gradients through ``mi.render``."""
 
-# (Mitsuba's type stubs know no arithmetic between its own array types.)
-
 from __future__ import annotations
 
 import dataclasses

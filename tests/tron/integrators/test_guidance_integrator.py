@@ -1,7 +1,5 @@
 """Laws of ``tron_guidance``: the library's guidance by Mitsuba's sensors, under its scene's own light."""
 
-# (Mitsuba's type stubs know no arithmetic between its own array types.)
-
 from __future__ import annotations
 
 from typing import Any
@@ -14,6 +12,7 @@ import pytest
 from tron import integrators
 from tron.cameras import Camera, mitsuba_sensor
 from tron.errors import TronError
+from tron.estimation import Estimation
 from tron.gaussians.scene import GaussianScene
 from tron.integrators.environment import environment_of
 from tron.seeds import generator
@@ -61,7 +60,7 @@ def channels(image: mi.TensorXf, integrator: mi.Integrator) -> dict[str, np.ndar
 
 
 def ours(surfels: GaussianScene, light: EnvironmentMap) -> Guidance:
-    return render_guidance(SurfelTracer(surfels), CAMERA, Lighting(light), 16, 0)
+    return render_guidance(SurfelTracer(surfels), CAMERA, Lighting(light), Estimation(rays=16), 0)
 
 
 @pytest.mark.parametrize("buffer", BUFFERS)
@@ -84,7 +83,9 @@ def test_many_rays_a_pixel_average_the_same_light(surfels, light) -> None:
     described = mitsuba_sensor(CAMERA, pixel_format="rgba")
     scene = mi.load_dict({"type": "scene", "sensor": described, "light": light.to_mitsuba()})
     seen = channels(mi.render(scene, integrator=integrator, spp=64), integrator)["main"]
-    fine = render_guidance(SurfelTracer(surfels), CAMERA.resized(36 * 8, 24 * 8), Lighting(light), 16, 0)
+    fine = render_guidance(
+        SurfelTracer(surfels), CAMERA.resized(36 * 8, 24 * 8), Lighting(light), Estimation(rays=16), 0
+    )
     truth = fine.irradiance.reshape(24, 8, 36, 8, 3).mean((1, 3))
     assert np.sqrt(np.mean((seen - truth) ** 2)) < 0.05 * truth.mean()
     assert abs(seen.mean() / truth.mean() - 1) < 0.01

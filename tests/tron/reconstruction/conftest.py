@@ -10,6 +10,7 @@ import pytest
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.color import agx
+from tron.estimation import Estimation
 from tron.gaussians import GaussianScene
 from tron.gaussians.harmonics import SH_COUNT, rgb_to_dc
 from tron.gaussians.scene import quats_from_normals
@@ -75,7 +76,7 @@ def captured(tracer: SurfelTracer) -> Callable[..., Capture]:
             gbuffer = tracer.gbuffer(camera)
             prior = [irradiance(tracer, gbuffer, lighting.light, 64, seed)[0] for seed in range(2)]
             prior = prior_scale * np.mean([np.array(p).T for p in prior], 0).reshape(SIZE, SIZE, 3)
-            shadowed = render_guidance(tracer, camera, lighting, 64, seed=9).shadowed
+            shadowed = render_guidance(tracer, camera, lighting, Estimation(rays=64), seed=9).shadowed
             made.append(View(f"{i}", camera, agx(exposure * shadowed), "display", irradiance=prior))
         return Capture(tuple(made), exposure=exposure)
 

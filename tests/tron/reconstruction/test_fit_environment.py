@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from tron.captures import Capture
 from tron.errors import TronError
+from tron.estimation import Estimation
 from tron.reconstruction import EnvironmentFit, FitSettings, fit_environment
 from tron.reconstruction.light_scale import choose_photos, fit_scale
 from tron.reconstruction.log_pyramid import LogPyramid
@@ -20,6 +21,7 @@ from tron.seeds import generator
 from tron.shading import EnvironmentMap, Lighting, render_guidance
 
 QUICK = FitSettings(resolution=16, steps=250, rays=16, pixels=512, scale_steps=100, split_sum_resolution=64)
+SCALE = FitSettings(scale_views=6, scale_pixels=10**6, scale_steps=150, scale_rays=32)
 
 
 def cosine_integral(light: EnvironmentMap, normals: np.ndarray, height: int = 96) -> np.ndarray:
@@ -49,17 +51,17 @@ def fit(tracer, captured, studio) -> EnvironmentFit:
 
 def test_a_known_light_is_found_and_its_scale_corrected(fit: EnvironmentFit, studio: EnvironmentMap) -> None:
     # The prior is 0.4 of the truth: stage 3a finds that light, stage 3b the factor that the photos ask for.
-    assert irradiance_error(EnvironmentMap(fit.environment.image / fit.sigma), studio) > 0.5
+    assert irradiance_error(EnvironmentMap(fit.environment.image / fit.scale.sigma), studio) > 0.5
     assert irradiance_error(fit.environment, studio) < 0.05
-    assert fit.sigma == pytest.approx(1 / 0.4, rel=0.02)
+    assert fit.scale.sigma == pytest.approx(1 / 0.4, rel=0.02)
 
 
 def test_the_losses_fall(fit: EnvironmentFit) -> None:
-    assert len(fit.irradiance_loss) == QUICK.steps
-    assert len(fit.scale_loss) == len(fit.scale_curve) == QUICK.scale_steps
-    assert fit.irradiance_loss[-25:].mean() < 0.3 * fit.irradiance_loss[:5].mean()
-    assert fit.scale_loss[-25:].mean() < 0.3 * fit.scale_loss[:5].mean()
-    assert fit.scale_curve[0] == 1
+    assert len(fit.cubemap.loss) == QUICK.steps
+    assert len(fit.scale.loss) == len(fit.scale.curve) == QUICK.scale_steps
+    assert fit.cubemap.loss[-25:].mean() < 0.3 * fit.cubemap.loss[:5].mean()
+    assert fit.scale.loss[-25:].mean() < 0.3 * fit.scale.loss[:5].mean()
+    assert fit.scale.curve[0] == 1
 
 
 def test_lights_are_where_they_were(fit: EnvironmentFit, studio: EnvironmentMap) -> None:
@@ -75,36 +77,30 @@ def test_a_small_sun_is_found(tracer, captured) -> None:
     sun = EnvironmentMap(image)
     settings = QUICK.model_copy(update={"steps": 400, "scale_steps": 0})
     found = fit_environment(captured(sun), tracer, settings)
-    assert found.sigma == 1
+    assert found.scale.sigma == 1
     assert irradiance_error(found.environment, sun) < 0.05
 
 
 def test_sigma_is_a_known_scale_within_a_hundredth(tracer, captured, studio) -> None:
     capture = captured(studio)
-    photos = choose_photos(capture.train_views, 6, 10**6, capture.exposure, seed=0)
+    photos = choose_photos(capture.train_views, SCALE, capture.exposure)
     for scale in (0.3, 1.0, 20.0):
         dimmed = Lighting(EnvironmentMap(studio.image / np.float32(scale)), 64)
-        found = fit_scale(
-            tracer,
-            photos,
-            dimmed,
-            exposure=capture.exposure,
-            steps=150,
-            rays=32,
-            learning_rate=0.1,
-            seed=0,
-            track=lambda items, _: items,
-        )
+        found = fit_scale(tracer, photos, dimmed, SCALE, capture.exposure)
         assert found.sigma == pytest.approx(scale, rel=0.01)
 
 
 def test_linear_photos_ask_for_the_same_scale(tracer, captured, studio) -> None:
     capture, lighting = captured(studio, views=3), Lighting(studio, 64)
     linear = [
-        replace(view, image=render_guidance(tracer, view.camera, lighting, 64, 9).shadowed, space="linear")
+        replace(
+            view,
+            image=render_guidance(tracer, view.camera, lighting, Estimation(rays=64), 9).shadowed,
+            space="linear",
+        )
         for view in capture.views
     ]
-    one, other = (choose_photos(views, 3, 10**6, capture.exposure, 0) for views in (capture.views, linear))
+    one, other = (choose_photos(views, SCALE, capture.exposure) for views in (capture.views, linear))
     for a, b in zip(one, other):
         np.testing.assert_allclose(a.shown, b.shown, atol=1e-5)
 
@@ -125,24 +121,24 @@ def test_the_sky_counts_in_neither_stage(tracer, captured, studio) -> None:
         for views in (masked, spoiled)
     )
     # Threads sum gradients in any order, so the two differ by rounding that the steps amplify.
-    np.testing.assert_allclose(one.irradiance_loss[:20], other.irradiance_loss[:20], rtol=1e-2)
-    assert one.sigma == pytest.approx(other.sigma, rel=1e-2)
+    np.testing.assert_allclose(one.cubemap.loss[:20], other.cubemap.loss[:20], rtol=1e-2)
+    assert one.scale.sigma == pytest.approx(other.scale.sigma, rel=1e-2)
 
 
 def test_texels_that_no_ray_met_keep_the_first_light(tracer, captured, studio) -> None:
     capture = captured(studio, views=1)
     few = {"resolution": 64, "coarsest": 64, "steps": 2, "rays": 2, "pixels": 16, "scale_steps": 0}
     found = fit_environment(capture, tracer, QUICK.model_copy(update={**few, "estimator": "plain"}))
-    assert 0 < found.seen.mean() < 1
-    assert np.ptp(found.texels[~found.seen], axis=0).max() < 1e-5
-    assert np.ptp(found.texels[found.seen], axis=0).max() > 1e-3
+    assert 0 < found.cubemap.has_gradient.mean() < 1
+    assert np.ptp(found.cubemap.texels[~found.cubemap.has_gradient], axis=0).max() < 1e-5
+    assert np.ptp(found.cubemap.texels[found.cubemap.has_gradient], axis=0).max() > 1e-3
 
 
 def test_one_thread_repeats_bit_by_bit_and_seeds_differ(tracer, captured, studio) -> None:
     capture, settings = captured(studio, views=2), QUICK.model_copy(update={"steps": 10, "scale_steps": 0})
     dr.set_thread_count(1)  # the fixture drjit_threads gives them back
-    one, two = (fit_environment(capture, tracer, settings).texels for _ in range(2))
-    other = fit_environment(capture, tracer, settings.model_copy(update={"seed": 1})).texels
+    one, two = (fit_environment(capture, tracer, settings).cubemap.texels for _ in range(2))
+    other = fit_environment(capture, tracer, settings.model_copy(update={"seed": 1})).cubemap.texels
     np.testing.assert_array_equal(one, two)
     assert (one != other).any()
 
@@ -180,7 +176,7 @@ def test_a_real_light_is_found(tracer, captured, shared_data, name: str) -> None
     found = fit_environment(captured(truth, prior_scale=0.5), tracer, FitSettings(scale_steps=100))
     # The witness sums points, so suns of a few texels are spread out first.
     assert irradiance_error(found.environment.resized(96), truth.resized(96)) < 0.05
-    assert found.sigma == pytest.approx(2, rel=0.04)
+    assert found.scale.sigma == pytest.approx(2, rel=0.04)
 
 
 def test_levels_add_up_to_the_light_they_start_from_and_stay_smooth(variant: str) -> None:
@@ -204,7 +200,7 @@ def test_the_papers_settings() -> None:
 
 def test_large_photos_are_reduced_by_averaging(captured, studio) -> None:
     view = captured(studio, views=1).views[0]
-    (photo,) = choose_photos([view], 1, 300, 1.0, 0)
+    (photo,) = choose_photos([view], FitSettings(scale_pixels=300), 1.0)
     assert photo.factor == 2
     assert photo.shown.shape == (16, 16, 3)
     np.testing.assert_allclose(photo.shown[3, 5], view.read()[6:8, 10:12].mean((0, 1)), rtol=1e-5)

@@ -212,7 +212,7 @@ def test_a_checkpoint_of_another_run_is_refused_by_the_name_of_what_differs(
         "capture": (replace(painted_capture, test=frozenset({"01"})), GroundTruth(), brief),
     }
     for key, (capture, prior, other) in others.items():
-        with pytest.raises(TronError, match=f"made with another {key} ") as caught:
+        with pytest.raises(TronError, match=f"a checkpoint made with {key}") as caught:
             reconstruct(capture, prior, other, checkpoint=path)
         assert "\n" not in str(caught.value)
     assert path.read_bytes() == before

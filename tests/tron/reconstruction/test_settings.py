@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from tron.apps.recipes import compose_recipe, resolve
+from tron.cli.recipes import compose_recipe, resolve
 from tron.reconstruction.settings import (
     DensitySettings,
     FitSettings,

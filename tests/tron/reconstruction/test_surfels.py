@@ -8,7 +8,8 @@ import torch
 
 from tron.errors import TronError
 from tron.gaussians import GaussianScene
-from tron.reconstruction.surfels import ADAM_EPSILON, ROWS, UNIT_INTERVAL, LearntSurfels
+from tron.gaussians.fields import MATERIALS
+from tron.reconstruction.surfels import ADAM_EPSILON, ROWS, LearntSurfels
 from tron.seeds import generator
 
 RATES = {name: 0.01 * (i + 1) for i, name in enumerate(ROWS)}
@@ -18,7 +19,7 @@ def rows(count: int, seed: int = 0) -> dict[str, torch.Tensor]:
     """Random tensors by name, materials in [0, 1]."""
     rng = generator(seed, "surfels")
     made = {name: rng.standard_normal((count, *shape)) for name, shape in ROWS.items()}
-    made |= {name: 0.3 + 0.4 * rng.random((count, *ROWS[name])) for name in UNIT_INTERVAL}
+    made |= {name: 0.3 + 0.4 * rng.random((count, *ROWS[name])) for name in MATERIALS}
     return {name: torch.tensor(values, dtype=torch.float32) for name, values in made.items()}
 
 
@@ -59,7 +60,7 @@ def test_two_steps_are_adams() -> None:
             second[name] = 0.999 * second[name] + 0.001 * g * g
             root = np.sqrt(second[name] / (1 - 0.999**step)) + ADAM_EPSILON
             wanted[name] -= RATES[name] * first[name] / (1 - 0.9**step) / root
-            if name in UNIT_INTERVAL:
+            if name in MATERIALS:
                 wanted[name] = wanted[name].clip(0, 1)
     for name in ROWS:
         np.testing.assert_allclose(surfels[name].detach().numpy(), wanted[name], atol=2e-6, err_msg=name)
@@ -124,7 +125,7 @@ def test_materials_stay_between_zero_and_one_and_nothing_else_is_clamped() -> No
     surfels.step()
     for name in ROWS:
         low = float(surfels[name].detach().min())
-        assert low == 0 if name in UNIT_INTERVAL else low < -3
+        assert low == 0 if name in MATERIALS else low < -3
 
 
 def test_what_has_no_rate_stands_still_through_steps_and_surgery() -> None:

@@ -1,7 +1,5 @@
 """A scene in closed form: a white sphere above a plane, traced exactly; the witness of every shadow test."""
 
-# (Mitsuba's type stubs know no arithmetic between its own array types.)
-
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -25,6 +23,9 @@ class SphereOverPlane:
     def __init__(self, sphere: bool = True, base_color: float = 1.0, metallic: float = 0.0) -> None:
         self.sphere, self.base_color, self.metallic = sphere, base_color, metallic
         self.scene = SimpleNamespace(spacing=0.02)
+
+    def sided(self, two_sided: bool) -> SphereOverPlane:
+        return self
 
     def _sphere_hit(self, origin: mi.Point3f, direction: mi.Vector3f) -> mi.Float:
         """Distance to the sphere, infinite if missed."""

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from tron.cameras import Camera
+from tron.estimation import Estimation
 from tron.seeds import generator
 from tron.shading.background import CLEAR_TRANSMITTANCE, background_share
 from tron.shading.environment import EnvironmentMap
@@ -33,7 +34,13 @@ def fitted_logits(count: int) -> np.ndarray:
 
 
 def rendered(scene, peak: float, **settings) -> Guidance:
-    return render_guidance(SurfelTracer(scene), VIEW, Lighting(low_sun(peak), 64), spp=2, **settings)
+    return render_guidance(
+        SurfelTracer(scene),
+        VIEW,
+        Lighting(low_sun(peak), 64),
+        Estimation(rays=2),
+        **settings,
+    )
 
 
 def test_share_is_none_of_the_opaque_all_of_the_clear_and_rises_smoothly_between(variant: str) -> None:

@@ -1,7 +1,5 @@
 """Laws of the cubemap: continuous on the sphere, one with the lat-long map, and its gradients are honest."""
 
-# (Mitsuba's type stubs know no arithmetic between its own array types.)
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -12,6 +12,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial.transform import Rotation
 
 from tron.cameras import Camera, mitsuba_sensor
+from tron.estimation import Estimation
 from tron.gaussians.scene import measure_spacing
 from tron.seeds import generator
 from tron.shading.environment import EnvironmentMap
@@ -64,7 +65,7 @@ def render_mitsuba(
 def test_a_furnace_lights_dense_surfels_fully(dense_surfels, white, shape: str) -> None:
     tracer = SurfelTracer(dense_surfels.scene(getattr(dense_surfels, shape)()))
     for view in VIEWS[:1] if shape == "plane" else VIEWS:
-        guidance = render_guidance(tracer, view, white, 64)
+        guidance = render_guidance(tracer, view, white, Estimation(rays=64))
         facing = -(guidance.gbuffer["normal"] * guidance.gbuffer["direction"]).sum(-1)
         seen = (guidance.mask > 0.99) & (facing > 0.3)
         assert seen.sum() > 300
@@ -110,7 +111,7 @@ def test_coarse_surfels_beside_fine_ones_darken_little(dense_surfels, white) -> 
     scales = np.log(0.5 * sizes)[:, None].repeat(2, 1)
     scene = dense_surfels.scene(plane, patch, spacing=measure_spacing(patch.points), log_scales=scales)
     assert measure_spacing(scene.means) < 0.11 * coarse
-    guidance = render_guidance(SurfelTracer(scene), VIEWS[0], white, 64)
+    guidance = render_guidance(SurfelTracer(scene), VIEWS[0], white, Estimation(rays=64))
     inner = away_from_silhouettes(guidance)
     assert inner.sum() > 400
     assert guidance.irradiance[inner].mean() > 0.98
@@ -125,7 +126,7 @@ def test_uneven_surfels_darken_little(
     tracer = SurfelTracer(
         dense_surfels.scene(uneven(dense_surfels.plane(SPACING, 1.5), SPACING, degrees, height))
     )
-    guidance = render_guidance(tracer, VIEWS[0], white, 64)
+    guidance = render_guidance(tracer, VIEWS[0], white, Estimation(rays=64))
     inner = away_from_silhouettes(guidance)
     assert inner.sum() > 400
     assert guidance.irradiance[inner].mean() > least
@@ -207,8 +208,8 @@ def test_the_shadow_of_a_box_reaches_its_foot(dense_surfels, faces: str) -> None
     assert umbra.sum() > 500
 
     def lit(two_sided: bool) -> np.ndarray:
-        tracer = SurfelTracer(scene, two_sided=two_sided)
-        guidance = render_guidance(tracer, view, Lighting(sun), 64)
+        estimation = Estimation(rays=64, two_sided=two_sided)
+        guidance = render_guidance(SurfelTracer(scene), view, Lighting(sun), estimation)
         inside = umbra & (guidance.mask > 0.99)
         return guidance.irradiance[inside, 0] / guidance.unshadowed[inside, 0]
 
@@ -253,7 +254,9 @@ def test_irradiance_is_that_of_mitsuba_on_the_shape_itself(
 ) -> None:
     """Within noise, plus a bias of at most 1.5% of the mean (what dense surfels darken near a contact)."""
     sheets, environment = sheets_of(dense_surfels, shape), lights(sun_map)[light]
-    guidance = render_guidance(SurfelTracer(dense_surfels.scene(*sheets)), VIEW, Lighting(environment), 128)
+    guidance = render_guidance(
+        SurfelTracer(dense_surfels.scene(*sheets)), VIEW, Lighting(environment), Estimation(rays=128)
+    )
     white_bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
     truth = render_mitsuba(sheets, VIEW, environment, white_bsdf, 256)
     inner = away_from_silhouettes(guidance)
@@ -298,7 +301,7 @@ def test_direct_light_is_that_of_mitsubas_principled_bsdf(
         roughness=np.full(count, roughness),
         metallic=np.full(count, metallic),
     )
-    guidance = render_guidance(SurfelTracer(scene), VIEW, Lighting(environment), 64)
+    guidance = render_guidance(SurfelTracer(scene), VIEW, Lighting(environment), Estimation(rays=64))
     bsdf = {
         "type": "principled",
         "base_color": {"type": "rgb", "value": 0.6},

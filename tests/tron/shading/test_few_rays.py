@@ -7,6 +7,7 @@ import pytest
 
 from tron.cameras import Camera
 from tron.color import luminance
+from tron.estimation import Estimation
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
 from tron.shading.few_rays import RATIO_FROM_RAYS, regressed_share
 from tron.shading.guidance import Lighting, reaching_share, render_guidance
@@ -31,23 +32,29 @@ def test_shadows_of_few_rays_are_as_dark_as_of_many(
     variant: str, sphere_over_plane, sun_map, light: str
 ) -> None:
     tracer, lighting = sphere_over_plane(), Lighting(sun_map if light == "sun" else windows())
-    many = render_guidance(tracer, VIEW, lighting, spp=256, seed=99)
+    many = render_guidance(tracer, VIEW, lighting, Estimation(rays=256), seed=99)
     surface = many.mask > 0
     shadowed = surface & (luminance(many.irradiance) < 0.5 * luminance(many.unshadowed))
     assert shadowed.sum() > 150
     truth = luminance(many.irradiance[shadowed]).mean()
     for spp, denoise in ((2, False), (2, True), (4, True), (8, False)):
-        few = [render_guidance(tracer, VIEW, lighting, spp, k, denoise).irradiance for k in range(2)]
+        few = [
+            render_guidance(tracer, VIEW, lighting, Estimation(rays=spp, filtered=denoise), k).irradiance
+            for k in range(2)
+        ]
         mean = np.mean([luminance(image[shadowed]).mean() for image in few])
         assert 0.94 < mean / truth < 1.07, (spp, denoise)  # the ratio: from 1.2 to 1.8 at 2 rays
 
 
 def test_the_regression_has_less_noise_than_the_ratio(variant: str, sphere_over_plane, sun_map) -> None:
     tracer, lighting = sphere_over_plane(), Lighting(sun_map)
-    many = render_guidance(tracer, VIEW, lighting, spp=256, seed=99)
+    many = render_guidance(tracer, VIEW, lighting, Estimation(rays=256), seed=99)
     surface, gbuffer = many.mask > 0, tracer.gbuffer(VIEW)
     found = irradiance(tracer, gbuffer, lighting.light, 2, 0)
-    shares = reaching_share(*found, gbuffer, lighting, tracer.scene.spacing, 2), visible_share(*found)
+    shares = (
+        reaching_share(*found, gbuffer, lighting, tracer.scene.spacing, Estimation(rays=2)),
+        visible_share(*found),
+    )
     ours, ratio = (np.std((as_image(s) * many.unshadowed - many.irradiance)[surface]) for s in shares)
     assert ours < 0.7 * ratio
 
@@ -57,7 +64,7 @@ def test_open_surfaces_keep_all_light_exactly(variant: str, sphere_over_plane, s
     gbuffer = tracer.gbuffer(VIEW)
     for spp in (2, 4, 8):
         found = irradiance(tracer, gbuffer, lighting.light, spp, 0)
-        share = reaching_share(*found, gbuffer, lighting, tracer.scene.spacing, spp)
+        share = reaching_share(*found, gbuffer, lighting, tracer.scene.spacing, Estimation(rays=spp))
         np.testing.assert_array_equal(as_image(share), 1)
 
 
@@ -72,7 +79,9 @@ def test_a_dark_umbra_stays_black(variant: str, sphere_over_plane) -> None:
     assert umbra.sum() > 20
     found = irradiance(tracer, gbuffer, lighting.light, 2, 0)
     for denoise, most in ((False, 1e-5), (True, 0.01)):
-        share = reaching_share(*found, gbuffer, lighting, tracer.scene.spacing, 2, denoise)
+        share = reaching_share(
+            *found, gbuffer, lighting, tracer.scene.spacing, Estimation(rays=2, filtered=denoise)
+        )
         assert as_image(share)[umbra].max() < most
 
 
@@ -94,5 +103,5 @@ def test_from_sixteen_rays_the_share_is_the_ratio(variant: str, sphere_over_plan
     gbuffer = tracer.gbuffer(camera)
     for spp, same in ((RATIO_FROM_RAYS - 2, False), (RATIO_FROM_RAYS, True), (64, True)):
         found = irradiance(tracer, gbuffer, EnvironmentLight(sun_map), spp, 0)
-        share = reaching_share(*found, gbuffer, lighting, tracer.scene.spacing, spp)
+        share = reaching_share(*found, gbuffer, lighting, tracer.scene.spacing, Estimation(rays=spp))
         assert (np.array(share) == np.array(visible_share(*found))).all() == same

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from tron.cameras import Camera
+from tron.estimation import Estimation
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
 from tron.shading.irradiance import irradiance
 
-BUFFERS = ("pbr", "irradiance", "unshadowed", "shadowed")
+BUFFERS = [name for name in Guidance.BUFFERS if name != "mask"]
 
 
 def blurry_map() -> EnvironmentMap:
@@ -20,7 +21,7 @@ def test_constant_light_with_nothing_in_the_way_is_returned_exactly(
     variant: str, sphere_over_plane, camera
 ) -> None:
     lighting = Lighting(EnvironmentMap.constant((0.5, 1.0, 2.0)))
-    guidance = render_guidance(sphere_over_plane(sphere=False), camera, lighting, spp=2)
+    guidance = render_guidance(sphere_over_plane(sphere=False), camera, lighting, Estimation(rays=2))
     for name in ("irradiance", "unshadowed"):
         np.testing.assert_allclose(
             getattr(guidance, name), np.broadcast_to((0.5, 1, 2), (48, 48, 3)), rtol=1e-5, err_msg=name
@@ -28,20 +29,24 @@ def test_constant_light_with_nothing_in_the_way_is_returned_exactly(
 
 
 def test_buffers_are_finite_float32_images(variant: str, sphere_over_plane, camera, sun_map) -> None:
-    guidance = render_guidance(sphere_over_plane(), camera, Lighting(sun_map), spp=4)
+    guidance = render_guidance(sphere_over_plane(), camera, Lighting(sun_map), Estimation(rays=4))
     for name in BUFFERS:
-        buffer = getattr(guidance, name)
+        buffer = guidance[name]
         assert buffer.shape == (48, 48, 3)
         assert buffer.dtype == np.float32
         assert np.isfinite(buffer).all()
         assert buffer.min() >= 0
-    assert guidance.mask.shape == (48, 48)
+    assert set(Guidance.BUFFERS) == {"pbr", "irradiance", "unshadowed", "shadowed", "mask"}
+    assert guidance["mask"].shape == (48, 48, 1)
+    np.testing.assert_array_equal(guidance["mask"][..., 0], guidance.mask)
+    with pytest.raises(KeyError):
+        guidance["gbuffer"]
     assert (guidance.irradiance <= guidance.unshadowed * (1 + 1e-5)).all()
 
 
 def test_buffers_differ_by_the_diffuse_shadow_alone(variant: str, sphere_over_plane, camera, sun_map) -> None:
     tracer = sphere_over_plane(base_color=0.6, metallic=0.25)
-    guidance = render_guidance(tracer, camera, Lighting(sun_map), spp=16)
+    guidance = render_guidance(tracer, camera, Lighting(sun_map), Estimation(rays=16))
     inside = guidance.mask == 1
     lost = 0.6 * 0.75 * (guidance.unshadowed - guidance.irradiance)
     assert lost[inside].max() > 0.1
@@ -53,16 +58,16 @@ def test_buffers_differ_by_the_diffuse_shadow_alone(variant: str, sphere_over_pl
 def test_metal_has_no_diffuse_and_keeps_its_reflection_in_shadow(
     variant: str, sphere_over_plane, camera, sun_map
 ) -> None:
-    guidance = render_guidance(sphere_over_plane(metallic=1.0), camera, Lighting(sun_map), spp=4)
+    guidance = render_guidance(sphere_over_plane(metallic=1.0), camera, Lighting(sun_map), Estimation(rays=4))
     np.testing.assert_allclose(guidance.pbr, guidance.shadowed, rtol=1e-5)
 
 
 def test_white_surfaces_in_a_white_furnace(variant: str, sphere_over_plane, camera) -> None:
     lighting = Lighting(EnvironmentMap.constant(1.0))
-    metal = render_guidance(sphere_over_plane(metallic=1.0), camera, lighting, spp=2).pbr
+    metal = render_guidance(sphere_over_plane(metallic=1.0), camera, lighting, Estimation(rays=2)).pbr
     assert metal.min() > 0.8
     assert metal.max() <= 1 + 1e-4
-    black = render_guidance(sphere_over_plane(base_color=0.0), camera, lighting, spp=2)
+    black = render_guidance(sphere_over_plane(base_color=0.0), camera, lighting, Estimation(rays=2))
     assert black.pbr[black.mask == 1].min() > 0.02  # a dielectric's own reflection
 
 
@@ -77,9 +82,9 @@ def test_the_environment_shows_where_surfels_do_not(variant: str, sphere_over_pl
 
     tracer, lighting = Faded(), Lighting(sun_map)
     behind = sun_map.lookup(camera.rays())
-    full = render_guidance(tracer, camera, lighting, spp=4)
+    full = render_guidance(tracer, camera, lighting, Estimation(rays=4))
     tracer.opacity = 0.25
-    faded = render_guidance(tracer, camera, lighting, spp=4)
+    faded = render_guidance(tracer, camera, lighting, Estimation(rays=4))
     empty = full.mask == 0
     assert 0.05 < empty.mean() < 0.9
     for name in BUFFERS:
@@ -98,7 +103,9 @@ def test_sharing_rays_makes_a_better_picture_than_either_estimate(
         np.array(irradiance(tracer, gbuffer, lighting.light, 64, seed)[0]).T[surface] for seed in range(33)
     ]
     truth = np.mean(plain[1:], axis=0)
-    ours = render_guidance(tracer, camera, lighting, spp=64, seed=0).irradiance.reshape(-1, 3)[surface]
+    ours = render_guidance(tracer, camera, lighting, Estimation(rays=64), seed=0).irradiance.reshape(-1, 3)[
+        surface
+    ]
 
     def error(a: np.ndarray) -> float:
         return float(np.sqrt(np.mean((a - truth) ** 2)) / truth.mean())
@@ -113,7 +120,7 @@ def test_the_filter_helps_two_rays_and_leaves_open_light_and_background_alone(
     camera = camera.resized(128, 128)
     tracer, lighting = sphere_over_plane(), Lighting(sun_map)
     truth, noisy, filtered = (
-        render_guidance(tracer, camera, lighting, spp=spp, seed=1, denoise=denoise)
+        render_guidance(tracer, camera, lighting, Estimation(rays=spp, filtered=denoise), seed=1)
         for spp, denoise in ((512, False), (2, False), (2, True))
     )
 
@@ -122,5 +129,21 @@ def test_the_filter_helps_two_rays_and_leaves_open_light_and_background_alone(
 
     assert error(filtered) < 0.5 * error(noisy)
     np.testing.assert_array_equal(filtered.irradiance[truth.mask == 0], noisy.irradiance[truth.mask == 0])
-    still = render_guidance(sphere_over_plane(sphere=False), camera, lighting, spp=2, denoise=True)
+    still = render_guidance(
+        sphere_over_plane(sphere=False), camera, lighting, Estimation(rays=2, filtered=True)
+    )
     np.testing.assert_allclose(still.irradiance, still.unshadowed, rtol=1e-5)
+
+
+def test_the_plain_estimate_is_the_mean_over_the_rays(
+    variant: str, sphere_over_plane, camera, sun_map
+) -> None:
+    tracer, lighting = sphere_over_plane(base_color=0.5), Lighting(sun_map)
+    plain = render_guidance(tracer, camera, lighting, Estimation(rays=16, estimator="plain"), seed=3)
+    shadowed, _ = irradiance(tracer, tracer.gbuffer(camera), lighting.light, 16, 3)
+    surface = plain.mask > 0
+    mean = np.array(shadowed).T.reshape(48, 48, 3)
+    np.testing.assert_allclose(plain.irradiance[surface], mean[surface], rtol=1e-4, atol=1e-5)
+    lost = 0.5 * (plain.unshadowed - plain.irradiance)
+    np.testing.assert_allclose((plain.pbr - plain.shadowed)[surface], lost[surface], atol=1e-3)
+    assert (plain.irradiance > plain.unshadowed * 1.01).any(), "the noise of the light has been taken out"

@@ -1,7 +1,5 @@
 """Laws of the sample points: uniform, stratified in every pixel and block of pixels, blue in the image."""
 
-# (Mitsuba's type stubs know no arithmetic between its own array types.)
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

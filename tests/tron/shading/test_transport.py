@@ -1,7 +1,5 @@
 """Laws of transport: it is irradiance, linear in the light, and finite differences confirm its gradients."""
 
-# (Mitsuba's type stubs know no arithmetic between its own array types.)
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -13,7 +13,7 @@ import pytest
 from tron import seeds
 from tron.errors import TronError
 from tron.shards import MEMBERS, REFERENCE_MEMBERS, ClipMeta, Manifest, ShardWriter, read_clips, verify
-from tron.shards.reader import decode_clip, group_clips, tar_files
+from tron.shards.reader import decode_clip, decode_meta, group_clips, tar_files
 from tron.shards.schema import parse_name
 
 
@@ -105,9 +105,9 @@ def test_only_wanted_members_and_frames_are_decoded(tmp_path):
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_values_that_are_not_finite_are_refused_and_leave_nothing(tmp_path, value):
     bad = frames("a0")
-    bad[1]["irr"][2, 3, 1] = value
+    bad[1]["irradiance"][2, 3, 1] = value
     with ShardWriter(tmp_path, "train") as writer:
-        with pytest.raises(TronError, match=r"a0 frame 1 irr holds 1 values"):
+        with pytest.raises(TronError, match=r"a0 frame 1 irradiance holds 1 values"):
             writer.write(meta("a0"), bad)
         writer.write(meta("a1"), frames("a1"))
     assert writer.entries[0].keys == ["a1"]
@@ -239,8 +239,8 @@ def rewritten(folder: Path, change) -> list[str]:
 
 
 def test_verify_names_missing_and_repeated_members_and_clips(tmp_path):
-    gone = rewritten(tmp_path / "1", lambda m: [x for x in m if x[0] != "a1.f01.irr.exr"])
-    assert any("a1" in problem and "f01.irr.exr" in problem for problem in gone)
+    gone = rewritten(tmp_path / "1", lambda m: [x for x in m if x[0] != "a1.f01.irradiance.exr"])
+    assert any("a1" in problem and "f01.irradiance.exr" in problem for problem in gone)
     twice = rewritten(tmp_path / "2", lambda m: [m[0], *m])
     assert any("f00.pbr.exr is there twice" in problem for problem in twice)
     lost = rewritten(tmp_path / "3", lambda m: [x for x in m if not x[0].startswith("a1.")])
@@ -331,6 +331,14 @@ def test_a_damaged_manifest_is_one_clear_line(tmp_path, text):
     assert "\n" not in str(caught.value)
 
 
+def test_clips_of_an_older_schema_are_refused_by_its_name(tmp_path):
+    old = meta("a0").model_copy(update={"schema_version": 1})
+    with pytest.raises(
+        TronError, match=r"dataset of schema 1, this program reads schema 2 \(clip a0\): make it"
+    ):
+        decode_meta(old.model_dump_json().encode())
+
+
 def test_a_manifest_cannot_name_files_outside_its_folder(tmp_path):
     entry = {
         "split": "train",
@@ -340,7 +348,7 @@ def test_a_manifest_cannot_name_files_outside_its_folder(tmp_path):
         "bytes": 1,
         "sha256": "0" * 64,
     }
-    (tmp_path / "manifest.json").write_text(json.dumps({"schema_version": 1, "shards": [entry]}))
+    (tmp_path / "manifest.json").write_text(json.dumps({"schema_version": 2, "shards": [entry]}))
     with pytest.raises(TronError, match="name"):
         Manifest.load(tmp_path)
 

@@ -1,7 +1,5 @@
 """Gradients from pixels to every parameter of a scene, against differences of the float64 reference."""
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 from types import SimpleNamespace
@@ -13,10 +11,11 @@ import pytest
 
 from tron import seeds
 from tron.cameras import Camera
+from tron.gaussians.fields import PARAMETERS
 from tron.tracing import reference
 from tron.tracing.bvh import build_bvh
 from tron.tracing.gbuffer import GBuffer, trace_gbuffer
-from tron.tracing.parameters import PARAMETERS, SurfelParameters, pack
+from tron.tracing.parameters import SurfelParameters, pack
 from tron.tracing.rays import trace_rays
 from tron.tracing.tiles import build_tiles
 

@@ -4,8 +4,6 @@ Slower than :mod:`tron.tracing.adjoint`, and nobody derived it: the witness that
 of the kernel.
 """
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 import drjit as dr

@@ -12,11 +12,12 @@ import pytest
 from tron import seeds
 from tron.cameras import Camera
 from tron.errors import TronError
+from tron.gaussians.fields import PARAMETERS
 from tron.gaussians.scene import GaussianScene
 from tron.tracing import SurfelTracer, adjoint, gbuffer, reference, relisting
 from tron.tracing.compositing import HitList
 from tron.tracing.hits import MAX_HITS
-from tron.tracing.parameters import PARAMETERS, SurfelParameters
+from tron.tracing.parameters import SurfelParameters
 from tron.tracing.streaming import stream
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -1,14 +1,13 @@
 """Laws of packing: gradients through it add to whatever else a loss asks of the parameters."""
 
-# (Mitsuba's type stubs know no arithmetic between its own array types.)
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from tron import seeds
-from tron.tracing.parameters import PARAMETERS, SurfelParameters, pack
+from tron.gaussians.fields import PARAMETERS
+from tron.tracing.parameters import SurfelParameters, pack
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -1,7 +1,5 @@
 """Laws of the gradient of shadows by opacity: float64 differences, and zeros where zeros are due."""
 
-# (Mitsuba's type stubs know neither arithmetic between its own array types nor its aliases of Dr.Jit's.)
-
 from __future__ import annotations
 
 import dataclasses
@@ -15,10 +13,11 @@ import pytest
 from tron import seeds
 from tron.cameras import Camera
 from tron.errors import TronError
+from tron.gaussians.fields import PARAMETERS
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
 from tron.shading.transport import Transport
 from tron.tracing import SurfelTracer, reference
-from tron.tracing.parameters import PARAMETERS, SurfelParameters
+from tron.tracing.parameters import SurfelParameters
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -29,7 +28,7 @@ def tracer_and_parameters(scene, *, two_sided: bool = True) -> tuple[SurfelTrace
     parameters = SurfelParameters.from_scene(scene)
     for name in PARAMETERS:
         dr.enable_grad(getattr(parameters, name))
-    return SurfelTracer(scene, two_sided=two_sided, parameters=parameters), parameters
+    return SurfelTracer(scene, parameters=parameters).sided(two_sided), parameters
 
 
 def rays(origins, directions) -> tuple[mi.Point3f, mi.Vector3f]:

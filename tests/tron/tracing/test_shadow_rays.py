@@ -45,7 +45,7 @@ def test_random_scenes_agree_with_the_float64_reference(
     truth, margin = reference.transmittance(scene, origins, directions, two_sided=two_sided)
     steady = margin > THRESHOLD
     tally.update(rays=len(truth), left_out=(~steady).sum(), dimmed=(truth < 1).sum(), dark=(truth == 0).sum())
-    found = shadows(SurfelTracer(scene, two_sided=two_sided), origins, directions)
+    found = shadows(SurfelTracer(scene).sided(two_sided), origins, directions)
     np.testing.assert_allclose(found[steady], truth[steady], atol=1e-4)
 
 

@@ -12,8 +12,9 @@ import torch
 from tron import seeds
 from tron.cameras import Camera
 from tron.errors import TronError
+from tron.gaussians.fields import PARAMETERS
 from tron.tracing import SurfelTracer, torch_bridge
-from tron.tracing.parameters import PARAMETERS, SurfelParameters
+from tron.tracing.parameters import SurfelParameters
 from tron.tracing.torch_bridge import IMAGES, render, tensors_of
 
 CAMERA = Camera.look_at((2.0, 0.7, 0.5), (0, 0, 0), fov_deg=50, width=21, height=14)

@@ -26,7 +26,7 @@ def test_agrees_with_the_float64_reference(random_rays, shadows, random_scene, d
     truth, margin = reference.transmittance(scene, origins, directions, two_sided=two_sided)
     steady = margin > 1e-5
     assert (~steady).mean() < 0.05
-    found = shadows(SurfelTracer(scene, two_sided=two_sided), origins, directions)
+    found = shadows(SurfelTracer(scene).sided(two_sided), origins, directions)
     np.testing.assert_allclose(found[steady], truth[steady], atol=1e-4)
 
 
@@ -53,7 +53,7 @@ def test_front_faces_block_from_zero_and_back_faces_beyond_two_spacings(shadows,
             for h in heights
         ]
         np.testing.assert_allclose(found, expected, rtol=1e-5)
-    one_sided = SurfelTracer(disks([[0, 0, 0.25]], [False], opacity=0.8, sigma=0.2), two_sided=False)
+    one_sided = SurfelTracer(disks([[0, 0, 0.25]], [False], opacity=0.8, sigma=0.2)).sided(False)
     assert shadows(one_sided, [[0, 0, 0]], up[:1])[0] == 1.0
 
 

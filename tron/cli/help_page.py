@@ -11,7 +11,8 @@ import pydantic
 import yaml
 from pydantic.fields import FieldInfo
 
-from tron.apps.recipes import nested_model
+from tron.cli.recipes import nested_model
+from tron.nested import leaves
 
 OPTIONS = {
     "-h, --help": "print this page",
@@ -120,17 +121,9 @@ def _entry(key: str, field: FieldInfo, default: Any, width: int) -> list[str]:
         lines = [_shorten(f"  {key}{shown}   [{describe_type(field.annotation)}]", width)]
     indent = " " * 6
     lines += textwrap.wrap(field.description or "", width, initial_indent=indent, subsequent_indent=indent)
-    lines += [_shorten(f"    {key}.{inner}={_yaml(value)}", width) for inner, value in _leaves(default)]
-    return lines
-
-
-def _leaves(values: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Values of a free-form mapping that a user may want to set."""
-    for name, value in values.items() if isinstance(values, Mapping) else ():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{prefix}{name}.")
-        elif name != "_target_":
-            yield prefix + name, value
+    inside = leaves(default) if isinstance(default, Mapping) else {}
+    shown = [(name, value) for name, value in inside.items() if name.rpartition(".")[2] != "_target_"]
+    return lines + [_shorten(f"    {key}.{name}={_yaml(value)}", width) for name, value in shown]
 
 
 def _yaml(value: Any) -> str:

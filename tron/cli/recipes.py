@@ -23,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from tron.errors import TronError
+from tron.nested import nested_items
 
 Settings = TypeVar("Settings", bound=pydantic.BaseModel)
 
@@ -94,19 +95,6 @@ def resolve(recipe: DictConfig) -> Any:
         return OmegaConf.to_container(recipe, resolve=True)
     except OmegaConfBaseException as error:
         raise TronError(_first_line(error)) from error
-
-
-def nested_items(values: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every dotted key of nested mappings and lists (`stages.0.steps`) with its value, parents first."""
-    if isinstance(values, Mapping):
-        pairs = values.items()
-    elif isinstance(values, list):
-        pairs = enumerate(values)
-    else:
-        return
-    for name, value in pairs:
-        yield f"{prefix}{name}", value
-        yield from nested_items(value, f"{prefix}{name}.")
 
 
 def group_options(config_module: str) -> dict[str, dict[str, str]]:

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tron.apps.command_line import command
+from tron.cli.command_line import command
 from tron.errors import TronError
 
 CONFIG = """

@@ -22,8 +22,9 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 import tron
-from tron.apps.help_page import default_examples, render_help
-from tron.apps.recipes import check, compose_recipe, group_options, resolve
+from tron.cli.help_page import default_examples, render_help
+from tron.cli.installation import require_own_packages
+from tron.cli.recipes import check, compose_recipe, group_options, resolve
 from tron.errors import TronError
 
 Settings = TypeVar("Settings", bound=pydantic.BaseModel)
@@ -48,6 +49,7 @@ class Command(Generic[Settings]):
 
     def _run(self, arguments: Sequence[str]) -> int:
         try:
+            require_own_packages()
             options = _parser(self.name).parse_args(arguments)
             if options.help:
                 print(self._help(options.overrides, options.config_dir), end="")

@@ -1,0 +1,39 @@
+"""The choices of estimating shadowed irradiance, from the paper's to ours."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Estimator = Literal["ratio", "plain"]
+
+
+class Estimation(BaseModel):
+    """Choices in estimating shadowed irradiance (docs/conventions.md, 10); by default those of final frames.
+
+    The paper's are ``Estimation(estimator="plain", two_sided=False)``. What each costs, on 10,000 to 20,000
+    surfels of scenes that no benchmark uses:
+
+    * ``rays``: time grows with them. Their noise is below the bias of surfels from 16 on; 64 are converged.
+    * ``estimator="plain"``: the noise of the light stays in. Of 64 rays under a sun the relative error is
+      0.13 instead of 0.04, and open surfaces are not exactly as bright as unshadowed ones. No time is saved.
+    * ``two_sided=False``: light leaks through undersides that no camera saw, 16 to 18 % of the pixels in
+      shadow; against path-traced irradiance 26.7 dB instead of 28.4 under a sun, 23.8 instead of 26.6 in a
+      studio. It saves no time to speak of.
+    * ``filtered=True``: six passes over the image. It takes the error of 2 rays from 0.081 to 0.030 under a
+      sun, from 0.171 to 0.038 in soft light, and blurs more than it cleans at 64.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    rays: int = Field(default=64, ge=2, multiple_of=2, description="shadow rays per pixel, even")
+    estimator: Estimator = Field(
+        default="ratio",
+        description="ratio: unshadowed irradiance, which has no noise, times the share of it that arrives; "
+        "plain: the Monte Carlo mean, as in the paper",
+    )
+    two_sided: bool = Field(
+        default=True,
+        description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
+    )
+    filtered: bool = Field(default=False, description="edge-avoiding filter over the image, for few rays")

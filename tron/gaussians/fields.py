@@ -1,0 +1,39 @@
+"""The table of a surfel's fields: whatever stores, uploads, optimises or checks surfels derives from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tron.gaussians.harmonics import SH_COUNT
+
+
+@dataclass(frozen=True)
+class Field:
+    """An array of :class:`tron.gaussians.GaussianScene`, one row a surfel.
+
+    Attributes:
+        shape: of a row.
+        properties: names in a PLY, in the order of the row's numbers, of those that a file must have.
+        unit: whether its numbers lie in [0, 1].
+        trained: whether it is a float32 parameter, which an optimiser may change; int32 otherwise.
+    """
+
+    shape: tuple[int, ...]
+    properties: tuple[str, ...]
+    unit: bool = False
+    trained: bool = True
+
+
+FIELDS = {
+    "means": Field((3,), ("x", "y", "z")),
+    "quats": Field((4,), ("rot_0", "rot_1", "rot_2", "rot_3")),
+    "log_scales": Field((2,), ("scale_0", "scale_1")),
+    "opacity_logits": Field((), ("opacity",)),
+    "sh": Field((SH_COUNT, 3), ("f_dc_0", "f_dc_1", "f_dc_2")),
+    "base_color": Field((3,), ("base_color_0", "base_color_1", "base_color_2"), unit=True),
+    "roughness": Field((), ("roughness",), unit=True),
+    "metallic": Field((), ("metallic",), unit=True),
+    "object_id": Field((), ("object_id",), trained=False),
+}
+PARAMETERS = tuple(name for name, field in FIELDS.items() if field.trained)
+MATERIALS = tuple(name for name, field in FIELDS.items() if field.unit)
