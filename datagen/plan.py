@@ -22,7 +22,7 @@ from datagen.settings import SPLITS, Settings
 from tron.claim import CHOOSE_ANOTHER, read_recipe, require_same
 from tron.errors import TronError
 from tron.shards.manifest import ShardEntry
-from tron.shards.schema import SCHEMA_VERSION, require_schema
+from tron.shards.schema import MEMBERS, SCHEMA_VERSION, clip_members, require_schema
 from tron.storage import write_if_changed
 
 RECORD_NAME = "record.json"
@@ -157,7 +157,8 @@ def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
     total = 0
     for item in items:
         recipe = settings.split(item.split)
-        pixel = 5 * 3 * 2 + 2 + 1 + (4 * 3 * 2 + 2 * 4 * 4 if recipe.reference_buffers else 0)
+        members = [MEMBERS[name] for name in clip_members(recipe.reference_buffers)]
+        pixel = sum(member.bytes * member.channels for member in members)
         frame = recipe.width * recipe.height * pixel + 16_384
         total += len(recipe.lights) * recipe.frames * frame + settings.surfels * SURFEL_BYTES
     return total

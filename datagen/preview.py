@@ -11,11 +11,10 @@ import numpy as np
 from tron.color import to_display
 from tron.images import write_image
 from tron.shards.manifest import ShardEntry
-from tron.shards.schema import ClipMeta
+from tron.shards.schema import MEMBERS, ClipMeta
 
-LIT = ("rgb", "pbr", "irradiance", "unshadowed", "shadowed")
-COLUMNS = (*LIT, "mask")
-REFERENCE_COLUMNS = ("irradiance_ref", "base_color_ref", "base_color", "normal_ref", "normal")
+DEPTHS = ("depth", "depth_ref")  # in world units, which no picture shows
+COLUMNS = tuple(name for name in MEMBERS if name not in ("foreground", *DEPTHS))
 LARGEST_TILE = 160
 GUTTER = 2
 
@@ -23,19 +22,19 @@ GUTTER = 2
 def contact_row(meta: ClipMeta, frame: dict[str, np.ndarray]) -> np.ndarray:
     """One frame's members side by side, (H, W', 3) float32 in [0, 1], ready for display.
 
-    Light goes through the clip's exposure and AgX, base color through the square root (near enough to sRGB to
-    look at), normals through (n + 1) / 2.
+    Base color goes through the square root (near enough to sRGB to look at), light through the clip's
+    exposure and AgX, normals through (n + 1) / 2.
     """
     tiles = []
-    for member in (*COLUMNS, *(m for m in REFERENCE_COLUMNS if m in frame)):
+    for member in (name for name in COLUMNS if name in frame):
         image = np.asarray(frame[member], np.float32)
         image = image if image.ndim == 3 else image[..., None]
         step = -(-max(image.shape[:2]) // LARGEST_TILE)
         image = np.broadcast_to(image[::step, ::step], (*image[::step, ::step].shape[:2], 3))
-        if member in LIT or member == "irradiance_ref":
-            image = np.asarray(to_display(image, meta.exposure), np.float32)
-        elif member.startswith("base_color"):
+        if member.startswith("base_color"):
             image = np.sqrt(np.clip(image, 0.0, 1.0))
+        elif MEMBERS[member].color_space == "linear":
+            image = np.asarray(to_display(image, meta.exposure), np.float32)
         elif member.startswith("normal"):
             image = np.where(np.abs(image).sum(-1, keepdims=True) > 0, 0.5 * image + 0.5, 0.0)
         tiles.append(
@@ -56,7 +55,7 @@ def sheet_name(shard: str) -> str:
 
 def index_html(title: str, entries: Sequence[ShardEntry]) -> str:
     """A page that shows every sheet; relative links only, no scripts, nothing from the network."""
-    columns = " | ".join((*COLUMNS, *REFERENCE_COLUMNS))
+    columns = " | ".join(COLUMNS)
     parts = [
         f"<!doctype html><html lang='en'><meta charset='utf-8'><title>{escape(title)}</title>",
         "<style>body{font:15px/1.5 system-ui,sans-serif;margin:2rem;background:#fafafa;color:#222}",

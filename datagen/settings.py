@@ -70,8 +70,8 @@ class SplitSettings(_Model):
         ge=2, multiple_of=2, description="Shadow rays a pixel of the surfels' irradiance, even."
     )
     reference_buffers: bool = Field(
-        description="Also store Mitsuba's direct irradiance, with and without shadows, base color, normals "
-        "and depth, and the surfels' own."
+        description="Also store Mitsuba's direct irradiance, with and without shadows, base color, normals, "
+        "depth, roughness and metallic, and the surfels' own."
     )
     reference_spp: int = Field(ge=2, description="Shadow rays a pixel of Mitsuba's direct irradiance.")
 

@@ -5,7 +5,6 @@ pairs.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Literal
 
 import numpy as np
 
@@ -24,18 +23,10 @@ from tron.runtime import torch_device
 from tron.seeds import integer
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
-from tron.shards.schema import ClipMeta
+from tron.shards.schema import MEMBERS, ClipMeta, clip_members
 from tron.tracing import SurfelTracer
 
 Frame = dict[str, np.ndarray]
-ColorSpace = Literal["linear", "display"]
-
-COLOR_SPACE: dict[str, ColorSpace] = dict.fromkeys(
-    ("pbr", "irradiance", "rgb", "unshadowed", "shadowed"), "linear"
-)
-REFERENCE_COLOR_SPACE: dict[str, ColorSpace] = dict.fromkeys(
-    ("irradiance_ref", "unshadowed_ref", "base_color_ref", "base_color"), "linear"
-)
 
 
 def make_surfels(
@@ -98,15 +89,8 @@ def make_clip(
         guidance = render_guidance(
             tracer, camera, lighting, Estimation(rays=recipe.guidance_spp), seeds["guidance"][i]
         )
-        frame = {
-            "pbr": guidance.pbr,
-            "irradiance": guidance.irradiance,
-            "rgb": rgb[i],
-            "unshadowed": guidance.unshadowed,
-            "shadowed": guidance.shadowed,
-            "mask": guidance.mask,
-            "foreground": truth.valid.astype(np.float32),
-        }
+        frame = {name: guidance[name] for name in guidance.BUFFERS}
+        frame |= {"rgb": rgb[i], "foreground": truth.valid.astype(np.float32)}
         if recipe.reference_buffers:
             direct = direct_irradiance(geometry, scene, camera, recipe.reference_spp, seeds["reference"][i])
             frame |= _reference(camera, truth, guidance, direct, environment)
@@ -125,7 +109,11 @@ def make_clip(
         height=recipe.height,
         cameras=[camera.to_dict() for camera in cameras],
         exposure=environment.exposure(),
-        color_space=COLOR_SPACE | (REFERENCE_COLOR_SPACE if recipe.reference_buffers else {}),
+        color_space={
+            name: space
+            for name in clip_members(recipe.reference_buffers)
+            if (space := MEMBERS[name].color_space) is not None
+        },
         seeds={"root": spec.seed, **{f"{what}0": values[0] for what, values in seeds.items()}},
         spp=spp,
         extra={
@@ -163,13 +151,16 @@ def _reference(
     """
     seen = truth.valid[..., None]
     behind = environment.lookup(camera.rays())
-    return {
-        "irradiance_ref": np.where(seen, direct.shadowed, behind),
-        "unshadowed_ref": np.where(seen, direct.unshadowed, behind),
-        "depth_ref": np.where(truth.valid, np.linalg.norm(truth.position - camera.position, axis=-1), 0.0),
-        "base_color_ref": np.where(seen, truth.base_color, 0.0),
-        "normal_ref": np.where(seen, truth.normal, 0.0),
-        "base_color": guidance.gbuffer["base_color"],
-        "normal": guidance.gbuffer["normal"],
-        "depth": guidance.gbuffer["depth"],
+    light = {"irradiance": direct.shadowed, "unshadowed": direct.unshadowed}
+    surface = {
+        "base_color": truth.base_color,
+        "normal": truth.normal,
+        "depth": np.linalg.norm(truth.position - camera.position, axis=-1),
+        "roughness": truth.roughness,
+        "metallic": truth.metallic,
     }
+    return (
+        {f"{name}_ref": np.where(seen, image, behind) for name, image in light.items()}
+        | {f"{name}_ref": np.where(seen, np.atleast_3d(image), 0.0) for name, image in surface.items()}
+        | {name: guidance.gbuffer[name] for name in surface}
+    )

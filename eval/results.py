@@ -11,7 +11,7 @@ and ``"high"``, the ends of its confidence interval (:mod:`eval.confidence`); ot
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -62,11 +62,12 @@ class Row(BaseModel):
         return {name: value for name, value in plain(self).items() if name not in absent}
 
 
-def mean_row(metric: str, unit: str, scenes: Sequence[str], values: Sequence[float], seed: int) -> Row:
-    """The mean of ``values`` with its interval over the scenes that ``scenes`` names for each of them.
+def mean_row(metric: str, unit: str, found: Iterable[tuple[str, float]], seed: int) -> Row:
+    """The mean of what was ``found``, (scene, value) each, with its interval over scenes.
 
     ``seed`` draws the scenes of the interval.
     """
+    scenes, values = zip(*found)
     row = Row(metric=metric, value=float(np.mean(values)), unit=unit, n=len(values))
     return row.within(mean_interval(scenes, values, seed))
 

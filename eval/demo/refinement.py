@@ -33,20 +33,21 @@ def refinement(dataset: Path, seed: int) -> tuple[list[Row], list[Section]]:
         except (OSError, ValueError, AttributeError) as error:
             raise TronError(f"not a scene's record: {error}", path) from error
         if record is not None:
-            found.append(record)
+            found.append((path.parent.name, record))
     if not found:
         return [], []
-    scenes = [str(k) for k in range(len(found))]
     rows, table = [], []
     for name, (label, unit, measured_by) in FIGURES.items():
         before, after = (
-            mean_row(f"refinement.{name}.{when}", unit, scenes, [each[when][name] for each in found], seed)
+            mean_row(
+                f"refinement.{name}.{when}", unit, [(scene, each[when][name]) for scene, each in found], seed
+            )
             for when in ("before", "after")
         )
         rows += [before, after]
         table.append([label, row_cell(before), row_cell(after, "strong"), Cell(measured_by, "faint")])
     caption = (
-        f"Surfels before and after {found[0]['steps']} steps that fit them to their scene's G-buffers, at "
+        f"Surfels before and after {found[0][1]['steps']} steps that fit them to their scene's G-buffers, at "
         f"cameras that they were not fitted to: means over {len(found)} scenes."
     )
     headings = ["Figure", "as made", "fitted", "Measured"]

@@ -13,9 +13,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from tron.cameras import Camera
 from tron.gaussians.scene import GaussianScene
 from tron.tracing.kernel import GEOMETRY_PACKETS, intersect
 from tron.tracing.parameters import SurfelParameters, pack
+from tron.tracing.tiles import TILE
 from tron.tracing.transmittance import OPAQUE_TRANSMITTANCE, BackFaces, blocks
 
 RESTART_OFFSET = 1e-4
@@ -46,9 +48,26 @@ def _geometry(scene: GaussianScene) -> mi.Float:
     return pack(SurfelParameters.from_scene(scene)).geometry
 
 
-def closest_hit(scene: mi.Scene, origin: mi.Point3f, direction: mi.Vector3f, coherent: bool) -> mi.Float:
+def tile_rays(view: Camera) -> tuple[mi.Point3f, mi.Vector3f]:
+    """Rays through the pixel centres, a 4 x 4 tile after the other: the order that is best for a packet."""
+    tiles = view.rays().reshape(view.height // TILE, TILE, view.width // TILE, TILE, 3)
+    rays = np.ascontiguousarray(tiles.transpose(0, 2, 1, 3, 4).reshape(-1, 3).T, np.float32)
+    origin = dr.repeat(mi.Point3f([float(x) for x in view.position]), rays.shape[1])
+    direction = mi.Vector3f(rays)
+    dr.eval(origin, direction)
+    return origin, direction
+
+
+def closest_hit(
+    scene: mi.Scene,
+    origin: mi.Point3f,
+    direction: mi.Vector3f,
+    active: mi.Bool | bool = True,
+    coherent: bool = False,
+) -> mi.Float:
     """Distance of the nearest quad along each ray, infinite where there is none."""
-    return scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=mi.Bool(coherent)).t
+    ray, flags = mi.Ray3f(origin, direction), (mi.Bool(coherent), mi.Bool(active))
+    return scene.ray_intersect_preliminary(ray, *flags).t
 
 
 def any_hit(

@@ -40,6 +40,7 @@ class Recipe:
     """How surfels are made of a surface.
 
     Attributes:
+        name: in the names of metrics; empty for the usual one.
         degree: kernel degree.
         overlap: summed area of the three-sigma disks over the area of the surface.
         anisotropy: standard deviation of the scales' natural logarithm.
@@ -48,6 +49,7 @@ class Recipe:
         opacity: the same opacity for all, or None for a spread that favours opaque ones (Beta(2.2, 0.6)).
     """
 
+    name: str = ""
     degree: int = 2
     overlap: float = 15.0
     anisotropy: float = 0.35
@@ -59,7 +61,7 @@ class Recipe:
 
 STUDY = Recipe()
 """Surfels as reconstructions give them, and as the design study had them: some 33 candidates a ray."""
-FROM_GBUFFERS = Recipe(degree=4, overlap=0.0, anisotropy=0.0, tilt=0.01, lift=0.0, opacity=0.99)
+FROM_GBUFFERS = Recipe("from_gbuffers", 4, overlap=0.0, anisotropy=0.0, tilt=0.01, lift=0.0, opacity=0.99)
 """As :func:`tron.gaussians.initialize.surfels_from_gbuffers` makes them: sigma is 0.4 neighbour distances."""
 
 
@@ -68,7 +70,7 @@ class Place:
     """:data:`OBJECTS` on a floor or in a room, and a camera that sees them.
 
     Attributes:
-        name: as metrics spell it; empty for the usual one.
+        name: in the names of metrics; empty for the usual one.
         floor: what they stand on, or in.
         eye, target: world, the camera's centre and what it looks at. fov_deg: angle of view.
     """

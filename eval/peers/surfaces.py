@@ -28,10 +28,6 @@ class Surface(abc.ABC):
     def patches(self, fineness: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """Lattices (u, v), 1D each and ascending, whose quads cover the surface."""
 
-    @abc.abstractmethod
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """(N,) unsigned distance of world points (N, 3) to the surface."""
-
     def mesh(self, fineness: int = 96) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Triangles of the surface: vertices (V, 3), vertex normals (V, 3), faces (F, 3) wound outwards."""
         vertices, normals, faces = [], [], []
@@ -79,11 +75,6 @@ class Floor(Surface):
         """One quad."""
         return [(np.array([0.0, 1.0]), np.array([0.0, 1.0]))]
 
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance to the square."""
-        beyond = np.maximum(np.abs(points[:, :2]) - self.half, 0)
-        return np.hypot(np.linalg.norm(beyond, axis=1), points[:, 2])
-
 
 @dataclass(frozen=True)
 class Sphere(Surface):
@@ -108,10 +99,6 @@ class Sphere(Surface):
         """Even in the polar angle, so that the poles are as fine as the equator."""
         polar = np.linspace(0, np.pi, fineness // 2 + 1)
         return [(np.linspace(0, 1, fineness + 1), (1 - np.cos(polar)) / 2)]
-
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance to the sphere."""
-        return np.abs(np.linalg.norm(points - np.array(self.centre), axis=1) - self.radius)
 
 
 @dataclass(frozen=True)
@@ -142,12 +129,6 @@ class Torus(Surface):
     def patches(self, fineness: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """Even in the tube angle."""
         return [(np.linspace(0, 1, fineness + 1), self._share(np.linspace(0, 2 * np.pi, fineness // 2 + 1)))]
-
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance to the torus."""
-        local = points - np.array(self.centre)
-        ring = np.hypot(local[:, 0], local[:, 1]) - self.major
-        return np.abs(np.hypot(ring, local[:, 2]) - self.minor)
 
 
 @dataclass(frozen=True)
@@ -180,9 +161,3 @@ class Box(Surface):
     def patches(self, fineness: int) -> list[tuple[np.ndarray, np.ndarray]]:  # noqa: ARG002 (flat)
         """One quad a face; the faces' upper ends stay a hair inside their strip of u."""
         return [(np.array([k, k + 1 - 1e-9]) / 6, np.array([0.0, 1.0])) for k in range(6)]
-
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance to the cube's surface."""
-        beyond = np.abs(points - np.array(self.centre)) - self.half
-        outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
-        return np.abs(outside + np.minimum(beyond.max(1), 0))

@@ -1,4 +1,4 @@
-"""How far a fitted light is from the true one, by the irradiance that both give to surfaces of all normals.
+"""Error of a fitted light, by the irradiance that it and the true one give to surfaces of all normals.
 
 Irradiance and not radiance is compared: it is what lights diffuse surfaces and all that the fit was given,
 while a pixel of the map that only a mirror could tell from its neighbour is nobody's error.
@@ -51,8 +51,7 @@ def light_errors(found: EnvironmentMap, truth: EnvironmentMap) -> dict[str, floa
     }
 
 
-def errors_of_files(found: Path, truth: Path) -> dict[str, float]:
-    """The same of two lat-long files; empty where one does not exist."""
-    if not (found.is_file() and truth.is_file()):
-        return {}
-    return light_errors(EnvironmentMap.load(found), EnvironmentMap.load(truth))
+def read_light(folder: Path) -> EnvironmentMap | None:
+    """The light of a capture or of a reconstruction; None if it has none."""
+    path = folder / "environment.exr"
+    return EnvironmentMap.load(path) if path.is_file() else None

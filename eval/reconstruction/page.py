@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from eval.reconstruction.measured import Measured
 from eval.reconstruction.page_fox import fox_section
 from eval.reconstruction.page_scenes import light_section, scenes_section, views_section
 from eval.reconstruction.page_steps import steps_section
@@ -14,10 +14,6 @@ from eval.report.outcome import Outcome
 from eval.report.page import Section, Text
 from eval.report.stage_table import stage_section
 from eval.results import Row
-
-if TYPE_CHECKING:
-    from eval.reconstruction.benchmark import Measured, Reconstruction
-    from eval.stages import Stages
 
 LEAD = (
     "A photo shows a thing in the light of that day. To show it in another light one must know what it is "
@@ -43,23 +39,19 @@ HEADLINE = {
 }
 
 
-def outcome(
-    settings: Reconstruction, measured: Measured, rows: Sequence[Row], stages: Stages, output_dir: Path
-) -> Outcome:
+def outcome(measured: Measured, output_dir: Path) -> Outcome:
     """Rows and sections of a run."""
+    settings, rows = measured.settings, list(measured.rows())
     found = {row.metric: row for row in rows}
     sections = [
-        *scenes_section(settings, measured, found),
+        *scenes_section(measured, found),
         *views_section(measured),
         *light_section(measured),
-        *fox_section(settings, measured, found),
-        *steps_section(settings, measured, found),
-        _limits(settings, measured),
-        *stage_section(stages.records),
+        *fox_section(measured, found),
+        *steps_section(measured),
+        _limits(measured),
+        *stage_section(measured.stages.records),
     ]
-    overrides = [f"output_dir={output_dir}"]
-    if settings.variant != "llvm_ad_rgb":
-        overrides.insert(0, f"benchmark.variant={settings.variant}")
     return Outcome(
         rows=rows,
         title="Reconstruction: from photos to relightable surfels",
@@ -67,24 +59,21 @@ def outcome(
         lead=LEAD,
         sections=sections,
         headline=HEADLINE,
-        reproduce=[" ".join(["tron-eval benchmark=reconstruction", *overrides])],
+        reproduce=[settings.command_line(output_dir)],
         inputs={"settings": settings.model_dump(mode="json", exclude={"targets"})},
     )
 
 
-def _verdict(found: dict[str, Row]) -> str:
-    def says(metric: str) -> str | None:
-        row = found.get(metric)
-        return None if row is None else with_interval(row)
-
+def _verdict(found: Mapping[str, Row]) -> str:
+    texts = {metric: with_interval(row) for metric, row in found.items()}
     parts = []
     if "reconstruction.test_psnr" in found:
         parts.append(
-            f"From random points, path-traced scenes reach {says('reconstruction.test_psnr')} on held-out "
-            f"views, in at most {says('reconstruction.seconds')} a scene."
+            f"From random points, path-traced scenes reach {texts['reconstruction.test_psnr']} on held-out "
+            f"views, in at most {texts['reconstruction.seconds']} a scene."
         )
     if "fox.test_psnr" in found:
-        parts.append(f"The photographed fox reaches {says('fox.test_psnr')} after {says('fox.seconds')}.")
+        parts.append(f"The photographed fox reaches {texts['fox.test_psnr']} after {texts['fox.seconds']}.")
     ratios = [found[name].value for name in STEP_RATIOS if name in found]
     if len(ratios) == len(STEP_RATIOS):
         parts.append(
@@ -94,7 +83,7 @@ def _verdict(found: dict[str, Row]) -> str:
     return " ".join(parts) or "Only some parts were run."
 
 
-def _limits(settings: Reconstruction, measured: Measured) -> Section:
+def _limits(measured: Measured) -> Section:
     texts = [
         "The path-traced scenes are small, made of a few procedural objects on a floor, photographed without "
         "noise, blur or changing exposure, with poses and masks that are exact. Real captures have none of "
@@ -114,6 +103,7 @@ def _limits(settings: Reconstruction, measured: Measured) -> Section:
             "the surfels were trained. No settings of either make the work exactly equal; the two pictures' "
             "PSNR beside the times says how alike they are."
         )
-    if not all(part in settings.parts for part in ("scenes", "fox", "steps")):
-        texts.append(f"Only these parts were run: {', '.join(settings.parts)}.")
+    parts = measured.settings.parts
+    if not all(part in parts for part in ("scenes", "fox", "steps")):
+        texts.append(f"Only these parts were run: {', '.join(parts)}.")
     return Section("limits", "What these figures do not say", [Text(text) for text in texts])

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
+from eval.reconstruction.measured import Fox, Measured
 from eval.report.charts import line_chart
-from eval.report.figures import format_value
-from eval.report.page import Block, Cell, Picture, Pictures, Section, Table, Text
+from eval.report.figures import row_cell
+from eval.report.page import Block, Picture, Pictures, Section, Table, Text
 from eval.results import Row
 from tron.images import read_image
-
-if TYPE_CHECKING:
-    from eval.reconstruction.benchmark import Measured, Reconstruction
-    from eval.reconstruction.relit import Fox
 
 WORDS = {
     "fox.test_psnr": "PSNR of held-out photos",
@@ -33,45 +29,29 @@ RELIT = (
 )
 
 
-def fox_section(settings: Reconstruction, measured: Measured, found: Mapping[str, Row]) -> list[Section]:
+def fox_section(measured: Measured, found: Mapping[str, Row]) -> list[Section]:
     """Everything about the fox, or why there is nothing."""
-    if measured.fox is None:
+    fox = measured.fox
+    if fox is None:
         if not measured.no_fox:
             return []
         reason = Text(f"The real capture was not reconstructed: {measured.no_fox}. Its figures are absent.")
         return [Section("fox", "The fox", [reason])]
-    fox = measured.fox
-    capture = fox.run.report.capture
+    capture, curve = fox.run.report.capture, fox.run.curve()
     skipped = f" Photos that its poses name and that are absent: {len(capture.skipped)}."
-    skipped = skipped if capture.skipped else ""
-    blocks: list[Block] = [
-        Text(
-            f"{capture.views} photos of a stuffed fox, taken with a phone whose lens distorts, "
-            f"{len(capture.held_out)} of them held out.{skipped} No mask tells the fox from the room behind "
-            "it, and no prior knows its materials: they come from the classical decomposition, which needs "
-            "no weights."
-        ),
-        Table(
-            "What was measured.",
-            ["Figure", "Measured"],
-            [
-                [Cell(text), Cell(format_value(found[metric].value, found[metric].unit), "strong")]
-                for metric, text in WORDS.items()
-                if metric in found
-            ],
-        ),
-    ]
-    if len(fox.run.curve()) > 1:
-        target = next((t for t in settings.targets if t.metric == "fox.test_psnr"), None)
-        blocks.append(
-            line_chart(
-                {"fox": fox.run.curve()},
-                "seconds of training",
-                "held-out PSNR in dB",
-                "Held-out PSNR of the fox while its surfels are learnt.",
-                None if target is None else ("target", target.value),
-            )
-        )
+    intro = Text(
+        f"{capture.views} photos of a stuffed fox, taken with a phone whose lens distorts, "
+        f"{len(capture.held_out)} of them held out.{skipped if capture.skipped else ''} No mask tells the "
+        "fox from the room behind it, and no prior knows its materials: they come from the classical "
+        "decomposition, which needs no weights."
+    )
+    rows = [[text, row_cell(row, "strong")] for metric, text in WORDS.items() if (row := found.get(metric))]
+    blocks: list[Block] = [intro, Table("What was measured.", ["Figure", "Measured"], rows)]
+    if len(curve) > 1:
+        axes = "seconds of training", "held-out PSNR in dB"
+        caption = "Held-out PSNR of the fox while its surfels are learnt."
+        target = measured.settings.target("fox.test_psnr", "target")
+        blocks.append(line_chart({"fox": curve}, *axes, caption, target))
     blocks += [*_held_out(fox), *_relit(fox), *_sheet(fox)]
     return [Section("fox", "The fox", blocks)]
 
@@ -81,7 +61,7 @@ def _held_out(fox: Fox) -> list[Pictures]:
     for name, photo in fox.photos.items():
         figures = fox.run.report.views.get(name, {})
         pictures = [Picture(photo, "photo", f"held-out photo {name} of the fox")]
-        for channel, image in fox.shown[name].items():
+        for channel, image in fox.rendered[name].items():
             figure = f"{figures['psnr']:.1f} dB" if channel == "radiance" and "psnr" in figures else ""
             pictures.append(Picture(image, channel, f"{channel} of the surfels, view {name}", figure))
         blocks.append(Pictures(f"Held-out photo {name}", pictures, columns=4))

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from eval.reconstruction.measured import Compared, Measured
+from eval.reconstruction.runs import Run
 from eval.report.charts import line_chart
-from eval.report.figures import format_value, with_interval
+from eval.report.figures import format_value, row_cell
 from eval.report.intervals import interval_note
 from eval.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
 from eval.results import Row
-
-if TYPE_CHECKING:
-    from eval.reconstruction.benchmark import Measured, Reconstruction
-    from eval.reconstruction.pictures import Compared
-    from eval.reconstruction.runs import Run
 
 WAYS = {
     "random": "random points, true prior",
@@ -48,74 +44,50 @@ def way_title(way: str) -> str:
     return WAYS.get(way, way)
 
 
-def scenes_section(settings: Reconstruction, measured: Measured, found: Mapping[str, Row]) -> list[Section]:
+def scenes_section(measured: Measured, found: Mapping[str, Row]) -> list[Section]:
     """Tables and curves of the path-traced scenes, if they were reconstructed."""
     if not measured.runs:
         return []
     first = next(iter(measured.runs.values()))
+    intro = Text(
+        f"{len(first)} {'scenes' if len(first) > 1 else 'scene'} of {first[0].report.capture.views} "
+        "path-traced views each, reconstructed "
+        "in each of these ways. From random points nothing is known but the cameras and the pictures' "
+        "masks; from depth maps surfels begin on the true surfaces. The true prior gives normals, base "
+        "color, roughness, metallic and irradiance of the training views; the classical one computes "
+        "what it can from the photos. Normals are off by a mean angle; base color is PSNR on linear "
+        "values after one factor a view and channel; roughness and metallic are mean absolute errors."
+    )
+    means = [[way_title(way), *_figures(found, measured.prefix(way) + ".{}")] for way in measured.runs]
+    caption = "Means over the scenes; surfels and time (the whole command) are of the scene with the most."
     blocks: list[Block] = [
-        Text(
-            f"{len(first)} {'scenes' if len(first) > 1 else 'scene'} of {first[0].report.capture.views} "
-            "path-traced views each, reconstructed "
-            "in each of these ways. From random points nothing is known but the cameras and the pictures' "
-            "masks; from depth maps surfels begin on the true surfaces. The true prior gives normals, base "
-            "color, roughness, metallic and irradiance of the training views; the classical one computes "
-            "what it can from the photos. Normals are off by a mean angle; base color is PSNR on linear "
-            "values after one factor a view and channel; roughness and metallic are mean absolute errors."
-        ),
-        _means(measured, found),
+        intro,
+        Table(caption, ["Begun from", *COLUMNS.values()], means),
         Text(interval_note(len(first))),
+        *_curves(measured),
     ]
-    blocks += _curves(settings, measured)
-    blocks += [
-        _scene_table(way, number == 0, runs, found)
-        for number, (way, runs) in enumerate(measured.runs.items())
-    ]
+    for way, runs in measured.runs.items():
+        rows = [
+            [run.name, *_figures(found, f"{measured.prefix(way)}.{{}}.{run.name.replace('-', '_')}")]
+            for run in runs
+        ]
+        blocks.append(Table(f"Each scene: {way_title(way)}.", ["Scene", *COLUMNS.values()], rows))
     return [Section("scenes", "Path-traced scenes", blocks)]
 
 
-def _prefix(way: str, main: bool) -> str:
-    return "reconstruction" if main else f"reconstruction.{way}"
-
-
-def _cell(row: Row | None) -> Cell:
-    if row is None:
-        return Cell("—")
-    return Cell(f"{row.value:,.0f}" if row.unit == "surfels" else with_interval(row))
-
-
-def _means(measured: Measured, found: Mapping[str, Row]) -> Table:
-    table = [
-        [
-            Cell(way_title(way)),
-            *(_cell(found.get(f"{_prefix(way, number == 0)}.{name}")) for name in COLUMNS),
-        ]
-        for number, way in enumerate(measured.runs)
+def _figures(found: Mapping[str, Row], metric: str) -> list[Cell]:
+    """Cells of all columns; ``metric`` has {} in place of the column's name."""
+    rows = {name: found.get(metric.format(name)) for name in COLUMNS}
+    return [
+        Cell(f"{row.value:,.0f}") if name == "surfels" and row else row_cell(row)
+        for name, row in rows.items()
     ]
-    caption = "Means over the scenes; surfels and time (the whole command) are of the scene with the most."
-    return Table(caption, ["Begun from", *COLUMNS.values()], table)
 
 
-def _scene_table(way: str, main: bool, runs: Sequence[Run], found: Mapping[str, Row]) -> Table:
-    table = [
-        [
-            Cell(run.name),
-            *(
-                _cell(found.get(f"{_prefix(way, main)}.{name}.{run.name.replace('-', '_')}"))
-                for name in COLUMNS
-            ),
-        ]
-        for run in runs
-    ]
-    return Table(f"Each scene: {way_title(way)}.", ["Scene", *COLUMNS.values()], table)
-
-
-def _curves(settings: Reconstruction, measured: Measured) -> list[Chart]:
-    charts = []
-    target = next((t for t in settings.targets if t.metric == "reconstruction.test_psnr"), None)
-    bound = None if target is None else ("target from random points", target.value)
+def _curves(measured: Measured) -> list[Chart]:
+    charts, axes = [], ("seconds of training", "held-out PSNR in dB")
+    bound = measured.settings.target("reconstruction.test_psnr", "target from random points")
     means = {way_title(way): mean for way, runs in measured.runs.items() if (mean := _mean_curve(runs))}
-    axes = "seconds of training", "held-out PSNR in dB"
     if means:
         caption = "Held-out PSNR while surfels are learnt, mean over the scenes."
         charts.append(line_chart(means, *axes, caption, bound))
@@ -188,11 +160,11 @@ def light_section(measured: Measured) -> list[Section]:
     """How far the fitted lights are from the true ones."""
     table = [
         [
-            Cell(run.name),
-            Cell(run.family or "—"),
-            Cell(way_title(way)),
+            run.name,
+            run.family or "—",
+            way_title(way),
             Cell(format_value(run.light["irradiance_error"], "fraction"), "strong"),
-            Cell(format_value(run.light["scaled_error"], "fraction")),
+            format_value(run.light["scaled_error"], "fraction"),
         ]
         for way, runs in measured.runs.items()
         for run in runs

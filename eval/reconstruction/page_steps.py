@@ -2,35 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
+from eval.reconstruction.measured import SHIPPED, TRON, VOLPRIM, Measured
 from eval.report.charts import line_chart
 from eval.report.figures import format_value
 from eval.report.page import Block, Cell, Chart, Section, Table, Text
-from eval.results import Row
-
-if TYPE_CHECKING:
-    from eval.reconstruction.benchmark import Measured, Reconstruction
-    from eval.reconstruction.step import Steps
 
 
-def steps_section(settings: Reconstruction, measured: Measured, found: Mapping[str, Row]) -> list[Section]:
+def steps_section(measured: Measured) -> list[Section]:
     """Ratios and growth, as far as they were measured."""
-    blocks: list[Block] = []
-    if measured.steps:
-        blocks += _beside_the_peer(settings, measured, found)
-    blocks += _growth(settings, measured)
+    blocks: list[Block] = [*(_beside_the_peer(measured) if measured.steps else []), *_growth(measured)]
     return [Section("steps", "An optimisation step", blocks)] if blocks else []
 
 
-def _milliseconds(steps: Steps, name: str) -> Cell:
-    return Cell(format_value(1e3 * steps.times[name].median, "ms") if name in steps.times else "—")
-
-
-def _beside_the_peer(settings: Reconstruction, measured: Measured, found: Mapping[str, Row]) -> list[Block]:
-    from eval.reconstruction.step import SHIPPED, TRON, VOLPRIM
-
+def _beside_the_peer(measured: Measured) -> list[Block]:
     shapes = " or ".join(dict.fromkeys(steps.shape for steps in measured.steps))
     intro = Text(
         "A step renders one view, compares it with the photo by 0.8 L1 + 0.2 (1 - SSIM), differentiates by "
@@ -39,9 +23,9 @@ def _beside_the_peer(settings: Reconstruction, measured: Measured, found: Mappin
         "that was reconstructed from photos; they differ in what renders and differentiates: TRON, or "
         f"Mitsuba's volprim_rf_basic on {shapes} (in each case the faster of its two plugins) through "
         "dr.wrap. Both draw the same kernel. That of degree 2 is the peer's own; the scene is the first of "
-        "those above, "
-        f"reconstructed once more with {' '.join(settings.step_degree2)}. With degree 4, the kernel of the "
-        "scene above, the peer's line of density is replaced, and it takes longer: fewer surfels are faint. "
+        f"those above, reconstructed once more with {' '.join(measured.settings.step_degree2)}. With degree "
+        "4, the kernel of the scene above, the peer's line of density is replaced, and it takes longer: "
+        "fewer surfels are faint. "
         "The peer stops a ray where TRON does; its own limit, ten times as high, ends rays sooner and is "
         "shown beside it, with the kernel that it ships. "
         "What either must make anew for surfels that have moved, TRON's tile lists and Mitsuba's hierarchy, "
@@ -63,16 +47,20 @@ def _beside_the_peer(settings: Reconstruction, measured: Measured, found: Mappin
     for steps in measured.steps:
         times = steps.times
         low, high = times[VOLPRIM].range_over(times[TRON])
+        milliseconds = (
+            format_value(1e3 * times[name].median, "ms") if name in times else "—"
+            for name in (TRON, VOLPRIM, SHIPPED)
+        )
         table.append(
             [
-                Cell(f"degree {steps.degree}"),
-                Cell(f"{steps.count:,}"),
-                Cell(f"{steps.size}²"),
-                *(_milliseconds(steps, name) for name in (TRON, VOLPRIM, SHIPPED)),
+                f"degree {steps.degree}",
+                f"{steps.count:,}",
+                f"{steps.size}²",
+                *milliseconds,
                 Cell(format_value(steps.ratio(), "x"), "strong"),
                 Cell(f"{low:.1f}–{high:.1f}", "faint"),
-                Cell(format_value(steps.ratio(SHIPPED), "x") if SHIPPED in times else "—"),
-                Cell(format_value(found[f"step.psnr_to_volprim.{steps.case}"].value, "dB")),
+                format_value(steps.ratio(SHIPPED), "x") if SHIPPED in times else "—",
+                format_value(steps.agreement, "dB"),
             ]
         )
     caption = (
@@ -83,17 +71,23 @@ def _beside_the_peer(settings: Reconstruction, measured: Measured, found: Mappin
     return [intro, Table(caption, headings, table, groups)]
 
 
-def _growth(settings: Reconstruction, measured: Measured) -> list[Chart]:
-    surfels, pixels = settings.growth_at
-    by_count = sorted((n, t.median) for (n, size), t in measured.growth.items() if size == pixels)
-    by_size = sorted(
-        (float(size * size), t.median) for (n, size), t in measured.growth.items() if n == surfels
-    )
+def _growth(measured: Measured) -> list[Chart]:
+    surfels, pixels = measured.settings.growth_at
     charts = []
-    if len(by_count) > 1:
-        caption = f"Seconds a step as surfels grow, {pixels}² pixels, on the tracing benchmark's scene."
-        charts.append(line_chart({"a step": by_count}, "surfels", "seconds", caption, logarithmic=True))
-    if len(by_size) > 1:
-        caption = f"Seconds a step as pixels grow, {surfels:,} surfels, on the same scene."
-        charts.append(line_chart({"a step": by_size}, "pixels", "seconds", caption, logarithmic=True))
+    for axis, fixed, points in (
+        (
+            "surfels",
+            f"{pixels}² pixels, on the tracing benchmark's scene",
+            [(found.count, found.seconds) for found in measured.growth if found.size == pixels],
+        ),
+        (
+            "pixels",
+            f"{surfels:,} surfels, on the same scene",
+            [(found.size**2, found.seconds) for found in measured.growth if found.count == surfels],
+        ),
+    ):
+        if len(points) > 1:
+            caption = f"Seconds a step as {axis} grow, {fixed}."
+            lines = {"a step": sorted(points)}
+            charts.append(line_chart(lines, axis, "seconds", caption, logarithmic=True))
     return charts

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from eval.reconstruction.light import read_light
+from eval.reconstruction.measured import CHANNELS, Compared
 from eval.reconstruction.runs import Run
 from tron.apps.labelled_sheet import labelled_sheet
 from tron.captures import View
@@ -20,63 +21,30 @@ from tron.reconstruction.evaluation import picture, wanted_picture
 from tron.shading.environment import EnvironmentMap
 from tron.tracing import SurfelTracer
 
-CHANNELS = ("radiance", "normal", "base color", "light")
 LIGHT_HEIGHT = 64
-
-
-@dataclass(frozen=True)
-class Compared:
-    """One held-out view of a path-traced scene.
-
-    Attributes:
-        scene: its name. family: of its light, if known. view: the view's name.
-        truth: channel -> (H, W, 3) display values, of the capture.
-        ways: way -> channel -> the same, of the reconstruction.
-        figures: way -> channel -> a short figure of that very picture, where there is one.
-    """
-
-    scene: str
-    family: str
-    view: str
-    truth: dict[str, np.ndarray]
-    ways: dict[str, dict[str, np.ndarray]]
-    figures: dict[str, dict[str, str]]
-
-    def sheet(self) -> np.ndarray:
-        """All of it as one labelled picture."""
-        columns = {"truth": self.truth, **self.ways}
-        blank = np.zeros((8, 8))
-        rows = {name: [images.get(name, blank) for images in columns.values()] for name in CHANNELS}
-        return labelled_sheet(rows, list(columns))
 
 
 def compare_scene(runs: Mapping[str, Run]) -> Compared:
     """The middle held-out view of a scene, as every way reconstructed it; ``runs`` maps a way to its run."""
     run = next(iter(runs.values()))
     view = middle_view(read_capture_folder(run.capture).test_views)
-    mask = (
-        view.read("mask") > 0.5
-        if view.has("mask")
-        else np.ones((view.camera.height, view.camera.width), bool)
-    )
+    everywhere = np.ones((view.camera.height, view.camera.width), bool)
+    mask = view.read("mask") > 0.5 if view.has("mask") else everywhere
     truth = {"radiance": wanted_picture(view)}
     if view.has("normal"):
         truth["normal"] = _normal_picture(view.read("normal"), mask)
     if view.has("base_color"):
         truth["base color"] = _color_picture(view.read("base_color"), mask)
-    light = run.capture / "environment.exr"
-    exposure = 1.0
-    if light.is_file():
-        environment = EnvironmentMap.load(light)
-        exposure = environment.exposure()
-        truth["light"] = light_picture(environment, exposure)
-    ways, figures = {}, {}
+    light, exposure = read_light(run.capture), 1.0
+    if light is not None:
+        exposure = light.exposure()
+        truth["light"] = light_picture(light, exposure)
+    ways = {}
     for way, each in runs.items():
-        ways[way] = _seen(each.folder, view, mask)
-        if (each.folder / "environment.exr").is_file():
-            found = EnvironmentMap.load(each.folder / "environment.exr")
+        ways[way] = show_view(each.folder, view, mask)
+        if (found := read_light(each.folder)) is not None:
             ways[way]["light"] = light_picture(found, exposure)
-        figures[way] = _figures(each, view.name)
+    figures = {way: _figures(each, view.name) for way, each in runs.items()}
     return Compared(run.name, run.family, view.name, truth, ways, figures)
 
 
@@ -85,9 +53,21 @@ def middle_view(views: Sequence[View]) -> View:
     return views[len(views) // 2]
 
 
-def show_view(folder: Path, view: View) -> dict[str, np.ndarray]:
-    """What a reconstruction in ``folder`` shows of a view: channel -> (H, W, 3) display values."""
-    return _seen(folder, view, None)
+def show_view(folder: Path, view: View, mask: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Surfels of a reconstruction from a view: channel -> (H, W, 3) display values.
+
+    Base color is scaled to the view's within ``mask`` (H, W), as its figure is, where there is one.
+    """
+    buffers = SurfelTracer(GaussianScene.load(folder / "scene.ply")).gbuffer(view.camera).numpy()
+    solid = buffers["opacity"] > 0.5
+    color = buffers["base_color"]
+    if mask is not None and view.has("base_color"):
+        color = scale_albedo(color, view.read("base_color"), mask)
+    return {
+        "radiance": picture(buffers),
+        "normal": _normal_picture(buffers["normal"], solid),
+        "base color": _color_picture(color, solid),
+    }
 
 
 def light_picture(light: EnvironmentMap, exposure: float | None = None) -> np.ndarray:
@@ -96,21 +76,10 @@ def light_picture(light: EnvironmentMap, exposure: float | None = None) -> np.nd
 
 
 def write_sheet(folder: Path, compared: Compared) -> None:
-    """Write ``folder/SCENE.png``."""
-    write_image(folder / f"{compared.scene}.png", compared.sheet())
-
-
-def _seen(folder: Path, view: View, mask: np.ndarray | None) -> dict[str, np.ndarray]:
-    buffers = SurfelTracer(GaussianScene.load(folder / "scene.ply")).gbuffer(view.camera).numpy()
-    solid = buffers["opacity"] > 0.5
-    color = buffers["base_color"]
-    if mask is not None and view.has("base_color"):  # scaled as the figure is
-        color = scale_albedo(color, view.read("base_color"), mask)
-    return {
-        "radiance": picture(buffers),
-        "normal": _normal_picture(buffers["normal"], solid),
-        "base color": _color_picture(color, solid),
-    }
+    """Write all of it as one labelled picture, ``folder/SCENE.png``."""
+    columns, blank = {"truth": compared.truth, **compared.ways}, np.zeros((8, 8))
+    rows = {name: [images.get(name, blank) for images in columns.values()] for name in CHANNELS}
+    write_image(folder / f"{compared.scene}.png", labelled_sheet(rows, list(columns)))
 
 
 def _normal_picture(normal: np.ndarray, where: np.ndarray) -> np.ndarray:

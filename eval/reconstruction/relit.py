@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from eval.reconstruction.light import read_light
+from eval.reconstruction.measured import Fox
 from eval.reconstruction.pictures import light_picture, show_view
-from eval.reconstruction.runs import Run
+from eval.reconstruction.runs import collect_run
 from tron.captures import LoadSettings, View, load_capture
 from tron.color import to_display
 from tron.errors import TronError
@@ -20,23 +22,25 @@ from tron.shading.environment import EnvironmentMap
 from tron.storage import write_atomic
 
 
-@dataclass(frozen=True)
-class Fox:
-    """The real capture as it was photographed, reconstructed and relit.
+@dataclass
+class FoxRun:
+    """Files that the commands left of the fox.
 
     Attributes:
-        run: the reconstruction.
-        photos: name of a held-out view -> (H, W, 3) display values.
-        shown: name -> channel -> (H, W, 3) display values, of the surfels.
-        relit: name of a light -> its picture, then one picture a view.
-        light: picture of the fitted light, if one was fitted.
+        capture: what was read.
+        folder: what tron-reconstruct wrote.
+        seconds: its wall time.
+        views: the held-out views that are shown.
+        lights: name of a light -> (map, folder of tron-relight's frames).
+        relit_seconds: wall time of all the lights together.
     """
 
-    run: Run
-    photos: dict[str, np.ndarray]
-    shown: dict[str, dict[str, np.ndarray]]
-    relit: dict[str, list[np.ndarray]]
-    light: np.ndarray | None
+    capture: Path
+    folder: Path
+    seconds: float
+    views: list[View]
+    lights: dict[str, tuple[Path, Path]] = field(default_factory=dict)
+    relit_seconds: float = 0.0
 
 
 def chosen_views(capture: Path, downscale: float, count: int) -> list[View]:
@@ -53,18 +57,19 @@ def write_cameras(path: Path, views: Sequence[View]) -> None:
         write_atomic(path, text)
 
 
-def collect(run: Run, views: Sequence[View], relit: dict[str, tuple[Path, Path]]) -> Fox:
-    """Pictures of a finished run; ``relit`` maps a light's name to its file and tron-relight's folder."""
-    fitted = run.folder / "environment.exr"
+def collect_fox(made: FoxRun) -> Fox:
+    """Figures and pictures of the finished commands."""
+    fitted = read_light(made.folder)
     return Fox(
-        run=run,
-        photos={view.name: wanted_picture(view) for view in views},
-        shown={view.name: show_view(run.folder, view) for view in views},
+        run=collect_run("fox", made.folder, made.capture, made.seconds),
+        photos={view.name: wanted_picture(view) for view in made.views},
+        rendered={view.name: show_view(made.folder, view) for view in made.views},
         relit={
-            name: [light_picture(EnvironmentMap.load(light)), *relit_frames(folder, len(views))]
-            for name, (light, folder) in relit.items()
+            name: [light_picture(EnvironmentMap.load(light)), *relit_frames(frames, len(made.views))]
+            for name, (light, frames) in made.lights.items()
         },
-        light=light_picture(EnvironmentMap.load(fitted)) if fitted.is_file() else None,
+        relit_seconds=made.relit_seconds,
+        light=None if fitted is None else light_picture(fitted),
     )
 
 

@@ -1,4 +1,4 @@
-"""What one run of tron-reconstruct left behind: its metrics.json, read and checked, and the time it took."""
+"""One run of tron-reconstruct: its metrics.json, read and checked, and the time it took."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
+from eval.reconstruction.light import light_errors, read_light
 from eval.results import Row, mean_row
 from tron.errors import TronError
 
@@ -22,7 +23,7 @@ FIGURES = {
     "roughness_mae": ("roughness_mae", "1"),
     "metallic_mae": ("metallic_mae", "1"),
 }
-"""Figure of metrics.json's held-out views -> how the rows call it, and its unit."""
+"""Figure of metrics.json's held-out views -> its name in the rows, and its unit."""
 
 
 class _Part(BaseModel):
@@ -59,7 +60,6 @@ class Report(_Part):
 
     capture: Views
     surfels: int
-    materials_learnt: list[str] = Field(default_factory=list)
     test: dict[str, FiniteFloat]
     train: dict[str, FiniteFloat]
     views: dict[str, dict[str, FiniteFloat]]
@@ -72,8 +72,11 @@ class Run:
     """A finished reconstruction.
 
     Attributes:
-        name: of the scene. folder: what the command wrote. capture: what it read.
-        report: its metrics.json. seconds: wall time of the command from start to end.
+        name: of the scene.
+        folder: what the command wrote.
+        capture: what it read.
+        report: its metrics.json.
+        seconds: wall time of the command from start to end.
         light: figures of its light against the true one, name -> value; empty where either is unknown.
         family: of the true light, such as "sun"; empty if unknown.
     """
@@ -106,8 +109,15 @@ def read_report(folder: Path) -> Report:
         raise TronError(f"not tron-reconstruct's metrics: {place}: {first['msg']}", path) from error
 
 
+def collect_run(name: str, folder: Path, capture: Path, seconds: float) -> Run:
+    """A finished reconstruction; its light is held against the capture's where both are known."""
+    found, truth = read_light(folder), read_light(capture)
+    light = light_errors(found, truth) if found is not None and truth is not None else {}
+    return Run(name, folder, capture, read_report(folder), seconds, light, light_family(capture))
+
+
 def light_family(capture: Path) -> str:
-    """What kind of light a path-traced capture stands in, as its spec.json says; empty where none says so."""
+    """Family of a path-traced capture's light, from its spec.json; empty where none says so."""
     try:
         return str(json.loads((capture / "spec.json").read_text("utf-8"))["lights"][0]["family"])
     except (OSError, ValueError, LookupError, TypeError):
@@ -115,11 +125,11 @@ def light_family(capture: Path) -> str:
 
 
 def rows_of(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
-    """Means over the scenes with intervals (of seconds and surfels the most, which has none), then every
-    scene's own figures. ``seed`` draws the scenes of the intervals.
+    """Means over the scenes with intervals, then every scene's own figures.
 
-    A figure that a scene lacks has no row for it, and no mean, which would be of other scenes than its
-    neighbours are.
+    Of seconds and surfels it is the most, which has no interval. A figure that a scene lacks has no row for
+    it, and no mean, which would be of other scenes than its neighbours are. ``seed`` draws the scenes of the
+    intervals.
     """
     for metric, unit, values in _figures(runs):
         if len(values) == len(runs):
@@ -127,7 +137,7 @@ def rows_of(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
             if unit in ("s", "surfels"):
                 yield Row(metric=name, value=max(values.values()), unit=unit, n=len(values))
             else:
-                yield mean_row(name, unit, [*values], [*values.values()], seed)
+                yield mean_row(name, unit, values.items(), seed)
         for run in runs:
             if run.name in values:
                 n = 1 if unit in ("s", "surfels") else max(len(run.report.capture.held_out), 1)

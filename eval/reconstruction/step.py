@@ -14,8 +14,8 @@ ellipsoids that are seen from both sides.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -25,7 +25,8 @@ import torch
 from torch import Tensor
 
 from eval.peers import volprim
-from eval.peers.timing import Times, interleaved
+from eval.peers.timing import Rounds, fastest, interleaved
+from eval.reconstruction.measured import SHIPPED, TRON, VOLPRIM, Growth, Steps
 from tron import metrics
 from tron.captures import View
 from tron.gaussians.scene import GaussianScene
@@ -35,34 +36,8 @@ from tron.reconstruction.surfels import LearntSurfels
 from tron.reconstruction.training import Plan, Stage, radiance_plan
 from tron.tracing import SurfelTracer
 
-TRON, VOLPRIM, SHIPPED = "tron", "volprim", "volprim_as_shipped"
-TRIED = 2
+TRIED = Rounds(2, 2)
 """Rounds in which the peer's two plugins are compared, to take the faster one for this kernel and size."""
-
-
-@dataclass(frozen=True)
-class Steps:
-    """Times of whole steps on one view of ``size`` x ``size`` pixels, contestant -> times.
-
-    ``degree`` is the kernel's, on both sides. ``agreement`` is the PSNR in dB between the two sides' pictures
-    before the first step. ``shape`` is the peer's plugin for its primitives, the faster of the two.
-    """
-
-    count: int
-    size: int
-    degree: int
-    times: Mapping[str, Times]
-    agreement: float
-    shape: str
-
-    @property
-    def case(self) -> str:
-        """How metrics spell the case, such as degree4_128."""
-        return f"degree{self.degree}_{self.size}"
-
-    def ratio(self, name: str = VOLPRIM) -> float:
-        """How many times as long the peer's step takes."""
-        return self.times[name].over(self.times[TRON])
 
 
 def step_plan(extent: float, seed: int) -> Plan:
@@ -71,16 +46,13 @@ def step_plan(extent: float, seed: int) -> Plan:
     return replace(plan, density=None, sh_every=1)
 
 
-def surfel_step(scene: GaussianScene, view: View, plan: Plan, seed: int) -> Callable[[], None]:
+def surfel_step(scene: GaussianScene, view: View, plan: Plan, seed: int) -> Callable[[], Any]:
     """A call that takes one of TRON's steps, from the surfels that the last one left."""
     surfels = LearntSurfels.of_scene(scene, plan.rates, _device())
     stage = Stage(plan, [view], surfels, scene.kernel_degree, seed)
     stage.step = plan.sh_degree  # the schedule of the harmonics is over
 
-    def step() -> None:
-        stage.advance()
-
-    return step
+    return stage.advance
 
 
 def volprim_step(
@@ -128,20 +100,16 @@ def ellipsoids(surfels: LearntSurfels) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def measure_steps(
-    scene: GaussianScene,
-    view: View,
-    extent: float,
-    seed: int,
-    repetitions: int,
-    slow_repetitions: int,
-    shape: str | None = None,
+    scene: GaussianScene, view: View, extent: float, seed: int, rounds: Rounds, shape: str | None = None
 ) -> Steps:
     """Time both sides in turns on one view; the peer has the scene's kernel and stops rays where TRON does.
 
     Where the kernel is the one that the peer ships, the peer as shipped runs beside it.
 
     Args:
-        scene: surfels, each side learns from there on. view: square, display values. extent: world units.
+        scene: surfels, each side learns from there on.
+        view: square, display values.
+        extent: world units.
         shape: the peer's plugin for its primitives; None takes the one whose step is faster here.
     """
     plan = step_plan(extent, seed)
@@ -149,22 +117,22 @@ def measure_steps(
     agreement = _agreement(scene, view, same_stop)
     if shape is None:
         peers = {name: volprim_step(scene, view, plan, name, same_stop) for name in volprim.SHAPES}
-        tried = interleaved(peers, TRIED, TRIED)
-        shape = min(tried, key=lambda name: tried[name].median)
+        shape = fastest(interleaved(peers, TRIED))
     contestants = {
         TRON: surfel_step(scene, view, plan, seed),
         VOLPRIM: volprim_step(scene, view, plan, shape, same_stop),
     }
     if scene.kernel_degree == 2:
         contestants[SHIPPED] = volprim_step(scene, view, plan, shape, volprim.load_integrator())
-    times = interleaved(contestants, repetitions, slow_repetitions)
-    return Steps(len(scene), view.camera.width, scene.kernel_degree, times, agreement, shape)
+    times = interleaved(contestants, rounds)
+    return Steps(len(scene), view.camera.width, times, scene.kernel_degree, agreement, shape)
 
 
-def measure_growth(scene: GaussianScene, view: View, extent: float, seed: int, repetitions: int) -> Times:
+def measure_growth(scene: GaussianScene, view: View, extent: float, seed: int, repetitions: int) -> Growth:
     """Times of TRON's own step."""
     step = surfel_step(scene, view, step_plan(extent, seed), seed)
-    return interleaved({TRON: step}, repetitions, repetitions)[TRON]
+    times = interleaved({TRON: step}, Rounds(repetitions, repetitions))
+    return Growth(len(scene), view.camera.width, times)
 
 
 def _agreement(scene: GaussianScene, view: View, integrator: Any) -> float:

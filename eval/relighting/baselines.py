@@ -1,6 +1,6 @@
-"""The baselines that a neural renderer must beat: products in linear light, and least-squares blends.
+"""Baselines that a neural renderer must beat: products in linear light, and least-squares blends.
 
-Definitions (docs: facts, section 9). With B = pbr, E = irradiance, E0 = unshadowed irradiance (all linear, E
+Definitions (docs/conventions.md, 12). With B = pbr, E = irradiance, E0 = unshadowed irradiance (all linear, E
 over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the displayed image:
 
 - ``pbr``: D(B).
@@ -13,170 +13,194 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 - ``affine_ratio``: the same with D(B E / E0) as a third input.
 - ``pixel_mlp``: 1x1 convolutions on D(B) and D(E), trained on the same data for the same time.
 
-Blends and s are fitted on the foreground of training data against the displayed truth, with the squared error
-that PSNR measures, in float64 (float32 sums over millions of pixels were several dB off).
+Blends and s are fitted on the foreground of training data (:mod:`eval.relighting.fits`). A blend of surfaces
+is wrong for the sky, which both buffers show as it is. On full frames the blends and ``pixel_mlp`` are
+therefore laid over pbr, whose sky is the displayed environment: o x blend + (1 - o) D(B). The other methods
+show the environment by themselves.
 
-A blend of surfaces is wrong for the sky, which both buffers show as it is. On full frames the blends and
-``pixel_mlp`` are therefore laid over pbr, whose sky is the displayed environment: o x blend + (1 - o) D(B),
-clipped (:func:`over_environment`). The other methods show the environment by themselves.
+A new baseline is one more entry of BASELINES: scores, tables and pictures iterate over it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
-import scipy.optimize
 
-from tron.color import agx
-
-THREE = ("pbr", "shadow_ratio", "affine")
-SEVEN = ("pbr", "pbr_x_irradiance", "shadow_ratio", "shadowed", "affine", "affine_ratio", "pixel_mlp")
+from eval.relighting.buffers import Buffers, Region, displayed_truth, region_mask
+from eval.relighting.fits import AffineFit, Fit, Fitted, ProductFit, Show
+from tron.color import to_display
+from tron.errors import TronError
+from tron.seeds import generator
+from tron.shards.schema import Clip
 
 RATIO_FLOOR = 1e-4
 """Exposed unshadowed irradiance under which no ratio is formed: AgX is black below 2e-4."""
+SAMPLED_PIXELS = 512
+"""Foreground pixels of a frame, on average, for fits that are content with some."""
 
 
-def shadow_ratio(
-    pbr: np.ndarray, irradiance: np.ndarray, unshadowed: np.ndarray, exposure: float
-) -> np.ndarray:
-    """pbr times the share of irradiance that arrives, per channel.
+def shadow_ratio(buffers: Buffers) -> np.ndarray:
+    """pbr times the share of irradiance that arrives, per channel: (..., 3) float32, linear, in pbr's unit.
 
     The share is irradiance / unshadowed clamped to [0, 1]: visibility only removes light, and what exceeds 1
     is Monte Carlo noise. Where ``exposure * unshadowed`` is under RATIO_FLOOR there is no light to lose and
     the share is 1. Where nothing is shadowed the result is pbr itself.
+    """
+    unshadowed = buffers.unshadowed
+    lit = unshadowed * buffers.exposure > RATIO_FLOOR
+    share = np.where(lit, buffers.irradiance / np.where(lit, unshadowed, 1), 1)
+    return (buffers.pbr * np.clip(share, 0, 1)).astype(np.float32)
+
+
+def show_pbr(buffers: Buffers) -> np.ndarray:
+    """D(B), (..., 3) in [0, 1]; so the next two."""
+    return buffers.displayed("pbr")
+
+
+def show_irradiance(buffers: Buffers) -> np.ndarray:
+    """D(E)."""
+    return buffers.displayed("irradiance")
+
+
+def show_shadow_ratio(buffers: Buffers) -> np.ndarray:
+    """D(B E / E0)."""
+    return to_display(shadow_ratio(buffers), buffers.exposure)
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to make the picture from the guidance.
+
+    Attributes:
+        name: in rows of results.json: ``NAME.psnr``.
+        title: in tables and under pictures.
+        what: what it does, in a few words.
+    """
+
+    name: str
+    title: str
+    what: str
+
+
+@dataclass(frozen=True)
+class Baseline(Method):
+    """A method that the neural renderer is held against.
+
+    Attributes:
+        show: the method; None where it is fitted, or a network whose weights are given.
+        fit: starts a fit of the method on training data.
+        surfaces: knows surfaces alone, and is laid over pbr on full frames.
+        simple: belongs to the simple baselines, over the best of which a gain is reported.
+        pictured: stands among the pictures of the report.
+    """
+
+    show: Show | None = None
+    fit: Callable[[], Fit] | None = None
+    surfaces: bool = False
+    simple: bool = False
+    pictured: bool = True
+
+
+NEURAL = Method("neural", "neural renderer", "a small transformer over pbr and irradiance")
+BASELINES = (
+    Baseline("pbr", "pbr", "split-sum shading of the surfels, no shadows", show_pbr, simple=True),
+    Baseline(
+        "pbr_x_irradiance",
+        "pbr × irradiance",
+        "pbr times irradiance times one fitted number",
+        fit=ProductFit,
+        pictured=False,
+    ),
+    Baseline(
+        "shadow_ratio",
+        "shadow ratio",
+        "pbr times the share of light that arrives",
+        show_shadow_ratio,
+        simple=True,
+    ),
+    Baseline(
+        "shadowed",
+        "shadowed shading",
+        "shadowed diffuse light plus split-sum specular",
+        lambda buffers: buffers.displayed("shadowed"),
+        pictured=False,
+    ),
+    Baseline(
+        "affine",
+        "affine blend",
+        "fitted blend of pbr, irradiance and a constant",
+        fit=lambda: AffineFit(show_pbr, show_irradiance),
+        surfaces=True,
+        simple=True,
+        pictured=False,
+    ),
+    Baseline(
+        "affine_ratio",
+        "affine blend with shadow ratio",
+        "fitted blend of pbr, irradiance, shadow ratio and a constant",
+        fit=lambda: AffineFit(show_pbr, show_irradiance, show_shadow_ratio),
+        surfaces=True,
+    ),
+    Baseline(
+        "pixel_mlp",
+        "per-pixel network",
+        "a network that sees one pixel at a time, trained for the same time",
+        surfaces=True,
+    ),
+)
+METHODS: tuple[Method, ...] = (NEURAL, *BASELINES)
+
+
+def fit_baselines(clips: Iterable[Clip], seed: int) -> dict[str, Fitted]:
+    """Baseline name -> the method as fitted on the foreground of training clips.
 
     Args:
-        pbr, irradiance, unshadowed: (..., 3) linear radiance and irradiance over pi, in the same unit.
-        exposure: the clip's scalar, for the floor alone.
+        clips: the training split, read once, one clip in memory at a time.
+        seed: of the choice of pixels, where some are enough.
+
+    Raises:
+        TronError: there are no training clips, or they have no foreground.
+    """
+    fits = {baseline.name: baseline.fit() for baseline in BASELINES if baseline.fit}
+    fitted_on = 0
+    for clip in clips:
+        inside = region_mask(clip, "foreground")
+        buffers, truth = Buffers.of(clip).at(inside), displayed_truth(clip)[inside]
+        rng = generator(seed, "eval", "scale", clip.meta.key)
+        count = min(SAMPLED_PIXELS * clip.meta.frames, len(truth))
+        some = np.sort(rng.choice(len(truth), count, replace=False)) if count else []
+        sample = buffers.at(some), truth[some]
+        for fit in fits.values():
+            fit.add(*(sample if fit.sampled else (buffers, truth)))
+        fitted_on += len(truth)
+    if not fitted_on:
+        raise TronError(
+            "no training clips with a foreground to fit the baselines on",
+            mend="the data set needs a training split",
+        )
+    return {name: fit.solve() for name, fit in fits.items()}
+
+
+def predictions(clip: Clip, methods: Mapping[str, Show]) -> dict[Region, dict[str, np.ndarray]]:
+    """Pictures of a clip by every baseline that needs no fit and by the ``methods`` given.
+
+    Args:
+        clip: with the members MEMBERS.
+        methods: name -> fitted baseline or network.
 
     Returns:
-        (..., 3) float32, linear, in pbr's unit.
+        Region -> method name -> (K, H, W, 3) display float32 in [0, 1]. The regions differ only for baselines
+        of ``surfaces``, which full frames show over the environment.
     """
-    lit = unshadowed * exposure > RATIO_FLOOR
-    share = np.where(lit, irradiance / np.where(lit, unshadowed, 1), 1)
-    return (pbr * np.clip(share, 0, 1)).astype(np.float32)
-
-
-def over_environment(shown: np.ndarray, pbr: np.ndarray, opacity: np.ndarray) -> np.ndarray:
-    """A method's surfaces before pbr's sky: o x shown + (1 - o) D(B).
-
-    Args:
-        shown, pbr: (..., 3) display values in [0, 1].
-        opacity: (..., 1) of the surfels, [0, 1].
-    """
-    return opacity * shown + (1 - opacity) * pbr
-
-
-@dataclass(frozen=True)
-class ProductTerms:
-    """The two images that pbr_x_irradiance blends: exposed linear (..., 3), ``scale * product + rest``."""
-
-    product: np.ndarray
-    rest: np.ndarray
-
-    def at(self, pixels: tuple[np.ndarray, ...]) -> ProductTerms:
-        """The terms of some pixels, (n, 3) each; ``pixels`` index all axes but the last."""
-        return ProductTerms(self.product[pixels], self.rest[pixels])
-
-    def displayed(self, scale: float) -> np.ndarray:
-        """AgX of the blend: (..., 3) display values in [0, 1]."""
-        return agx(scale * self.product + self.rest)
-
-
-def product_terms(
-    pbr: np.ndarray, irradiance: np.ndarray, opacity: np.ndarray, exposure: float
-) -> ProductTerms:
-    """Split e (o s B e E + (1 - o) B) into what s multiplies and what it does not.
-
-    Args:
-        pbr, irradiance: (..., 3) linear.
-        opacity: (..., 1) of the surfels, [0, 1].
-        exposure: the clip's scalar.
-    """
-    exposed = pbr * exposure
-    return ProductTerms(opacity * exposed * (irradiance * exposure), (1 - opacity) * exposed)
-
-
-@dataclass
-class ScaleFit:
-    """Collects pixels of the training data and finds the s with the least displayed squared error."""
-
-    _products: list[np.ndarray] = field(default_factory=list)
-    _rests: list[np.ndarray] = field(default_factory=list)
-    _truths: list[np.ndarray] = field(default_factory=list)
-
-    def add(self, terms: ProductTerms, truth: np.ndarray) -> None:
-        """Keep these pixels: ``terms`` and displayed ``truth``, each (n, 3)."""
-        self._products.append(np.asarray(terms.product, np.float64))
-        self._rests.append(np.asarray(terms.rest, np.float64))
-        self._truths.append(np.asarray(truth, np.float64))
-
-    def solve(self) -> float:
-        """The scale, in [1e-3, 1e3]: a scan of its logarithm, then Brent's method around the best point.
-
-        Raises:
-            ValueError: no pixels were added.
-        """
-        if not self._products or not sum(map(len, self._products)):
-            raise ValueError("no training pixels to fit the scale on")
-        terms = ProductTerms(np.concatenate(self._products), np.concatenate(self._rests))
-        truth = np.concatenate(self._truths)
-
-        def error(log_scale: float) -> float:
-            return float(np.mean((terms.displayed(np.exp(log_scale)) - truth) ** 2))
-
-        scan = np.linspace(np.log(1e-3), np.log(1e3), 43)
-        best = int(np.argmin([error(x) for x in scan]))
-        low, high = scan[max(best - 1, 0)], scan[min(best + 1, len(scan) - 1)]
-        found = scipy.optimize.minimize_scalar(
-            error, bounds=(low, high), method="bounded", options={"xatol": 1e-6}
-        )
-        return float(np.exp(found.x))  # type: ignore[attr-defined]
-
-
-@dataclass(frozen=True)
-class AffineBlend:
-    """weights (3 output channels, inputs + 1) float64; the last column is the constant."""
-
-    weights: np.ndarray
-
-    def displayed(self, inputs: Sequence[np.ndarray]) -> np.ndarray:
-        """Blend displayed images: inputs of (..., 3) each -> (..., 3) float32 in [0, 1]."""
-        if len(inputs) + 1 != self.weights.shape[1]:
-            raise ValueError(f"the blend has {self.weights.shape[1] - 1} inputs, {len(inputs)} given")
-        blend = self.weights[:, -1] + sum(
-            weight * np.asarray(image, np.float64) for weight, image in zip(self.weights.T, inputs)
-        )
-        return np.clip(blend, 0, 1).astype(np.float32)
-
-
-class AffineFit:
-    """Float64 normal equations of an :class:`AffineBlend`, summed over any number of images."""
-
-    RIDGE = 1e-9
-    """Share of the diagonal added to it, so that equal inputs (an unshadowed data set) still have a
-    solution.
-    """
-
-    def __init__(self, n_inputs: int):
-        self._gram = np.zeros((3, n_inputs + 1, n_inputs + 1))
-        self._moment = np.zeros((3, n_inputs + 1))
-        self.n_pixels = 0
-
-    def add(self, inputs: Sequence[np.ndarray], truth: np.ndarray) -> None:
-        """Add pixels: displayed inputs and truth, (n, 3) each."""
-        columns = np.stack([*(np.asarray(x, np.float64) for x in inputs), np.ones(truth.shape)], axis=-1)
-        by_channel = columns.transpose(1, 2, 0)  # (3, inputs + 1, n)
-        self._gram += by_channel @ columns.transpose(1, 0, 2)
-        self._moment += (by_channel @ np.asarray(truth, np.float64).T[:, :, None])[..., 0]
-        self.n_pixels += len(truth)
-
-    def solve(self) -> AffineBlend:
-        """The least-squares weights of each channel; ValueError if no pixels were added."""
-        if not self.n_pixels:
-            raise ValueError("no training pixels to fit the blend on")
-        diagonal = np.einsum("cii->ci", self._gram)
-        ridge = np.eye(self._gram.shape[-1]) * (self.RIDGE * diagonal)[:, None, :]
-        return AffineBlend(np.linalg.solve(self._gram + ridge, self._moment[..., None])[..., 0])
+    buffers = Buffers.of(clip)
+    plain = {baseline.name: baseline.show for baseline in BASELINES if baseline.show}
+    foreground = {name: show(buffers) for name, show in {**plain, **methods}.items()}
+    surfaces = {baseline.name for baseline in BASELINES if baseline.surfaces}
+    opacity, pbr = buffers.opacity, buffers.displayed("pbr")
+    frame = {
+        name: opacity * image + (1 - opacity) * pbr if name in surfaces else image
+        for name, image in foreground.items()
+    }
+    return {"foreground": foreground, "frame": frame}

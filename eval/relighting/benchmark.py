@@ -1,24 +1,26 @@
-"""Benchmark `relighting`: the neural renderer against seven baselines on held-out scenes and lights."""
+"""Benchmark `relighting`: the neural renderer against baselines on held-out scenes and lights."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from eval.benchmark import Benchmark
 from eval.relighting import page
-from eval.relighting.gallery import Shown, middle_frame
+from eval.relighting.baselines import NEURAL, fit_baselines, predictions
+from eval.relighting.buffers import MEMBERS, displayed_truth
+from eval.relighting.fits import Show
+from eval.relighting.gallery import Example, middle_frame
 from eval.relighting.guidance import GuidanceScores
-from eval.relighting.predictions import MEMBERS, Predictor, Render, displayed_truth, fit_baselines
-from eval.relighting.scores import Scores
+from eval.relighting.measured import Measured
+from eval.relighting.scores import Scores, Where
 from eval.report.charts import training_curves
 from eval.report.outcome import Outcome
-from eval.report.page import Chart
 from tron.errors import TronError
 from tron.runtime import set_torch_threads
 from tron.shards.manifest import Manifest
@@ -27,6 +29,9 @@ from tron.shards.schema import Clip
 from tron.storage import sha256
 
 log = logging.getLogger("tron.eval")
+
+SETTINGS = {"neural": "renderer", "pixel_mlp": "pixel_mlp"}
+"""Network -> the setting that names its weights."""
 
 
 class Relighting(Benchmark):
@@ -59,36 +64,46 @@ class Relighting(Benchmark):
         """Fit on the training splits, score the test split, choose and make the pictures."""
         self.check()
         dataset = self._dataset()
-        manifest = Manifest.load(dataset)
         set_torch_threads(self.threads)
-        networks = self._networks()
+        for name in SETTINGS.keys() - self._weights():
+            log.warning("no weights for %s: its rows will be absent", name)
+        networks = {name: load_network(path, self.vae) for name, path in self._weights().items()}
         log.info("fitting the baselines on %s", ", ".join(self.train_splits))
-        predictor = Predictor(fit_baselines(self._training_clips(), self.seed), networks)
+        fitted = fit_baselines(self._training_clips(), self.seed)
+        methods = {name: each.show for name, each in fitted.items()} | networks
         scores, guidance, clips = Scores(), GuidanceScores(), []
         for clip in read_clips(dataset, self.test_split):
-            scores.add(clip, predictor.shown(clip), displayed_truth(clip))
+            scores.add(clip, predictions(clip, methods), displayed_truth(clip))
             guidance.add(clip)
             clips.append(clip.meta)
             log.info("scored clip %s (%s, %s)", clip.meta.key, clip.meta.light, clip.meta.light_family)
-        shown = self._shown(predictor, choose_clips(scores, self.pictures))
-        inputs: dict[str, Any] = {
+        rows = [*scores.rows(self.seed), *guidance.rows(self.seed)]
+        measured = Measured(
+            scores=scores,
+            guidance=guidance,
+            rows={row.metric: row for row in rows},
+            clips=clips,
+            examples=self._examples(methods, choose_clips(scores, self.pictures)),
+            curves=training_curves(
+                {name: path.parent / "metrics.csv" for name, path in self._weights().items()}
+            ),
+        )
+        manifest = Manifest.load(dataset)
+        inputs = {
             "dataset_config_sha256": manifest.config_sha256,
             "clips": {entry: sum(s.samples for s in manifest.of_split(entry)) for entry in manifest.splits()},
-            "fitted_scale": predictor.fits.scale,
+            "fitted_weights": {name: each.weights.round(4).tolist() for name, each in fitted.items()},
+            **{f"{SETTINGS[name]}_sha256": sha256(path) for name, path in self._weights().items()},
         }
-        for name, path in (("renderer", self.renderer), ("pixel_mlp", self.pixel_mlp)):
-            if path is not None:
-                inputs[f"{name}_sha256"] = sha256(path)
-        return page.outcome(
-            scores,
-            guidance,
-            clips,
-            shown,
-            self._curves(),
-            inputs,
-            output_dir,
-            self._typed(output_dir),
-            self.seed,
+        return Outcome(
+            rows=rows,
+            title="Relighting held-out scenes under held-out lights",
+            verdict=page.verdict(measured),
+            lead=page.LEAD,
+            sections=page.sections(measured, output_dir / "pictures"),
+            headline=page.HEADLINE,
+            reproduce=[self._typed(output_dir)],
+            inputs=inputs,
         )
 
     def _dataset(self) -> Path:
@@ -100,37 +115,29 @@ class Relighting(Benchmark):
         for split in self.train_splits:
             yield from read_clips(self._dataset(), split, MEMBERS)
 
-    def _networks(self) -> dict[str, Render]:
-        given = {"neural": self.renderer, "pixel_mlp": self.pixel_mlp}
-        for name, path in given.items():
-            if path is None:
-                log.warning("no weights for %s: its rows will be absent", name)
-        return {name: load_network(path, self.vae) for name, path in given.items() if path is not None}
+    def _weights(self) -> dict[str, Path]:
+        """Network -> the file of its weights, of those that were given."""
+        return {name: path for name, key in SETTINGS.items() if (path := getattr(self, key)) is not None}
 
-    def _curves(self) -> list[Chart]:
-        """Curves of the trainings whose metrics.csv lies beside the weights."""
-        given = {"neural": self.renderer, "pixel_mlp": self.pixel_mlp}
-        return training_curves({name: path.parent / "metrics.csv" for name, path in given.items() if path})
-
-    def _typed(self, output_dir: Path) -> list[str]:
+    def _typed(self, output_dir: Path) -> str:
         inputs = {"dataset": self.dataset, "renderer": self.renderer, "pixel_mlp": self.pixel_mlp}
         given = [f"{name}={path}" for name, path in inputs.items() if path is not None]
-        return [" \\\n    ".join(["tron-eval benchmark=relighting", *given, f"output_dir={output_dir}"])]
+        return " \\\n    ".join(["tron-eval benchmark=relighting", *given, f"output_dir={output_dir}"])
 
-    def _shown(self, predictor: Predictor, keys: list[str]) -> list[Shown]:
+    def _examples(self, methods: Mapping[str, Show], keys: list[str]) -> list[Example]:
         """The middle frames of the chosen clips by every method, in that order: a second pass."""
         if not keys:
             return []
-        shown = {
-            clip.meta.key: middle_frame(clip, predictor.shown(clip)["frame"], displayed_truth(clip))
+        examples = {
+            clip.meta.key: middle_frame(clip, predictions(clip, methods)["frame"], displayed_truth(clip))
             for clip in read_clips(self._dataset(), self.test_split)
             if clip.meta.key in keys
         }
-        return [shown[key] for key in keys]
+        return [examples[key] for key in keys]
 
 
-def load_network(path: Path, vae: Path | None = None) -> Render:
-    """Weights on disk -> a function that shows clips; torch is imported here and not before.
+def load_network(path: Path, vae: Path | None = None) -> Show:
+    """Weights on disk -> a method; torch is imported here and not before.
 
     Raises:
         TronError: the file is missing or holds no renderer.
@@ -139,7 +146,7 @@ def load_network(path: Path, vae: Path | None = None) -> Render:
     from tron.neural.weights import load_renderer
 
     renderer = load_renderer(path, vae)
-    return lambda pbr, irradiance, exposure: render_clip(renderer, pbr, irradiance, exposure)
+    return lambda buffers: render_clip(renderer, buffers.pbr, buffers.irradiance, buffers.exposure)
 
 
 def choose_clips(scores: Scores, count: int) -> list[str]:
@@ -148,18 +155,13 @@ def choose_clips(scores: Scores, count: int) -> list[str]:
     The gain is neural PSNR minus that of the best of the baselines that were scored, foreground; without a
     neural renderer the clips are ranked by the PSNR of pbr.
     """
-    keys = list(dict.fromkeys(score.clip for score in scores.entries))
-    baselines = [method for method in scores.methods if method != "neural"]
+    baselines = [method.name for method in scores.methods if method is not NEURAL]
 
     def rank(key: str) -> float:
-        gain = scores.gain(baselines, "foreground", clip=key)
-        alone = scores.mean("pbr", "foreground", clip=key)
-        return gain[0] if gain else alone[0] if alone else -np.inf
+        of_clip = Where(clip=key)
+        found = (scores.gain(baselines, of_clip), scores.psnr("pbr", of_clip))
+        return next((figure for figure in found if figure is not None), -np.inf)
 
-    ordered = sorted(keys, key=rank)
-    if len(ordered) <= count:
-        return ordered
-    places = (
-        np.linspace(0, len(ordered) - 1, count).round().astype(int) if count > 1 else np.zeros(count, int)
-    )
-    return [ordered[place] for place in dict.fromkeys(places.tolist())]
+    ordered = sorted(scores.clips, key=rank)
+    places = np.linspace(0, len(ordered) - 1, min(count, len(ordered))).round().astype(int)
+    return [ordered[place] for place in places]

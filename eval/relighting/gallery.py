@@ -6,43 +6,39 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eval.relighting.shadows import MEMBERS as SHADOW_MEMBERS
+from eval.relighting.baselines import BASELINES, NEURAL
+from eval.relighting.buffers import Buffers
 from eval.relighting.shadows import direct_light, same_depth, shadow_errors
 from eval.report.page import Picture, Pictures
 from tron import metrics
 from tron.color import linear_to_srgb, luminance, to_display
 from tron.shards.schema import Clip, ClipMeta
 
-METHOD_TITLES = {
-    "pbr": "pbr",
-    "irradiance": "irradiance",
-    "shadow_ratio": "shadow_ratio",
-    "affine_ratio": "affine_ratio",
-    "pixel_mlp": "pixel_mlp",
-    "neural": "neural renderer",
-}
-METHOD_ALTS = {
-    "pbr": "split-sum shading of the surfels without shadows",
-    "irradiance": "light arriving at each surface, with shadows, as a white surface would show it",
-    "shadow_ratio": "pbr darkened by the share of light that arrives",
-    "affine_ratio": "best linear blend of pbr, irradiance and shadow_ratio",
-    "pixel_mlp": "a network that sees one pixel at a time",
-    "neural": "the neural renderer's image",
-}
 ERROR_GAIN = 3
+PICTURED = [baseline for baseline in BASELINES if baseline.pictured]
+
+
+IRRADIANCE = "light arriving at each surface, with shadows, as a white surface would show it"
 
 
 @dataclass(frozen=True)
-class Shown:
-    """The middle frame of a clip, display values (H, W, 3): by every method, the truth, and the guidance
-    pictures.
+class Example:
+    """The middle frame of a clip, display values (H, W, 3).
 
-    ``psnr`` holds dB on the foreground of these very pictures; ``guidance`` is empty without references.
+    Attributes:
+        meta: of the clip.
+        frame: its number.
+        methods: method name -> its picture.
+        irradiance: as displayed.
+        truth: the path-traced picture.
+        psnr: method name -> dB on the foreground of this very picture.
+        guidance: title -> picture of the guidance or its error; empty without references.
     """
 
     meta: ClipMeta
     frame: int
     methods: dict[str, np.ndarray]
+    irradiance: np.ndarray
     truth: np.ndarray
     psnr: dict[str, float]
     guidance: dict[str, np.ndarray]
@@ -55,26 +51,21 @@ class Shown:
         return f"Scene {self.meta.scene} · light {light} · frame {self.frame + 1} of {self.meta.frames}"
 
 
-def middle_frame(clip: Clip, shown: dict[str, np.ndarray], truth: np.ndarray) -> Shown:
+def middle_frame(clip: Clip, shown: dict[str, np.ndarray], truth: np.ndarray) -> Example:
     """Take the middle frame of a clip's predictions (method -> (K, H, W, 3)) and of its truth."""
     k = clip.meta.frames // 2
-    frames, exposure = clip.frames, clip.meta.exposure
     methods = {name: images[k] for name, images in shown.items()}
-    methods["irradiance"] = to_display(frames["irradiance"][k], exposure)
-    foreground = frames["foreground"][k, ..., 0] > 0.5
+    foreground = clip.frames["foreground"][k, ..., 0] > 0.5
     where = foreground if foreground.any() else None
-    psnr = {
-        name: metrics.capped_psnr(image, truth[k], where)
-        for name, image in methods.items()
-        if name != "irradiance"
-    }
-    return Shown(clip.meta, k, methods, truth[k], psnr, _guidance_pictures(clip, k))
+    psnr = {name: metrics.capped_psnr(image, truth[k], where) for name, image in methods.items()}
+    irradiance = Buffers.of(clip).displayed("irradiance")[k]
+    return Example(clip.meta, k, methods, irradiance, truth[k], psnr, _guidance_pictures(clip, k))
 
 
 def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
-    frames = {name: images[k] for name, images in clip.frames.items()}
-    if not {"irradiance_ref", "base_color", "base_color_ref", "normal", "normal_ref"} <= frames.keys():
+    if not clip.has_reference:
         return {}
+    frames = {name: images[k] for name, images in clip.frames.items()}
     foreground = frames["foreground"] > 0.5
     ours, truth = (
         np.where(foreground, to_display(frames[name], clip.meta.exposure), 0)
@@ -85,8 +76,7 @@ def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
         "irradiance, path-traced": truth,
         f"difference ×{ERROR_GAIN}": np.clip(np.abs(ours - truth) * ERROR_GAIN, 0, 1),
     }
-    if set(SHADOW_MEMBERS) <= frames.keys():
-        pictures["shadow errors"] = _shadow_error_picture(frames, truth)
+    pictures["shadow errors"] = _shadow_error_picture(frames, truth)
     for name, title in (("base_color", "base color"), ("normal", "normals")):
         for member, whose in ((name, "surfels"), (f"{name}_ref", "true")):
             image = frames[member]
@@ -107,27 +97,25 @@ def _shadow_error_picture(frames: dict[str, np.ndarray], truth: np.ndarray) -> n
     return picture
 
 
-def comparison(shown: Shown) -> Pictures:
-    """pbr, irradiance, the strongest baselines, the neural renderer, the truth and the error of the neural
-    one.
-    """
-    pictures = []
-    where = f"scene {shown.meta.scene} under light {shown.meta.light}"
-    for name, title in METHOD_TITLES.items():
-        if name in shown.methods:
-            figure = f"{shown.psnr[name]:.1f} dB" if name in shown.psnr else ""
-            alt = f"{METHOD_ALTS[name]}, {where}"
-            pictures.append(Picture(shown.methods[name], title, alt, figure, strong=name == "neural"))
-    pictures.append(Picture(shown.truth, "path-traced truth", f"path-traced ground truth, {where}"))
-    judged_name = "neural" if "neural" in shown.methods else "pbr"
-    error = np.clip(np.abs(shown.methods[judged_name] - shown.truth) * ERROR_GAIN, 0, 1)
-    title = f"|{METHOD_TITLES[judged_name]} − truth| ×{ERROR_GAIN}"
-    pictures.append(Picture(error, title, f"absolute error of {judged_name} times {ERROR_GAIN}, {where}"))
-    return Pictures(shown.title, pictures)
+def comparison(example: Example) -> Pictures:
+    """The guidance, baselines and the neural renderer beside the truth, and the last one's error."""
+    where = f"scene {example.meta.scene} under light {example.meta.light}"
+    pictures = [Picture(example.irradiance, "irradiance", f"{IRRADIANCE}, {where}")]
+    chosen = [method for method in (*PICTURED, NEURAL) if method.name in example.methods]
+    for method in chosen:
+        image, figure = example.methods[method.name], f"{example.psnr[method.name]:.1f} dB"
+        picture = Picture(image, method.title, f"{method.what}, {where}", figure, strong=method is NEURAL)
+        pictures.insert(0 if method.name == "pbr" else len(pictures), picture)
+    pictures.append(Picture(example.truth, "path-traced truth", f"path-traced ground truth, {where}"))
+    judged = chosen[-1] if NEURAL in chosen else chosen[0]
+    error = np.clip(np.abs(example.methods[judged.name] - example.truth) * ERROR_GAIN, 0, 1)
+    title = f"|{judged.title} − truth| ×{ERROR_GAIN}"
+    alt = f"absolute error of the {judged.title} times {ERROR_GAIN}, {where}"
+    return Pictures(example.title, [*pictures, Picture(error, title, alt)])
 
 
-def guidance(shown: Shown) -> Pictures:
+def guidance(example: Example) -> Pictures:
     """Irradiance, its reference and errors; base color and normals of the surfels beside the true ones."""
-    where = f"scene {shown.meta.scene} under light {shown.meta.light}"
-    pictures = [Picture(image, name, f"{name}, {where}") for name, image in shown.guidance.items()]
-    return Pictures(shown.title, pictures)
+    where = f"scene {example.meta.scene} under light {example.meta.light}"
+    pictures = [Picture(image, name, f"{name}, {where}") for name, image in example.guidance.items()]
+    return Pictures(example.title, pictures)

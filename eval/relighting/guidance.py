@@ -1,4 +1,4 @@
-"""How good the surfels and their irradiance are, before any network: measured against the path tracer.
+"""Quality of the surfels and their irradiance, before any network: measured against the path tracer.
 
 A tracer that leaks would make a network look good, so its errors are quoted beside the network's gain.
 Irradiance is judged against Mitsuba's direct irradiance, never through the final image: leaks fake bounce
@@ -7,13 +7,11 @@ light.
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from eval.confidence import interval, mean_interval, quotient, scene_sums
-from eval.relighting.shadows import MEMBERS as SHADOW_MEMBERS
+from eval.confidence import interval, quotient, scene_sums
 from eval.relighting.shadows import (
     ShadowCounts,
     both_have_surface,
@@ -22,12 +20,10 @@ from eval.relighting.shadows import (
     same_depth,
     same_normal,
 )
-from eval.results import Row
+from eval.results import Row, mean_row
 from tron import metrics
 from tron.color import to_display
 from tron.shards.schema import Clip
-
-log = logging.getLogger("tron.eval")
 
 JUDGED = {"": same_depth, "_same_normal": same_normal, "_with_silhouettes": both_have_surface}
 """Tail of a row's name -> which pixels of a frame shadows are judged on."""
@@ -35,9 +31,13 @@ JUDGED = {"": same_depth, "_same_normal": same_normal, "_with_silhouettes": both
 
 @dataclass
 class GuidanceScores:
-    """Gathers the measurements of test clips, each with its scene, those of irradiance by the light's family.
+    """Measurements of test clips; a clip without the reference members adds nothing.
 
-    A clip without the reference members adds nothing.
+    Attributes:
+        irradiance_psnr: family of lights -> (scene, dB) of each frame.
+        shadows: key of JUDGED -> family of lights -> (scene, pixels) of each frame.
+        base_color_psnr: (scene, dB) of each view.
+        normal_error: (scene, degrees) of each view.
     """
 
     irradiance_psnr: dict[str, list[tuple[str, float]]] = field(default_factory=dict)
@@ -47,7 +47,6 @@ class GuidanceScores:
     base_color_psnr: list[tuple[str, float]] = field(default_factory=list)
     normal_error: list[tuple[str, float]] = field(default_factory=list)
     _views: set[str] = field(default_factory=set)
-    _told: bool = False
 
     def add(self, clip: Clip) -> None:
         """Measure every frame of a clip, on the ground-truth foreground.
@@ -55,43 +54,33 @@ class GuidanceScores:
         Geometry does not depend on the light: a view (scene and camera) seen under several lights counts
         once for base color and normals.
         """
+        if not clip.has_reference:
+            return
         frames, meta = clip.frames, clip.meta
         for k, foreground in enumerate(frames["foreground"][..., 0] > 0.5):
             if not foreground.any():
                 continue
-            if "irradiance_ref" in frames:
-                shown, truth = (
-                    to_display(frames[name][k], meta.exposure) for name in ("irradiance", "irradiance_ref")
-                )
-                psnr = metrics.capped_psnr(shown, truth, foreground)
-                self.irradiance_psnr.setdefault(meta.light_family, []).append((meta.scene, psnr))
-                self._count_shadows(clip, k)
+            shown, truth = (
+                to_display(frames[name][k], meta.exposure) for name in ("irradiance", "irradiance_ref")
+            )
+            psnr = metrics.capped_psnr(shown, truth, foreground)
+            self.irradiance_psnr.setdefault(meta.light_family, []).append((meta.scene, psnr))
+            self._count_shadows(clip, k)
             view = f"{meta.scene} {sorted(meta.cameras[k].items())}"
             if view in self._views:
                 continue
             self._views.add(view)
-            if {"base_color", "base_color_ref"} <= frames.keys():
-                ours, truth = (np.clip(frames[name][k], 0, 1) for name in ("base_color", "base_color_ref"))
-                psnr = metrics.capped_psnr(ours, truth, foreground)
-                self.base_color_psnr.append((meta.scene, psnr))
-            if {"normal", "normal_ref"} <= frames.keys():
-                ours, truth = frames["normal"][k], frames["normal_ref"][k]
-                lengths = np.minimum(*(np.linalg.norm(n, axis=-1) for n in (ours, truth)))
-                both = foreground & (lengths > 0.5)
-                if both.any():
-                    error = float(metrics.angular_error_deg(ours, truth, both))
-                    self.normal_error.append((meta.scene, error))
+            ours, truth = (np.clip(frames[name][k], 0, 1) for name in ("base_color", "base_color_ref"))
+            psnr = metrics.capped_psnr(ours, truth, foreground)
+            self.base_color_psnr.append((meta.scene, psnr))
+            ours, truth = frames["normal"][k], frames["normal_ref"][k]
+            lengths = np.minimum(*(np.linalg.norm(n, axis=-1) for n in (ours, truth)))
+            both = foreground & (lengths > 0.5)
+            if both.any():
+                error = float(metrics.angular_error_deg(ours, truth, both))
+                self.normal_error.append((meta.scene, error))
 
     def _count_shadows(self, clip: Clip, k: int) -> None:
-        missing = [name for name in SHADOW_MEMBERS if name not in clip.frames]
-        if missing:
-            if not self._told:
-                log.warning(
-                    "no shadow figures: clips of this dataset lack %s; make it again with this tron-datagen",
-                    ", ".join(missing),
-                )
-            self._told = True
-            return
         frame = {name: images[k] for name, images in clip.frames.items()}
         for tail, judged in JUDGED.items():
             counts = count_shadow_errors(frame["irradiance"], direct_light(frame), judged(frame))
@@ -109,7 +98,7 @@ class GuidanceScores:
         rows: list[Row] = []
         if self.irradiance_psnr:
             by_family = {
-                family: _mean(f"guidance.irradiance_psnr.{family}", "dB", values, seed)
+                family: mean_row(f"guidance.irradiance_psnr.{family}", "dB", values, seed)
                 for family, values in sorted(self.irradiance_psnr.items())
             }
             lowest = min(by_family.values(), key=lambda row: row.value)
@@ -124,14 +113,8 @@ class GuidanceScores:
             ("surfels.normal_mae_deg", self.normal_error, "deg"),
         ):
             if values:
-                rows.append(_mean(metric, unit, values, seed))
+                rows.append(mean_row(metric, unit, values, seed))
         return rows
-
-
-def _mean(metric: str, unit: str, found: list[tuple[str, float]], seed: int) -> Row:
-    scenes, values = zip(*found)
-    row = Row(metric=metric, value=float(np.mean(values)), unit=unit, n=len(values))
-    return row.within(mean_interval(scenes, values, seed))
 
 
 def _fractions(tail: str, counted: list[tuple[str, ShadowCounts]], seed: int) -> list[Row]:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from eval.relighting.baselines import SEVEN, THREE
-from eval.relighting.gallery import Shown, comparison, guidance
-from eval.relighting.guidance import GuidanceScores
-from eval.relighting.predictions import Region
-from eval.relighting.scores import GROUPS, REGIONS, SUFFIX, Scores
+from eval.relighting.baselines import BASELINES, METHODS, NEURAL
+from eval.relighting.buffers import Region
+from eval.relighting.gallery import comparison, guidance
+from eval.relighting.measured import Measured
+from eval.relighting.scores import GROUPS, METRICS, REGIONS, Where
 from eval.relighting.shadows import (
     DARKENED_BELOW,
     LEAK_OVER_MEAN,
@@ -19,161 +18,130 @@ from eval.relighting.shadows import (
     SAME_NORMAL_DEG,
     SHADOWED_BELOW,
 )
-from eval.report.figures import MINUS, with_interval
+from eval.report.figures import MINUS, row_cell, with_interval
 from eval.report.intervals import interval_note
-from eval.report.outcome import Outcome
-from eval.report.page import Block, Cell, Chart, Section, Table, Text, Tone
+from eval.report.page import Block, Cell, Section, Table, Text
 from eval.report.strips import write_strips
 from eval.results import Row
-from tron.shards.schema import ClipMeta
 
-WHAT = {
-    "neural": "the neural renderer: a small transformer over pbr and irradiance",
-    "pbr": "split-sum shading of the surfels, no shadows",
-    "pbr_x_irradiance": "pbr times irradiance times one fitted number",
-    "shadow_ratio": "pbr times the share of light that arrives",
-    "shadowed": "shadowed diffuse light plus split-sum specular",
-    "affine": "fitted blend of pbr, irradiance and a constant",
-    "affine_ratio": "the same with shadow_ratio as a third input",
-    "pixel_mlp": "a network that sees one pixel at a time, trained as long",
-}
+TITLES = {method.name: method.title for method in METHODS}
+SIMPLE = ", ".join(TITLES[name] for name in GROUPS["best_simple_baseline"])
 REGION_WORDS: dict[Region, str] = {"foreground": "foreground", "frame": "full frame"}
 HEADLINE = {
     "neural.psnr": "Neural renderer, foreground PSNR",
-    "neural.gain_over_best_of_three": "Gain over the best of pbr, shadow_ratio and affine",
-    "neural.gain_over_best_of_seven": "Gain over the best of all seven baselines",
+    "neural.gain_over_best_simple_baseline": f"Gain over the best simple baseline ({SIMPLE})",
+    "neural.gain_over_best_baseline": f"Gain over the best of all {len(BASELINES)} baselines",
     "neural.psnr_full": "Neural renderer, full-frame PSNR",
     "guidance.irradiance_psnr": "Irradiance against path tracing, worst kind of light",
     "guidance.shadow_leak": "Shadow pixels of the surfels that leak light",
     "surfels.base_color_psnr": "Base color of the surfels",
     "surfels.normal_mae_deg": "Normals of the surfels, mean error",
 }
-PAIRED = (
-    "A gain's interval is that of the differences on the same frames, not the difference of two intervals. "
-    "No interval says how much another training of the same networks would differ."
-)
 LEAD = (
     "TRON relights captured 3D worlds. A scene becomes a cloud of small flat disks (surfels) with "
     "materials; under a new light, a ray tracer turns them into two quick pictures: pbr, shading without "
     "shadows, and irradiance, the light that arrives at each surface. A neural renderer turns the two into"
     " a photograph-like image.",
     "This page measures that last step on scenes and lights that were not trained on, against a path "
-    "tracer's ground truth and against seven simpler ways of using the same two pictures.",
+    f"tracer's ground truth and against {len(BASELINES)} simpler ways of using the same two pictures, the "
+    "baselines.",
 )
+PAIRED = (
+    "A gain's interval is that of the differences on the same frames, not the difference of two intervals. "
+    "No interval says how much another training of the same networks would differ."
+)
+GUIDANCE_ROWS = {
+    "irradiance PSNR": "guidance.irradiance_psnr",
+    "shadow pixels leaking": "guidance.shadow_leak",
+    "shadow pixels leaking, same surface by normals": "guidance.shadow_leak_same_normal",
+    "shadow pixels leaking, silhouettes included": "guidance.shadow_leak_with_silhouettes",
+    "lit pixels darkened": "guidance.lit_darkened",
+    "lit pixels darkened, same surface by normals": "guidance.lit_darkened_same_normal",
+    "lit pixels darkened, silhouettes included": "guidance.lit_darkened_with_silhouettes",
+}
+SURFEL_ROWS = {
+    "surfels.base_color_psnr": ("base color PSNR", "linear, on the foreground, averaged over views"),
+    "surfels.normal_mae_deg": ("normals, mean angular error", "where both have a surface"),
+}
 
 
-def outcome(
-    scores: Scores,
-    guidance_scores: GuidanceScores,
-    clips: Sequence[ClipMeta],
-    shown: Sequence[Shown],
-    curves: Sequence[Chart],
-    inputs: dict[str, Any],
-    output_dir: Path,
-    reproduce: Sequence[str],
-    seed: int,
-) -> Outcome:
-    """Rows and sections of an evaluation; the pictures are also written below ``output_dir/pictures``.
-
-    ``seed`` draws the scenes of the intervals.
-    """
-    rows = [*scores.rows(seed), *guidance_scores.rows(seed)]
-    found = {row.metric: row for row in rows}
-    sections = [
-        Section("results", "Every method, every held-out frame", [*_methods(scores, clips, found)]),
-        Section("lights", "By kind of light", [_families(scores, found)]),
+def sections(measured: Measured, pictures: Path) -> list[Section]:
+    """The body of the page; its pictures are also written as files into the folder ``pictures``."""
+    found = [
+        Section("results", "Every method, every held-out frame", _methods(measured)),
+        Section("lights", "By kind of light", [_families(measured)]),
     ]
-    if shown:
-        comparisons = [comparison(each) for each in shown]
-        write_strips(comparisons, [each.meta.key for each in shown], output_dir / "pictures")
+    if measured.examples:
+        comparisons = [comparison(example) for example in measured.examples]
+        write_strips(comparisons, [example.meta.key for example in measured.examples], pictures)
         intro = Text(
             "Middle frames of held-out clips, evenly spaced in the ranking by gain: the first is the clip "
             "on which the network gains least, the last the one on which it gains most. Decibels are of the"
             " picture shown, on the foreground; higher is better, and 1 dB is easy to see side by side."
         )
-        sections.append(Section("pictures", "Held-out scenes under held-out lights", [intro, *comparisons]))
-    sections += _guidance_section(guidance_scores, found, shown, output_dir)
-    if curves:
-        sections.append(Section("training", "How the training went", curves))
-    return Outcome(
-        rows=rows,
-        title="Relighting held-out scenes under held-out lights",
-        verdict=_verdict(scores, clips, found),
-        lead=LEAD,
-        sections=sections,
-        headline=HEADLINE,
-        reproduce=reproduce,
-        inputs=inputs,
-    )
+        found.append(Section("pictures", "Held-out scenes under held-out lights", [intro, *comparisons]))
+    found += _guidance_section(measured, pictures)
+    if measured.curves:
+        found.append(Section("training", "How the training went", measured.curves))
+    return found
 
 
-def _verdict(scores: Scores, clips: Sequence[ClipMeta], found: Mapping[str, Row]) -> str:
-    n_frames = sum(meta.frames for meta in clips)
-    n_scenes, n_lights = len({meta.scene for meta in clips}), len({meta.light for meta in clips})
-    where = f"On {n_frames} held-out frames ({n_scenes} scenes, {n_lights} lights)"
-    neural, pbr = found.get("neural.psnr"), found.get("pbr.psnr")
+def verdict(measured: Measured) -> str:
+    """The finding in one sentence."""
+    frames, scenes, lights = measured.count()
+    text = f"On {frames} held-out frames ({scenes} scenes, {lights} lights)"
+    neural, pbr = (measured.rows.get(f"{name}.psnr") for name in ("neural", "pbr"))
     if neural is None:
-        if pbr is None:
-            return f"{where}."
-        return f"{where} pbr alone reaches {with_interval(pbr)}; no neural renderer was given."
-    text = f"{where} the neural renderer reaches {with_interval(neural)} on the foreground"
-    gain_three, gain_seven = (found.get(f"neural.gain_over_{group}") for group in GROUPS)
-    best = scores.best(SEVEN, "foreground")
-    if gain_three:
-        text += f", {with_interval(gain_three, signed=True)} over the best of pbr, shadow_ratio and affine"
-    if gain_seven and best:
-        text += f", {with_interval(gain_seven, signed=True)} over the best of all seven baselines ({best[0]})"
+        alone = f" pbr alone reaches {with_interval(pbr)}; no neural renderer was given" if pbr else ""
+        return f"{text}{alone}."
+    text += f" the neural renderer reaches {with_interval(neural)} on the foreground"
+    best = measured.scores.best(GROUPS["best_baseline"])
+    for group, words in (
+        ("best_simple_baseline", f"the best simple baseline ({SIMPLE})"),
+        ("best_baseline", f"the best of all {len(BASELINES)} baselines ({TITLES.get(best or '')})"),
+    ):
+        if gain := measured.rows.get(f"neural.gain_over_{group}"):
+            text += f", {with_interval(gain, signed=True)} over {words}"
     return text + "."
 
 
-def _methods(scores: Scores, clips: Sequence[ClipMeta], found: Mapping[str, Row]) -> list[Block]:
-    headings = ["Method", "What it is", *(["PSNR", "SSIM", "neural gains"] * len(REGIONS))]
-    groups = [("", 2), *((REGION_WORDS[region], 3) for region in REGIONS)]
-    rows = []
-    for method in scores.methods:
-        tone = "strong" if method == "neural" else "plain"
-        row = [Cell(method, tone), Cell(WHAT[method], "faint")]
-        for region in REGIONS:
-            suffix = SUFFIX[region]
-            row += [
-                _cell(found.get(f"{method}.psnr{suffix}"), tone),
-                _cell(found.get(f"{method}.ssim{suffix}"), tone),
-                _gain_cell(found.get(f"neural.gain_over_{method}{suffix}")),
-            ]
+def _methods(measured: Measured) -> list[Block]:
+    headings = [*(metric.title for metric in METRICS), "neural gains ↑"]
+    groups = [("", 2), *((REGION_WORDS[region], len(headings)) for region in REGIONS)]
+    rows: list[Sequence[Cell | str]] = []
+    for method in measured.scores.methods:
+        tone = "strong" if method is NEURAL else "plain"
+        row = [Cell(method.title, tone), Cell(method.what, "faint")]
+        for where in map(Where, REGIONS):
+            names = [f"{method.name}.{metric.name}{where.tail}" for metric in METRICS]
+            row += [row_cell(measured.rows.get(name), tone, unit=False) for name in names]
+            row.append(_gain_cell(measured.rows.get(f"neural.gain_over_{method.name}{where.tail}")))
         rows.append(row)
-    for group, methods in GROUPS.items():
-        row = [Cell(group.replace("_", " "), "strong"), Cell("", "faint")]
-        for region in REGIONS:
-            best = scores.best(methods, region)
-            row += [
-                Cell(f"{best[1]:.2f}" if best else "—", "strong"),
-                Cell(best[0] if best else "—", "faint"),
-                _gain_cell(found.get(f"neural.gain_over_{group}{SUFFIX[region]}")),
-            ]
+    for group, names in GROUPS.items():
+        row = [Cell(group.replace("_", " "), "strong"), Cell("the one with the highest PSNR", "faint")]
+        for where in map(Where, REGIONS):
+            best = measured.scores.best(names, where)
+            reached = None if best is None else measured.scores.psnr(best, where)
+            row += [Cell("—" if reached is None else f"{reached:.2f}", "strong")]
+            row += [Cell(TITLES.get(best or "", "—"), "faint"), *([Cell("")] * (len(METRICS) - 2))]
+            row.append(_gain_cell(measured.rows.get(f"neural.gain_over_{group}{where.tail}")))
         rows.append(row)
+    caption = "Mean over held-out frames, PSNR and gains in dB; an arrow points to the better side."
+    frames, scenes, _ = measured.count()
     notes = (
-        "PSNR says how close a picture is to the truth, in decibels: 20 dB is a typical error of 10% of full "
-        "brightness, 30 dB of 3%, and 6 dB more halve it. SSIM compares structure; 1 is identical. "
-        "PSNR is taken of each displayed frame (exposure, then the AgX tone curve; peak 1) and averaged "
-        "over frames; SSIM likewise. “Neural gains” is the neural renderer's mean PSNR minus the method's. "
-        "Foreground is where a ray through the pixel's centre meets true geometry. Best of three: "
-        f"{', '.join(THREE)}. Products are taken in linear light before the tone curve. Blends and factors "
-        "are fitted on the foreground of the training split in float64. On full frames the blends and the "
-        "per-pixel network are laid over pbr by the surfels' opacity, because a blend that suits surfaces is "
-        "wrong for the sky, which pbr shows as it is."
+        f"{' '.join(metric.what for metric in METRICS)} Each is taken of every displayed frame (exposure, "
+        "then the AgX tone curve; peak 1) and averaged over frames. “Neural gains” is the neural renderer's "
+        "mean PSNR minus the method's. Foreground is where a ray through the pixel's centre meets true "
+        f"geometry. Simple baselines: {SIMPLE}. Products are taken in linear light before the tone curve. "
+        "Blends and factors are fitted on the foreground of the training split in float64. On full frames "
+        "the blends and the per-pixel network are laid over pbr by the surfels' opacity, because a blend "
+        "that suits surfaces is wrong for the sky, which pbr shows as it is."
     )
-    caption = "PSNR and gains in dB; higher is better everywhere."
-    scenes = len({meta.scene for meta in clips})
-    frames = sum(meta.frames for meta in clips)
     return [
-        Table(caption, headings, rows, groups, words=[1]),
+        Table(caption, ["Method", "What it is", *(headings * len(REGIONS))], rows, groups, words=[1]),
         Text(f"{interval_note(scenes, f'{frames} frames')} {PAIRED}"),
         Text(notes),
     ]
-
-
-def _cell(row: Row | None, tone: Tone = "plain") -> Cell:
-    return Cell("—" if row is None else with_interval(row).replace(" dB", ""), tone)
 
 
 def _gain_cell(row: Row | None) -> Cell:
@@ -185,29 +153,26 @@ def _gain_cell(row: Row | None) -> Cell:
     return Cell(text, "good" if text[0] == "+" else "bad" if text[0] == MINUS else "plain")
 
 
-def _families(scores: Scores, found: Mapping[str, Row]) -> Table:
-    families = scores.families
-    headings = ["Method", *families, *families]
-    groups = [("", 1), *((REGION_WORDS[region], len(families)) for region in REGIONS)]
-    places: list[tuple[Region, str]] = [(region, family) for region in REGIONS for family in families]
-    rows = []
-    for method in scores.methods:
-        tone = "strong" if method == "neural" else "plain"
-        means = [found.get(f"{method}.psnr{SUFFIX[region]}.{family}") for region, family in places]
-        rows.append([Cell(method, tone), *(_cell(mean, tone) for mean in means)])
+def _families(measured: Measured) -> Table:
+    families = measured.scores.families
+    places = [Where(region, family) for region in REGIONS for family in families]
+    rows: list[Sequence[Cell | str]] = []
+    for method in measured.scores.methods:
+        tone = "strong" if method is NEURAL else "plain"
+        means = [measured.rows.get(f"{method.name}.psnr{where.tail}") for where in places]
+        rows.append([Cell(method.title, tone), *(row_cell(mean, tone, unit=False) for mean in means)])
     for group in GROUPS:
-        gains = [found.get(f"neural.gain_over_{group}{SUFFIX[region]}.{family}") for region, family in places]
-        rows.append([Cell(f"gain over {group.replace('_', ' ')}"), *map(_gain_cell, gains)])
-    counts = [
-        f"{family}: {mean[1]} frames" for family in families if (mean := scores.mean("pbr", "frame", family))
-    ]
-    return Table(f"PSNR in dB by kind of light ({', '.join(counts)}).", headings, rows, groups)
+        gains = [measured.rows.get(f"neural.gain_over_{group}{where.tail}") for where in places]
+        rows.append([f"gain over the {group.replace('_', ' ')}", *map(_gain_cell, gains)])
+    counts = {family: len(measured.scores.of("pbr", Where("frame", family))) for family in families}
+    frames = ", ".join(f"{family}: {count} frames" for family, count in counts.items())
+    groups = [("", 1), *((REGION_WORDS[region], len(families)) for region in REGIONS)]
+    return Table(f"PSNR in dB by kind of light ({frames}).", ["Method", *families, *families], rows, groups)
 
 
-def _guidance_section(
-    scores: GuidanceScores, rows: Mapping[str, Row], shown: Sequence[Shown], output_dir: Path
-) -> list[Section]:
+def _guidance_section(measured: Measured, pictures: Path) -> list[Section]:
     """The surfels' own quality; no section where the test clips carry no reference buffers."""
+    rows = measured.rows
     if not any(name.startswith(("guidance.", "surfels.")) for name in rows):
         return []
     intro = Text(
@@ -222,41 +187,25 @@ def _guidance_section(
         "called shadow errors show leaking pixels in orange, darkened ones in blue."
     )
     blocks: list[Block] = [intro]
-    families = sorted(scores.irradiance_psnr)
-    if families:
-        metrics = {
-            "irradiance PSNR": "guidance.irradiance_psnr",
-            "shadow pixels leaking": "guidance.shadow_leak",
-            "shadow pixels leaking, same surface by normals": "guidance.shadow_leak_same_normal",
-            "shadow pixels leaking, silhouettes included": "guidance.shadow_leak_with_silhouettes",
-            "lit pixels darkened": "guidance.lit_darkened",
-            "lit pixels darkened, same surface by normals": "guidance.lit_darkened_same_normal",
-            "lit pixels darkened, silhouettes included": "guidance.lit_darkened_with_silhouettes",
-        }
-        table_rows = [
-            [Cell(name), _value(rows.get(metric), "strong")]
-            + [_value(rows.get(f"{metric}.{family}")) for family in families]
-            for name, metric in metrics.items()
+    if families := sorted(measured.guidance.irradiance_psnr):
+        table = [
+            [name, row_cell(rows.get(metric), "strong")]
+            + [row_cell(rows.get(f"{metric}.{family}")) for family in families]
+            for name, metric in GUIDANCE_ROWS.items()
         ]
         caption = (
             "Irradiance; “overall” is the lowest PSNR of the kinds of light, and the fraction of all pixels."
         )
-        blocks.append(Table(caption, ["Figure", "overall", *families], table_rows))
+        blocks.append(Table(caption, ["Figure", "overall", *families], table))
     surfels = [
-        [Cell(name), _value(rows.get(metric), "strong"), Cell(note, "faint")]
-        for name, metric, note in (
-            ("base color PSNR", "surfels.base_color_psnr", "linear, on the foreground, averaged over views"),
-            ("normals, mean angular error", "surfels.normal_mae_deg", "where both have a surface"),
-        )
+        [name, row_cell(rows[metric], "strong"), Cell(measured_by, "faint")]
+        for metric, (name, measured_by) in SURFEL_ROWS.items()
         if metric in rows
     ]
     if surfels:
-        blocks.append(Table("Surfels at held-out views.", ["Figure", "Measured", "How"], surfels, words=[2]))
-    drawn = list({each.meta.light_family: each for each in reversed(shown) if each.guidance}.values())
-    groups = [guidance(each) for each in drawn]
-    write_strips(groups, [f"{each.meta.key}-guidance" for each in drawn], output_dir / "pictures")
+        headings = ["Figure", "Measured", "How"]
+        blocks.append(Table("Surfels at held-out views.", headings, surfels, words=[2]))
+    drawn = {each.meta.light_family: each for each in reversed(measured.examples) if each.guidance}
+    groups = [guidance(each) for each in drawn.values()]
+    write_strips(groups, [f"{each.meta.key}-guidance" for each in drawn.values()], pictures)
     return [Section("guidance", "The guidance itself", [*blocks, *groups])]
-
-
-def _value(row: Row | None, tone: Tone = "plain") -> Cell:
-    return Cell(with_interval(row) if row else "—", tone)

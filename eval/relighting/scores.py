@@ -1,53 +1,98 @@
-"""PSNR and SSIM of every method on every held-out frame, and the rows made of them.
+"""Metrics of every method on every held-out frame, and the rows made of them.
 
-PSNR is computed on each displayed frame against a peak of 1 and then averaged over frames, not of an average
-error: a dark, easy frame counts as much as a bright, hard one. SSIM likewise. A frame that equals the truth
-has no finite PSNR and counts as PSNR_CAP of :mod:`tron.metrics`. Intervals are over scenes
-(:mod:`eval.confidence`), whose frames and lights are no independent observations; a gain's is of the
-differences on the same frames.
+A metric is computed on each displayed frame and then averaged over frames, PSNR too, not of an average
+error: a dark, easy frame counts as much as a bright, hard one. A frame that equals the truth has no finite
+PSNR and counts as PSNR_CAP of :mod:`tron.metrics`. Intervals are over scenes (:mod:`eval.confidence`), whose
+frames and lights are no independent observations; a gain's is of the differences on the same frames.
+
+A new metric is one more entry of METRICS: rows and tables iterate over it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
-from eval.confidence import Interval, interval, mean_interval, scene_sums
-from eval.relighting.baselines import SEVEN, THREE
-from eval.relighting.predictions import REGIONS, Region, region_mask
-from eval.results import Row
+from eval.confidence import Interval, interval, scene_sums
+from eval.relighting.baselines import BASELINES, METHODS, Method
+from eval.relighting.buffers import REGIONS, Region, region_mask
+from eval.results import Row, mean_row
 from tron import metrics
 from tron.shards.schema import Clip
 
-METHODS = ("neural", *SEVEN)
-GROUPS = {"best_of_three": THREE, "best_of_seven": SEVEN}
-RIVALS: dict[str, Sequence[str]] = {**{method: (method,) for method in SEVEN}, **GROUPS}
+
+class Metric(NamedTuple):
+    """A figure of one displayed frame against the truth.
+
+    Attributes:
+        name: in rows: ``METHOD.NAME``.
+        title: in tables, with an arrow to its better side.
+        unit: of its rows.
+        measure: (image, truth, mask or None) -> the figure; images (H, W, 3) in [0, 1], mask (H, W) bool.
+        what: how to read it, a sentence or two.
+    """
+
+    name: str
+    title: str
+    unit: str
+    measure: Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]
+    what: str
+
+
+METRICS = (
+    Metric(
+        "psnr",
+        "PSNR ↑",
+        "dB",
+        metrics.capped_psnr,
+        "PSNR says how close a picture is to the truth, in decibels: 20 dB is a typical error of 10% of full "
+        "brightness, 30 dB of 3%, and 6 dB more halve it.",
+    ),
+    Metric("ssim", "SSIM ↑", "1", metrics.ssim, "SSIM compares structure; 1 is identical."),
+)
+GROUPS = {
+    "best_simple_baseline": [baseline.name for baseline in BASELINES if baseline.simple],
+    "best_baseline": [baseline.name for baseline in BASELINES],
+}
+RIVALS = {baseline.name: [baseline.name] for baseline in BASELINES} | GROUPS
 """What the neural renderer's gains are over: each baseline, and the best of each group."""
-SUFFIX: dict[Region, str] = {"foreground": "", "frame": "_full"}
-"""Full-frame metrics carry ``_full`` after their name, foreground metrics nothing."""
+
+
+class Where(NamedTuple):
+    """Part of the scores: a region, of all clips, of one family of lights or of one clip."""
+
+    region: Region = "foreground"
+    family: str | None = None
+    clip: str | None = None
+
+    @property
+    def tail(self) -> str:
+        """End of the rows' names: ``_full`` for frames, ``.FAMILY`` for one family."""
+        return ("_full" if self.region == "frame" else "") + (f".{self.family}" if self.family else "")
+
+
+ALL = Where()
 
 
 @dataclass(frozen=True)
 class Score:
-    """One method on one region of one frame: psnr in dB (capped), ssim in [-1, 1]."""
+    """Metric name -> figure of one method on one frame of a clip."""
 
-    method: str
-    region: Region
     family: str
     scene: str
     clip: str
-    frame: int
-    psnr: float
-    ssim: float
+    figures: Mapping[str, float]
 
 
 @dataclass
 class Scores:
-    """All scores of an evaluation, kept by method and region."""
+    """All scores of an evaluation: (method, region) -> one for each frame."""
 
-    _kept: dict[tuple[str, Region], list[Score]] = field(default_factory=dict)
+    kept: defaultdict[tuple[str, Region], list[Score]] = field(default_factory=lambda: defaultdict(list))
 
     def add(self, clip: Clip, shown: dict[Region, dict[str, np.ndarray]], truth: np.ndarray) -> None:
         """Score a clip's predictions; a frame without foreground has no foreground score.
@@ -57,104 +102,78 @@ class Scores:
             shown: region -> method -> (K, H, W, 3) display values.
             truth: (K, H, W, 3) display values.
         """
+        meta = clip.meta
         for region, images in shown.items():
             inside = region_mask(clip, region)
             for method, frames in images.items():
-                for k, (image, target, mask) in enumerate(zip(frames, truth, inside)):
-                    if not mask.any():
-                        continue
-                    where = None if region == "frame" else mask
-                    score = Score(
-                        method,
-                        region,
-                        clip.meta.light_family,
-                        clip.meta.scene,
-                        clip.meta.key,
-                        k,
-                        metrics.capped_psnr(image, target, where),
-                        metrics.ssim(image, target, where),
-                    )
-                    self._kept.setdefault((method, region), []).append(score)
+                for image, target, mask in zip(frames, truth, inside):
+                    if mask.any():
+                        where = None if region == "frame" else mask
+                        figures = {metric.name: metric.measure(image, target, where) for metric in METRICS}
+                        score = Score(meta.light_family, meta.scene, meta.key, figures)
+                        self.kept[method, region].append(score)
 
     @property
-    def entries(self) -> list[Score]:
-        """Every score, method by method."""
-        return [score for scores in self._kept.values() for score in scores]
+    def clips(self) -> list[str]:
+        """Keys of the clips that were scored, in order."""
+        return list(dict.fromkeys(score.clip for scores in self.kept.values() for score in scores))
 
     @property
     def families(self) -> list[str]:
-        """Light families seen, sorted."""
-        return sorted({score.family for score in self.entries})
+        """Light families that were scored, sorted."""
+        return sorted({score.family for scores in self.kept.values() for score in scores})
 
     @property
-    def methods(self) -> list[str]:
-        """Methods seen, in the order of METHODS."""
-        seen = {method for method, _ in self._kept}
-        return [method for method in METHODS if method in seen]
+    def methods(self) -> list[Method]:
+        """Methods that were scored, in the order of METHODS."""
+        scored = {method for method, _ in self.kept}
+        return [method for method in METHODS if method.name in scored]
 
-    def mean(
-        self,
-        method: str,
-        region: Region = "foreground",
-        family: str | None = None,
-        metric: str = "psnr",
-        clip: str | None = None,
-    ) -> tuple[float, int] | None:
-        """Mean over frames and the number of frames; None where nothing was scored."""
-        values = [getattr(score, metric) for score in self._of(method, region, family, clip)]
-        return (float(np.mean(values)), len(values)) if values else None
+    def of(self, method: str, where: Where) -> list[Score]:
+        """A method's scores, in the order of the frames."""
+        kept = self.kept.get((method, where.region), ())
+        return [s for s in kept if where.family in (None, s.family) and where.clip in (None, s.clip)]
 
-    def _of(self, method: str, region: Region, family: str | None, clip: str | None = None) -> list[Score]:
-        kept = self._kept.get((method, region), ())
-        return [score for score in kept if family in (None, score.family) and clip in (None, score.clip)]
+    def psnr(self, method: str, where: Where = ALL) -> float | None:
+        """Mean PSNR over frames in dB; None where nothing was scored."""
+        scores = self.of(method, where)
+        return float(np.mean([score.figures["psnr"] for score in scores])) if scores else None
 
-    def best(
-        self, methods: Iterable[str], region: Region, family: str | None = None, clip: str | None = None
-    ) -> tuple[str, float] | None:
-        """The method with the highest mean PSNR and that PSNR; None unless all of them were scored."""
-        means = {method: self.mean(method, region, family, clip=clip) for method in methods}
-        if not all(means.values()):
-            return None
-        return max(((name, mean[0]) for name, mean in means.items() if mean), key=lambda pair: pair[1])
+    def best(self, methods: Sequence[str], where: Where = ALL) -> str | None:
+        """The method with the highest mean PSNR; None unless all of them were scored."""
+        means = {method: self.psnr(method, where) for method in methods}
+        known = {method: mean for method, mean in means.items() if mean is not None}
+        return max(known, key=known.__getitem__) if len(known) == len(means) > 0 else None
 
-    def gain(
-        self, group: Iterable[str], region: Region, family: str | None = None, clip: str | None = None
-    ) -> tuple[float, int] | None:
-        """Neural PSNR minus that of the best method of the group, in dB, and the number of frames."""
-        neural, best = self.mean("neural", region, family, clip=clip), self.best(group, region, family, clip)
-        return (neural[0] - best[1], neural[1]) if neural and best else None
+    def gain(self, methods: Sequence[str], where: Where = ALL) -> float | None:
+        """Neural PSNR minus that of the best of the methods, in dB; None unless all were scored."""
+        neural, best = self.psnr("neural", where), self.best(methods, where)
+        reached = None if best is None else self.psnr(best, where)
+        return None if neural is None or reached is None else neural - reached
 
-    def rows(self, seed: int = 0) -> list[Row]:
-        """``METHOD.psnr``, ``METHOD.ssim`` and ``neural.gain_over_*``; ``_full`` for frames, ``.FAMILY`` for
-        one. ``seed`` draws the scenes of the intervals.
+    def rows(self, seed: int = 0) -> Iterator[Row]:
+        """``METHOD.METRIC`` and ``neural.gain_over_RIVAL``, each with the tails of :class:`Where`.
+
+        ``seed`` draws the scenes of the intervals.
         """
-        rows: list[Row] = []
-        for family in (None, *self.families):
-            tail = "" if family is None else f".{family}"
-            for region in REGIONS:
-                for method in self.methods:
-                    for metric, unit in (("psnr", "dB"), ("ssim", "1")):
-                        mean = self.mean(method, region, family, metric)
-                        if mean is not None:
-                            name = f"{method}.{metric}{SUFFIX[region]}{tail}"
-                            row = Row(metric=name, value=mean[0], unit=unit, n=mean[1])
-                            scores = self._of(method, region, family)
-                            scenes = [score.scene for score in scores]
-                            values = [getattr(score, metric) for score in scores]
-                            rows.append(row.within(mean_interval(scenes, values, seed)))
-                for rival, methods in RIVALS.items():
-                    gain = self.gain(methods, region, family)
-                    if gain is not None:
-                        name = f"neural.gain_over_{rival}{SUFFIX[region]}{tail}"
-                        row = Row(metric=name, value=gain[0], unit="dB", n=gain[1])
-                        rows.append(row.within(self._gain_interval(methods, region, family, seed)))
-        return rows
+        for where in (Where(region, family) for family in (None, *self.families) for region in REGIONS):
+            for method in self.methods:
+                scores = self.of(method.name, where)
+                for metric in METRICS if scores else ():
+                    name = f"{method.name}.{metric.name}{where.tail}"
+                    found = ((score.scene, score.figures[metric.name]) for score in scores)
+                    yield mean_row(name, metric.unit, found, seed)
+            for rival, methods in RIVALS.items():
+                gain = self.gain(methods, where)
+                if gain is not None:
+                    name, n = f"neural.gain_over_{rival}{where.tail}", len(self.of("neural", where))
+                    row = Row(metric=name, value=gain, unit="dB", n=n)
+                    yield row.within(self._gain_interval(methods, where, seed))
 
-    def _gain_interval(self, group: Sequence[str], region: Region, family: str | None, seed: int) -> Interval:
+    def _gain_interval(self, methods: Sequence[str], where: Where, seed: int) -> Interval:
         """The interval of a gain: in each resample over the method that is the best one there."""
-        compared = ("neural", *group)
-        by_method = [self._of(method, region, family) for method in compared]
-        psnr = [[score.psnr for score in scores] for scores in by_method]
+        by_method = [self.of(method, where) for method in ("neural", *methods)]
+        psnr = [[score.figures["psnr"] for score in scores] for scores in by_method]
         scenes = [score.scene for score in by_method[0]]
         per_scene = scene_sums(scenes, np.array([*psnr, [1.0] * len(scenes)]).T)
 

@@ -32,9 +32,6 @@ hundredth of a scene's width, the study's value."""
 SAME_NORMAL_DEG = 20.0
 """The same by normals: where they differ by less than this."""
 
-MEMBERS = ("irradiance", "irradiance_ref", "unshadowed_ref", "depth", "depth_ref", "normal", "normal_ref")
-"""Members of a clip that the judgement needs, beside ``foreground`` and ``mask``."""
-
 
 @dataclass(frozen=True)
 class ShadowCounts:

@@ -9,8 +9,7 @@ counted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -18,10 +17,10 @@ import mitsuba as mi
 import numpy as np
 
 from eval.peers import volprim
-from eval.peers.contenders import Contenders, spelled
+from eval.peers.contenders import Contenders
 from eval.peers.scene import camera
-from eval.peers.timing import Times, interleaved
-from eval.results import Row
+from eval.peers.timing import Rounds, interleaved
+from eval.tracing.measured import GradientStep
 from tron.gaussians.fields import PARAMETERS
 from tron.tracing.gbuffer import trace_gbuffer
 from tron.tracing.parameters import SurfelParameters, pack
@@ -31,47 +30,11 @@ TARGET = 0.5
 """The target image, a grey one: every pixel has something to learn."""
 
 
-@dataclass(frozen=True)
-class GradientStep:
-    """Times of a forward and backward pass; ``agreement`` is the cosine between the gradients by colour."""
-
-    count: int
-    size: int
-    times: Mapping[str, Times]
-    agreement: float
-
-    @property
-    def case(self) -> str:
-        """How metrics spell the case."""
-        return f"{spelled(self.count)}_{self.size}"
-
-    @property
-    def ratio(self) -> float:
-        """How many times as long the peer takes."""
-        return self.times["volprim"].over(self.times["tron"])
-
-    def rows(self) -> list[Row]:
-        """The ratio, both times and the agreement of the gradients."""
-        figures = {
-            "gradient.ratio_to_volprim": (self.ratio, "x"),
-            "gradient.ms": (1e3 * self.times["tron"].median, "ms"),
-            "gradient.volprim_ms": (1e3 * self.times["volprim"].median, "ms"),
-            "gradient.cosine_with_volprim": (self.agreement, "1"),
-        }
-        n = min(len(t.seconds) for t in self.times.values())
-        return [
-            Row(metric=f"{name}.{self.case}", value=value, unit=unit, n=n)
-            for name, (value, unit) in figures.items()
-        ]
-
-
-def measure_gradient(
-    contenders: Contenders, size: int, repetitions: int, slow_repetitions: int
-) -> GradientStep:
+def measure_gradient(contenders: Contenders, size: int, rounds: Rounds) -> GradientStep:
     """Time both steps, in turns; the peer stops where TRON does."""
     ours, peer = surfel_step(contenders, size), volprim_step(contenders, size)
-    times = interleaved({"tron": ours, "volprim": peer}, repetitions, slow_repetitions)
-    bands = (contenders.sh_degree + 1) ** 2
+    times = interleaved({"tron": ours, "volprim": peer}, rounds)
+    bands = (contenders.recipe.sh_degree + 1) ** 2
     by_color = np.array(ours()["sh"]).reshape(len(contenders.scene), -1, 3)[:, :bands].ravel()
     peer_color = np.array(peer()["surfels.sh_coeffs"]).ravel()
     cosine = by_color @ peer_color / max(np.linalg.norm(by_color) * np.linalg.norm(peer_color), 1e-30)

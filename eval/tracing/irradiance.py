@@ -10,8 +10,6 @@ aligned block as across its border, unless pixels of a block share something: th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -20,9 +18,9 @@ import numpy as np
 
 from eval.peers.contenders import Contenders
 from eval.peers.scene import camera, mitsuba_mesh
-from eval.peers.timing import Times, interleaved
-from eval.results import Row
+from eval.peers.timing import Rounds, interleaved
 from eval.tracing.lights import LIGHTS
+from eval.tracing.measured import DirectTimes, LitImages, Noise
 from tron import seeds
 from tron.cameras import mitsuba_sensor
 from tron.color import luminance
@@ -30,6 +28,7 @@ from tron.shading import EnvironmentLight, Estimation, Lighting, irradiance, ren
 from tron.shading.guidance import reaching_share, shade
 from tron.shading.irradiance import ORIGIN_OFFSET
 from tron.tracing import GBuffer, SurfelTracer
+from tron.tracing.bvh import build_bvh
 from tron.tracing.tiles import lanes_of_pixels, tile_pixels
 
 FEW, MANY = 2, 64
@@ -37,29 +36,11 @@ FAN = 4
 REFERENCE_SEED, TRIALS = 1_000_003, 8
 
 
-@dataclass(frozen=True)
-class DirectTimes:
-    """The 64-ray pass and Mitsuba's ``direct`` under one light; ``images`` (H, W, 3) of both, linear."""
-
-    light: str
-    times: Mapping[str, Times]
-    images: Mapping[str, np.ndarray]
-    exposure: float
-
-    @property
-    def ratio(self) -> float:
-        """TRON's time, its hierarchy's build and its camera rays included, over Mitsuba's faster time."""
-        direct = min(t.median for name, t in self.times.items() if name.startswith("direct"))
-        return sum(self.times[name].median for name in ("tron", "build", "gbuffer")) / direct
-
-
-def measure_direct(contenders: Contenders, size: int, light: str, seed: int, repetitions: int) -> DirectTimes:
+def measure_direct(contenders: Contenders, size: int, light: str, seed: int, rounds: Rounds) -> DirectTimes:
     """Time the pass on the surfels and Mitsuba on the mesh: as many shadow rays, the same camera and light.
 
     Mitsuba's 64 rays are tried in both ways it offers: all from one camera ray, and two from each of 32.
     """
-    from tron.tracing.bvh import build_bvh
-
     view, environment = camera(size), LIGHTS[light]()
     prepared = EnvironmentLight(environment)
     tracer = contenders.tracer
@@ -69,7 +50,7 @@ def measure_direct(contenders: Contenders, size: int, light: str, seed: int, rep
     ways = {"direct at once": (1, half), "direct by camera rays": (half, 1)}
     contestants: dict[str, Any] = {
         "tron": lambda: irradiance(tracer, gbuffer, prepared, MANY, seed),
-        "build": lambda: build_bvh(contenders.records).nodes,
+        "build": lambda: build_bvh(tracer.records).nodes,
         "gbuffer": lambda: tracer.gbuffer(view),
     }
     for name, (spp, samples) in ways.items():
@@ -80,25 +61,14 @@ def measure_direct(contenders: Contenders, size: int, light: str, seed: int, rep
         contestants[name] = lambda i=integrator, s=sensor, n=spp: mi.render(
             scene, sensor=s, integrator=i, spp=n
         )
-    times = interleaved(contestants, repetitions, repetitions)
+    times = interleaved(contestants, rounds)
     shadowed, _ = contestants["tron"]()
     images = {
         "tron": np.array(shadowed).T.reshape(size, size, 3),
         "direct": np.array(contestants["direct by camera rays"]()),
     }
-    return DirectTimes(light, times, images, environment.exposure())
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Errors under one light; ``images`` are linear, ``rmse`` shares of an upward plane's light."""
-
-    light: str
-    rmse: Mapping[str, float]
-    blocks: Mapping[str, float]
-    equal_time_spp: int
-    images: Mapping[str, np.ndarray]
-    exposure: float
+    lit = LitImages(light, environment.exposure(), images)
+    return DirectTimes(len(contenders.scene), size, times, lit)
 
 
 def measure_noise(contenders: Contenders, size: int, light: str, reference_spp: int, seed: int) -> Noise:
@@ -127,7 +97,7 @@ def measure_noise(contenders: Contenders, size: int, light: str, reference_spp: 
             "tron": lambda: irradiance(tracer, gbuffer, lighting.light, MANY, seed),
             "independent": lambda: independent_irradiance(tracer, gbuffer, lighting.light, MANY, seed),
         },
-        3,
+        Rounds(3),
     )
     equal = max(2, 2 * round(MANY / 2 * times["tron"].over(times["independent"])))
     few, many = ([ours(spp, k) for k in range(TRIALS)] for spp in (FEW, MANY))
@@ -155,34 +125,13 @@ def measure_noise(contenders: Contenders, size: int, light: str, reference_spp: 
         "tron 64": many[0],
         "independent 64": alone_many[0],
     }
-    return Noise(light, rmse, blocks, equal, images, environment.exposure())
+    return Noise(LitImages(light, environment.exposure(), images), TRIALS, rmse, blocks, equal)
 
 
 def relative_rmse(images: list[np.ndarray], truth: np.ndarray, surface: np.ndarray, plane: float) -> float:
     """Root mean square over trials, pixels with a surface and channels, over an upward plane's light."""
     squares = [((image - truth)[surface].astype(np.float64) ** 2).mean() for image in images]
     return float(np.sqrt(np.mean(squares)) / plane)
-
-
-def noise_rows(noises: list[Noise]) -> list[Row]:
-    """Rows of every light, and over the lights: root mean square errors, worst block correlation."""
-    rows = [
-        Row(metric=f"irradiance.{name}.{noise.light}", value=value, unit="fraction", n=TRIALS)
-        for noise in noises
-        for name, value in noise.rmse.items()
-    ]
-    rows += [
-        Row(metric=f"irradiance.{name}.{noise.light}", value=value, unit="correlation", n=TRIALS)
-        for noise in noises
-        for name, value in noise.blocks.items()
-    ]
-    for name in noises[0].rmse:
-        value = float(np.sqrt(np.mean([noise.rmse[name] ** 2 for noise in noises])))
-        rows.append(Row(metric=f"irradiance.{name}", value=value, unit="fraction", n=TRIALS * len(noises)))
-    for name in noises[0].blocks:
-        worst = max((noise.blocks[name] for noise in noises), key=abs)
-        rows.append(Row(metric=f"irradiance.{name}", value=worst, unit="correlation", n=TRIALS * len(noises)))
-    return rows
 
 
 def block_correlation(errors: np.ndarray, surface: np.ndarray, side: int) -> float:

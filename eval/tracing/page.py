@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from eval.report.figures import format_value
+from eval.report.figures import row_cell
 from eval.report.outcome import Outcome
-from eval.report.page import Cell, Section, Table, Text
+from eval.report.page import Section, Table, Text
 from eval.results import Row
-from eval.tracing.page_few_rays import few_rays_section
-from eval.tracing.page_light import irradiance_section, noise_section
+from eval.tracing.measured import Measured
+from eval.tracing.page_light import few_rays_section, irradiance_section, noise_section
 from eval.tracing.page_rays import (
     camera_section,
     family,
@@ -20,9 +19,6 @@ from eval.tracing.page_rays import (
     inside_section,
     shadow_section,
 )
-
-if TYPE_CHECKING:
-    from eval.tracing.benchmark import Measured, Tracing
 
 LEAD = (
     "TRON holds a captured scene as surfels: small flat disks whose opacity falls off like a Gaussian, with "
@@ -46,20 +42,34 @@ HEADLINE = {
 }
 
 
-def outcome(settings: Tracing, measured: Measured, rows: Sequence[Row], output_dir: Path) -> Outcome:
+EXACTNESS = {
+    "primary.max_error": "camera rays, the largest of all",
+    "primary.max_error_rgb": "camera rays, radiance",
+    "primary.max_error_opacity": "camera rays, opacity",
+    "primary.max_error_depth": "camera rays, median depth, relative",
+    "primary.rays_at_a_threshold": "camera rays left out: at a threshold",
+    "primary.rays_off": "camera rays off by more than 1e-4, of all",
+    "shadow.max_error": "shadow rays, transmittance",
+    "shadow.rays_at_a_threshold": "shadow rays left out: at a threshold",
+    "shadow.rays_off": "shadow rays off by more than 1e-4, of all",
+}
+
+
+def outcome(measured: Measured, output_dir: Path) -> Outcome:
     """Rows and sections of a run; pictures are also written below ``output_dir/pictures``."""
+    settings, rows = measured.settings, list(measured.rows())
     found = {row.metric: row for row in rows}
     sections = [
-        *camera_section(settings, measured, output_dir),
+        *camera_section(measured, output_dir),
         *inside_section(measured, output_dir),
-        *growth_section(settings, measured),
+        *growth_section(measured),
         *shadow_section(measured, found),
         *gradient_section(measured),
         *irradiance_section(measured, output_dir),
-        *noise_section(settings, measured, output_dir),
+        *noise_section(measured, output_dir),
         *few_rays_section(measured, output_dir),
         *_exactness(found),
-        *_memory(settings, measured),
+        *_memory(measured),
     ]
     targets = {target.metric for target in settings.targets}
     tiles = {
@@ -67,9 +77,6 @@ def outcome(settings: Tracing, measured: Measured, rows: Sequence[Row], output_d
         for name, label in HEADLINE.items()
         if (metric := next((m for m in found if m in targets and family(m) == name), None))
     }
-    overrides = [f"output_dir={output_dir}"]
-    if settings.variant != "llvm_ad_rgb":
-        overrides.insert(0, f"benchmark.variant={settings.variant}")
     return Outcome(
         rows=rows,
         title="The surfel tracer against what a user would pick instead",
@@ -77,12 +84,12 @@ def outcome(settings: Tracing, measured: Measured, rows: Sequence[Row], output_d
         lead=LEAD,
         sections=sections,
         headline=tiles,
-        reproduce=[" ".join(["tron-eval benchmark=tracing", *overrides])],
+        reproduce=[settings.command_line(output_dir)],
         inputs={"settings": settings.model_dump(exclude={"targets"})},
     )
 
 
-def _verdict(found: dict[str, Row]) -> str:
+def _verdict(found: Mapping[str, Row]) -> str:
     parts = []
     for name, text in (
         ("primary.ratio_to_volprim", "camera rays {} times"),
@@ -98,26 +105,11 @@ def _verdict(found: dict[str, Row]) -> str:
     return f"Beside Mitsuba's own tools TRON traces {', '.join(parts)} as fast."
 
 
-def _exactness(found: dict[str, Row]) -> list[Section]:
-    words = {
-        "primary.max_error": "camera rays, the largest of all",
-        "primary.max_error_rgb": "camera rays, radiance",
-        "primary.max_error_opacity": "camera rays, opacity",
-        "primary.max_error_depth": "camera rays, median depth, relative",
-        "primary.rays_at_a_threshold": "camera rays left out: at a threshold",
-        "primary.rays_off": "camera rays off by more than 1e-4, of all",
-        "shadow.max_error": "shadow rays, transmittance",
-        "shadow.rays_at_a_threshold": "shadow rays left out: at a threshold",
-        "shadow.rays_off": "shadow rays off by more than 1e-4, of all",
-    }
+def _exactness(found: Mapping[str, Row]) -> list[Section]:
     rows = [
-        [
-            Cell(text),
-            Cell(format_value(found[name].value, found[name].unit), "strong"),
-            Cell(str(found[name].n)),
-        ]
-        for name, text in words.items()
-        if name in found
+        [words, row_cell(row, "strong"), str(row.n)]
+        for name, words in EXACTNESS.items()
+        if (row := found.get(name))
     ]
     if not rows:
         return []
@@ -131,10 +123,10 @@ def _exactness(found: dict[str, Row]) -> list[Section]:
     return [Section("exactness", "Exactness", [intro, table])]
 
 
-def _memory(settings: Tracing, measured: Measured) -> list[Section]:
-    if not measured.memory:
+def _memory(measured: Measured) -> list[Section]:
+    memory, settings = measured.memory, measured.settings
+    if not memory:
         return []
-    memory = measured.memory
     text = Text(
         f"A process of its own that holds {settings.memory_surfels:,} surfels, traces one frame of "
         f"{settings.pixels[-1]}² pixels and as many shadow rays reaches a resident set of "

@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from eval.peers.contenders import PEERS
+from eval.peers.timing import Times
 from eval.report.charts import line_chart
 from eval.report.figures import format_value
 from eval.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
 from eval.report.strips import write_strips
 from eval.results import Row
+from eval.tracing.measured import BINNING, TRON, USUAL, CameraRays, Measured, SamePicture
 
-if TYPE_CHECKING:
-    from eval.tracing.benchmark import Measured, Tracing
-    from eval.tracing.camera_rays import CameraRays
-
-NAMES = {
-    "tron": "TRON",
-    "volprim": "volprim_rf_basic",
-    "volprim_as_shipped": "volprim_rf_basic as shipped",
-    "embree_closest_hit": "one closest hit",
-    "gsplat": "gsplat 2DGS",
+TITLES = {TRON: "TRON", **{peer.name: peer.title for peer in PEERS}}
+VARIANTS = {
+    "sh3": "harmonics of degree 3 on both sides",
+    "from_gbuffers": "surfels as made from G-buffers: kernel degree 4",
 }
+STOP = 0.001
+ERROR_GAIN = 4
 
 
 def family(metric: str) -> str:
@@ -30,28 +30,34 @@ def family(metric: str) -> str:
     return ".".join(metric.split(".")[:2])
 
 
-def _range(frame: CameraRays, name: str) -> str:
-    low, high = frame.times[name].range_over(frame.times["tron"])
-    return f"{low:.1f}–{high:.1f}"
+def _range(times: Mapping[str, Times], peer: str) -> Cell:
+    low, high = times[peer].range_over(times[TRON])
+    return Cell(f"{low:.1f}–{high:.1f}", "faint")
 
 
-def _ms(seconds: float) -> str:
-    return f"{1e3 * seconds:.1f}" if seconds < 10 else f"{1e3 * seconds:.0f}"
+def _ms(times: Times) -> str:
+    return f"{1e3 * times.median:.{1 if times.median < 10 else 0}f}"
 
 
-def camera_section(settings: Tracing, measured: Measured, output_dir: Path) -> list[Section]:
+def camera_section(measured: Measured, output_dir: Path) -> list[Section]:
     """One frame against the peers, what they cannot do the same, and both pictures."""
-    if not measured.pictures:
+    if measured.same_picture is None:
         return []
-    frames = [measured.camera[key] for key in measured.camera if _is_main(settings, measured.camera[key])]
-    stop = "0.001"
-    text = [
+    settings = measured.settings
+    title = TITLES["volprim"]
+    frames = [
+        frame
+        for frame in measured.camera
+        if frame.count in settings.surfels and frame.size in settings.pixels
+    ]
+    shapes = ", ".join(f"{name} {1e3 * times.median:.0f} ms" for name, times in measured.shapes.items())
+    blocks: list[Block] = [
         Text(
             f"{_hits(measured)}The peer is the integrator that Mitsuba ships for such scenes, "
-            "volprim_rf_basic, on flat ellipsoids made of the same surfels, harmonics of degree "
+            f"{title}, on flat ellipsoids made of the same surfels, harmonics of degree "
             f"{settings.sh_degree} on both sides, one ray a pixel, box filter. As shipped it ends a ray at a "
-            f"transmittance of 0.01; TRON ends at {stop}. The column “{NAMES['volprim']}” is its source "
-            f"with that one number changed to {stop}, “as shipped” does less work than TRON."
+            f"transmittance of 0.01; TRON ends at {STOP}. The column “{title}” is its source "
+            f"with that one number changed to {STOP}, “as shipped” does less work than TRON."
         ),
         _camera_table(frames),
         Text(
@@ -63,29 +69,21 @@ def camera_section(settings: Tracing, measured: Measured, output_dir: Path) -> l
             "one Embree query against a quad around each surfel: no opacity, no order, no colour; what any "
             "tracer of triangles spends at the least."
         ),
-    ]
-    extras = [frame for frame in (measured.harmonics, measured.from_gbuffers) if frame is not None]
-    blocks: list[Block] = [*text]
-    if extras:
-        labels = ["harmonics of degree 3 on both sides", "surfels as made from G-buffers: kernel degree 4"]
-        rows = [
+        Table(
+            f"The same at {measured.variants[0].case}, other surfels.",
+            ["Surfels", "TRON, Mrays/s", "times as fast as volprim"],
             [
-                Cell(label),
-                Cell(f"{frame.mrays('tron'):.2f}", "strong"),
-                Cell(f"{frame.times['volprim'].over(frame.times['tron']):.1f}×" if _has(frame) else "—"),
-            ]
-            for label, frame in zip(labels, extras)
-        ]
-        caption = f"The same at {measured.harmonics.case if measured.harmonics else ''}, other surfels."
-        headings = ["Surfels", "TRON, Mrays/s", "times as fast as volprim"]
-        blocks.append(Table(caption, headings, rows))
-    shapes = {name: f"{1e3 * times.median:.0f} ms" for name, times in measured.shapes.items()}
-    if shapes:
-        told = ", ".join(f"{name} {value}" for name, value in shapes.items())
-        blocks.append(
-            Text(f"Mitsuba has two plugins for such primitives; the faster here was taken: {told}.")
-        )
-    blocks.append(_same_picture(measured, output_dir))
+                [
+                    VARIANTS[frame.recipe],
+                    Cell(f"{frame.mrays():.2f}", "strong"),
+                    f"{frame.ratio('volprim'):.1f}×" if "volprim" in frame.times else "—",
+                ]
+                for frame in measured.variants
+            ],
+        ),
+        Text(f"Mitsuba has two plugins for such primitives; the faster here was taken: {shapes}."),
+        _same_picture(measured.same_picture, output_dir),
+    ]
     return [Section("camera", "Camera rays", blocks)]
 
 
@@ -93,8 +91,6 @@ def inside_section(measured: Measured, output_dir: Path) -> list[Section]:
     """Frames of cameras within their scenes."""
     if not measured.inside:
         return []
-    from eval.tracing.camera_rays import USUAL
-
     intro = (
         "Views so far look at the scene from outside. Here the camera stands in a room, and on a ground that "
         "goes on behind it: surfels lie on all sides, and many cross the plane through the camera, where "
@@ -103,7 +99,7 @@ def inside_section(measured: Measured, output_dir: Path) -> list[Section]:
     blocks: list[Block] = [Text(intro), _camera_table(measured.inside)]
     for frame in measured.inside:
         if USUAL in frame.times:
-            ours, usual = frame.times["tron"], frame.times[USUAL]
+            ours, usual = frame.times[TRON], frame.times[USUAL]
             low, high = ours.range_over(usual)
             blocks.append(
                 Text(
@@ -116,69 +112,52 @@ def inside_section(measured: Measured, output_dir: Path) -> list[Section]:
         Picture(picture, f"in a {place}", f"radiance from within a {place}")
         for place, picture in measured.inside_pictures.items()
     ]
-    group = Pictures("What the cameras see", pictures, "", columns=2)
+    group = Pictures("Views of the cameras", pictures, columns=2)
     write_strips([group], ["inside"], output_dir / "pictures")
     return [Section("inside", "From within", [*blocks, group])]
-
-
-def _has(frame: CameraRays) -> bool:
-    return "volprim" in frame.times
-
-
-def _is_main(settings: Tracing, frame: CameraRays) -> bool:
-    return frame.count in settings.surfels and frame.size in settings.pixels
 
 
 def _hits(measured: Measured) -> str:
     if measured.hits is None:
         return ""
-    met, front, effective = measured.hits
+    hit, front, effective = measured.hits
     return (
-        f"A camera ray of the smallest scene meets {met:.0f} surfels, {front:.0f} of them from the front, "
+        f"A camera ray of the smallest scene hits {hit:.0f} surfels, {front:.0f} of them from the front, "
         f"and is opaque after {effective:.0f}. "
     )
 
 
 def _camera_table(frames: Sequence[CameraRays]) -> Table:
-    peers = [name for name in NAMES if name != "tron" and any(name in frame.times for frame in frames)]
+    peers = [peer.name for peer in PEERS if any(peer.name in frame.times for frame in frames)]
     headings = ["Surfels, pixels", "ms", "of it binning", "Mrays/s"]
-    groups = [("", 1), ("TRON", 3)]
-    for name in peers:
-        headings += ["Mrays/s", "TRON is × as fast", "rounds from–to"]
-        groups.append((NAMES[name], 3))
+    headings += ["Mrays/s", "TRON is × as fast", "rounds from–to"] * len(peers)
     rows = []
     for frame in frames:
-        ours = frame.times["tron"]
-        row = [
-            Cell(f"{f'{frame.place}, ' if frame.place else ''}{frame.count:,} surfels, {frame.size}²"),
-            Cell(_ms(ours.median)),
-            Cell(_ms(frame.times["binning"].median)),
-            Cell(f"{frame.mrays('tron'):.2f}", "strong"),
-        ]
+        times, place = frame.times, f"{frame.place}, " if frame.place else ""
+        row = [f"{place}{frame.count:,} surfels, {frame.size}²", _ms(times[TRON]), _ms(times[BINNING])]
+        row = [*row, Cell(f"{frame.mrays():.2f}", "strong")]
         for name in peers:
-            if name in frame.times:
-                ratio = frame.times[name].over(ours)
-                digits = 1 if ratio > 2 else 2
-                row += [Cell(f"{frame.mrays(name):.3g}"), Cell(f"{ratio:.{digits}f}", "strong")]
-                row.append(Cell(_range(frame, name), "faint"))
+            if name in times:
+                ratio = frame.ratio(name)
+                as_fast = Cell(f"{ratio:.{1 if ratio > 2 else 2}f}", "strong")
+                row += [f"{frame.mrays(name):.3g}", as_fast, _range(times, name)]
             else:
-                row += [Cell("—")] * 3
+                row += ["—"] * 3
         rows.append(row)
     absent = "" if "gsplat" in peers else " gsplat's 2DGS is absent: it needs a GPU and the package."
     caption = "Camera rays. Ratios are of medians; below 1 the peer is faster." + absent
-    return Table(caption, headings, rows, groups)
+    return Table(caption, headings, rows, [("", 1), *((TITLES[name], 3) for name in (TRON, *peers))])
 
 
-def _same_picture(measured: Measured, output_dir: Path) -> Pictures:
+def _same_picture(same: SamePicture, output_dir: Path) -> Pictures:
+    difference = np.clip(ERROR_GAIN * np.abs(same.tron - same.volprim), 0, 1)
+    alt = f"absolute difference of the two, times {ERROR_GAIN}"
     pictures = [
-        Picture(measured.pictures["tron"], "TRON", "the benchmark's scene by TRON", strong=True),
+        Picture(same.tron, "TRON", "the benchmark's scene by TRON", strong=True),
         Picture(
-            measured.pictures["volprim"],
-            "volprim_rf_basic",
-            "the same scene by Mitsuba's integrator",
-            f"{measured.pictures['psnr']:.1f} dB",
+            same.volprim, TITLES["volprim"], "the same scene by Mitsuba's integrator", f"{same.psnr:.1f} dB"
         ),
-        Picture(measured.pictures["difference"], "difference ×4", "absolute difference of the two, times 4"),
+        Picture(difference, f"difference ×{ERROR_GAIN}", alt),
     ]
     note = (
         "Radiance along the same rays, at the smallest scene's large surfels, where differences show best. "
@@ -189,34 +168,40 @@ def _same_picture(measured: Measured, output_dir: Path) -> Pictures:
     return group
 
 
-def growth_section(settings: Tracing, measured: Measured) -> list[Section]:
+def growth_section(measured: Measured) -> list[Section]:
     """Time over surfels and over pixels, one line a contestant."""
     charts: list[Chart] = []
-    size, count = settings.pixels[0], settings.surfels[min(1, len(settings.surfels) - 1)]
-    by_surfels = sorted((f for f in measured.camera.values() if f.size == size), key=lambda f: f.count)
-    by_pixels = sorted((f for f in measured.camera.values() if f.count == count), key=lambda f: f.size)
-    for frames, axis, where in (
+    size, count = measured.settings.pixels[0], measured.settings.middle[0]
+    by_surfels = {frame.count: frame.times for frame in measured.camera if frame.size == size}
+    by_pixels = {frame.size**2: frame.times for frame in measured.camera if frame.count == count}
+    for frames, axis, fixed in (
         (by_surfels, "surfels", f"{size} × {size} pixels"),
         (by_pixels, "pixels", f"{count:,} surfels"),
     ):
-        if len(frames) < 2:
-            continue
-        names = ("tron", "volprim", "embree_closest_hit", "gsplat")
         lines = {
-            NAMES[name]: [
-                (f.count if axis == "surfels" else f.size**2, f.times[name].median)
-                for f in frames
-                if name in f.times
-            ]
-            for name in names
+            title: [(x, times[name].median) for x, times in sorted(frames.items()) if name in times]
+            for name, title in TITLES.items()
+            if name != "volprim_as_shipped"
         }
-        caption = f"Seconds a frame as {axis} grow, {where}."
-        lines = {name: points for name, points in lines.items() if len(points) > 1}
-        charts.append(line_chart(lines, axis, "seconds", caption, logarithmic=True))
+        lines = {title: points for title, points in lines.items() if len(points) > 1}
+        if lines:
+            caption = f"Seconds a frame as {axis} grow, {fixed}."
+            charts.append(line_chart(lines, axis, "seconds", caption, logarithmic=True))
     return [Section("growth", "Growth with surfels and pixels", charts)] if charts else []
 
 
-def shadow_section(measured: Measured, found: dict[str, Row]) -> list[Section]:
+SHADOW_GROUPS = {
+    "random rays, Mrays/s": (
+        "TRON", "restarts", "closest hit", "any hit", "× restarts", "× closest hit", "× any hit",
+    ),
+    "irradiance pass, Mrays/s": ("TRON", "closest hit", "any hit", "× closest hit", "× any hit"),
+    "hierarchy, ms": ("build", "refit", "Embree's build"),
+    "tracing, × time": ("after refit", "with strays"),
+}  # fmt: skip
+"""Headings of the rows of :class:`eval.tracing.measured.ShadowRays`, in their order."""
+
+
+def shadow_section(measured: Measured, found: Mapping[str, Row]) -> list[Section]:
     """Both sets of shadow rays, and the hierarchy's build and refit."""
     if not measured.shadow:
         return []
@@ -232,60 +217,28 @@ def shadow_section(measured: Measured, found: dict[str, Row]) -> list[Section]:
         "here a tenth of them, together, by five spacings. The last column is the time of random rays when "
         "20 surfels lie 10,000 units outside, as reconstructions leave them, over that without."
     )
-    headings = [
-        "Surfels", "TRON", "restarts", "closest hit", "any hit", "× restarts", "× closest hit", "× any hit",
-        "TRON", "closest hit", "any hit", "× closest hit", "× any hit",
-        "build", "refit", "Embree's build", "after refit", "with strays",
-    ]  # fmt: skip
-    groups = [
-        ("", 1),
-        ("random rays, Mrays/s", 7),
-        ("irradiance pass, Mrays/s", 5),
-        ("hierarchy, ms", 3),
-        ("tracing, × time", 2),
+    rows = [
+        [f"{shadow.count:,}", *(_shadow_cell(row) for row in shadow.rows())] for shadow in measured.shadow
     ]
-    columns = [
-        "shadow.mrays_random",
-        "shadow.embree_restart_mrays_random",
-        "shadow.embree_closest_hit_mrays_random",
-        "shadow.embree_any_hit_mrays_random",
-        "shadow.ratio_to_embree_restart",
-        "shadow.ratio_to_embree_closest_hit_random",
-        "shadow.ratio_to_embree_any_hit_random",
-        "shadow.mrays_irradiance",
-        "shadow.embree_closest_hit_mrays_irradiance",
-        "shadow.embree_any_hit_mrays_irradiance",
-        "shadow.ratio_to_embree_closest_hit",
-        "shadow.ratio_to_embree_any_hit",
-        "bvh.build_ms",
-        "bvh.refit_ms",
-        "bvh.embree_build_ms",
-        "bvh.trace_after_refit",
-        "shadow.stray_slowdown",
-    ]
-    rows = []
-    for shadow in measured.shadow:
-        by_name = {family(row.metric): row.value for row in shadow.rows()}
-        cells = [
-            Cell(
-                f"{by_name[name]:.{1 if name.endswith('_ms') else 2}f}",
-                "strong" if "ratio" in name else "plain",
-            )
-            for name in columns
-        ]
-        rows.append([Cell(f"{shadow.count:,}"), *cells])
+    headings = ["Surfels", *(heading for group in SHADOW_GROUPS.values() for heading in group)]
+    groups = [("", 1), *((title, len(group)) for title, group in SHADOW_GROUPS.items())]
     caption = "Shadow rays; a ratio above 1 means that TRON is faster."
     blocks: list[Block] = [intro, Table(caption, headings, rows, groups)]
     wrong = found.get("shadow.embree_restart_wrong_rays")
     if wrong is not None:
+        share, most = format_value(wrong.value, "fraction"), found["shadow.embree_restart_max_error"].value
         blocks.append(
             Text(
-                f"Restarting is not exact: {format_value(wrong.value, 'fraction')} of its rays are off by "
-                f"more than 0.001, by up to {found['shadow.embree_restart_max_error'].value:.2f}, because "
-                "hits within 0.0001 of one another are skipped."
+                f"Restarting is not exact: {share} of its rays are off by more than 0.001, by up to "
+                f"{most:.2f}, because hits within 0.0001 of one another are skipped."
             )
         )
     return [Section("shadow", "Shadow rays", blocks)]
+
+
+def _shadow_cell(row: Row) -> Cell:
+    digits = 1 if row.unit == "ms" else 2
+    return Cell(f"{row.value:.{digits}f}", "strong" if "ratio" in row.metric else "plain")
 
 
 def gradient_section(measured: Measured) -> list[Section]:
@@ -301,12 +254,12 @@ def gradient_section(measured: Measured) -> list[Section]:
     )
     rows = [
         [
-            Cell(f"{step.count:,} surfels, {step.size}²"),
-            Cell(_ms(step.times["tron"].median)),
-            Cell(_ms(step.times["volprim"].median)),
+            f"{step.count:,} surfels, {step.size}²",
+            _ms(step.times[TRON]),
+            _ms(step.times["volprim"]),
             Cell(f"{step.ratio:.1f}", "strong"),
-            Cell("–".join(f"{v:.1f}" for v in step.times["volprim"].range_over(step.times["tron"])), "faint"),
-            Cell(f"{step.agreement:.3f}"),
+            _range(step.times, "volprim"),
+            f"{step.agreement:.3f}",
         ]
         for step in measured.gradient
     ]

@@ -8,26 +8,25 @@ and taken off both sides.
 
 from __future__ import annotations
 
-import abc
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from eval.peers import embree
-from eval.peers.contenders import Contenders, spelled
+from eval.peers.contenders import Contenders
 from eval.peers.scene import camera
-from eval.peers.timing import Times, interleaved
-from eval.results import Row
+from eval.peers.timing import Rounds, interleaved
 from eval.tracing.lights import soft
+from eval.tracing.measured import ShadowRays
 from tron import seeds
 from tron.gaussians.scene import GaussianScene
 from tron.shading.environment import EnvironmentLight
 from tron.shading.irradiance import ORIGIN_OFFSET, irradiance
-from tron.tracing import GBuffer
+from tron.tracing import GBuffer, SurfelTracer
 from tron.tracing.bvh import build_bvh, refit
 
 MOVED = 0.1
@@ -36,63 +35,12 @@ STRAYS, STRAY_DISTANCE = 20, 10_000.0
 """Surfels that a reconstruction left far outside, and how far, world units."""
 
 
-@dataclass(frozen=True)
-class ShadowRays:
-    """Times over ``count`` surfels; ``rays`` random rays, ``pass_rays`` of the irradiance pass."""
+@dataclass
+class Occluder:
+    """What the irradiance pass asks of a tracer; ``transmittance`` traces one ray a lane."""
 
-    count: int
-    rays: int
-    pass_rays: int
-    times: Mapping[str, Times]
-
-    def rows(self) -> list[Row]:
-        """Ratios with TRON's build counted and the peers' not, rays a second, and the builds apart."""
-        case, times = spelled(self.count), self.times
-        build = times["build"].median
-        random = times["random tron"].median
-        idle = times["pass idle"].median
-        ours, closest, anything = (times[f"pass {name}"].median - idle for name in ("tron", "closest", "any"))
-        figures = {
-            "shadow.ratio_to_embree_restart": (times["random restart"].median / (random + build), "x"),
-            "shadow.ratio_to_embree_closest_hit": (closest / (ours + build), "x"),
-            "shadow.ratio_to_embree_closest_hit_random": (
-                times["random closest"].median / (random + build),
-                "x",
-            ),
-            "shadow.ratio_to_embree_any_hit": (anything / (ours + build), "x"),
-            "shadow.ratio_to_embree_any_hit_random": (times["random any"].median / (random + build), "x"),
-            "shadow.mrays_random": (self.rays / random / 1e6, "Mrays/s"),
-            "shadow.mrays_irradiance": (self.pass_rays / ours / 1e6, "Mrays/s"),
-            "shadow.embree_restart_mrays_random": (
-                self.rays / times["random restart"].median / 1e6,
-                "Mrays/s",
-            ),
-            "shadow.embree_closest_hit_mrays_random": (
-                self.rays / times["random closest"].median / 1e6,
-                "Mrays/s",
-            ),
-            "shadow.embree_closest_hit_mrays_irradiance": (self.pass_rays / closest / 1e6, "Mrays/s"),
-            "shadow.embree_any_hit_mrays_random": (self.rays / times["random any"].median / 1e6, "Mrays/s"),
-            "shadow.embree_any_hit_mrays_irradiance": (self.pass_rays / anything / 1e6, "Mrays/s"),
-            "shadow.stray_slowdown": (times["random strays"].over(times["random tron"]), "x"),
-            "bvh.build_ms": (1e3 * build, "ms"),
-            "bvh.refit_ms": (1e3 * times["refit"].median, "ms"),
-            "bvh.embree_build_ms": (1e3 * times["embree build"].median, "ms"),
-            "bvh.trace_after_refit": (times["random refitted"].median / times["random rebuilt"].median, "x"),
-        }
-        n = min(len(t.seconds) for t in times.values())
-        return [Row(metric=f"{name}.{case}", value=v, unit=unit, n=n) for name, (v, unit) in figures.items()]
-
-
-class _Occluder(abc.ABC):
-    """What the irradiance pass asks of a tracer; fans of rays are traced one by one."""
-
-    def __init__(self, scene: GaussianScene) -> None:
-        self.scene = scene
-
-    @abc.abstractmethod
-    def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Transmittance of one ray a lane."""
+    scene: GaussianScene
+    transmittance: Callable[[mi.Point3f, mi.Vector3f, mi.Bool], mi.Float]
 
     def transmittances(
         self, origin: mi.Point3f, directions: Sequence[mi.Vector3f], active: Sequence[mi.Bool]
@@ -101,105 +49,72 @@ class _Occluder(abc.ABC):
         return [self.transmittance(origin, d, a) for d, a in zip(directions, active, strict=True)]
 
 
-class Unshadowed(_Occluder):
-    """Nothing in the way: what the irradiance pass costs without its tracing."""
+def occluders(contenders: Contenders) -> dict[str, Occluder]:
+    """What stands in the way of the pass: nothing, or quads, opaque or not.
 
-    def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """1 for all that could be traced; the ray is still used, so that no one optimises it away."""
+    Nothing still looks at the ray, so that no one optimises it away.
+    """
+    quads = contenders.quads
+
+    def idle(origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
         return dr.select(active & (origin.x + direction.x > 1e30), mi.Float(0), 1)
 
+    def closest_hit(origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        distance = embree.closest_hit(quads, origin, direction, active)
+        return dr.select(active & dr.isfinite(distance), mi.Float(0), 1)
 
-class ClosestHits(_Occluder):
-    """Quads in the way: one closest-hit query a ray, opaque or not."""
+    def any_hit(origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        return dr.select(active & embree.any_hit(quads, origin, direction, active), mi.Float(0), 1)
 
-    def __init__(self, scene: GaussianScene, traced: mi.Scene) -> None:
-        super().__init__(scene)
-        self._traced = traced
-
-    def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """0 where a quad is met."""
-        found = self._traced.ray_intersect_preliminary(
-            mi.Ray3f(origin, direction), coherent=mi.Bool(False), active=active
-        )
-        return dr.select(active & found.is_valid(), mi.Float(0), 1)
+    queries = {"idle": idle, "embree_closest_hit": closest_hit, "embree_any_hit": any_hit}
+    return {name: Occluder(contenders.scene, query) for name, query in queries.items()}
 
 
-class AnyHits(_Occluder):
-    """Quads in the way: one any-hit query a ray, opaque or not; what one would ask for a shadow."""
+def count_rays(scene: GaussianScene, gbuffer: GBuffer, light: EnvironmentLight, spp: int, seed: int) -> int:
+    """Number of the rays that the irradiance pass asks for."""
+    total = dr.zeros(mi.UInt32, 1)
 
-    def __init__(self, scene: GaussianScene, traced: mi.Scene) -> None:
-        super().__init__(scene)
-        self._traced = traced
-
-    def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """0 where a quad is met."""
-        met = embree.any_hit(self._traced, origin, direction, active)
-        return dr.select(active & met, mi.Float(0), 1)
-
-
-class Counted(_Occluder):
-    """Counts the rays that the pass asks for, as an occluder in their way."""
-
-    def __init__(self, scene: GaussianScene) -> None:
-        super().__init__(scene)
-        self.total = dr.zeros(mi.UInt32, 1)
-
-    def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:  # noqa: ARG002
-        """1, and one more for each ray."""
-        dr.scatter_add(self.total, mi.UInt32(1), mi.UInt32(0), active)
+    def counted(_origin: mi.Point3f, _direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        dr.scatter_add(total, mi.UInt32(1), mi.UInt32(0), active)
         return mi.Float(1)
+
+    irradiance(Occluder(scene, counted), gbuffer, light, spp, seed)
+    return int(total[0])
 
 
 def measure_shadow_rays(
-    contenders: Contenders,
-    size: int,
-    rays: int,
-    spp: int,
-    seed: int,
-    repetitions: int,
-    slow_repetitions: int,
+    contenders: Contenders, size: int, rays: int, spp: int, seed: int, rounds: Rounds
 ) -> ShadowRays:
     """Time both sets of rays, the builds, and a refit after a tenth of the surfels moved."""
-    scene, tracer = contenders.scene, contenders.tracer
-    gbuffer = tracer.gbuffer(camera(size))
-    origin, direction = random_rays(gbuffer, scene.spacing, rays, seed)
-    light = EnvironmentLight(soft())
-    restarted = embree.RestartedShadows(scene, contenders.quads)
-    closest, anything = ClosestHits(scene, contenders.quads), AnyHits(scene, contenders.quads)
-    idle, counted = Unshadowed(scene), Counted(scene)
-    irradiance(counted, gbuffer, light, spp, seed)
-    moved = moved_surfels(contenders, seed)
-    old, rebuilt = tracer.bvh, build_bvh(moved.records)
-    refitted = refit(old.order, old.levels, moved.records)
-    moved.tracer.bvh = rebuilt
-    after = Contenders(moved.scene)
-    after.tracer.bvh = refitted
-    strayed = Contenders(stray_surfels(scene, seed)).tracer
-
-    def shaded(occluder: Any) -> Any:
-        return irradiance(occluder, gbuffer, light, spp, seed)
-
+    scene, tracer, quads = contenders.scene, contenders.tracer, contenders.quads
+    gbuffer, light = tracer.gbuffer(camera(size)), EnvironmentLight(soft())
+    ray = random_rays(gbuffer, scene.spacing, rays, seed)
+    restarted = embree.RestartedShadows(scene, quads)
+    rebuilt, old = SurfelTracer(moved_surfels(scene, seed)), tracer.bvh
+    refitted = copy(rebuilt)
+    refitted.bvh = refit(old.order, old.levels, rebuilt.records)
+    strayed = SurfelTracer(stray_surfels(scene, seed))
+    in_the_way = {"tron": tracer, **occluders(contenders)}
     times = interleaved(
         {
-            "random tron": lambda: tracer.transmittance(origin, direction),
-            "random strays": lambda: strayed.transmittance(origin, direction),
-            "random restart": lambda: restarted.transmittance(origin, direction),
-            "random closest": lambda: embree.closest_hit(contenders.quads, origin, direction, coherent=False),
-            "random any": lambda: embree.any_hit(contenders.quads, origin, direction),
-            "pass tron": lambda: shaded(tracer),
-            "pass closest": lambda: shaded(closest),
-            "pass any": lambda: shaded(anything),
-            "pass idle": lambda: shaded(idle),
-            "build": lambda: build_bvh(contenders.records).nodes,
-            "refit": lambda: refit(old.order, old.levels, moved.records).nodes,
-            "random rebuilt": lambda: moved.tracer.transmittance(origin, direction),
-            "random refitted": lambda: after.tracer.transmittance(origin, direction),
-            "embree build": lambda: embree.quads(scene),
+            "random tron": lambda: tracer.transmittance(*ray),
+            "random embree_restart": lambda: restarted.transmittance(*ray),
+            "random embree_closest_hit": lambda: embree.closest_hit(quads, *ray),
+            "random embree_any_hit": lambda: embree.any_hit(quads, *ray),
+            **{
+                f"irradiance {name}": lambda o=occluder: irradiance(o, gbuffer, light, spp, seed)
+                for name, occluder in in_the_way.items()
+            },
+            "build": lambda: build_bvh(tracer.records).nodes,
+            "refit": lambda: refit(old.order, old.levels, rebuilt.records).nodes,
+            "embree_build": lambda: embree.quads(scene),
+            "rebuilt": lambda: rebuilt.transmittance(*ray),
+            "refitted": lambda: refitted.transmittance(*ray),
+            "strays": lambda: strayed.transmittance(*ray),
         },
-        repetitions,
-        slow_repetitions,
+        rounds,
     )
-    return ShadowRays(len(scene), rays, int(counted.total[0]), times)
+    return ShadowRays(len(scene), size, times, rays, count_rays(scene, gbuffer, light, spp, seed))
 
 
 def random_rays(gbuffer: GBuffer, spacing: float, rays: int, seed: int) -> tuple[mi.Point3f, mi.Vector3f]:
@@ -224,18 +139,17 @@ def random_rays(gbuffer: GBuffer, spacing: float, rays: int, seed: int) -> tuple
     return origin, direction
 
 
-def moved_surfels(contenders: Contenders, seed: int) -> Contenders:
+def moved_surfels(scene: GaussianScene, seed: int) -> GaussianScene:
     """The scene after one object, a tenth of all surfels, moved by half its neighbours' reach: a small step.
 
     The tenth is the surfels nearest to the first sphere's top, moved together by five spacings.
     """
-    scene = contenders.scene
     top = np.array([0.0, 0.0, 1.6])
     nearest = np.argsort(np.linalg.norm(scene.means - top, axis=1))[: max(1, round(MOVED * len(scene)))]
-    means = scene.means.copy()
     step = seeds.generator(seed, "tracing", "step").normal(size=3)
+    means = scene.means.copy()
     means[nearest] += 5 * scene.spacing * step / np.linalg.norm(step)
-    return Contenders(replace(scene, means=means), contenders.sh_degree, contenders.shape)
+    return replace(scene, means=means)
 
 
 def stray_surfels(scene: GaussianScene, seed: int) -> GaussianScene:

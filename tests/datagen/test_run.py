@@ -28,7 +28,7 @@ from tron.gaussians.scene import GaussianScene
 from tron.images import read_image
 from tron.shards.manifest import Manifest
 from tron.shards.reader import read_clips
-from tron.shards.schema import MEMBERS, REFERENCE_MEMBERS
+from tron.shards.schema import MEMBERS, clip_members
 from tron.shards.verify import verify
 from tron.storage import locked
 
@@ -107,7 +107,7 @@ def test_clips_hold_consecutive_frames_with_true_metadata(dataset):
     clips = list(read_clips(dataset, "test"))
     assert clips[0].meta.light_family == "overcast"
     for clip in clips:
-        assert set(clip.frames) == {*MEMBERS, *REFERENCE_MEMBERS}
+        assert set(clip.frames) == set(MEMBERS)
         seen = clip.frames["foreground"][..., 0] > 0
         shadowed, unshadowed = (clip.frames[name][seen] for name in ("irradiance_ref", "unshadowed_ref"))
         assert (shadowed <= unshadowed * 1.001).all()
@@ -126,7 +126,7 @@ def test_clips_hold_consecutive_frames_with_true_metadata(dataset):
         np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1.0, atol=1e-3)
     for split in ("train", "validation"):
         for clip in read_clips(dataset, split):
-            assert set(clip.frames) == set(MEMBERS)
+            assert set(clip.frames) == set(clip_members(reference=False))
 
 
 def test_guidance_and_frames_see_the_same_light(dataset):

@@ -9,7 +9,7 @@ import pytest
 from tron.cameras import Camera
 from tron.seeds import generator
 from tron.shards.manifest import Manifest
-from tron.shards.schema import REFERENCE_MEMBERS, Clip, ClipMeta
+from tron.shards.schema import Clip, ClipMeta, clip_members
 from tron.shards.writer import ShardWriter
 
 LIGHTS = {"noon": "sun", "softbox": "studio", "grey": "overcast", "dusk": "sun", "window": "studio"}
@@ -62,6 +62,10 @@ def draw_frame(size: int, seed: int, light: str, frame: int = 0) -> dict[str, np
         "normal": np.where(solid, normal, 0).astype(np.float32),
         "depth_ref": np.where(solid[..., 0], 4 - y, 0).astype(np.float32),
         "depth": np.where(solid[..., 0], 4 - y + 0.01, 0).astype(np.float32),
+        "roughness_ref": np.where(solid[..., 0], 0.4, 0).astype(np.float32),
+        "roughness": np.where(solid[..., 0], 0.45, 0).astype(np.float32),
+        "metallic_ref": np.where(ball, 0.5, 0).astype(np.float32),
+        "metallic": np.where(ball, 0.48, 0).astype(np.float32),
     }
 
 
@@ -127,7 +131,7 @@ def write_dataset() -> Callable[..., Path]:
 
 
 def _without_references(frame: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return {name: image for name, image in frame.items() if name not in REFERENCE_MEMBERS}
+    return {name: frame[name] for name in clip_members(reference=False)}
 
 
 @pytest.fixture(scope="session")

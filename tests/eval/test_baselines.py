@@ -3,20 +3,41 @@
 import numpy as np
 import pytest
 
-from eval.relighting.baselines import (
-    RATIO_FLOOR,
-    AffineFit,
-    ProductTerms,
-    ScaleFit,
-    product_terms,
-    shadow_ratio,
-)
+from eval.relighting import baselines
+from eval.relighting.baselines import RATIO_FLOOR
+from eval.relighting.buffers import Buffers
+from eval.relighting.fits import AffineFit, ProductFit, Show, show_product
 from tron.color import agx
 from tron.seeds import generator
 
 
 def images(*names: str, n: int = 4000, low: float = 0.01, high: float = 2.0) -> list[np.ndarray]:
     return [generator(1, "images", name).uniform(low, high, (n, 3)).astype(np.float32) for name in names]
+
+
+def guided(
+    pbr: np.ndarray,
+    irradiance: np.ndarray,
+    unshadowed: np.ndarray | None = None,
+    opacity: np.ndarray | float = 1.0,
+    exposure: float = 0.4,
+) -> Buffers:
+    """Buffers of n pixels; what is not given plays no part."""
+    opacity = np.broadcast_to(opacity, (len(pbr), 1))
+    unshadowed = irradiance if unshadowed is None else unshadowed
+    return Buffers(pbr, irradiance, unshadowed, pbr, opacity, exposure)
+
+
+def shadow_ratio(pbr: np.ndarray, irradiance: np.ndarray, unshadowed: np.ndarray, exposure: float):
+    return baselines.shadow_ratio(guided(pbr, irradiance, unshadowed, exposure=exposure))
+
+
+def linear(name: str) -> Show:
+    """An input of a blend that is taken as it is."""
+    return lambda buffers: getattr(buffers, name)
+
+
+FIRST, SECOND, THIRD = linear("pbr"), linear("irradiance"), linear("unshadowed")
 
 
 def test_shadow_ratio_is_pbr_where_nothing_is_shadowed():
@@ -47,47 +68,46 @@ def test_shadow_ratio_does_not_depend_on_the_unit_of_light():
 @pytest.mark.parametrize("scale", [0.03, 0.9, 7.5])
 def test_the_fitted_scale_is_exact_on_data_made_with_it(scale: float):
     pbr, irradiance = images("pbr", "irradiance")
-    opacity = np.linspace(0, 1, len(pbr))[:, None]
-    terms = product_terms(pbr, irradiance, opacity, exposure=0.4)
-    fit = ScaleFit()
-    fit.add(terms, terms.displayed(scale))
-    assert fit.solve() == pytest.approx(scale, rel=1e-3)
+    buffers = guided(pbr, irradiance, opacity=np.linspace(0, 1, len(pbr))[:, None])
+    fit = ProductFit()
+    fit.add(buffers, show_product(buffers, scale))
+    assert fit.solve().weights == pytest.approx(scale, rel=1e-3)
 
 
 def test_the_fitted_scale_is_no_worse_than_any_other():
     pbr, irradiance, truth = images("pbr", "irradiance", "truth")
-    terms = ProductTerms(pbr * irradiance, np.zeros_like(pbr))
-    fit = ScaleFit()
-    fit.add(terms, agx(truth))
-    error = [
-        np.mean((terms.displayed(s) - agx(truth)) ** 2) for s in (fit.solve(), *np.geomspace(1e-3, 1e3, 200))
-    ]
-    assert error[0] <= min(error[1:]) * (1 + 1e-6)
+    buffers = guided(pbr, irradiance, exposure=1.0)
+    fit = ProductFit()
+    fit.add(buffers, agx(truth))
+    fitted = np.mean((fit.solve().show(buffers) - agx(truth)) ** 2)
+    for scale in np.geomspace(1e-3, 1e3, 200):
+        assert fitted <= np.mean((show_product(buffers, scale) - agx(truth)) ** 2) * (1 + 1e-6)
 
 
 def test_where_no_surfel_is_the_product_keeps_the_environment():
     pbr, irradiance = images("pbr", "irradiance")
-    terms = product_terms(pbr, irradiance, np.zeros((len(pbr), 1)), exposure=0.4)
-    np.testing.assert_allclose(terms.displayed(123.0), agx(0.4 * pbr), rtol=1e-6)
+    shown = show_product(guided(pbr, irradiance, opacity=0.0), 123.0)
+    np.testing.assert_allclose(shown, agx(0.4 * pbr), rtol=1e-6)
 
 
 def test_affine_recovers_a_known_affine_map_of_each_channel():
     first, second = images("first", "second", low=0.2, high=0.8)
     weights = np.array([[0.5, 0.3, 0.05], [0.7, -0.2, 0.2], [0.1, 0.6, 0.0]])
     truth = weights[:, 0] * first + weights[:, 1] * second + weights[:, 2]
-    fit = AffineFit(2)
+    buffers = guided(first, second)
+    fit = AffineFit(FIRST, SECOND)
     for part in range(4):  # as clips come, one after another
         rows = slice(part * 1000, (part + 1) * 1000)
-        fit.add([first[rows], second[rows]], truth[rows])
-    blend = fit.solve()
-    np.testing.assert_allclose(blend.weights, weights, atol=1e-6)
-    np.testing.assert_allclose(blend.displayed([first, second]), truth, atol=1e-6)
+        fit.add(buffers.at(rows), truth[rows])
+    fitted = fit.solve()
+    np.testing.assert_allclose(fitted.weights, weights, atol=1e-6)
+    np.testing.assert_allclose(fitted.show(buffers), truth, atol=1e-6)
 
 
 def test_affine_agrees_with_numpy_least_squares():
     first, second, truth = images("first", "second", "truth", high=1.0)
-    fit = AffineFit(2)
-    fit.add([first, second], truth)
+    fit = AffineFit(FIRST, SECOND)
+    fit.add(guided(first, second), truth)
     for channel in range(3):
         columns = np.stack([first[:, channel], second[:, channel], np.ones(len(first))], 1).astype(float)
         expected = np.linalg.lstsq(columns, truth[:, channel].astype(float), rcond=None)[0]
@@ -96,23 +116,17 @@ def test_affine_agrees_with_numpy_least_squares():
 
 def test_affine_of_equal_inputs_still_has_a_solution():
     (image,) = images("first", high=1.0)
-    fit = AffineFit(2)
-    fit.add([image, image], image)
-    np.testing.assert_allclose(fit.solve().displayed([image, image]), image, atol=1e-5)
+    fit = AffineFit(FIRST, SECOND)
+    fit.add(guided(image, image), image)
+    np.testing.assert_allclose(fit.solve().show(guided(image, image)), image, atol=1e-5)
 
 
 def test_a_third_input_never_hurts_on_the_data_it_was_fitted_on():
     first, second, third, truth = images("a", "b", "c", "d", high=1.0)
-    two, three = AffineFit(2), AffineFit(3)
-    two.add([first, second], truth)
-    three.add([first, second, third], truth)
-    error_two = np.mean((two.solve().displayed([first, second]) - truth) ** 2)
-    error_three = np.mean((three.solve().displayed([first, second, third]) - truth) ** 2)
-    assert error_three <= error_two
-
-
-def test_nothing_to_fit_on_is_said():
-    with pytest.raises(ValueError, match="no training pixels"):
-        AffineFit(2).solve()
-    with pytest.raises(ValueError, match="no training pixels"):
-        ScaleFit().solve()
+    buffers = guided(first, second, third)
+    errors = []
+    for inputs in ((FIRST, SECOND, THIRD), (FIRST, SECOND)):
+        fit = AffineFit(*inputs)
+        fit.add(buffers, truth)
+        errors.append(np.mean((fit.solve().show(buffers) - truth) ** 2))
+    assert errors[0] <= errors[1]

@@ -5,7 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from eval.relighting.predictions import Predictor, displayed_truth, fit_baselines, region_mask
+from eval.relighting.baselines import fit_baselines, predictions
+from eval.relighting.buffers import Buffers, Region, displayed_truth, region_mask
+from eval.relighting.fits import Show
 from eval.relighting.scores import Scores
 from tron.color import to_display
 from tron.errors import TronError
@@ -17,6 +19,14 @@ MakeClip = Callable[..., Clip]
 
 def both(images: dict[str, np.ndarray]) -> dict:
     return {"foreground": images, "frame": images}
+
+
+def fitted_and_shown(
+    clips: list[Clip], networks: dict[str, Show] | None = None
+) -> dict[Region, dict[str, np.ndarray]]:
+    """What baselines fitted on clips, and networks, show for the first of them."""
+    fits = fit_baselines(clips, seed=0)
+    return predictions(clips[0], {name: fitted.show for name, fitted in fits.items()} | (networks or {}))
 
 
 def rows_of(scores: Scores) -> dict[str, tuple[float, int]]:
@@ -77,8 +87,8 @@ def test_gains_are_over_the_best_of_their_group_and_absent_without_all_of_it(dra
     scores = Scores()
     scores.add(clip, both(three), truth)
     rows = rows_of(scores)
-    assert rows["neural.gain_over_best_of_three"][0] == pytest.approx(20 * np.log10(2), abs=1e-2)
-    assert not [name for name in rows if "best_of_seven" in name]
+    assert rows["neural.gain_over_best_simple_baseline"][0] == pytest.approx(20 * np.log10(2), abs=1e-2)
+    assert not [name for name in rows if "best_baseline" in name]
     four = {
         "pbr_x_irradiance": off(0.2),
         "shadowed": off(0.2),
@@ -88,13 +98,13 @@ def test_gains_are_over_the_best_of_their_group_and_absent_without_all_of_it(dra
     scores = Scores()
     scores.add(clip, both({**three, **four}), truth)
     expected = 20 * np.log10(1.5)
-    assert rows_of(scores)["neural.gain_over_best_of_seven_full.sun"][0] == pytest.approx(expected, abs=1e-2)
+    assert rows_of(scores)["neural.gain_over_best_baseline_full.sun"][0] == pytest.approx(expected, abs=1e-2)
 
 
 def test_what_was_not_given_has_no_row(drawn_clip: MakeClip):
     clip = drawn_clip()
     scores = Scores()
-    scores.add(clip, Predictor(fit_baselines([clip], seed=0)).shown(clip), displayed_truth(clip))
+    scores.add(clip, fitted_and_shown([clip]), displayed_truth(clip))
     names = set(rows_of(scores))
     assert "affine_ratio.psnr" in names
     assert not [name for name in names if name.startswith(("neural", "pixel_mlp"))]
@@ -114,7 +124,7 @@ def test_without_shadows_and_bounces_every_product_is_the_truth(drawn_clip: Make
     clip = drawn_clip()
     clip.frames["irradiance"] = clip.frames["unshadowed"].copy()
     clip.frames["rgb"] = clip.frames["shadowed"] = clip.frames["pbr"].copy()
-    shown = Predictor(fit_baselines([clip], seed=0)).shown(clip)
+    shown = fitted_and_shown([clip])
     truth = displayed_truth(clip)
     for region, images in shown.items():
         for method in ("pbr", "shadow_ratio", "shadowed", "affine", "affine_ratio"):
@@ -139,7 +149,7 @@ def test_a_blend_of_surfaces_leaves_the_sky_as_it_is(drawn_clip: MakeClip, metho
     clips = [drawn_clip(light, seed) for light in ("noon", "grey") for seed in (0, 1)]
     for clip in clips:
         as_photographed(clip, where_sky_and_surface_differ(clip))
-    shown = Predictor(fit_baselines(clips, seed=0)).shown(clips[0])
+    shown = fitted_and_shown(clips)
     truth = displayed_truth(clips[0])
     inside = region_mask(clips[0], "foreground")
     np.testing.assert_allclose(shown["foreground"][method][inside], truth[inside], atol=1e-4)
@@ -148,11 +158,8 @@ def test_a_blend_of_surfaces_leaves_the_sky_as_it_is(drawn_clip: MakeClip, metho
 
 def test_half_a_surface_shows_half_of_pbr_in_full_frames_alone(drawn_clip: MakeClip):
     clip = drawn_clip()
-    predictor = Predictor(
-        fit_baselines([clip], seed=0), {"pixel_mlp": lambda pbr, *_: np.full_like(pbr, 0.9)}
-    )
     clip.frames["mask"] = np.full_like(clip.frames["mask"], 0.25)
-    shown = predictor.shown(clip)
+    shown = fitted_and_shown([clip], {"pixel_mlp": lambda buffers: np.full_like(buffers.pbr, 0.9)})
     assert np.all(shown["foreground"]["pixel_mlp"] == np.float32(0.9))
     expected = 0.25 * 0.9 + 0.75 * shown["frame"]["pbr"]
     np.testing.assert_allclose(shown["frame"]["pixel_mlp"], expected, atol=1e-6)
@@ -160,25 +167,28 @@ def test_half_a_surface_shows_half_of_pbr_in_full_frames_alone(drawn_clip: MakeC
 
 def test_the_neural_renderer_draws_its_own_sky(drawn_clip: MakeClip):
     clip = drawn_clip()
-    predictor = Predictor(fit_baselines([clip], seed=0), {"neural": lambda pbr, *_: np.full_like(pbr, 0.9)})
-    shown = predictor.shown(clip)
+    shown = fitted_and_shown([clip], {"neural": lambda buffers: np.full_like(buffers.pbr, 0.9)})
     np.testing.assert_array_equal(shown["frame"]["neural"], shown["foreground"]["neural"])
 
 
 def test_the_network_is_given_linear_buffers_and_the_exposure(drawn_clip: MakeClip):
     clip = drawn_clip()
 
-    def network(pbr: np.ndarray, irradiance: np.ndarray, exposure: float) -> np.ndarray:
-        np.testing.assert_array_equal(irradiance, clip.frames["irradiance"])
-        return to_display(pbr, exposure)
+    def network(buffers: Buffers) -> np.ndarray:
+        np.testing.assert_array_equal(buffers.irradiance, clip.frames["irradiance"])
+        return to_display(buffers.pbr, buffers.exposure)
 
-    shown = Predictor(fit_baselines([clip], seed=0), {"neural": network}).shown(clip)
+    shown = fitted_and_shown([clip], {"neural": network})
     np.testing.assert_array_equal(shown["frame"]["neural"], shown["frame"]["pbr"])
 
 
-def test_no_training_clips_is_one_line():
+def test_nothing_to_fit_on_is_one_line(drawn_clip: MakeClip):
     with pytest.raises(TronError, match="no training clips"):
         fit_baselines([], seed=0)
+    clip = drawn_clip()
+    clip.frames["foreground"] = np.zeros_like(clip.frames["foreground"])
+    with pytest.raises(TronError, match="no training clips with a foreground"):
+        fit_baselines([clip], seed=0)
 
 
 def test_a_captured_photo_is_shown_as_it_is(drawn_clip: MakeClip):

@@ -47,6 +47,10 @@ class Command(Generic[Settings]):
         """Run on `arguments`, those of the process where None."""
         sys.exit(self._run(sys.argv[1:] if arguments is None else arguments))
 
+    def compose(self, *overrides: str) -> Settings:
+        """Checked settings from `key=value` overrides, for `main` called from Python; TronError if wrong."""
+        return check(compose_recipe(self.config_module, overrides), self.settings)
+
     def _run(self, arguments: Sequence[str]) -> int:
         try:
             require_own_packages()

@@ -14,7 +14,7 @@ from tron.captures import View
 from tron.errors import TronError
 from tron.metrics import capped_psnr
 from tron.reconstruction.evaluation import BACKGROUND, picture, wanted_picture
-from tron.reconstruction.training import Progress, Stage
+from tron.reconstruction.training import Stage, StepSummary
 from tron.storage import write_atomic
 from tron.tracing.torch_bridge import render
 
@@ -30,8 +30,8 @@ class Curve:
         every: steps between two scores.
 
     Attributes:
-        points: stage, step, seconds (of the steps up to here, as :class:`Progress` has them: neither set-up,
-            scores nor checkpoints), test_psnr (dB), surfels.
+        points: stage, step, seconds (of the steps up to here, as :class:`StepSummary` has them: neither
+            set-up, scores nor checkpoints), test_psnr (dB), surfels.
 
     Raises:
         TronError: the file holds no curve.
@@ -48,7 +48,7 @@ class Curve:
                 raise TronError(f"not a curve: {error}", path, "remove it") from error
         self._seconds: float | None = None
 
-    def watch(self, progress: Progress, stage: Stage) -> None:
+    def watch(self, progress: StepSummary, stage: Stage) -> None:
         """Take note of a step."""
         if self._seconds is None:
             self._seconds = self._begin(progress)
@@ -65,7 +65,7 @@ class Curve:
             )
             write_atomic(self.path, json.dumps(self.points, indent=1) + "\n")
 
-    def _begin(self, progress: Progress) -> float:
+    def _begin(self, progress: StepSummary) -> float:
         """Forget what was scored after the checkpoint that the run goes on from; the seconds until there."""
         self.points = [p for p in self.points if p["stage"] != progress.stage or p["step"] < progress.step]
         return self.points[-1]["seconds"] if self.points else 0.0

@@ -27,7 +27,7 @@ from tron.reconstruction.initial import extent_of, initial_surfels, source_of
 from tron.reconstruction.settings import ReconstructionSettings
 from tron.reconstruction.supervision import MATERIALS
 from tron.reconstruction.surfels import LearntSurfels
-from tron.reconstruction.training import Plan, Progress, Stage, Watch, materials_plan, radiance_plan
+from tron.reconstruction.training import Plan, Stage, StepSummary, Watch, materials_plan, radiance_plan
 from tron.tracing import SurfelTracer
 
 log = logging.getLogger(__name__)
@@ -169,7 +169,7 @@ class _Run:
         self._save(stage)
         return stage.surfels
 
-    def _after(self, progress: Progress, stage: Stage) -> None:
+    def _after(self, progress: StepSummary, stage: Stage) -> None:
         if progress.step % self.settings.checkpoint_every == 0 and progress.step < progress.steps:
             self._save(stage)
         if self.watch is not None:

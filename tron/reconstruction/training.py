@@ -30,7 +30,7 @@ _PSNR_MEMORY = 0.98
 
 
 @dataclass(frozen=True)
-class Progress:
+class StepSummary:
     """Where a stage stands after a step.
 
     Attributes:
@@ -49,7 +49,7 @@ class Progress:
     seconds: float
 
 
-Watch = Callable[[Progress, "Stage"], None]
+Watch = Callable[[StepSummary, "Stage"], None]
 """Called after every step: to show progress, to write checkpoints, to measure."""
 
 
@@ -155,7 +155,7 @@ class Stage:
             if watch is not None:
                 watch(progress, self)
 
-    def advance(self) -> Progress:
+    def advance(self) -> StepSummary:
         """Take one step."""
         began = time.perf_counter()
         plan, surfels, number = self.plan, self.surfels, self.step + 1
@@ -185,7 +185,7 @@ class Stage:
         self.step = number
         self._remember(seen, target, background)
         seconds = time.perf_counter() - began
-        return Progress(plan.name, number, plan.steps, value, self.psnr, len(surfels), seconds)
+        return StepSummary(plan.name, number, plan.steps, value, self.psnr, len(surfels), seconds)
 
     @property
     def sh_degree(self) -> int:

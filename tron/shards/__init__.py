@@ -6,19 +6,20 @@ them, `reader` opens them again without ever unpickling anything, `verify` finds
 
 from tron.shards.manifest import Manifest, ShardEntry
 from tron.shards.reader import read_clips
-from tron.shards.schema import MEMBERS, REFERENCE_MEMBERS, SCHEMA_VERSION, Clip, ClipMeta
+from tron.shards.schema import GUIDANCE, MEMBERS, SCHEMA_VERSION, Clip, ClipMeta, clip_members
 from tron.shards.verify import verify
 from tron.shards.writer import ShardWriter
 
 __all__ = [
+    "GUIDANCE",
     "MEMBERS",
-    "REFERENCE_MEMBERS",
     "SCHEMA_VERSION",
     "Clip",
     "ClipMeta",
     "Manifest",
     "ShardEntry",
     "ShardWriter",
+    "clip_members",
     "read_clips",
     "verify",
 ]

@@ -15,7 +15,13 @@ LARGEST_MANIFEST = 256 * 2**20
 
 
 class ShardEntry(BaseModel):
-    """One shard: its split, file name, clips (keys in order), size in bytes and sha256 (hex)."""
+    """One shard.
+
+    Attributes:
+        samples: number of its clips.
+        keys: of its clips, in order.
+        sha256: of the file, hexadecimal.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -28,7 +34,12 @@ class ShardEntry(BaseModel):
 
 
 class Manifest(BaseModel):
-    """manifest.json of a dataset folder; config_sha256 hashes the resolved configuration that made it."""
+    """The manifest.json of a dataset folder.
+
+    Attributes:
+        config_sha256: of the resolved configuration that made it, hexadecimal.
+        failures: scenes and clips that could not be made.
+    """
 
     model_config = ConfigDict(extra="forbid")
 

@@ -13,11 +13,11 @@ from tron.errors import TronError
 from tron.images import decode_exr, decode_png
 from tron.shards.manifest import Manifest
 from tron.shards.schema import (
-    ALL_MEMBERS,
+    MEMBERS,
     META_SUFFIX,
-    REFERENCE_MEMBERS,
     Clip,
     ClipMeta,
+    clip_members,
     parse_name,
     require_schema,
 )
@@ -62,10 +62,10 @@ def decode_member(name: str, data: bytes) -> np.ndarray:
     _, _, member = parse_name(f"x.{name}")
     if member == "meta":
         raise TronError(f"{name} is metadata, not an image")
-    image = _DECODERS[ALL_MEMBERS[member].extension](data)
+    image = _DECODERS[MEMBERS[member].extension](data)
     if image.ndim == 2:
         image = image[..., None]
-    channels = ALL_MEMBERS[member].channels
+    channels = MEMBERS[member].channels
     if image.shape[-1] != channels:
         image = image[..., :channels]  # a PNG decoder may hand back grey as RGB
     return np.ascontiguousarray(image, np.float32)
@@ -100,22 +100,17 @@ def decode_clip(
     meta = decode_meta(files[META_SUFFIX])
     indices = range(meta.frames) if frames is None else frames
     if members is None:
-        references = [m for m in REFERENCE_MEMBERS if _file_name(0, m) in files]
-        names = [m for m in ALL_MEMBERS if m not in REFERENCE_MEMBERS or m in references]
-    else:
-        names = list(members)
+        every = clip_members(reference=False)
+        members = clip_members(reference=any(_file_name(0, m) in files for m in MEMBERS if m not in every))
     decoded: dict[str, np.ndarray] = {}
-    for member in names:
+    for member in members:
         images = []
         for index in indices:
             name = _file_name(index, member)
             if name not in files:
-                mend = (
-                    "make the dataset again: its test split is older than this member, or was made without "
-                    "reference buffers"
-                )
-                optional = member in REFERENCE_MEMBERS
-                raise TronError(f"clip {meta.key} has no member {name}", mend=mend if optional else None)
+                optional = MEMBERS[member].clips == "reference"
+                mend = "its split was made without reference_buffers" if optional else None
+                raise TronError(f"clip {meta.key} has no member {name}", mend=mend)
             image = decode_member(name, files[name])
             if image.shape[:2] != (meta.height, meta.width):
                 raise TronError(f"clip {meta.key} {name} has size {image.shape[1::-1]}, not the clip's")
@@ -127,9 +122,9 @@ def decode_clip(
 
 
 def _file_name(frame: int, member: str) -> str:
-    if member not in ALL_MEMBERS:
-        raise TronError(f"no member is called {member!r}", mend=f"they are {', '.join(ALL_MEMBERS)}")
-    return f"f{frame:02d}.{member}.{ALL_MEMBERS[member].extension}"
+    if member not in MEMBERS:
+        raise TronError(f"no member is called {member!r}", mend=f"they are {', '.join(MEMBERS)}")
+    return f"f{frame:02d}.{member}.{MEMBERS[member].extension}"
 
 
 def read_clips(folder: str | Path, split: str, members: Iterable[str] | None = None) -> Iterator[Clip]:

@@ -10,56 +10,88 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from tron.color import agx
 from tron.errors import TronError
 
 SCHEMA_VERSION = 2
 
-LightFamily = Literal["sun", "studio", "overcast", "hdri", "capture"]
+ColorSpace = Literal["linear", "display"]
+
+GUIDANCE = ("pbr", "irradiance")
+"""Members that the neural renderer is conditioned on, unless its configuration names others."""
 
 
-class Member(NamedTuple):
-    """How one buffer of a frame is stored.
+@dataclass(frozen=True)
+class Member:
+    """One buffer of a frame.
 
-    extension: "exr" or "png"; channels: 3 or 1; half: 16-bit EXR, else 32-bit (unit normals need it).
+    Attributes:
+        extension: of its files; EXR holds linear floats, PNG 8 bits.
+        channels: 3 or 1.
+        bytes: of one value on disk: 4 (unit normals need them), 2 or 1.
+        color_space: of colours, unless a clip's metadata say otherwise; None: these are no colours.
+        clips: which clips hold it; those with references are of splits with reference_buffers (test splits).
+        meaning: one line for docs/data.md.
     """
 
-    extension: str
+    extension: Literal["exr", "png"]
     channels: int
-    half: bool
+    bytes: int
+    color_space: ColorSpace | None
+    clips: Literal["all", "reference"]
+    meaning: str
+
+
+def _light(meaning: str, clips: Literal["all", "reference"] = "all") -> Member:
+    return Member("exr", 3, 2, "linear", clips, meaning)
+
+
+def _vector(meaning: str) -> Member:
+    return Member("exr", 3, 4, None, "reference", meaning)
+
+
+def _depth(meaning: str) -> Member:
+    return Member("exr", 1, 4, None, "reference", meaning)
+
+
+def _scalar(meaning: str, clips: Literal["all", "reference"] = "reference") -> Member:
+    return Member("exr", 1, 2, None, clips, meaning)
 
 
 MEMBERS: dict[str, Member] = {
-    "pbr": Member("exr", 3, True),  # split-sum shading of the surfels, linear
-    "irradiance": Member("exr", 3, True),  # shadowed irradiance / pi, linear
-    "rgb": Member("exr", 3, True),  # what the network must produce: path-traced radiance, linear
-    "unshadowed": Member("exr", 3, True),  # irradiance / pi without visibility, linear
-    "shadowed": Member("exr", 3, True),  # base_color (1 - metallic) irradiance + split-sum specular, linear
-    "mask": Member("exr", 1, True),  # the surfels' opacity in [0, 1]
-    "foreground": Member("png", 1, False),  # 1 where the pixel-centre ray meets true geometry
+    "pbr": _light("split-sum shading of the surfels, without shadows"),
+    "irradiance": _light("irradiance / pi at the surfels, with shadows"),
+    "rgb": _light("path-traced radiance, which the network must produce"),
+    "unshadowed": _light("irradiance / pi at the surfels, without visibility"),
+    "shadowed": _light("base_color (1 - metallic) irradiance, plus the split sum's specular part"),
+    "mask": _scalar("opacity of the surfels in [0, 1]", "all"),
+    "foreground": Member("png", 1, 1, None, "all", "1 where the pixel-centre ray meets true geometry"),
+    "irradiance_ref": _light("direct irradiance / pi by Mitsuba, with shadows", "reference"),
+    "unshadowed_ref": _light("the same with nothing in the way", "reference"),
+    "base_color_ref": _light("true base color", "reference"),
+    "normal_ref": _vector("true unit normal, world (x, y, z)"),
+    "base_color": _light("base color of the surfels", "reference"),
+    "normal": _vector("unit normal of the surfels, world (x, y, z)"),
+    "depth_ref": _depth("true distance from the camera, world units; 0 where there is none"),
+    "depth": _depth("median distance of the surfels, likewise"),
+    "roughness_ref": _scalar("true roughness in [0, 1]"),
+    "metallic_ref": _scalar("true metallic in [0, 1]"),
+    "roughness": _scalar("roughness of the surfels"),
+    "metallic": _scalar("metallic of the surfels"),
 }
-"""Members that every frame has."""
+"""All buffers of a frame, in the order they are stored; a clip holds all reference members or none."""
 
-REFERENCE_MEMBERS: dict[str, Member] = {
-    "irradiance_ref": Member("exr", 3, True),  # Mitsuba's direct irradiance / pi, linear
-    "unshadowed_ref": Member("exr", 3, True),  # the same with nothing in the way
-    "base_color_ref": Member("exr", 3, True),  # true base color, linear
-    "normal_ref": Member("exr", 3, False),  # true unit normals, world (x, y, z)
-    "base_color": Member("exr", 3, True),  # the surfels' base color, linear
-    "normal": Member("exr", 3, False),  # the surfels' unit normals, world (x, y, z)
-    "depth_ref": Member("exr", 1, False),  # true distance from the camera, world units, 0 where there is none
-    "depth": Member("exr", 1, False),  # the surfels' median distance, likewise
-}
-"""Members of splits made with reference buffers (test splits).
 
-All of them or none are written. Datasets made before one of them was added lack it, and are read without.
-"""
+def clip_members(reference: bool) -> tuple[str, ...]:
+    """Names of a clip's members, in the order they are stored."""
+    return tuple(name for name, member in MEMBERS.items() if reference or member.clips == "all")
 
-ALL_MEMBERS: dict[str, Member] = MEMBERS | REFERENCE_MEMBERS
+
 META_SUFFIX = "meta.json"
 
 KEY_PATTERN = re.compile(r"[A-Za-z0-9_-]{1,60}")
@@ -69,12 +101,30 @@ _MEMBER_PATTERN = re.compile(r"([A-Za-z0-9_-]{1,60})\.f(\d{2,4})\.([a-z_]+)\.([a
 _META_PATTERN = re.compile(r"([A-Za-z0-9_-]{1,60})\.meta\.json")
 
 
-class ClipMeta(BaseModel):
-    """A clip's metadata (meta.json).
+def members_table() -> str:
+    """MEMBERS in Markdown, which stands in docs/data.md."""
+    rows = ["| member | file | values | colours | clips | meaning |", "|---|---|---|---|---|---|"]
+    kinds = {1: "8 bits", 2: "half float", 4: "float"}
+    for name, member in MEMBERS.items():
+        values = f"{member.channels} x {kinds[member.bytes]}"
+        space = member.color_space or "none"
+        file = member.extension.upper()
+        rows.append(f"| `{name}` | {file} | {values} | {space} | {member.clips} | {member.meaning} |")
+    return "\n".join(rows) + "\n"
 
-    exposure: the scalar that multiplies linear values before AgX, one per light (facts 4b).
-    color_space: "linear" or "display" for each member that holds colour.
-    cameras: `Camera.to_dict()` of each frame, OpenCV, pixels, world-to-camera.
+
+class ClipMeta(BaseModel):
+    """Metadata of a clip (meta.json).
+
+    Attributes:
+        scene: name of the scene; the split's other clips show it under other lights.
+        light: name of the light.
+        cameras: `Camera.to_dict()` of each frame, OpenCV, pixels, world-to-camera.
+        exposure: factor on linear values before AgX, one a light (docs/conventions.md, 5).
+        color_space: of each member that holds colours; photographs are "display".
+        seeds: root seed, and the first frame's seed of each kind of randomness.
+        spp: samples a pixel of each kind.
+        extra: anything else that is worth knowing of the clip.
     """
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -83,14 +133,14 @@ class ClipMeta(BaseModel):
     key: str
     scene: str
     light: str
-    light_family: LightFamily
+    light_family: str = Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")
     split: str
     frames: int = Field(ge=1, le=10_000)
     width: int = Field(ge=1, le=16_384)
     height: int = Field(ge=1, le=16_384)
     cameras: list[dict[str, Any]]
     exposure: float = Field(gt=0)
-    color_space: dict[str, Literal["linear", "display"]]
+    color_space: dict[str, ColorSpace]
     seeds: dict[str, int] = Field(default_factory=dict)
     spp: dict[str, int] = Field(default_factory=dict)
     extra: dict[str, Any] = Field(default_factory=dict)
@@ -112,10 +162,33 @@ class ClipMeta(BaseModel):
 
 @dataclass
 class Clip:
-    """A clip in memory: its metadata and `frames[member]`, (K, H, W, C) float32."""
+    """Clip in memory.
+
+    Attributes:
+        meta: its metadata.
+        frames: (K, H, W, C) float32 by member.
+    """
 
     meta: ClipMeta
     frames: dict[str, np.ndarray]
+
+    @property
+    def has_reference(self) -> bool:
+        """Whether the reference members are there."""
+        return set(clip_members(reference=True)) <= self.frames.keys()
+
+    def is_display(self, member: str) -> bool:
+        """Whether a member is display-encoded already, as photographs are."""
+        return self.meta.color_space.get(member, MEMBERS[member].color_space) == "display"
+
+    def exposed(self, member: str) -> np.ndarray:
+        """(K, H, W, 3) linear under the clip's exposure, ready for AgX; display values as they are."""
+        image = self.frames[member]
+        return image if self.is_display(member) else image * np.float32(self.meta.exposure)
+
+    def displayed(self, member: str) -> np.ndarray:
+        """(K, H, W, 3) in [0, 1] as a screen shows it: exposure, then AgX, unless it is display-encoded."""
+        return self.exposed(member) if self.is_display(member) else agx(self.exposed(member))
 
 
 def require_schema(version: int, where: str | Path) -> None:
@@ -130,7 +203,7 @@ def require_schema(version: int, where: str | Path) -> None:
 
 def member_name(key: str, frame: int, member: str) -> str:
     """The tar member that holds one buffer of one frame, e.g. `s000012-l2.f00.pbr.exr`."""
-    return f"{key}.f{frame:02d}.{member}.{ALL_MEMBERS[member].extension}"
+    return f"{key}.f{frame:02d}.{member}.{MEMBERS[member].extension}"
 
 
 def meta_name(key: str) -> str:
@@ -146,7 +219,7 @@ def parse_name(name: str) -> tuple[str, int | None, str]:
     if meta := _META_PATTERN.fullmatch(name):
         return meta[1], None, "meta"
     found = _MEMBER_PATTERN.fullmatch(name)
-    if found and found[3] in ALL_MEMBERS and found[4] == ALL_MEMBERS[found[3]].extension:
+    if found and found[3] in MEMBERS and found[4] == MEMBERS[found[3]].extension:
         return found[1], int(found[2]), found[3]
     raise TronError(f"shard member {name[:80]!r} is none this schema knows", mend="make the dataset again")
 

@@ -1,4 +1,4 @@
-"""A dataset folder against its manifest: whether its shards still hold what was written."""
+"""Check of a dataset folder: whether its shards still hold what its manifest says."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from pathlib import Path
 from tron.errors import TronError
 from tron.shards.manifest import Manifest, ShardEntry
 from tron.shards.reader import decode_clip, tar_files
-from tron.shards.schema import MEMBERS
 from tron.storage import sha256
 
 
 def verify(folder: str | Path) -> list[str]:
-    """Every problem of a dataset folder, one line each, naming shard and clip; empty when it is whole.
+    """Problems of a dataset folder, one line each, naming shard and clip; empty when it is whole.
 
     Finds missing, stray and truncated shards (a tar cut at a member's end reads without an error: only the
     count shows it), flipped bytes, missing, repeated and unknown members, and files that do not decode.
@@ -70,7 +69,4 @@ def _clip_problems(entry: ShardEntry, key: str, files: dict[str, bytes]) -> list
     problems = []
     if clip.meta.key != key or clip.meta.split != entry.split:
         problems.append(f"{entry.name}: {key}: its metadata say {clip.meta.key} of {clip.meta.split}")
-    missing = [member for member in MEMBERS if member not in clip.frames]
-    if missing:
-        problems.append(f"{entry.name}: {key}: has no {', '.join(missing)}")
     return problems

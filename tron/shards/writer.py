@@ -18,11 +18,10 @@ from tron.errors import TronError
 from tron.images import encode_exr, encode_png
 from tron.shards.manifest import ShardEntry
 from tron.shards.schema import (
-    ALL_MEMBERS,
     MEMBERS,
-    REFERENCE_MEMBERS,
     SPLIT_PATTERN,
     ClipMeta,
+    clip_members,
     member_name,
     meta_name,
     shard_name,
@@ -143,16 +142,17 @@ class _HashingFile(io.RawIOBase):
         return len(data)
 
 
-def _members_of(meta: ClipMeta, index: int, frame: dict[str, np.ndarray]) -> list[str]:
+def _members_of(meta: ClipMeta, index: int, frame: dict[str, np.ndarray]) -> tuple[str, ...]:
     """The frame's members in the schema's order; every reference member or none."""
-    wanted = set(MEMBERS) | (set(REFERENCE_MEMBERS) if set(frame) & set(REFERENCE_MEMBERS) else set())
-    if wrong := sorted(set(frame) ^ wanted):
+    every = clip_members(reference=False)
+    wanted = clip_members(reference=not set(frame).isdisjoint(set(MEMBERS).difference(every)))
+    if wrong := sorted(set(frame).symmetric_difference(wanted)):
         raise TronError(f"clip {meta.key} frame {index}: missing or unknown members {', '.join(wrong)}")
-    return [member for member in ALL_MEMBERS if member in frame]
+    return wanted
 
 
 def _encode(meta: ClipMeta, index: int, member: str, image: np.ndarray) -> bytes:
-    kind = ALL_MEMBERS[member]
+    kind = MEMBERS[member]
     image = np.asarray(image, np.float32)
     if image.ndim == 2:
         image = image[..., None]
@@ -163,4 +163,4 @@ def _encode(meta: ClipMeta, index: int, member: str, image: np.ndarray) -> bytes
         raise TronError(f"{where} holds {int((~np.isfinite(image)).sum())} values that are not finite")
     if kind.extension == "png":
         return encode_png(image)
-    return encode_exr(image, half=kind.half)
+    return encode_exr(image, half=kind.bytes == 2)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tron.apps import reconstruct as app
+from tron.apps import reconstruct_run as app
 from tron.apps.reconstruct import cli
 from tron.apps.relight import cli as relight_cli
 from tron.cameras import Camera
@@ -78,13 +78,13 @@ def reconstruct(variant, capture_path) -> Callable[..., int]:
 def steps(monkeypatch) -> list[tuple[str, int]]:
     """The steps that a command takes, as they come."""
     taken: list[tuple[str, int]] = []
-    watch = app._Bars.watch
+    watch = app.StageBars.watch
 
     def counting(self, progress) -> None:
         taken.append((progress.stage, progress.step))
         watch(self, progress)
 
-    monkeypatch.setattr(app._Bars, "watch", counting)
+    monkeypatch.setattr(app.StageBars, "watch", counting)
     return taken
 
 
@@ -199,18 +199,18 @@ def test_lost_results_come_back_without_training(reconstruct, steps, tmp_path: P
 def test_an_interrupted_run_goes_on_where_it_was_saved(
     reconstruct, steps, tmp_path: Path, monkeypatch, capsys, cut: tuple[str, int]
 ):
-    out, counting = tmp_path / "out", app._Bars.watch
+    out, counting = tmp_path / "out", app.StageBars.watch
 
     def interrupting(self, progress) -> None:
         counting(self, progress)
         if (progress.stage, progress.step) == cut:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(app._Bars, "watch", interrupting)
+    monkeypatch.setattr(app.StageBars, "watch", interrupting)
     assert reconstruct(out) == 130
     assert capsys.readouterr().err.strip() == "tron-reconstruct: interrupted"
     assert not (out / "metrics.json").exists()
-    monkeypatch.setattr(app._Bars, "watch", counting)
+    monkeypatch.setattr(app.StageBars, "watch", counting)
     steps.clear()
     assert reconstruct(out) == 0
     assert steps[0] == (("radiance", 6) if cut[0] == "radiance" else ("materials", 1))
@@ -222,7 +222,7 @@ def test_an_interrupted_run_goes_on_where_it_was_saved(
 
 def test_one_thread_repeats_bit_by_bit_through_an_interruption(reconstruct, tmp_path: Path, monkeypatch):
     """And writes OpenEXR, for which Mitsuba wants a second thread."""
-    watch = app._Bars.watch
+    watch = app.StageBars.watch
 
     def interrupting(self, progress) -> None:
         if (progress.stage, progress.step) == ("radiance", 8):
@@ -230,9 +230,9 @@ def test_one_thread_repeats_bit_by_bit_through_an_interruption(reconstruct, tmp_
         watch(self, progress)
 
     assert reconstruct(tmp_path / "whole", "threads=1") == 0
-    monkeypatch.setattr(app._Bars, "watch", interrupting)
+    monkeypatch.setattr(app.StageBars, "watch", interrupting)
     assert reconstruct(tmp_path / "cut", "threads=1") == 130
-    monkeypatch.setattr(app._Bars, "watch", watch)
+    monkeypatch.setattr(app.StageBars, "watch", watch)
     assert reconstruct(tmp_path / "cut", "threads=1") == 0
     whole, cut = ((tmp_path / name / "scene.ply").read_bytes() for name in ("whole", "cut"))
     assert whole == cut

@@ -13,7 +13,7 @@ from tron.reconstruction.curve import Curve
 from tron.reconstruction.evaluation import mean_figures, score_views
 from tron.reconstruction.settings import DensitySettings, MaterialSettings, RadianceSettings
 from tron.reconstruction.surfels import LearntSurfels
-from tron.reconstruction.training import Progress, Stage, materials_plan, radiance_plan
+from tron.reconstruction.training import Stage, StepSummary, materials_plan, radiance_plan
 from tron.tracing import SurfelTracer
 
 
@@ -24,8 +24,8 @@ def stage(painted, painted_capture) -> Stage:
     return Stage(plan, painted_capture.train_views, LearntSurfels.of_scene(painted, plan.rates), 2, 0)
 
 
-def progress(step: int, steps: int = 100, stage: str = "radiance", seconds: float = 0.5) -> Progress:
-    return Progress(stage, step, steps, 0.1, 20.0, 600, seconds)
+def progress(step: int, steps: int = 100, stage: str = "radiance", seconds: float = 0.5) -> StepSummary:
+    return StepSummary(stage, step, steps, 0.1, 20.0, 600, seconds)
 
 
 def test_points_come_every_so_many_steps_and_at_the_end(stage, painted_capture, tmp_path: Path) -> None:
@@ -53,7 +53,7 @@ def test_the_seconds_are_those_of_the_steps_alone(stage, painted_capture, tmp_pa
 
     advance = stage.advance
 
-    def step() -> Progress:
+    def step() -> StepSummary:
         now[0] += 10  # a checkpoint
         return advance()
 

@@ -25,7 +25,7 @@ from tron.reconstruction.settings import (
     RadianceSettings,
     ReconstructionSettings,
 )
-from tron.reconstruction.training import Progress, Stage
+from tron.reconstruction.training import Stage, StepSummary
 from tron.tracing import SurfelTracer
 
 DENSITY = DensitySettings(start=0, end=16, every=6, threshold=1e-5, prune_every=4, reset_every=0, most=420)
@@ -66,7 +66,7 @@ class CutAt:
     def __init__(self, stage: str = "", step: int = 0) -> None:
         self.at, self.steps = (stage, step), []
 
-    def __call__(self, progress: Progress, stage: Stage) -> None:
+    def __call__(self, progress: StepSummary, stage: Stage) -> None:
         self.steps.append((progress.stage, progress.step))
         if self.steps[-1] == self.at:
             raise Cut
@@ -256,7 +256,7 @@ def test_surfels_that_have_a_way_to_go_take_longer_steps_when_there_are_few(
     rates: dict[float, dict[str, float]] = {}
     for scaler in (1.0, 0.25):
 
-        def watch(_: Progress, stage: Stage, scaler: float = scaler) -> None:
+        def watch(_: StepSummary, stage: Stage, scaler: float = scaler) -> None:
             rates.setdefault(scaler, stage.plan.rates)
 
         initial = InitialSettings(source=source, count=100)

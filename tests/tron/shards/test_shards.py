@@ -12,9 +12,9 @@ import pytest
 
 from tron import seeds
 from tron.errors import TronError
-from tron.shards import MEMBERS, REFERENCE_MEMBERS, ClipMeta, Manifest, ShardWriter, read_clips, verify
+from tron.shards import MEMBERS, ClipMeta, Manifest, ShardWriter, clip_members, read_clips, verify
 from tron.shards.reader import decode_clip, decode_meta, group_clips, tar_files
-from tron.shards.schema import parse_name
+from tron.shards.schema import members_table, parse_name
 
 
 def meta(key: str, split: str = "train", frames: int = 2) -> ClipMeta:
@@ -36,11 +36,11 @@ def meta(key: str, split: str = "train", frames: int = 2) -> ClipMeta:
 
 def frames(key: str, count: int = 2, reference: bool = False) -> list[dict[str, np.ndarray]]:
     random = seeds.generator(0, "shards", key)
-    members = MEMBERS | (REFERENCE_MEMBERS if reference else {})
     made = []
     for _ in range(count):
         frame = {}
-        for name, member in members.items():
+        for name in clip_members(reference):
+            member = MEMBERS[name]
             image = random.random((6, 8, member.channels), dtype=np.float32)
             frame[name] = image.round() if member.extension == "png" else image * 3
         made.append(frame)
@@ -62,11 +62,11 @@ def test_round_trip_is_exact_up_to_half_precision(tmp_path):
     assert [clip.meta.key for clip in clips] == ["a0", "a1", "a2"]
     for clip in clips:
         assert clip.meta == meta(clip.meta.key)
-        assert set(clip.frames) == {*MEMBERS, *REFERENCE_MEMBERS}
+        assert set(clip.frames) == set(MEMBERS)
         for number, frame in enumerate(frames(clip.meta.key, reference=True)):
             for name, image in frame.items():
-                member = (MEMBERS | REFERENCE_MEMBERS)[name]
-                expected = image.astype(np.float16) if member.half else image
+                member = MEMBERS[name]
+                expected = image.astype(np.float16) if member.bytes == 2 else image
                 np.testing.assert_array_equal(clip.frames[name][number], expected.astype(np.float32), name)
 
 
@@ -359,3 +359,9 @@ def test_an_absent_split_names_those_there_are(tmp_path):
         list(read_clips(tmp_path, "test"))
     with pytest.raises(TronError, match="no dataset folder"):
         list(read_clips(tmp_path / "nowhere", "test"))
+
+
+def test_the_table_of_the_documentation_is_the_schemas():
+    text = (Path(__file__).resolve().parents[3] / "docs" / "data.md").read_text()
+    begin, end = "<!-- tron.shards.schema.members_table() -->\n", "<!-- end -->"
+    assert text.split(begin)[1].split(end)[0] == members_table()

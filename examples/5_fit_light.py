@@ -1,0 +1,29 @@
+"""Find the light of a scene from a few views: photos, and irradiance as a prior would estimate it.
+
+The views are rendered here under a known light, so that the picture can show both: found above, true below.
+"""
+
+import numpy as np
+from stage import arguments, load_light, load_scene, look_at
+
+from tron.captures import Capture, View
+from tron.cli.progress import track
+from tron.color import to_display
+from tron.images import write_image
+from tron.reconstruction import FitSettings, fit_environment
+from tron.shading import Estimation, Lighting, render_guidance
+from tron.tracing import SurfelTracer
+
+chosen = arguments(__doc__, "5_fit_light.jpg")
+scene, light = load_scene(chosen), load_light(chosen)
+tracer, lighting, exposure, views = SurfelTracer(scene), Lighting(light), light.exposure(), []
+for index, camera in enumerate(look_at(scene, chosen, frames=6)):
+    camera = camera.resized(96, 64)
+    seen = render_guidance(tracer, camera, lighting, Estimation(rays=256), seed=index)
+    photo = to_display(seen.shadowed, exposure)
+    views.append(View(f"{index}", camera, photo, "display", irradiance=seen.irradiance, mask=seen.mask))
+settings = FitSettings(resolution=16, steps=60 if chosen.small else 400, rays=16, pixels=1024, scale_steps=20)
+fit = fit_environment(Capture(tuple(views), exposure=exposure), tracer, settings, track)
+found = fit.environment.resized(light.image.shape[0])
+write_image(chosen.output, to_display(np.vstack([found.image, light.image]), exposure))
+print(f"loss {fit.irradiance_loss[0]:.4f} -> {fit.irradiance_loss[-10:].mean():.4f}: {chosen.output}")

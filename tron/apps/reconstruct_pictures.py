@@ -1,0 +1,65 @@
+"""Pictures of a reconstruction: held-out views with every channel, and the light."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tron.apps.labelled_sheet import labelled_sheet
+from tron.captures import Capture
+from tron.color import linear_to_srgb, to_display
+from tron.estimation import Estimation
+from tron.images import write_image
+from tron.reconstruction import EnvironmentFit
+from tron.reconstruction.evaluation import picture, wanted_picture
+from tron.shading.guidance import Lighting, render_guidance
+from tron.tracing import SurfelTracer
+
+SHEET_VIEWS = 6
+SHADOW_RAYS = 16
+
+
+def write_sheet(path: Path, tracer: SurfelTracer, capture: Capture, light: EnvironmentFit | None) -> None:
+    """Held-out views (training views, if none is) with every channel of the G-buffer and the guidance."""
+    views = capture.test_views or capture.train_views
+    views = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, SHEET_VIEWS).astype(int))]
+    rows: dict[str, list[np.ndarray]] = {}
+    lighting = None if light is None else Lighting(light.environment)
+    for number, view in enumerate(views):
+        buffers = tracer.gbuffer(view.camera).numpy()
+        rendered, wanted = picture(buffers), wanted_picture(view)
+        for name, image in {
+            "photo": wanted,
+            "radiance": rendered,
+            "error x 4": 4 * np.abs(rendered - wanted),
+            "opacity": buffers["opacity"],
+            "depth": _relative(buffers["depth"]),
+            "position": _relative(buffers["position"], buffers["opacity"] > 0.5),
+            "normal": 0.5 * buffers["normal"] + 0.5,
+            "base color": linear_to_srgb(np.clip(buffers["base_color"], 0, 1)),
+            "roughness": buffers["roughness"],
+            "metallic": buffers["metallic"],
+        }.items():
+            rows.setdefault(name, []).append(image)
+        if lighting is not None:
+            estimation = Estimation(rays=SHADOW_RAYS, filtered=True)
+            guidance = render_guidance(tracer, view.camera, lighting, estimation, number)
+            for name, image in (("pbr", guidance.pbr), ("irradiance", guidance.irradiance)):
+                rows.setdefault(name, []).append(to_display(image, capture.exposure))
+    write_image(path, labelled_sheet(rows, [view.name for view in views]))
+
+
+def _relative(values: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
+    """Values spread over [0, 1], each channel for itself, strays left out; black where nothing is known."""
+    known = values > 0 if known is None else known
+    if not known.any():
+        return np.zeros_like(values)
+    low, high = np.percentile(values[known], [2, 98], axis=0)
+    spread = np.clip((values - low) / np.maximum(high - low, 1e-9), 0, 1)
+    return np.where(known if values.ndim == 2 else known[..., None], spread, 0)
+
+
+def write_light(path: Path, light: EnvironmentFit) -> None:
+    """The environment map, exposed as tron-relight would."""
+    write_image(path, to_display(light.environment.image, light.environment.exposure()))
