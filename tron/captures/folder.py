@@ -27,6 +27,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from tron.cameras import Camera, opencv_to_opengl, opengl_to_opencv
 from tron.captures.capture import Capture
+from tron.captures.points import encode_points, read_points
 from tron.captures.settings import PhotoSettings
 from tron.captures.transforms import read_json
 from tron.captures.view import ColorSpace, View
@@ -175,7 +176,7 @@ def write_capture(
             file_path, entry = _write_view(folder, view, stem)
             entries[file_path] = entry
         if capture.points is not None:
-            (folder / POINTS_NAME).write_bytes(_encode_points(capture.points, capture.point_colors))
+            (folder / POINTS_NAME).write_bytes(encode_points(capture.points, capture.point_colors))
         text = _describe(capture, entries).model_dump_json(indent=1, exclude_none=True) + "\n"
         (folder / TRANSFORMS_NAME).write_bytes(text.encode())
 
@@ -203,7 +204,7 @@ def read_capture_folder(path: str | os.PathLike[str]) -> Capture:
             views.append(_view(folder, transforms, frame, entry))
         points = colors = None
         if tron.points is not None:
-            points, colors = _read_points(_existing(folder, tron.points))
+            points, colors = read_points(_existing(folder, tron.points))
         return Capture(
             views=tuple(views),
             test=frozenset(tron.test),
@@ -430,38 +431,3 @@ def _camera(transforms: _Transforms, frame: _Frame, name: str) -> Camera:
         raise TronError("camera matrix cannot be inverted", f"view {name}") from error
     except TronError as error:
         raise TronError(error.what, f"view {name}", error.mend) from error
-
-
-_POINTS_HEADER = (
-    "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n"
-    "property float x\nproperty float y\nproperty float z\n{colors}end_header\n"
-)
-_POINTS_COLORS = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
-
-
-def _encode_points(points: np.ndarray, colors: np.ndarray | None) -> bytes:
-    rows = np.empty(len(points), _points_type(colors is not None))
-    rows["xyz"] = points
-    if colors is not None:
-        rows["rgb"] = np.round(np.clip(colors, 0, 1) * 255).astype(np.uint8)
-    header = _POINTS_HEADER.format(count=len(points), colors="" if colors is None else _POINTS_COLORS)
-    return header.encode() + rows.tobytes()
-
-
-def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """(N, 3) points and colours of a file as written above: any other header is refused, not interpreted."""
-    data = path.read_bytes()
-    pattern = _POINTS_HEADER.format(count=r"(\d{1,10})", colors=f"({_POINTS_COLORS})?")
-    found = re.match(pattern.encode(), data)
-    if not found:
-        raise TronError("points are not stored as TRON stores them", path)
-    kind, count = _points_type(found[2] is not None), int(found[1])
-    if len(data) - found.end() != count * kind.itemsize:
-        raise TronError(f"file says {count} points and has {len(data) - found.end()} bytes for them", path)
-    rows = np.frombuffer(data, kind, count, found.end())
-    colors = None if found[2] is None else rows["rgb"].astype(np.float32) / 255
-    return rows["xyz"].astype(np.float32), colors
-
-
-def _points_type(with_colors: bool) -> np.dtype:
-    return np.dtype([("xyz", "<f4", 3), *([("rgb", "u1", 3)] if with_colors else [])])

@@ -30,6 +30,7 @@ from tron.captures.assembly import PosedPhoto, PosedPhotos, rigid_pose
 from tron.captures.distortion import Lens, opencv_lens
 from tron.captures.image_folder import ImageFolder, relative_parts
 from tron.captures.not_a_capture import require_poses_of_photos
+from tron.captures.points import read_points
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
 
@@ -229,24 +230,11 @@ def _to_original(meta: Mapping[str, Any], file: Path) -> np.ndarray:
 
 
 def _points(root: Path, name: str, transform: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points (N, 3) in the capture's world and colours (N, 3) of a PLY in the file's world."""
-    path = root.joinpath(*relative_parts(name))
-    from plyfile import PlyData, PlyParseError
-
-    try:
-        vertex = PlyData.read(str(path))["vertex"]
-        points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
-        names = {each.name for each in vertex.properties}
-        channels = ("red", "green", "blue")
-        colors = np.stack([vertex[c] for c in channels], 1) if names.issuperset(channels) else None
-    except (OSError, ValueError, KeyError, PlyParseError, MemoryError) as error:
-        raise TronError(f"cannot read points: {error}", path) from error
+    """Finite points (N, 3) in the capture's world and colours (N, 3) of a PLY in the file's world."""
+    points, colors = read_points(root.joinpath(*relative_parts(name)))
     finite = np.isfinite(points).all(1)
     points = points[finite] @ transform[:3, :3].T + transform[:3, 3]
-    if colors is None:
-        return points, None
-    scale = 255.0 if np.issubdtype(colors.dtype, np.integer) else 1.0
-    return points, np.clip(colors[finite] / scale, 0, 1)
+    return points, None if colors is None else colors[finite]
 
 
 def _colmap_points(root: Path, photos: Sequence[PosedPhoto]) -> tuple[np.ndarray | None, np.ndarray | None]:

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-HEAVY = {"mitsuba", "drjit", "torch", "cv2", "pycolmap", "plyfile"}
+HEAVY = {"mitsuba", "drjit", "torch", "cv2", "pycolmap"}
 
 
 def test_importing_captures_is_light() -> None:

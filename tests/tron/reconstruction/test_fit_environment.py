@@ -84,7 +84,7 @@ def test_a_small_sun_is_found(tracer, captured) -> None:
 def test_sigma_is_a_known_scale_within_a_hundredth(tracer, captured, studio) -> None:
     capture = captured(studio)
     photos = choose_photos(capture.train_views, SCALE, capture.exposure)
-    for scale in (0.3, 1.0, 20.0):
+    for scale in (0.3, 20.0):
         dimmed = Lighting(EnvironmentMap(studio.image / np.float32(scale)), 64)
         found = fit_scale(tracer, photos, dimmed, SCALE, capture.exposure)
         assert found.sigma == pytest.approx(scale, rel=0.01)
@@ -106,8 +106,8 @@ def test_linear_photos_ask_for_the_same_scale(tracer, captured, studio) -> None:
 
 
 def test_the_sky_counts_in_neither_stage(tracer, captured, studio) -> None:
-    capture = captured(studio)
-    settings = QUICK.model_copy(update={"steps": 100, "scale_steps": 50})
+    capture = captured(studio, views=4)
+    settings = QUICK.model_copy(update={"steps": 25, "scale_steps": 25})
     spoiled = []
     for view in capture.views:
         sky = np.zeros((32, 32), np.float32)
