@@ -22,7 +22,6 @@ import yaml
 from datagen.build import Geometry
 from datagen.capture_manifest import CaptureManifest
 from datagen.clusters import require_cluster
-from datagen.lights import bake
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.plan import Sources, Work, chosen, find_sources
 from datagen.run import FAILURES_NAME, draw_and_build, failure, outcomes, write_failures
@@ -111,8 +110,7 @@ def make_capture(item: Work, settings: Settings, sources: Sources) -> Path:
     folder = settings.output_dir / CAPTURES / item.name
     family = wanted.lights[item.index % len(wanted.lights)]
     spec, geometry = draw_and_build(item, settings, sources, [family])
-    maps = None if settings.environments is None else str(settings.environments)
-    environment = bake(spec.lights[0], settings.environment_height, maps).baked()
+    environment = spec.lights[0].bake(settings.environment_height, settings.environments).baked()
     beside = {
         SPEC_NAME: spec.to_json().encode(),
         ENVIRONMENT_NAME: encode_exr(environment.image, half=False),
