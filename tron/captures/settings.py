@@ -1,4 +1,4 @@
-"""What a user may say of the photos of any capture before it is loaded."""
+"""Settings of the photos of any capture."""
 
 from __future__ import annotations
 
