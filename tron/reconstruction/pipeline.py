@@ -85,13 +85,11 @@ def reconstruct(
         raise TronError(
             "surfels are learnt from display values and an image is linear",
             f"view {linear[0]}",
-            "display-encode it",
+            "encode it for display",
         )
     run = _Run(settings, made_with(capture, prior, settings), checkpoint, device, watch)
     extent = extent_of(views)
-    source = source_of(
-        capture, settings.initial
-    )  # one that is not there is told before the prior's long work
+    source = source_of(capture, settings.initial)  # a lacking one is told before a prior works for hours
     radiance = settings.radiance.scaled(settings.steps_scaler, placed=source == "depth")
     wanted = [] if radiance.normal == 0 else ["normal"]
     taught = apply_prior(capture, prior, fields=wanted, track=track) if wanted else capture

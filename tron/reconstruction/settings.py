@@ -1,7 +1,7 @@
 """Settings of a reconstruction: its beginning, and stages 1 (radiance), 2 (materials) and 3 (light).
 
-The defaults are those of 3DGRT, which the paper inherits (docs/conventions.md, 15): 30,000 steps, then 7,000. A
-machine without a GPU takes fewer of them: ``scaled`` shortens every schedule at once, as gsplat's
+The defaults are those of 3DGRT, which the paper inherits (docs/conventions.md, 15): 30,000 steps, then 7,000.
+A machine without a GPU takes fewer of them: ``scaled`` shortens every schedule at once, as gsplat's
 ``steps_scaler`` does, and lets surfels move and turn faster, since otherwise they would not arrive.
 """
 
@@ -148,8 +148,10 @@ class ReconstructionSettings(Settings):
 
 
 class FitSettings(Settings):
-    """How an environment is fitted. The defaults take about half a minute on two CPU cores for a small scene;
-    ``FitSettings.paper()`` wants a GPU.
+    """Stage 3, the fit of an environment.
+
+    The defaults take about half a minute on two CPU cores for a small scene; the recipe ``experiment=paper``
+    wants a GPU.
     """
 
     resolution: int = Field(default=64, ge=2, description="Texels along a face edge of the cubemap.")

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from tron.captures import View
+from tron.gaussians.fields import MATERIALS
 from tron.reconstruction.losses import SSIM_WEIGHT, photometric_loss
 
-MATERIALS = ("base_color", "roughness", "metallic")
 _COMPARED = ("image", "normal", *MATERIALS)
 _SURFACE = 0.5
 

@@ -35,7 +35,7 @@ def surface_mask(view: View, opacity: np.ndarray) -> np.ndarray:
 
 @dataclass
 class PointBatch:
-    """Fields that :class:`tron.shading.transport.Transport` reads of a G-buffer, and the wanted irradiance / pi.
+    """G-buffer for :class:`tron.shading.transport.Transport`, with the wanted irradiance / pi.
 
     ``width`` makes a square of the points, whose neighbours then share out the strata of their rays.
     """
