@@ -152,11 +152,7 @@ class _Run:
         """Run a stage to its end, from the checkpoint if that lies in it or behind it."""
         degree, seed = self.settings.initial.kernel_degree, self.settings.seed
         found = self.found
-        if (
-            found is not None
-            and found.stage != plan.name
-            and _ORDER.index(found.stage) > _ORDER.index(plan.name)
-        ):
+        if found is not None and _ORDER.index(found.stage) > _ORDER.index(plan.name):
             # A later stage is under way: this one's surfels are those of the checkpoint.
             return found.surfels(plan.rates, self.device)
         if found is not None and found.stage == plan.name:
