@@ -94,7 +94,7 @@ def test_4_gradient_leads_back_to_where_the_ball_was(tmp_path: Path):
 
 def test_5_fit_light_finds_the_sun(tmp_path: Path):
     run("5_fit_light", tmp_path / "light.png")
-    found, true = np.split(read_image(tmp_path / "light.png"), 2)
+    found, true = np.split(read_image(tmp_path / "light.png"), 2, axis=1)
     sun = np.unravel_index(true.sum(axis=2).argmax(), true.shape[:2])
     brightest = np.unravel_index(found.sum(axis=2).argmax(), found.shape[:2])
     height, width = found.shape[:2]
