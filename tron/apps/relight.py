@@ -88,8 +88,8 @@ def main(settings: Settings) -> None:
         for light, clip in zip(lights, clips):
             report = _report(light, clip, scene, turn_cameras(cameras, turn.T), clock)
             write_atomic(light.output_dir / "relight.json", json.dumps(report, indent=1) + "\n")
-            rendered = len(cameras), len(clip.seconds), light.output_dir
-            log.info("%d frames, %d of them rendered now: %s", *rendered)
+            made = len(cameras), len(clip.seconds), light.output_dir / "relit.mp4"
+            log.info("%d frames, %d of them rendered now: look at %s", *made)
 
 
 class _Clock:
