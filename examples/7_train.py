@@ -23,7 +23,7 @@ main(settings)
 renderer = load_renderer(chosen.output / "renderer.safetensors")
 rows = []
 for clip in read_clips(chosen.dataset, "test"):
-    drawn = render_clip(renderer, clip.frames["pbr"], clip.frames["irradiance"], clip.meta.exposure)
+    drawn = render_clip(renderer, {name: clip.displayed(name) for name in renderer.config.guidance})
     rows.append(np.hstack([clip.displayed("pbr")[0], drawn[0], clip.displayed("rgb")[0]]))
 write_image(chosen.output / "train.jpg", np.vstack(rows[:3]).repeat(3, axis=0).repeat(3, axis=1))
 print(f"trained for {steps} steps: {chosen.output / 'train.jpg'}")
