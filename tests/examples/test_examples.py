@@ -13,7 +13,6 @@ import pytest
 from tron.gaussians import GaussianScene
 from tron.images import read_image
 from tron.shading import EnvironmentMap
-from tron.video import read_video
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SCRIPTS = sorted(EXAMPLES.glob("[0-9]_*.py"))
@@ -67,7 +66,7 @@ def load_stage() -> tuple[GaussianScene, EnvironmentMap]:
     return make_scene(0.08), make_light()
 
 
-def test_2_orbit_films_every_frame_and_they_differ(tmp_path: Path):
+def test_2_orbit_films_every_frame_and_they_differ(tmp_path: Path, read_video):
     run("2_orbit", tmp_path / "orbit.jpg")
     film = read_video(tmp_path / "orbit.mp4").astype(float)
     assert film.shape == (6, HEIGHT, WIDTH, 3)
