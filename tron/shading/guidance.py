@@ -197,5 +197,4 @@ def shade(
     """Guidance from a G-buffer and the share of the unshadowed irradiance that reaches each pixel."""
     colors = shade_surface(gbuffer, visibility, lighting, background)
     buffers = gbuffer.numpy()
-    images = {name: gbuffer.image(color) for name, color in colors.items()}
-    return Guidance(**images, mask=buffers["opacity"], gbuffer=buffers)
+    return Guidance(**gbuffer.images(colors), mask=buffers["opacity"], gbuffer=buffers)
