@@ -10,7 +10,7 @@ import numpy as np
 
 from eval.peers.contenders import Contenders
 from eval.peers.scene import camera
-from eval.relighting.shadows import DirectLight, shadow_classes
+from eval.relighting.shadows import shadow_pixels
 from eval.tracing.irradiance import REFERENCE_SEED, relative_rmse
 from eval.tracing.lights import LIGHTS
 from eval.tracing.measured import FewRays, LitImages
@@ -30,7 +30,7 @@ def measure_few_rays(contenders: Contenders, size: int, light: str, reference_sp
     spp = min(reference_spp, REFERENCE_SPP)
     truth = render_guidance(tracer, view, lighting, Estimation(rays=spp), REFERENCE_SEED)
     surface = truth.mask > 0
-    shadowed, _ = shadow_classes(DirectLight(truth.irradiance, truth.unshadowed), surface)
+    shadowed = shadow_pixels(truth.irradiance, truth.irradiance, truth.unshadowed, surface).shadowed
     plane = float(luminance(environment.unoccluded_upward()))
     mean, rmse, images = {}, {}, {"reference": truth.irradiance}
     for rays in RAYS:
