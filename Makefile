@@ -25,9 +25,10 @@ lint: setup  ## style, formatting, who may import whom, types
 	$(BIN)/lint-imports
 	$(BIN)/pyright
 
-format: setup  ## let ruff mend and format the code
+format: setup  ## let ruff mend and format the code, and bring README's file tree up to date
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
+	$(BIN)/python .ci/file_tree.py --write
 
 clean:  ## remove caches, build results and .venv; outputs/ stays
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .import_linter_cache .hypothesis

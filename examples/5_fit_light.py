@@ -26,4 +26,5 @@ settings = FitSettings(resolution=16, steps=60 if chosen.small else 400, rays=16
 fit = fit_environment(Capture(tuple(views), exposure=exposure), tracer, settings, track)
 found = fit.environment.resized(light.image.shape[0])
 write_image(chosen.output, to_display(np.vstack([found.image, light.image]), exposure))
-print(f"loss {fit.irradiance_loss[0]:.4f} -> {fit.irradiance_loss[-10:].mean():.4f}: {chosen.output}")
+loss = fit.cubemap.loss
+print(f"loss {loss[0]:.4f} -> {loss[-10:].mean():.4f}: {chosen.output}")

@@ -1,4 +1,4 @@
-"""What the examples share: their arguments, and a scene and a light made by formulas for those who give none.
+"""Arguments of the examples, and a scene and a light made by formulas for those who give none.
 
 A red ball and a metal ring on a chequered floor, under a low sun; z is up, lengths are metres.
 """

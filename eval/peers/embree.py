@@ -21,7 +21,7 @@ from tron.tracing.tiles import TILE
 from tron.tracing.transmittance import OPAQUE_TRANSMITTANCE, BackFaces, blocks
 
 RESTART_OFFSET = 1e-4
-"""How far behind a hit the next query starts, world units: what Mitsuba's volprim integrators use too."""
+"""Distance behind a hit at which the next query starts, world units; Mitsuba's volprim uses it too."""
 MAX_RESTARTS = 512
 
 
@@ -102,9 +102,9 @@ class RestartedShadows:
             found = self._traced.ray_intersect_preliminary(ray, coherent=mi.Bool(False), active=going)
             going &= found.is_valid()
             surfel = dr.select(going, found.prim_index >> 1, 0)
-            met = intersect(self._geometry, surfel, origin, direction, self._degree)
-            counts = going & blocks(met, self._back_faces)
-            product = dr.select(counts, product * (1 - met.alpha), product)
+            hit = intersect(self._geometry, surfel, origin, direction, self._degree)
+            counts = going & blocks(hit, self._back_faces)
+            product = dr.select(counts, product * (1 - hit.alpha), product)
             travelled = dr.select(going, travelled + found.t + RESTART_OFFSET, travelled)
             queries += 1
             going &= (product >= OPAQUE_TRANSMITTANCE) & (queries < MAX_RESTARTS)

@@ -37,7 +37,7 @@ _PLASTIC = 1.32471795724474602596
 
 @dataclass(frozen=True)
 class Recipe:
-    """How surfels are made of a surface.
+    """Recipe of surfels on a surface.
 
     Attributes:
         name: in the names of metrics; empty for the usual one.

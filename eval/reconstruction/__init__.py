@@ -1,1 +1,1 @@
-"""What the benchmark `reconstruction` measures: reconstructions, their lights, optimisation steps."""
+"""Benchmark `reconstruction`: reconstructions, their lights, optimisation steps."""

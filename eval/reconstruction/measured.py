@@ -130,7 +130,7 @@ class Steps(Timed):
         shape: the peer's plugin for its primitives, the faster of the two.
     """
 
-    kind = "trained"
+    kind = "step"
     degree: int
     agreement: float
     shape: str
@@ -139,11 +139,6 @@ class Steps(Timed):
     def case(self) -> str:
         """Name of the case in metrics, such as degree4_128."""
         return f"degree{self.degree}_{self.size}"
-
-    @property
-    def label(self) -> str:
-        """Name in times.json."""
-        return f"{self.kind} {self.count} {self.case}"
 
     def ratio(self, peer: str = VOLPRIM) -> float:
         """Time of the peer's step over TRON's."""
@@ -164,11 +159,6 @@ class Growth(Timed):
     """Times of TRON's own step on drawn surfels."""
 
     kind = "growth"
-
-    @property
-    def label(self) -> str:
-        """Name in times.json."""
-        return f"{self.kind} {self.count} {self.size}"
 
     @property
     def seconds(self) -> float:

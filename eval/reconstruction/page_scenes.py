@@ -157,7 +157,7 @@ def _alt(channel: str, compared: Compared, who: str) -> str:
 
 
 def light_section(measured: Measured) -> list[Section]:
-    """How far the fitted lights are from the true ones."""
+    """Errors of the fitted lights."""
     table = [
         [
             run.name,

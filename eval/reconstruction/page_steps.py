@@ -1,4 +1,4 @@
-"""What an optimisation step costs: beside Mitsuba's volprim, and as surfels and pixels grow."""
+"""Cost of an optimisation step, beside Mitsuba's volprim, and as surfels and pixels grow."""
 
 from __future__ import annotations
 

@@ -88,8 +88,10 @@ def peer_picture(primitives: mi.Scene, view: View, integrator: Any) -> Callable[
 
 
 def ellipsoids(surfels: LearntSurfels) -> tuple[Tensor, Tensor, Tensor]:
-    """The peer's parameters of surfels, differentiable: centres, scales and quaternions (M, 10), opacities
-    (M,), harmonics (M, 48).
+    """The peer's parameters of surfels, differentiable.
+
+    Returns:
+        Centres, scales and quaternions (M, 10), opacities (M,), harmonics (M, 48).
     """
     scales = surfels["log_scales"].exp()
     flat = volprim.THINNESS * scales.amin(1, keepdim=True)

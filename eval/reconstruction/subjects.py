@@ -1,4 +1,4 @@
-"""What optimisation steps are timed on: a reconstructed scene, and drawn surfels of any number."""
+"""Scenes on which optimisation steps are timed: a reconstructed one, and drawn surfels of any number."""
 
 from __future__ import annotations
 
@@ -35,8 +35,11 @@ def first_trained(folder: Path, way: str) -> str:
 
 
 def trained(folder: Path, way: str, size: int) -> tuple[GaussianScene, View, float]:
-    """The first scene reconstructed in a way below the benchmark's folder, a held-out view of it resized to
-    ``size`` x ``size`` pixels, and its extent.
+    """The first scene reconstructed in a way, a held-out view of it, and its extent.
+
+    Args:
+        folder: of the benchmark.
+        size: width and height to which the view is resized, pixels.
 
     Raises:
         TronError: none is there.
@@ -58,7 +61,7 @@ def trained(folder: Path, way: str, size: int) -> tuple[GaussianScene, View, flo
 def drawn(count: int, size: int, seed: int) -> tuple[GaussianScene, View, float]:
     """The tracing benchmark's surfels and view, with a photo that is their own picture, dimmed."""
     scene, view = surfels(count, seed), camera(size)
-    seen = SurfelTracer(scene).gbuffer(view).numpy()["rgb"]
-    photo = np.clip(_DIMMED * seen + (1 - _DIMMED) / 2, 0, 1)
+    rendered = SurfelTracer(scene).gbuffer(view).numpy()["rgb"]
+    photo = np.clip(_DIMMED * rendered + (1 - _DIMMED) / 2, 0, 1)
     extent = float(np.linalg.norm(view.position - np.median(scene.means, axis=0)))
     return scene, View("drawn", view, photo, "display"), extent

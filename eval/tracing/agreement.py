@@ -11,7 +11,6 @@ from eval.tracing.measured import SamePicture
 from tron import metrics, seeds
 from tron.gaussians.scene import GaussianScene
 from tron.tracing import reference
-from tron.tracing.kernel import MAX_ALPHA, MIN_ALPHA, MIN_RESPONSE, T_MIN
 
 RAYS = 300
 
@@ -30,21 +29,6 @@ def hits_a_ray(scene: GaussianScene, size: int, seed: int) -> tuple[float, float
     chosen = seeds.generator(seed, "tracing", "hits").choice(
         size * size, min(RAYS, size * size), replace=False
     )
-    directions = view.rays().reshape(-1, 3)[chosen].astype(np.float64)
-    normals, opacities, scales = scene.normals(), scene.opacities(), scene.scales()
-    tangents = scene.tangents()
-    offset = view.position - scene.means
-    hit = front = 0
-    for direction in directions:
-        facing = normals @ direction
-        t = -(offset * normals).sum(1) / facing
-        point = offset + t[:, None] * direction
-        q = sum(((point * axis).sum(1) / scales[:, k]) ** 2 for k, axis in enumerate(tangents))
-        response = np.exp(-q / 2) if scene.kernel_degree == 2 else np.exp(-q * q / 18)
-        alpha = np.minimum(opacities * response, MAX_ALPHA)
-        counted = (response >= MIN_RESPONSE) & (alpha >= MIN_ALPHA) & (t > T_MIN)
-        hit += counted.sum()
-        front += (counted & (facing < 0)).sum()
-    origins = np.tile(view.position, (len(directions), 1))
-    hits = reference.composite(scene, origins, directions).hits
-    return float(hit / len(chosen)), float(front / len(chosen)), float(hits.mean())
+    directions = view.rays().reshape(-1, 3)[chosen]
+    found = reference.composite(scene, np.tile(view.position, (len(chosen), 1)), directions)
+    return float(found.candidates.mean()), float(found.front.mean()), float(found.hits.mean())

@@ -10,6 +10,7 @@ aligned block as across its border, unless pixels of a block share something: th
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import drjit as dr
@@ -25,7 +26,7 @@ from tron import seeds
 from tron.cameras import mitsuba_sensor
 from tron.color import luminance
 from tron.shading import EnvironmentLight, Estimation, Lighting, irradiance, render_guidance
-from tron.shading.guidance import reaching_share, shade
+from tron.shading.guidance import Guidance, reaching_share, shade
 from tron.shading.irradiance import ORIGIN_OFFSET
 from tron.tracing import GBuffer, SurfelTracer
 from tron.tracing.bvh import build_bvh
@@ -71,26 +72,56 @@ def measure_direct(contenders: Contenders, size: int, light: str, seed: int, rou
     return DirectTimes(len(contenders.scene), size, times, lit)
 
 
+class LitView:
+    """The benchmark's view of the surfels under one light, beside a rendering of many rays per pixel.
+
+    Attributes:
+        tracer: of the surfels.
+        lighting: the prepared light.
+        truth: the rendering of many rays.
+        surface: (H, W) bool, pixels with a surface.
+    """
+
+    def __init__(self, contenders: Contenders, size: int, light: str, reference_spp: int, seed: int) -> None:
+        environment = LIGHTS[light]()
+        self.tracer, self.lighting = contenders.tracer, Lighting(environment)
+        self._light, self._exposure = light, environment.exposure()
+        self._plane = float(luminance(environment.unoccluded_upward()))
+        self._view, self._seed = camera(size), seed
+        self.truth = self._render(Estimation(rays=reference_spp), REFERENCE_SEED)
+        self.surface = self.truth.mask > 0
+
+    def _render(self, estimation: Estimation, seed: int) -> Guidance:
+        return render_guidance(self.tracer, self._view, self.lighting, estimation, seed)
+
+    def trials(self, count: int, rays: int, filtered: bool = False) -> list[np.ndarray]:
+        """Irradiance of few rays, (H, W, 3) each."""
+        estimation = Estimation(rays=rays, filtered=filtered)
+        return [self._render(estimation, self._seed + k).irradiance for k in range(count)]
+
+    def rmse(self, trials: Sequence[np.ndarray]) -> float:
+        """Error of trials as a share of an upward plane's light."""
+        return relative_rmse(trials, self.truth.irradiance, self.surface, self._plane)
+
+    def images(self, trials: Mapping[str, Sequence[np.ndarray]]) -> LitImages:
+        """The first trial of each way, and the reference."""
+        firsts = {way: images[0] for way, images in trials.items()}
+        return LitImages(self._light, self._exposure, {"reference": self.truth.irradiance, **firsts})
+
+
 def measure_noise(contenders: Contenders, size: int, light: str, reference_spp: int, seed: int) -> Noise:
     """Errors of TRON's and of independent sampling at 2 and 64 rays, and at the time of TRON's 64."""
-    environment = LIGHTS[light]()
-    view, lighting, tracer = camera(size), Lighting(environment), contenders.tracer
-    gbuffer = tracer.gbuffer(view)
-    surface = gbuffer.numpy()["opacity"] > 0
-    plane = float(luminance(environment.unoccluded_upward()))
-    truth = render_guidance(tracer, view, lighting, Estimation(rays=reference_spp), REFERENCE_SEED).irradiance
+    lit = LitView(contenders, size, light, reference_spp, seed)
+    tracer, lighting, gbuffer = lit.tracer, lit.lighting, lit.tracer.gbuffer(camera(size))
 
-    def ours(spp: int, trial: int, denoise: bool = False) -> np.ndarray:
-        return render_guidance(
-            tracer, view, lighting, Estimation(rays=spp, filtered=denoise), seed + trial
-        ).irradiance
-
-    def independent(spp: int, trial: int) -> np.ndarray:
-        shadowed, unshadowed = independent_irradiance(tracer, gbuffer, lighting.light, spp, seed + trial)
-        share = reaching_share(
-            shadowed, unshadowed, gbuffer, lighting, tracer.scene.spacing, Estimation(rays=spp)
-        )
-        return shade(gbuffer, share, lighting).irradiance
+    def independent(rays: int) -> list[np.ndarray]:
+        images = []
+        for k in range(TRIALS):
+            sums = independent_irradiance(tracer, gbuffer, lighting.light, rays, seed + k)
+            estimation = Estimation(rays=rays)
+            share = reaching_share(*sums, gbuffer, lighting, tracer.scene.spacing, estimation)
+            images.append(shade(gbuffer, share, lighting).irradiance)
+        return images
 
     times = interleaved(
         {
@@ -100,35 +131,27 @@ def measure_noise(contenders: Contenders, size: int, light: str, reference_spp: 
         Rounds(3),
     )
     equal = max(2, 2 * round(MANY / 2 * times["tron"].over(times["independent"])))
-    few, many = ([ours(spp, k) for k in range(TRIALS)] for spp in (FEW, MANY))
-    alone_few, alone_many = ([independent(spp, k) for k in range(TRIALS)] for spp in (FEW, MANY))
-    estimates = {
-        "rmse_2spp": few,
-        "rmse_64spp": many,
-        "rmse_2spp_denoised": [ours(FEW, k, denoise=True) for k in range(TRIALS)],
-        "independent_rmse_2spp": alone_few,
-        "independent_rmse_64spp": alone_many,
-        "independent_rmse_equal_time": [independent(equal, k) for k in range(TRIALS)],
+    trials = {
+        "rmse_2spp": lit.trials(TRIALS, FEW),
+        "independent_rmse_2spp": independent(FEW),
+        "rmse_2spp_denoised": lit.trials(TRIALS, FEW, filtered=True),
+        "rmse_64spp": lit.trials(TRIALS, MANY),
+        "independent_rmse_64spp": independent(MANY),
+        "independent_rmse_equal_time": independent(equal),
     }
-    rmse = {name: relative_rmse(images, truth, surface, plane) for name, images in estimates.items()}
     blocks = {}
     for side in (4, 8):
-        for whose, images in (("", many), ("independent_", alone_many)):
-            errors = luminance(np.stack(images) - truth)
+        for whose in ("", "independent_"):
+            errors = luminance(np.stack(trials[f"{whose}rmse_64spp"]) - lit.truth.irradiance)
             name = f"{whose}block_correlation_{side}x{side}"
-            blocks[name] = block_correlation(errors, surface, side)
-    images = {
-        "reference": truth,
-        "tron 2": few[0],
-        "independent 2": alone_few[0],
-        "denoised 2": estimates["rmse_2spp_denoised"][0],
-        "tron 64": many[0],
-        "independent 64": alone_many[0],
-    }
-    return Noise(LitImages(light, environment.exposure(), images), TRIALS, rmse, blocks, equal)
+            blocks[name] = block_correlation(errors, lit.surface, side)
+    rmse = {name: lit.rmse(images) for name, images in trials.items()}
+    return Noise(lit.images(trials), TRIALS, rmse, blocks, equal)
 
 
-def relative_rmse(images: list[np.ndarray], truth: np.ndarray, surface: np.ndarray, plane: float) -> float:
+def relative_rmse(
+    images: Sequence[np.ndarray], truth: np.ndarray, surface: np.ndarray, plane: float
+) -> float:
     """Root mean square over trials, pixels with a surface and channels, over an upward plane's light."""
     squares = [((image - truth)[surface].astype(np.float64) ** 2).mean() for image in images]
     return float(np.sqrt(np.mean(squares)) / plane)

@@ -25,14 +25,6 @@ BLOCK_WORDS = {
     "block_correlation_8x8": "TRON, 8 × 8 blocks",
     "independent_block_correlation_8x8": "independent, 8 × 8 blocks",
 }
-NOISE_PICTURES = {
-    "tron 2": "TRON, 2 rays",
-    "independent 2": "independent, 2 rays",
-    "denoised 2": "TRON, 2 rays, denoised",
-    "tron 64": "TRON, 64 rays",
-    "independent 64": "independent, 64 rays",
-    "reference": "reference",
-}
 TWICE = "Pixels are shown twice as large."
 
 
@@ -95,9 +87,9 @@ def noise_section(measured: Measured, output_dir: Path) -> list[Section]:
     correlations = [
         [words, *(f"{noise.blocks[name]:+.4f}" for noise in noises)] for name, words in BLOCK_WORDS.items()
     ]
-    groups = [
-        _pictures(noise.lit, NOISE_PICTURES, TWICE, columns=3, enlarged=2, strong="TRON") for noise in noises
-    ]
+    titles = {name: words for name, words in NOISE_WORDS.items() if "time" not in name}
+    titles["reference"] = "reference"
+    groups = [_pictures(noise.lit, titles, TWICE, columns=3, enlarged=2, strong="TRON") for noise in noises]
     write_strips(groups, [f"irradiance-{light}" for light in lights], output_dir / "pictures")
     blocks: list[Block] = [
         intro,

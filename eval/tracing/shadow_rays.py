@@ -37,7 +37,7 @@ STRAYS, STRAY_DISTANCE = 20, 10_000.0
 
 @dataclass
 class Occluder:
-    """What the irradiance pass asks of a tracer; ``transmittance`` traces one ray a lane."""
+    """Tracer as the irradiance pass sees it; ``transmittance`` traces one ray a lane."""
 
     scene: GaussianScene
     transmittance: Callable[[mi.Point3f, mi.Vector3f, mi.Bool], mi.Float]
@@ -50,7 +50,7 @@ class Occluder:
 
 
 def occluders(contenders: Contenders) -> dict[str, Occluder]:
-    """What stands in the way of the pass: nothing, or quads, opaque or not.
+    """Occluders of the pass: nothing, or quads, opaque or not.
 
     Nothing still looks at the ray, so that no one optimises it away.
     """

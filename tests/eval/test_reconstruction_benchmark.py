@@ -378,4 +378,4 @@ def test_the_whole_benchmark_with_the_real_commands(shared_data: Path, tmp_path:
     page = (tmp_path / "report.html").read_text()
     for anchor in ("targets", "scenes", "views", "light", "fox", "steps", "limits", "stages"):
         assert f'id="{anchor}"' in page
-    assert len(json.loads((tmp_path / "times.json").read_text())["trained 600 degree4_32"]["tron"]) == 1
+    assert len(json.loads((tmp_path / "times.json").read_text())["step degree4_32"]["tron"]) == 1

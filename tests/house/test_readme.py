@@ -13,6 +13,7 @@ from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.images import read_image, write_image
 
 README = Path(__file__).resolve().parents[2] / "README.md"
+PYTHON = README.parent / "docs/python.md"
 
 
 def plane_view() -> GBufferView:
@@ -38,13 +39,14 @@ def plane_view() -> GBufferView:
 
 @pytest.mark.usefixtures("variant")
 def test_the_python_examples_do_what_they_say(tmp_path, monkeypatch):
-    first, second = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    first, second = re.findall(r"```python\n(.*?)```", PYTHON.read_text(), re.DOTALL)
+    assert first in README.read_text()
     assert "width=512, height=512" in first
     surfels_from_gbuffers([plane_view()], count=500).save(tmp_path / "scene.ply")
     write_image(tmp_path / "studio.hdr", np.full((16, 32, 3), 0.7, np.float32))
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
-    exec(compile(first.replace("512", "24"), str(README), "exec"), names)
+    exec(compile(first.replace("512", "24"), str(PYTHON), "exec"), names)
     pbr = read_image(tmp_path / "pbr.exr")
     assert pbr.shape == (24, 24, 3)
     # A grey floor under a constant light of 0.7: half of it comes back, and a little gloss.
@@ -53,7 +55,7 @@ def test_the_python_examples_do_what_they_say(tmp_path, monkeypatch):
 
     assert "steps=500" in second
     smaller = second.replace("512", "24").replace("steps=500", "steps=30, scale_steps=2")
-    exec(compile(smaller, str(README), "exec"), names)
+    exec(compile(smaller, str(PYTHON), "exec"), names)
     assert names["surfels"]["base_color"].grad.abs().max() > 0
     assert names["tracer"].scene is not names["scene"]
     # Above the horizon, where the floor sees it, the light comes back as it was.
@@ -84,3 +86,10 @@ def test_files_that_the_readme_links_exist():
     links = [link for link in re.findall(r"\]\(([^)]+)\)", README.read_text()) if "://" not in link]
     assert links
     assert [link for link in links if not (README.parent / link).is_file()] == []
+
+
+def test_the_file_tree_is_that_of_today():
+    done = subprocess.run(
+        [sys.executable, README.parent / ".ci/file_tree.py"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout in README.read_text(), "the README's file tree is old: make format"

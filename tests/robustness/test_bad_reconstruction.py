@@ -114,7 +114,7 @@ BAD = {
         "absent",
     ),
     "maps, none": (["capture={inputs}/good", "prior=precomputed", "prior.folder={inputs}/empty"], "empty"),
-    "a prior's number": (["capture={inputs}/good", "prior.roughness=7"], "roughness is 7"),
+    "a prior's number": (["capture={inputs}/good", "prior.roughness=7"], "prior.roughness"),
     "a prior's word": (["capture={inputs}/good", "prior.tone_curve=film"], "film"),
     "output is a file": (["capture={inputs}/good", "output_dir={inputs}/file"], "file"),
     "a size no light has": (

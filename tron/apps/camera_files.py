@@ -49,21 +49,23 @@ def read_cameras(path: Path, width: int, height: int) -> list[Camera]:
 
 
 def _nerfstudio(content: dict[str, Any]) -> list[Camera]:
-    """Cameras of nerfstudio's camera_path.json: 16 numbers camera-to-world, row-major, in OpenGL's axes, and
-    the vertical field of view in degrees."""
+    """Cameras of nerfstudio's camera_path.json.
+
+    Each has 16 numbers camera-to-world, row-major, in OpenGL's axes, and the vertical field of view, degrees.
+    """
     kind = content.get("camera_type", "perspective")
     if kind != "perspective":
         raise TronError(f"nerfstudio's camera path is {kind}", mend="save a perspective one")
     try:
         width, height = int(content["render_width"]), int(content["render_height"])
-        return [_seen_by(entry, width, height) for entry in content["camera_path"]]
+        return [_camera(entry, width, height) for entry in content["camera_path"]]
     except KeyError as error:
         raise TronError(f"nerfstudio's camera path lacks {error.args[0]!r}") from error
     except (TypeError, ValueError, ZeroDivisionError) as error:
         raise TronError(f"nerfstudio's camera path has an unreadable field: {error}") from error
 
 
-def _seen_by(entry: dict[str, Any], width: int, height: int) -> Camera:
+def _camera(entry: dict[str, Any], width: int, height: int) -> Camera:
     to_world = opengl_to_opencv(np.asarray(entry["camera_to_world"], np.float64).reshape(4, 4))
     focal = 0.5 * height / math.tan(0.5 * math.radians(float(entry["fov"])))
     return Camera(focal, focal, width / 2, height / 2, width, height, np.linalg.inv(to_world))

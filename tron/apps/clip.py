@@ -1,10 +1,11 @@
-"""One light's clip on disk: linear buffers that are traced once, pictures developed from them, and videos."""
+"""One light's clip on disk: linear buffers that are traced once, pictures made of them, and videos."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from tron.cli.progress import track
 from tron.color import to_display
 from tron.estimation import Estimation
 from tron.gaussians.scene import GaussianScene
+from tron.images import write_image
 
 if TYPE_CHECKING:
     from tron.shading.environment import EnvironmentMap
@@ -51,14 +53,21 @@ class Clip:
     keeps_linear: bool = False
     seconds: list[float] = field(default_factory=list)
 
-    def develop(self, index: int) -> None:
+    @cached_property
+    def lighting(self) -> Lighting:
+        """The environment, prepared when the first frame is traced."""
+        from tron.shading.guidance import Lighting
+
+        return Lighting(self.environment)
+
+    def write_pictures(self, index: int) -> None:
         """Write the pictures of a frame whose buffers are there, those that need no network."""
         for name in GUIDANCE:
             self.folder.write_picture(index, name, to_display(self.folder.read(index, name), self.exposure))
         if not self.picture.neural:
             self.folder.write_picture(index, "relit", self.picture.display(self.folder, index, self.exposure))
         if self.keeps_linear:
-            self.folder.write_linear(index, "relit", self.picture.linear(self.folder, index))
+            write_image(self.folder.path(index, "relit", "exr"), self.picture.linear(self.folder, index))
         else:  # that of an earlier run may stand before another background
             self.folder.path(index, "relit", "exr").unlink(missing_ok=True)
 
@@ -99,37 +108,30 @@ def trace(
     estimation: Estimation,
     seed: int,
 ) -> None:
-    """Trace the frames that are missing, each view once for all lights, and develop all of them.
+    """Trace the frames that are missing, each view once for all lights, and write the pictures of all.
 
     Args:
-        scene: the surfels. cameras: one a frame.
+        scene: the surfels.
+        cameras: one a frame.
+        clips: one a light.
         estimation: of the shadows.
         seed: root of their random numbers; a frame's do not depend on the light.
     """
     tracer_for = _tracers(scene)
-    prepared: dict[int, Lighting] = {}
-    seen: tuple[Camera, SurfelTracer, GBuffer] | None = None
+    view: tuple[Camera, SurfelTracer, GBuffer] | None = None
     for index, camera in enumerate(track(cameras, "guidance")):
-        for number, clip in enumerate(clips):
+        for clip in clips:
             if not clip.folder.finished(index):
                 started = time.perf_counter()
-                if number not in prepared:
-                    prepared[number] = _lighting(clip.environment)
-                if seen is None or seen[0] is not camera:
+                if view is None or view[0] is not camera:
                     tracer = tracer_for(camera)
-                    seen = camera, tracer, tracer.gbuffer(camera)
-                lighting = prepared[number].turned_to(clip.rotations[index])
+                    view = camera, tracer, tracer.gbuffer(camera)
+                lighting = clip.lighting.turned_to(clip.rotations[index])
                 ray_seed = seeds.integer(seed, "relight", index)
-                buffers = _shade(*seen[1:], lighting, clip.folder.buffers, estimation, ray_seed)
+                buffers = _shade(*view[1:], lighting, clip.folder.buffers, estimation, ray_seed)
                 clip.seconds.append(time.perf_counter() - started)
                 clip.folder.write(index, buffers)
-            clip.develop(index)
-
-
-def _lighting(environment: EnvironmentMap) -> Lighting:
-    from tron.shading.guidance import Lighting
-
-    return Lighting(environment)
+            clip.write_pictures(index)
 
 
 def _tracers(scene: GaussianScene) -> Callable[[Camera], SurfelTracer]:

@@ -1,5 +1,4 @@
-"""The frames of a run on disk: linear buffers that are rendered once, and pictures that are developed from
-them.
+"""Frames of a run on disk: linear buffers that are rendered once, and pictures made from them.
 
 A file appears under its name only when it is whole, so a frame is finished exactly if its files are there.
 What the frames were made with stands beside them; frames of other settings are never mixed in silently.
@@ -13,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
+from tron.apps.labelled_sheet import thumbnail
 from tron.claim import first_difference, read_recipe, require_same
 from tron.errors import TronError
 from tron.images import read_image, write_image
@@ -56,7 +55,7 @@ class FrameFolder:
         write_atomic(record, json.dumps(made_with, indent=1) + "\n")
 
     def path(self, index: int, name: str, suffix: str) -> Path:
-        """Where frame `index`'s buffer or picture `name` is; suffix "exr" or "png"."""
+        """File of frame `index`'s buffer or picture `name`; suffix "exr" or "png"."""
         return self.folder / f"{index:04d}.{name}.{suffix}"
 
     def finished(self, index: int) -> bool:
@@ -76,10 +75,6 @@ class FrameFolder:
         """A frame's buffer as (H, W, 3) float32."""
         return read_image(self.path(index, name, "exr"))
 
-    def write_linear(self, index: int, name: str, image: np.ndarray) -> None:
-        """Write linear values that follow from the buffers, (H, W, 3) or (H, W, 4), as NNNN.NAME.exr."""
-        write_image(self.path(index, name, "exr"), image)
-
     def write_picture(self, index: int, name: str, display: np.ndarray) -> None:
         """Write display values in [0, 1], (H, W, 3) or with straight alpha (H, W, 4), as NNNN.NAME.png."""
         write_image(self.path(index, name, "png"), display)
@@ -98,19 +93,12 @@ class FrameFolder:
     def write_sheet(self, path: Path, frames: int, names: Sequence[str]) -> None:
         """Write a contact sheet: a column for each of a few frames evenly spread, a row for each picture."""
         columns = np.linspace(0, frames, min(frames, _SHEET_COLUMNS), endpoint=False).astype(int)
-        rows = [[_thumbnail(self.row(index, [name])) for index in columns] for name in names]
-        write_image(path, np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0))
+        width = min(read_image(self.path(0, names[0], "png")).shape[1], _SHEET_WIDTH)
+        rows = [[thumbnail(self.row(index, [name]), width) for index in columns] for name in names]
+        sheet = np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0)
+        write_image(path, sheet.astype(np.float32) / 255)
 
 
 def _over_black(path: Path) -> np.ndarray:
     picture = read_image(path, channels=4)
     return picture[..., :3] * picture[..., 3:]
-
-
-def _thumbnail(display: np.ndarray) -> np.ndarray:
-    height, width = display.shape[:2]
-    if width <= _SHEET_WIDTH:
-        return display
-    size = (_SHEET_WIDTH, max(1, round(height * _SHEET_WIDTH / width)))
-    picture = Image.fromarray(np.round(np.clip(display, 0, 1) * 255).astype(np.uint8))
-    return np.asarray(picture.resize(size, Image.Resampling.LANCZOS), dtype=np.float32) / 255

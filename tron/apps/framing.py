@@ -35,7 +35,13 @@ _NEAREST = 1.2
 
 @dataclass(frozen=True)
 class Subject:
-    """What is worth looking at: surfel centres (N, 3), and centre (3,) and radius of their sphere, world."""
+    """Part of a scene that is worth looking at.
+
+    Attributes:
+        points: (N, 3) surfel centres, world.
+        centre: (3,) of their sphere, world.
+        radius: of that sphere, world units.
+    """
 
     points: np.ndarray
     centre: np.ndarray
@@ -83,26 +89,19 @@ def plan_cameras(
 ) -> list[Camera]:
     """A camera path around the scene's subject.
 
-    width, height: pixels; fov_deg: horizontal, degrees; distance: a factor on the automatic stand-off.
+    Args:
+        scene: the surfels, and which way is up.
+        trajectory: name of a path in tron.trajectories.
+        frames: number of cameras.
+        width, height: pixels.
+        fov_deg: horizontal field of view, degrees.
+        distance: factor on the automatic distance.
     """
     subject = find_subject(scene)
-    path = {
-        "orbit": trajectories.orbit,
-        "spiral": trajectories.spiral,
-        "oscillating": trajectories.oscillating,
-        "still": trajectories.still,
-    }[trajectory]
+    view = {"target": subject.centre, "up": scene.up, "width": width, "height": height, "fov_deg": fov_deg}
 
     def at(radius: float) -> list[Camera]:
-        return path(
-            frames,
-            target=subject.centre,
-            radius=radius,
-            width=width,
-            height=height,
-            fov_deg=fov_deg,
-            up=scene.up,
-        )
+        return getattr(trajectories, trajectory)(frames, radius=radius, **view)
 
     probes = subject.points[:: max(1, len(subject.points) // _PROBES)]
     # From the far end a sphere around the subject fits into any frame; bisection of the logarithm from there.

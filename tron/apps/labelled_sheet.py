@@ -39,11 +39,12 @@ def labelled_sheet(
         top = 18 + row * (height + _GAP)
         draw.text((4, top + 4), label, fill=(_INK,) * 3, font=font)
         for column, image in enumerate(images):
-            sheet.paste(_thumbnail(image, width), (_LABEL_WIDTH + column * (width + _GAP), top))
+            sheet.paste(thumbnail(image, width), (_LABEL_WIDTH + column * (width + _GAP), top))
     return np.asarray(sheet)
 
 
-def _thumbnail(image: np.ndarray, width: int) -> Image.Image:
+def thumbnail(image: np.ndarray, width: int) -> Image.Image:
+    """A display image (h, w, 3) or (h, w) in [0, 1] made `width` pixels wide, as 8-bit RGB."""
     color = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
     picture = Image.fromarray(np.round(255 * np.clip(color, 0, 1)).astype(np.uint8))
     size = (width, max(1, round(width * picture.height / picture.width)))

@@ -48,17 +48,24 @@ def main(settings: Settings) -> None:
     relight.json; with a checkpoint also NNNN.neural.png and neural.mp4. A run that was interrupted goes on
     where it stopped when it is started again.
     """
+    from tron.shading.environment import EnvironmentMap  # Mitsuba: not for --help or a mistyped key
+
     clock = _Clock()
     lights = settings.by_light()
     _check_paths(settings, lights)
     size = settings.width, settings.height
     given = None if settings.cameras is None else read_cameras(settings.cameras, *size)
-    environments = [_load_environment(light) for light in lights]
+    environments = [EnvironmentMap.load(light.environment) for light in lights]
     renderer = _load_renderer(settings)
     scene = _load_scene(settings)
     turn = upright(scene.up)  # to +z, which is up in environment maps
     scene = scene if np.allclose(turn, np.eye(3)) else scene.rotated(turn)
-    cameras = _plan(scene, settings) if given is None else turn_cameras(given, turn)
+    if given is not None:
+        cameras = turn_cameras(given, turn)
+    else:
+        view = {"width": settings.width, "height": settings.height, "fov_deg": settings.fov}
+        path = settings.trajectory, settings.frames
+        cameras = plan_cameras(scene, *path, **view, distance=settings.distance)
     activate(settings.variant, settings.threads)
     clips = [_clip(light, environment, len(cameras)) for light, environment in zip(lights, environments)]
     clock.lap("loading")
@@ -131,13 +138,6 @@ def _load_scene(settings: Settings) -> GaussianScene:
     return scene
 
 
-def _load_environment(settings: Settings) -> EnvironmentMap:
-    from tron.shading.environment import EnvironmentMap
-
-    assert isinstance(settings.environment, Path)
-    return EnvironmentMap.load(settings.environment)
-
-
 def _load_renderer(settings: Settings) -> Any:
     """The network, before any frame is traced, so that a wrong file is found at once; None without one."""
     if settings.checkpoint is None:
@@ -148,18 +148,6 @@ def _load_renderer(settings: Settings) -> Any:
     if settings.threads is not None:
         set_torch_threads(settings.threads)
     return load_renderer(settings.checkpoint, settings.vae).to(torch_device(settings.variant))
-
-
-def _plan(scene: GaussianScene, settings: Settings) -> list[Camera]:
-    return plan_cameras(
-        scene,
-        settings.trajectory,
-        settings.frames,
-        width=settings.width,
-        height=settings.height,
-        fov_deg=settings.fov,
-        distance=settings.distance,
-    )
 
 
 def _clip(light: Settings, environment: EnvironmentMap, frames: int) -> Clip:
@@ -176,7 +164,7 @@ def _clip(light: Settings, environment: EnvironmentMap, frames: int) -> Clip:
 
 
 def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> dict[str, Any]:
-    """What the pixels of the linear frames depend on, as JSON values."""
+    """Recipe of the linear frames: all that their pixels depend on, as JSON values."""
     keys = {"rotation", "trajectory", "quality", "width", "height", "fov", "distance", "seed", "variant"}
     assert isinstance(light.environment, Path)
     return {

@@ -1,4 +1,4 @@
-"""The relit picture: what a run of tron-relight is for, developed from the buffers on disk.
+"""The relit picture: what a run of tron-relight is for, made of the buffers on disk.
 
 With a checkpoint it is the neural picture, without one `shadowed` (diffuse light with traced shadows plus
 split-sum reflections). What stands behind the surfels is chosen:
@@ -30,10 +30,10 @@ Background = Literal["environment", "transparent"] | tuple[Channel, Channel, Cha
 
 @dataclass(frozen=True)
 class RelitPicture:
-    """How a frame's relit picture is made of its buffers.
+    """Recipe of a frame's relit picture.
 
     Attributes:
-        background: see above.
+        background: behind the surfels: "environment", "transparent" or a display colour, see above.
         neural: whether a network draws the surfels.
     """
 

@@ -15,16 +15,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Annotated
 
 import numpy as np
+import pydantic
+from pydantic import Field
 
 from tron.captures import Capture, View
 from tron.captures.view import Pixels
 from tron.color import luminance
 from tron.errors import TronError
-from tron.priors.linear_light import ToneCurve, check_tone_curve, linear_light
+from tron.priors.linear_light import ToneCurve, linear_light
 from tron.priors.map_geometry import resized, world_normals
-from tron.priors.prior import GBuffers, Maps, Request, Track
+from tron.priors.prior import CONFIG, GBuffers, Maps, Request, Track
 from tron.priors.retinex import residual_shading
 from tron.priors.shading_fit import Shading, chromaticity, fit_shading
 from tron.priors.sky import capture_radius, sky_mask
@@ -34,20 +37,24 @@ _OPAQUE = 0.5
 _FLOOR = 1e-3  # linear; below it, 8 bits hold neither luminance nor colour
 _LIMIT = 2.0  # log units: no shadow is deeper for its colour, and no highlight brighter
 _PERCENTILE = 95
-_POSITIVE = ("brightest", "groups", "edge", "chroma_edge", "grey", "screening")
-_POSITIVE += ("longest_side", "samples", "sky_distance")
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Positive = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1)]
 
 
-@dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True, config=CONFIG)
 class Classical:
     """The default prior. Everything but the constants waits for the geometry.
 
     Attributes:
-        roughness, metallic: the constants that are given everywhere.
+        roughness: given everywhere.
+        metallic: given everywhere.
         tone_curve: how display images are decoded: "srgb" for photos, "agx" for path-traced pictures.
         brightest: base color of the 95th percentile of all surface points, largest channel.
         groups: chromaticities that are told apart when light and color are.
-        edge, chroma_edge: log differences from which on a change is of color, not of light.
+        edge: log difference of luminance from which on a change is of color, not of light.
+        chroma_edge: log difference of chromaticity, likewise.
         grey: log chromaticity below which a colour says nothing of the material, so that its brightness
             is believed.
         screening: how much a colour seen elsewhere counts against what neighbouring pixels say.
@@ -57,31 +64,22 @@ class Classical:
         seed: root of the samples and the clustering.
 
     Raises:
-        TronError: a number outside its range.
+        ValidationError: a number outside its range.
     """
 
-    roughness: float = 0.6
-    metallic: float = 0.0
+    roughness: Share = 0.6
+    metallic: Share = 0.0
     tone_curve: ToneCurve = "srgb"
-    brightest: float = 0.8
-    groups: int = 24
-    edge: float = 0.3
-    chroma_edge: float = 0.2
-    grey: float = 0.15
-    screening: float = 0.1
-    longest_side: int = 256
-    samples: int = 20_000
-    sky_distance: float = 10.0
+    brightest: Positive = 0.8
+    groups: Count = 24
+    edge: Positive = 0.3
+    chroma_edge: Positive = 0.2
+    grey: Positive = 0.15
+    screening: Positive = 0.1
+    longest_side: Count = 256
+    samples: Count = 20_000
+    sky_distance: Positive = 10.0
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_tone_curve(self.tone_curve)
-        for name in ("roughness", "metallic"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise TronError(f"{name} is {getattr(self, name)}", mend="give a number in [0, 1]")
-        for name in _POSITIVE:
-            if not getattr(self, name) > 0:
-                raise TronError(f"{name} is {getattr(self, name)}", mend="give a positive number")
 
     @property
     def needs_geometry(self) -> frozenset[str]:

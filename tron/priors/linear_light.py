@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from tron.captures import View
 from tron.color import agx, srgb_to_linear
-from tron.errors import TronError
 
 ToneCurve = Literal["srgb", "agx"]
 
 _TABLE = 4096
 _AGX_STOPS = (-12.4, 4.0)  # within the range that AgX does not clip
-
-
-def check_tone_curve(curve: str) -> None:
-    """TronError names a curve that there is not."""
-    if curve not in get_args(ToneCurve):
-        raise TronError(f"tone_curve is {curve!r}", mend=f"use {' or '.join(get_args(ToneCurve))}")
 
 
 def linear_light(view: View, exposure: float, curve: ToneCurve) -> np.ndarray:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from tron.cameras import Camera
-from tron.errors import TronError
 
 NormalFrame = Literal["camera_opengl", "camera_opencv", "world"]
 """Axes of a normal map: x right, y up, z towards the viewer (OpenGL); x right, y down, z away (OpenCV)."""
@@ -16,12 +15,6 @@ ASPECT_TOLERANCE = 0.01
 """Relative difference of aspect ratios that rounding to whole pixels, or to multiples of 8, explains."""
 
 _UNIT_RANGE = (0.5, 1.5)  # lengths of vectors that are normals, give or take what a network gets wrong
-
-
-def check_normal_frame(frame: str) -> None:
-    """TronError names a frame that there is not."""
-    if frame not in get_args(NormalFrame):
-        raise TronError(f"normal_frame is {frame!r}", mend=f"use {', '.join(get_args(NormalFrame))}")
 
 
 def world_normals(normals: np.ndarray, camera: Camera, frame: NormalFrame) -> np.ndarray:

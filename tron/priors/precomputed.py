@@ -16,12 +16,13 @@ Maps must show the pixels of the view: where photos were undistorted, run the pr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
+import pydantic
+from pydantic import Field
 
 from tron.captures import Capture, View
 from tron.captures.view import Pixels
@@ -29,15 +30,15 @@ from tron.color import srgb_to_linear
 from tron.errors import TronError
 from tron.images import read_image
 from tron.priors.map_files import MapFile, find_maps, match_by_name, match_by_order
-from tron.priors.map_geometry import NormalFrame, check_normal_frame, resized, same_aspect, world_normals
-from tron.priors.prior import FIELDS, Maps, Request
+from tron.priors.map_geometry import NormalFrame, resized, same_aspect, world_normals
+from tron.priors.prior import CONFIG, FIELDS, Maps, Request
 
 FileSpace = Literal["srgb", "linear"]
 
 _LINEAR_SUFFIXES = (".exr", ".hdr")
 
 
-@dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True, config=CONFIG)
 class Precomputed:
     """Reads a folder of maps, each when it is asked for; layouts and names: :mod:`tron.priors.map_files`.
 
@@ -54,26 +55,19 @@ class Precomputed:
             refused, since they may as well be cropped.
 
     Raises:
-        TronError: an option that there is not, or no such folder.
+        ValidationError: an option that there is not.
+        TronError: no such folder.
     """
 
     folder: str
     color_space: FileSpace = "srgb"
     irradiance_space: FileSpace = "srgb"
-    irradiance_scale: float = 1.0
+    irradiance_scale: Annotated[float, Field(gt=0)] = 1.0
     normal_frame: NormalFrame = "camera_opengl"
     match: Literal["name", "order"] = "name"
     stretched: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("color_space", "irradiance_space"):
-            if getattr(self, name) not in get_args(FileSpace):
-                raise TronError(f"{name} is {getattr(self, name)!r}", mend="use srgb or linear")
-        check_normal_frame(self.normal_frame)
-        if self.match not in ("name", "order"):
-            raise TronError(f"match is {self.match!r}", mend="use name or order")
-        if not (np.isfinite(self.irradiance_scale) and self.irradiance_scale > 0):
-            raise TronError(f"irradiance_scale is {self.irradiance_scale}", mend="give a positive number")
         find_maps(Path(self.folder))  # a folder that is not there is told before photos are posed
 
     @property

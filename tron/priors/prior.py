@@ -1,4 +1,4 @@
-"""What a prior is, and how its maps come onto the views of a capture.
+"""Priors and their maps on the views of a capture.
 
 A prior says what it can give for a capture and how it comes by it, and gives that and nothing else: a field
 that it lacks stays None on the views, so that whoever needs it says so, rather than learn from an invention.
@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
+from pydantic import ConfigDict
 
 from tron.captures import Capture, View
 from tron.captures.view import Pixels
@@ -28,6 +29,9 @@ read ``normal`` (H, W, 3) world, ``depth`` (H, W) and ``opacity`` (H, W)."""
 Maps = Callable[[View], Mapping[str, Pixels]]
 """The maps of one view: field -> array, or what reads the array when it is asked for."""
 
+CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
+"""Of the pydantic dataclasses that priors are: values outside of their range are refused when one is made."""
+
 Track = Callable[[Iterable, str], Iterable]
 """Wraps long loops as ``track(items, label)``, such as :func:`tron.cli.progress.track`."""
 
@@ -42,7 +46,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Request:
-    """What a prior is asked for.
+    """Maps that a prior is asked for.
 
     Attributes:
         capture: all its views are offered; only the training views are asked for maps afterwards.
@@ -58,7 +62,7 @@ class Request:
 
 
 class Prior(Protocol):
-    """A source of per-view maps; a frozen dataclass of plain values, for Hydra's ``_target_``."""
+    """Source of per-view maps; a frozen dataclass of plain values, for Hydra's ``_target_``."""
 
     @property
     def needs_geometry(self) -> frozenset[str]:
@@ -66,7 +70,7 @@ class Prior(Protocol):
         ...
 
     def fields(self, capture: Capture) -> Mapping[str, str]:
-        """What can be given for this capture, geometry supposed: field -> how, in a few words.
+        """Maps that can be given for this capture, geometry supposed: field -> how, in a few words.
 
         Raises:
             TronError: nothing can be given, for example because a folder or a checkpoint is missing.
@@ -148,28 +152,18 @@ def _carrying(
 def _packed(field: str, pixels: np.ndarray) -> Callable[[], np.ndarray]:
     """Hold a map in half precision, or 8 bits, until it is read; half's relative error is 5e-4."""
     if field == "sky_mask":
-        return partial(_from_bytes, np.round(255 * pixels.clip(0, 1)).astype(np.uint8))
+        return partial(_unpacked, np.round(255 * pixels.clip(0, 1)).astype(np.uint8), 255)
     limit = float(np.finfo(np.float16).max)
-    return partial(_from_half, pixels.clip(-limit, limit).astype(np.float16))
+    return partial(_unpacked, pixels.clip(-limit, limit).astype(np.float16), 1)
 
 
-def _from_bytes(pixels: np.ndarray) -> np.ndarray:
-    return pixels.astype(np.float32) / 255
-
-
-def _from_half(pixels: np.ndarray) -> np.ndarray:
-    return pixels.astype(np.float32)
+def _unpacked(pixels: np.ndarray, scale: int) -> np.ndarray:
+    return pixels.astype(np.float32) / scale
 
 
 def _report_gaps(name: str, given: Collection[str], found: Mapping[str, Mapping[str, Pixels]]) -> None:
     for field in given:
         without = [view for view, maps in found.items() if field not in maps]
         if without:
-            log.warning(
-                "prior %s: %s: missing for %d of %d views (first: %s)",
-                name,
-                field,
-                len(without),
-                len(found),
-                without[0],
-            )
+            gap = f"missing for {len(without)} of {len(found)} views (first: {without[0]})"
+            log.warning("prior %s: %s: %s", name, field, gap)

@@ -1,4 +1,4 @@
-"""What is left of a photo's shading after light by direction: shadows, by Land's and Horn's rule.
+"""Shadows: the rest of a photo's shading after light by direction, by Land's and Horn's rule.
 
 Land and McCann 1971 ("Lightness and Retinex Theory") and Horn 1974 ("Determining Lightness from an Image"):
 reflectance changes abruptly, illumination gently. Colour helps: a shadow darkens, another material also

@@ -15,17 +15,18 @@ huggingface.co/zheng95z/rgb-to-x, and see its license.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+import pydantic
+from pydantic import Field
 
 from tron.captures import Capture, View
 from tron.captures.view import Pixels
 from tron.color import luminance
 from tron.errors import TronError
 from tron.priors.map_geometry import resized, world_normals
-from tron.priors.prior import Maps, Request
+from tron.priors.prior import CONFIG, Maps, Request
 from tron.priors.rgbx_checkpoint import check_checkpoint
 from tron.seeds import integer
 
@@ -48,7 +49,7 @@ _SCHEDULE = 1000  # steps of noise that the model was trained with
 _MULTIPLE = 8  # pixels a latent
 
 
-@dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True, config=CONFIG)
 class RgbX:
     """The RGB->X model from a local checkpoint in diffusers' layout.
 
@@ -61,7 +62,8 @@ class RgbX:
         longest_side: photos are brought to this many pixels along their longer side, as the authors do.
 
     Raises:
-        TronError: an option out of its range, no checkpoint, or one that lacks a part.
+        ValidationError: an option outside its range.
+        TronError: steps that do not divide 1000, no checkpoint, or one that lacks a part.
     """
 
     checkpoint: str | None = None
@@ -69,16 +71,12 @@ class RgbX:
     seed: int = 0
     device: str = "cpu"
     dtype: Dtype = "float32"
-    longest_side: int = 1000
+    longest_side: Annotated[int, Field(ge=_MULTIPLE)] = 1000
 
     def __post_init__(self) -> None:
         # DDIM with trailing steps reaches the clean image only if its steps are all of one length.
         if self.steps < 1 or _SCHEDULE % self.steps:
             raise TronError(f"steps is {self.steps}", mend=f"give a divisor of {_SCHEDULE}, such as 20 or 50")
-        if self.longest_side < _MULTIPLE:
-            raise TronError(f"longest_side is {self.longest_side}", mend=f"give at least {_MULTIPLE}")
-        if self.dtype not in get_args(Dtype):
-            raise TronError(f"dtype is {self.dtype!r}", mend=f"use {', '.join(get_args(Dtype))}")
         check_checkpoint(self.checkpoint)  # told before photos are posed
 
     @property

@@ -81,8 +81,8 @@ class RgbXModel:
         latent = (noise * self.scheduler.init_noise_sigma).to(device, dtype)
         self.scheduler.set_timesteps(steps)
         for step in self.scheduler.timesteps:
-            seen = torch.cat([self.scheduler.scale_model_input(latent, step), condition], dim=1)
-            predicted = self.unet(seen, step.to(device), encoder_hidden_states=words).sample
+            sample = torch.cat([self.scheduler.scale_model_input(latent, step), condition], dim=1)
+            predicted = self.unet(sample, step.to(device), encoder_hidden_states=words).sample
             latent = self.scheduler.step(predicted, int(step), latent).prev_sample
         decoded = self.vae.decode(latent / scale).sample[0].movedim(0, -1)
         return decoded.float().cpu().numpy()

@@ -35,7 +35,7 @@ _CELLS = 4  # a side of the cube on which normals are counted, a face
 
 @dataclass(frozen=True, eq=False)
 class Shading:
-    """What all views share.
+    """Light by direction and reflectance by colour, which all views share.
 
     Attributes:
         coefficients: (9,) of log S, the log of irradiance by normal, up to scale, in sh_matrix's first terms.

@@ -1,4 +1,4 @@
-"""Where a view shows sky: nothing near, above the horizon, bright or blue."""
+"""Sky in a view: nothing near, above the horizon, bright or blue."""
 
 from __future__ import annotations
 

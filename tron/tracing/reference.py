@@ -46,6 +46,8 @@ class ReferenceHits:
             (alpha cut, stop, median): pixels with a tiny margin may differ in float32.
         gap: (P,) smallest distance along the ray between two composited hits that are neighbours; where it is
             tiny, rounding may order them otherwise.
+        candidates: (P,) int, surfels whose kernel counts where the ray hits them, on either side.
+        front: (P,) int, those of them that it hits from the front.
     """
 
     normal: np.ndarray
@@ -59,6 +61,8 @@ class ReferenceHits:
     hits: np.ndarray
     margin: np.ndarray
     gap: np.ndarray
+    candidates: np.ndarray
+    front: np.ndarray
 
 
 def rotation_matrices(quats: np.ndarray) -> np.ndarray:
@@ -194,6 +198,8 @@ def _composite_block(
         hits=hits,
         margin=np.minimum(margin, cuts),
         gap=gap,
+        candidates=(met.counted & (met.t > T_MIN)).sum(1),
+        front=visible.sum(1),
     )
 
 

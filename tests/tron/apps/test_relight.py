@@ -11,7 +11,7 @@ from tron.apps.clip import GUIDANCE, Clip
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
-from tron.gaussians.ply import MATERIALS
+from tron.gaussians.ply import MATERIAL_PROPERTIES
 from tron.images import read_image
 from tron.seeds import generator
 from tron.shading.environment import EnvironmentMap
@@ -111,7 +111,7 @@ def test_other_settings_in_the_same_folder_are_refused(relight, scene_path, ligh
 def test_a_plain_3dgs_file_is_relit_with_a_warning(relight, scene_path, light_path, tmp_path, caplog):
     """Without materials, and with normals of random sign, as 3DGS writes them."""
     rows = plyfile.PlyData.read(str(scene_path))["vertex"].data
-    names = [name for name in rows.dtype.names if name not in (*MATERIALS, "object_id")]
+    names = [name for name in rows.dtype.names if name not in (*MATERIAL_PROPERTIES, "object_id")]
     plain = np.empty(len(rows), [(name, "<f4") for name in names])
     for name in names:
         plain[name] = rows[name]
