@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from eval.cli import cli
+from eval.relighting.baselines import BASELINES, METHODS
 from eval.relighting.benchmark import Relighting, choose_clips
-from eval.relighting.scores import Score, Scores
+from eval.relighting.scores import METRICS, Score, Scores
 from eval.report.outcome import Outcome
-from eval.report.page import Pictures
+from eval.report.page import Pictures, Table
 from eval.results import Results
 from tron.images import read_image
 
@@ -66,6 +67,22 @@ def test_every_row_of_the_issue_is_there(outcome: Outcome):
         row for row in outcome.rows if row.metric.startswith(("neural", "pbr", "guidance", "surfels"))
     ]
     assert all(row.scenes == 2 and row.low is not None for row in averaged)
+
+
+def test_every_method_and_metric_of_the_lists_is_in_rows_tables_and_pictures(outcome: Outcome):
+    rows = {row.metric for row in outcome.rows}
+    blocks = {section.name: section.blocks for section in outcome.sections}
+    tables = [block for block in (*blocks["results"], *blocks["lights"]) if isinstance(block, Table)]
+    pictures = next(block for block in blocks["pictures"] if isinstance(block, Pictures))
+    for method in METHODS:
+        assert {f"{method.name}.{metric.name}" for metric in METRICS} <= rows
+        assert all(method.title in [row[0].text for row in table.cells] for table in tables)
+    for table in tables[:2]:
+        assert {metric.title for metric in METRICS} <= set(table.headings)
+    shown = {baseline.title for baseline in BASELINES if baseline.pictured}
+    assert shown <= {picture.title for picture in pictures.pictures}
+    for baseline in BASELINES:
+        assert f"neural.gain_over_{baseline.name}" in rows
 
 
 def test_networks_that_return_pbr_score_as_pbr(outcome: Outcome):
