@@ -18,6 +18,7 @@ from pydantic import (
 
 from datagen.lights import Family
 from datagen.materials import Style
+from tron.estimation import Estimation, Estimator
 
 LightChoice = Literal["any", "sun", "studio", "overcast", "hdri"]
 Split = Literal["train", "train_b", "validation", "test"]
@@ -165,6 +166,16 @@ class Settings(_Model):
         le=100_000,
         description="Optimisation steps that fit a scene's surfels to its G-buffers; 0 takes them as made.",
     )
+    estimator: Estimator = Field(
+        "ratio",
+        description="Irradiance of the surfels. ratio: unshadowed irradiance times the share of it that "
+        "arrives; plain: the Monte Carlo mean, as in the paper.",
+    )
+    two_sided: bool = Field(
+        True,
+        description="Back faces block the surfels' shadow rays beyond two spacings; false: never, as in the "
+        "paper.",
+    )
     mesh_edge: float = Field(
         0.04,
         gt=0,
@@ -253,6 +264,11 @@ class Settings(_Model):
     def split(self, name: str) -> SplitSettings:
         """The settings of one split."""
         return getattr(self, name)
+
+    def estimation(self, split: str) -> Estimation:
+        """Estimation of the surfels' irradiance."""
+        rays = self.split(split).guidance_spp
+        return Estimation(rays=rays, estimator=self.estimator, two_sided=self.two_sided)
 
     def used_splits(self) -> list[Split]:
         """The splits that have scenes."""

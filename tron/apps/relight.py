@@ -21,7 +21,7 @@ from tron.apps.camera_files import read_cameras
 from tron.apps.clip import GUIDANCE, Clip, trace
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.framing import plan_cameras, turn_cameras, upright
-from tron.apps.relight_settings import QUALITY, Settings
+from tron.apps.relight_settings import Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
 from tron.cli.command_line import command
@@ -76,7 +76,7 @@ def main(settings: Settings) -> None:
     with locked(settings.output_dir):
         for light, clip in zip(lights, clips):
             clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite)
-        trace(scene, cameras, clips, estimation=QUALITY[settings.quality], seed=settings.seed)
+        trace(scene, cameras, clips, estimation=settings.estimation(), seed=settings.seed)
         clock.lap("guidance")
         if renderer is not None:
             for clip in clips:
@@ -166,6 +166,7 @@ def _clip(light: Settings, environment: EnvironmentMap, frames: int) -> Clip:
 def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> dict[str, Any]:
     """Recipe of the linear frames: all that their pixels depend on, as JSON values."""
     keys = {"rotation", "trajectory", "quality", "width", "height", "fov", "distance", "seed", "variant"}
+    keys |= {"estimator", "two_sided", "denoise"}
     assert isinstance(light.environment, Path)
     return {
         "scene_sha256": sha256(light.scene),
