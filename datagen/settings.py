@@ -16,11 +16,10 @@ from pydantic import (
     model_validator,
 )
 
-from datagen.lights import Family
+from datagen.lights import PROCEDURAL, Family, LightChoice
 from datagen.materials import Style
 from tron.estimation import Estimation, Estimator
 
-LightChoice = Literal["any", "sun", "studio", "overcast", "hdri"]
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {"output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "cluster", "captures"}
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
@@ -278,7 +277,7 @@ class Settings(_Model):
         """The families that ``any`` chooses from."""
         if self.families is not None:
             return list(self.families)
-        return ["hdri"] if self.environments is not None else ["sun", "studio", "overcast"]
+        return ["hdri"] if self.environments is not None else list(PROCEDURAL)
 
     def recipe(self) -> dict[str, Any]:
         """What decides a scene's content, as plain values: not where it goes, who makes it or how many."""
