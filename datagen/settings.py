@@ -68,10 +68,10 @@ class SplitSettings(_Model):
     path_spp: int = Field(
         default=256,
         ge=1,
-        description="Paths a pixel of path-traced frames; rounded up to a product of near numbers.",
+        description="Paths per pixel of path-traced frames; rounded up to a product of near numbers.",
     )
     guidance_spp: int = Field(
-        default=64, ge=2, multiple_of=2, description="Shadow rays a pixel of the surfels' irradiance, even."
+        default=64, ge=2, multiple_of=2, description="Shadow rays per pixel of the surfels' irradiance, even."
     )
     reference_buffers: bool = Field(
         default=False,
@@ -79,7 +79,7 @@ class SplitSettings(_Model):
         "depth, roughness and metallic, and the surfels' own.",
     )
     reference_spp: int = Field(
-        default=128, ge=2, description="Shadow rays a pixel of Mitsuba's direct irradiance."
+        default=128, ge=2, description="Shadow rays per pixel of Mitsuba's direct irradiance."
     )
 
 
@@ -107,9 +107,11 @@ class CaptureSettings(_Model):
     width: int = Field(default=128, ge=8, le=8192, description="View width in pixels.")
     height: int = Field(default=128, ge=8, le=8192, description="View height in pixels.")
     path_spp: int = Field(
-        default=64, ge=1, description="Paths a pixel; rounded up to a product of near numbers, such as 8 x 8."
+        default=64,
+        ge=1,
+        description="Paths per pixel; rounded up to a product of near numbers, such as 8 x 8.",
     )
-    reference_spp: int = Field(default=32, ge=2, description="Shadow rays a pixel of the irradiance maps.")
+    reference_spp: int = Field(default=32, ge=2, description="Shadow rays per pixel of the irradiance maps.")
     points: int | None = Field(
         default=None,
         ge=1,
@@ -121,7 +123,7 @@ class CaptureSettings(_Model):
 class Settings(_Model):
     """Everything that ``tron-datagen`` can be told."""
 
-    output_dir: Path = Field(description="Folder of the dataset; a run that was interrupted goes on in it.")
+    output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
     mode: Literal["make", "validate", "captures"] = Field(
         "make",
         description="make the dataset, validate the one in output_dir and list every problem, or path-trace "
@@ -158,7 +160,7 @@ class Settings(_Model):
     views: int = Field(64, ge=1, description="Spiral views whose G-buffers the surfels are made from.")
     view_width: int = Field(256, ge=8, le=8192, description="Width of those views in pixels.")
     view_height: int = Field(256, ge=8, le=8192, description="Height of those views in pixels.")
-    surfels: int = Field(60_000, ge=100, description="Number of surfels of a scene, about.")
+    surfels: int = Field(60_000, ge=100, description="Approximate number of surfels of a scene.")
     refine_steps: int = Field(
         200,
         ge=0,
@@ -199,7 +201,7 @@ class Settings(_Model):
     )
     only: list[str] = Field(default_factory=list, description="Make these scenes only, such as train-000012.")
     clips_per_shard: int = Field(
-        64, ge=1, description="Most clips of a shard; a shard never spans two scenes."
+        64, ge=1, description="Maximum number of clips of a shard; no shard spans two scenes."
     )
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = Field(
         "llvm_ad_rgb", description="Mitsuba variant; on cuda_ad_rgb bytes are not repeatable."
@@ -207,7 +209,7 @@ class Settings(_Model):
     workers: int | None = Field(
         None,
         ge=1,
-        description="Worker processes of the cluster; null: one a core with cluster=local.",
+        description="Worker processes of the cluster; null: one per core with cluster=local.",
     )
     worker_timeout: float = Field(
         600.0, gt=0, description="Seconds to wait for the cluster's first worker: jobs may queue for long."

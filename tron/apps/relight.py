@@ -46,8 +46,8 @@ def main(settings: Settings) -> None:
     Writes frames/NNNN.relit.png, relit.mp4 (the neural renderer's pictures where there is a checkpoint,
     otherwise diffuse light with traced shadows plus reflections), what they are made of as
     frames/NNNN.{pbr,irradiance,...}.exr (linear) and .png (AgX), guidance.mp4, contact_sheet.png and
-    relight.json; with a checkpoint also NNNN.neural.png and neural.mp4. A run that was interrupted goes on
-    where it stopped when it is started again.
+    relight.json; with a checkpoint also NNNN.neural.png and neural.mp4. An interrupted run resumes when it is
+    started again.
     """
     from tron.shading.environment import EnvironmentMap  # Mitsuba: not for --help or a mistyped key
 
