@@ -44,7 +44,9 @@ TINY = [
 
 
 def tiny(output: Path, *overrides: str) -> Settings:
-    return check(compose_recipe("conf.datagen", [*TINY, f"output_dir={output}", *overrides]), Settings)
+    return check(
+        compose_recipe("conf.datagen", Settings, [*TINY, f"output_dir={output}", *overrides]), Settings
+    )
 
 
 @pytest.fixture(scope="module")
@@ -193,7 +195,7 @@ def test_nothing_that_is_not_finite_is_stored(tmp_path, monkeypatch):
     assert "values that are not finite" in told["reason"]
     monkeypatch.undo()
     words = shlex.split(told["command"])
-    assert make_captures(check(compose_recipe("conf.datagen", words[1:]), Settings)) == 0
+    assert make_captures(check(compose_recipe("conf.datagen", Settings, words[1:]), Settings)) == 0
     assert not listed.exists()
     assert not (tmp_path / "captures/failures").exists()
 

@@ -25,7 +25,7 @@ Tiny = Callable[..., Settings]
 def tiny(tiny_scenes) -> Tiny:
     def tiny(output: Path, *overrides: str) -> Settings:
         words = [*tiny_scenes, f"output_dir={output}", *overrides]
-        return check(compose_recipe("conf.datagen", words), Settings)
+        return check(compose_recipe("conf.datagen", Settings, words), Settings)
 
     return tiny
 

@@ -124,7 +124,7 @@ def test_a_second_scene_of_a_split_brings_no_kernel(variant, tmp_path: Path):
     tiny += ["test.lights=[studio,overcast]", "test.guidance_spp=2", "cluster=null", "path_frames=8"]
     tiny += ["views=6", "view_width=32", "view_height=32", "surfels=1500", "refine_steps=6", "mesh_edge=0.2"]
     tiny += ["environment_height=16", "objects=[2,2]", f"output_dir={tmp_path}"]
-    settings = check(compose_recipe("conf.datagen", tiny), Settings)
+    settings = check(compose_recipe("conf.datagen", Settings, tiny), Settings)
 
     def made(index: int) -> set[str]:
         item = Work("test", index, f"test-{index:06d}", first_shard=index)

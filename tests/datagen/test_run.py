@@ -63,7 +63,9 @@ for _split in ("train", "train_b", "validation", "test"):
 
 
 def tiny(output: Path, *overrides: str) -> Settings:
-    return check(compose_recipe("conf.datagen", [*TINY, f"output_dir={output}", *overrides]), Settings)
+    return check(
+        compose_recipe("conf.datagen", Settings, [*TINY, f"output_dir={output}", *overrides]), Settings
+    )
 
 
 @pytest.fixture(scope="module")
@@ -253,7 +255,7 @@ def test_failures_are_listed_and_retried_by_their_command(dataset, unfinished, f
     monkeypatch.undo()
     words = shlex.split(failure["command"])
     assert words[0] == "tron-datagen"
-    again = check(compose_recipe("conf.datagen", words[1:]), Settings)
+    again = check(compose_recipe("conf.datagen", Settings, words[1:]), Settings)
     assert again.only == ["train-000001"]
     assert again.recipe() == settings.recipe()
     assert make(again) == 0
@@ -303,7 +305,7 @@ def test_the_command_of_the_card_makes_the_same_settings(dataset, cluster):
     settings = tiny(dataset, "allow_unlicensed=['a b','c']", "only=[train-000001]")
     settings = settings.model_copy(update={"cluster": cluster})
     words = shlex.split(command_line(settings, str(dataset), settings.only))
-    assert check(compose_recipe("conf.datagen", words[1:]), Settings) == settings
+    assert check(compose_recipe("conf.datagen", Settings, words[1:]), Settings) == settings
 
 
 def test_previews_are_the_clips_first_frames_side_by_side(dataset):

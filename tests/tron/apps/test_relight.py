@@ -7,20 +7,21 @@ import plyfile
 import pytest
 
 from tron.apps import clip as clips
-from tron.apps.clip import GUIDANCE, Clip
+from tron.apps.clip import Clip
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
+from tron.color import to_display
 from tron.gaussians.ply import MATERIAL_PROPERTIES
 from tron.images import read_image
 from tron.seeds import generator
 from tron.shading.environment import EnvironmentMap
-from tron.video import read_video
+from tron.shards.schema import GUIDANCE
 
 SIZE = 32
 
 
-def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, tmp_path):
+def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, tmp_path, read_video):
     out = tmp_path / "out"
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=2"]
     assert relight(*base, "buffers=[normal,depth,mask]") == 0
@@ -137,7 +138,7 @@ def test_a_plain_3dgs_file_is_relit_with_a_warning(relight, scene_path, light_pa
     assert json.loads((silent / "frames" / "settings.json").read_text())["up"] == [0, -1, 0]
 
 
-def test_a_new_renderer_shows_the_pbr_buffer(relight, scene_path, light_path, tmp_path):
+def test_a_new_renderer_shows_the_pbr_buffer(relight, scene_path, light_path, tmp_path, read_video):
     """Untrained, a renderer gives its PBR input back; what is tested is the way there and back."""
     from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
     from tron.neural.weights import save_renderer
@@ -173,8 +174,8 @@ def test_a_clip_in_parts_is_the_clip_in_one(tmp_path, monkeypatch):
     monkeypatch.setattr(clips, "CLIP_FRAMES", 6)
     light, picture = EnvironmentMap.constant(1.0), RelitPicture("environment", neural=True)
     Clip(light, [0.0] * 13, 0.7, picture, folder).draw(renderer)
-    clip = (np.stack([folder.read(i, name) for i in range(13)]) for name in GUIDANCE)
-    whole = render_clip(renderer, *clip, exposure=0.7)
+    linear = {name: np.stack([folder.read(i, name) for i in range(13)]) for name in GUIDANCE}
+    whole = render_clip(renderer, {name: to_display(buffer, 0.7) for name, buffer in linear.items()})
     for index in range(13):
         np.testing.assert_allclose(folder.row(index, ["neural"]), whole[index], atol=1.01 / 255)
 
