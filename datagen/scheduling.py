@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 Made = TypeVar("Made")
 Task = Callable[[Work, Settings, Sources], Made]
-"""What makes something of one scene, in a worker; it can be pickled."""
+"""Function that makes something of one scene, in a worker; it can be pickled."""
 
 
 def make_each(
