@@ -3,6 +3,7 @@
 import ctypes
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -58,3 +59,38 @@ def drjit_threads() -> None:
         threads = max(2, os.cpu_count() or 1)
         if dr.thread_count() != threads:
             dr.set_thread_count(threads)
+
+
+@pytest.fixture(scope="session")
+def tiny_scenes() -> list[str]:
+    """Overrides of `tron-datagen` for two scenes of one small frame each, made in seconds."""
+    train = [
+        "scenes=2",
+        "lights=[overcast]",
+        "frames=1",
+        "width=16",
+        "height=12",
+        "path_spp=2",
+        "guidance_spp=2",
+    ]
+    return [
+        *(f"train.{value}" for value in train),
+        *(f"{split}.scenes=0" for split in ("train_b", "validation", "test")),
+        *("views=4", "view_width=24", "view_height=24", "surfels=500", "refine_steps=0"),
+        *("mesh_edge=0.2", "environment_height=16", "objects=[1,1]"),
+    ]
+
+
+@pytest.fixture(scope="session")
+def files_of() -> Callable[[Path], dict[str, bytes]]:
+    """What gives every file that a recipe made in a folder, with its bytes: no lock and no log."""
+
+    def files_of(folder: Path) -> dict[str, bytes]:
+        files = {p.relative_to(folder): p for p in sorted(folder.rglob("*")) if p.is_file()}
+        return {
+            path.as_posix(): file.read_bytes()
+            for path, file in files.items()
+            if path.name != ".tron.lock" and path.parts[0] not in ("logs", "slurm")
+        }
+
+    return files_of

@@ -46,6 +46,11 @@ class PointBatch:
     target: mi.Color3f
     width: int
 
+    @property
+    def pixel(self) -> mi.UInt32:
+        """Place of each point in the square, row by row."""
+        return dr.arange(mi.UInt32, dr.width(self.opacity))
+
 
 class SurfacePoints:
     """Points of all views, one view after the other; the geometry is frozen, so they are traced once.

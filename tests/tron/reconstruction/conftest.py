@@ -75,7 +75,7 @@ def captured(tracer: SurfelTracer) -> Callable[..., Capture]:
             )
             gbuffer = tracer.gbuffer(camera)
             prior = [irradiance(tracer, gbuffer, lighting.light, 64, seed)[0] for seed in range(2)]
-            prior = prior_scale * np.mean([np.array(p).T for p in prior], 0).reshape(SIZE, SIZE, 3)
+            prior = prior_scale * np.mean([gbuffer.image(p) for p in prior], 0)
             shadowed = render_guidance(tracer, camera, lighting, Estimation(rays=64), seed=9).shadowed
             made.append(View(f"{i}", camera, agx(exposure * shadowed), "display", irradiance=prior))
         return Capture(tuple(made), exposure=exposure)
