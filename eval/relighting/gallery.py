@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from eval.relighting.baselines import BASELINES, NEURAL
-from eval.relighting.buffers import Buffers
 from eval.relighting.shadows import direct_light, same_depth, shadow_errors
 from eval.report.page import Picture, Pictures
 from tron import metrics
@@ -58,7 +57,7 @@ def middle_frame(clip: Clip, shown: dict[str, np.ndarray], truth: np.ndarray) ->
     foreground = clip.frames["foreground"][k, ..., 0] > 0.5
     where = foreground if foreground.any() else None
     psnr = {name: metrics.capped_psnr(image, truth[k], where) for name, image in methods.items()}
-    irradiance = Buffers.of(clip).displayed("irradiance")[k]
+    irradiance = clip.displayed("irradiance")[k]
     return Example(clip.meta, k, methods, irradiance, truth[k], psnr, _guidance_pictures(clip, k))
 
 
