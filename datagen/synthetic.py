@@ -1,6 +1,4 @@
-"""The synthetic source: a scene's specification becomes surfels and, light by light, a clip of training
-pairs.
-"""
+"""The synthetic source: a scene's specification becomes surfels and, light by light, a clip of pairs."""
 
 from __future__ import annotations
 
@@ -126,7 +124,7 @@ def make_clip(
 
 
 def first_bad_value(frames: Sequence[Frame]) -> str | None:
-    """Where a clip is not finite, in words, or None: such a clip must not reach a shard."""
+    """First value of a clip that is not finite, in words, or None: such a clip must not reach a shard."""
     for i, frame in enumerate(frames):
         for member, image in frame.items():
             bad = int((~np.isfinite(image)).sum())
@@ -146,9 +144,7 @@ def _reference(
     direct: DirectIrradiance,
     environment: EnvironmentMap,
 ) -> Frame:
-    """The reference members of one frame; behind the scene irradiance shows the environment, as guidance
-    does.
-    """
+    """Reference members of one frame; behind the scene irradiance shows the environment, as guidance does."""
     seen = truth.valid[..., None]
     behind = environment.lookup(camera.rays())
     light = {"irradiance": direct.shadowed, "unshadowed": direct.unshadowed}

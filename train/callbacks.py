@@ -1,4 +1,4 @@
-"""What happens around the steps: the clock, the progress bar and metrics.csv."""
+"""Callbacks around the steps: the clock, the progress bar and metrics.csv."""
 
 from __future__ import annotations
 

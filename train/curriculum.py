@@ -11,7 +11,7 @@ from tron.neural.windows import TEMPORAL_FACTOR
 
 
 class Stage(BaseModel):
-    """One stage of the curriculum: what it trains on and for how long."""
+    """One stage of the curriculum: its data and its length."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -62,7 +62,7 @@ class Stage(BaseModel):
 
 
 class StageClock:
-    """How far a stage has come, from 0 to 1: by its steps, or by its share of a time limit.
+    """Progress of a stage from 0 to 1: by its steps, or by its share of a time limit.
 
     By steps a run is reproducible; by time the schedule anneals to its end within the limit on any machine,
     and the number of steps depends on the machine. Time counts only while the stage runs: `seconds` is what

@@ -47,7 +47,7 @@ SEGMENT = 500  # batches after which a stream starts anew, so that resuming skip
 class Batches(IterableDataset):
     """Endless batches {member: (B, 3, K, h, w)} of one stage, from step `first_step` on.
 
-    Batch s is a function of (seed, stage, s), so a resumed run sees what it would have seen. Ranks share it:
+    Batch s is a function of (seed, stage, s), so that a resumed run has the same ones. Ranks share it:
     together the batches of R ranks are the batch of R times the size that one process would have. A streamed
     split also depends on the number of loader processes, which must then stay the same.
     """
@@ -85,8 +85,9 @@ class Batches(IterableDataset):
             step += workers
 
     def _sources(self, segment: int, step: int, workers: int) -> Callable[[str, int], Source]:
-        """(split, place in the batch) -> where its samples come from: memory, or a stream of this segment,
-        wound forward to `step`. Each place has a stream of its own, so that ranks read what they use.
+        """(split, place in the batch) -> its source: memory, or a stream of this segment, wound to `step`.
+
+        Each place has a stream of its own, so that ranks read what they use.
         """
         streams: dict[tuple[str, int], Source] = {}
         earlier = range(segment * SEGMENT + (step - segment * SEGMENT) % workers, step, workers)
@@ -169,7 +170,7 @@ class TrainingData(lightning.LightningDataModule):
             log.info("No validation: this dataset has no split '%s'", validation.split)
             self.validation_split = None
         elif validation.split is not None:
-            self.manifest.of_split(validation.split)  # a wrong name is told now, not after hours
+            self.manifest.of_split(validation.split)  # a wrong name ends the run now, not after hours
 
     def open(self, stages: Sequence[Stage], guidance: Sequence[str] = GUIDANCE) -> None:
         """Check that every stage finds its splits, frames and sizes; decode the splits that fit in memory.

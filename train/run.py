@@ -54,7 +54,7 @@ def run(settings: Settings) -> None:
 
 
 def train(processes: Processes, settings: Settings) -> None:
-    """What each process of a run does; the first holds the folder and writes."""
+    """Work of each process of a run; the first holds the folder and writes."""
     if settings.threads is not None:
         set_torch_threads(settings.threads)
     stages = [stage for stage in settings.stages if stage.steps > 0]

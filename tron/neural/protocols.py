@@ -1,4 +1,4 @@
-"""What may be exchanged in the neural renderer: the network itself, and the codec inside it."""
+"""The two exchangeable parts: the renderer, and the codec inside it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Codec(Protocol):
 
 
 class GuidedConfig(BaseModel):
-    """What every renderer is told; it travels inside the weights file."""
+    """Settings of every renderer; they travel inside the weights file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -76,7 +76,7 @@ class Renderer(nn.Module):
         raise NotImplementedError
 
     def calibrate(self, videos: Iterable[Tensor]) -> None:
-        """Fit what is fitted before training, to videos (B, 3, K, H, W) in [-1, 1]: nothing, unless told."""
+        """Fit what is fitted before training, to videos (B, 3, K, H, W) in [-1, 1]; here nothing."""
 
     def stacked(self, buffers: Mapping[str, Tensor]) -> list[Tensor]:
         """The buffers of `config.guidance`, in order, checked."""
