@@ -21,18 +21,18 @@ import yaml
 
 from datagen.build import Geometry
 from datagen.capture_manifest import CaptureManifest
-from datagen.clusters import require_cluster
-from datagen.lights import bake
+from datagen.clusters import logs_folder, require_cluster
+from datagen.failures import record_failures, summary
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.plan import Sources, Work, chosen, find_sources
-from datagen.run import FAILURES_NAME, draw_and_build, failure, outcomes, write_failures
+from datagen.run import draw_and_build
 from datagen.scene import SceneSpec, scene_name
+from datagen.scheduling import make_each
 from datagen.settings import CaptureSettings, Settings
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder, write_capture
 from tron.claim import read_recipe, require_same
-from tron.cli.progress import Progress
 from tron.color import to_display
 from tron.errors import TronError
 from tron.images import encode_exr
@@ -72,32 +72,22 @@ def make_captures(settings: Settings) -> int:
     activate(settings.variant, threads=1)
     sources = find_sources(settings)
     folder = settings.output_dir / CAPTURES
-    reasons: dict[str, str] = {}
     with locked(settings.output_dir):
         _adopt(settings, folder)
         manifest = CaptureManifest.load(folder)
         missing = [item for item in items if not _finished(folder / item.name, wanted)]
         require_free_space(folder, len(missing) * _estimate_bytes(settings))
-        with Progress("captures", len(missing) * wanted.views, unit="views") as progress:
-            for item, outcome in outcomes(make_capture, missing, settings, sources):
-                if isinstance(outcome, str):
-                    reasons[item.name] = outcome
-                    log.error("%s failed: %s", item.name, outcome)
-                else:
-                    manifest.record(outcome)
-                progress.advance(wanted.views, item.name)
-        for item in items:  # those that an older or an interrupted run has finished
-            if item.name not in manifest.captures and item.name not in reasons:
+        failed = make_each(make_capture, missing, settings, sources, lambda _: wanted.views, "views")
+        finished = [item for item in items if item.name not in failed]
+        for item in finished:
+            if item in missing or item.name not in manifest.captures:  # made now, or by an older engine
                 manifest.record(folder / item.name)
         manifest.save(folder)
-        write_failures(
-            folder / FAILURES_NAME,
-            [failure(settings, i, reasons[i.name]) for i in items if i.name in reasons],
-        )
-    log.info("%d of %d captures are in %s", len(items) - len(reasons), len(items), folder)
-    if reasons:
-        log.error("%d failures, listed in %s", len(reasons), folder / FAILURES_NAME)
-    return len(reasons)
+        failures = record_failures(folder, settings, items, failed, {item.name: () for item in finished})
+    log.info("%d of %d captures are in %s", len(finished), len(items), folder)
+    if failures:
+        log.error("%s", summary(failures, folder, logs_folder(settings)))
+    return failures
 
 
 def make_capture(item: Work, settings: Settings, sources: Sources) -> Path:
@@ -111,8 +101,7 @@ def make_capture(item: Work, settings: Settings, sources: Sources) -> Path:
     folder = settings.output_dir / CAPTURES / item.name
     family = wanted.lights[item.index % len(wanted.lights)]
     spec, geometry = draw_and_build(item, settings, sources, [family])
-    maps = None if settings.environments is None else str(settings.environments)
-    environment = bake(spec.lights[0], settings.environment_height, maps).baked()
+    environment = spec.lights[0].bake(settings.environment_height, settings.environments).baked()
     beside = {
         SPEC_NAME: spec.to_json().encode(),
         ENVIRONMENT_NAME: encode_exr(environment.image, half=False),

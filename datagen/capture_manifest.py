@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from datagen.failures import TRACEBACKS
 from tron.captures.folder import read_capture_folder
 from tron.errors import TronError
 from tron.storage import sha256, write_if_changed
@@ -64,6 +65,12 @@ class CaptureManifest(BaseModel):
         write_if_changed(folder / MANIFEST_NAME, ordered.model_dump_json(indent=1) + "\n")
 
 
+def capture_names(folder: Path) -> list[str]:
+    """Names of the captures in their folder, in order; what is hidden is half-written."""
+    found = (path.name for path in folder.iterdir() if path.is_dir() and path.name != TRACEBACKS)
+    return sorted(name for name in found if not name.startswith("."))
+
+
 def _files(capture: Path) -> Iterator[tuple[str, Path]]:
     for path in sorted(capture.rglob("*")):
         if path.is_file():
@@ -79,7 +86,7 @@ def verify_captures(folder: Path) -> list[str]:
         manifest = CaptureManifest.load(folder)
     except TronError as error:
         return [str(error)]
-    there = {path.name for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")}
+    there = set(capture_names(folder))
     problems = []
     for name in sorted(there | manifest.captures.keys()):
         if name not in there:

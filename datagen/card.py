@@ -29,7 +29,7 @@ def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), 
     It does not lean on recipes, whose content may change. ``output_dir`` and ``only`` are the caller's;
     without ``machine`` it leaves out what decides nothing of the content: cluster and workers.
     """
-    shipped = cast(dict, OmegaConf.to_container(compose_recipe("conf.datagen", []), resolve=False))
+    shipped = cast(dict, OmegaConf.to_container(compose_recipe("conf.datagen", Settings), resolve=False))
     values = settings.model_dump(mode="json") | {"output_dir": output_dir, "only": list(only)}
     if not machine:
         values = {key: value for key, value in values.items() if key not in OUTSIDE}

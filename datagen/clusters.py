@@ -7,7 +7,7 @@ import logging
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,8 @@ from tron.errors import TronError
 
 log = logging.getLogger(__name__)
 
-RECYCLE_SECONDS = 60.0
-"""Seconds that a worker has to come back with a new process before the others go on without it."""
+CLOSE_SECONDS = 30.0
+"""Seconds that a cluster has to end."""
 
 LOCAL = "dask.distributed.LocalCluster"
 ADDRESS = "dask.distributed.Client"
@@ -73,7 +73,10 @@ def workers(settings: Settings, most: int) -> Iterator[Any]:
     Raises:
         TronError: the cluster does not start, or no worker has come within `settings.worker_timeout`.
     """
+    import dask.config
     from dask.distributed import Client
+
+    from datagen.worker_log import WorkerLog
 
     logging.getLogger("distributed").setLevel(logging.WARNING)  # it reports every connection otherwise
     assert settings.cluster is not None
@@ -82,12 +85,19 @@ def workers(settings: Settings, most: int) -> Iterator[Any]:
     if target == LOCAL:
         options.setdefault("n_workers", min(settings.workers or cores(), most))
     with ExitStack() as stack:
-        made = stack.enter_context(make(options, "cluster", _where(options)))
-        if not isinstance(made, Client):
-            if not made.worker_spec:
+        made = make(options, "cluster", _where(options))
+        if isinstance(made, Client):
+            stack.callback(_close, made)
+        else:
+            if made.worker_spec:
+                # Dask drops a worker that is gone for 15 s, even one that restarts on a busy machine.
+                patience = {"distributed.deploy.lost-worker-timeout": f"{settings.worker_timeout}s"}
+                stack.enter_context(dask.config.set(patience))
+            else:
                 # Not scale: a job that ends, by its time limit or a dead node, is then replaced.
                 wanted = min(settings.workers or 1, most)
                 made.adapt(minimum=wanted, maximum=wanted)
+            stack.callback(_close, made)
             made = stack.enter_context(Client(made))
         try:
             made.wait_for_workers(1, timeout=settings.worker_timeout)
@@ -97,23 +107,50 @@ def workers(settings: Settings, most: int) -> Iterator[Any]:
                 _where(options),
                 "look at the queue and the workers' logs, or wait longer",
             ) from error
+        log_to = WorkerLog(logs_folder(settings).absolute(), logging.getLogger().getEffectiveLevel())
+        try:
+            made.register_plugin(log_to)
+        except OSError as error:
+            raise TronError(
+                f"a worker cannot write its log: {error}",
+                logs_folder(settings),
+                "all workers must see output_dir by the same path",
+            ) from error
+        if not ours(settings):
+            stack.callback(made.unregister_worker_plugin, log_to.name)
         yield made
+
+
+def _close(cluster: Any) -> None:
+    """End a cluster, or a client of another's; Dask may wait for ever for a worker that is just starting."""
+    try:
+        cluster.close(timeout=CLOSE_SECONDS)
+    except TimeoutError:
+        log.warning("a worker does not end; it ends with this process")
 
 
 def recycle(client: Any, seconds: float) -> None:
     """Replace the workers' processes: Mitsuba's memory grows with every scene it loads.
 
-    Dask's own wait ends the run where one worker of many does not come back; here the others go on.
+    Those that do not come back within ``seconds`` are left behind, and the others go on.
     """
-    count = len(client.scheduler_info(n_workers=-1)["workers"])
-    with suppress(TimeoutError):  # a process that does not end by itself is no longer the scheduler's
-        client.restart(wait_for_workers=False)
-    try:
-        client.wait_for_workers(count, timeout=min(seconds, RECYCLE_SECONDS))
-    except TimeoutError:
-        client.wait_for_workers(1, timeout=seconds)
-        back = len(client.scheduler_info(n_workers=-1)["workers"])
-        log.warning("%d of %d workers have come back after their scenes; going on with them", back, count)
+    found = client.scheduler_info(n_workers=-1)["workers"]
+    before = [address for address, worker in found.items() if worker["nanny"]]  # others cannot be replaced
+    client.restart_workers(before, timeout=seconds, raise_for_error=False)
+    client.wait_for_workers(1, timeout=seconds)
+    back = worker_count(client)
+    if back < len(found):
+        log.warning("%d of %d workers have come back after their scenes", back, len(found))
+
+
+def worker_count(client: Any) -> int:
+    """Workers that a client's scheduler has, one at the least: more may be on their way."""
+    return max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
+
+
+def logs_folder(settings: Settings) -> Path:
+    """Where workers write their logs."""
+    return settings.output_dir / "logs"
 
 
 def ours(settings: Settings) -> bool:

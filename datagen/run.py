@@ -9,23 +9,21 @@ record.
 from __future__ import annotations
 
 import gc
-import hashlib
 import io
-import json
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
 
 import drjit as dr
 import numpy as np
 
 from datagen.assets import for_split, load_models
 from datagen.build import Geometry, build
-from datagen.card import card_text, command_line
-from datagen.clusters import ours, recycle, require_cluster, workers
+from datagen.card import card_text
+from datagen.clusters import logs_folder, require_cluster
+from datagen.failures import Failure, record_failures, summary
+from datagen.lights import LightChoice
 from datagen.models import outline
 from datagen.plan import (
     RECORD_NAME,
@@ -45,21 +43,15 @@ from datagen.plan import (
 )
 from datagen.preview import contact_row, index_html, sheet_name, write_sheet
 from datagen.scene import SceneSpec, draw_scene
-from datagen.settings import SPLITS, LightChoice, Settings
+from datagen.scheduling import make_each
+from datagen.settings import SPLITS, Settings
 from datagen.synthetic import first_bad_value, make_clips, make_surfels
-from tron.cli.progress import Progress
-from tron.errors import TronError
 from tron.runtime import activate
 from tron.shards.manifest import Manifest
 from tron.shards.writer import ShardWriter
 from tron.storage import locked, require_free_space, write_atomic, write_if_changed
 
 log = logging.getLogger(__name__)
-
-FAILURES_NAME = "failures.jsonl"
-Made = TypeVar("Made")
-Task = Callable[[Work, Settings, Sources], Made]
-"""What makes something of one scene, in a worker; it can be pickled."""
 
 
 def make(settings: Settings) -> int:
@@ -79,20 +71,15 @@ def make(settings: Settings) -> int:
         clear_temporaries(output)
         adopt(settings)
         missing = [item for item in wanted if read_record(output, item) is None]
-        reasons: dict[str, str] = {}
+        failed: dict[str, Failure] = {}
         if missing:
             require_free_space(output, estimate_bytes(settings, missing))
             log.info("%d of %d scenes to make in %s", len(missing), len(items), output)
             clips = {item: len(settings.split(item.split).lights) for item in missing}
-            with Progress("scenes", sum(clips.values()), unit="clips") as progress:
-                for item, outcome in outcomes(make_scene, missing, settings, sources):
-                    if isinstance(outcome, str):
-                        reasons[item.name] = outcome
-                        log.error("%s failed: %s", item.name, outcome)
-                    progress.advance(clips[item], item.name)
-        failures = _account(settings, items, sources, reasons)
+            failed = make_each(make_scene, missing, settings, sources, clips.__getitem__, "clips")
+        failures = _account(settings, items, sources, failed)
     if failures:
-        log.error("%d failures, listed in %s", failures, output / FAILURES_NAME)
+        log.error("%s", summary(failures, output, logs_folder(settings)))
     else:
         log.info("dataset is in %s: look at %s", output, output / "index.html")
     return failures
@@ -162,75 +149,16 @@ def _set_aside(path: Path, frames: Sequence[dict[str, np.ndarray]]) -> None:
     write_atomic(path, buffer.getvalue())
 
 
-def attempt(task: Task[Made], item: Work, settings: Settings, sources: Sources) -> Made | str:
-    """Do a task, with whatever goes wrong as one line: one scene's failure is not the run's."""
-    try:
-        return task(item, settings, sources)
-    except Exception as error:
-        log.debug("scene %s", item.name, exc_info=True)
-        text = str(error) if isinstance(error, TronError) else f"{type(error).__name__}: {error}"
-        return " ".join(text.split())
-
-
-def outcomes(
-    task: Task[Made], items: Sequence[Work], settings: Settings, sources: Sources
-) -> Iterator[tuple[Work, Made | str]]:
-    """Do a task for every scene, here or on the cluster: what it gave, or the reason why it gave nothing, as
-    scenes are finished, in any order.
-    """
-    if settings.cluster is None:
-        for item in items:
-            yield item, attempt(task, item, settings, sources)
-        return
-    from dask.distributed import as_completed
-
-    with workers(settings, len(items)) as client:
-        queue = iter(items)
-        mine = ours(settings)
-        while wave := list(islice(queue, _count(client) * settings.recycle_after if mine else None)):
-            futures = {
-                client.submit(
-                    attempt, task, item, settings, sources, key=_key(settings, item), pure=False
-                ): item
-                for item in wave
-            }
-            for future in as_completed(futures):
-                # A worker that died (killed for memory, crashed in native code) surfaces here, after Dask's
-                # retries.
-                error = future.exception()
-                yield futures[future], f"worker lost: {error}" if error is not None else future.result()
-            if mine and len(wave) < len(items):
-                recycle(client, settings.worker_timeout)
-
-
-def _key(settings: Settings, item: Work) -> str:
-    """A task's name on a scheduler that may serve several runs."""
-    return f"{item.name}-{hashlib.sha256(str(settings.output_dir.absolute()).encode()).hexdigest()[:16]}"
-
-
-def _count(client: Any) -> int:
-    return max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
-
-
-def _account(settings: Settings, items: Sequence[Work], sources: Sources, reasons: dict[str, str]) -> int:
+def _account(
+    settings: Settings, items: Sequence[Work], sources: Sources, failed: Mapping[str, Failure]
+) -> int:
     """Write failures, manifest, card and index from the records; return the number of failures."""
     output = settings.output_dir
-    records = {item.name: read_record(output, item) for item in items}
-    known = {entry["scene"]: entry for entry in _read_failures(output / FAILURES_NAME)}
-    failures: list[dict[str, Any]] = []
-    for item in items:
-        record = records[item.name]
-        if record is not None:
-            failures += [failure(settings, item, q.reason, q.key) for q in record.quarantined]
-        elif item.name in reasons:
-            failures.append(failure(settings, item, reasons[item.name]))
-        elif item.name in known:
-            failures.append(known[item.name])
-    write_failures(output / FAILURES_NAME, failures)
-
-    made = [record for record in records.values() if record is not None]
+    made = [record for item in items if (record := read_record(output, item)) is not None]
+    finished = {record.name: record.quarantined for record in made}
+    failures = record_failures(output, settings, items, failed, finished)
     shards = sorted((entry for record in made for entry in record.shards), key=lambda entry: entry.name)
-    manifest = Manifest(config_sha256=config_sha256(settings), shards=shards, failures=len(failures))
+    manifest = Manifest(config_sha256=config_sha256(settings), shards=shards, failures=failures)
     lights = {split: Counter[str]() for split in SPLITS}
     for record in made:
         spec = SceneSpec.model_validate_json((scene_folder(output, record.name) / "spec.json").read_bytes())
@@ -242,32 +170,4 @@ def _account(settings: Settings, items: Sequence[Work], sources: Sources, reason
     write_if_changed(output / "card.md", card_text(settings, manifest, sources, lights, refinements))
     write_if_changed(output / "index.html", index_html("TRON dataset", shards))
     manifest.save(output)
-    return len(failures)
-
-
-def write_failures(path: Path, failures: Sequence[dict[str, Any]]) -> None:
-    """One line of JSON a failure; no file where there is none."""
-    if failures:
-        write_if_changed(path, "".join(json.dumps(each) + "\n" for each in failures))
-    else:
-        path.unlink(missing_ok=True)
-
-
-def failure(settings: Settings, item: Work, reason: str, clip: str | None = None) -> dict[str, Any]:
-    """What failures.jsonl says of a scene, clip or capture: with the command that tries it again."""
-    return {
-        "scene": item.name,
-        "clip": clip,
-        "split": item.split,
-        "index": item.index,
-        "seed": settings.seed,
-        "reason": reason,
-        "command": command_line(settings, str(settings.output_dir), only=[item.name]),
-    }
-
-
-def _read_failures(path: Path) -> list[dict[str, Any]]:
-    try:
-        return [json.loads(line) for line in path.read_text("utf-8").splitlines()]
-    except (OSError, ValueError):
-        return []
+    return failures

@@ -7,13 +7,12 @@ of the split alone. What it is rendered with (resolution, samples) is the run's 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 from pydantic import Field
 from trimesh import Trimesh
 
 from datagen.layout import Placement, place
-from datagen.lights import Family, HdriSpec, LightSpec, draw_light
+from datagen.lights import FAMILIES, PROCEDURAL, Family, HdriSpec, LightChoice, LightSpec
 from datagen.materials import MaterialSpec, Style, draw_material
 from datagen.shapes import ShapeSpec, draw_shape, make_mesh
 from datagen.spec import Number, Spec, Triple
@@ -29,8 +28,6 @@ LAYOUT_EDGE = 0.5
 FEWEST_OBJECTS = 2
 SCENE_RADIUS = 1.45
 """World units from the origin within which objects stand: all of them in view from every camera."""
-
-DEFAULT_FAMILIES: tuple[Family, ...] = ("sun", "studio", "overcast")
 
 
 class ObjectSpec(Spec):
@@ -128,8 +125,8 @@ def draw_scene(
     index: int,
     *,
     style: Style,
-    lights: Sequence[Family | Literal["any"]],
-    families: Sequence[Family] = DEFAULT_FAMILIES,
+    lights: Sequence[LightChoice],
+    families: Sequence[Family] = PROCEDURAL,
     environments: Sequence[HdriSpec] = (),
     assets: Mapping[str, Trimesh] | None = None,
     asset_share: float = 1.0,
@@ -205,7 +202,7 @@ def _draw_lights(
     seed: int,
     split: str,
     index: int,
-    lights: Sequence[Family | Literal["any"]],
+    lights: Sequence[LightChoice],
     families: Sequence[Family],
     environments: Sequence[HdriSpec],
 ) -> list[LightSpec]:
@@ -213,7 +210,7 @@ def _draw_lights(
     for k, wanted in enumerate(lights):
         rng = generator(seed, split, index, "light", k)
         family = families[int(rng.integers(len(families)))] if wanted == "any" else wanted
-        drawn.append(draw_light(rng, family, environments))
+        drawn.append(FAMILIES[family].draw(rng, environments))
     return drawn
 
 

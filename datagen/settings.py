@@ -16,10 +16,9 @@ from pydantic import (
     model_validator,
 )
 
-from datagen.lights import Family
+from datagen.lights import PROCEDURAL, Family, LightChoice
 from datagen.materials import Style
 
-LightChoice = Literal["any", "sun", "studio", "overcast", "hdri"]
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {"output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "cluster", "captures"}
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
@@ -53,34 +52,44 @@ class SplitSettings(_Model):
     """One split: how many scenes of which kind, and how they are rendered."""
 
     scenes: int = Field(ge=0, le=1_000_000, description="Number of scenes.")
-    style: Style = Field(description="Distribution of shapes, patterns, object counts and floor.")
+    style: Style = Field(
+        default="A", description="Distribution of shapes, patterns, object counts and floor."
+    )
     lights: list[LightChoice] = Field(
+        default=["any"] * 4,
         min_length=1,
         max_length=64,
         description="Light family of each clip of a scene; any draws one of families.",
     )
-    frames: int = Field(ge=1, le=1000, description="Consecutive frames of a clip.")
-    width: int = Field(ge=8, le=8192, description="Frame width in pixels.")
-    height: int = Field(ge=8, le=8192, description="Frame height in pixels.")
+    frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
+    width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
+    height: int = Field(default=256, ge=8, le=8192, description="Frame height in pixels.")
     path_spp: int = Field(
+        default=256,
         ge=1,
         description="Paths a pixel of path-traced frames; rounded up to a product of near numbers.",
     )
     guidance_spp: int = Field(
-        ge=2, multiple_of=2, description="Shadow rays a pixel of the surfels' irradiance, even."
+        default=64, ge=2, multiple_of=2, description="Shadow rays a pixel of the surfels' irradiance, even."
     )
     reference_buffers: bool = Field(
+        default=False,
         description="Also store Mitsuba's direct irradiance, with and without shadows, base color, normals, "
-        "depth, roughness and metallic, and the surfels' own."
+        "depth, roughness and metallic, and the surfels' own.",
     )
-    reference_spp: int = Field(ge=2, description="Shadow rays a pixel of Mitsuba's direct irradiance.")
+    reference_spp: int = Field(
+        default=128, ge=2, description="Shadow rays a pixel of Mitsuba's direct irradiance."
+    )
 
 
 class CaptureSettings(_Model):
     """Scenes of the test split as captures: spiral views under one light, path-traced, with true maps."""
 
     scenes: int = Field(
-        4, ge=1, le=1_000_000, description="Captures that mode=captures makes, of as many test scenes."
+        default=4,
+        ge=1,
+        le=1_000_000,
+        description="Captures that mode=captures makes, of as many test scenes.",
     )
     lights: list[LightChoice] = Field(
         default=["overcast", "studio", "sun"],
@@ -89,16 +98,19 @@ class CaptureSettings(_Model):
         description="Light family of each capture, in rotation; any draws one of families.",
     )
     views: int = Field(
-        64, ge=2, le=100_000, description="Spiral views of a capture; each 8th is held out, from the first."
+        default=64,
+        ge=2,
+        le=100_000,
+        description="Spiral views of a capture; each 8th is held out, from the first.",
     )
-    width: int = Field(128, ge=8, le=8192, description="View width in pixels.")
-    height: int = Field(128, ge=8, le=8192, description="View height in pixels.")
+    width: int = Field(default=128, ge=8, le=8192, description="View width in pixels.")
+    height: int = Field(default=128, ge=8, le=8192, description="View height in pixels.")
     path_spp: int = Field(
-        64, ge=1, description="Paths a pixel; rounded up to a product of near numbers, such as 8 x 8."
+        default=64, ge=1, description="Paths a pixel; rounded up to a product of near numbers, such as 8 x 8."
     )
-    reference_spp: int = Field(32, ge=2, description="Shadow rays a pixel of the irradiance maps.")
+    reference_spp: int = Field(default=32, ge=2, description="Shadow rays a pixel of the irradiance maps.")
     points: int | None = Field(
-        None,
+        default=None,
         ge=1,
         le=10_000_000,
         description="Also store about so many points on surfaces, with their colours, as photos would give.",
@@ -117,15 +129,21 @@ class Settings(_Model):
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."
     )
-    train: SplitSettings = Field(description="First training split.")
-    train_b: SplitSettings = Field(description="Second training split, of another distribution.")
+    train: SplitSettings = Field(SplitSettings(scenes=16), description="First training split.")
+    train_b: SplitSettings = Field(
+        SplitSettings(scenes=4, style="B"), description="Second training split, of another distribution."
+    )
     validation: SplitSettings = Field(
-        description="Scenes whose PSNR training shows; nothing is trained on them."
+        SplitSettings(scenes=2, lights=["any"] * 2),
+        description="Scenes whose PSNR training shows; nothing is trained on them.",
     )
     test: SplitSettings = Field(
-        description="Held-out scenes under held-out lights, for evaluation alone: training never reads them."
+        SplitSettings(scenes=4, lights=["sun", "studio", "overcast"], reference_buffers=True),
+        description="Held-out scenes under held-out lights, for evaluation alone: training never reads them.",
     )
-    captures: CaptureSettings = Field(description="Captures to reconstruct, of the test scenes.")
+    captures: CaptureSettings = Field(
+        CaptureSettings(), description="Captures to reconstruct, of the test scenes."
+    )
     path_frames: int = Field(
         93, ge=1, le=100_000, description="Frames of the whole path that clips are cut from."
     )
@@ -136,10 +154,10 @@ class Settings(_Model):
         None,
         description="What light 'any' chooses from; null: hdri with environments, else the procedural ones.",
     )
-    views: int = Field(290, ge=1, description="Spiral views whose G-buffers the surfels are made from.")
-    view_width: int = Field(800, ge=8, le=8192, description="Width of those views in pixels.")
-    view_height: int = Field(800, ge=8, le=8192, description="Height of those views in pixels.")
-    surfels: int = Field(200_000, ge=100, description="Number of surfels of a scene, about.")
+    views: int = Field(64, ge=1, description="Spiral views whose G-buffers the surfels are made from.")
+    view_width: int = Field(256, ge=8, le=8192, description="Width of those views in pixels.")
+    view_height: int = Field(256, ge=8, le=8192, description="Height of those views in pixels.")
+    surfels: int = Field(60_000, ge=100, description="Number of surfels of a scene, about.")
     refine_steps: int = Field(
         200,
         ge=0,
@@ -147,7 +165,7 @@ class Settings(_Model):
         description="Optimisation steps that fit a scene's surfels to its G-buffers; 0 takes them as made.",
     )
     mesh_edge: float = Field(
-        0.03,
+        0.04,
         gt=0,
         le=1,
         description="Longest edge of procedural meshes in world units; patterns are that sharp.",
@@ -243,7 +261,7 @@ class Settings(_Model):
         """The families that ``any`` chooses from."""
         if self.families is not None:
             return list(self.families)
-        return ["hdri"] if self.environments is not None else ["sun", "studio", "overcast"]
+        return ["hdri"] if self.environments is not None else list(PROCEDURAL)
 
     def recipe(self) -> dict[str, Any]:
         """What decides a scene's content, as plain values: not where it goes, who makes it or how many."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from datagen.build import Geometry
-from datagen.lights import LightSpec, bake, classify
+from datagen.lights import classify
 from datagen.pathtrace import DirectIrradiance, direct_irradiance, gbuffers, render_frames
 from datagen.plan import Refinement
 from datagen.refinement import refine_surfels
@@ -55,26 +55,16 @@ def make_clips(
     both under the same baked map; with reference buffers also what Mitsuba says of the pixel centres.
     """
     tracer = SurfelTracer(surfels)
-    for number, light in enumerate(spec.lights):
-        environment = bake(
-            light,
-            settings.environment_height,
-            None if settings.environments is None else str(settings.environments),
-        )
-        yield make_clip(spec, geometry, tracer, light, number, environment, settings)
+    for number in range(len(spec.lights)):
+        yield make_clip(spec, geometry, tracer, number, settings)
 
 
 def make_clip(
-    spec: SceneSpec,
-    geometry: Geometry,
-    tracer: SurfelTracer,
-    light: LightSpec,
-    number: int,
-    environment: EnvironmentMap,
-    settings: Settings,
+    spec: SceneSpec, geometry: Geometry, tracer: SurfelTracer, number: int, settings: Settings
 ) -> tuple[ClipMeta, list[Frame]]:
     """Render the clip of one light; ``number`` is its place in the scene's list and names its seeds."""
-    recipe = settings.split(spec.split)
+    recipe, light = settings.split(spec.split), spec.lights[number]
+    environment = light.bake(settings.environment_height, settings.environments)
     cameras = spec.clip(number, recipe.frames, recipe.width, recipe.height)
     scene = geometry.lit(environment)
     path = ("light", number, "frame")

@@ -8,7 +8,7 @@ import logging
 from pathlib import Path
 
 from datagen.capture_export import CAPTURES
-from datagen.capture_manifest import verify_captures
+from datagen.capture_manifest import capture_names, verify_captures
 from tron.shards.manifest import MANIFEST_NAME, Manifest
 from tron.shards.verify import verify
 
@@ -33,7 +33,7 @@ def validate(folder: Path) -> int:
     for problem in problems:
         log.error("%s", problem)
     if captures.is_dir():
-        log.info("%d captures", len(list(captures.glob("[!.]*/"))))
+        log.info("%d captures", len(capture_names(captures)))
     log.info("%d problems", len(problems))
     return len(problems)
 

@@ -19,7 +19,9 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     benchmark: dict[str, Any] = Field(description="settings of the benchmark; benchmark=NAME chooses it")
-    output_dir: Path = Field(description="folder for results.json, report.html and the pictures")
+    output_dir: Path = Field(
+        default=Path("outputs/eval"), description="folder for results.json, report.html and the pictures"
+    )
     dataset: Path | None = Field(default=None, description="data set to evaluate on, made by tron-datagen")
     renderer: Path | None = Field(default=None, description="weights of the neural renderer (.safetensors)")
     pixel_mlp: Path | None = Field(default=None, description="weights of the pixel MLP baseline")

@@ -3,8 +3,10 @@
 import ctypes
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 # Read by torch when it is first imported: sums depend on the thread count, tests must not.
@@ -58,3 +60,50 @@ def drjit_threads() -> None:
         threads = max(2, os.cpu_count() or 1)
         if dr.thread_count() != threads:
             dr.set_thread_count(threads)
+
+
+@pytest.fixture(scope="session")
+def tiny_scenes() -> list[str]:
+    """Overrides of `tron-datagen` for two scenes of one small frame each, made in seconds."""
+    train = [
+        "scenes=2",
+        "lights=[overcast]",
+        "frames=1",
+        "width=16",
+        "height=12",
+        "path_spp=2",
+        "guidance_spp=2",
+    ]
+    return [
+        *(f"train.{value}" for value in train),
+        *(f"{split}.scenes=0" for split in ("train_b", "validation", "test")),
+        *("views=4", "view_width=24", "view_height=24", "surfels=500", "refine_steps=0"),
+        *("mesh_edge=0.2", "environment_height=16", "objects=[1,1]"),
+    ]
+
+
+@pytest.fixture(scope="session")
+def files_of() -> Callable[[Path], dict[str, bytes]]:
+    """What gives every file that a recipe made in a folder, with its bytes: no lock and no log."""
+
+    def files_of(folder: Path) -> dict[str, bytes]:
+        files = {p.relative_to(folder): p for p in sorted(folder.rglob("*")) if p.is_file()}
+        return {
+            path.as_posix(): file.read_bytes()
+            for path, file in files.items()
+            if path.name != ".tron.lock" and path.parts[0] not in ("logs", "slurm")
+        }
+
+    return files_of
+
+
+@pytest.fixture
+def read_video() -> Callable[[Path], np.ndarray]:
+    """All frames of a video, (N, H, W, 3) uint8."""
+    import av
+
+    def read(path: Path) -> np.ndarray:
+        with av.open(str(path)) as container:
+            return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+
+    return read

@@ -26,7 +26,8 @@ from torch import distributed
 from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException, start_processes
 
 from train.settings import Settings
-from tron.cli.command_line import INTERRUPTED, USER_ERROR, configure_logging
+from tron.cli.command_line import INTERRUPTED, USER_ERROR
+from tron.cli.log import configure_logging
 from tron.errors import TronError
 
 GRACE_SECONDS = 15.0

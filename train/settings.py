@@ -100,6 +100,19 @@ class ValidationSettings(BaseModel):
     every: int = Field(default=250, ge=1, description="Steps between validations.")
 
 
+# Half of the samples come from stage 1's split, against forgetting it.
+_REHEARSED: dict[str, Any] = {"rehearsal_split": "train", "rehearsal_ratio": 0.5, "learning_rate": 0.5}
+THREE_STAGES = [
+    Stage(name="synthetic", split="train", steps=3000, crop=64),
+    Stage(name="adapt", split="train_b", steps=1000, crop=64, **_REHEARSED),
+    Stage(name="video", split="train_b", frames=5, steps=1000, batch_size=4, crop=64, **_REHEARSED),
+]
+"""The paper's curriculum; a second path-traced split of another distribution replaces real photographs.
+
+It shows that the curriculum works, not what real data would add.
+"""
+
+
 class Settings(BaseModel):
     """Settings of tron-train."""
 
@@ -112,7 +125,7 @@ class Settings(BaseModel):
     renderer: dict[str, Any] = Field(
         description="What is trained, a `_target_` (group: tiny, pixel_mlp, cosmos)."
     )
-    stages: list[Stage] = Field(min_length=1, description="The curriculum, in order.")
+    stages: list[Stage] = Field(default=THREE_STAGES, min_length=1, description="The curriculum, in order.")
     optimizer: OptimizerSettings = OptimizerSettings()
     loss: LossSettings = LossSettings()
     data: DataSettings = DataSettings()

@@ -21,6 +21,9 @@ from tron.errors import TronError
 MINIMUM_LLVM = 17
 """Below it a kernel with min or max aborts the whole process ("Cannot select: fminimum")."""
 
+keep_kernel_history = False
+"""Whether :func:`activate` lets Dr.Jit take note of each kernel it starts, for `--profile`."""
+
 _TESTED_LLVM = 19
 _STACK = ("tron", "mitsuba", "drjit", "numpy", "scipy", "torch", "diffusers", "lightning", "OpenEXR", "av")
 _LLVM_FOLDERS = (
@@ -132,6 +135,8 @@ def activate(variant: str = "llvm_ad_rgb", threads: int | None = None) -> None:
         if threads < 1:
             raise TronError(f"number of threads must be at least 1, not {threads}")
         dr.set_thread_count(threads)
+    if keep_kernel_history:
+        dr.set_flag(dr.JitFlag.KernelHistory, True)
     if mi.variant() == variant:
         return
     try:

@@ -8,6 +8,7 @@ the world's x axis where up is +z. Elevation is the angle above the plane throug
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NotRequired, TypedDict, Unpack
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -19,18 +20,32 @@ Vector = Sequence[float] | np.ndarray
 Z_UP = (0.0, 0.0, 1.0)
 
 
+class View(TypedDict):
+    """The subject of a path, and the images that its cameras take.
+
+    Attributes:
+        target: (3,) world point in the middle of every image.
+        radius: distance of the cameras from the target, world units.
+        width, height: pixels.
+        fov_deg: horizontal field of view.
+        up: (3,) world direction; +z if it is not given.
+    """
+
+    target: Vector
+    radius: float
+    width: int
+    height: int
+    fov_deg: float
+    up: NotRequired[Vector]
+
+
 def spiral(
     n: int,
     *,
-    target: Vector,
-    radius: float,
-    width: int,
-    height: int,
-    fov_deg: float,
     elevation_deg: tuple[float, float] = (10.0, 75.0),
     turns: float = 3.0,
     phase: float = 0.0,
-    up: Vector = Z_UP,
+    **view: Unpack[View],
 ) -> list[Camera]:
     """Wind around the target from the lower to the upper elevation, evenly over the sphere's area.
 
@@ -39,62 +54,49 @@ def spiral(
 
     Args:
         n: number of cameras.
-        target: (3,) world point in the middle of every image.
-        radius: distance of the cameras from the target, world units.
-        width, height, fov_deg: image size in pixels and horizontal field of view.
         elevation_deg: of the first and the last camera, within (-90, 90).
         turns: windings from the first to the last camera.
         phase: azimuth of the first camera in degrees.
-        up: (3,) world direction.
+        view: what the path goes around.
     """
     fraction = _fractions(n)
     low, high = np.sin(np.radians(elevation_deg))
     elevation = np.degrees(np.arcsin(low + (high - low) * fraction))
     azimuth = phase + 360.0 * turns * fraction
-    return _around(azimuth, elevation, target, radius, up, fov_deg, width, height)
+    return _around(azimuth, elevation, **view)
 
 
 def oscillating(
     n: int,
     *,
-    target: Vector,
-    radius: float,
-    width: int,
-    height: int,
-    fov_deg: float,
     elevation_deg: float = 28.0,
     amplitude_deg: float = 14.0,
     azimuth_deg: tuple[float, float] = (17.0, 338.0),
     swings: float = 1.5,
-    up: Vector = Z_UP,
+    **view: Unpack[View],
 ) -> list[Camera]:
     """Travel around the target while rising and sinking: the path of the benchmark's test clips.
 
     Args:
         n: number of cameras.
-        target, radius, width, height, fov_deg, up: as in :func:`spiral`.
         elevation_deg: mean elevation.
         amplitude_deg: largest deviation from it.
         azimuth_deg: of the first and the last camera.
         swings: full up-and-down periods from the first to the last camera.
+        view: what the path goes around.
     """
     fraction = _fractions(n)
     azimuth = azimuth_deg[0] + (azimuth_deg[1] - azimuth_deg[0]) * fraction
     elevation = elevation_deg + amplitude_deg * np.sin(2 * np.pi * swings * fraction)
-    return _around(azimuth, elevation, target, radius, up, fov_deg, width, height)
+    return _around(azimuth, elevation, **view)
 
 
 def orbit(
     n: int,
     *,
-    target: Vector,
-    radius: float,
-    width: int,
-    height: int,
-    fov_deg: float,
     elevation_deg: float = 25.0,
     phase: float = 0.0,
-    up: Vector = Z_UP,
+    **view: Unpack[View],
 ) -> list[Camera]:
     """Go once around the target at one elevation; frame n would be frame 0 again, so the clip loops.
 
@@ -102,27 +104,22 @@ def orbit(
     """
     _fractions(n)
     azimuth = phase + 360.0 * np.arange(n) / n
-    return _around(azimuth, np.full(n, elevation_deg), target, radius, up, fov_deg, width, height)
+    return _around(azimuth, np.full(n, elevation_deg), **view)
 
 
 def still(
     n: int,
     *,
-    target: Vector,
-    radius: float,
-    width: int,
-    height: int,
-    fov_deg: float,
     elevation_deg: float = 25.0,
     phase: float = 0.0,
-    up: Vector = Z_UP,
+    **view: Unpack[View],
 ) -> list[Camera]:
     """Stay at the first camera of :func:`orbit`, one object n times: for clips in which only the light moves.
 
     Args: as in :func:`spiral`.
     """
     where = np.array([phase]), np.array([elevation_deg])
-    return _around(*where, target, radius, up, fov_deg, width, height) * len(_fractions(n))
+    return _around(*where, **view) * len(_fractions(n))
 
 
 def keyframed(cameras: Sequence[Camera], n: int) -> list[Camera]:
@@ -168,28 +165,18 @@ def _fractions(n: int) -> np.ndarray:
     return np.arange(n) / max(n - 1, 1)
 
 
-def _around(
-    azimuth_deg: np.ndarray,
-    elevation_deg: np.ndarray,
-    target: Vector,
-    radius: float,
-    up: Vector,
-    fov_deg: float,
-    width: int,
-    height: int,
-) -> list[Camera]:
+def _around(azimuth_deg: np.ndarray, elevation_deg: np.ndarray, **view: Unpack[View]) -> list[Camera]:
+    target, radius = np.asarray(view["target"], dtype=np.float64), view["radius"]
+    east, north, zenith = _frame(np.asarray(view.get("up", Z_UP), dtype=np.float64))
+    image = {"fov_deg": view["fov_deg"], "width": view["width"], "height": view["height"]}
     if np.abs(elevation_deg).max() >= 90:
         raise TronError("elevations of a camera path must stay between -90 and 90 degrees")
     if not radius > 0:
         raise TronError(f"radius of a camera path must be positive, not {radius}")
-    east, north, zenith = _frame(np.asarray(up, dtype=np.float64))
     azimuth, elevation = np.radians(azimuth_deg)[:, None], np.radians(elevation_deg)[:, None]
     level = np.cos(azimuth) * east + np.sin(azimuth) * north
     outward = np.cos(elevation) * level + np.sin(elevation) * zenith
-    return [
-        Camera.look_at(position, target, up=zenith, fov_deg=fov_deg, width=width, height=height)
-        for position in np.asarray(target, dtype=np.float64) + radius * outward
-    ]
+    return [Camera.look_at(position, target, up=zenith, **image) for position in target + radius * outward]
 
 
 def _frame(up: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Videos in and out by PyAV: H.264 in an MP4 that every browser plays."""
+"""Videos by PyAV: H.264 in an MP4 that every browser plays."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from types import TracebackType
 
 import av
 import numpy as np
-from av.error import FFmpegError
 from av.video.reformatter import ColorRange, Colorspace
 
 from tron.errors import TronError
@@ -18,7 +17,6 @@ from tron.storage import atomic_path
 
 _CODECS = ("libx264", "libopenh264", "mpeg4")  # the first that this build of PyAV can encode
 _CRF = "18"  # visually lossless
-_MAX_DECODED_BYTES = 2**32
 
 
 class VideoWriter:
@@ -83,26 +81,6 @@ class VideoWriter:
             if self._frames == 0:
                 raise TronError("video has no frames", self._path)
             self._container.mux(self._stream.encode())
-
-
-def read_video(path: str | os.PathLike[str]) -> np.ndarray:
-    """Read all frames of a video as (N, H, W, 3) uint8 display values.
-
-    Raises:
-        TronError: the file is missing, not a video, without frames, or larger than 4 GiB once decoded.
-    """
-    frames: list[np.ndarray] = []
-    try:
-        with av.open(str(path)) as container:
-            for frame in container.decode(video=0):
-                if (len(frames) + 1) * frame.width * frame.height * 3 > _MAX_DECODED_BYTES:
-                    raise TronError("video is too large to be read at once", path)
-                frames.append(frame.to_ndarray(format="rgb24"))
-    except (FFmpegError, OSError, IndexError) as error:
-        raise TronError(f"cannot read video: {getattr(error, 'strerror', None) or error}", path) from error
-    if not frames:
-        raise TronError("video has no frames", path)
-    return np.stack(frames)
 
 
 def _codec() -> str:

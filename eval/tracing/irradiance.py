@@ -30,7 +30,6 @@ from tron.shading.guidance import Guidance, reaching_share, shade
 from tron.shading.irradiance import ORIGIN_OFFSET
 from tron.tracing import GBuffer, SurfelTracer
 from tron.tracing.bvh import build_bvh
-from tron.tracing.tiles import lanes_of_pixels, tile_pixels
 
 FEW, MANY = 2, 64
 FAN = 4
@@ -65,7 +64,7 @@ def measure_direct(contenders: Contenders, size: int, light: str, seed: int, rou
     times = interleaved(contestants, rounds)
     shadowed, _ = contestants["tron"]()
     images = {
-        "tron": np.array(shadowed).T.reshape(size, size, 3),
+        "tron": gbuffer.image(shadowed),
         "direct": np.array(contestants["direct by camera rays"]()),
     }
     lit = LitImages(light, environment.exposure(), images)
@@ -194,17 +193,14 @@ def independent_irradiance(
     """Shadowed and unshadowed irradiance / pi by the estimator of :mod:`tron.shading.irradiance`, plainly.
 
     Every ray has random numbers of its own (PCG32); half are cosine-distributed, half follow the light.
-    Pixels go in tile order and rays in fans, as in the pass itself, so that only the numbers differ.
+    Rays go in fans, as in the pass itself, so that only the numbers differ.
     """
-    _, x, y, inside = tile_pixels(gbuffer.width, gbuffer.height)
-    pixel = y * dr.opaque(mi.UInt32, gbuffer.width) + x
-    frame = mi.Frame3f(mi.Normal3f(*[dr.gather(mi.Float, v, pixel, inside) for v in gbuffer.normal]))
-    origin = mi.Point3f(*[dr.gather(mi.Float, v, pixel, inside) for v in gbuffer.position])
-    origin += frame.n * dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
-    surface = inside & (dr.gather(mi.Float, gbuffer.opacity, pixel, inside) > 0)
+    frame = mi.Frame3f(gbuffer.normal)
+    origin = gbuffer.position + frame.n * dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
+    surface = gbuffer.opacity > 0
     stream = dr.opaque(mi.UInt64, seeds.integer(seed, "independent irradiance", bits=31))
-    random = mi.PCG32(size=dr.width(pixel), initstate=stream)
-    shadowed, unshadowed = (dr.zeros(mi.Color3f, dr.width(pixel)) for _ in range(2))
+    random = mi.PCG32(size=dr.width(surface), initstate=stream)
+    shadowed, unshadowed = (dr.zeros(mi.Color3f, dr.width(surface)) for _ in range(2))
     dr.make_opaque(shadowed, unshadowed)
     dr.eval(frame, origin, surface, random)
     half, fan = spp // 2, FAN if spp % (2 * FAN) == 0 else 1
@@ -226,9 +222,7 @@ def independent_irradiance(
         unshadowed += sum(values)
         shadowed += sum(value * share for value, share in zip(values, visible, strict=True))
         dr.eval(shadowed, unshadowed, random)
-    lane, scale = lanes_of_pixels(gbuffer.width, gbuffer.height), dr.opaque(mi.Float, 1 / half)
-    in_rows = [
-        mi.Color3f(*[dr.gather(mi.Float, v, lane) for v in color]) * scale for color in (shadowed, unshadowed)
-    ]
-    dr.eval(in_rows)
-    return in_rows[0], in_rows[1]
+    scale = dr.opaque(mi.Float, 1 / half)
+    shadowed, unshadowed = shadowed * scale, unshadowed * scale
+    dr.eval(shadowed, unshadowed)
+    return shadowed, unshadowed

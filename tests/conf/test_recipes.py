@@ -4,9 +4,10 @@ import inspect
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
+import yaml
 from hydra.utils import get_object
 from omegaconf import OmegaConf
 from pydantic import BaseModel
@@ -14,13 +15,15 @@ from pydantic import BaseModel
 from tron.cli.command_line import Command
 from tron.cli.recipes import (
     check,
+    complete,
     compose_recipe,
     field_keys,
     group_options,
-    nested_items,
+    model_defaults,
     nested_model,
     resolve,
 )
+from tron.nested import leaves, nested_items
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
@@ -41,7 +44,7 @@ def load_command(folder: str) -> Command:
 
 def with_required_values(command: Command, overrides: list[str]) -> list[str]:
     """The overrides and a stand-in for every key that only the user can know: all names or paths."""
-    recipe = compose_recipe(command.config_module, overrides)
+    recipe = complete(compose_recipe(command.config_module, command.settings, overrides))
     required = [key for key, value in nested_items(OmegaConf.to_container(recipe)) if value == "???"]
     return [*overrides, *(f"{key}=stand-in" for key in required)]
 
@@ -54,14 +57,16 @@ def test_every_command_has_a_folder_of_recipes_and_no_folder_is_without_a_comman
 @pytest.mark.parametrize(("folder", "overrides"), shipped_recipes())
 def test_a_shipped_recipe_is_valid(folder: str, overrides: list[str]):
     command = load_command(folder)
-    recipe = compose_recipe(command.config_module, with_required_values(command, overrides))
+    recipe = compose_recipe(command.config_module, command.settings, with_required_values(command, overrides))
     check(recipe, command.settings)
 
 
 @pytest.mark.parametrize(("folder", "overrides"), shipped_recipes())
 def test_a_class_that_a_recipe_names_exists(folder: str, overrides: list[str]):
     command = load_command(folder)
-    values = resolve(compose_recipe(command.config_module, with_required_values(command, overrides)))
+    values = resolve(
+        compose_recipe(command.config_module, command.settings, with_required_values(command, overrides))
+    )
     for key, value in nested_items(values):
         if key.rpartition(".")[2] == "_target_":
             assert callable(get_object(value)), f"{key}={value}"
@@ -70,9 +75,9 @@ def test_a_class_that_a_recipe_names_exists(folder: str, overrides: list[str]):
 @pytest.mark.parametrize(("folder", "overrides"), shipped_recipes())
 def test_every_seed_follows_the_seed_of_the_run(folder: str, overrides: list[str]):
     """Seeds of parts are the run's unless they are set, and no class that takes one is left without."""
-    recipe = compose_recipe(
-        load_command(folder).config_module, [*with_required_values(load_command(folder), overrides), "seed=7"]
-    )
+    command = load_command(folder)
+    overrides = [*with_required_values(command, overrides), "seed=7"]
+    recipe = complete(compose_recipe(command.config_module, command.settings, overrides))
     values = dict(nested_items(resolve(recipe)))
     seeds = {key: value for key, value in values.items() if key.rpartition(".")[2] == "seed"}
     for key, value in values.items():
@@ -82,11 +87,37 @@ def test_every_seed_follows_the_seed_of_the_run(folder: str, overrides: list[str
     assert seeds == dict.fromkeys(seeds, 7)
 
 
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "conf").rglob("*.yaml")), ids=lambda p: str(p.relative_to(ROOT))
+)
+def test_no_key_is_stated_twice_with_one_value(path: Path):
+    """Defaults are the model's: YAML says what differs from the model and from the YAML beneath it."""
+    folder, *group, _ = path.relative_to(ROOT / "conf").with_suffix("").parts
+    command = load_command(folder)
+    said = {key: value for key, value in yaml.safe_load(path.read_text()).items() if key != "defaults"}
+    if not group:
+        beneath = OmegaConf.create(model_defaults(command.settings))
+    elif "@package _global_" in path.read_text():
+        beneath = complete(compose_recipe(command.config_module, command.settings))
+    else:
+        beneath = complete(OmegaConf.create(only_targets(said)))
+    known = leaves(cast(dict, OmegaConf.to_container(beneath)))
+    named = {key: value for key, value in leaves(said).items() if key.rpartition(".")[2] != "_target_"}
+    assert {key: value for key, value in named.items() if key in known and known[key] == value} == {}
+
+
+def only_targets(values: dict[str, Any]) -> dict[str, Any]:
+    """What a file of one object would be if it said nothing but the classes."""
+    inner = {name: only_targets(value) for name, value in values.items() if isinstance(value, dict)}
+    named = {"_target_": values["_target_"]} if "_target_" in values else {}
+    return named | {name: value for name, value in inner.items() if value}
+
+
 @pytest.mark.parametrize("folder", sorted(COMMANDS))
 def test_every_setting_can_be_set_from_the_command_line(folder: str):
     """A field that its YAML leaves out would be an unknown key to Hydra."""
     command = load_command(folder)
-    values = OmegaConf.to_container(compose_recipe(command.config_module, []))
+    values = OmegaConf.to_container(compose_recipe(command.config_module, command.settings))
     written = {key for key, _ in nested_items(values)}
     optional = {
         key for key, value in nested_items(values) if value is None

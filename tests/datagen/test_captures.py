@@ -44,12 +44,9 @@ TINY = [
 
 
 def tiny(output: Path, *overrides: str) -> Settings:
-    return check(compose_recipe("conf.datagen", [*TINY, f"output_dir={output}", *overrides]), Settings)
-
-
-def tree(folder: Path) -> dict[str, bytes]:
-    files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != ".tron.lock")
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in files}
+    return check(
+        compose_recipe("conf.datagen", Settings, [*TINY, f"output_dir={output}", *overrides]), Settings
+    )
 
 
 @pytest.fixture(scope="module")
@@ -189,15 +186,18 @@ def test_nothing_that_is_not_finite_is_stored(tmp_path, monkeypatch):
     assert make_captures(tiny(tmp_path, "captures.scenes=1", "captures.path_spp=1")) == 1
     listed = tmp_path / "captures" / "failures.jsonl"
     assert {path.name for path in (tmp_path / "captures").iterdir()} == {
-        "config.yaml", "manifest.json", "failures.jsonl",
+        "config.yaml", "manifest.json", "failures.jsonl", "failures",
     }  # fmt: skip
+    assert "in develop" in (tmp_path / "captures/failures/test-000000.txt").read_text()
+    assert validate(tmp_path) == 0, "tracebacks are no capture"
     told = json.loads(listed.read_text())
     assert told["scene"] == "test-000000"
     assert "values that are not finite" in told["reason"]
     monkeypatch.undo()
     words = shlex.split(told["command"])
-    assert make_captures(check(compose_recipe("conf.datagen", words[1:]), Settings)) == 0
+    assert make_captures(check(compose_recipe("conf.datagen", Settings, words[1:]), Settings)) == 0
     assert not listed.exists()
+    assert not (tmp_path / "captures/failures").exists()
 
 
 def _damaged(folder: Path, how: str) -> str:
@@ -248,20 +248,20 @@ def test_captures_of_an_older_engine_are_recorded_by_the_next_run(output, tmp_pa
     assert validate(copy) == 0
 
 
-def test_captures_repeat_byte_by_byte_in_any_groups_and_company(output, tmp_path, monkeypatch):
+def test_captures_repeat_byte_by_byte_in_any_groups_and_company(output, tmp_path, monkeypatch, files_of):
     """Views rendered two at a time, one scene alone: the bytes do not depend on it."""
     monkeypatch.setattr(datagen.capture_export, "GROUP_PIXELS", 2 * 28 * 20)
     assert make_captures(tiny(tmp_path, "only=[test-000001]")) == 0
-    whole = tree(output / "captures" / "test-000001")
-    assert tree(tmp_path / "captures" / "test-000001") == whole
+    whole = files_of(output / "captures" / "test-000001")
+    assert files_of(tmp_path / "captures" / "test-000001") == whole
     assert not (tmp_path / "captures" / "test-000000").exists()
     other = tiny(tmp_path / "other", "seed=1", "only=[test-000001]", "captures.path_spp=4")
     assert make_captures(other) == 0
-    assert tree(tmp_path / "other/captures/test-000001")["spec.json"] != whole["spec.json"]
+    assert files_of(tmp_path / "other/captures/test-000001")["spec.json"] != whole["spec.json"]
 
 
-def test_a_finished_capture_is_not_made_again_and_a_damaged_one_is(output, monkeypatch):
-    before = tree(output)
+def test_a_finished_capture_is_not_made_again_and_a_damaged_one_is(output, monkeypatch, files_of):
+    before = files_of(output)
     made = []
 
     def watched(item: Work, *rest):
@@ -276,7 +276,7 @@ def test_a_finished_capture_is_not_made_again_and_a_damaged_one_is(output, monke
     assert make_captures(tiny(output)) == 0
     assert made == ["test-000000"]
     (output / "captures/.test-000001.part").rmdir()
-    assert tree(output) == before
+    assert files_of(output) == before
 
 
 @pytest.mark.parametrize(
@@ -289,12 +289,12 @@ def test_a_finished_capture_is_not_made_again_and_a_damaged_one_is(output, monke
         ("mesh_edge=0.2", "mesh_edge"),
     ],
 )
-def test_another_recipe_is_refused_before_anything_is_written(output, change, message):
-    before = tree(output)
+def test_another_recipe_is_refused_before_anything_is_written(output, change, message, files_of):
+    before = files_of(output)
     with pytest.raises(TronError, match=message) as caught:
         make_captures(tiny(output, change))
     assert "\n" not in str(caught.value)
-    assert tree(output) == before
+    assert files_of(output) == before
 
 
 def test_more_captures_may_be_added_and_datasets_do_not_care(output):
@@ -349,6 +349,6 @@ def test_the_folder_says_what_it_was_made_from(folder, output):
 
 
 @pytest.mark.long
-def test_two_workers_make_the_bytes_of_one_process(output, tmp_path):
+def test_two_workers_make_the_bytes_of_one_process(output, tmp_path, files_of):
     assert make_captures(tiny(tmp_path, "cluster=local", "workers=2")) == 0
-    assert tree(tmp_path) == tree(output)
+    assert files_of(tmp_path) == files_of(output)

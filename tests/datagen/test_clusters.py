@@ -1,9 +1,11 @@
 """Clusters: what is missing is said before work starts, a scheduler that runs is used and left as it was."""
 
 import importlib.util
+import logging
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from dask.distributed import Client, LocalCluster
@@ -12,38 +14,20 @@ from datagen.capture_export import make_captures
 from datagen.cli import cli
 from datagen.run import make
 from datagen.settings import Settings
+from datagen.worker_log import WorkerLog
 from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
 
-TINY = [
-    "train.scenes=2",
-    "train_b.scenes=0",
-    "validation.scenes=0",
-    "test.scenes=0",
-    "train.lights=[overcast]",
-    "train.frames=1",
-    "train.width=16",
-    "train.height=12",
-    "train.path_spp=2",
-    "train.guidance_spp=2",
-    "views=4",
-    "view_width=24",
-    "view_height=24",
-    "surfels=500",
-    "refine_steps=0",
-    "mesh_edge=0.2",
-    "environment_height=16",
-    "objects=[1,1]",
-]
+Tiny = Callable[..., Settings]
 
 
-def tiny(output: Path, *overrides: str) -> Settings:
-    return check(compose_recipe("conf.datagen", [*TINY, f"output_dir={output}", *overrides]), Settings)
+@pytest.fixture
+def tiny(tiny_scenes) -> Tiny:
+    def tiny(output: Path, *overrides: str) -> Settings:
+        words = [*tiny_scenes, f"output_dir={output}", *overrides]
+        return check(compose_recipe("conf.datagen", Settings, words), Settings)
 
-
-def tree(folder: Path) -> dict[str, bytes]:
-    files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != ".tron.lock")
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in files}
+    return tiny
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +37,7 @@ def empty_scheduler() -> Iterator[str]:
         yield client.scheduler_info()["address"]
 
 
-def test_none_is_this_process_and_null_is_too(tmp_path):
+def test_none_is_this_process_and_null_is_too(tiny, tmp_path):
     assert tiny(tmp_path, "cluster=none").cluster is None
     assert tiny(tmp_path, "cluster=null").cluster is None
     cluster = tiny(tmp_path).cluster
@@ -61,7 +45,7 @@ def test_none_is_this_process_and_null_is_too(tmp_path):
     assert cluster["_target_"] == "dask.distributed.LocalCluster"
 
 
-def test_one_kind_of_cluster_keeps_no_key_of_another(tmp_path):
+def test_one_kind_of_cluster_keeps_no_key_of_another(tiny, tmp_path):
     local = tiny(tmp_path).cluster
     slurm = tiny(tmp_path, "cluster=slurm", "cluster.queue=long").cluster
     assert local is not None
@@ -94,7 +78,7 @@ def test_one_kind_of_cluster_keeps_no_key_of_another(tmp_path):
     ],
 )
 def test_what_a_cluster_lacks_is_one_line_before_anything_is_written(
-    tmp_path, monkeypatch, work: Callable[[Settings], int], overrides, without, message
+    tiny, tmp_path, monkeypatch, work: Callable[[Settings], int], overrides, without, message
 ):
     find, which = importlib.util.find_spec, shutil.which
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == without else find(name))
@@ -106,23 +90,56 @@ def test_what_a_cluster_lacks_is_one_line_before_anything_is_written(
     assert not (tmp_path / "out").exists()
 
 
-def test_ssh_needs_hosts(tmp_path):
+def test_ssh_needs_hosts(tiny, tmp_path):
     with pytest.raises(TronError, match=r"'cluster\.hosts' has no value"):
         tiny(tmp_path, "cluster=ssh")
 
 
 @pytest.mark.usefixtures("variant")
-def test_a_cluster_without_workers_is_not_waited_for_longer_than_told(tmp_path, empty_scheduler):
+def test_a_cluster_without_workers_is_not_waited_for_longer_than_told(tiny, tmp_path, empty_scheduler):
     with pytest.raises(TronError, match=r"no worker came within worker_timeout=1 s"):
         make(tiny(tmp_path, "cluster=address", f"cluster.address={empty_scheduler}", "worker_timeout=1"))
 
 
 @pytest.mark.usefixtures("variant")
-def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
+def test_a_scheduler_that_is_not_there_is_one_line(tiny, tmp_path):
     address = ["cluster=address", "cluster.address=tcp://127.0.0.1:9", "cluster.timeout=1"]
     with pytest.raises(TronError, match=r"cluster cannot be made: .*127\.0\.0\.1:9") as caught:
         make(tiny(tmp_path, *address))
     assert "\n" not in str(caught.value)
+
+
+def test_a_worker_writes_its_log_until_it_is_taken_away(tmp_path):
+    log, names = logging.getLogger("datagen.somewhere"), logging.getLogger().handlers[:]
+    plugin = WorkerLog(tmp_path / "logs", logging.INFO)
+    plugin.setup(SimpleNamespace(name="tcp://host:1"))
+    log.info("a scene begins")
+    log.debug("nobody asked for this")
+    plugin.teardown(None)
+    log.info("too late")
+    assert logging.getLogger().handlers == names
+    (line,) = (tmp_path / "logs" / "worker-tcp-host-1.log").read_text().splitlines()
+    assert line.endswith("INFO datagen.somewhere: a scene begins")
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("variant")
+def test_a_scene_that_fails_on_a_worker_leaves_its_traceback_and_the_workers_log(tiny, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "train-000000").write_text("in the way")
+    settings = tiny(tmp_path, "workers=1", "recycle_after=1")
+    assert make(settings) == 1
+    trace = (tmp_path / "failures" / "train-000000.txt").read_text()
+    assert trace.startswith("Traceback")
+    assert "write_atomic" in trace
+    (said,) = (tmp_path / "logs").glob("worker-*.log")
+    for line in ("train-000000 failed", "NotADirectoryError", "train-000001 is made"):
+        assert line in said.read_text()
+    assert f"tracebacks in {tmp_path / 'failures'}, workers' logs in {tmp_path / 'logs'}" in caplog.text
+    (tmp_path / "scenes" / "train-000000").unlink()
+    assert make(tiny(tmp_path, "cluster=none")) == 0
+    assert not (tmp_path / "failures").exists()
 
 
 def test_help_lists_the_keys_of_the_chosen_kind(capsys):
@@ -136,7 +153,7 @@ def test_help_lists_the_keys_of_the_chosen_kind(capsys):
 
 @pytest.mark.long
 @pytest.mark.usefixtures("variant")
-def test_a_running_scheduler_makes_the_bytes_of_this_process_and_goes_on_running(tmp_path):
+def test_a_running_scheduler_makes_the_bytes_of_this_process_and_goes_on_running(tiny, files_of, tmp_path):
     assert make(tiny(tmp_path / "here", "cluster=none")) == 0
     with (
         LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
@@ -146,4 +163,4 @@ def test_a_running_scheduler_makes_the_bytes_of_this_process_and_goes_on_running
         address = ["cluster=address", f"cluster.address={client.scheduler_info()['address']}"]
         assert make(tiny(tmp_path / "there", *address, "recycle_after=1")) == 0
         assert list(client.scheduler_info()["workers"]) == [before], "another's workers are not restarted"
-    assert tree(tmp_path / "here") == tree(tmp_path / "there")
+    assert files_of(tmp_path / "here") == files_of(tmp_path / "there")

@@ -12,7 +12,7 @@ import pytest
 
 from datagen.build import Geometry, build
 from datagen.capture_export import captured
-from datagen.lights import Family, bake, draw_light
+from datagen.lights import FAMILIES, Family
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.plan import Sources, Work
 from datagen.run import make_scene
@@ -51,7 +51,7 @@ def camera(angle: float, fov: float = 34.0, size: int = 16) -> Camera:
 
 
 def light(number: int, rotation: float) -> EnvironmentMap:
-    return bake(draw_light(generator(0, "kernels", number), "studio", []), 16).rotated(rotation)
+    return FAMILIES["studio"].draw(generator(0, "kernels", number), []).bake(16).rotated(rotation)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_another_light_is_prepared_by_the_same_kernels(variant):
 
 def test_a_sun_brings_no_more_than_its_own_kernels(variant):
     def baked(number: int) -> set[str]:
-        return kernels_of(lambda: bake(draw_light(generator(1, "kernels", number), "sun", []), 16))
+        return kernels_of(lambda: FAMILIES["sun"].draw(generator(1, "kernels", number), []).bake(16))
 
     first = baked(0)
     assert len(baked(1) - first) <= SUN_KERNELS
@@ -124,7 +124,7 @@ def test_a_second_scene_of_a_split_brings_no_kernel(variant, tmp_path: Path):
     tiny += ["test.lights=[studio,overcast]", "test.guidance_spp=2", "cluster=null", "path_frames=8"]
     tiny += ["views=6", "view_width=32", "view_height=32", "surfels=1500", "refine_steps=6", "mesh_edge=0.2"]
     tiny += ["environment_height=16", "objects=[2,2]", f"output_dir={tmp_path}"]
-    settings = check(compose_recipe("conf.datagen", tiny), Settings)
+    settings = check(compose_recipe("conf.datagen", Settings, tiny), Settings)
 
     def made(index: int) -> set[str]:
         item = Work("test", index, f"test-{index:06d}", first_shard=index)
@@ -145,7 +145,7 @@ def test_a_second_capture_brings_no_kernel(variant):
         spec = draw_scene(
             0, "test", index, style="A", lights=families, frames=1, path_frames=4, objects=(2, 2)
         )
-        capture = captured(spec, build(spec, edge=0.2), bake(spec.lights[0], 16).baked(), settings)
+        capture = captured(spec, build(spec, edge=0.2), spec.lights[0].bake(16).baked(), settings)
         return kernels_of(lambda: [view.read() for view in capture.views])
 
     first = shot(0)

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from datagen.lights import (
+    FAMILIES,
+    PROCEDURAL,
     HdriSpec,
     OvercastSpec,
     Panel,
     StudioSpec,
     SunSpec,
-    bake,
     classify,
-    draw_light,
 )
 from tron.color import luminance
 from tron.seeds import generator
@@ -38,7 +38,7 @@ def direction(azimuth_deg, elevation_deg):
 
 @pytest.mark.parametrize("azimuth", [0.0, 100.0, 250.0])
 def test_the_sun_stands_where_the_specification_says(azimuth):
-    environment = bake(sun(azimuth_deg=azimuth), 64)
+    environment = sun(azimuth_deg=azimuth).bake(64)
     rng = generator(0, "directions")
     d = rng.normal(size=(200_000, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -49,21 +49,21 @@ def test_the_sun_stands_where_the_specification_says(azimuth):
 
 
 def test_a_wider_sun_gives_the_same_light():
-    narrow, wide = (bake(sun(aperture_deg=a), 96).unoccluded_upward() for a in (2.5, 5.0))
+    narrow, wide = (sun(aperture_deg=a).bake(96).unoccluded_upward() for a in (2.5, 5.0))
     np.testing.assert_allclose(narrow, wide, rtol=0.05)
 
 
-@pytest.mark.parametrize("family", ["sun", "studio", "overcast"])
+@pytest.mark.parametrize("family", PROCEDURAL)
 def test_a_light_does_not_depend_on_the_resolution_it_is_baked_at(family):
-    light = draw_light(generator(1, family), family)
-    small, large = (bake(light, height).unoccluded_upward() for height in (64, 160))
+    light = FAMILIES[family].draw(generator(1, family), [])
+    small, large = (light.bake(height).unoccluded_upward() for height in (64, 160))
     np.testing.assert_allclose(small, large, rtol=0.06)
 
 
-@pytest.mark.parametrize("family", ["sun", "studio", "overcast"])
+@pytest.mark.parametrize("family", PROCEDURAL)
 def test_every_drawn_light_can_be_exposed_and_is_finite(family):
     for k in range(4):
-        environment = bake(draw_light(generator(k, family), family), 32)
+        environment = FAMILIES[family].draw(generator(k, family), []).bake(32)
         assert np.isfinite(environment.image).all()
         assert environment.exposure() > 0
         assert environment.image[-1].min() > 0, "the ground is not black"
@@ -71,8 +71,8 @@ def test_every_drawn_light_can_be_exposed_and_is_finite(family):
 
 def test_suns_cast_shadows_and_clouds_do_not():
     for k in range(3):
-        assert classify(bake(draw_light(generator(k, "s"), "sun"), 64)) == "high"
-        assert classify(bake(draw_light(generator(k, "o"), "overcast"), 64)) == "low"
+        assert classify(FAMILIES["sun"].draw(generator(k, "s"), []).bake(64)) == "high"
+        assert classify(FAMILIES["overcast"].draw(generator(k, "o"), []).bake(64)) == "low"
 
 
 def test_a_panel_shines_with_its_solid_angle():
@@ -86,7 +86,7 @@ def test_a_panel_shines_with_its_solid_angle():
         softness_deg=0.2,
         radiance=(5.0, 5.0, 5.0),
     )
-    environment = bake(StudioSpec(panels=(panel,), floor=(0, 0, 0), ceiling=(0, 0, 0)), 256)
+    environment = StudioSpec(panels=(panel,), floor=(0, 0, 0), ceiling=(0, 0, 0)).bake(256)
     # Half sizes are measured in the box's two planes, so its edges lie on tan a and tan b.
     a, b = np.tan(np.radians([15.0, 10.0]))
     solid_angle = 4 * np.arctan(a * b / np.sqrt(1 + a * a + b * b))
@@ -103,7 +103,7 @@ def test_an_overcast_zenith_outshines_the_horizon_as_the_cie_says():
         patch_width_deg=30,
         patch=(0, 0, 0),
     )
-    environment = bake(light, 181)
+    environment = light.bake(181)
     for elevation in (20.0, 45.0, 90.0):
         expected = (1 + 2 * np.sin(np.radians(elevation))) / 3
         assert environment.lookup(direction(70.0, elevation))[0] == pytest.approx(expected, abs=0.01)
@@ -114,9 +114,9 @@ def test_a_file_is_averaged_down_and_turned(tmp_path):
     image[12, 20] = 50.0
     EnvironmentMap(image).save(tmp_path / "lamp.exr")
     spec = HdriSpec(path="lamp.exr", sha256="", rotation_deg=90.0, contrast="high")
-    turned = bake(spec, 16, str(tmp_path))
+    turned = spec.bake(16, tmp_path)
     assert turned.image.shape == (16, 32, 3)
-    plain = bake(spec.model_copy(update={"rotation_deg": 0.0}), 16, str(tmp_path))
+    plain = spec.model_copy(update={"rotation_deg": 0.0}).bake(16, tmp_path)
     d = direction(10.0, 20.0)
     np.testing.assert_allclose(turned.lookup(direction(100.0, 20.0)), plain.lookup(d), rtol=1e-5)
     np.testing.assert_allclose(plain.mean(), EnvironmentMap(image).mean(), rtol=1e-3)

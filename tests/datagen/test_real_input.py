@@ -65,7 +65,7 @@ def dataset(shared_data: Path, variant: str, tmp_path_factory: pytest.TempPathFa
         *(f"{split}.{key}" for split in ("train", "test") for key in ("frames=2", "width=96", "height=96")),
         *(f"{split}.path_spp=16" for split in ("train", "test")),
     ]
-    assert make(check(compose_recipe("conf.datagen", overrides), Settings)) == 0
+    assert make(check(compose_recipe("conf.datagen", Settings, overrides), Settings)) == 0
     return folder / "dataset"
 
 

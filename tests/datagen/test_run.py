@@ -63,13 +63,9 @@ for _split in ("train", "train_b", "validation", "test"):
 
 
 def tiny(output: Path, *overrides: str) -> Settings:
-    return check(compose_recipe("conf.datagen", [*TINY, f"output_dir={output}", *overrides]), Settings)
-
-
-def tree(folder: Path) -> dict[str, bytes]:
-    """Every file but the lock, with its bytes."""
-    files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != ".tron.lock")
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in files}
+    return check(
+        compose_recipe("conf.datagen", Settings, [*TINY, f"output_dir={output}", *overrides]), Settings
+    )
 
 
 @pytest.fixture(scope="module")
@@ -137,18 +133,30 @@ def test_guidance_and_frames_see_the_same_light(dataset):
         assert 0.5 < ratio < 2.0
 
 
-def test_a_finished_dataset_is_not_touched(dataset, monkeypatch):
+def test_a_finished_dataset_is_not_touched(dataset, monkeypatch, files_of):
     def never(*_):
         raise AssertionError("nothing is left to make")
 
     monkeypatch.setattr(datagen.run, "make_scene", never)
-    before = {path: os.stat(dataset / path).st_mtime_ns for path in tree(dataset)}
+    before = {path: os.stat(dataset / path).st_mtime_ns for path in files_of(dataset)}
     assert make(tiny(dataset)) == 0
-    assert {path: os.stat(dataset / path).st_mtime_ns for path in tree(dataset)} == before
+    assert {path: os.stat(dataset / path).st_mtime_ns for path in files_of(dataset)} == before
 
 
-def test_an_interrupted_run_ends_with_the_same_bytes(dataset, tmp_path, monkeypatch):
-    """Killed twice, once between a scene's shards and its record, with debris of half-written files."""
+@pytest.fixture
+def unfinished(dataset, tmp_path) -> Path:
+    """A copy of the dataset whose last training scene has never been made."""
+    copy = tmp_path / "unfinished"
+    shutil.copytree(dataset, copy)
+    shutil.rmtree(copy / "scenes" / "train-000001")
+    for file in ("train-00001.tar", "previews/train-00001.png"):
+        (copy / file).unlink()
+    return copy
+
+
+def test_an_interrupted_run_ends_with_the_same_bytes(dataset, unfinished, files_of, monkeypatch):
+    """Killed between scenes and between a scene's shards and its record, with files half-written."""
+    shutil.rmtree(unfinished / "scenes" / "test-000000")
     made = []
 
     def stops_after_one(item: Work, settings: Settings, sources: Sources):
@@ -159,25 +167,26 @@ def test_an_interrupted_run_ends_with_the_same_bytes(dataset, tmp_path, monkeypa
 
     monkeypatch.setattr(datagen.run, "make_scene", stops_after_one)
     with pytest.raises(KeyboardInterrupt):
-        make(tiny(tmp_path))
+        make(tiny(unfinished))
     monkeypatch.undo()
-    (tmp_path / "scenes" / made[0] / "record.json").unlink()
-    (tmp_path / ".train-00000.abcd.tar").write_bytes(b"half a shard")
-    assert make(tiny(tmp_path)) == 0
-    assert tree(tmp_path) == tree(dataset)
+    assert made == ["train-000001"]
+    (unfinished / "scenes" / made[0] / "record.json").unlink()
+    (unfinished / ".train-00000.abcd.tar").write_bytes(b"half a shard")
+    assert make(tiny(unfinished)) == 0
+    assert files_of(unfinished) == files_of(dataset)
 
 
-def test_a_scene_depends_on_nothing_else_that_is_made(dataset, tmp_path):
+def test_a_scene_depends_on_nothing_else_that_is_made(dataset, tmp_path, files_of):
     settings = tiny(tmp_path, "only=[train-000001]")
     assert make(settings) == 0
-    alone = tree(tmp_path)
-    whole = tree(dataset)
+    alone = files_of(tmp_path)
+    whole = files_of(dataset)
     for path in ("train-00001.tar", "scenes/train-000001/surfels.ply", "scenes/train-000001/spec.json"):
         assert alone[path] == whole[path]
     assert [entry.name for entry in Manifest.load(tmp_path).shards] == ["train-00001.tar"]
 
 
-def test_a_dataset_grows_without_making_the_old_scenes_again(tmp_path, monkeypatch):
+def test_a_dataset_grows_without_making_the_old_scenes_again(tmp_path, monkeypatch, files_of):
     small = ["train.scenes=1", "train_b.scenes=0", "validation.scenes=0", "test.scenes=0"]
     assert make(tiny(tmp_path, *small)) == 0
     names = []
@@ -192,10 +201,10 @@ def test_a_dataset_grows_without_making_the_old_scenes_again(tmp_path, monkeypat
     # A split that has no scenes yet may still become anything: so older datasets get a validation split.
     names.clear()
     made = ["train.scenes=2", "validation.scenes=1", "validation.lights=[studio]"]
-    before = tree(tmp_path)
+    before = files_of(tmp_path)
     assert make(tiny(tmp_path, *small, *made)) == 0
     assert names == ["validation-000000"]
-    after = tree(tmp_path)
+    after = files_of(tmp_path)
     assert {path: after[path] for path in before if path.startswith(("scenes/", "train"))} == {
         path: data for path, data in before.items() if path.startswith(("scenes/", "train"))
     }
@@ -214,39 +223,43 @@ def test_what_a_split_without_scenes_says_does_not_matter(tmp_path):
         tiny(tmp_path, "mode=captures", "test.scenes=0", "test.frames=9")
 
 
-def test_another_recipe_is_refused_before_anything_is_written(dataset):
-    before = tree(dataset)
+def test_another_recipe_is_refused_before_anything_is_written(dataset, files_of):
+    before = files_of(dataset)
     with pytest.raises(TronError, match=r"path_spp=2, not 3"):
         make(tiny(dataset, "test.path_spp=3"))
-    assert tree(dataset) == before
+    assert files_of(dataset) == before
 
 
-def test_failures_are_listed_and_retried_by_their_command(tmp_path, monkeypatch):
-    real = datagen.run.build
-
-    def fails(spec, *rest):
-        if spec.name == "train-000001":
-            raise RuntimeError("no memory\nfor this")
-        return real(spec, *rest)
+def test_failures_are_listed_and_retried_by_their_command(dataset, unfinished, files_of, monkeypatch, caplog):
+    def fails(spec, *_):
+        raise RuntimeError("no memory\nfor this")
 
     monkeypatch.setattr(datagen.run, "build", fails)
-    settings = tiny(tmp_path)
+    settings = tiny(unfinished)
     assert make(settings) == 1
-    failure = json.loads((tmp_path / "failures.jsonl").read_text())
+    failure = json.loads((unfinished / "failures.jsonl").read_text())
     assert failure["scene"] == "train-000001"
     assert failure["reason"] == "RuntimeError: no memory for this"
-    assert Manifest.load(tmp_path).failures == 1
-    assert verify(tmp_path) == []
+    trace = (unfinished / failure["traceback"]).read_text()
+    assert failure["traceback"] == "failures/train-000001.txt"
+    assert "in draw_and_build" in trace
+    assert trace.endswith("RuntimeError: no memory\nfor this\n")
+    assert (
+        f"listed in {unfinished / 'failures.jsonl'}, tracebacks in {unfinished / 'failures'}" in caplog.text
+    )
+    assert Manifest.load(unfinished).failures == 1
+    assert verify(unfinished) == []
+    assert make(tiny(unfinished, "only=[train-000000]")) == 1, "what is not tried again stays listed"
+    assert (unfinished / failure["traceback"]).is_file()
 
     monkeypatch.undo()
     words = shlex.split(failure["command"])
     assert words[0] == "tron-datagen"
-    again = check(compose_recipe("conf.datagen", words[1:]), Settings)
+    again = check(compose_recipe("conf.datagen", Settings, words[1:]), Settings)
     assert again.only == ["train-000001"]
     assert again.recipe() == settings.recipe()
     assert make(again) == 0
-    assert not (tmp_path / "failures.jsonl").exists()
-    assert Manifest.load(tmp_path).failures == 0
+    assert files_of(unfinished) == files_of(dataset), "no failure and no traceback is left"
 
 
 def test_values_that_are_not_finite_never_reach_a_shard(tmp_path, monkeypatch):
@@ -292,7 +305,7 @@ def test_the_command_of_the_card_makes_the_same_settings(dataset, cluster):
     settings = tiny(dataset, "allow_unlicensed=['a b','c']", "only=[train-000001]")
     settings = settings.model_copy(update={"cluster": cluster})
     words = shlex.split(command_line(settings, str(dataset), settings.only))
-    assert check(compose_recipe("conf.datagen", words[1:]), Settings) == settings
+    assert check(compose_recipe("conf.datagen", Settings, words[1:]), Settings) == settings
 
 
 def test_previews_are_the_clips_first_frames_side_by_side(dataset):
@@ -318,13 +331,14 @@ def test_config_says_how_it_was_made_and_not_where(dataset):
 
 
 @pytest.mark.long
-def test_two_workers_make_the_bytes_of_one_process(dataset, tmp_path):
-    assert make(tiny(tmp_path, "cluster=local", "workers=2", "recycle_after=1")) == 0
-    assert tree(tmp_path) == tree(dataset)
+def test_two_workers_make_the_bytes_of_one_process(dataset, tmp_path, files_of):
+    assert make(tiny(tmp_path, "cluster=local", "workers=2", "recycle_after=2")) == 0
+    assert files_of(tmp_path) == files_of(dataset)
+    assert len(list((tmp_path / "logs").iterdir())) == 2
 
 
 @pytest.mark.long
-def test_kill_9_at_any_moment_and_again_gives_the_same_bytes(dataset, tmp_path):
+def test_kill_9_at_any_moment_and_again_gives_the_same_bytes(dataset, tmp_path, files_of):
     command = [sys.executable, "-m", "tests_run_tiny"]
     script = tmp_path / "tests_run_tiny.py"
     output = tmp_path / "out"
@@ -339,4 +353,4 @@ def test_kill_9_at_any_moment_and_again_gives_the_same_bytes(dataset, tmp_path):
         process.wait()
         time.sleep(2.0)  # orphaned workers notice and go
     assert make(tiny(output)) == 0
-    assert tree(output) == tree(dataset)
+    assert files_of(output) == files_of(dataset)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from datagen.build import build
-from datagen.lights import Family, bake
+from datagen.lights import Family
 from datagen.pathtrace import direct_irradiance, gbuffers
 from datagen.scene import draw_scene
 from datagen.synthetic import first_bad_value
@@ -37,7 +37,7 @@ def test_20k_surfels_and_their_irradiance_on_held_out_views_of_textured_scenes(i
     tracer = SurfelTracer(surfels)
     leaking = shadowed = darkened = lit = 0
     for number, (family, light) in enumerate(zip(families, spec.lights)):
-        environment = bake(light, 128)
+        environment = light.bake(128)
         camera = spec.clip(number, 5, SIZE, SIZE)[2]
         truth = gbuffers(geometry, [camera])[0]
         ours = render_guidance(tracer, camera, Lighting(environment), Estimation(rays=64), seed=number)

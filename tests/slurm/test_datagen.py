@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,44 +11,20 @@ import pytest
 pytestmark = pytest.mark.long
 
 LONGEST = 500.0
-TINY = [
-    "train.scenes=3",
-    "train_b.scenes=0",
-    "validation.scenes=0",
-    "test.scenes=0",
-    "train.lights=[overcast]",
-    "train.frames=1",
-    "train.width=16",
-    "train.height=12",
-    "train.path_spp=2",
-    "train.guidance_spp=2",
-    "views=4",
-    "view_width=24",
-    "view_height=24",
-    "surfels=500",
-    "refine_steps=0",
-    "mesh_edge=0.2",
-    "environment_height=16",
-    "objects=[1,1]",
-]
 SLURM = ["cluster=slurm", "cluster.queue=all", "cluster.memory=1GB", "cluster.walltime=00:20:00"]
 
 
-def command(output: Path, *more: str) -> list[str]:
-    return [str(Path(sys.executable).with_name("tron-datagen")), *TINY, f"output_dir={output}", *more]
+@pytest.fixture(scope="module")
+def command(tiny_scenes) -> Callable[..., list[str]]:
+    def command(output: Path, *more: str) -> list[str]:
+        script = str(Path(sys.executable).with_name("tron-datagen"))
+        return [script, *tiny_scenes, "train.scenes=3", f"output_dir={output}", *more]
 
-
-def tree(folder: Path) -> dict[str, bytes]:
-    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ".tron.lock")
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in files
-        if path.parent != folder / "slurm"
-    }
+    return command
 
 
 @pytest.fixture(scope="module")
-def here(tmp_path_factory) -> Path:
+def here(command, tmp_path_factory) -> Path:
     output = tmp_path_factory.mktemp("here")
     subprocess.run(command(output, "cluster=none"), check=True, timeout=LONGEST)
     return output
@@ -58,7 +35,7 @@ def jobs(slurm: dict[str, str]) -> list[str]:
     return subprocess.run(asked, env=slurm, capture_output=True, text=True, check=True).stdout.split()
 
 
-def test_two_jobs_make_the_bytes_of_one_process(slurm, here, tmp_path):
+def test_two_jobs_make_the_bytes_of_one_process(slurm, command, files_of, here, tmp_path):
     done = subprocess.run(
         command(tmp_path / "out", *SLURM, "workers=2"),
         env=slurm,
@@ -68,12 +45,12 @@ def test_two_jobs_make_the_bytes_of_one_process(slurm, here, tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert tree(tmp_path / "out") == tree(here)
+    assert files_of(tmp_path / "out") == files_of(here)
     assert len(list((tmp_path / "out" / "slurm").glob("*.out"))) == 2, "a log of each job"
     assert none_left(slurm)
 
 
-def test_a_job_that_ends_is_replaced(slurm, here, tmp_path):
+def test_a_job_that_ends_is_replaced(slurm, command, files_of, here, tmp_path):
     output = tmp_path / "out"
     process = subprocess.Popen(
         command(output, *SLURM, "workers=1"), env=slurm, stderr=subprocess.PIPE, text=True
@@ -88,10 +65,10 @@ def test_a_job_that_ends_is_replaced(slurm, here, tmp_path):
     _, said = process.communicate(timeout=LONGEST)
     assert process.returncode == 0, said
     assert len(list((output / "slurm").glob("*.out"))) == 2, "it did not end with the job"
-    assert tree(output) == tree(here)
+    assert files_of(output) == files_of(here)
 
 
-def test_a_queue_that_is_not_there_is_one_line(slurm, tmp_path):
+def test_a_queue_that_is_not_there_is_one_line(slurm, command, tmp_path):
     done = subprocess.run(
         command(tmp_path / "out", *SLURM, "workers=1", "cluster.queue=nowhere", "worker_timeout=5"),
         env=slurm,

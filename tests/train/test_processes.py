@@ -310,7 +310,7 @@ def test_a_gpu_that_is_not_there_is_one_line(make_settings, dataset, tmp_path):
 def test_a_number_of_devices_that_is_none_is_one_line(value):
     overrides = ["dataset=d", "output_dir=o", f"devices={value}"]
     with pytest.raises(TronError, match="wrong value for 'devices'"):
-        check(compose_recipe("conf.train", overrides), Settings)
+        check(compose_recipe("conf.train", Settings, overrides), Settings)
 
 
 def test_more_devices_than_torchrun_has_started_are_one_line(monkeypatch, make_settings, dataset, tmp_path):

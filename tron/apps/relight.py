@@ -11,7 +11,6 @@ import json
 import logging
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -57,7 +56,7 @@ def main(settings: Settings) -> None:
     _check_paths(settings, lights)
     size = settings.width, settings.height
     given = None if settings.cameras is None else read_cameras(settings.cameras, *size)
-    environments = [EnvironmentMap.load(light.environment) for light in lights]
+    environments = [EnvironmentMap.load(light.light) for light in lights]
     renderer = _load_renderer(settings)
     scene = _load_scene(settings)
     turn = upright(scene.up)  # to +z, which is up in environment maps
@@ -91,8 +90,8 @@ def main(settings: Settings) -> None:
         for light, clip in zip(lights, clips):
             report = _report(light, clip, scene, turn_cameras(cameras, turn.T), clock)
             write_atomic(light.output_dir / "relight.json", json.dumps(report, indent=1) + "\n")
-            rendered = len(cameras), len(clip.seconds), light.output_dir
-            log.info("%d frames, %d of them rendered now: %s", *rendered)
+            made = len(cameras), len(clip.seconds), light.output_dir / "relit.mp4"
+            log.info("%d frames, %d of them rendered now: look at %s", *made)
 
 
 class _Clock:
@@ -110,9 +109,8 @@ class _Clock:
 
 def _check_paths(settings: Settings, lights: Sequence[Settings]) -> None:
     """Every file is there and is of its kind as far as names and headers tell, before anything is loaded."""
-    maps = [light.environment for light in lights]
+    maps = [light.light for light in lights]
     for path in (settings.scene, *maps, settings.cameras, settings.checkpoint, settings.vae):
-        assert path is None or isinstance(path, Path)
         if path is not None and not path.is_file():
             if path.is_dir():
                 raise TronError("cannot read: is a folder", path, "give one file of it")
@@ -170,10 +168,9 @@ def _clip(light: Settings, environment: EnvironmentMap, frames: int, guidance: S
 def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> dict[str, Any]:
     """Recipe of the linear frames: all that their pixels depend on, as JSON values."""
     keys = {"rotation", "trajectory", "quality", "width", "height", "fov", "distance", "seed", "variant"}
-    assert isinstance(light.environment, Path)
     return {
         "scene_sha256": sha256(light.scene),
-        "environment_sha256": sha256(light.environment),
+        "environment_sha256": sha256(light.light),
         "cameras_sha256": None if light.cameras is None else sha256(light.cameras),
         "frames": len(cameras),
         "up": [round(float(value), 6) for value in turn[2]],

@@ -8,8 +8,8 @@ mend, said in one line on stderr before long work starts; 130 interrupted.
 
 import argparse
 import inspect
-import logging
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +18,13 @@ from typing import Any, Generic, NoReturn, TypeVar
 import pydantic
 import yaml
 from omegaconf import OmegaConf
-from rich.console import Console
-from rich.logging import RichHandler
 
 import tron
 from tron.cli.help_page import default_examples, render_help
 from tron.cli.installation import require_own_packages
-from tron.cli.recipes import check, compose_recipe, group_options, resolve
+from tron.cli.log import LEVELS, configure_logging
+from tron.cli.profiling import profiled
+from tron.cli.recipes import check, complete, compose_recipe, group_options, resolve
 from tron.errors import TronError
 
 Settings = TypeVar("Settings", bound=pydantic.BaseModel)
@@ -49,7 +49,7 @@ class Command(Generic[Settings]):
 
     def compose(self, *overrides: str) -> Settings:
         """Checked settings from `key=value` overrides, for `main` called from Python; TronError if wrong."""
-        return check(compose_recipe(self.config_module, overrides), self.settings)
+        return check(compose_recipe(self.config_module, self.settings, overrides), self.settings)
 
     def _run(self, arguments: Sequence[str]) -> int:
         try:
@@ -61,14 +61,20 @@ class Command(Generic[Settings]):
             if options.version:
                 print(f"{self.name} {tron.__version__}")
                 return 0
-            recipe = compose_recipe(self.config_module, options.overrides, options.config_dir)
+            recipe = compose_recipe(self.config_module, self.settings, options.overrides, options.config_dir)
             if options.cfg:
-                print(yaml.safe_dump(resolve(recipe), sort_keys=False), end="")
+                print(yaml.safe_dump(resolve(complete(recipe)), sort_keys=False), end="")
                 return 0
             settings = check(recipe, self.settings)
-            configure_logging()
+            configure_logging(options.log_level)
+            if options.profile:
+                folder = getattr(settings, "output_dir", Path()) / "profile"
+                with profiled(folder, self.name):
+                    return self.main(settings) or 0
             return self.main(settings) or 0
         except TronError as error:
+            if "--traceback" in arguments:
+                traceback.print_exc()
             print(f"{self.name}: {error}", file=sys.stderr)
             return USER_ERROR
         except KeyboardInterrupt:
@@ -77,7 +83,7 @@ class Command(Generic[Settings]):
 
     def _help(self, overrides: Sequence[str], config_dir: Path | None) -> str:
         groups = group_options(self.config_module)
-        recipe = compose_recipe(self.config_module, overrides, config_dir)
+        recipe = complete(compose_recipe(self.config_module, self.settings, overrides, config_dir))
         defaults: Any = OmegaConf.to_container(recipe, resolve=False)
         purpose = inspect.getdoc(self.main) or self.settings.__doc__ or self.name
         examples = self.examples or default_examples(self.name, groups)
@@ -103,18 +109,6 @@ def command(
     return Command(name, config_module, settings, main, examples)
 
 
-def configure_logging(level: int = logging.INFO) -> None:
-    """Send the log to stderr: coloured on a terminal, plain unwrapped lines into a file or a pipe."""
-    if sys.stderr.isatty():
-        handler: logging.Handler = RichHandler(console=Console(stderr=True), show_path=False)
-        handler.setFormatter(logging.Formatter("%(message)s", datefmt="%X"))
-    else:
-        handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", datefmt="%X"))
-    logging.basicConfig(level=level, handlers=[handler])
-    logging.captureWarnings(True)
-
-
 class _Arguments(argparse.ArgumentParser):
     """argparse, but a mistake is an exception: the caller prints it in its own one line."""
 
@@ -128,5 +122,8 @@ def _parser(name: str) -> argparse.ArgumentParser:
     parser.add_argument("-h", "--help", action="store_true")
     parser.add_argument("--version", action="store_true")
     parser.add_argument("--cfg", choices=["job"])
+    parser.add_argument("--log-level", choices=LEVELS)
+    parser.add_argument("--profile", action="store_true")
+    parser.add_argument("--traceback", action="store_true")
     parser.add_argument("--config-dir", type=Path)
     return parser

@@ -5,6 +5,7 @@ that can be wrong with it is found here, before any long work starts, and raised
 """
 
 import difflib
+import inspect
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,31 +15,40 @@ from typing import Any, TypeVar, Union, get_args, get_origin
 
 import pydantic
 from hydra import compose, initialize_config_module
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
+from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from pydantic_core import to_jsonable_python
 
 from tron.errors import TronError
 from tron.nested import nested_items
 
 Settings = TypeVar("Settings", bound=pydantic.BaseModel)
 
+OWN_PACKAGES = ("tron", "datagen", "train", "eval")  # classes of others keep their defaults to themselves
 SHOWN_CHARACTERS = 80  # of a wrong value, so that the error stays one readable line
 
 
 def compose_recipe(
-    config_module: str, overrides: Sequence[str], config_dir: Path | None = None
+    config_module: str,
+    settings: type[pydantic.BaseModel],
+    overrides: Sequence[str] = (),
+    config_dir: Path | None = None,
 ) -> DictConfig:
-    """Compose `config_module`'s `config.yaml` with overrides in Hydra's grammar (`key=value`, `group=name`).
+    """Compose the model's defaults, `config.yaml` and its groups, and overrides in Hydra's grammar.
 
     Hydra's compose API is used instead of `hydra.main`: nothing is written and the working directory stays.
+    YAML only says what differs from the model.
 
     Args:
         config_module: importable package that holds `config.yaml` and its groups.
+        settings: model of the whole recipe.
         overrides: as typed on the command line; a later one wins.
         config_dir: the user's own folder of groups, searched beside the package's.
 
@@ -58,14 +68,82 @@ def compose_recipe(
         for each in selections:
             _require_option(each, groups[each.key_or_group])
         try:
-            base = compose("config", overrides=[*search, *(str(each.input_line) for each in selections)])
-            known = [*(key for key, _ in nested_items(OmegaConf.to_container(base))), *groups]
-            for each in parsed:
-                if not each.is_add() and not each.is_force_add() and each.key_or_group not in known:
-                    raise unknown_key(each.key_or_group, known)
-            return compose("config", overrides=[*search, *(str(each.input_line) for each in parsed)])
+            shipped = compose("config", overrides=[*search, *(str(each.input_line) for each in selections)])
+            recipe = DictConfig(_merged(model_defaults(settings), OmegaConf.to_container(shipped)))
+            keys = [each for each in parsed if each.key_or_group not in groups]
+            changed = {each.key_or_group for each in keys if not each.is_add() and not each.is_force_add()}
+            if not changed <= _keys(recipe):
+                recipe = complete(recipe)
+            for key in sorted(changed - _keys(recipe)):
+                raise unknown_key(key, [*_keys(recipe), *groups])
+            # The part of `compose` that changes keys: the model's are not in the files that it reads.
+            ConfigLoaderImpl._apply_overrides_to_config(keys, recipe)
+            return recipe
         except (HydraException, OmegaConfBaseException) as error:
             raise TronError(_first_line(error), where=config_module) from error
+
+
+def model_defaults(model: type[pydantic.BaseModel]) -> dict[str, Any]:
+    """Defaults of a settings model as nested plain values, `???` where there is none."""
+    values: dict[str, Any] = {}
+    for name, field in model.model_fields.items():
+        inner = nested_model(field.annotation)
+        if field.is_required():
+            values[name] = "???" if inner is None else _seeded(model_defaults(inner))
+        else:
+            values[name] = _seeded(to_jsonable_python(field.get_default(call_default_factory=True)))
+    return values
+
+
+def _seeded(values: Any) -> Any:
+    """The same with the seed of a part following the seed of the run."""
+    if not isinstance(values, dict):
+        return values
+    return {name: "${seed}" if name == "seed" else _seeded(value) for name, value in values.items()}
+
+
+def _completed(values: Any) -> Any:
+    if isinstance(values, list):
+        return [_completed(value) for value in values]
+    if not isinstance(values, dict):
+        return values
+    target = values.get("_target_")
+    own = {name: value for name, value in values.items() if name != "_target_"}
+    made_of_parts = own and all(isinstance(value, dict) and "_target_" in value for value in own.values())
+    if target is not None and target.partition(".")[0] in OWN_PACKAGES and not made_of_parts:
+        values = _merged({"_target_": target, **_target_defaults(target)}, own)
+    return {name: _completed(value) for name, value in values.items()}
+
+
+def _merged(under: Any, over: Any) -> Any:
+    """Nested plain values with others over them; unlike OmegaConf's merge, `???` takes a value away."""
+    if not (isinstance(under, dict) and isinstance(over, dict)):
+        return over
+    return under | {name: _merged(under.get(name), value) for name, value in over.items()}
+
+
+def _target_defaults(target: str) -> dict[str, Any]:
+    try:
+        made = get_object(target)
+    except Exception:  # whatever importing it raises: it is told when the object is made
+        return {}
+    if isinstance(made, type) and issubclass(made, pydantic.BaseModel):
+        return _seeded(model_defaults(made))
+    parameters = inspect.signature(made).parameters.values()
+    defaults = {each.name: "???" if each.default is each.empty else each.default for each in parameters}
+    return _seeded(to_jsonable_python(defaults))
+
+
+def _keys(recipe: DictConfig) -> set[str]:
+    return {key for key, _ in nested_items(OmegaConf.to_container(recipe))}
+
+
+def complete(recipe: DictConfig) -> DictConfig:
+    """The recipe with the defaults of our own classes that it names by `_target_`, which are imported.
+
+    An object made of such objects alone has no settings of its own, and is not looked into.
+    """
+    return DictConfig(_completed(OmegaConf.to_container(recipe)))
 
 
 def check(recipe: DictConfig, settings: type[Settings]) -> Settings:
@@ -75,6 +153,11 @@ def check(recipe: DictConfig, settings: type[Settings]) -> Settings:
         TronError: a required key has no value, or a key is unknown or of the wrong type; the first of them
             is named.
     """
+    _validated(recipe, settings)  # before anything is imported for it
+    return _validated(complete(recipe), settings)
+
+
+def _validated(recipe: DictConfig, settings: type[Settings]) -> Settings:
     for key, value in nested_items(OmegaConf.to_container(recipe)):
         if value == "???":
             raise _required(key)

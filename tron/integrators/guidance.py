@@ -22,7 +22,6 @@ constant, and so is the light.
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 import drjit as dr
@@ -36,7 +35,7 @@ from tron.integrators.surfels import Surfels, unwrap
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, shade_surface, visibility
 from tron.shading.split_sum import CUBEMAP_RESOLUTION
-from tron.tracing import GBuffer, Surface
+from tron.tracing import GBuffer
 
 BUFFERS = tuple(name for name in Guidance.BUFFERS if name != "mask")
 
@@ -62,10 +61,10 @@ class GuidanceAppearance:
         lighting = self._lighting(scene)
         seen = self.surfels.trace(ray.o, ray.d, active)
         with dr.suspend_grad():
-            fixed = {f.name: dr.detach(getattr(seen, f.name)) for f in fields(Surface)}
-            rays = GBuffer(**fixed, width=width, height=dr.width(seen.opacity) // width)
-            dr.eval(*fixed.values())
+            rays = GBuffer.of_rows(dr.detach(seen), width, dr.width(seen.opacity) // width)
+            dr.eval(rays)
             reaching = visibility(self.surfels.tracer, rays, lighting, self.estimation, seed)
+            reaching = rays.in_rows(reaching)
         shaded = shade_surface(seen, reaching, lighting)
         extra = [part for name in self.others for part in shaded[name]]
         return Shown(shaded[self.buffer], seen.opacity, [*extra, seen.opacity])

@@ -20,7 +20,7 @@ import numpy as np
 
 from tron.color import LUMINANCE
 from tron.errors import TronError
-from tron.shading.environment import PDF_FLOOR, EnvironmentLight, EnvironmentMap
+from tron.shading.environment import PDF_FLOOR, EnvironmentMap
 
 BELOW_ONE = 1 - 2**-24
 
@@ -118,14 +118,6 @@ class CubemapLight:
         # Not on demand: the demand comes from inside a symbolic loop, where nothing can be evaluated.
         self._distribution = _RowsAndColumns(dr.detach(self._bordered), resolution)
         self._width, self._first = dr.opaque(mi.UInt32, resolution), dr.opaque(mi.UInt32, 0)
-
-    @classmethod
-    def from_environment(cls, environment: EnvironmentMap, resolution: int) -> CubemapLight:
-        """The cubemap whose texels are the averages of ``environment`` over their solid angles."""
-        light = EnvironmentLight(environment)
-        samples = int(np.clip(np.ceil(1.5 * light.face_resolution / resolution), 2, 16))
-        rgb = _texel_means(light, dr.opaque(mi.UInt32, resolution), dr.opaque(mi.UInt32, samples), resolution)
-        return cls(dr.ravel(rgb), resolution)
 
     @property
     def face_resolution(self) -> int:
@@ -288,25 +280,6 @@ def _bordered(texels: mi.Float, resolution: int) -> mi.Float:
     bordered = dr.ravel(mi.Vector4f(*channels, dr.zeros(mi.Float, dr.width(source))))
     dr.eval(bordered)
     return bordered
-
-
-@dr.syntax
-def _texel_means(
-    light: EnvironmentLight, resolution: mi.UInt32, per_edge: mi.UInt32, size: int
-) -> mi.Color3f:
-    lane = dr.arange(mi.UInt32, 6 * size**2)
-    column, row, face = lane % resolution, (lane // resolution) % resolution, lane // (resolution**2)
-    step = 2 / mi.Float(resolution * per_edge)
-    total, area = mi.Color3f(0), mi.Float(0)
-    i = mi.UInt32(0)
-    while i < per_edge * per_edge:
-        u = (mi.Float(column * per_edge + i % per_edge) + 0.5) * step - 1
-        v = (mi.Float(row * per_edge + i // per_edge) + 0.5) * step - 1
-        solid = dr.rcp(_stretch(u, v))
-        total += solid * light.radiance(face_direction(face, u, v))
-        area += solid
-        i += 1
-    return total / area
 
 
 @dr.syntax

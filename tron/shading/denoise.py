@@ -43,7 +43,7 @@ def atrous(
     """Filter both estimates of irradiance / pi with common weights; pixels of opacity 0 stay as they are.
 
     Args:
-        shadowed, unshadowed: linear, row-major, from the same rays.
+        shadowed, unshadowed: linear, from the same rays.
         share: of the light that arrives, in [0, 1], to be smoothed and guide the weights.
         gbuffer: positions, unit normals and opacity of the same pixels.
         spacing: the scene's surfel spacing, world units.

@@ -47,7 +47,7 @@ def regressed_share(
     """Share of the light that arrives at each pixel, by channel in [0, 1]; the regression of this module.
 
     Args:
-        shadowed, unshadowed: irradiance / pi, linear, row-major, from the same rays.
+        shadowed, unshadowed: irradiance / pi, linear, from the same rays.
         known: unshadowed irradiance / pi without noise.
         gbuffer: positions, unit normals and opacity of the same pixels.
         spacing: the scene's surfel spacing, world units.

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import drjit as dr
@@ -60,14 +60,12 @@ class Lighting:
     """
 
     def __init__(self, environment: EnvironmentMap, cubemap_resolution: int = CUBEMAP_RESOLUTION) -> None:
-        self.environment = environment
         self.light = EnvironmentLight(environment)
-        self.split_sum = SplitSum(environment, cubemap_resolution, self.light)
+        self.split_sum = SplitSum(self.light, cubemap_resolution)
 
     def turned_to(self, rotation_deg: float) -> Lighting:
         """The same environment at another rotation about +z, in microseconds: lookups are turned."""
         other = copy(self)
-        other.environment = replace(self.environment, rotation_deg=rotation_deg)
         other.light = self.light.turned_to(rotation_deg)
         other.split_sum = self.split_sum.turned_to(rotation_deg)
         return other
@@ -198,10 +196,6 @@ def shade(
 ) -> Guidance:
     """Guidance from a G-buffer and the share of the unshadowed irradiance that reaches each pixel."""
     colors = shade_surface(gbuffer, visibility, lighting, background)
-
-    def image(color: mi.Color3f) -> np.ndarray:
-        return np.ascontiguousarray(np.array(color).T.reshape(gbuffer.height, gbuffer.width, 3))
-
     buffers = gbuffer.numpy()
-    images = {name: image(color) for name, color in colors.items()}
+    images = {name: gbuffer.image(color) for name, color in colors.items()}
     return Guidance(**images, mask=buffers["opacity"], gbuffer=buffers)

@@ -8,10 +8,10 @@ which is the balance heuristic (Veach 1997); V is the transmittance of what stan
 / pi, the radiance of a white diffuse surface. Points in either unit square come from
 :mod:`tron.shading.sampling`.
 
-Lanes are pixels in tile order, and a lane traces up to four rays of neighbouring strata at once: rays that
-start and point close together share most of their way through the hierarchy. One kernel traces one such fan
-for every pixel and is launched again for the next, so memory does not grow with the ray count. (The loop over
-rays inside the kernel was three times as slow.)
+Lanes are those of the G-buffer, pixels in tile order. A lane traces up to four rays of neighbouring strata
+at once: rays that start and point close together share most of their way through the hierarchy. One kernel
+traces one such fan for every pixel and is launched again for the next, so memory does not grow with the ray
+count. (The loop over rays inside the kernel was three times as slow.)
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ import mitsuba as mi
 
 from tron.errors import TronError
 from tron.shading.sampling import PixelPoints, has_strata
-from tron.tracing.tiles import lanes_of_pixels, tile_pixels
 
 if TYPE_CHECKING:
     from tron.gaussians.scene import GaussianScene
@@ -80,59 +79,40 @@ def irradiance(
         strategy: "mis", or one kind of ray alone, for comparison.
 
     Returns:
-        (shadowed, unshadowed), linear, row-major as the G-buffer.
+        (shadowed, unshadowed), linear, one lane each of the G-buffer's.
 
     Raises:
         TronError: ``spp`` is odd or not positive.
     """
     plan = RayPlan.make(spp, seed, gbuffer.width, strategy)
-    points = _ShadingPoints.in_tile_order(gbuffer, ORIGIN_OFFSET * tracer.scene.spacing)
-    lanes = dr.width(points.pixel)
+    # Rays stand still where the surface is differentiated.
+    normal = mi.Normal3f(dr.detach(gbuffer.normal))
+    offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
+    origin = mi.Point3f(dr.detach(gbuffer.position)) + normal * offset
+    surface, frame, pixel = dr.detach(gbuffer.opacity) > 0, mi.Frame3f(normal), gbuffer.pixel
+    dr.eval(pixel, surface, frame, origin)
+    lanes = dr.width(surface)
     shadowed, unshadowed = dr.zeros(mi.Color3f, lanes), dr.zeros(mi.Color3f, lanes)
     dr.make_opaque(shadowed, unshadowed)  # or the first launch would be a kernel of its own
     for first in range(0, plan.rays, plan.fan):
         ray = dr.opaque(mi.UInt32, first)
         directions, values, active = [], [], []
         for k in range(plan.fan):
-            direction, weight = shadow_ray(light, points.frame, plan, points.pixel, ray + k)
+            direction, weight = shadow_ray(light, frame, plan, pixel, ray + k)
             radiance = light.radiance(direction)
-            counts = points.surface & (weight > 0) & (dr.max(radiance) > 0)
+            counts = surface & (weight > 0) & (dr.max(radiance) > 0)
             directions.append(direction)
             active.append(counts)
             values.append(dr.select(counts, radiance * weight, 0))
         dr.eval(directions, values, active)  # tracers look at the rays more than once
-        visible = tracer.transmittances(points.origin, directions, active)
+        visible = tracer.transmittances(origin, directions, active)
         unshadowed += sum(values)
         shadowed += sum(value * share for value, share in zip(values, visible, strict=True))
         dr.eval(shadowed, unshadowed)
-    row_major = lanes_of_pixels(gbuffer.width, gbuffer.height)
     scale = dr.rcp(mi.Float(plan.count))
-    shadowed, unshadowed = (_gather(color, row_major) * scale for color in (shadowed, unshadowed))
+    shadowed, unshadowed = shadowed * scale, unshadowed * scale
     dr.eval(shadowed, unshadowed)
     return shadowed, unshadowed
-
-
-@dataclass
-class _ShadingPoints:
-    """Where shadow rays start, in tile order: a packet's lanes are neighbours in both directions."""
-
-    pixel: mi.UInt32
-    surface: mi.Bool
-    frame: mi.Frame3f
-    origin: mi.Point3f
-
-    @classmethod
-    def in_tile_order(cls, gbuffer: GBuffer, offset: float) -> _ShadingPoints:
-        _, x, y, inside = tile_pixels(gbuffer.width, gbuffer.height)
-        pixel = y * dr.opaque(mi.UInt32, gbuffer.width) + x
-        # Rays stand still where the surface is differentiated.
-        normal = _gather(mi.Normal3f(dr.detach(gbuffer.normal)), pixel, inside)
-        origin = _gather(mi.Point3f(dr.detach(gbuffer.position)), pixel, inside)
-        origin += normal * dr.opaque(mi.Float, offset)
-        surface = inside & (dr.gather(mi.Float, dr.detach(gbuffer.opacity), pixel, inside) > 0)
-        frame = mi.Frame3f(normal)
-        dr.eval(pixel, surface, frame, origin)
-        return cls(pixel, surface, frame, origin)
 
 
 @dataclass
@@ -199,7 +179,3 @@ def shadow_ray(
     cosine_pdf = dr.dot(frame.n, direction) * dr.inv_pi
     density = plan.by_cosine * cosine_pdf + plan.by_light * light.pdf(direction)
     return direction, dr.select(cosine_pdf > 0, cosine_pdf / density, 0)
-
-
-def _gather(value: mi.Color3f, index: mi.UInt32, active: mi.Bool | bool = True) -> mi.Color3f:
-    return type(value)(*[dr.gather(type(channel), channel, index, active) for channel in value])

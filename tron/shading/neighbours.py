@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
+from tron.tracing.tiles import lane_at, tile_counts
+
 if TYPE_CHECKING:
     from tron.tracing import GBuffer
 
@@ -33,7 +35,7 @@ def neighbourhood_mean(
     """Weighted means of ``values`` about each pixel, and where there was anything to average.
 
     Args:
-        values: of each pixel, row-major, evaluated.
+        values: of each of the G-buffer's lanes, evaluated.
         gbuffer: positions, unit normals and opacity of the same pixels; those of opacity 0 do not count.
         spacing: the scene's surfel spacing, world units.
         step: distance of the taps, pixels.
@@ -44,7 +46,7 @@ def neighbourhood_mean(
         the means, 0 where nothing counts, and whether something does.
     """
     if guide is None:
-        guide = dr.zeros(mi.Float, gbuffer.width * gbuffer.height)
+        guide = dr.zeros(mi.Float, dr.width(gbuffer.opacity))
     means, found = _means(
         list(values),
         guide,
@@ -69,9 +71,10 @@ def _means(
     own: mi.Bool,
 ) -> tuple[list[mi.Float], mi.Bool]:
     width, height = dr.opaque(mi.Int, gbuffer.width), dr.opaque(mi.Int, gbuffer.height)
+    across = dr.opaque(mi.UInt32, tile_counts(gbuffer.width, gbuffer.height)[0])
     position, normal, surface = gbuffer.position, gbuffer.normal, gbuffer.opacity > 0
-    lane = mi.Int(dr.arange(mi.UInt32, gbuffer.width * gbuffer.height))
-    x, y = lane % width, lane // width
+    pixel = mi.Int(gbuffer.pixel)
+    x, y = pixel % width, pixel // width
 
     def at(value: mi.Color3f, index: mi.UInt32, inside: mi.Bool) -> mi.Color3f:
         return type(value)(*[dr.gather(mi.Float, channel, index, inside) for channel in value])
@@ -89,7 +92,7 @@ def _means(
         tap_x, tap_y = x + dx * step, y + dy * step
         inside = surface & (tap_x >= 0) & (tap_x < width) & (tap_y >= 0) & (tap_y < height)
         inside &= own | (tap != 12)
-        index = mi.UInt32(tap_y * width + tap_x)
+        index = lane_at(mi.UInt32(tap_x), mi.UInt32(tap_y), across)
         inside &= dr.gather(mi.Bool, surface, index, inside)
         agreement = dr.maximum(dr.dot(normal, at(normal, index, inside)), 0)
         off_plane = dr.dot(normal, at(position, index, inside) - position) / plane

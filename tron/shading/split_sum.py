@@ -9,7 +9,6 @@ more, at 32 texels a face: its kink at the terminator shows at 16 (4 % off at wo
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import replace
 from functools import cache
 
 import drjit as dr
@@ -19,7 +18,7 @@ import numpy as np
 from tron.aligned import aligned
 from tron.errors import TronError
 from tron.shading.cubemap import CubemapLight, bilinear, face_direction
-from tron.shading.environment import EnvironmentLight, EnvironmentMap
+from tron.shading.environment import EnvironmentLight
 from tron.shading.prefilter import LightTree, ggx_prefilter
 
 CUBEMAP_RESOLUTION = 128
@@ -38,30 +37,23 @@ class SplitSum:
     levels; make a new one after each change of the light.
 
     Args:
-        environment: the light, a map or a cubemap on the device.
+        light: on the device.
         resolution: texels along a face edge of the sharpest level, a power of two in [64, 1024]. Preparing a
             light takes about 0.3, 1.2 and 5 seconds on one core at 128, 256 and 512.
-        light: the same map on the device, if the caller has it already.
 
     Raises:
         TronError: another resolution.
     """
 
-    def __init__(
-        self,
-        environment: EnvironmentMap | CubemapLight,
-        resolution: int = CUBEMAP_RESOLUTION,
-        light: EnvironmentLight | None = None,
-    ) -> None:
+    def __init__(self, light: EnvironmentLight | CubemapLight, resolution: int = CUBEMAP_RESOLUTION) -> None:
         if resolution not in (64, 128, 256, 512, 1024):
             raise TronError(f"cubemap resolution is {resolution}", mend="use 64, 128, 256, 512 or 1024")
         # Levels are those of the map at rest, and lookups are turned: one preparation serves all rotations.
         self._turn_to(0.0)
-        if isinstance(environment, EnvironmentMap):
-            self._turn_to(environment.rotation_deg)
-            environment = replace(environment, rotation_deg=0.0)
-            light = light and light.turned_to(0.0)
-        tree = LightTree.build(_on_device(environment, 8 * resolution, light), resolution)
+        if isinstance(light, EnvironmentLight):
+            self._turn_to(light.environment.rotation_deg)
+            light = _at_rest(light, 8 * resolution)
+        tree = LightTree.build(light, resolution)
         resolutions = _level_resolutions(resolution)
         roughnesses = _level_roughnesses(len(resolutions))
         self._last = dr.opaque(mi.UInt32, len(resolutions) - 1)
@@ -151,15 +143,12 @@ class SplitSum:
         return value.x, value.y
 
 
-def _on_device(
-    environment: EnvironmentMap | CubemapLight, widest: int, light: EnvironmentLight | None
-) -> EnvironmentLight | CubemapLight:
-    """The light to filter; a map with far more columns than the levels can show is averaged down first."""
-    if isinstance(environment, CubemapLight):
-        return environment
-    if environment.image.shape[1] > widest:
-        return EnvironmentLight(environment.resized(widest // 2))
-    return light or EnvironmentLight(environment)
+def _at_rest(light: EnvironmentLight, widest: int) -> EnvironmentLight:
+    """The map before it is turned; one with far more columns than the levels can show is averaged down."""
+    light = light.turned_to(0.0)
+    if light.environment.image.shape[1] <= widest:
+        return light
+    return EnvironmentLight(light.environment.resized(widest // 2))
 
 
 def _level_resolutions(resolution: int) -> list[int]:

@@ -66,6 +66,7 @@ class Transport:
         lane = dr.arange(mi.UInt32, pixels * spp)
         rays = dr.opaque(mi.UInt32, plan.rays)
         pixel, ray = lane // rays, lane % rays
+        in_rows = dr.gather(mi.UInt32, gbuffer.pixel, pixel)
 
         def spread(value: mi.Point3f) -> mi.Point3f:
             return type(value)(*[dr.gather(mi.Float, channel, pixel) for channel in value])
@@ -73,7 +74,7 @@ class Transport:
         with dr.suspend_grad():
             normal = mi.Normal3f(spread(gbuffer.normal))
             surface = dr.gather(mi.Float, gbuffer.opacity, pixel) > 0
-            direction, weight = shadow_ray(light, mi.Frame3f(normal), plan, pixel, ray)
+            direction, weight = shadow_ray(light, mi.Frame3f(normal), plan, in_rows, ray)
             counts = surface & (weight > 0)
             offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
             origin = spread(gbuffer.position) + normal * offset

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -28,7 +29,9 @@ FEW_HITS = 64
 
 @dataclass
 class GBuffer(Surface):
-    """What a camera sees, per pixel: a :class:`Surface` of ``width * height`` lanes in row-major order.
+    """View of one camera: a :class:`Surface` whose lanes are its pixels tile by tile.
+
+    Tiles at the right and at the bottom may hang over the image's edge: opacity is 0 there.
 
     Attributes:
         width, height: pixels.
@@ -37,14 +40,42 @@ class GBuffer(Surface):
     width: int
     height: int
 
-    def numpy(self) -> dict[str, np.ndarray]:
-        """Every field as (H, W) or (H, W, 3) float32."""
-        return {f.name: self._image(getattr(self, f.name)) for f in fields(Surface)}
+    @staticmethod
+    def of_rows(surface: Surface, width: int, height: int) -> GBuffer:
+        """The G-buffer of pixels that come row by row."""
+        _, x, y, inside = tile_pixels(width, height)
+        pixel = y * dr.opaque(mi.UInt32, width) + x
+        tiled = _fields(surface, lambda value: dr.gather(type(value), value, pixel, inside))
+        return GBuffer(**tiled, width=width, height=height)
 
-    def _image(self, value: mi.Float) -> np.ndarray:
-        array = np.array(dr.detach(value))
+    @property
+    def pixel(self) -> mi.UInt32:
+        """Row-major number of each lane's pixel."""
+        _, x, y, _ = tile_pixels(self.width, self.height)
+        return y * dr.opaque(mi.UInt32, self.width) + x
+
+    def in_rows(self, value: Any) -> Any:
+        """Numbers of each lane (Dr.Jit) -> of each pixel, row by row; differentiable."""
+        lane = lanes_of_pixels(self.width, self.height)
+        return dr.gather(type(value), value, lane, mode=dr.ReduceMode.Permute)
+
+    def rows(self) -> Surface:
+        """The pixels row by row; differentiable."""
+        return Surface(**_fields(self, self.in_rows))
+
+    def image(self, value: Any) -> np.ndarray:
+        """Numbers of each lane (Dr.Jit) as (H, W) or (H, W, C) float32."""
+        array = np.array(dr.detach(self.in_rows(value)))
         shape = (self.height, self.width) if array.ndim == 1 else (self.height, self.width, -1)
         return np.ascontiguousarray(array.T.reshape(shape))
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Every field as (H, W) or (H, W, 3) float32."""
+        return _fields(self, self.image)
+
+
+def _fields(surface: Surface, change: Callable[[Any], Any]) -> dict[str, Any]:
+    return {field.name: change(getattr(surface, field.name)) for field in fields(Surface)}
 
 
 @dataclass
@@ -139,22 +170,6 @@ def trace_gbuffer(records: SurfelRecords, lists: TileLists, camera: Camera) -> G
     rays = tile_rays(camera)
     sums, hits = trace_tiles(records.detached(), lists, rays, has_gradients(records, rays.direction))
     sums = attach(sums, records, rays.origin, rays.direction, hits)
-    lane = lanes_of_pixels(camera.width, camera.height)
-
-    def gather(value: mi.Float) -> mi.Float:
-        return dr.gather(type(value), value, lane, mode=dr.ReduceMode.Permute)
-
-    in_rows = Composite(
-        channels=[gather(channel) for channel in sums.channels],
-        mean_depth=gather(sums.mean_depth),
-        transmittance=gather(sums.transmittance),
-        median_depth=gather(sums.median_depth),
-        count=gather(sums.count),
-    )
-    direction = mi.Vector3f(*[gather(v) for v in rays.direction])
-    seen = surface(in_rows, rays.origin, direction)
-    buffer = GBuffer(
-        **{f.name: getattr(seen, f.name) for f in fields(Surface)}, width=camera.width, height=camera.height
-    )
-    dr.eval(*(getattr(buffer, f.name) for f in fields(Surface)))
-    return buffer
+    seen = surface(sums, rays.origin, rays.direction)
+    dr.eval(seen)
+    return GBuffer(**_fields(seen, lambda value: value), width=camera.width, height=camera.height)

@@ -17,10 +17,10 @@ Function = TypeVar("Function", bound=Callable)
 
 
 def recorded(function: Function) -> Function:
-    """Freeze ``function``: recorded once for each kind of arguments, by shape of tree and literals."""
+    """Freeze ``function``, which is recorded once for each kind of arguments; ``__wrapped__`` is Dr.Jit's."""
     frozen = dr.freeze(function, limit=64, warn_after=1000)
 
-    @wraps(function)
+    @wraps(frozen)
     def call(*arguments: object) -> object:
         collects = gc.isenabled()
         gc.disable()

@@ -4,7 +4,7 @@ With ``T = prod_j (1 - alpha_j)`` and ``alpha_j = o_j response_j``,
 
     dT/do_j = -T / (1 - alpha_j) response_j
 
-T is known from the forward pass, so a second walk through the hierarchy meets the same surfels, in whatever
+T is known from the forward pass, so a second walk through the hierarchy hits the same surfels, in whatever
 order, and adds this up at each. Opacity alone is differentiated. The derivative is exactly zero where the ray
 is blocked (T below 0.01 counts as 0) and where alpha is clipped.
 """
@@ -19,22 +19,20 @@ import mitsuba as mi
 
 from tron.tracing.bvh import Bvh
 from tron.tracing.kernel import GEOMETRY_PACKETS, MAX_ALPHA, SurfelRecords, intersect
-from tron.tracing.transmittance import BackFaces, blocks, transmittance
+from tron.tracing.transmittance import BackFaces, Fans, blocks, transmittance
 from tron.tracing.traversal import walk
 
 _OPACITY = 3
-"""Where a geometry record holds the opacity."""
+"""Place of the opacity in a geometry record."""
 
 
 @dataclass
 class _Shadow:
-    """What the second walk needs to know of the first."""
+    """Rays of the first walk, as the second needs them."""
 
     bvh: Bvh
-    origin: mi.Point3f
-    direction: mi.Vector3f
+    fans: Fans
     back_faces: BackFaces
-    active: mi.Bool
 
 
 @dataclass
@@ -45,22 +43,16 @@ class _Whole:
     farthest: list[mi.Float]
 
 
-def transmittance_by_opacity(
-    records: SurfelRecords,
-    bvh: Bvh,
-    origin: mi.Point3f,
-    direction: mi.Vector3f,
-    back_faces: BackFaces,
-    active: mi.Bool,
-) -> mi.Float:
+def transmittance_by_opacity(records: SurfelRecords, bvh: Bvh, fans: Fans, back_faces: BackFaces) -> mi.Float:
     """:func:`tron.tracing.transmittance.transmittance` of one ray a lane, differentiable by opacities.
 
     Args:
         records: the surfels, whose gradients the opacities receive.
-        bvh: their hierarchy. The other arguments are those of ``transmittance``.
+        bvh: their hierarchy.
+        fans: fans of one ray, detached.
+        back_faces: from where on they block.
     """
-    shadow = _Shadow(bvh, dr.detach(origin), dr.detach(direction), back_faces, active)
-    return dr.custom(_Transmittance, records.geometry, shadow)
+    return dr.custom(_Transmittance, records.geometry, _Shadow(bvh, fans, back_faces))
 
 
 class _Transmittance(dr.CustomOp):
@@ -68,30 +60,27 @@ class _Transmittance(dr.CustomOp):
 
     def eval(self, geometry: Any, shadow: _Shadow) -> Any:
         self.width, self.shadow = dr.width(geometry), shadow
-        (self.result,) = transmittance(
-            shadow.bvh, shadow.origin, [shadow.direction], shadow.back_faces, [shadow.active]
-        )
+        (self.result,) = transmittance(shadow.bvh, shadow.fans, shadow.back_faces)
         dr.eval(self.result)
         return mi.Float(self.result)
 
     def backward(self) -> None:
-        shadow, target = self.shadow, dr.zeros(mi.Float, self.width)
+        bvh, fans, target = self.shadow.bvh, self.shadow.fans, dr.zeros(mi.Float, self.width)
+        (direction,), (active,) = fans.directions, fans.active
         outer = self.grad_out() * self.result
         dr.eval(outer)
 
         def visit(state: _Whole, surfel: mi.UInt32, lanes: mi.Bool) -> _Whole:
-            met = intersect(shadow.bvh.geometry, surfel, shadow.origin, shadow.direction, shadow.bvh.degree)
-            counts = lanes & blocks(met, shadow.back_faces) & (met.unclipped < MAX_ALPHA)
-            by_opacity = -outer * met.response / (1 - met.alpha)
-            index = dr.gather(mi.UInt32, shadow.bvh.order, surfel, counts)
+            hit = intersect(bvh.geometry, surfel, fans.origin, direction, bvh.degree)
+            counts = lanes & blocks(hit, self.shadow.back_faces) & (hit.unclipped < MAX_ALPHA)
+            by_opacity = -outer * hit.response / (1 - hit.alpha)
+            index = dr.gather(mi.UInt32, bvh.order, surfel, counts)
             dr.scatter_reduce(
                 dr.ReduceOp.Add, target, by_opacity, index * (4 * GEOMETRY_PACKETS) + _OPACITY, counts
             )
             return state
 
         start = _Whole([mi.Float(0)], [mi.Float(dr.inf)])
-        state = walk(
-            shadow.bvh, shadow.origin, [shadow.direction], start, visit, shadow.active & (self.result > 0)
-        )
+        state = walk(bvh, fans.origin, [direction], start, visit, active & (self.result > 0))
         dr.eval(state, target)
         self.set_grad_in("geometry", target)

@@ -17,7 +17,7 @@ import mitsuba as mi
 
 from tron.tracing.bvh import Bvh
 from tron.tracing.recording import recorded
-from tron.tracing.transmittance import BackFaces, Products, multiply, remaining
+from tron.tracing.transmittance import BackFaces, Fans, Products, multiply, remaining
 from tron.tracing.traversal import Descent, look, search, slopes_of
 
 _NO_FAN = 0xFFFFFFFF
@@ -32,24 +32,20 @@ class Line:
     taken: mi.UInt32
 
 
-def queued_transmittance(
-    bvh: Bvh,
-    origin: mi.Point3f,
-    directions: Sequence[mi.Vector3f],
-    back_faces: BackFaces,
-    active: Sequence[mi.Bool],
-) -> list[mi.Float]:
+def queued_transmittance(bvh: Bvh, fans: Fans, back_faces: BackFaces) -> list[mi.Float]:
     """:func:`tron.tracing.transmittance.transmittance`, evaluated at once; not inside a recorded loop."""
-    fans = dr.width(origin, directions, active)
-    origin = mi.Point3f(*[_spread(dr.detach(v), fans) for v in origin])
-    directions = [mi.Vector3f(*[_spread(dr.detach(v), fans) for v in along]) for along in directions]
-    active = [_spread(mi.Bool(lanes), fans) for lanes in active]
-    dr.eval(origin, directions, active)
-    found = [dr.zeros(mi.Float, fans) for _ in directions]
-    line = Line(dr.arange(mi.UInt32, fans), dr.opaque(mi.UInt32, fans), dr.opaque(mi.UInt32, 0))
+    count = dr.width(fans)
+    fans = Fans(
+        mi.Point3f(*[_spread(dr.detach(v), count) for v in fans.origin]),
+        [mi.Vector3f(*[_spread(dr.detach(v), count) for v in along]) for along in fans.directions],
+        [_spread(mi.Bool(lanes), count) for lanes in fans.active],
+    )
+    dr.eval(fans)
+    found = [dr.zeros(mi.Float, count) for _ in fans.directions]
+    line = Line(dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, 0))
     dr.make_opaque(found, line)
-    found = _trace_recorded(bvh, origin, directions, back_faces, active, line, found)
-    return [dr.select(lanes, value, 1) for value, lanes in zip(found, active)]
+    found = _trace(bvh, fans, back_faces, line, found)
+    return [dr.select(lanes, value, 1) for value, lanes in zip(found, fans.active)]
 
 
 def _spread(value: Any, width: int) -> Any:
@@ -62,45 +58,28 @@ def _spread(value: Any, width: int) -> Any:
 # Tracing the walk takes Python as long as tracing 10,000 rays takes a core, so it is recorded once for each
 # kind of arguments: kernel degree, levels, rays in a fan. Other sizes are free.
 @recorded
-def _trace_recorded(
-    bvh: Bvh,
-    origins: mi.Point3f,
-    directions: Sequence[mi.Vector3f],
-    back_faces: BackFaces,
-    active: Sequence[mi.Bool],
-    line: Line,
-    found: Sequence[mi.Float],
-) -> Sequence[mi.Float]:
-    _trace(bvh, origins, directions, back_faces, active, line, found)
-    return found
-
-
 @dr.syntax
 def _trace(
-    bvh: Bvh,
-    origins: mi.Point3f,
-    directions: Sequence[mi.Vector3f],
-    back_faces: BackFaces,
-    active: Sequence[mi.Bool],
-    line: Line,
-    found: Sequence[mi.Float],
-) -> None:
+    bvh: Bvh, fans: Fans, back_faces: BackFaces, line: Line, found: Sequence[mi.Float]
+) -> Sequence[mi.Float]:
     """Trace all fans; ``found`` receives what is left of each ray."""
+    rays = range(len(fans.directions))
     fan, going = mi.UInt32(_NO_FAN), line.lane < line.fans
-    origin, along = mi.Point3f(0), [mi.Vector3f(0) for _ in directions]
-    slopes = [mi.Vector3f(0) for _ in directions]
-    at, state = Descent.begun(), Products.clear([mi.Bool(False) for _ in directions])
+    origin, along = mi.Point3f(0), [mi.Vector3f(0) for _ in rays]
+    slopes = [mi.Vector3f(0) for _ in rays]
+    at, state = Descent.begun(), Products.clear([mi.Bool(False) for _ in rays])
     while going:
         if ~at.unfinished(state):
             for value, product in zip(found, state.product):
                 dr.scatter(value, remaining(product), fan, fan < line.fans)
             fan = dr.scatter_inc(line.taken, mi.UInt32(0))
             going = fan < line.fans
-            origin = mi.Point3f(*[dr.gather(mi.Float, v, fan, going) for v in origins])
-            for ray in range(len(directions)):
-                along[ray] = mi.Vector3f(*[dr.gather(mi.Float, v, fan, going) for v in directions[ray]])
+            origin = mi.Point3f(*[dr.gather(mi.Float, v, fan, going) for v in fans.origin])
+            for ray in rays:
+                along[ray] = mi.Vector3f(*[dr.gather(mi.Float, v, fan, going) for v in fans.directions[ray]])
                 slopes[ray] = slopes_of(along[ray])
             at = Descent.begun()
-            state = Products.clear([dr.gather(mi.Bool, lanes, fan, going) for lanes in active])
+            state = Products.clear([dr.gather(mi.Bool, lanes, fan, going) for lanes in fans.active])
         at = search(bvh, origin, slopes, state, at, going)
         at, state = look(at, state, multiply(bvh, origin, along, back_faces), going)
+    return found

@@ -72,7 +72,11 @@ def lanes_of_pixels(width: int, height: int) -> mi.UInt32:
     """For each pixel in row-major order, its lane in tile order."""
     pixel = dr.arange(mi.UInt32, width * height)
     across, columns = dr.opaque(mi.UInt32, tile_counts(width, height)[0]), dr.opaque(mi.UInt32, width)
-    x, y = pixel % columns, pixel // columns
+    return lane_at(pixel % columns, pixel // columns, across)
+
+
+def lane_at(x: mi.UInt32, y: mi.UInt32, across: mi.UInt32) -> mi.UInt32:
+    """The lane of pixel (x, y) in tile order, with ``across`` tiles side by side."""
     return ((y // TILE) * across + x // TILE) * LANES + (y % TILE) * TILE + x % TILE
 
 

@@ -77,7 +77,7 @@ def render(
             sh_degree=sh_degree,
         )
         records = pack(parameters)
-        seen = trace_gbuffer(records, build_tiles(records.detached(), camera), camera)
+        seen = trace_gbuffer(records, build_tiles(records.detached(), camera), camera).rows()
         return {name: _image(getattr(seen, name), camera) for name in IMAGES}
 
     # The bridge knows tensors but not their subclasses, such as nn.Parameter: a view is a plain tensor.

@@ -19,7 +19,7 @@ from tron.tracing.shadow_gradient import transmittance_by_opacity
 from tron.tracing.shadow_queue import queued_transmittance
 from tron.tracing.surface import Surface
 from tron.tracing.tiles import build_tiles
-from tron.tracing.transmittance import BackFaces, transmittance
+from tron.tracing.transmittance import BackFaces, Fans, transmittance
 
 if TYPE_CHECKING:
     from tron.cameras import Camera
@@ -139,12 +139,11 @@ class SurfelTracer:
         """
         recorded = dr.flag(dr.JitFlag.SymbolicScope)
         trace = transmittance if recorded else queued_transmittance
-        return trace(self.bvh, origin, directions, self._back_faces, active)
+        return trace(self.bvh, Fans(origin, directions, active), self._back_faces)
 
     def transmittance_by_opacity(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
     ) -> mi.Float:
         """:meth:`transmittance`, differentiable by the opacities; not inside a recorded loop."""
-        return transmittance_by_opacity(
-            self._attached(), self.bvh, origin, direction, self._back_faces, mi.Bool(active)
-        )
+        fans = Fans(dr.detach(origin), [dr.detach(direction)], [mi.Bool(active)])
+        return transmittance_by_opacity(self._attached(), self.bvh, fans, self._back_faces)

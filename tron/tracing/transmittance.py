@@ -1,6 +1,6 @@
-"""Transmittance along arbitrary rays: a product over hits, so the order in which they are met is free.
+"""Transmittance along arbitrary rays: a product over hits, so the order in which they are hit is free.
 
-Sidedness (measured in guidance.md): one-sided surfels leak, because undersides that no camera saw do not
+Sidedness (docs/conventions.md, 8): one-sided surfels leak, because undersides that no camera saw do not
 exist; naive two-sided surfels darken their own surface. So front faces block from t = 0, and back faces
 only beyond two surfel spacings, where they can no longer belong to the surface that the ray left. Where
 surfels are larger than the scene's median, their spacing is larger by as much (:class:`BackFaces`).
@@ -25,6 +25,21 @@ BACK_FACE_SPACINGS = 2.0
 
 
 @dataclass
+class Fans:
+    """Shadow rays, a fan of them from each origin.
+
+    Attributes:
+        origin: world, one a lane.
+        directions: unit, world, of the rays that leave it: close to each other, for speed.
+        active: the lanes of each direction to trace; transmittance of the others is 1.
+    """
+
+    origin: mi.Point3f
+    directions: Sequence[mi.Vector3f]
+    active: Sequence[mi.Bool]
+
+
+@dataclass
 class Products:
     """Transmittance so far of each ray of a fan; a blocked ray's interval is empty."""
 
@@ -34,7 +49,7 @@ class Products:
 
     @staticmethod
     def clear(active: Sequence[mi.Bool]) -> Products:
-        """Nothing met yet, by the rays that are traced."""
+        """Nothing hit yet, by the rays that are traced."""
         return Products(
             product=[mi.Float(1) for _ in active],
             nearest=[mi.Float(0) for _ in active],
@@ -68,11 +83,11 @@ class BackFaces:
         return BackFaces(dr.opaque(mi.Float, reach), dr.opaque(mi.Float, reach / median))
 
 
-def blocks(met: SurfelHit, back_faces: BackFaces) -> mi.Bool:
+def blocks(hit: SurfelHit, back_faces: BackFaces) -> mi.Bool:
     """Whether a surfel stands in the ray's way: the rule of sidedness above."""
-    local = back_faces.radii * met.radius
+    local = back_faces.radii * hit.radius
     far = dr.select(local > back_faces.distance, local, back_faces.distance)
-    return met.within & (met.t > dr.select(met.front, 0, far))
+    return hit.within & (hit.t > dr.select(hit.front, 0, far))
 
 
 def remaining(product: mi.Float) -> mi.Float:
@@ -83,13 +98,13 @@ def remaining(product: mi.Float) -> mi.Float:
 def multiply(
     bvh: Bvh, origin: mi.Point3f, directions: Sequence[mi.Vector3f], back_faces: BackFaces
 ) -> Callable[[Products, mi.UInt32, mi.Bool], Products]:
-    """What a walk does at each surfel."""
+    """Visitor of a walk: multiplies by what each surfel lets through."""
 
     def visit(state: Products, surfel: mi.UInt32, _: mi.Bool) -> Products:
         for ray, direction in enumerate(directions):
-            met = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
+            hit = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
             before = state.product[ray]
-            product = dr.select(blocks(met, back_faces), before * (1 - met.alpha), before)
+            product = dr.select(blocks(hit, back_faces), before * (1 - hit.alpha), before)
             state.product[ray] = product
             state.farthest[ray] = dr.select(product >= OPAQUE_TRANSMITTANCE, state.farthest[ray], -dr.inf)
         return state
@@ -97,27 +112,13 @@ def multiply(
     return visit
 
 
-def transmittance(
-    bvh: Bvh,
-    origin: mi.Point3f,
-    directions: Sequence[mi.Vector3f],
-    back_faces: BackFaces,
-    active: Sequence[mi.Bool],
-) -> list[mi.Float]:
+def transmittance(bvh: Bvh, fans: Fans, back_faces: BackFaces) -> list[mi.Float]:
     """Product of (1 - alpha) over the surfels that block each ray; exactly 0 below ``OPAQUE_TRANSMITTANCE``.
 
-    Args:
-        bvh: the hierarchy.
-        origin: world. directions: unit, world, of the rays that leave it: close to each other, for speed.
-        back_faces: from where on they block.
-        active: the lanes of each direction to trace; the others get 1.
-
-    Returns:
-        mi.Float in [0, 1] for each direction.
+    mi.Float in [0, 1] for each direction. Within recorded loops too; elsewhere
+    :func:`tron.tracing.shadow_queue.queued_transmittance` is faster.
     """
-
-    start = Products.clear(active)
-    products = walk(
-        bvh, origin, directions, start, multiply(bvh, origin, directions, back_faces), any_of(active)
-    ).product
-    return [dr.select(lanes, remaining(product), 1) for product, lanes in zip(products, active)]
+    visit = multiply(bvh, fans.origin, fans.directions, back_faces)
+    start, active = Products.clear(fans.active), any_of(fans.active)
+    products = walk(bvh, fans.origin, fans.directions, start, visit, active).product
+    return [dr.select(lanes, remaining(product), 1) for product, lanes in zip(products, fans.active)]

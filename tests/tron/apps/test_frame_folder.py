@@ -7,7 +7,6 @@ from tron.apps.frame_folder import FrameFolder
 from tron.errors import TronError
 from tron.images import read_image
 from tron.seeds import generator
-from tron.video import read_video
 
 
 @pytest.fixture
@@ -67,11 +66,11 @@ def test_the_same_settings_keep_frames_and_others_need_overwrite(folder):
 
 def test_damaged_settings_are_refused(folder):
     (folder.folder / "settings.json").write_text("{")
-    with pytest.raises(TronError, match="cannot read"):
+    with pytest.raises(TronError, match="is damaged"):
         folder.claim({}, overwrite=False)
 
 
-def test_rows_videos_and_sheets_show_every_picture_in_its_place(folder, tmp_path):
+def test_rows_videos_and_sheets_show_every_picture_in_its_place(folder, tmp_path, read_video):
     shades = {"pbr": 0.2, "irradiance": 0.8}
     for index in range(3):
         for name, shade in shades.items():

@@ -17,12 +17,11 @@ from tron.images import read_image
 from tron.seeds import generator
 from tron.shading.environment import EnvironmentMap
 from tron.shards.schema import GUIDANCE
-from tron.video import read_video
 
 SIZE = 32
 
 
-def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, tmp_path):
+def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, tmp_path, read_video):
     out = tmp_path / "out"
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=2"]
     assert relight(*base, "buffers=[normal,depth,mask]") == 0
@@ -139,7 +138,7 @@ def test_a_plain_3dgs_file_is_relit_with_a_warning(relight, scene_path, light_pa
     assert json.loads((silent / "frames" / "settings.json").read_text())["up"] == [0, -1, 0]
 
 
-def test_a_new_renderer_shows_the_pbr_buffer(relight, scene_path, light_path, tmp_path):
+def test_a_new_renderer_shows_the_pbr_buffer(relight, scene_path, light_path, tmp_path, read_video):
     """Untrained, a renderer gives its PBR input back; what is tested is the way there and back."""
     from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
     from tron.neural.weights import save_renderer

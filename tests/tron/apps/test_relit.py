@@ -15,7 +15,6 @@ from tron.images import read_image
 from tron.seeds import generator
 from tron.shading.background import background_share
 from tron.shading.environment import EnvironmentMap
-from tron.video import read_video
 
 SIZE = 32
 STEP = 1.01 / 255
@@ -159,7 +158,9 @@ def test_another_background_traces_nothing_again(relight, scene_path, lights, tm
     assert picture(tmp_path, "relit").shape[2] == 3
 
 
-def test_what_has_alpha_is_black_behind_in_videos_and_sheets(relight, scene_path, lights, tmp_path):
+def test_what_has_alpha_is_black_behind_in_videos_and_sheets(
+    relight, scene_path, lights, tmp_path, read_video
+):
     base = [f"scene={scene_path}", f"environment={lights[0]}", f"output_dir={tmp_path}", "frames=2"]
     assert relight(*base, "background=transparent") == 0
     empty = picture(tmp_path, "relit")[..., 3] == 0

@@ -1,6 +1,9 @@
 """The way into every command, tried on a toy one: what a user types wrong costs one line, not a traceback."""
 
+import json
 import logging
+import pstats
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tron.cli.command_line import command
 from tron.errors import TronError
+from tron.runtime import activate
 
 CONFIG = """
 defaults:
@@ -144,6 +148,7 @@ def run(toy_conf: str, capsys: pytest.CaptureFixture[str], monkeypatch, tmp_path
         (["output_dir=a(1).ply"], ["cannot read", """'output_dir="a(1).ply"'"""]),
         (["--multirun"], ["--multirun", "--help"]),
         (["--cfg", "hydra"], ["--cfg", "hydra"]),
+        (["--log-level", "loud"], ["--log-level", "loud", "warning"]),
         (["--config-dir", "nowhere"], ["folder not found (nowhere)"]),
     ],
     ids=lambda value: "_".join(value) if isinstance(value, list) else None,
@@ -273,10 +278,103 @@ def test_a_defect_keeps_its_traceback(run: Run):
 
 
 def test_log_lines_are_neither_wrapped_nor_coloured_in_a_pipe(run: Run, monkeypatch):
-    monkeypatch.setattr(logging.getLogger(), "handlers", [])
-    monkeypatch.setattr(logging.getLogger(), "level", logging.WARNING)
+    forget_the_log(monkeypatch)
     long = "word " * 60
 
     _, _, err = run("output_dir=o", does=lambda _: logging.getLogger("tron").info(long))
     assert long in err
     assert "\x1b" not in err
+
+
+def forget_the_log(monkeypatch) -> None:
+    """Neither handlers nor level of other tests, and none for them."""
+    monkeypatch.setenv("TRON_LOG_LEVEL", "")
+    for name in ("", "tron", "datagen", "train", "eval"):
+        monkeypatch.setattr(logging.getLogger(name), "level", logging.WARNING)
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+
+
+@pytest.mark.parametrize(
+    ("level", "heard"),
+    [
+        (None, ["info", "warning", "foreign info"]),
+        ("debug", ["debug", "info", "warning", "foreign info"]),
+        ("warning", ["warning"]),
+    ],
+)
+def test_the_log_is_as_loud_as_asked(run: Run, monkeypatch, level, heard):
+    forget_the_log(monkeypatch)
+
+    def speak(_):
+        ours, foreign = logging.getLogger("tron.cli"), logging.getLogger("foreign")
+        ours.debug("says debug")
+        ours.info("says info")
+        ours.warning("says warning")
+        foreign.debug("says foreign debug")
+        foreign.info("says foreign info")
+
+    _, _, err = run("output_dir=o", *(["--log-level", level] if level else []), does=speak)
+    assert [line.partition("says ")[2] for line in err.splitlines()] == heard
+
+
+def test_processes_that_a_command_starts_log_at_its_level(run: Run):
+    code = (
+        "import logging, tron.cli.log as log; log.configure_logging(); logging.getLogger('train').debug('hi')"
+    )
+    said = []
+
+    def start(_):
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        said.append(done.stderr)
+
+    run("output_dir=o", does=start)
+    run("output_dir=o", "--log-level", "debug", does=start)
+    assert [text.endswith("DEBUG hi\n") for text in said] == [False, True]
+
+
+def test_a_mistakes_traceback_is_shown_where_it_is_asked_for(run: Run):
+    def fail(_):
+        raise TronError("file not found", where="a.ply")
+
+    code, _, err = run("output_dir=o", "--traceback", does=fail)
+    assert code == 2
+    assert "in fail" in err
+    assert err.endswith("\ntron-toy: file not found (a.ply)\n")
+    assert "Traceback" in run("framez=3", "--traceback")[2]
+
+
+def test_a_profile_of_a_command_that_fails_is_kept_too(run: Run, tmp_path: Path, monkeypatch):
+    monkeypatch.delitem(sys.modules, "drjit", raising=False)
+
+    def slow(_):
+        return sum(range(10_000))
+
+    def fail(settings):
+        slow(settings)
+        raise TronError("no luck")
+
+    assert run("output_dir=o", "--profile", does=fail)[0] == 2
+    _, _, err = run("output_dir=o", "--profile", does=lambda settings: slow(settings) * 0)
+    stats = pstats.Stats(str(tmp_path / "o" / "profile" / "tron-toy.prof")).stats  # type: ignore[attr-defined]
+    assert "slow" in {function for _, _, function in stats}
+    assert "slow" in err
+    assert not (tmp_path / "o" / "profile" / "tron-toy.kernels.json").exists()
+
+
+@pytest.mark.usefixtures("variant")
+def test_a_profile_counts_kernels(run: Run, tmp_path: Path, variant: str):
+    import drjit as dr
+    import mitsuba as mi
+
+    def render(_):
+        activate(variant)
+        for size in (1000, 3000):
+            dr.eval(dr.sin(dr.arange(mi.Float, size) + 0.125))
+
+    assert run("output_dir=o", "--profile", does=render)[0] == 0
+    kernels = json.loads((tmp_path / "o" / "profile" / "tron-toy.kernels.json").read_text())
+    assert (kernels["launches"], kernels["kernels"]) == (2, 1)
+    assert kernels["cache_hits"] >= 1
+    (kernel,) = kernels["slowest"]
+    assert (kernel["launches"], kernel["largest_size"]) == (2, 3000)
+    assert not dr.flag(dr.JitFlag.KernelHistory), "nothing is noted once the profile is written"

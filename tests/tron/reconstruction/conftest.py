@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -64,6 +65,7 @@ def studio() -> EnvironmentMap:
 def captured(tracer: SurfelTracer) -> Callable[..., Capture]:
     """A capture of the spheres: photos under a light; the prior is its irradiance times ``prior_scale``."""
 
+    @cache
     def capture(light: EnvironmentMap, views: int = 8, prior_scale: float = 1.0) -> Capture:
         lighting, exposure = Lighting(light, 64), light.exposure()
         made = []
@@ -75,7 +77,7 @@ def captured(tracer: SurfelTracer) -> Callable[..., Capture]:
             )
             gbuffer = tracer.gbuffer(camera)
             prior = [irradiance(tracer, gbuffer, lighting.light, 64, seed)[0] for seed in range(2)]
-            prior = prior_scale * np.mean([np.array(p).T for p in prior], 0).reshape(SIZE, SIZE, 3)
+            prior = prior_scale * np.mean([gbuffer.image(p) for p in prior], 0)
             shadowed = render_guidance(tracer, camera, lighting, Estimation(rays=64), seed=9).shadowed
             made.append(View(f"{i}", camera, agx(exposure * shadowed), "display", irradiance=prior))
         return Capture(tuple(made), exposure=exposure)

@@ -193,11 +193,6 @@ def test_levels_add_up_to_the_light_they_start_from_and_stay_smooth(variant: str
     assert list(LogPyramid(texels, 16).levels) == ["level_16"]
 
 
-def test_the_papers_settings() -> None:
-    paper = FitSettings.paper(seed=3)
-    assert (paper.resolution, paper.steps, paper.seed) == (512, 4000, 3)
-
-
 def test_large_photos_are_reduced_by_averaging(captured, studio) -> None:
     view = captured(studio, views=1).views[0]
     (photo,) = choose_photos([view], FitSettings(scale_pixels=300), 1.0)

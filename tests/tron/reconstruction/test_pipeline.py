@@ -34,12 +34,13 @@ DENSITY = DensitySettings(start=0, end=16, every=6, threshold=1e-5, prune_every=
 def settings(**changes: Any) -> ReconstructionSettings:
     """A dozen and some steps, with density changes; rates for so few."""
     radiance = RadianceSettings(
-        steps=14, position_rate=1e-3, sh_rate=0.05, scale_rate=0.02, sh_every=4, density=DENSITY
+        steps=14, position_rate=1e-3, sh_rate=0.05, scale_rate=0.02, sh_every=4, normal=0.1, density=DENSITY
     )
     values = {
-        "initial": InitialSettings(source="depth", count=300),
+        "initial": InitialSettings(source="depth", count=300, kernel_degree=2),
         "radiance": radiance,
-        "materials": MaterialSettings(steps=6, rate=0.03),
+        "materials": MaterialSettings(steps=6, rate=0.03, decay=1),
+        "steps_scaler": 1,
         "checkpoint_every": 5,
     }
     return ReconstructionSettings(**{**values, **changes})

@@ -7,11 +7,10 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from tron.cli.recipes import compose_recipe, resolve
+from tron.apps.reconstruct import Settings
+from tron.cli.recipes import check, compose_recipe
 from tron.reconstruction.settings import (
     DensitySettings,
-    FitSettings,
-    InitialSettings,
     MaterialSettings,
     RadianceSettings,
     ReconstructionSettings,
@@ -33,41 +32,38 @@ def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def test_the_defaults_are_those_of_the_facts() -> None:
+@pytest.fixture(scope="module")
+def paper() -> Settings:
+    """The recipe experiment=paper of tron-reconstruct."""
+    return check(compose_recipe("conf.reconstruct", Settings, ["experiment=paper", *PATHS]), Settings)
+
+
+def test_the_papers_recipe_is_that_of_the_facts(paper: Settings) -> None:
     """facts.md sections 1 and 2."""
-    radiance, density = RadianceSettings(), DensitySettings()
-    assert (radiance.steps, MaterialSettings().steps) == (30_000, 7000)
+    radiance, density, materials = paper.radiance, paper.radiance.density, paper.materials
+    assert (radiance.steps, materials.steps, paper.steps_scaler) == (30_000, 7000, 1.0)
     assert (radiance.position_rate, radiance.position_rate_final) == (1.6e-4, 1.6e-6)
     assert (radiance.opacity_rate, radiance.sh_rate, radiance.sh_rest_rate) == (0.05, 2.5e-3, 1.25e-4)
     assert (radiance.rotation_rate, radiance.scale_rate) == (1e-3, 5e-3)
     assert (radiance.sh_degree, radiance.sh_every) == (3, 1000)
-    assert (radiance.ssim, MaterialSettings().ssim, radiance.mask) == (0.2, 0.2, 0.2)
+    assert (radiance.ssim, materials.ssim, radiance.mask) == (0.2, 0.2, 0.2)
     assert radiance.background == "black"
     assert (density.start, density.end, density.every, density.threshold) == (500, 15_000, 300, 2e-4)
     assert (density.clone_below, density.split_shrink) == (0.01, 1.6)
     assert (density.prune_every, density.prune_below) == (100, 0.005)
     assert (density.reset_every, density.reset_to) == (3000, 0.01)
-    assert InitialSettings().kernel_degree == 2
+    assert (paper.initial.kernel_degree, paper.initial.count, paper.max_side) == (2, 100_000, None)
+    assert paper.light is not None
+    assert (paper.light.resolution, paper.light.steps) == (512, 4000)
 
 
-def test_the_papers_experiment_is_the_defaults() -> None:
-    recipe: Any = resolve(compose_recipe("conf.reconstruct", ["experiment=paper", *PATHS]))
-    defaults = ReconstructionSettings().model_dump(mode="json")
-    for name in ("initial", "radiance", "materials", "steps_scaler", "checkpoint_every", "seed"):
-        assert recipe[name] == defaults[name], name
-    assert recipe["light"] == FitSettings.paper().model_dump(mode="json")
-    assert recipe["max_side"] is None
-
-
-def test_the_commands_own_numbers_are_the_papers_but_for_those_that_are_named() -> None:
-    recipe: Any = resolve(compose_recipe("conf.reconstruct", PATHS))
-    own, paper = (
+def test_the_defaults_are_the_papers_but_for_what_so_short_a_schedule_needs(paper: Settings) -> None:
+    """Each measured: docs/experiments.md."""
+    own, its = (
         flat({name: values[name] for name in ("radiance", "materials")})
-        for values in (recipe, ReconstructionSettings().model_dump(mode="json"))
+        for values in (ReconstructionSettings().model_dump(mode="json"), paper.model_dump(mode="json"))
     )
-    different = {name for name in paper if own[name] != paper[name]}
-    # What so short a schedule needs, each measured: docs/experiments.md.
-    assert different == {
+    assert {name for name in its if own[name] != its[name]} == {
         "radiance.normal",
         *(f"radiance.density.{name}" for name in ("end", "every", "threshold", "reset_every", "most")),
         "materials.rate",

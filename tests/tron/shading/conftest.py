@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from tron.cameras import Camera
+from tron.shading.cubemap import CubemapLight, texel_directions
 from tron.shading.environment import EnvironmentMap
-from tron.tracing import GBuffer
+from tron.tracing import GBuffer, Surface
 
 CENTRE, RADIUS = np.array([0.0, 0.0, 0.8]), 0.5
 
@@ -55,7 +56,7 @@ class SphereOverPlane:
         centre = mi.Point3f(*map(float, CENTRE))
         normal = dr.select(sphere < plane, dr.normalize(position - centre), mi.Vector3f(0, 0, 1))
         one = dr.select(seen, mi.Float(1), 0)
-        return GBuffer(
+        seen = Surface(
             position=position,
             depth=dr.select(seen, t, 0),
             normal=mi.Normal3f(dr.select(seen, normal, 0)),
@@ -65,9 +66,8 @@ class SphereOverPlane:
             rgb=mi.Color3f(0) * one,
             opacity=one,
             direction=direction,
-            width=camera.width,
-            height=camera.height,
         )
+        return GBuffer.of_rows(seen, camera.width, camera.height)
 
 
 @pytest.fixture
@@ -90,6 +90,18 @@ def sun_map() -> EnvironmentMap:
 
 
 @pytest.fixture
+def cubemap_of(variant: str) -> Callable[[EnvironmentMap, int], CubemapLight]:
+    """A map as a cubemap whose texels are means over 8 x 8 of its values."""
+
+    def make(environment: EnvironmentMap, resolution: int) -> CubemapLight:
+        directions = np.array(texel_directions(8 * resolution)).T
+        fine = environment.lookup(directions).reshape(6, resolution, 8, resolution, 8, 3)
+        return CubemapLight(mi.Float(fine.mean((2, 4)).ravel()), resolution)
+
+    return make
+
+
+@pytest.fixture
 def points_gbuffer() -> Callable[[np.ndarray, np.ndarray], SimpleNamespace]:
     """Make what `irradiance` reads of a G-buffer from positions and unit normals (N, 3)."""
 
@@ -99,6 +111,7 @@ def points_gbuffer() -> Callable[[np.ndarray, np.ndarray], SimpleNamespace]:
             position=mi.Point3f(columns[0]),
             normal=mi.Normal3f(columns[1]),
             opacity=dr.ones(mi.Float, len(positions)),
+            pixel=dr.arange(mi.UInt32, len(positions)),
             width=len(positions),
             height=1,
         )

@@ -6,14 +6,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tron.shading.environment import EnvironmentMap
+from tron.shading.environment import EnvironmentLight, EnvironmentMap
 from tron.shading.guidance import DIELECTRIC_F0
 from tron.shading.split_sum import SplitSum, brdf_table
 
 
 @pytest.fixture
 def furnace(variant: str) -> SplitSum:
-    return SplitSum(EnvironmentMap.constant(1.0), 64)
+    return SplitSum(EnvironmentLight(EnvironmentMap.constant(1.0)), 64)
 
 
 def every_case() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

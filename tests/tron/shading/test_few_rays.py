@@ -23,10 +23,6 @@ def windows() -> EnvironmentMap:
     return EnvironmentMap(image)
 
 
-def as_image(color) -> np.ndarray:
-    return np.array(color).T.reshape(VIEW.height, VIEW.width, 3)
-
-
 @pytest.mark.parametrize("light", ["sun", "soft"])
 def test_shadows_of_few_rays_are_as_dark_as_of_many(
     variant: str, sphere_over_plane, sun_map, light: str
@@ -55,7 +51,7 @@ def test_the_regression_has_less_noise_than_the_ratio(variant: str, sphere_over_
         reaching_share(*found, gbuffer, lighting, tracer.scene.spacing, Estimation(rays=2)),
         visible_share(*found),
     )
-    ours, ratio = (np.std((as_image(s) * many.unshadowed - many.irradiance)[surface]) for s in shares)
+    ours, ratio = (np.std((gbuffer.image(s) * many.unshadowed - many.irradiance)[surface]) for s in shares)
     assert ours < 0.7 * ratio
 
 
@@ -65,7 +61,7 @@ def test_open_surfaces_keep_all_light_exactly(variant: str, sphere_over_plane, s
     for spp in (2, 4, 8):
         found = irradiance(tracer, gbuffer, lighting.light, spp, 0)
         share = reaching_share(*found, gbuffer, lighting, tracer.scene.spacing, Estimation(rays=spp))
-        np.testing.assert_array_equal(as_image(share), 1)
+        np.testing.assert_array_equal(gbuffer.image(share), 1)
 
 
 def test_a_dark_umbra_stays_black(variant: str, sphere_over_plane) -> None:
@@ -82,7 +78,7 @@ def test_a_dark_umbra_stays_black(variant: str, sphere_over_plane) -> None:
         share = reaching_share(
             *found, gbuffer, lighting, tracer.scene.spacing, Estimation(rays=2, filtered=denoise)
         )
-        assert as_image(share)[umbra].max() < most
+        assert gbuffer.image(share)[umbra].max() < most
 
 
 def test_a_pixel_without_neighbours_keeps_the_ratio(

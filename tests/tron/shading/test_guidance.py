@@ -98,14 +98,12 @@ def test_sharing_rays_makes_a_better_picture_than_either_estimate(
 ) -> None:
     tracer, lighting = sphere_over_plane(), Lighting(sun_map)
     gbuffer = tracer.gbuffer(camera)
-    surface = np.array(gbuffer.opacity) > 0
+    surface = gbuffer.numpy()["opacity"] > 0
     plain = [
-        np.array(irradiance(tracer, gbuffer, lighting.light, 64, seed)[0]).T[surface] for seed in range(33)
+        gbuffer.image(irradiance(tracer, gbuffer, lighting.light, 64, seed)[0])[surface] for seed in range(33)
     ]
     truth = np.mean(plain[1:], axis=0)
-    ours = render_guidance(tracer, camera, lighting, Estimation(rays=64), seed=0).irradiance.reshape(-1, 3)[
-        surface
-    ]
+    ours = render_guidance(tracer, camera, lighting, Estimation(rays=64), seed=0).irradiance[surface]
 
     def error(a: np.ndarray) -> float:
         return float(np.sqrt(np.mean((a - truth) ** 2)) / truth.mean())
@@ -140,9 +138,8 @@ def test_the_plain_estimate_is_the_mean_over_the_rays(
 ) -> None:
     tracer, lighting = sphere_over_plane(base_color=0.5), Lighting(sun_map)
     plain = render_guidance(tracer, camera, lighting, Estimation(rays=16, estimator="plain"), seed=3)
-    shadowed, _ = irradiance(tracer, tracer.gbuffer(camera), lighting.light, 16, 3)
-    surface = plain.mask > 0
-    mean = np.array(shadowed).T.reshape(48, 48, 3)
+    gbuffer, surface = tracer.gbuffer(camera), plain.mask > 0
+    mean = gbuffer.image(irradiance(tracer, gbuffer, lighting.light, 16, 3)[0])
     np.testing.assert_allclose(plain.irradiance[surface], mean[surface], rtol=1e-4, atol=1e-5)
     lost = 0.5 * (plain.unshadowed - plain.irradiance)
     np.testing.assert_allclose((plain.pbr - plain.shadowed)[surface], lost[surface], atol=1e-3)

@@ -95,10 +95,10 @@ def test_prefilter_is_the_lobe_integral(variant: str, make, alpha: float) -> Non
 def test_diffuse_is_the_cosine_integral(variant: str, make) -> None:
     environment, normals = make(), towards_sun()
     truth = lobe_integral(environment, normals, 1.0)
-    ours = rows(SplitSum(environment, 64).diffuse(vector(normals)))
+    ours = rows(SplitSum(EnvironmentLight(environment), 64).diffuse(vector(normals)))
     np.testing.assert_allclose(ours, truth, rtol=0.01, atol=4e-3 * truth.max())
     np.testing.assert_allclose(
-        rows(SplitSum(environment, 64).diffuse(mi.Vector3f(0, 0, 1)))[0],
+        rows(SplitSum(EnvironmentLight(environment), 64).diffuse(mi.Vector3f(0, 0, 1)))[0],
         environment.unoccluded_upward(),
         rtol=4e-3,
     )
@@ -106,7 +106,7 @@ def test_diffuse_is_the_cosine_integral(variant: str, make) -> None:
 
 @pytest.mark.parametrize("resolution", [64, 128])
 def test_a_constant_environment_is_returned_exactly(variant: str, resolution: int) -> None:
-    light = SplitSum(EnvironmentMap.constant((0.5, 1.0, 2.0)), resolution)
+    light = SplitSum(EnvironmentLight(EnvironmentMap.constant((0.5, 1.0, 2.0))), resolution)
     d = vector(unit(2000))
     np.testing.assert_allclose(rows(light.diffuse(d)), np.tile((0.5, 1, 2), (2000, 1)), rtol=1e-5)
     roughness = mi.Float(generator(2, "roughness").random(2000).astype(np.float32))
@@ -118,7 +118,7 @@ def test_a_constant_environment_is_returned_exactly(variant: str, resolution: in
 def test_white_metal_in_a_white_furnace_reflects_at_most_all_and_smooth_metal_nearly_all(
     variant: str,
 ) -> None:
-    light = SplitSum(EnvironmentMap.constant(1.0), 64)
+    light = SplitSum(EnvironmentLight(EnvironmentMap.constant(1.0)), 64)
     n, v = unit(20000), unit(20000, seed=3)
     v *= np.sign((n * v).sum(1))[:, None]
     roughness = generator(4, "roughness").random(20000).astype(np.float32)
@@ -131,7 +131,7 @@ def test_white_metal_in_a_white_furnace_reflects_at_most_all_and_smooth_metal_ne
 
 def test_reflection_looks_where_a_mirror_would(variant: str) -> None:
     environment = EnvironmentMap(random_map().resized(8).image).resized(64)
-    light = SplitSum(environment, 128)
+    light = SplitSum(EnvironmentLight(environment), 128)
     n, v = unit(500), unit(500, seed=3)
     n *= np.sign((n * v).sum(1))[:, None]
     mirrored = 2 * (n * v).sum(1, keepdims=True) * n - v
@@ -145,21 +145,21 @@ def test_a_smooth_map_survives_the_cubemap_within_a_hundredth(variant: str) -> N
     environment = random_map().resized(4).resized(64)
     d = unit(5000)
     seen, truth = (
-        rows(SplitSum(environment, 128).prefiltered(vector(d), mi.Float(0.08))),
+        rows(SplitSum(EnvironmentLight(environment), 128).prefiltered(vector(d), mi.Float(0.08))),
         environment.lookup(d),
     )
     assert np.abs(seen - truth).mean() < 0.01 * truth.mean()
 
 
 def test_level_lookup(variant: str) -> None:
-    light = SplitSum(EnvironmentMap.constant(1.0), 128)  # levels 128, 64, 32, 16
+    light = SplitSum(EnvironmentLight(EnvironmentMap.constant(1.0)), 128)  # levels 128, 64, 32, 16
     level = light._level_of(mi.Float([0, 0.08, 0.29, 0.5, 0.75, 1]))
     np.testing.assert_allclose(np.array(level), (0, 0, 1, 2, 2.5, 3), atol=1e-5)
 
 
 def test_roughness_of_a_level_is_filtered_by_its_own_lobe(variant: str) -> None:
     environment, axes = random_map(), unit(40)
-    light = SplitSum(environment, 128)
+    light = SplitSum(EnvironmentLight(environment), 128)
     for roughness, tolerance in ((0.29, 0.03), (0.5, 0.03), (1.0, 0.03)):
         truth = lobe_integral(environment, axes, roughness**2)
         seen = rows(light.prefiltered(vector(axes), mi.Float(roughness)))
@@ -168,7 +168,7 @@ def test_roughness_of_a_level_is_filtered_by_its_own_lobe(variant: str) -> None:
 
 @pytest.mark.parametrize("roughness", [0.08, 0.5, 1.0])
 def test_no_seam_between_faces(variant: str, roughness: float) -> None:
-    light = SplitSum(random_map(), 64)
+    light = SplitSum(EnvironmentLight(random_map()), 64)
     along = np.linspace(-1, 1, 200)
     step = 1e-4
     for axis in range(3):
@@ -188,9 +188,11 @@ def test_turning_the_light_turns_its_filters(variant: str) -> None:
     environment, d = random_map(), unit(500)
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     for roughness in (0.2, 0.7):
-        still = rows(SplitSum(environment, 64).prefiltered(vector(d), mi.Float(roughness)))
+        still = rows(SplitSum(EnvironmentLight(environment), 64).prefiltered(vector(d), mi.Float(roughness)))
         turned = rows(
-            SplitSum(environment.rotated(90), 64).prefiltered(vector(d @ turn.T), mi.Float(roughness))
+            SplitSum(EnvironmentLight(environment.rotated(90)), 64).prefiltered(
+                vector(d @ turn.T), mi.Float(roughness)
+            )
         )
         np.testing.assert_allclose(turned, still, rtol=0.01, atol=0.01)
 
@@ -209,7 +211,7 @@ def test_one_preparation_serves_every_rotation(variant: str) -> None:
         (anew.light.sample(u)[0], turned.light.sample(u)[0]),
     ):
         np.testing.assert_array_equal(rows(one), rows(other))
-    assert turned.environment.rotation_deg == 130
+    assert turned.light.environment.rotation_deg == 130
 
 
 def monte_carlo_albedo(cosine: float, alpha: float, n: int = 400_000) -> tuple[float, float]:
@@ -254,7 +256,7 @@ def test_table_is_the_albedo_of_mitsubas_rough_conductor(variant: str, row: int,
 
 def test_another_light_of_another_size_compiles_nothing_new(variant: str, kernels_of) -> None:
     def shade(environment: EnvironmentMap) -> None:
-        light = SplitSum(environment, 64)
+        light = SplitSum(EnvironmentLight(environment), 64)
         dr.eval(light.diffuse(vector(unit(64))), light.prefiltered(vector(unit(64)), mi.Float(0.3)))
 
     seen = kernels_of(lambda: shade(random_map(16)))
@@ -272,4 +274,4 @@ def test_another_light_of_another_size_compiles_nothing_new(variant: str, kernel
 @pytest.mark.parametrize("resolution", [0, 100, 32, 4096])
 def test_an_odd_resolution_is_refused(variant: str, resolution: int) -> None:
     with pytest.raises(TronError, match=str(resolution)):
-        SplitSum(EnvironmentMap.constant(1.0), resolution)
+        SplitSum(EnvironmentLight(EnvironmentMap.constant(1.0)), resolution)

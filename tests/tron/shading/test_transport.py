@@ -35,10 +35,12 @@ def test_the_wavefront_is_the_loop(variant: str, sphere_over_plane, camera, sun_
             np.testing.assert_allclose(rows(ours), rows(theirs), rtol=1e-4, atol=1e-5)
 
 
-def test_cubemap_and_map_light_a_scene_alike(variant: str, sphere_over_plane, camera, sun_map) -> None:
+def test_cubemap_and_map_light_a_scene_alike(
+    variant: str, cubemap_of, sphere_over_plane, camera, sun_map
+) -> None:
     tracer = sphere_over_plane()
     gbuffer = tracer.gbuffer(camera)
-    light = CubemapLight.from_environment(sun_map, 64)
+    light = cubemap_of(sun_map, 64)
     one, other = (
         np.mean([rows(irradiance(tracer, gbuffer, each, 64, seed)[0]) for seed in range(8)], 0)
         for each in (light, EnvironmentLight(sun_map))

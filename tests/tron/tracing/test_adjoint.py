@@ -12,9 +12,9 @@ import pytest
 from tron import seeds
 from tron.cameras import Camera
 from tron.gaussians.fields import PARAMETERS
-from tron.tracing import reference
+from tron.tracing import Surface, reference
 from tron.tracing.bvh import build_bvh
-from tron.tracing.gbuffer import GBuffer, trace_gbuffer
+from tron.tracing.gbuffer import trace_gbuffer
 from tron.tracing.parameters import SurfelParameters, pack
 from tron.tracing.rays import trace_rays
 from tron.tracing.tiles import build_tiles
@@ -33,9 +33,9 @@ def differentiable(scene) -> SurfelParameters:
     return parameters
 
 
-def render(parameters: SurfelParameters, camera: Camera = CAMERA) -> GBuffer:
+def render(parameters: SurfelParameters, camera: Camera = CAMERA) -> Surface:
     records = pack(parameters)
-    return trace_gbuffer(records, build_tiles(records.detached(), camera), camera)
+    return trace_gbuffer(records, build_tiles(records.detached(), camera), camera).rows()
 
 
 def in_float64(scene) -> SimpleNamespace:
@@ -87,7 +87,7 @@ class Loss:
         fields = surface_fields(reference.composite(scene, *self.rays), *self.rays)
         return sum(float((self.weights[name] * fields[name]).sum()) for name in FIELDS)
 
-    def traced(self, seen: GBuffer) -> mi.Float:
+    def traced(self, seen: Surface) -> mi.Float:
         total = mi.Float(0)
         for name in FIELDS:
             weight, value = self.weights[name].astype(np.float32), getattr(seen, name)

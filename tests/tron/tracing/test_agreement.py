@@ -75,7 +75,7 @@ def test_tiles_hierarchy_and_reference_agree(seed, count, degree, size, distance
         **{name: getattr(truth, name) for name in ("rgb", "base_color", "roughness", "metallic")},
     }
     tracer = SurfelTracer(scene)
-    by_tiles = columns(tracer.gbuffer(camera))
+    by_tiles = columns(tracer.gbuffer(camera).rows())
     origin, direction = (mi.Point3f(np.float32(a).T.copy()) for a in (origins, directions))
     by_hierarchy = columns(tracer.trace(origin, mi.Vector3f(direction)))
     for name, values in expected.items():

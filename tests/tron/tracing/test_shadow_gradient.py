@@ -124,6 +124,7 @@ def test_shadowed_irradiance_is_differentiable_by_opacity_on_request(disks):
         position=mi.Point3f(0, 0, 0),
         normal=mi.Normal3f(0, 0, 1),
         opacity=mi.Float(1),
+        pixel=mi.UInt32(0),
         width=1,
         height=1,
     )

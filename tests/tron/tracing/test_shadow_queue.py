@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tron.tracing import SurfelTracer
-from tron.tracing.transmittance import BackFaces, transmittance
+from tron.tracing.transmittance import BackFaces, Fans, transmittance
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -29,7 +29,7 @@ def test_the_line_changes_no_bit(random_scene, random_rays, count: int, rays: in
     origin, directions = fans(random_rays, count, rays)
     active = [dr.arange(mi.UInt32, count) % 3 != ray for ray in range(rays)]
     back_faces = BackFaces.of(tracer.records, scene.spacing)
-    alone = transmittance(tracer.bvh, origin, directions, back_faces, active)
+    alone = transmittance(tracer.bvh, Fans(origin, directions, active), back_faces)
     found = tracer.transmittances(origin, directions, active)
     np.testing.assert_array_equal(np.array(found), np.array(alone))
     if count == 5000:

@@ -1,0 +1,48 @@
+"""The log that a Dask worker writes: what its scenes said, and where native code crashed."""
+
+from __future__ import annotations
+
+import faulthandler
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+from dask.distributed import WorkerPlugin
+
+FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+
+
+class WorkerLog(WorkerPlugin):
+    """A file of each worker's log in a folder, named for the worker; one that is replaced goes on in it.
+
+    Args:
+        folder: made where it is missing.
+        level: least severe records that are written, such as logging.INFO.
+    """
+
+    def __init__(self, folder: Path, level: int) -> None:
+        self.name = f"log in {folder}"
+        self._folder, self._level = folder, level
+
+    def setup(self, worker: Any) -> None:
+        """Begin to write; Dask calls this in every worker that is there or comes."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        path = self._folder / f"worker-{re.sub(r'[^0-9A-Za-z.-]+', '-', str(worker.name))}.log"
+        self._stream = path.open("a")
+        self._handler = logging.StreamHandler(self._stream)
+        self._handler.setLevel(self._level)
+        self._handler.setFormatter(logging.Formatter(FORMAT))
+        root = logging.getLogger()
+        root.addHandler(self._handler)
+        root.setLevel(min(root.level, self._level))
+        self._crashes = not faulthandler.is_enabled()
+        if self._crashes:
+            faulthandler.enable(self._stream)
+
+    def teardown(self, worker: Any) -> None:  # noqa: ARG002
+        """End the log; a worker of another's scheduler lives on without it."""
+        if self._crashes:
+            faulthandler.disable()
+        logging.getLogger().removeHandler(self._handler)
+        self._stream.close()

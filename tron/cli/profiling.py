@@ -1,0 +1,98 @@
+"""Where the time of a command goes: in Python by cProfile, in kernels by Dr.Jit's own history."""
+
+from __future__ import annotations
+
+import cProfile
+import json
+import pstats
+import sys
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tron import runtime
+from tron.storage import write_atomic
+
+SHOWN_FUNCTIONS = 15
+KEPT_KERNELS = 20
+
+
+@contextmanager
+def profiled(folder: Path, name: str) -> Iterator[None]:
+    """Profile the block, whether it succeeds or not.
+
+    Writes folder/NAME.prof (for snakeviz, pstats) and, where Dr.Jit was used, folder/NAME.kernels.json; shows
+    the functions that took longest, and the sums of the kernels, on stderr. It sees the main thread of this
+    process. Dr.Jit's history holds the code of every kernel that was started: long runs need memory for it.
+
+    Args:
+        folder: made if missing.
+        name: of the command, which the files are called after.
+    """
+    profile = cProfile.Profile()
+    runtime.keep_kernel_history = True
+    profile.enable()
+    try:
+        yield
+    finally:
+        profile.disable()
+        runtime.keep_kernel_history = False
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{name}.prof"
+        profile.dump_stats(path)
+        pstats.Stats(profile, stream=sys.stderr).strip_dirs().sort_stats("tottime").print_stats(
+            SHOWN_FUNCTIONS
+        )
+        kernels = _kernels()
+        if kernels is not None:
+            write_atomic(folder / f"{name}.kernels.json", json.dumps(kernels, indent=1) + "\n")
+            said = (f"{key.replace('_', ' ')} {value}" for key, value in kernels.items() if key != "slowest")
+            print(f"Dr.Jit: {', '.join(said)}", file=sys.stderr)
+        print(f"profile: {path}", file=sys.stderr)
+
+
+def summarize(history: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Sums over Dr.Jit's kernel history; its times are milliseconds, here they are seconds.
+
+    A kernel is compiled once and started often; `compile_seconds` are code generation and the backend, and
+    `slowest` are the kernels whose launches took longest together.
+    """
+    launches: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for entry in history:
+        launches[str(entry.get("hash", entry["type"]))].append(entry)
+    kernels = [
+        {
+            "hash": key,
+            "launches": len(entries),
+            "operations": entries[0].get("operation_count"),
+            "largest_size": max(entry["size"] for entry in entries),
+            "execution_seconds": _seconds(entries, "execution_time"),
+        }
+        for key, entries in launches.items()
+    ]
+    kernels.sort(key=lambda kernel: kernel["execution_seconds"], reverse=True)
+    return {
+        "launches": len(history),
+        "kernels": len(launches),
+        "cache_hits": sum(bool(entry.get("cache_hit")) for entry in history),
+        "disk_cache_hits": sum(bool(entry.get("cache_disk")) for entry in history),
+        "compile_seconds": round(_seconds(history, "codegen_time") + _seconds(history, "backend_time"), 3),
+        "execution_seconds": _seconds(history, "execution_time"),
+        "slowest": kernels[:KEPT_KERNELS],
+    }
+
+
+def _kernels() -> dict[str, Any] | None:
+    """The summary of what Dr.Jit did in this process; None where it was never imported."""
+    dr = sys.modules.get("drjit")
+    if dr is None:
+        return None
+    history = dr.kernel_history()
+    dr.set_flag(dr.JitFlag.KernelHistory, False)
+    return summarize(history)
+
+
+def _seconds(entries: Sequence[dict[str, Any]], name: str) -> float:
+    return round(sum(entry.get(name) or 0.0 for entry in entries) / 1000, 3)
