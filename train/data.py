@@ -24,7 +24,6 @@ from train.curriculum import Stage
 from train.processes import Processes
 from train.settings import DataSettings, ValidationSettings
 from train.sources import (
-    TARGET,
     CachedSplit,
     Draw,
     Source,
@@ -36,7 +35,7 @@ from train.sources import (
 from tron import seeds
 from tron.errors import TronError
 from tron.shards.manifest import Manifest
-from tron.shards.schema import GUIDANCE, Clip
+from tron.shards.schema import GUIDANCE, TARGET, Clip
 
 log = logging.getLogger(__name__)
 

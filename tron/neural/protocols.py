@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from torch import Tensor, nn
 
 from tron.errors import TronError
-from tron.shards.schema import GUIDANCE, MEMBERS
+from tron.shards.schema import GUIDANCE, MEMBERS, TARGET, clip_members
 
 
 class Codec(Protocol):
@@ -51,7 +51,8 @@ class GuidedConfig(BaseModel):
     @field_validator("guidance")
     @classmethod
     def _colours(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        colours = [name for name, member in MEMBERS.items() if member.color_space and member.clips == "all"]
+        colours = [name for name in clip_members(reference=False) if MEMBERS[name].color_space]
+        colours.remove(TARGET)
         if "pbr" not in names or len(set(names)) < len(names) or not set(names) <= set(colours):
             raise ValueError(f"guidance is pbr and others of {', '.join(colours)}")
         return names

@@ -24,6 +24,8 @@ ColorSpace = Literal["linear", "display"]
 
 GUIDANCE = ("pbr", "irradiance")
 """Members that the neural renderer is conditioned on, unless its configuration names others."""
+TARGET = "rgb"
+"""Member that the neural renderer must produce."""
 
 
 @dataclass(frozen=True)
