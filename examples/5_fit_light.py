@@ -1,6 +1,6 @@
 """Find the light of a scene from a few views: photos, and irradiance as a prior would estimate it.
 
-The views are rendered here under a known light, so that the picture can show both: found above, true below.
+The views are rendered here under a known light, so that the picture can show both: found left, true right.
 """
 
 import numpy as np
@@ -25,6 +25,7 @@ for index, camera in enumerate(look_at(scene, chosen, frames=6)):
 settings = FitSettings(resolution=16, steps=60 if chosen.small else 400, rays=16, pixels=1024, scale_steps=20)
 fit = fit_environment(Capture(tuple(views), exposure=exposure), tracer, settings, track)
 found = fit.environment.resized(light.image.shape[0])
-write_image(chosen.output, to_display(np.vstack([found.image, light.image]), exposure))
+both = to_display(np.hstack([found.image, light.image]), exposure)
+write_image(chosen.output, both.repeat(2, axis=0).repeat(2, axis=1))
 loss = fit.cubemap.loss
 print(f"loss {loss[0]:.4f} -> {loss[-10:].mean():.4f}: {chosen.output}")

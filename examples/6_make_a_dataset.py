@@ -7,7 +7,6 @@ import numpy as np
 from stage import arguments
 
 from datagen.cli import cli, main
-from tron.color import to_display
 from tron.images import write_image
 from tron.shards.reader import read_clips
 
@@ -27,7 +26,6 @@ if main(settings) != 0:
     raise SystemExit("a scene could not be made: see failures.jsonl")
 rows = []
 for clip in read_clips(chosen.output, "train"):
-    frame = np.hstack([clip.frames[name][0] for name in ("pbr", "irradiance", "rgb")])
-    rows.append(to_display(frame, clip.meta.exposure))
+    rows.append(np.hstack([clip.displayed(name)[0] for name in ("pbr", "irradiance", "rgb")]))
 write_image(chosen.output / "dataset.jpg", np.vstack(rows[:3]).repeat(3, axis=0).repeat(3, axis=1))
 print(f"{len(rows)} clips to train on: {chosen.output / 'index.html'}")

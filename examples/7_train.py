@@ -7,7 +7,6 @@ import numpy as np
 from stage import OUTPUTS, arguments
 
 from train.cli import cli, main
-from tron.color import to_display
 from tron.images import write_image
 from tron.neural.renderer import render_clip
 from tron.neural.weights import load_renderer
@@ -24,8 +23,7 @@ main(settings)
 renderer = load_renderer(chosen.output / "renderer.safetensors")
 rows = []
 for clip in read_clips(chosen.dataset, "test"):
-    drawn = render_clip(renderer, clip.frames["pbr"], clip.frames["irradiance"], clip.meta.exposure)
-    given, true = (to_display(clip.frames[name][0], clip.meta.exposure) for name in ("pbr", "rgb"))
-    rows.append(np.hstack([given, drawn[0], true]))
+    drawn = render_clip(renderer, {name: clip.displayed(name) for name in renderer.config.guidance})
+    rows.append(np.hstack([clip.displayed("pbr")[0], drawn[0], clip.displayed("rgb")[0]]))
 write_image(chosen.output / "train.jpg", np.vstack(rows[:3]).repeat(3, axis=0).repeat(3, axis=1))
 print(f"trained for {steps} steps: {chosen.output / 'train.jpg'}")

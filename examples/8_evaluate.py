@@ -31,6 +31,7 @@ bars = axes.barh(
     list(psnr), list(psnr.values()), color=["#c44" if name == "neural" else "#89a" for name in psnr]
 )
 axes.bar_label(bars, fmt="%.1f", padding=3)
+axes.margins(x=0.1)
 axes.invert_yaxis()
 axes.set_xlabel("PSNR of the surfels on unseen scenes, dB")
 figure.savefig(chosen.output / "evaluation.jpg", dpi=100)

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 # Read by torch when it is first imported: sums depend on the thread count, tests must not.
@@ -94,3 +95,15 @@ def files_of() -> Callable[[Path], dict[str, bytes]]:
         }
 
     return files_of
+
+
+@pytest.fixture
+def read_video() -> Callable[[Path], np.ndarray]:
+    """All frames of a video, (N, H, W, 3) uint8."""
+    import av
+
+    def read(path: Path) -> np.ndarray:
+        with av.open(str(path)) as container:
+            return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+
+    return read

@@ -10,7 +10,7 @@ from typing import Any
 import lightning
 from lightning.pytorch.callbacks import Callback
 
-from train.curriculum import Pace, Stage
+from train.curriculum import Stage, StageClock
 from train.processes import Processes
 from tron.cli.progress import Progress
 from tron.storage import write_atomic
@@ -19,36 +19,36 @@ SMOOTHING = 0.98
 
 
 class Clock(Callback):
-    """Runs the stage's pace, and ends the stage when its time is up: by the first process's clock in all."""
+    """Runs the stage's clock, and ends the stage when its time is up: by the first process's clock in all."""
 
-    def __init__(self, pace: Pace, processes: Processes):
-        self.pace, self.processes = pace, processes
+    def __init__(self, clock: StageClock, processes: Processes):
+        self.clock, self.processes = clock, processes
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Start the clock: setting up and loading do not count."""
         del trainer, pl_module
-        self.pace.start()
+        self.clock.start()
 
     def on_before_optimizer_step(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, optimizer: Any
     ) -> None:
         """Look at the clock: learning rate and end of this step follow from what it shows now."""
         del trainer, pl_module, optimizer
-        if self.pace.seconds_limit is not None:
-            self.pace.shown = self.processes.number_of_first(self.pace.seconds())
+        if self.clock.seconds_limit is not None:
+            self.clock.shown = self.processes.number_of_first(self.clock.seconds())
 
     def on_train_batch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, *_args: Any, **_kwargs: Any
     ) -> None:
         """Stop the stage where its limit of seconds is reached."""
         del pl_module
-        if self.pace.seconds_limit is not None and self.pace.progress(trainer.global_step) >= 1:
+        if self.clock.seconds_limit is not None and self.clock.progress(trainer.global_step) >= 1:
             trainer.should_stop = True
 
     def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Stop the clock."""
         del trainer, pl_module
-        self.pace.stop()
+        self.clock.stop()
 
 
 class TrainingLog(Callback):
@@ -69,9 +69,9 @@ class TrainingLog(Callback):
         "val_psnr_full",
     )
 
-    def __init__(self, path: Path, stage: Stage, pace: Pace, every: int = 50, first_step: int = 0):
-        self.path, self.stage, self.pace, self.every = path, stage, pace, every
-        self._total = pace.seconds_limit or float(stage.steps)
+    def __init__(self, path: Path, stage: Stage, clock: StageClock, every: int = 50, first_step: int = 0):
+        self.path, self.stage, self.clock, self.every = path, stage, clock, every
+        self._total = clock.seconds_limit or float(stage.steps)
         self.loss = float("nan")
         self.validated: dict[str, float] = {}
         self._rows = earlier_rows(path, stage.name, first_step)
@@ -81,8 +81,8 @@ class TrainingLog(Callback):
         """Open the bar."""
         del pl_module
         if trainer.is_global_zero:
-            done = self._total * self.pace.progress(trainer.global_step)
-            unit = "steps" if self.pace.seconds_limit is None else "s"
+            done = self._total * self.clock.progress(trainer.global_step)
+            unit = "steps" if self.clock.seconds_limit is None else "s"
             self._progress = Progress(self.stage.name, self._total, done, unit)
 
     def on_train_batch_end(
@@ -158,7 +158,7 @@ class TrainingLog(Callback):
         return {
             "stage": self.stage.name,
             "step": trainer.global_step,
-            "seconds": f"{self.pace.seconds():.1f}",
+            "seconds": f"{self.clock.seconds():.1f}",
             "loss": f"{self.loss:.6g}",
             "learning_rate": f"{rate:.4g}",
             **{name: f"{value:.3f}" for name, value in self.validated.items()},
@@ -177,7 +177,7 @@ class TrainingLog(Callback):
         if validated is not None:
             text += f" validation {validated:.2f} dB"
         if self._progress is not None:
-            self._progress.update(self._total * self.pace.progress(trainer.global_step), text)
+            self._progress.update(self._total * self.clock.progress(trainer.global_step), text)
 
     def _close(self) -> None:
         if self._progress is not None:

@@ -7,7 +7,7 @@ import time
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from tron.neural.windows import TIME
+from tron.neural.windows import TEMPORAL_FACTOR
 
 
 class Stage(BaseModel):
@@ -45,7 +45,7 @@ class Stage(BaseModel):
     @field_validator("frames")
     @classmethod
     def _codec_frames(cls, value: int) -> int:
-        if (value - 1) % TIME:
+        if (value - 1) % TEMPORAL_FACTOR:
             raise ValueError("frames must be 1 + 4n: 1, 5, 9, ...")
         return value
 
@@ -61,7 +61,7 @@ class Stage(BaseModel):
         )
 
 
-class Pace:
+class StageClock:
     """How far a stage has come, from 0 to 1: by its steps, or by its share of a time limit.
 
     By steps a run is reproducible; by time the schedule anneals to its end within the limit on any machine,

@@ -15,33 +15,28 @@ from pathlib import Path
 from typing import Any
 
 import lightning
-import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
+from train.augmentation import augmented, display_encoded
 from train.curriculum import Stage
 from train.processes import Processes
 from train.settings import DataSettings, ValidationSettings
 from train.sources import (
-    BUFFERS,
+    TARGET,
     CachedSplit,
     Draw,
-    Sample,
     Source,
     StreamedSplit,
-    decoded_bytes,
-    display_video,
+    channels_first,
     first_meta,
-    is_display,
     spread_clips,
 )
 from tron import seeds
-from tron.color import luminance, to_display
 from tron.errors import TronError
-from tron.neural.windows import TIME
 from tron.shards.manifest import Manifest
-from tron.shards.schema import Clip
+from tron.shards.schema import GUIDANCE, Clip
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +45,7 @@ SEGMENT = 500  # batches after which a stream starts anew, so that resuming skip
 
 
 class Batches(IterableDataset):
-    """Endless batches {"pbr", "irradiance", "rgb": (B, 3, K, h, w)} of one stage, from step `first_step` on.
+    """Endless batches {member: (B, 3, K, h, w)} of one stage, from step `first_step` on.
 
     Batch s is a function of (seed, stage, s), so a resumed run sees what it would have seen. Ranks share it:
     together the batches of R ranks are the batch of R times the size that one process would have. A streamed
@@ -62,6 +57,7 @@ class Batches(IterableDataset):
         stage: Stage,
         cached: Mapping[str, CachedSplit],
         folder: Path,
+        members: Sequence[str],
         settings: DataSettings,
         seed: int,
         first_step: int = 0,
@@ -69,7 +65,8 @@ class Batches(IterableDataset):
         ranks: int = 1,
     ):
         super().__init__()
-        self.stage, self.cached, self.folder, self.settings = stage, cached, folder, settings
+        self.stage, self.cached, self.folder = stage, cached, folder
+        self.members, self.settings = members, settings
         self.seed, self.first_step, self.rank, self.ranks = seed, first_step, rank, ranks
         self.places = stage.batch_size * ranks
 
@@ -106,6 +103,7 @@ class Batches(IterableDataset):
                 streams[split, place] = StreamedSplit(
                     self.folder,
                     split,
+                    self.members,
                     self.stage.frames,
                     seeds.integer(self.seed, "train", *path),
                     shuffle_buffer=buffer,
@@ -139,54 +137,11 @@ class Batches(IterableDataset):
             random = seeds.generator(self.seed, "train", "sample", self.stage.name, sample)
             draw = Draw(number, random, self.stage.frames_of(step))
             drawn = source(split, sample % self.places).sample(draw)
-            samples.append(varied(drawn, random, self.stage.crop, self.settings))
-        shapes = {tuple(sample.buffers["rgb"].shape) for sample in samples}
+            samples.append(augmented(drawn, random, self.stage.crop, self.settings))
+        shapes = {tuple(sample.buffers[TARGET].shape) for sample in samples}
         if len(shapes) > 1:
             raise TronError(f"stage {self.stage.name} meets frames of several sizes", mend="give it a crop")
-        return {name: developed(samples, name) for name in BUFFERS}
-
-
-def developed(samples: Sequence[Sample], name: str) -> Tensor:
-    """One buffer of a batch as the network sees it: AgX where it is linear, then [-1, 1], (B, 3, K, h, w)."""
-    batch = torch.stack([sample.buffers[name] for sample in samples])
-    linear = torch.tensor([name not in sample.display for sample in samples])
-    if linear.all():
-        batch = to_display(batch, 1.0, axis=1)
-    elif linear.any():
-        batch[linear] = to_display(batch[linear], 1.0, axis=1)
-    return batch * 2 - 1
-
-
-def varied(sample: Sample, random: np.random.Generator, crop: int | None, settings: DataSettings) -> Sample:
-    """Crop, mirror and recolour a sample, its buffers all alike.
-
-    Colours are changed in linear light, where permuting and scaling channels of the light gives exactly the
-    permuted and scaled buffers: transport is linear and no channel knows another. A tint keeps the
-    luminance of white, so that the exposure rule still holds. Samples with display members keep their
-    colours.
-    """
-    height, width = sample.buffers["rgb"].shape[-2:]
-    rows, columns = slice(None), slice(None)
-    if crop is not None:
-        if crop > min(height, width):
-            raise TronError(
-                f"crop of {crop} pixels from frames of {width} x {height}", mend="make it smaller"
-            )
-        top, left = (
-            int(random.integers((side - crop) // settings.crop_alignment + 1)) * settings.crop_alignment
-            for side in (height, width)
-        )
-        rows, columns = slice(top, top + crop), slice(left, left + crop)
-    mirrored = random.random() < settings.flip
-    order = random.permutation(3) if random.random() < settings.permute_colors else np.arange(3)
-    tint = np.exp(settings.tint * random.standard_normal(3))
-    gains = torch.tensor(tint / luminance(tint), dtype=torch.float32).view(3, 1, 1, 1)
-    buffers = {}
-    for name, video in sample.buffers.items():
-        video = video[..., rows, columns]
-        video = video.flip(-1) if mirrored else video
-        buffers[name] = video if sample.display else video[order.tolist()] * gains
-    return Sample(buffers, sample.display)
+        return {name: display_encoded(samples, name) for name in self.members}
 
 
 class TrainingData(lightning.LightningDataModule):
@@ -204,6 +159,7 @@ class TrainingData(lightning.LightningDataModule):
         self.processes = processes or Processes()
         self.folder, self.settings, self.seed, self.validation = Path(folder), settings, seed, validation
         self.manifest = Manifest.load(folder)
+        self.members = (*GUIDANCE, TARGET)
         self.cached: dict[str, CachedSplit] = {}
         self.stage: Stage | None = None
         self.first_step = 0
@@ -215,8 +171,12 @@ class TrainingData(lightning.LightningDataModule):
         elif validation.split is not None:
             self.manifest.of_split(validation.split)  # a wrong name is told now, not after hours
 
-    def open(self, stages: Sequence[Stage]) -> None:
-        """Check that every stage finds its splits, frames and sizes; decode the splits that fit in memory."""
+    def open(self, stages: Sequence[Stage], guidance: Sequence[str] = GUIDANCE) -> None:
+        """Check that every stage finds its splits, frames and sizes; decode the splits that fit in memory.
+
+        guidance: members that the network is conditioned on.
+        """
+        self.members = (*guidance, TARGET)
         budget = self.settings.cache_gb * 1e9
         for stage in stages:
             for split in stage.splits():
@@ -233,30 +193,29 @@ class TrainingData(lightning.LightningDataModule):
                     )
                 if split in self.cached:
                     continue
-                size = decoded_bytes(first) * sum(entry.samples for entry in self.manifest.of_split(split))
+                clips = sum(entry.samples for entry in self.manifest.of_split(split))
+                size = clips * first.frames * first.height * first.width * len(self.members) * 3 * 4
                 if size <= budget:
-                    self.cached[split] = CachedSplit(self.folder, split, self.seed)
+                    self.cached[split] = CachedSplit(self.folder, split, self.members, self.seed)
                     budget -= size
-                    log.info("Split %s: in memory, %d clips, %.2f GB", split, *self._size(split, size))
+                    log.info("Split %s: in memory, %d clips, %.2f GB", split, clips, size / 1e9)
                 else:
                     log.info("Split %s: streamed, %.1f GB would not fit data.cache_gb", split, size / 1e9)
 
-    def _size(self, split: str, size: float) -> tuple[int, float]:
-        return len(self.cached[split].clips), size / 1e9
-
     def stands_in(self, split: str) -> bool:
         """Whether a split holds path-traced pictures where the curriculum would have photographs."""
-        return split == STAND_IN and not is_display(first_meta(self.folder, self.manifest, split), "rgb")
+        first = first_meta(self.folder, self.manifest, split)
+        return split == STAND_IN and first.color_space.get(TARGET) != "display"
 
-    def calibration(self, stages: Sequence[Stage], clips: int = 64) -> Iterator[Tensor]:
-        """Training videos (1, 3, K, H, W), all buffers, of the longest stage's K, to fit the codec on."""
+    def calibration(self, stages: Sequence[Stage], temporal_factor: int, clips: int = 64) -> Iterator[Tensor]:
+        """Training videos (1, 3, K, H, W), all buffers, of the longest stage's K, to calibrate a codec on."""
         longest = max(stages, key=lambda stage: stage.frames)
         for split in dict.fromkeys(split for stage in stages for split in stage.splits()):
             frames = min(longest.frames, first_meta(self.folder, self.manifest, split).frames)
-            frames -= (frames - 1) % TIME
-            for clip in spread_clips(self.folder, self.manifest, split, clips, BUFFERS):
-                for name in BUFFERS:
-                    yield torch.from_numpy(display_video(clip, name))[None, :, :frames]
+            frames -= (frames - 1) % temporal_factor
+            for clip in spread_clips(self.folder, self.manifest, split, clips, self.members):
+                for name in self.members:
+                    yield network_input(clip, name)[None, :, :frames]
 
     def begin(self, stage: Stage, first_step: int) -> None:
         """Choose the stage, and the step to go on from, of the loaders made next."""
@@ -270,6 +229,7 @@ class TrainingData(lightning.LightningDataModule):
             self.stage,
             self.cached,
             self.folder,
+            self.members,
             self.settings,
             self.seed,
             self.first_step,
@@ -284,7 +244,7 @@ class TrainingData(lightning.LightningDataModule):
         if self.stage is None or self.validation_split is None:
             return []
         if self._held_out is None:
-            members = (*BUFFERS, "foreground")
+            members = (*self.members, "foreground")
             chosen = (self.validation_split, self.validation.clips, members)
             share = slice(self.processes.rank, None, self.processes.count)
             self._held_out = list(spread_clips(self.folder, self.manifest, *chosen, share))
@@ -300,18 +260,20 @@ class HeldOut(IterableDataset):
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         windows = (windows_of(clip, self.frames) for clip in self.clips)
-        return (window for window in windows if len(window["rgb"]))
+        return (window for window in windows if len(window[TARGET]))
 
 
 def windows_of(clip: Clip, frames: int) -> dict[str, Tensor]:
-    """A clip as windows: pbr, irradiance, rgb (B, 3, K, H, W) in [-1, 1], mask (B, 1, K, H, W) in {0, 1}."""
+    """A clip as windows: its buffers (B, 3, K, H, W) in [-1, 1], mask (B, 1, K, H, W) in {0, 1}."""
     count = clip.meta.frames // frames
-    result = {}
-    for name in (*BUFFERS, "mask"):
-        if name == "mask":
-            video = np.moveaxis((clip.frames["foreground"] > 0.5).astype(np.float32), -1, 0)
-        else:
-            video = display_video(clip, name)
-        video = video[:, : count * frames].reshape(len(video), count, frames, *video.shape[2:])
-        result[name] = torch.from_numpy(np.ascontiguousarray(np.moveaxis(video, 1, 0)))
-    return result
+    videos = {name: network_input(clip, name) for name in clip.frames if name != "foreground"}
+    videos["mask"] = torch.from_numpy(channels_first(clip.frames["foreground"] > 0.5))
+    return {
+        name: video[:, : count * frames].unflatten(1, (count, frames)).movedim(1, 0).contiguous()
+        for name, video in videos.items()
+    }
+
+
+def network_input(clip: Clip, name: str) -> Tensor:
+    """A clip's buffer as the network sees it: display-encoded in [-1, 1], (3, K, H, W) float32."""
+    return torch.from_numpy(channels_first(clip.displayed(name))) * 2 - 1

@@ -6,39 +6,41 @@ from typing import Any
 
 import lightning
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from train.curriculum import Pace, Stage, learning_rate_factor
+from train.curriculum import Stage, StageClock, learning_rate_factor
 from train.optimizers import make_optimizer
 from train.settings import OptimizerSettings
+from train.sources import TARGET
 from tron.neural.losses import RendererLoss, psnr_per_frame
+from tron.neural.protocols import Renderer
 
 
 class RendererModule(lightning.LightningModule):
-    """Trains a renderer on {"pbr", "irradiance", "rgb"}, each (B, 3, K, H, W) display-encoded in [-1, 1]."""
+    """Trains a renderer on its guidance and the target, each (B, 3, K, H, W) display-encoded in [-1, 1]."""
 
-    def __init__(self, renderer: nn.Module, loss: RendererLoss, optimizer: OptimizerSettings):
+    def __init__(self, renderer: Renderer, loss: RendererLoss, optimizer: OptimizerSettings):
         super().__init__()
         self.renderer = renderer
         self.loss = loss
         self.settings = optimizer
         self.stage: Stage | None = None
-        self.pace = Pace(1)
+        self.clock = StageClock(1)
         self._psnr = torch.zeros(2, 2)
 
-    def begin(self, stage: Stage, pace: Pace) -> None:
+    def begin(self, stage: Stage, clock: StageClock) -> None:
         """Choose the stage whose optimiser and schedule are made next."""
-        self.stage, self.pace = stage, pace
+        self.stage, self.clock = stage, clock
 
     def training_step(self, batch: dict[str, Tensor], _index: int) -> Tensor:
         """The loss of one batch."""
-        return self.loss(self.renderer(batch["pbr"], batch["irradiance"]), batch["rgb"])
+        return self.loss(self.renderer(batch), batch[TARGET])
 
     def validation_step(self, batch: dict[str, Tensor], _index: int) -> None:
         """PSNR of held-out windows, of the foreground and of the full frame: sums over frames and counts."""
-        shown = self.renderer(batch["pbr"], batch["irradiance"])
+        shown = self.renderer(batch)
         for row, mask in enumerate((batch["mask"], None)):
-            psnr = psnr_per_frame(shown, batch["rgb"], mask)
+            psnr = psnr_per_frame(shown, batch[TARGET], mask)
             psnr = psnr[~psnr.isnan()]  # frames without foreground
             self._psnr[row] += torch.stack([psnr.sum(), psnr.new_tensor(psnr.numel())])
 
@@ -63,7 +65,7 @@ class RendererModule(lightning.LightningModule):
         optimizer = make_optimizer(self.renderer, settings)
 
         def factor(step: int) -> float:
-            return learning_rate_factor(stage, self.pace.progress(step), step, settings.warmup_steps)
+            return learning_rate_factor(stage, self.clock.progress(step), step, settings.warmup_steps)
 
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
@@ -71,8 +73,8 @@ class RendererModule(lightning.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep the stage's name and the seconds it has run."""
         checkpoint["tron_stage"] = self.stage.name if self.stage else ""
-        checkpoint["tron_seconds"] = self.pace.seconds()
+        checkpoint["tron_seconds"] = self.clock.seconds()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Go on counting a stage's time where it was left."""
-        self.pace.spent = self.pace.shown = float(checkpoint["tron_seconds"])
+        self.clock.spent = self.clock.shown = float(checkpoint["tron_seconds"])

@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from train.settings import OptimizerSettings
+from tron.neural.protocols import Renderer
 
 
-def make_optimizer(renderer: nn.Module, settings: OptimizerSettings) -> torch.optim.Optimizer:
+def make_optimizer(renderer: Renderer, settings: OptimizerSettings) -> torch.optim.Optimizer:
     """Optimise what is not frozen, at the settings' rates.
 
     With muon_learning_rate, the matrices that the renderer names as `hidden_matrices` follow Muon
@@ -21,15 +22,15 @@ def make_optimizer(renderer: nn.Module, settings: OptimizerSettings) -> torch.op
     trained = [parameter for parameter in renderer.parameters() if parameter.requires_grad]
     if settings.muon_learning_rate is None:
         return _adamw(trained, settings)
-    hidden: Sequence[Tensor] = renderer.hidden_matrices()  # type: ignore[operator]
+    hidden = renderer.hidden_matrices()
     chosen = {id(matrix) for matrix in hidden}
     muon = torch.optim.Muon(
-        list(hidden),
+        hidden,
         lr=settings.muon_learning_rate,
         weight_decay=settings.weight_decay,
         adjust_lr_fn="original",
     )
-    return Together([muon, _adamw([p for p in trained if id(p) not in chosen], settings)])
+    return CombinedOptimizer([muon, _adamw([p for p in trained if id(p) not in chosen], settings)])
 
 
 def _adamw(parameters: list[nn.Parameter], settings: OptimizerSettings) -> torch.optim.AdamW:
@@ -41,7 +42,7 @@ def _adamw(parameters: list[nn.Parameter], settings: OptimizerSettings) -> torch
     )
 
 
-class Together(torch.optim.Optimizer):
+class CombinedOptimizer(torch.optim.Optimizer):
     """Several optimisers that step as one: schedules, clipping and checkpoints see a single optimiser."""
 
     def __init__(self, parts: Sequence[torch.optim.Optimizer]):

@@ -13,7 +13,6 @@ import torch
 import yaml
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging
 from lightning.pytorch.strategies import DDPStrategy
-from torch import nn
 
 from train.callbacks import Clock, TrainingLog
 from train.checkpoints import (
@@ -24,7 +23,7 @@ from train.checkpoints import (
     remove_checkpoints,
     stage_end,
 )
-from train.curriculum import Pace, Stage
+from train.curriculum import Stage, StageClock
 from train.data import TrainingData
 from train.module import RendererModule
 from train.processes import Processes, launch
@@ -33,9 +32,9 @@ from tron import seeds
 from tron.claim import read_recipe, require_same
 from tron.cli.instantiation import make
 from tron.errors import TronError
-from tron.neural.codecs import BlockDCT
 from tron.neural.losses import RendererLoss
-from tron.neural.weights import load_renderer, save_renderer
+from tron.neural.protocols import Renderer
+from tron.neural.weights import restore_renderer, save_renderer
 from tron.runtime import set_torch_threads
 from tron.shards.manifest import MANIFEST_NAME
 from tron.storage import locked, sha256, write_atomic
@@ -68,9 +67,8 @@ def train(processes: Processes, settings: Settings) -> None:
         if position is None:
             return
         module = processes.together(lambda: _make_module(settings, stages, position, data))
-        codec = getattr(module.renderer, "codec", None)
-        if isinstance(codec, BlockDCT) and position == Position(0):
-            codec.load_state_dict(processes.from_first(lambda: _fitted(codec, data, stages)))
+        if position == Position(0):
+            _calibrate(module.renderer, data, stages, processes)
         for index in range(position.stage, len(stages)):
             here = position if index == position.stage else Position(index)
             _run_stage(settings, stages, here, module, data, processes)
@@ -98,23 +96,29 @@ def _make_module(
     torch.manual_seed(seeds.integer(settings.seed, "train", "weights", bits=63))
     renderer = build_renderer(settings.renderer)
     module = RendererModule(renderer, RendererLoss(**settings.loss.model_dump()), settings.optimizer)
-    data.open(stages)
+    data.open(stages, renderer.config.guidance)
     if position.stage > 0:
         folder = settings.output_dir / "checkpoints"
-        _take_weights(renderer, stage_end(folder, position.stage, stages[position.stage - 1]))
+        restore_renderer(stage_end(folder, position.stage, stages[position.stage - 1]), renderer)
     return module
 
 
-def _fitted(codec: BlockDCT, data: TrainingData, stages: list[Stage]) -> dict[str, torch.Tensor]:
-    codec.fit(data.calibration(stages))
-    return codec.state_dict()
+def _calibrate(renderer: Renderer, data: TrainingData, stages: list[Stage], processes: Processes) -> None:
+    """Calibrate in the first process; the constants of the others become its own."""
+
+    def constants() -> dict[str, torch.Tensor]:
+        renderer.calibrate(data.calibration(stages, renderer.temporal_factor))
+        return dict(renderer.named_buffers())
+
+    for name, value in processes.from_first(constants).items():
+        renderer.get_buffer(name).copy_(value)
 
 
-def build_renderer(recipe: dict[str, Any]) -> nn.Module:
+def build_renderer(recipe: dict[str, Any]) -> Renderer:
     """Make the renderer that a recipe's `_target_` names; TronError where the recipe does not fit it."""
     renderer = make(recipe, "renderer")
-    if not isinstance(renderer, nn.Module):
-        raise TronError(f"renderer._target_ makes a {type(renderer).__name__}, not a torch module")
+    if not isinstance(renderer, Renderer):
+        raise TronError(f"renderer._target_ makes a {type(renderer).__name__}, not a renderer")
     return renderer
 
 
@@ -129,26 +133,26 @@ def _run_stage(
     number, stage = position.stage + 1, stages[position.stage]
     folder = settings.output_dir / "checkpoints"
     share = stage.steps / sum(each.steps for each in stages)
-    pace = Pace(stage.steps, settings.max_seconds * share if settings.max_seconds else None)
+    clock = StageClock(stage.steps, settings.max_seconds * share if settings.max_seconds else None)
     _announce(number, stages, settings.max_seconds, position.step, data.stands_in(stage.split))
-    if position.checkpoint and pace.seconds_limit is None and position.step >= stage.steps:
+    if position.checkpoint and clock.seconds_limit is None and position.step >= stage.steps:
         # Interrupted between its last step and its end: Lightning would not even start, nor average weights.
         checkpoint = position.checkpoint
         state = processes.together(lambda: AtomicCheckpoints().load_checkpoint(checkpoint)["state_dict"])
         module.load_state_dict(state)
         return
-    module.begin(stage, pace)
+    module.begin(stage, clock)
     data.begin(stage, position.step)
     callbacks: list[Callback] = [
-        Clock(pace, processes),
-        TrainingLog(settings.output_dir / "metrics.csv", stage, pace, first_step=position.step),
+        Clock(clock, processes),
+        TrainingLog(settings.output_dir / "metrics.csv", stage, clock, first_step=position.step),
         periodic_checkpoint(folder, number, stage, settings.checkpoint_every),
     ]
     if settings.optimizer.ema_decay is not None:
         # The codec's normalisation is a buffer: averaging it would mix it with itself, so only weights are.
         callbacks.insert(0, EMAWeightAveraging(decay=settings.optimizer.ema_decay, use_buffers=False))
     trainer = lightning.Trainer(
-        max_steps=stage.steps if pace.seconds_limit is None else -1,
+        max_steps=stage.steps if clock.seconds_limit is None else -1,
         max_epochs=-1,
         accelerator=settings.accelerator,
         devices=settings.devices if processes.count == 1 else processes.count // settings.nodes,
@@ -221,13 +225,3 @@ def _claim_settings(settings: Settings, processes: int) -> None:
     kept = [key for key in described if key not in ("output_dir", "dataset", "devices", "nodes")]
     before, now = ({key: each.get(key) for key in kept} for each in ({"processes": 1} | earlier, described))
     require_same(before, now, settings.output_dir, "a run")
-
-
-def _take_weights(renderer: nn.Module, path: Path) -> None:
-    vae = getattr(getattr(renderer, "codec", None), "vae", None)
-    if vae is None:
-        renderer.load_state_dict(load_renderer(path).state_dict())
-        return
-    from safetensors.torch import load_file
-
-    renderer.load_state_dict(load_file(path))

@@ -1,6 +1,6 @@
-"""Where samples come from: a split decoded into memory, or streamed from its tar files by webdataset.
+"""Sources of samples: a split decoded into memory, or streamed from its tar files by webdataset.
 
-Exposure and AgX are applied when a clip is loaded; what the network sees is display-encoded in [-1, 1].
+Exposure is applied when a clip is loaded, AgX after augmentation (train.augmentation).
 """
 
 from __future__ import annotations
@@ -18,57 +18,48 @@ from webdataset.pipeline import DataPipeline
 from webdataset.shardlists import ResampledShards
 
 from tron import seeds
-from tron.color import to_display
 from tron.errors import TronError
 from tron.shards.manifest import Manifest
 from tron.shards.reader import decode_clip, decode_meta, group_clips, read_clips, tar_files
 from tron.shards.schema import META_SUFFIX, Clip, ClipMeta
 
-BUFFERS = ("pbr", "irradiance", "rgb")
+TARGET = "rgb"
+"""Member that the network must produce; beside it samples hold its guidance."""
 
 
-def exposed_video(clip: Clip, member: str) -> np.ndarray:
-    """A clip's buffer (K, H, W, C) as (C, K, H, W) float32: linear under the clip's exposure, or display as
-    it is.
-
-    Members whose color_space is "display" (captured photos) are left alone: exposure is for linear values.
-    """
-    image = clip.frames[member]
-    if not is_display(clip.meta, member):
-        image = image * np.float32(clip.meta.exposure)
-    return np.ascontiguousarray(np.moveaxis(image, -1, 0), np.float32)
-
-
-def is_display(meta: ClipMeta, member: str) -> bool:
-    """Whether a member holds display values, to which neither exposure nor AgX is applied."""
-    return meta.color_space.get(member, "linear") == "display"
-
-
-def display_video(clip: Clip, member: str) -> np.ndarray:
-    """A clip's buffer as the network sees it: display-encoded in [-1, 1], (3, K, H, W) float32."""
-    video = exposed_video(clip, member)
-    if not is_display(clip.meta, member):
-        video = to_display(video, 1.0, axis=0)
-    return (video * 2 - 1).astype(np.float32)
+def channels_first(frames: np.ndarray) -> np.ndarray:
+    """(K, H, W, C) -> (C, K, H, W) float32."""
+    return np.ascontiguousarray(np.moveaxis(frames, -1, 0), np.float32)
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Frames of one clip: buffers (3, K, H, W), exposed linear, or display in [0, 1] where `display` says."""
+    """Frames of one clip.
+
+    Attributes:
+        buffers: (3, K, H, W) by name: linear under the clip's exposure, or in [0, 1] where display-encoded.
+        display: names of the display-encoded ones.
+    """
 
     buffers: dict[str, Tensor]
     display: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, clip: Clip) -> Sample:
-        """All frames of a clip."""
-        buffers = {name: torch.from_numpy(exposed_video(clip, name)) for name in BUFFERS}
-        return cls(buffers, frozenset(name for name in BUFFERS if is_display(clip.meta, name)))
+        """All frames of a clip, in the members that it was read with."""
+        buffers = {name: torch.from_numpy(channels_first(clip.exposed(name))) for name in clip.frames}
+        return cls(buffers, frozenset(name for name in buffers if clip.is_display(name)))
 
 
 @dataclass(frozen=True)
 class Draw:
-    """The how-manieth sample of a stage this is, and the random stream that is its own."""
+    """Order for one sample.
+
+    Attributes:
+        number: of the sample within its split, counted through the stage.
+        random: its own stream of random numbers.
+        frames: K.
+    """
 
     number: int
     random: np.random.Generator
@@ -86,9 +77,9 @@ class Source(Protocol):
 class CachedSplit:
     """A split decoded into memory; sample number n is clip n of an endless series of shuffled passes."""
 
-    def __init__(self, folder: Path, split: str, seed: int):
+    def __init__(self, folder: Path, split: str, members: Sequence[str], seed: int):
         self.seed, self.split = seed, split
-        self.clips = [Sample.of(clip) for clip in read_clips(folder, split, BUFFERS)]
+        self.clips = [Sample.of(clip) for clip in read_clips(folder, split, members)]
         self._pass = -1
         self._order = np.zeros(0, np.int64)
 
@@ -99,7 +90,7 @@ class CachedSplit:
             order = seeds.generator(self.seed, "train", "pass", self.split, which)
             self._pass, self._order = which, order.permutation(len(self.clips))
         clip = self.clips[int(self._order[place])]
-        count = clip.buffers["rgb"].shape[1]
+        count = clip.buffers[TARGET].shape[1]
         if count < draw.frames:
             raise TronError(
                 f"split '{self.split}' has a clip of {count} frames", mend=f"{draw.frames} are needed"
@@ -110,8 +101,7 @@ class CachedSplit:
 
 
 class StreamedSplit:
-    """A split read from its tar files as it goes, by webdataset: shards resampled, clips shuffled in a
-    buffer.
+    """A split read from its tar files as it goes: webdataset resamples shards and shuffles clips in a buffer.
 
     Only the members and frames that a sample needs are decoded, by the reader's table of decoders. The
     stream is a function of (seed, stream name); `skip` samples at its start are not decoded.
@@ -121,6 +111,7 @@ class StreamedSplit:
         self,
         folder: Path,
         split: str,
+        members: Sequence[str],
         frames: int,
         seed: int,
         *,
@@ -128,7 +119,8 @@ class StreamedSplit:
         per_clip: int = 1,
         skip: int = 0,
     ):
-        self.frames, self.per_clip, self.seed, self.skip = frames, per_clip, seed, skip
+        self.members, self.frames, self.seed = members, frames, seed
+        self.per_clip, self.skip = per_clip, skip
         names = [str(folder / e.name) for e in Manifest.load(folder).of_split(split) if e.samples]
         self._pipeline: Any = DataPipeline(
             ResampledShards(
@@ -142,7 +134,7 @@ class StreamedSplit:
     def _undecoded(self, shards: Iterator[dict[str, str]]) -> Iterator[dict[str, Any]]:
         """Bytes of the windows drawn from each clip of each shard, the first stages of a sample."""
         for number, shard in enumerate(shards):
-            for key, files in group_clips(tar_files(shard["url"], BUFFERS)):
+            for key, files in group_clips(tar_files(shard["url"], self.members)):
                 random = seeds.generator(self.seed, "window", number, key)
                 count = decode_meta(files[META_SUFFIX]).frames if META_SUFFIX in files else 0
                 if count < self.frames:
@@ -163,7 +155,7 @@ class StreamedSplit:
                 next(self._samples)
         drawn: Any = next(self._samples)
         indices = range(drawn["start"], drawn["start"] + draw.frames)
-        return Sample.of(decode_clip(drawn["files"], BUFFERS, indices))
+        return Sample.of(decode_clip(drawn["files"], self.members, indices))
 
 
 def _zero() -> int:
@@ -177,11 +169,6 @@ def first_meta(folder: Path, manifest: Manifest, split: str) -> ClipMeta:
         if name == META_SUFFIX:
             return decode_meta(data)
     raise TronError("shard holds no clip", str(folder / entry.name), "make it again with tron-datagen")
-
-
-def decoded_bytes(meta: ClipMeta) -> int:
-    """Memory that a clip's three buffers take as float32."""
-    return meta.frames * meta.height * meta.width * len(BUFFERS) * 3 * 4
 
 
 def spread_clips(

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eval.relighting.buffers import Buffers, Region, displayed_truth, region_mask
+from eval.relighting.buffers import Buffers, Region, region_mask
 from eval.relighting.fits import AffineFit, Fit, Fitted, ProductFit, Show
 from tron.color import to_display
 from tron.errors import TronError
@@ -48,10 +48,10 @@ def shadow_ratio(buffers: Buffers) -> np.ndarray:
     is Monte Carlo noise. Where ``exposure * unshadowed`` is under RATIO_FLOOR there is no light to lose and
     the share is 1. Where nothing is shadowed the result is pbr itself.
     """
-    unshadowed = buffers.unshadowed
+    unshadowed = buffers["unshadowed"]
     lit = unshadowed * buffers.exposure > RATIO_FLOOR
-    share = np.where(lit, buffers.irradiance / np.where(lit, unshadowed, 1), 1)
-    return (buffers.pbr * np.clip(share, 0, 1)).astype(np.float32)
+    share = np.where(lit, buffers["irradiance"] / np.where(lit, unshadowed, 1), 1)
+    return (buffers["pbr"] * np.clip(share, 0, 1)).astype(np.float32)
 
 
 def show_pbr(buffers: Buffers) -> np.ndarray:
@@ -167,7 +167,7 @@ def fit_baselines(clips: Iterable[Clip], seed: int) -> dict[str, Fitted]:
     fitted_on = 0
     for clip in clips:
         inside = region_mask(clip, "foreground")
-        buffers, truth = Buffers.of(clip).at(inside), displayed_truth(clip)[inside]
+        buffers, truth = Buffers.of(clip).at(inside), clip.displayed("rgb")[inside]
         rng = generator(seed, "eval", "scale", clip.meta.key)
         count = min(SAMPLED_PIXELS * clip.meta.frames, len(truth))
         some = np.sort(rng.choice(len(truth), count, replace=False)) if count else []
@@ -198,7 +198,7 @@ def predictions(clip: Clip, methods: Mapping[str, Show]) -> dict[Region, dict[st
     plain = {baseline.name: baseline.show for baseline in BASELINES if baseline.show}
     foreground = {name: show(buffers) for name, show in {**plain, **methods}.items()}
     surfaces = {baseline.name for baseline in BASELINES if baseline.surfaces}
-    opacity, pbr = buffers.opacity, buffers.displayed("pbr")
+    opacity, pbr = buffers["mask"], buffers.displayed("pbr")
     frame = {
         name: opacity * image + (1 - opacity) * pbr if name in surfaces else image
         for name, image in foreground.items()

@@ -13,7 +13,7 @@ from pydantic import Field, NonNegativeInt, PositiveInt
 from eval.benchmark import Benchmark
 from eval.relighting import page
 from eval.relighting.baselines import NEURAL, fit_baselines, predictions
-from eval.relighting.buffers import MEMBERS, displayed_truth
+from eval.relighting.buffers import MEMBERS
 from eval.relighting.fits import Show
 from eval.relighting.gallery import Example, middle_frame
 from eval.relighting.guidance import GuidanceScores
@@ -73,7 +73,7 @@ class Relighting(Benchmark):
         methods = {name: each.show for name, each in fitted.items()} | networks
         scores, guidance, clips = Scores(), GuidanceScores(), []
         for clip in read_clips(dataset, self.test_split):
-            scores.add(clip, predictions(clip, methods), displayed_truth(clip))
+            scores.add(clip, predictions(clip, methods), clip.displayed("rgb"))
             guidance.add(clip)
             clips.append(clip.meta)
             log.info("scored clip %s (%s, %s)", clip.meta.key, clip.meta.light, clip.meta.light_family)
@@ -129,7 +129,7 @@ class Relighting(Benchmark):
         if not keys:
             return []
         examples = {
-            clip.meta.key: middle_frame(clip, predictions(clip, methods)["frame"], displayed_truth(clip))
+            clip.meta.key: middle_frame(clip, predictions(clip, methods)["frame"], clip.displayed("rgb"))
             for clip in read_clips(self._dataset(), self.test_split)
             if clip.meta.key in keys
         }
@@ -146,7 +146,8 @@ def load_network(path: Path, vae: Path | None = None) -> Show:
     from tron.neural.weights import load_renderer
 
     renderer = load_renderer(path, vae)
-    return lambda buffers: render_clip(renderer, buffers.pbr, buffers.irradiance, buffers.exposure)
+    guidance = renderer.config.guidance
+    return lambda buffers: render_clip(renderer, {name: buffers.displayed(name) for name in guidance})
 
 
 def choose_clips(scores: Scores, count: int) -> list[str]:

@@ -47,9 +47,9 @@ class Fit(Protocol):
 
 def product_terms(buffers: Buffers) -> tuple[np.ndarray, np.ndarray]:
     """Split e (o s B e E + (1 - o) B) into what s multiplies and the rest, (..., 3) exposed linear each."""
-    exposed = buffers.pbr * buffers.exposure
-    lit = buffers.opacity * exposed * (buffers.irradiance * buffers.exposure)
-    return lit, (1 - buffers.opacity) * exposed
+    exposed = buffers["pbr"] * buffers.exposure
+    lit = buffers["mask"] * exposed * (buffers["irradiance"] * buffers.exposure)
+    return lit, (1 - buffers["mask"]) * exposed
 
 
 def show_product(buffers: Buffers, scale: float) -> np.ndarray:

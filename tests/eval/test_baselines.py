@@ -25,7 +25,8 @@ def guided(
     """Buffers of n pixels; what is not given plays no part."""
     opacity = np.broadcast_to(opacity, (len(pbr), 1))
     unshadowed = irradiance if unshadowed is None else unshadowed
-    return Buffers(pbr, irradiance, unshadowed, pbr, opacity, exposure)
+    images = {"pbr": pbr, "irradiance": irradiance, "unshadowed": unshadowed, "mask": opacity}
+    return Buffers(images, exposure)
 
 
 def shadow_ratio(pbr: np.ndarray, irradiance: np.ndarray, unshadowed: np.ndarray, exposure: float):
@@ -34,7 +35,7 @@ def shadow_ratio(pbr: np.ndarray, irradiance: np.ndarray, unshadowed: np.ndarray
 
 def linear(name: str) -> Show:
     """An input of a blend that is taken as it is."""
-    return lambda buffers: getattr(buffers, name)
+    return lambda buffers: buffers[name]
 
 
 FIRST, SECOND, THIRD = linear("pbr"), linear("irradiance"), linear("unshadowed")

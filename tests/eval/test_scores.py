@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eval.relighting.baselines import fit_baselines, predictions
-from eval.relighting.buffers import Buffers, Region, displayed_truth, region_mask
+from eval.relighting.buffers import Buffers, Region, region_mask
 from eval.relighting.fits import Show
 from eval.relighting.scores import Scores
 from tron.color import to_display
@@ -24,7 +24,7 @@ def both(images: dict[str, np.ndarray]) -> dict:
 def fitted_and_shown(
     clips: list[Clip], networks: dict[str, Show] | None = None
 ) -> dict[Region, dict[str, np.ndarray]]:
-    """What baselines fitted on clips, and networks, show for the first of them."""
+    """Pictures of the first of some clips by baselines fitted on all of them, and by networks."""
     fits = fit_baselines(clips, seed=0)
     return predictions(clips[0], {name: fitted.show for name, fitted in fits.items()} | (networks or {}))
 
@@ -35,7 +35,7 @@ def rows_of(scores: Scores) -> dict[str, tuple[float, int]]:
 
 def test_a_known_error_has_its_known_psnr(drawn_clip: MakeClip):
     clip = drawn_clip(frames=3)
-    truth = displayed_truth(clip) * 0.5 + 0.2
+    truth = clip.displayed("rgb") * 0.5 + 0.2
     scores = Scores()
     scores.add(clip, both({"pbr": truth + 0.1, "neural": truth - 0.01}), truth)
     rows = rows_of(scores)
@@ -46,7 +46,7 @@ def test_a_known_error_has_its_known_psnr(drawn_clip: MakeClip):
 
 def test_psnr_is_averaged_over_frames_not_taken_of_the_mean_error(drawn_clip: MakeClip):
     clip = drawn_clip(frames=2)
-    truth = np.full_like(displayed_truth(clip), 0.5)
+    truth = np.full_like(clip.displayed("rgb"), 0.5)
     shown = truth.copy()
     shown[0] += 0.1
     shown[1] += 0.001
@@ -57,7 +57,7 @@ def test_psnr_is_averaged_over_frames_not_taken_of_the_mean_error(drawn_clip: Ma
 
 def test_a_perfect_prediction_is_capped_and_never_infinite(drawn_clip: MakeClip):
     clip = drawn_clip()
-    truth = displayed_truth(clip)
+    truth = clip.displayed("rgb")
     scores = Scores()
     scores.add(clip, both({"neural": truth}), truth)
     assert rows_of(scores)["neural.psnr"][0] == PSNR_CAP
@@ -66,7 +66,7 @@ def test_a_perfect_prediction_is_capped_and_never_infinite(drawn_clip: MakeClip)
 
 def test_errors_outside_the_foreground_count_in_the_full_frame_only(drawn_clip: MakeClip):
     clip = drawn_clip()
-    truth = displayed_truth(clip)
+    truth = clip.displayed("rgb")
     outside = ~region_mask(clip, "foreground")[..., None]
     scores = Scores()
     scores.add(clip, both({"pbr": truth + 0.2 * outside}), truth)
@@ -78,7 +78,7 @@ def test_errors_outside_the_foreground_count_in_the_full_frame_only(drawn_clip: 
 
 def test_gains_are_over_the_best_of_their_group_and_absent_without_all_of_it(drawn_clip: MakeClip):
     clip = drawn_clip()
-    truth = np.full_like(displayed_truth(clip), 0.5)
+    truth = np.full_like(clip.displayed("rgb"), 0.5)
 
     def off(error: float) -> np.ndarray:
         return truth + np.float32(error)
@@ -104,7 +104,7 @@ def test_gains_are_over_the_best_of_their_group_and_absent_without_all_of_it(dra
 def test_what_was_not_given_has_no_row(drawn_clip: MakeClip):
     clip = drawn_clip()
     scores = Scores()
-    scores.add(clip, fitted_and_shown([clip]), displayed_truth(clip))
+    scores.add(clip, fitted_and_shown([clip]), clip.displayed("rgb"))
     names = set(rows_of(scores))
     assert "affine_ratio.psnr" in names
     assert not [name for name in names if name.startswith(("neural", "pixel_mlp"))]
@@ -113,7 +113,7 @@ def test_what_was_not_given_has_no_row(drawn_clip: MakeClip):
 def test_a_frame_without_foreground_has_no_foreground_score(drawn_clip: MakeClip):
     clip = drawn_clip(frames=3)
     clip.frames["foreground"][1] = 0
-    truth = displayed_truth(clip)
+    truth = clip.displayed("rgb")
     scores = Scores()
     scores.add(clip, both({"pbr": truth}), truth)
     assert rows_of(scores)["pbr.psnr"][1] == 2
@@ -125,7 +125,7 @@ def test_without_shadows_and_bounces_every_product_is_the_truth(drawn_clip: Make
     clip.frames["irradiance"] = clip.frames["unshadowed"].copy()
     clip.frames["rgb"] = clip.frames["shadowed"] = clip.frames["pbr"].copy()
     shown = fitted_and_shown([clip])
-    truth = displayed_truth(clip)
+    truth = clip.displayed("rgb")
     for region, images in shown.items():
         for method in ("pbr", "shadow_ratio", "shadowed", "affine", "affine_ratio"):
             np.testing.assert_allclose(images[method], truth, atol=1e-4, err_msg=f"{region} {method}")
@@ -150,7 +150,7 @@ def test_a_blend_of_surfaces_leaves_the_sky_as_it_is(drawn_clip: MakeClip, metho
     for clip in clips:
         as_photographed(clip, where_sky_and_surface_differ(clip))
     shown = fitted_and_shown(clips)
-    truth = displayed_truth(clips[0])
+    truth = clips[0].displayed("rgb")
     inside = region_mask(clips[0], "foreground")
     np.testing.assert_allclose(shown["foreground"][method][inside], truth[inside], atol=1e-4)
     np.testing.assert_allclose(shown["frame"][method], truth, atol=1e-4)
@@ -159,7 +159,7 @@ def test_a_blend_of_surfaces_leaves_the_sky_as_it_is(drawn_clip: MakeClip, metho
 def test_half_a_surface_shows_half_of_pbr_in_full_frames_alone(drawn_clip: MakeClip):
     clip = drawn_clip()
     clip.frames["mask"] = np.full_like(clip.frames["mask"], 0.25)
-    shown = fitted_and_shown([clip], {"pixel_mlp": lambda buffers: np.full_like(buffers.pbr, 0.9)})
+    shown = fitted_and_shown([clip], {"pixel_mlp": lambda buffers: np.full_like(buffers["pbr"], 0.9)})
     assert np.all(shown["foreground"]["pixel_mlp"] == np.float32(0.9))
     expected = 0.25 * 0.9 + 0.75 * shown["frame"]["pbr"]
     np.testing.assert_allclose(shown["frame"]["pixel_mlp"], expected, atol=1e-6)
@@ -167,7 +167,7 @@ def test_half_a_surface_shows_half_of_pbr_in_full_frames_alone(drawn_clip: MakeC
 
 def test_the_neural_renderer_draws_its_own_sky(drawn_clip: MakeClip):
     clip = drawn_clip()
-    shown = fitted_and_shown([clip], {"neural": lambda buffers: np.full_like(buffers.pbr, 0.9)})
+    shown = fitted_and_shown([clip], {"neural": lambda buffers: np.full_like(buffers["pbr"], 0.9)})
     np.testing.assert_array_equal(shown["frame"]["neural"], shown["foreground"]["neural"])
 
 
@@ -175,8 +175,8 @@ def test_the_network_is_given_linear_buffers_and_the_exposure(drawn_clip: MakeCl
     clip = drawn_clip()
 
     def network(buffers: Buffers) -> np.ndarray:
-        np.testing.assert_array_equal(buffers.irradiance, clip.frames["irradiance"])
-        return to_display(buffers.pbr, buffers.exposure)
+        np.testing.assert_array_equal(buffers["irradiance"], clip.frames["irradiance"])
+        return to_display(buffers["pbr"], buffers.exposure)
 
     shown = fitted_and_shown([clip], {"neural": network})
     np.testing.assert_array_equal(shown["frame"]["neural"], shown["frame"]["pbr"])
@@ -194,4 +194,4 @@ def test_nothing_to_fit_on_is_one_line(drawn_clip: MakeClip):
 def test_a_captured_photo_is_shown_as_it_is(drawn_clip: MakeClip):
     clip = drawn_clip()
     clip.meta.color_space["rgb"] = "display"
-    np.testing.assert_array_equal(displayed_truth(clip), clip.frames["rgb"])
+    np.testing.assert_array_equal(clip.displayed("rgb"), clip.frames["rgb"])

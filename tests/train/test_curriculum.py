@@ -1,4 +1,4 @@
-"""Stages and their pace: what the schedule promises at its ends and in between."""
+"""Stages and their clock: what the schedule promises at its ends and in between."""
 
 import time
 from itertools import pairwise
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from train.curriculum import Pace, Stage, learning_rate_factor
+from train.curriculum import Stage, StageClock, learning_rate_factor
 
 STAGE = Stage(name="one", split="train", steps=1000, learning_rate=0.5, final_learning_rate=0.01)
 
@@ -35,26 +35,26 @@ def test_single_frames_take_their_share_of_any_run_of_batches(ratio):
 
 
 def test_a_pace_by_steps_ignores_the_clock():
-    pace = Pace(200)
-    pace.start()
-    assert [pace.progress(step) for step in (0, 50, 200, 300)] == [0.0, 0.25, 1.0, 1.0]
+    clock = StageClock(200)
+    clock.start()
+    assert [clock.progress(step) for step in (0, 50, 200, 300)] == [0.0, 0.25, 1.0, 1.0]
 
 
 def test_a_pace_by_time_ignores_the_steps_and_stands_still_while_stopped():
-    pace = Pace(200, seconds_limit=10.0)
-    pace.spent = 2.5  # an earlier session's
-    pace.shown = pace.seconds()
-    assert pace.progress(10**9) == 0.25
-    pace.start()
+    clock = StageClock(200, seconds_limit=10.0)
+    clock.spent = 2.5  # an earlier session's
+    clock.shown = clock.seconds()
+    assert clock.progress(10**9) == 0.25
+    clock.start()
     time.sleep(0.02)
-    assert pace.progress(0) == 0.25, "nobody has looked at the clock since"
-    pace.stop()
-    reached = pace.seconds()
+    assert clock.progress(0) == 0.25, "nobody has looked at the clock since"
+    clock.stop()
+    reached = clock.seconds()
     assert 2.52 <= reached < 6
     time.sleep(0.01)
-    assert pace.seconds() == reached
-    pace.shown = reached
-    assert pace.progress(0) == reached / 10
+    assert clock.seconds() == reached
+    clock.shown = reached
+    assert clock.progress(0) == reached / 10
 
 
 @pytest.mark.parametrize(

@@ -11,16 +11,18 @@ from pydantic import ValidationError
 from torch.utils.data import DataLoader
 
 from train import data as training_data
+from train.augmentation import augmented, display_encoded
 from train.curriculum import Stage
-from train.data import Batches, TrainingData, developed, varied
+from train.data import Batches, TrainingData, network_input
 from train.processes import Processes
 from train.settings import DataSettings, Settings, ValidationSettings
-from train.sources import BUFFERS, CachedSplit, Sample, display_video
+from train.sources import CachedSplit, Sample
 from tron import seeds
 from tron.color import luminance, to_display
 from tron.errors import TronError
-from tron.shards import read_clips
+from tron.shards import GUIDANCE, read_clips
 
+BUFFERS = (*GUIDANCE, "rgb")
 STAGE = Stage(name="one", split="train", steps=10, batch_size=3, crop=16)
 MIXED = Stage(
     name="two",
@@ -37,8 +39,8 @@ MIXED = Stage(
 
 def batches(dataset: Path, stage: Stage = STAGE, cache: bool = True, **options) -> Batches:
     settings = DataSettings(shuffle_buffer=4)
-    cached = {split: CachedSplit(dataset, split, 0) for split in stage.splits()} if cache else {}
-    return Batches(stage, cached, dataset, settings, options.pop("seed", 0), **options)
+    cached = {split: CachedSplit(dataset, split, BUFFERS, 0) for split in stage.splits()} if cache else {}
+    return Batches(stage, cached, dataset, BUFFERS, settings, options.pop("seed", 0), **options)
 
 
 def take(stream, count: int) -> list[torch.Tensor]:
@@ -97,7 +99,7 @@ def test_ranks_share_each_pass_over_the_clips(dataset):
 
 
 def test_every_clip_is_seen_once_a_pass(dataset):
-    source = CachedSplit(dataset, "train", 0)
+    source = CachedSplit(dataset, "train", BUFFERS, 0)
     for number in range(10):
         source.sample(training_data.Draw(number, seeds.generator(0, "x"), 1))
         if number % 5 == 0:
@@ -125,7 +127,7 @@ def test_crops_flips_and_colours_are_the_same_in_all_buffers():
     settings = DataSettings(permute_colors=1.0)
     seen = set()
     for number in range(20):
-        out = varied(sample_of(grid), seeds.generator(0, "varied", number), 8, settings).buffers
+        out = augmented(sample_of(grid), seeds.generator(0, "augmented", number), 8, settings).buffers
         assert all(torch.equal(out[name], out["pbr"]) for name in BUFFERS)
         assert out["pbr"].shape == (3, 2, 8, 8)
         corner = int(out["pbr"][0, 0, 0].min())
@@ -137,7 +139,7 @@ def test_crops_flips_and_colours_are_the_same_in_all_buffers():
 
 def test_without_options_a_sample_is_left_as_it_is():
     video = torch.rand(3, 1, 8, 8)
-    out = varied(sample_of(video), seeds.generator(0, "x"), None, DataSettings(flip=0.0))
+    out = augmented(sample_of(video), seeds.generator(0, "x"), None, DataSettings(flip=0.0))
     assert all(torch.equal(out.buffers[name], video) for name in BUFFERS)
 
 
@@ -145,14 +147,14 @@ def test_a_tint_scales_the_light_and_keeps_the_luminance_of_white():
     settings = DataSettings(flip=0.0, tint=0.3)
     white = torch.ones(3, 1, 4, 4)
     gains = [
-        varied(sample_of(white), seeds.generator(0, n), None, settings).buffers["rgb"] for n in range(50)
+        augmented(sample_of(white), seeds.generator(0, n), None, settings).buffers["rgb"] for n in range(50)
     ]
     for tinted in gains:
         np.testing.assert_allclose(luminance(tinted.numpy(), axis=0), 1.0, rtol=1e-5)
         assert torch.equal(tinted, tinted[:, :1, :1, :1].expand_as(tinted))
     assert 0.2 < torch.stack(gains).log().std() < 0.4
     picture = torch.rand(3, 1, 4, 4)
-    out = varied(sample_of(picture), seeds.generator(0, 7), None, settings).buffers
+    out = augmented(sample_of(picture), seeds.generator(0, 7), None, settings).buffers
     torch.testing.assert_close(out["irradiance"], picture * gains[7])
 
 
@@ -160,7 +162,7 @@ def test_colours_of_photos_are_left_alone():
     video = torch.rand(3, 1, 8, 8)
     photo = sample_of(video, frozenset({"rgb"}))
     settings = DataSettings(flip=0.0, tint=0.5, permute_colors=1.0)
-    out = varied(photo, seeds.generator(0, 3), None, settings)
+    out = augmented(photo, seeds.generator(0, 3), None, settings)
     assert all(torch.equal(out.buffers[name], video) for name in BUFFERS)
 
 
@@ -169,15 +171,16 @@ def test_exposure_and_agx_are_applied_to_linear_members_and_not_to_photos(datase
     spaces = {"rgb": "display", "pbr": "linear", "irradiance": "linear"}
     clip.meta = clip.meta.model_copy(update={"exposure": 0.3, "color_space": spaces})
     as_stored = clip.frames["rgb"]
+    clip.frames = {name: clip.frames[name] for name in BUFFERS}
     for name, expected in (("pbr", to_display(clip.frames["pbr"], 0.3)), ("rgb", as_stored)):
-        shown = (np.moveaxis(display_video(clip, name), 0, -1) + 1) / 2
+        shown = (np.moveaxis(network_input(clip, name).numpy(), 0, -1) + 1) / 2
         np.testing.assert_allclose(shown, expected, atol=1e-6)
-        other = next(iter(read_clips(dataset, "train")))
-        batch = developed(
+        other = next(iter(read_clips(dataset, "train", BUFFERS)))
+        batch = display_encoded(
             [Sample.of(clip), Sample.of(other)], name
         )  # a photo and a path-traced clip in one batch
-        np.testing.assert_allclose(batch[0].numpy(), display_video(clip, name), atol=1e-5)
-        np.testing.assert_allclose(batch[1].numpy(), display_video(other, name), atol=1e-5)
+        np.testing.assert_allclose(batch[0].numpy(), network_input(clip, name).numpy(), atol=1e-5)
+        np.testing.assert_allclose(batch[1].numpy(), network_input(other, name).numpy(), atol=1e-5)
 
 
 def test_what_does_not_fit_the_budget_is_streamed(dataset):
@@ -238,7 +241,7 @@ def test_validation_is_on_its_own_split_and_the_test_split_is_never_opened(
     settings = Settings.model_validate(make_settings(folder, tmp_path / "out"))
     data = TrainingData(folder, settings.data, 0, settings.validation)
     data.open(settings.stages)
-    assert len(list(data.calibration(settings.stages))) > 0
+    assert len(list(data.calibration(settings.stages, 4))) > 0
     data.begin(settings.stages[0], 0)
     next(iter(data.train_dataloader()))
     held_out = {clip.meta.split for clip in (list(data.val_dataloader()), data._held_out)[1] or []}

@@ -5,7 +5,7 @@ import copy
 import pytest
 import torch
 
-from train.optimizers import Together, make_optimizer
+from train.optimizers import CombinedOptimizer, make_optimizer
 from train.settings import OptimizerSettings
 from tron.neural.backbone import BackboneConfig
 from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
@@ -65,7 +65,7 @@ def parts(net: torch.nn.Sequential) -> list[torch.optim.Optimizer]:
 
 def test_two_together_do_what_each_does_alone():
     joined, apart = model(), model()
-    run(Together(parts(joined)), joined, 5)
+    run(CombinedOptimizer(parts(joined)), joined, 5)
     separate = parts(apart)
     for step in range(5):
         generator = torch.Generator().manual_seed(step)
@@ -79,7 +79,7 @@ def test_two_together_do_what_each_does_alone():
 
 def test_a_schedule_reaches_every_part():
     net = model()
-    optimizer = Together(parts(net))
+    optimizer = CombinedOptimizer(parts(net))
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.5**step)
     run(optimizer, net, 1)
     schedule.step()
@@ -88,11 +88,11 @@ def test_a_schedule_reaches_every_part():
 
 def test_state_goes_through_a_checkpoint():
     whole, resumed = model(), model()
-    run(Together(parts(whole)), whole, 6)
-    first = Together(parts(resumed))
+    run(CombinedOptimizer(parts(whole)), whole, 6)
+    first = CombinedOptimizer(parts(resumed))
     run(first, resumed, 3)
     state = copy.deepcopy(first.state_dict())
-    second = Together(parts(resumed))
+    second = CombinedOptimizer(parts(resumed))
     second.load_state_dict(state)
     schedule = torch.optim.lr_scheduler.LambdaLR(second, lambda _: 1.0)  # still reaches the restored groups
     run(second, resumed, 3, first=3)

@@ -179,7 +179,7 @@ def test_stages_without_steps_are_left_out(train, dataset, tmp_path):
     [
         ({"_target_": "tron.neural.renderer.Nothing"}, "renderer cannot be made"),
         ({"_target_": "tron.neural.pixel_mlp.PixelMLP", "wide": 1}, "renderer cannot be made"),
-        ({"_target_": "builtins.dict"}, "not a torch module"),
+        ({"_target_": "builtins.dict"}, "not a renderer"),
         (
             {"_target_": "tron.neural.weights.load_cosmos", "transformer_path": None, "vae_path": None},
             "model.pt",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -93,18 +92,6 @@ def _transform() -> Any:
     import mitsuba as mi
 
     return mi.ScalarTransform4f()
-
-
-@pytest.fixture
-def read_video() -> Callable[[Path], np.ndarray]:
-    """All frames of a video, (N, H, W, 3) uint8."""
-    import av
-
-    def read(path: Path) -> np.ndarray:
-        with av.open(str(path)) as container:
-            return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
-
-    return read
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,13 +20,14 @@ from tron.color import to_display
 from tron.estimation import Estimation
 from tron.gaussians.scene import GaussianScene
 from tron.images import write_image
+from tron.shards.schema import GUIDANCE
 
 if TYPE_CHECKING:
+    from tron.neural.protocols import Renderer
     from tron.shading.environment import EnvironmentMap
     from tron.shading.guidance import Lighting
     from tron.tracing import GBuffer, SurfelTracer
 
-GUIDANCE = ("pbr", "irradiance")
 # Frames that the neural renderer gets at once; bounds memory, not its view into the past.
 CLIP_FRAMES = 16
 
@@ -41,6 +42,7 @@ class Clip:
         exposure: factor before AgX.
         picture: how the relit picture is made.
         folder: the frames; claimed before anything is written.
+        guidance: buffers that the neural renderer is conditioned on, and that are shown.
         keeps_linear: whether the relit picture is written as EXR too.
         seconds: of each frame that was traced in this run.
     """
@@ -50,6 +52,7 @@ class Clip:
     exposure: float
     picture: RelitPicture
     folder: FrameFolder
+    guidance: Sequence[str] = GUIDANCE
     keeps_linear: bool = False
     seconds: list[float] = field(default_factory=list)
 
@@ -62,7 +65,7 @@ class Clip:
 
     def write_pictures(self, index: int) -> None:
         """Write the pictures of a frame whose buffers are there, those that need no network."""
-        for name in GUIDANCE:
+        for name in self.guidance:
             self.folder.write_picture(index, name, to_display(self.folder.read(index, name), self.exposure))
         if not self.picture.neural:
             self.folder.write_picture(index, "relit", self.picture.display(self.folder, index, self.exposure))
@@ -71,33 +74,38 @@ class Clip:
         else:  # that of an earlier run may stand before another background
             self.folder.path(index, "relit", "exr").unlink(missing_ok=True)
 
-    def draw(self, renderer: Any) -> None:
+    def draw(self, renderer: Renderer) -> None:
         """Write the neural renderer's pictures, as one window sliding over the clip gives them."""
         from tron.neural.renderer import render_clip
 
         # A window that starts this many frames before a part makes the part's own frames independent of the
         # cut.
-        before = getattr(getattr(renderer, "config", None), "window", 1) - 1
+        before = renderer.config.window - 1
         frames, step = len(self.rotations), max(CLIP_FRAMES, before + 1)
         for start in track(range(0, frames, step), "neural"):
             first, end = max(start - before, 0), min(start + step, frames)
-            pbr, irradiance = (
-                np.stack([self.folder.read(i, name) for i in range(first, end)]) for name in GUIDANCE
-            )
-            display = render_clip(renderer, pbr, irradiance, self.exposure)
+            guidance = {name: self._displayed(name, first, end) for name in self.guidance}
+            display = render_clip(renderer, guidance)
             for index in range(start, end):
                 neural = display[index - first]
                 self.folder.write_picture(index, "neural", neural)
                 relit = self.picture.display(self.folder, index, self.exposure, neural)
                 self.folder.write_picture(index, "relit", relit)
 
+    def _displayed(self, name: str, first: int, end: int) -> np.ndarray:
+        return to_display(np.stack([self.folder.read(i, name) for i in range(first, end)]), self.exposure)
+
     def assemble(self, output_dir: Path, fps: float) -> None:
         """Write videos and the contact sheet from the pictures of all frames."""
         frames, drawn = len(self.rotations), ["neural"] if self.picture.neural else []
-        for name, pictures in {"relit": ["relit"], "guidance": [*GUIDANCE, *drawn], "neural": drawn}.items():
+        for name, pictures in {
+            "relit": ["relit"],
+            "guidance": [*self.guidance, *drawn],
+            "neural": drawn,
+        }.items():
             if pictures:
                 self.folder.write_video(output_dir / f"{name}.mp4", frames, pictures, fps)
-        self.folder.write_sheet(output_dir / "contact_sheet.png", frames, ["relit", *GUIDANCE, *drawn])
+        self.folder.write_sheet(output_dir / "contact_sheet.png", frames, ["relit", *self.guidance, *drawn])
 
 
 def trace(

@@ -11,14 +11,13 @@ import json
 import logging
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import tron
 from tron.apps.camera_files import read_cameras
-from tron.apps.clip import GUIDANCE, Clip, trace
+from tron.apps.clip import Clip, trace
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.framing import plan_cameras, turn_cameras, upright
 from tron.apps.relight_settings import QUALITY, Settings
@@ -31,9 +30,11 @@ from tron.gaussians.foreign_files import refuse_foreign
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
 from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
+from tron.shards.schema import GUIDANCE
 from tron.storage import locked, require_free_space, sha256, write_atomic
 
 if TYPE_CHECKING:
+    from tron.neural.protocols import Renderer
     from tron.shading.environment import EnvironmentMap
 
 log = logging.getLogger(__name__)
@@ -55,7 +56,7 @@ def main(settings: Settings) -> None:
     _check_paths(settings, lights)
     size = settings.width, settings.height
     given = None if settings.cameras is None else read_cameras(settings.cameras, *size)
-    environments = [EnvironmentMap.load(light.environment) for light in lights]
+    environments = [EnvironmentMap.load(light.light) for light in lights]
     renderer = _load_renderer(settings)
     scene = _load_scene(settings)
     turn = upright(scene.up)  # to +z, which is up in environment maps
@@ -67,7 +68,8 @@ def main(settings: Settings) -> None:
         path = settings.trajectory, settings.frames
         cameras = plan_cameras(scene, *path, **view, distance=settings.distance)
     activate(settings.variant, settings.threads)
-    clips = [_clip(light, environment, len(cameras)) for light, environment in zip(lights, environments)]
+    guidance = GUIDANCE if renderer is None else renderer.config.guidance
+    clips = [_clip(*each, len(cameras), guidance) for each in zip(lights, environments)]
     clock.lap("loading")
 
     pixels = len(clips) * len(cameras) * settings.width * settings.height
@@ -88,8 +90,8 @@ def main(settings: Settings) -> None:
         for light, clip in zip(lights, clips):
             report = _report(light, clip, scene, turn_cameras(cameras, turn.T), clock)
             write_atomic(light.output_dir / "relight.json", json.dumps(report, indent=1) + "\n")
-            rendered = len(cameras), len(clip.seconds), light.output_dir
-            log.info("%d frames, %d of them rendered now: %s", *rendered)
+            made = len(cameras), len(clip.seconds), light.output_dir / "relit.mp4"
+            log.info("%d frames, %d of them rendered now: look at %s", *made)
 
 
 class _Clock:
@@ -107,9 +109,8 @@ class _Clock:
 
 def _check_paths(settings: Settings, lights: Sequence[Settings]) -> None:
     """Every file is there and is of its kind as far as names and headers tell, before anything is loaded."""
-    maps = [light.environment for light in lights]
+    maps = [light.light for light in lights]
     for path in (settings.scene, *maps, settings.cameras, settings.checkpoint, settings.vae):
-        assert path is None or isinstance(path, Path)
         if path is not None and not path.is_file():
             if path.is_dir():
                 raise TronError("cannot read: is a folder", path, "give one file of it")
@@ -138,7 +139,7 @@ def _load_scene(settings: Settings) -> GaussianScene:
     return scene
 
 
-def _load_renderer(settings: Settings) -> Any:
+def _load_renderer(settings: Settings) -> Renderer | None:
     """The network, before any frame is traced, so that a wrong file is found at once; None without one."""
     if settings.checkpoint is None:
         return None
@@ -150,15 +151,16 @@ def _load_renderer(settings: Settings) -> Any:
     return load_renderer(settings.checkpoint, settings.vae).to(torch_device(settings.variant))
 
 
-def _clip(light: Settings, environment: EnvironmentMap, frames: int) -> Clip:
+def _clip(light: Settings, environment: EnvironmentMap, frames: int, guidance: Sequence[str]) -> Clip:
     picture = RelitPicture(light.background, neural=light.checkpoint is not None)
-    buffers = [name for name in (*GUIDANCE, *picture.buffers, *light.buffers) if name != "relit"]
+    buffers = [name for name in (*guidance, *picture.buffers, *light.buffers) if name != "relit"]
     return Clip(
         environment=environment,
         rotations=light.rotations(frames),
         exposure=environment.exposure() if light.exposure == "auto" else light.exposure,
         picture=picture,
         folder=FrameFolder(light.output_dir / "frames", tuple(dict.fromkeys(buffers))),
+        guidance=guidance,
         keeps_linear="relit" in light.buffers,
     )
 
@@ -166,10 +168,9 @@ def _clip(light: Settings, environment: EnvironmentMap, frames: int) -> Clip:
 def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> dict[str, Any]:
     """Recipe of the linear frames: all that their pixels depend on, as JSON values."""
     keys = {"rotation", "trajectory", "quality", "width", "height", "fov", "distance", "seed", "variant"}
-    assert isinstance(light.environment, Path)
     return {
         "scene_sha256": sha256(light.scene),
-        "environment_sha256": sha256(light.environment),
+        "environment_sha256": sha256(light.light),
         "cameras_sha256": None if light.cameras is None else sha256(light.cameras),
         "frames": len(cameras),
         "up": [round(float(value), 6) for value in turn[2]],

@@ -132,6 +132,12 @@ class Settings(BaseModel):
             for path in self.environment
         ]
 
+    @property
+    def light(self) -> Path:
+        """File of the environment, where these are the settings of one light alone (`by_light`)."""
+        assert isinstance(self.environment, Path)
+        return self.environment
+
     def rotations(self, frames: int) -> list[float]:
         """Turn of the environment in each of so many frames, degrees.
 

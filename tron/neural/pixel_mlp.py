@@ -1,37 +1,37 @@
-"""The strongest baseline without context: an MLP on each pixel's two colours."""
+"""The strongest baseline without context: an MLP on the colours of each pixel."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import pairwise
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import Tensor, nn
 
-from tron.errors import TronError
+from tron.neural.protocols import GuidedConfig, Renderer
 
 
-class PixelMLPConfig(BaseModel):
-    """Width and number of hidden layers; it travels inside the weights file."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class PixelMLPConfig(GuidedConfig):
+    """Width and number of hidden layers."""
 
     width: int = Field(default=64, ge=1)
     hidden_layers: int = Field(default=3, ge=1)
-    window: int = Field(default=1, ge=1)
 
 
-class PixelMLP(nn.Module):
-    """1 x 1 convolutions on the two buffers (facts 9), with the residual taken from the PBR buffer.
+class PixelMLP(Renderer):
+    """1 x 1 convolutions on the guidance (docs/conventions.md, 12), with the residual taken from pbr.
 
     What it cannot do, since it sees one pixel, is what a neural renderer is for: reflections and bounce
     light from elsewhere. It trains through the same tron-train as the renderer.
     """
 
+    config: PixelMLPConfig
+
     def __init__(self, config: PixelMLPConfig | None = None):
         super().__init__()
         self.config = config or PixelMLPConfig()
-        sizes = [6] + [self.config.width] * self.config.hidden_layers
+        sizes = [3 * len(self.config.guidance)] + [self.config.width] * self.config.hidden_layers
         layers: list[nn.Module] = []
         for inputs, outputs in pairwise(sizes):
             layers += [nn.Linear(inputs, outputs), nn.GELU()]
@@ -40,13 +40,11 @@ class PixelMLP(nn.Module):
         nn.init.zeros_(last.bias)
         self.layers = nn.Sequential(*layers, last)
 
-    def forward(self, pbr: Tensor, irradiance: Tensor) -> Tensor:
-        """Both (B, 3, K, H, W), display-encoded in [-1, 1] -> the same shape, not clamped."""
-        if pbr.shape != irradiance.shape or pbr.ndim != 5 or pbr.shape[1] != 3:
-            raise TronError(f"buffers of shapes {tuple(pbr.shape)} and {tuple(irradiance.shape)}")
+    def forward(self, buffers: Mapping[str, Tensor]) -> Tensor:
+        """As Renderer.forward."""
         # A linear layer over the last axis is a 1 x 1 convolution, and much faster on a CPU.
-        pixels = torch.cat([pbr, irradiance], 1).movedim(1, -1)
-        return pbr + self.layers(pixels).movedim(-1, 1)
+        pixels = torch.cat(self.stacked(buffers), 1).movedim(1, -1)
+        return buffers["pbr"] + self.layers(pixels).movedim(-1, 1)
 
     def hidden_matrices(self) -> list[nn.Parameter]:
         """Weights between hidden layers, 2-D."""

@@ -66,7 +66,7 @@ def test_the_same_settings_keep_frames_and_others_need_overwrite(folder):
 
 def test_damaged_settings_are_refused(folder):
     (folder.folder / "settings.json").write_text("{")
-    with pytest.raises(TronError, match="cannot read"):
+    with pytest.raises(TronError, match="is damaged"):
         folder.claim({}, overwrite=False)
 
 

@@ -7,14 +7,16 @@ import plyfile
 import pytest
 
 from tron.apps import clip as clips
-from tron.apps.clip import GUIDANCE, Clip
+from tron.apps.clip import Clip
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
+from tron.color import to_display
 from tron.gaussians.ply import MATERIAL_PROPERTIES
 from tron.images import read_image
 from tron.seeds import generator
 from tron.shading.environment import EnvironmentMap
+from tron.shards.schema import GUIDANCE
 
 SIZE = 32
 
@@ -172,8 +174,8 @@ def test_a_clip_in_parts_is_the_clip_in_one(tmp_path, monkeypatch):
     monkeypatch.setattr(clips, "CLIP_FRAMES", 6)
     light, picture = EnvironmentMap.constant(1.0), RelitPicture("environment", neural=True)
     Clip(light, [0.0] * 13, 0.7, picture, folder).draw(renderer)
-    clip = (np.stack([folder.read(i, name) for i in range(13)]) for name in GUIDANCE)
-    whole = render_clip(renderer, *clip, exposure=0.7)
+    linear = {name: np.stack([folder.read(i, name) for i in range(13)]) for name in GUIDANCE}
+    whole = render_clip(renderer, {name: to_display(buffer, 0.7) for name, buffer in linear.items()})
     for index in range(13):
         np.testing.assert_allclose(folder.row(index, ["neural"]), whole[index], atol=1.01 / 255)
 

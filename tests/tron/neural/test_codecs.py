@@ -7,7 +7,8 @@ from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
 from scipy.fft import dctn
 
 from tron.errors import TronError
-from tron.neural.codecs import BlockDCT, WanCodec
+from tron.neural.block_dct import BlockDCT
+from tron.neural.wan import WanCodec
 
 
 def video(frames: int, height: int = 16, width: int = 24, batch: int = 2, seed: int = 0) -> torch.Tensor:
@@ -17,7 +18,7 @@ def video(frames: int, height: int = 16, width: int = 24, batch: int = 2, seed: 
 @pytest.fixture(scope="module")
 def codec() -> BlockDCT:
     codec = BlockDCT()
-    codec.fit([video(5, seed=1), video(9, seed=2)])
+    codec.calibrate([video(5, seed=1), video(9, seed=2)])
     return codec
 
 
@@ -80,7 +81,7 @@ def test_shapes_that_would_lose_frames_or_pixels_are_refused(codec, shape):
 
 def test_nothing_to_fit_on_is_an_error():
     with pytest.raises(TronError, match="fit"):
-        BlockDCT().fit([])
+        BlockDCT().calibrate([])
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from tron import seeds
-from tron.color import to_display
 from tron.errors import TronError
 from tron.neural.backbone import Backbone, BackboneConfig
 from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
@@ -20,6 +19,10 @@ def buffers(frames: int = 1, height: int = 16, width: int = 16, batch: int = 2, 
     return [torch.rand(batch, 3, frames, height, width, generator=generator) * 2 - 1 for _ in range(3)]
 
 
+def guided(pbr, irradiance) -> dict:
+    return {"pbr": pbr, "irradiance": irradiance}
+
+
 def awake(renderer: NeuralRenderer) -> NeuralRenderer:
     """A renderer whose output layer is not zero."""
     torch.manual_seed(1)
@@ -31,13 +34,13 @@ def awake(renderer: NeuralRenderer) -> NeuralRenderer:
 def test_a_new_renderer_returns_the_pbr_buffer(frames):
     pbr, irradiance, _ = buffers(frames)
     for renderer in (NeuralRenderer(RendererConfig(backbone=SMALL)), PixelMLP(PixelMLPConfig(width=8))):
-        torch.testing.assert_close(renderer(pbr, irradiance), pbr, atol=2e-6, rtol=0)
+        torch.testing.assert_close(renderer(guided(pbr, irradiance)), pbr, atol=2e-6, rtol=0)
 
 
 def test_skip_mean_starts_from_the_mean_of_the_buffers():
     pbr, irradiance, _ = buffers()
     renderer = NeuralRenderer(RendererConfig(fusion="average", skip="mean", backbone=SMALL))
-    torch.testing.assert_close(renderer(pbr, irradiance), 0.5 * (pbr + irradiance), atol=2e-6, rtol=0)
+    torch.testing.assert_close(renderer(guided(pbr, irradiance)), 0.5 * (pbr + irradiance), atol=2e-6, rtol=0)
 
 
 def test_averaging_keeps_the_pretrained_input_width_and_concatenation_doubles_it():
@@ -51,8 +54,8 @@ def test_averaging_keeps_the_pretrained_input_width_and_concatenation_doubles_it
 def test_any_size_goes_in_and_comes_out(size):
     pbr, irradiance, _ = buffers(1, *size)
     renderer = NeuralRenderer(RendererConfig(backbone=SMALL))
-    torch.testing.assert_close(renderer(pbr, irradiance), pbr, atol=2e-6, rtol=0)
-    assert awake(renderer)(pbr, irradiance).shape == pbr.shape
+    torch.testing.assert_close(renderer(guided(pbr, irradiance)), pbr, atol=2e-6, rtol=0)
+    assert awake(renderer)(guided(pbr, irradiance)).shape == pbr.shape
 
 
 def test_padding_does_not_reach_what_a_multiple_of_the_block_shows():
@@ -62,21 +65,21 @@ def test_padding_does_not_reach_what_a_multiple_of_the_block_shows():
         torch.nn.functional.pad(b[..., :14, :13], (0, 3, 0, 2, 0, 0), mode="replicate")
         for b in (pbr, irradiance)
     ]
-    cropped = renderer(pbr[..., :14, :13], irradiance[..., :14, :13])
-    torch.testing.assert_close(cropped, renderer(*padded)[..., :14, :13], atol=1e-6, rtol=0)
+    cropped = renderer(guided(pbr[..., :14, :13], irradiance[..., :14, :13]))
+    torch.testing.assert_close(cropped, renderer(guided(*padded))[..., :14, :13], atol=1e-6, rtol=0)
 
 
 def test_the_irradiance_matters_once_the_output_layer_is_awake():
     pbr, irradiance, other = buffers()
     renderer = awake(NeuralRenderer(RendererConfig(backbone=SMALL)))
-    assert (renderer(pbr, irradiance) - renderer(pbr, other)).abs().max() > 1e-2
+    assert (renderer(guided(pbr, irradiance)) - renderer(guided(pbr, other))).abs().max() > 1e-2
 
 
 @pytest.mark.parametrize("frames", [2, 3, 4, 6])
 def test_windows_that_are_not_1_plus_4n_are_refused(frames):
     pbr, irradiance, _ = buffers(frames)
     with pytest.raises(TronError, match=r"1 \+ 4n"):
-        NeuralRenderer(RendererConfig(backbone=SMALL))(pbr, irradiance)
+        NeuralRenderer(RendererConfig(backbone=SMALL))(guided(pbr, irradiance))
     with pytest.raises(TronError, match=r"1 \+ 4n"):
         NeuralRenderer(RendererConfig(window=frames, backbone=SMALL))
 
@@ -85,7 +88,7 @@ def test_buffers_of_different_shape_are_refused():
     pbr, irradiance, _ = buffers()
     for renderer in (NeuralRenderer(RendererConfig(backbone=SMALL)), PixelMLP()):
         with pytest.raises(TronError):
-            renderer(pbr, irradiance[..., :8])
+            renderer(guided(pbr, irradiance[..., :8]))
 
 
 def test_leaving_out_the_text_branch_changes_nothing():
@@ -118,7 +121,7 @@ def test_one_batch_can_be_learnt_by_heart(fusion):
     optimizer = torch.optim.AdamW(renderer.parameters(), lr=5e-3)
     first = last = (pbr - target).square().mean().item()
     for _ in range(150):
-        loss = (renderer(pbr, irradiance) - target).square().mean()
+        loss = (renderer(guided(pbr, irradiance)) - target).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -133,8 +136,8 @@ def test_a_pixel_mlp_sees_single_pixels():
     pbr, irradiance, _ = buffers(5, 8, 8)
     order = torch.randperm(8 * 8 * 5)
     shuffled = [b.flatten(2)[..., order].view_as(b) for b in (pbr, irradiance)]
-    expected = mlp(pbr, irradiance).flatten(2)[..., order].view_as(pbr)
-    torch.testing.assert_close(mlp(*shuffled), expected, atol=1e-6, rtol=0)
+    expected = mlp(guided(pbr, irradiance)).flatten(2)[..., order].view_as(pbr)
+    torch.testing.assert_close(mlp(guided(*shuffled)), expected, atol=1e-6, rtol=0)
     assert (expected - shuffled[0]).abs().max() > 0.01
 
 
@@ -149,25 +152,22 @@ def test_windows_give_every_frame_once_and_the_newest_last(frames, size):
 @pytest.mark.parametrize("size", [1, 5])
 def test_render_clip_is_the_forward_pass_of_each_window(size):
     random = seeds.generator(0, "clip")
-    pbr, irradiance = (random.random((7, 9, 10, 3), dtype=np.float32) * 2 for _ in range(2))
+    pbr, irradiance = (random.random((7, 9, 10, 3), dtype=np.float32) for _ in range(2))
     renderer = awake(NeuralRenderer(RendererConfig(window=size, backbone=SMALL)))
-    shown = render_clip(renderer, pbr, irradiance, exposure=0.5)
+    shown = render_clip(renderer, guided(pbr, irradiance))
     assert shown.shape == pbr.shape
     assert shown.dtype == np.float32
     assert shown.min() >= 0
     assert shown.max() <= 1
-    last = [
-        torch.from_numpy(to_display(b, 0.5))[7 - size :].movedim(-1, 0)[None].float() * 2 - 1
-        for b in (pbr, irradiance)
-    ]
-    expected = (renderer(*last)[0, :, -1].clamp(-1, 1) + 1) / 2
+    last = [torch.from_numpy(b)[7 - size :].movedim(-1, 0)[None] * 2 - 1 for b in (pbr, irradiance)]
+    expected = (renderer(guided(*last))[0, :, -1].clamp(-1, 1) + 1) / 2
     np.testing.assert_allclose(shown[-1], expected.detach().movedim(0, -1).numpy(), atol=1e-6)
 
 
 def test_rendering_changes_neither_mode_nor_weights():
     renderer = NeuralRenderer(RendererConfig(backbone=SMALL)).train()
     before = {k: v.clone() for k, v in renderer.state_dict().items()}
-    render_clip(renderer, np.ones((1, 8, 8, 3), np.float32), np.ones((1, 8, 8, 3), np.float32), 1.0)
+    render_clip(renderer, guided(*np.ones((2, 1, 8, 8, 3), np.float32)))
     assert renderer.training
     assert all(torch.equal(v, before[k]) for k, v in renderer.state_dict().items())
 
@@ -180,4 +180,26 @@ def test_render_clip_refuses_what_is_no_clip():
         ((0, 8, 8, 3), (0, 8, 8, 3)),
     ]:
         with pytest.raises(TronError):
-            render_clip(renderer, np.ones(pbr, np.float32), np.ones(irradiance, np.float32), 1.0)
+            render_clip(renderer, guided(np.ones(pbr, np.float32), np.ones(irradiance, np.float32)))
+
+
+@pytest.mark.parametrize("fusion", ["concat", "average"])
+def test_a_third_buffer_is_seen_and_a_missing_one_named(fusion):
+    names = ("pbr", "irradiance", "shadowed")
+    pbr, irradiance, shadowed = buffers()
+    given = {"pbr": pbr, "irradiance": irradiance, "shadowed": shadowed}
+    config = {"fusion": fusion, "guidance": names, "backbone": SMALL}
+    mlp = PixelMLP(PixelMLPConfig(width=8, guidance=names))
+    torch.nn.init.normal_(list(mlp.parameters())[-2])
+    for renderer in (awake(NeuralRenderer(RendererConfig.model_validate(config))), mlp):
+        changed = renderer(given | {"shadowed": -shadowed}) - renderer(given)
+        assert changed.abs().max() > 1e-3
+        with pytest.raises(TronError, match="needs the buffer 'shadowed'"):
+            renderer(guided(pbr, irradiance))
+
+
+@pytest.mark.parametrize("names", [("irradiance",), ("pbr", "pbr"), ("pbr", "depth"), ("pbr", "nonsense")])
+def test_guidance_that_no_network_can_have_is_refused(names):
+    for config in (RendererConfig, PixelMLPConfig):
+        with pytest.raises(ValueError, match="guidance is pbr and others of pbr, irradiance"):
+            config(guidance=names)

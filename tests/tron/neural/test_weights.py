@@ -11,10 +11,10 @@ from safetensors.torch import load_file, save_file
 
 from tron.errors import TronError
 from tron.neural.backbone import BackboneConfig, transformer
-from tron.neural.codecs import WanCodec
 from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
 from tron.neural.renderer import NeuralRenderer, RendererConfig
-from tron.neural.weights import load_cosmos, load_renderer, load_wan, save_renderer
+from tron.neural.wan import WanCodec, load_wan
+from tron.neural.weights import load_cosmos, load_renderer, restore_renderer, save_renderer
 
 SMALL = BackboneConfig(heads=2, head_dim=12, layers=2, adaln_lora_dim=8)
 WAN: dict[str, Any] = {"base_dim": 8, "num_res_blocks": 1}
@@ -46,7 +46,8 @@ RAW_NAMES = [
 
 def inputs(frames: int = 1, size: int = 32):
     generator = torch.Generator().manual_seed(0)
-    return [torch.rand(1, 3, frames, size, size, generator=generator) * 2 - 1 for _ in range(2)]
+    names = ("pbr", "irradiance")
+    return {name: torch.rand(1, 3, frames, size, size, generator=generator) * 2 - 1 for name in names}
 
 
 @pytest.mark.parametrize(
@@ -61,7 +62,7 @@ def test_a_saved_renderer_loads_again_bit_by_bit(tmp_path, renderer):
     for parameter in renderer.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
     if isinstance(renderer, NeuralRenderer):
-        renderer.codec.fit([torch.rand(1, 3, 5, 16, 16)])
+        renderer.calibrate([torch.rand(1, 3, 5, 16, 16)])
     save_renderer(tmp_path / "a.safetensors", renderer)
     save_renderer(tmp_path / "b.safetensors", renderer)
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
@@ -70,7 +71,27 @@ def test_a_saved_renderer_loads_again_bit_by_bit(tmp_path, renderer):
     assert again.config == renderer.config
     assert not again.training
     with torch.no_grad():
-        torch.testing.assert_close(again(*inputs()), renderer.eval()(*inputs()), atol=0, rtol=0)
+        torch.testing.assert_close(again(inputs()), renderer.eval()(inputs()), atol=0, rtol=0)
+
+
+def test_files_from_before_guidance_was_named_are_of_pbr_and_irradiance(tmp_path):
+    renderer = PixelMLP(PixelMLPConfig(width=8))
+    header: dict[str, Any] = {"format": "tron-renderer 1", "kind": "pixel_mlp"}
+    header["config"] = renderer.config.model_dump(mode="json", exclude={"guidance"})
+    save_file(renderer.state_dict(), tmp_path / "old.safetensors", {"tron": json.dumps(header)})
+    again = load_renderer(tmp_path / "old.safetensors")
+    assert again.config.guidance == ("pbr", "irradiance")
+    torch.testing.assert_close(again(inputs()), renderer(inputs()), atol=0, rtol=0)
+
+
+def test_weights_go_back_into_a_renderer_that_is_there(tmp_path):
+    saved, other = (PixelMLP(PixelMLPConfig(width=8)) for _ in range(2))
+    torch.nn.init.normal_(list(saved.parameters())[-2])
+    save_renderer(tmp_path / "a.safetensors", saved)
+    restore_renderer(tmp_path / "a.safetensors", other)
+    torch.testing.assert_close(other(inputs()), saved(inputs()), atol=0, rtol=0)
+    with pytest.raises(TronError, match="do not fit the model at"):
+        restore_renderer(tmp_path / "a.safetensors", PixelMLP(PixelMLPConfig(width=4)))
 
 
 def test_files_that_are_no_renderer_are_refused_in_one_line(tmp_path):
@@ -125,39 +146,39 @@ def test_the_published_formats_load_into_the_paper_s_step(published, source):
     folder, model, vae = published
     renderer = load_cosmos(folder / source, folder / "vae", {"backbone": COSMOS.model_dump()})
     assert renderer.config.fusion == "average"
-    pbr, irradiance = inputs(5)
+    given = inputs(5)
     codec = WanCodec(vae)
     with torch.no_grad():
-        z = 0.5 * (codec.encode(pbr) + codec.encode(irradiance))
+        z = 0.5 * (codec.encode(given["pbr"]) + codec.encode(given["irradiance"]))
         # Cosmos-Predict2's preconditioning at sigma 0.25: t = 0.2, x0 = 0.8 z - 0.2 net(0.8 z)
         fed = torch.cat([0.8 * z, torch.zeros_like(z[:, :1])], 1)
         net = model(
             fed, timestep=torch.tensor([0.2]), encoder_hidden_states=torch.zeros(1, 1, 16), return_dict=False
         )
         expected = codec.decode(0.8 * z - 0.2 * net[0])
-        torch.testing.assert_close(renderer(pbr, irradiance), expected, atol=1e-5, rtol=0)
+        torch.testing.assert_close(renderer(given), expected, atol=1e-5, rtol=0)
 
 
 def test_concatenation_of_published_weights_starts_from_the_pbr_latent(published):
     folder, model, vae = published
     config = {"backbone": COSMOS.model_dump(), "fusion": "concat", "skip": "pbr"}
     renderer = load_cosmos(folder / "model.pt", folder / "vae", config)
-    pbr, irradiance = inputs()
+    given = inputs()
     codec = WanCodec(vae)
     with torch.no_grad():
-        z = codec.encode(pbr)
+        z = codec.encode(given["pbr"])
         fed = torch.cat([0.8 * z, torch.zeros_like(z[:, :1])], 1)
         net = model(
             fed, timestep=torch.tensor([0.2]), encoder_hidden_states=torch.zeros(1, 1, 16), return_dict=False
         )
         expected = codec.decode(0.8 * z - 0.2 * net[0])
-        torch.testing.assert_close(renderer(pbr, irradiance), expected, atol=1e-5, rtol=0)
+        torch.testing.assert_close(renderer(given), expected, atol=1e-5, rtol=0)
 
 
 def test_gradients_reach_the_transformer_and_stop_at_the_text_branch(published):
     folder, _, _ = published
     renderer = load_cosmos(folder / "transformer", folder / "vae", {"backbone": COSMOS.model_dump()})
-    renderer(*inputs()).square().mean().backward()
+    renderer(inputs()).square().mean().backward()
     with_gradient = {name for name, p in renderer.named_parameters() if p.grad is not None}
     assert with_gradient == {name for name, p in renderer.named_parameters() if p.requires_grad}
     assert not any(".attn2." in name or ".norm2." in name or "vae" in name for name in with_gradient)
@@ -170,7 +191,7 @@ def test_a_trained_cosmos_renderer_is_saved_without_the_frozen_vae(published, tm
     assert all(name.startswith("backbone.") for name in load_file(tmp_path / "r.safetensors"))
     again = load_renderer(tmp_path / "r.safetensors", vae=folder / "vae")
     with torch.no_grad():
-        torch.testing.assert_close(again(*inputs()), renderer(*inputs()), atol=1e-5, rtol=0)
+        torch.testing.assert_close(again(inputs()), renderer(inputs()), atol=1e-5, rtol=0)
     with pytest.raises(TronError, match=r"tokenizer\.pth"):
         load_renderer(tmp_path / "r.safetensors")
 

@@ -1,0 +1,59 @@
+"""Samples as the network sees them: augmented in linear light, then display-encoded in [-1, 1]."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from train.settings import DataSettings
+from train.sources import TARGET, Sample
+from tron.color import agx, luminance
+from tron.errors import TronError
+
+
+def augmented(
+    sample: Sample, random: np.random.Generator, crop: int | None, settings: DataSettings
+) -> Sample:
+    """Crop, mirror and recolour a sample, its buffers all alike.
+
+    Colours are changed in linear light, where permuting and scaling channels of the light gives exactly the
+    permuted and scaled buffers: transport is linear and no channel knows another. A tint keeps the
+    luminance of white, so that the exposure rule still holds. Samples with display members keep their
+    colours.
+    """
+    height, width = sample.buffers[TARGET].shape[-2:]
+    rows, columns = slice(None), slice(None)
+    if crop is not None:
+        if crop > min(height, width):
+            raise TronError(
+                f"crop of {crop} pixels from frames of {width} x {height}", mend="make it smaller"
+            )
+        top, left = (
+            int(random.integers((side - crop) // settings.crop_alignment + 1)) * settings.crop_alignment
+            for side in (height, width)
+        )
+        rows, columns = slice(top, top + crop), slice(left, left + crop)
+    mirrored = random.random() < settings.flip
+    order = random.permutation(3) if random.random() < settings.permute_colors else np.arange(3)
+    tint = np.exp(settings.tint * random.standard_normal(3))
+    gains = torch.tensor(tint / luminance(tint), dtype=torch.float32).view(3, 1, 1, 1)
+    buffers = {}
+    for name, video in sample.buffers.items():
+        video = video[..., rows, columns]
+        video = video.flip(-1) if mirrored else video
+        buffers[name] = video if sample.display else video[order.tolist()] * gains
+    return Sample(buffers, sample.display)
+
+
+def display_encoded(samples: Sequence[Sample], name: str) -> Tensor:
+    """One buffer of a batch as the network sees it: AgX where it is linear, then [-1, 1], (B, 3, K, h, w)."""
+    batch = torch.stack([sample.buffers[name] for sample in samples])
+    linear = torch.tensor([name not in sample.display for sample in samples])
+    if linear.all():
+        batch = agx(batch, axis=1)
+    elif linear.any():
+        batch[linear] = agx(batch[linear], axis=1)
+    return batch * 2 - 1

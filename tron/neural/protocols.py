@@ -1,0 +1,89 @@
+"""What may be exchanged in the neural renderer: the network itself, and the codec inside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Protocol
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+from torch import Tensor, nn
+
+from tron.errors import TronError
+from tron.shards.schema import GUIDANCE, MEMBERS
+
+
+class Codec(Protocol):
+    """Video to latents and back, causally: the first frame stands alone.
+
+    Attributes:
+        latent_channels: C of a latent.
+        space_block: pixels that both sides of a frame must be multiples of.
+        temporal_factor: frames of each latent frame after the first.
+    """
+
+    latent_channels: int
+    space_block: int
+    temporal_factor: int
+
+    def encode(self, video: Tensor) -> Tensor:
+        """(B, 3, K, H, W) in [-1, 1] -> (B, C, 1 + (K - 1) / temporal_factor, h, w)."""
+        ...
+
+    def decode(self, latent: Tensor) -> Tensor:
+        """Latents -> (B, 3, K, H, W), not clamped."""
+        ...
+
+    def calibrate(self, videos: Iterable[Tensor]) -> None:
+        """Fit what is fitted before training, to videos (B, 3, K, H, W) in [-1, 1]."""
+        ...
+
+
+class GuidedConfig(BaseModel):
+    """What every renderer is told; it travels inside the weights file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    guidance: tuple[str, ...] = Field(
+        default=GUIDANCE, description="Members of a clip that are its input, in order; pbr among them."
+    )
+    window: int = Field(default=1, ge=1, description="Frames that render_clip hands over at once.")
+
+    @field_validator("guidance")
+    @classmethod
+    def _colours(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        colours = [name for name, member in MEMBERS.items() if member.color_space and member.clips == "all"]
+        if "pbr" not in names or len(set(names)) < len(names) or not set(names) <= set(colours):
+            raise ValueError(f"guidance is pbr and others of {', '.join(colours)}")
+        return names
+
+
+class Renderer(nn.Module):
+    """Network from guidance to the picture; `window` frames are 1 + temporal_factor * n."""
+
+    config: GuidedConfig
+    temporal_factor: int = 1
+
+    def forward(self, buffers: Mapping[str, Tensor]) -> Tensor:
+        """Guidance by name, each (B, 3, K, H, W) display-encoded in [-1, 1] -> the same shape, not clamped.
+
+        Names that `config.guidance` does not hold are left alone. Raises TronError where one of them is
+        missing, or shapes differ.
+        """
+        raise NotImplementedError
+
+    def hidden_matrices(self) -> list[nn.Parameter]:
+        """Weights between hidden layers, 2-D, which Muon may optimise."""
+        raise NotImplementedError
+
+    def calibrate(self, videos: Iterable[Tensor]) -> None:
+        """Fit what is fitted before training, to videos (B, 3, K, H, W) in [-1, 1]: nothing, unless told."""
+
+    def stacked(self, buffers: Mapping[str, Tensor]) -> list[Tensor]:
+        """The buffers of `config.guidance`, in order, checked."""
+        if missing := [name for name in self.config.guidance if name not in buffers]:
+            raise TronError(f"the renderer needs the buffer '{missing[0]}'", mend="give all its guidance")
+        videos = [buffers[name] for name in self.config.guidance]
+        shape = videos[0].shape
+        if len(shape) != 5 or shape[1] != 3 or any(video.shape != shape for video in videos):
+            raise TronError(f"buffers of shapes {', '.join(str(tuple(video.shape)) for video in videos)}")
+        return videos
