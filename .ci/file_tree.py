@@ -1,7 +1,7 @@
 """The file tree of README.md: one line a file, from the first line of each module's docstring.
 
-    python .ci/file_tree.py          # print it
-    python .ci/file_tree.py --write  # put it into README.md, between its two markers
+python .ci/file_tree.py          # print it
+python .ci/file_tree.py --write  # put it into README.md, between its two markers
 """
 
 import ast

@@ -14,9 +14,7 @@ from tron.shards.schema import GUIDANCE, Clip
 Region = Literal["foreground", "frame"]
 REGIONS: tuple[Region, Region] = ("foreground", "frame")
 MEMBERS = tuple(
-    dict.fromkeys(
-        (*GUIDANCE, "pbr", "irradiance", "rgb", "unshadowed", "shadowed", "mask", "foreground")
-    )
+    dict.fromkeys((*GUIDANCE, "pbr", "irradiance", "rgb", "unshadowed", "shadowed", "mask", "foreground"))
 )
 """Members of a clip that predictions and their scores need."""
 

@@ -299,7 +299,7 @@ def test_a_format_that_the_folder_does_not_have(tmp_path: Path, kind) -> None:
 
 
 def test_a_folder_of_images_that_is_absent(folder: Path) -> None:
-    assert "absent" in refusal(folder, LoadSettings(images="absent"))
+    assert "absent" in refusal(folder, LoadSettings(images=Path("absent")))
 
 
 def test_two_photos_without_poses(tmp_path: Path) -> None:

@@ -29,13 +29,13 @@ _SHOWN = 5
 
 @dataclass(frozen=True)
 class PosedPhoto:
-    """One photo as its file describes it; nothing is checked yet.
+    """Photo as its file describes it; nothing is checked yet.
 
     Attributes:
         name: as the file has it.
         path: the image, None if it was not found.
         camera_to_world: matrix to the capture's world, OpenCV camera axes; anything (4, 4) or (3, 4).
-        lens: gives the lens for a photo of this width and height.
+        lens: of the photo, or what gives the lens for a photo of this width and height.
         split: whether the file holds the photo out; None where it does not say.
         maps: more images of the same pixels, by field of :class:`View`, with what they encode.
         refused: why the photo cannot be used, if the file itself shows that.
@@ -44,7 +44,7 @@ class PosedPhoto:
     name: str
     path: Path | None
     camera_to_world: object
-    lens: Callable[[int, int], Lens]
+    lens: Lens | Callable[[int, int], Lens] | None
     split: Literal["train", "test"] | None = None
     maps: Mapping[str, tuple[Path, Decode]] = field(default_factory=dict)
     refused: str | None = None
@@ -52,7 +52,7 @@ class PosedPhoto:
 
 @dataclass(frozen=True)
 class PosedPhotos:
-    """What a file of poses says; fields as in :class:`Capture`.
+    """Photos and points of a file of poses; fields as in :class:`Capture`.
 
     Attributes:
         source: the file or folder, for messages.
@@ -99,7 +99,7 @@ def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> C
         except TronError as error:
             skipped[_free(name, skipped, views)] = error.what + (f": {error.mend}" if error.mend else "")
     _report(posed, skipped, len(views), lost_maps)
-    _tell_reduced(posed.source, len(views), reduced, settings)
+    _log_reduced(posed.source, len(views), reduced, settings)
     ordered = tuple(views[name] for name in sorted(views))
     up = (
         estimate_up([view.camera for view in ordered])
@@ -126,14 +126,14 @@ def _view(
     lost_maps: list[str],
     reduced: list[tuple[tuple[int, int], tuple[int, int]]],
 ) -> View:
-    if photo.refused:
-        raise TronError(photo.refused)
+    if photo.refused or photo.lens is None:
+        raise TronError(photo.refused or "no camera")
     if photo.path is None:
         raise TronError("image not found")
     world_to_camera = np.linalg.inv(rigid_pose(photo.camera_to_world))
     header = inspect_photo(photo.path)
     width, height = header.size(upright)
-    lens = photo.lens(width, height)
+    lens = photo.lens(width, height) if callable(photo.lens) else photo.lens
     # Halved sizes are rounded, so shapes may differ by a pixel.
     if abs(width * lens.height - height * lens.width) > max(
         _SHAPE_TOLERANCE * width * lens.height, lens.width, lens.height
@@ -235,7 +235,7 @@ def _report(posed: PosedPhotos, skipped: Mapping[str, str], usable: int, lost_ma
         log.warning("%s: %d maps left out, first %s", posed.source, len(lost_maps), lost_maps[0])
 
 
-def _tell_reduced(
+def _log_reduced(
     source: Path, count: int, reduced: list[tuple[tuple[int, int], tuple[int, int]]], settings: PhotoSettings
 ) -> None:
     """Say what ``max_side`` cost; ``downscale`` is asked for, so that it needs no line."""

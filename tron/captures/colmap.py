@@ -23,7 +23,7 @@ _MIN_TRACK = 3
 
 
 def model_folder(path: Path) -> Path | None:
-    """Where a capture's folder keeps its sparse model: ``sparse/0`` or its like, or the folder itself."""
+    """Folder of a capture's sparse model, ``sparse/0`` or its like or the capture's own, if there is any."""
     for name in _FOLDERS:
         folder = path / name
         if any((folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
@@ -51,14 +51,9 @@ def read_colmap(path: Path, settings: PhotoSettings) -> PosedPhotos:
         root = path.parent.parent if path.parent.name == "sparse" else path.parent
     found = ImageFolder(root, settings.images or ("." if _beside(root, model) else None))
     prefix = "" if found.images is not None else "images/"
-    posed = posed_by(model)
     photos = []
-    for name, camera_to_world, lens in posed:
-        try:
-            image = found.find(prefix + name)
-        except TronError as error:
-            raise TronError(error.what, folder, error.mend) from error
-        photos.append(PosedPhoto(name, image, camera_to_world, lambda _w, _h, lens=lens: lens))
+    for name, camera_to_world, lens in posed_by(model):
+        photos.append(PosedPhoto(name, found.find(prefix + name, folder), camera_to_world, lens))
     points, colors = points_of(model)
     used = {photo.path for photo in photos}
     folders = {each.parent for each in used if each is not None}
@@ -91,12 +86,8 @@ def posed_by(model: pycolmap.Reconstruction) -> list[tuple[str, np.ndarray, Lens
     for image in sorted(model.images.values(), key=lambda each: each.name):
         if not image.has_pose:
             continue
-        world_to_camera = np.eye(4)
-        world_to_camera[:3] = image.cam_from_world().matrix()
-        with np.errstate(all="ignore"):
-            camera_to_world = np.eye(4)
-            camera_to_world[:3, :3] = world_to_camera[:3, :3].T
-            camera_to_world[:3, 3] = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
+        camera_to_world = np.eye(4)
+        camera_to_world[:3] = image.cam_from_world().inverse().matrix()
         posed.append((image.name, camera_to_world, _lens(model.cameras[image.camera_id])))
     return posed
 

@@ -31,7 +31,8 @@ class Lens:
 
     Attributes:
         model: COLMAP's name of the model, such as ``PINHOLE`` or ``OPENCV``.
-        width, height: image size that the parameters belong to; images at hand may have another.
+        width: of the image that the parameters belong to; images at hand may have another.
+        height: likewise.
         parameters: in COLMAP's order: focal lengths and principal point in pixels, then distortion.
 
     Raises:
@@ -82,7 +83,7 @@ class Lens:
         return Camera(fx * sx, fy * sy, cx * sx, cy * sy, width, height, world_to_camera)
 
     def undistortion_maps(self, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-        """Where the undistorted image of this size finds its pixels in the stored one of the same size.
+        """Places in the stored image that the pixels of the undistorted one, of the same size, come from.
 
         Returns:
             (height, width, 2) int16 and (height, width) uint16: fixed-point maps for ``cv2.remap``.

@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
@@ -30,7 +30,7 @@ from tron.captures.capture import Capture
 from tron.captures.points import encode_points, read_points
 from tron.captures.settings import PhotoSettings
 from tron.captures.transforms import read_json
-from tron.captures.view import ColorSpace, View
+from tron.captures.view import MAPS, ColorSpace, View
 from tron.errors import TronError
 from tron.images import MAX_SIDE, encode_exr, encode_png, read_image
 from tron.storage import atomic_folder
@@ -43,21 +43,9 @@ LARGEST_JSON = 2**28
 MapName = Literal["normal", "base_color", "roughness", "metallic", "irradiance", "depth", "sky_mask"]
 
 
-class _Stored(NamedTuple):
-    suffix: str
-    channels: int
-    half: bool = True
-
-
-_MAPS: dict[MapName, _Stored] = {
-    "normal": _Stored(".exr", 3),
-    "base_color": _Stored(".exr", 3),
-    "roughness": _Stored(".exr", 1),
-    "metallic": _Stored(".exr", 1),
-    "irradiance": _Stored(".exr", 3),
-    "depth": _Stored(".exr", 1, half=False),  # half a millimetre at a metre is too coarse for surfaces
-    "sky_mask": _Stored(".png", 1),
-}
+_MAPS: tuple[MapName, ...] = get_args(MapName)
+_IN_8_BITS = ("sky_mask",)
+_IN_FLOAT32 = ("depth",)  # half a millimetre at a metre is too coarse for surfaces
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 
@@ -104,7 +92,7 @@ class _ViewEntry(BaseModel):
 
 
 class _Tron(BaseModel):
-    """What nerfstudio's format has no word for; ``views`` is keyed by the frames' file_path."""
+    """Object of what nerfstudio's format has no word for; ``views`` is keyed by the frames' file_path."""
 
     model_config = ConfigDict(allow_inf_nan=False, extra="forbid")
 
@@ -277,12 +265,13 @@ def _write_view(folder: Path, view: View, stem: str) -> tuple[str, _ViewEntry]:
     file_path = f"images/{stem}{'.png' if view.space == 'display' else '.exr'}"
     _write(folder / file_path, encode_png(image) if view.space == "display" else encode_exr(image))
     maps: dict[MapName, str] = {}
-    for name, stored in _MAPS.items():
-        if view.has(name):
-            maps[name] = f"{name}/{stem}{stored.suffix}"
-            pixels = view.read(name)
-            data = encode_png(pixels) if stored.suffix == ".png" else encode_exr(pixels, stored.half)
-            _write(folder / maps[name], data)
+    for name in _MAPS:
+        if not view.has(name):
+            continue
+        pixels, in_8_bits = view.read(name), name in _IN_8_BITS
+        maps[name] = f"{name}/{stem}{'.png' if in_8_bits else '.exr'}"
+        data = encode_png(pixels) if in_8_bits else encode_exr(pixels, half=name not in _IN_FLOAT32)
+        _write(folder / maps[name], data)
     return file_path, _ViewEntry(name=view.name, alpha=alpha, maps=maps)
 
 
@@ -372,7 +361,7 @@ def _located(path: Path) -> Iterator[None]:
 def _view(folder: Path, transforms: _Transforms, frame: _Frame, entry: _ViewEntry) -> View:
     image = _existing(folder, frame.file_path)
     maps = {
-        name: partial(read_image, _existing(folder, inner), _MAPS[name].channels)
+        name: partial(read_image, _existing(folder, inner), MAPS[name].channels)
         for name, inner in entry.maps.items()
     }
     return View(

@@ -1,4 +1,4 @@
-"""Where the image is that a file of poses names."""
+"""Images by the names that files of poses give them."""
 
 from __future__ import annotations
 
@@ -35,13 +35,16 @@ class ImageFolder:
         self._stems: dict[Path, dict[str, list[Path]]] = {}
         self._substitutes: dict[str, str] = {}
 
-    def find(self, name: str) -> Path | None:
-        """The file of an image, or None if it is absent.
+    def find(self, name: str, where: str | Path) -> Path | None:
+        """File of an image that ``where`` names, or None if it is absent.
 
         Raises:
-            TronError: the name is absolute or leads out of the folder.
+            TronError: the name is absolute or leads out of the folder; it was found in ``where``.
         """
-        parts = relative_parts(name)
+        try:
+            parts = relative_parts(name)
+        except TronError as error:
+            raise TronError(error.what, where, error.mend) from error
         if self.images is not None:
             return self._file(self.images, parts) or self._file(self.images, parts[1:])
         return self._file(self.root, (self._present(parts[0]), *parts[1:]))

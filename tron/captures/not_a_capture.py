@@ -1,4 +1,4 @@
-"""What people give in place of a capture: what each of these files is, and where it belongs."""
+"""Files that people give in place of a capture, and where each of them belongs."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def refusal(path: Path, captures: str) -> TronError:
 
 
 def _kind(file: Path) -> tuple[str, str] | None:
-    """What a file is by its name, and what to do with it; None of an unknown kind."""
+    """Kind of a file by its name, and what to do with it; None of an unknown kind."""
     suffix = file.suffix.lower()
     if suffix in VIDEOS:
         return "a video", f"{photos_of_video(file)}; then capture=photos matching=sequential"

@@ -1,4 +1,4 @@
-"""Which way is up, from how a scene was photographed."""
+"""Up direction of a scene, from how it was photographed."""
 
 from __future__ import annotations
 

@@ -36,10 +36,11 @@ Decode = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class PhotoHeader:
-    """What a photo's file says of itself.
+    """Header of a photo's file.
 
     Attributes:
-        width, height: pixels as stored, before any turning.
+        width: pixels as stored, before any turning.
+        height: likewise.
         alpha: whether it has transparency.
         orientation: EXIF's 1 to 8; 1 is upright as stored.
     """
@@ -119,7 +120,7 @@ class PhotoCache:
         return int(self._kept.currsize)
 
     def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """What is kept under ``key``: an array or a tuple of arrays, made now if it is not there."""
+        """An array or a tuple of arrays that is kept under ``key``, made now if it is not there."""
         with self._lock:
             if key in self._kept:
                 return self._kept[key]
@@ -239,7 +240,7 @@ def _with_hidden_grey(path: Path, pixels: np.ndarray) -> np.ndarray:
 
 
 def _steps_of_grey(path: Path) -> int:
-    """What one step of a grey PNG of 1, 2 or 4 bits is of 8, to which it is decoded; else 1."""
+    """Steps of 8 bits in one step of a grey PNG of 1, 2 or 4 bits, which is decoded to 8; else 1."""
     with open(path, "rb") as file:
         bits = file.read(_BIT_DEPTH_AT + 1)[_BIT_DEPTH_AT]
     return 255 // (2**bits - 1) if bits < 8 else 1

@@ -1,6 +1,8 @@
-"""What a user may say of the photos of any capture before it is loaded."""
+"""Settings of the photos of any capture."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 from pydantic import BaseModel, Field, field_validator
@@ -9,7 +11,7 @@ from pydantic import BaseModel, Field, field_validator
 class PhotoSettings(BaseModel):
     """Photos of a capture: where they lie, how large they are made, which are held out."""
 
-    images: str | None = Field(
+    images: Path | None = Field(
         default=None,
         description="folder of the photos, from the capture's folder or absolute, where it is not the one "
         "that the poses name",

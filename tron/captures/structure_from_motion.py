@@ -113,7 +113,7 @@ def pose_photos(path: Path, settings: PosingSettings, progress: Progress = log.i
     posed = []
     for copy, camera_to_world, lens in posed_by(model):
         name = copies[copy]
-        posed.append(PosedPhoto(name, by_name.pop(name), camera_to_world, lambda _w, _h, lens=lens: lens))
+        posed.append(PosedPhoto(name, by_name.pop(name), camera_to_world, lens))
     skipped |= dict.fromkeys(by_name, "not posed: too few features in common with the others")
     points, colors = points_of(model)
     return PosedPhotos(folder, posed, points, colors, skipped=skipped, upright=True)
@@ -136,19 +136,20 @@ def _posed_copies(
         progress(f"poses of {len(photos)} photos taken from {workspace}")
         return kept["copies"]
     record.unlink(missing_ok=True)
-    for name in ("images", "models", "sparse"):
-        shutil.rmtree(workspace / name, ignore_errors=True)
-    for stale in workspace.glob("database.db*"):
-        stale.unlink()
+    _clear(workspace, "images", "models", "sparse")
     progress(f"copying {len(photos)} photos for feature extraction")
     copies = _copy(photos, workspace / "images", settings.feature_side)
     _map(workspace, len(photos), settings, progress)
     write_atomic(record, json.dumps({"wanted": wanted, "copies": copies}, indent=1))
-    shutil.rmtree(workspace / "images", ignore_errors=True)
-    shutil.rmtree(workspace / "models", ignore_errors=True)
+    _clear(workspace, "images", "models")
+    return copies
+
+
+def _clear(workspace: Path, *folders: str) -> None:
+    for name in folders:
+        shutil.rmtree(workspace / name, ignore_errors=True)
     for stale in workspace.glob("database.db*"):
         stale.unlink()
-    return copies
 
 
 def _kept(record: Path) -> dict[str, Any]:

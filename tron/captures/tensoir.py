@@ -75,19 +75,12 @@ def _photo(folder: Path, light: str) -> PosedPhoto:
         if (folder / name).is_file()
     }
     split = "train" if folder.name.startswith("train") else "test"
-    pose, lens, refused = None, _no_lens, None
+    pose, lens, refused = None, None, None
     try:
-        pose, focal_lens = _camera(folder / "metadata.json")
-
-        def lens(_width: int, _height: int) -> Lens:
-            return focal_lens
+        pose, lens = _camera(folder / "metadata.json")
     except TronError as error:
         refused = error.what
     return PosedPhoto(folder.name, image, pose, lens, split, maps, refused)
-
-
-def _no_lens(_width: int, _height: int) -> Lens:
-    raise TronError("no camera")
 
 
 def _camera(path: Path) -> tuple[np.ndarray, Lens]:

@@ -65,7 +65,6 @@ def read_transforms(path: Path, settings: PhotoSettings) -> PosedPhotos:
     root = path if path.is_dir() else path.parent
     folder = ImageFolder(root, settings.images)
     photos: list[PosedPhoto] = []
-    skipped: dict[str, str] = {}
     points = colors = None
     transform = np.eye(4)
     for file, split in files:
@@ -83,7 +82,7 @@ def read_transforms(path: Path, settings: PhotoSettings) -> PosedPhotos:
             points, colors = _points(root, meta["ply_file_path"], transform)
     if points is None and "applied_transform" in meta:
         points, colors = _colmap_points(root, photos)
-    return PosedPhotos(path, photos, points, colors, transform, skipped)
+    return PosedPhotos(path, photos, points, colors, transform)
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -118,10 +117,7 @@ def _photo(
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
         raise TronError("frame has no file_path", where)
     name, matrix = frame["file_path"], frame.get("transform_matrix")
-    try:
-        image = folder.find(name)
-    except TronError as error:
-        raise TronError(error.what, where, error.mend) from error
+    image = folder.find(name, where)
     camera_to_world, refused = None, None
     try:
         camera_to_world = transform @ opengl_to_opencv(rigid_pose(matrix))
@@ -183,7 +179,7 @@ def _number(data: Mapping[str, Any], key: str, default: float) -> float:
 
 
 def _listed_splits(meta: Mapping[str, Any], file: Path) -> dict[tuple[str, ...], str]:
-    """Which split nerfstudio's lists put an image into; empty where there are none."""
+    """Split of each image that nerfstudio's lists name; empty where there are none."""
     listed: dict[tuple[str, ...], str] = {}
     for split in _SPLITS:
         names = meta.get(f"{split}_filenames") or []

@@ -1,10 +1,10 @@
-"""One posed view: a camera, what it saw, and maps that say more about the same pixels."""
+"""Posed view: a camera, its image, and maps that say more about the same pixels."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -16,25 +16,33 @@ ColorSpace = Literal["linear", "display"]
 Pixels = np.ndarray | Callable[[], np.ndarray]
 """An array, or what reads one when it is asked for, such as ``partial(read_image, path)``."""
 
-_CHANNELS = {
-    "image": 3,
-    "normal": 3,
-    "base_color": 3,
-    "roughness": 1,
-    "metallic": 1,
-    "irradiance": 3,
-    "mask": 1,
-    "sky_mask": 1,
-    "depth": 1,
+
+class Map(NamedTuple):
+    """Channels of a view's image or map, and the range of its values."""
+
+    channels: int
+    low: float = 0.0
+    high: float = np.inf
+
+
+MAPS = {
+    "image": Map(3),
+    "normal": Map(3, low=-np.inf),
+    "base_color": Map(3, high=1.0),
+    "roughness": Map(1, high=1.0),
+    "metallic": Map(1, high=1.0),
+    "irradiance": Map(3),
+    "mask": Map(1, high=1.0),
+    "sky_mask": Map(1, high=1.0),
+    "depth": Map(1),
 }
-_NOT_NEGATIVE = ("image", "base_color", "roughness", "metallic", "irradiance", "mask", "sky_mask", "depth")
-_AT_MOST_ONE = ("base_color", "roughness", "metallic", "mask", "sky_mask")
+"""The image and the maps of a view by the names of its fields; those of display images are at most 1."""
 _TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What one camera saw. Arrays are checked at once, readers when they are read.
+    """View of one camera. Arrays are checked at once, readers when they are read.
 
     Attributes:
         name: unique within a capture.
@@ -43,7 +51,8 @@ class View:
         space: "display", photos as stored and AgX pictures, or "linear", scene-referred radiance.
         normal: (H, W, 3) world, unit, or zero where nothing is known.
         base_color: (H, W, 3) linear, in [0, 1].
-        roughness, metallic: (H, W) in [0, 1].
+        roughness: (H, W) in [0, 1].
+        metallic: (H, W) in [0, 1].
         irradiance: (H, W, 3) linear irradiance / pi, the radiance of a white diffuse surface.
         mask: (H, W) in [0, 1], 1 on the subject; the alpha of an RGBA picture, whose colours are straight.
         sky_mask: (H, W) in [0, 1], 1 on the sky.
@@ -75,7 +84,7 @@ class View:
             raise TronError(
                 f"colour space of an image is {self.space!r}", f"view {self.name}", "say linear or display"
             )
-        for field in _CHANNELS:
+        for field in MAPS:
             value = getattr(self, field)
             if value is not None and not callable(value):
                 object.__setattr__(self, field, self._checked(field, np.asarray(value)))
@@ -98,7 +107,9 @@ class View:
     def _checked(self, field: str, value: np.ndarray) -> np.ndarray:
         where, height, width = f"view {self.name}", self.camera.height, self.camera.width
         pixels = value
-        channels = _CHANNELS[field]
+        channels, low, high = MAPS[field]
+        if field == "image" and self.space == "display":
+            high = 1.0
         if channels == 1 and pixels.shape == (height, width, 1):
             pixels = pixels[..., 0]
         expected = (height, width) if channels == 1 else (height, width, channels)
@@ -108,8 +119,6 @@ class View:
         bad = ~np.isfinite(pixels)
         if bad.any():
             raise TronError(f"{field} holds {bad.sum()} values that are NaN or infinite", where)
-        low = 0.0 if field in _NOT_NEGATIVE else -np.inf
-        high = 1.0 if field in _AT_MOST_ONE or (field == "image" and self.space == "display") else np.inf
         if pixels.min() < low - _TOLERANCE or pixels.max() > high + _TOLERANCE:
             raise TronError(
                 f"{field} ranges from {pixels.min():.4g} to {pixels.max():.4g}",

@@ -76,9 +76,9 @@ class Curve:
         with torch.no_grad():
             surfels = stage.surfels.rendered()
             for view in self.views:
-                seen = render(
+                rendered = render(
                     surfels, view.camera, kernel_degree=stage.kernel_degree, sh_degree=stage.sh_degree
                 )
-                buffers = {name: seen[name].cpu().numpy() for name in ("rgb", "opacity")}
+                buffers = {name: rendered[name].cpu().numpy() for name in ("rgb", "opacity")}
                 scores.append(capped_psnr(picture(buffers, behind), wanted_picture(view, behind)))
         return float(np.mean(scores))

@@ -46,7 +46,7 @@ class DensityControl:
         self.seen = torch.zeros(len(surfels), device=surfels.device)
 
     def after(self, surfels: LearntSurfels, step: int) -> None:
-        """What is due once ``step`` (from 1) is done."""
+        """Add, remove and reset surfels as is due once ``step`` (from 1) is done."""
         s = self.settings
         if s.start < step < s.end and step % s.every == 0:
             self._add(surfels, step)
@@ -67,10 +67,10 @@ class DensityControl:
     def _add(self, surfels: LearntSurfels, step: int) -> None:
         s = self.settings
         pull = self.total / self.seen.clamp(min=1)
-        room = max(s.most - len(surfels), 0)
+        capacity = max(s.most - len(surfels), 0)
         chosen = torch.nonzero(pull > s.threshold)[:, 0]
-        if len(chosen) > room:  # a clone and a split both add one
-            chosen = chosen[torch.topk(pull[chosen], room, sorted=False).indices].sort().values
+        if len(chosen) > capacity:  # a clone and a split both add one
+            chosen = chosen[torch.topk(pull[chosen], capacity, sorted=False).indices].sort().values
         if len(chosen):
             scale = surfels["log_scales"].detach()[chosen].exp().amax(dim=1)
             small = scale <= s.clone_below * self.extent

@@ -11,7 +11,7 @@ from tron.gaussians.scene import GaussianScene
 from tron.reconstruction.settings import InitialSettings
 from tron.seeds import generator
 
-# Fractions of the distance to neighbouring surfels, measured for each kernel (guidance.md).
+# Fractions of the distance to neighbouring surfels, measured for each kernel (docs/conventions.md, 6).
 _SCALES = {2: 0.6, 4: 0.4}
 _SUBJECT = 0.5
 # A few pixels a surfel say all that surfels of that size can hold.

@@ -1,8 +1,8 @@
-"""How good a reconstruction is: its pictures against photos, its maps against the truth where there is any.
+"""Scores of a reconstruction: its pictures against photos, its maps against the truth where there is any.
 
 Pictures are compared over the whole frame, behind the subject the background that was trained with, and on
 the subject where views have masks. Base color is known up to a factor: it is scaled for each view and channel
-by least squares on the subject, as the TRON paper does (facts.md section 1).
+by least squares on the subject, as the TRON paper does (docs/conventions.md, 11).
 """
 
 from __future__ import annotations
@@ -24,8 +24,12 @@ _LPIPS_LEAST_SIDE = 16
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Figures of one view by name, such as ``psnr`` (dB), ``ssim``, ``normal_mae_deg``; what is not there
-    could not be measured.
+    """Figures of one view.
+
+    Attributes:
+        view: its name.
+        figures: by name, such as ``psnr`` (dB), ``ssim``, ``normal_mae_deg``; those that are not there could
+            not be measured.
     """
 
     view: str
@@ -46,8 +50,11 @@ def score_views(
     view has the truth, over its subject. All are finite: a PSNR is at most PSNR_CAP of :mod:`tron.metrics`.
 
     Args:
-        tracer: the surfels. views: display images. background: as trained with; random is judged on black.
-        lpips: the metric, where its weights are given. track: shows progress.
+        tracer: the surfels.
+        views: display images.
+        background: as trained with; random is judged on black.
+        lpips: the metric, where its weights are given.
+        track: shows progress.
     """
     scores = []
     for view in track(views, "scores"):
@@ -83,17 +90,17 @@ def wanted_picture(view: View, behind: float = 0.0) -> np.ndarray:
 def _figures(
     buffers: Mapping[str, np.ndarray], view: View, behind: float, lpips: LPIPS | None
 ) -> Iterator[tuple[str, float]]:
-    seen, wanted = picture(buffers, behind), wanted_picture(view, behind)
-    yield "psnr", capped_psnr(seen, wanted)
-    if min(seen.shape[:2]) >= 6:
-        yield "ssim", ssim(seen, wanted)
-    if lpips is not None and min(seen.shape[:2]) >= _LPIPS_LEAST_SIDE:
-        yield "lpips", _distance(lpips, seen, wanted)
-    subject = view.read("mask") > _SUBJECT if view.has("mask") else np.ones(seen.shape[:2], bool)
+    rendered, wanted = picture(buffers, behind), wanted_picture(view, behind)
+    yield "psnr", capped_psnr(rendered, wanted)
+    if min(rendered.shape[:2]) >= 6:
+        yield "ssim", ssim(rendered, wanted)
+    if lpips is not None and min(rendered.shape[:2]) >= _LPIPS_LEAST_SIDE:
+        yield "lpips", _distance(lpips, rendered, wanted)
+    subject = view.read("mask") > _SUBJECT if view.has("mask") else np.ones(rendered.shape[:2], bool)
     if not subject.any():
         return
     if view.has("mask"):
-        yield "psnr_subject", capped_psnr(seen, wanted, subject)
+        yield "psnr_subject", capped_psnr(rendered, wanted, subject)
     if view.has("normal"):
         normal = view.read("normal")
         known = subject & normal.any(axis=-1)
@@ -108,9 +115,9 @@ def _figures(
             yield f"{name}_mae", float(np.abs(buffers[name] - view.read(name))[subject].mean())
 
 
-def _distance(lpips: LPIPS, seen: np.ndarray, wanted: np.ndarray) -> float:
+def _distance(lpips: LPIPS, rendered: np.ndarray, wanted: np.ndarray) -> float:
     import torch
 
-    pair = [torch.from_numpy(2 * np.float32(image) - 1).movedim(-1, 0)[None] for image in (seen, wanted)]
+    pair = [torch.from_numpy(2 * np.float32(image) - 1).movedim(-1, 0)[None] for image in (rendered, wanted)]
     with torch.no_grad():
         return float(lpips(*pair)[0])

@@ -1,8 +1,8 @@
 """Surfels that are nearly right, made better: every parameter answers to true G-buffers, none is added.
 
-Surfels made straight from G-buffers blur what is smaller than they are and overhang silhouettes by a pixel
-(guidance.md). Some steps of the reconstruction's own optimiser, on normals, materials and masks at once,
-place and shape them to what the views show.
+Surfels made straight from G-buffers blur what is smaller than they are and overhang silhouettes by a pixel.
+Some steps of the reconstruction's own optimiser, on normals, materials and masks at once, place and shape
+them to what the views show.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ def refine(
         views: with normal, base_color, roughness, metallic and mask, taken along pixel centres.
         settings: steps, rates, weights.
         seed: root of the views' order.
-        device: torch's, that of the active Mitsuba variant. watch: called after each step.
+        device: torch's, that of the active Mitsuba variant.
+        watch: called after each step.
     """
     if not settings.steps:
         return scene

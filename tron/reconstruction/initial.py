@@ -44,7 +44,7 @@ def extent_of(views: Sequence[View]) -> float:
 
 
 def source_of(capture: Capture, settings: InitialSettings) -> Source:
-    """Where the first surfels of a capture come from.
+    """Source of a capture's first surfels.
 
     Raises:
         TronError: the source asked for is not there.
@@ -65,8 +65,10 @@ def initial_surfels(
     """Surfels to begin with.
 
     Args:
-        capture: its training views and points. settings: from what. seed: root of all random numbers.
-        most: surfels; of more points as many are drawn.
+        capture: its training views and points.
+        settings: source, number and kernel.
+        seed: root of all random numbers.
+        most: maximum number of surfels; of more points as many are drawn.
 
     Raises:
         TronError: the source asked for is not there.
@@ -98,7 +100,11 @@ def surfels_at(
     from those that have it in their picture: neighbours then face all sides that anyone sees.
 
     Args:
-        points: (N, 3) world. colors: (N, 3) display, or None for grey.
+        points: (N, 3) world.
+        colors: (N, 3) display, or None for grey.
+        capture: its training views.
+        settings: opacity and kernel.
+        seed: root of the draw.
     """
     count = len(points)
     if count < 4:
@@ -164,7 +170,7 @@ def random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
 def _coverage(
     points: np.ndarray, views: Sequence[View], masks: Sequence[np.ndarray | None]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How many views have each point in their picture, and in how many of those it is on the subject."""
+    """Numbers of views, (N,) each, that have a point in their picture, and that have it on the subject."""
     seen, inside = np.zeros(len(points), int), np.zeros(len(points), int)
     for view, mask in zip(views, masks):
         column, row, within = _pixels(view, points)
@@ -184,8 +190,9 @@ def _pixels(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def _focus(camera_to_world: Sequence[np.ndarray]) -> tuple[np.ndarray, bool]:
-    """(3,) the point nearest to all optical axes, least squares; in front of the cameras if they diverge. And
-    whether they do.
+    """(3,) the point nearest to all optical axes, and whether these diverge.
+
+    Nearest by least squares; in front of the cameras if the axes diverge.
     """
     matrices = np.stack(camera_to_world)
     origins, axes = matrices[:, :3, 3], matrices[:, :3, 2]

@@ -1,5 +1,4 @@
-"""Log radiance as a sum of cubemaps, each twice as fine as the one before: what is seen coarsely moves
-first.
+"""Log radiance as a sum of cubemaps, each twice as fine as the one before: coarse patches move first.
 
 Irradiance hardly depends on single texels, and Adam gives each of them steps of the same size whatever its
 gradient, so texels fitted one by one end as noise. In a sum of levels, every texel of a coarse level moves

@@ -29,7 +29,8 @@ def photometric_loss(
     """(1 - w) L1 + w (1 - SSIM) of two images, a scalar; differentiable in ``predicted``.
 
     Args:
-        predicted, target: (H, W, 3) or (H, W) display values.
+        predicted: (H, W, 3) or (H, W) display values.
+        target: likewise.
         mask: (H, W) bool, the pixels that count; elsewhere the prediction is taken to be right, so that
             SSIM's window, which reaches over the mask's edge, meets no foreign contrast there.
         ssim_weight: w. Images smaller than SSIM's half window (6 pixels) are compared by L1 alone.
@@ -50,8 +51,9 @@ def photometric_loss(
 
 
 def structural_similarity(predicted: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity of each pixel and channel, (H, W, C), for values in [0, 1]; images are continued
-    by reflection. Differentiable in ``predicted`` alone.
+    """Structural similarity of each pixel and channel, (H, W, C), for values in [0, 1].
+
+    Images are continued by reflection. Differentiable in ``predicted`` alone.
     """
     return _StructuralSimilarity.apply(predicted, target)  # pyright: ignore[reportReturnType]
 

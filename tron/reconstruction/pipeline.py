@@ -19,13 +19,13 @@ import numpy as np
 from tron.captures import Capture, View
 from tron.color import srgb_to_linear
 from tron.errors import TronError
+from tron.gaussians.fields import MATERIALS
 from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
 from tron.priors import Prior, Track, apply_prior, untracked
 from tron.reconstruction.checkpoint import Checkpoint, save_checkpoint
 from tron.reconstruction.initial import extent_of, initial_surfels, source_of
 from tron.reconstruction.settings import ReconstructionSettings
-from tron.reconstruction.supervision import MATERIALS
 from tron.reconstruction.surfels import LearntSurfels
 from tron.reconstruction.training import Plan, Stage, StepSummary, Watch, materials_plan, radiance_plan
 from tron.tracing import SurfelTracer
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What stages 1 and 2 made.
+    """Result of stages 1 and 2.
 
     Attributes:
         scene: surfels with radiance and materials.
@@ -83,13 +83,13 @@ def reconstruct(
     linear = [view.name for view in views if view.space != "display"]
     if linear:
         raise TronError(
-            "surfels are learnt from display values and an image is linear", f"view {linear[0]}", "develop it"
+            "surfels are learnt from display values and an image is linear",
+            f"view {linear[0]}",
+            "encode it for display",
         )
     run = _Run(settings, made_with(capture, prior, settings), checkpoint, device, watch)
     extent = extent_of(views)
-    source = source_of(
-        capture, settings.initial
-    )  # one that is not there is told before a prior works for hours
+    source = source_of(capture, settings.initial)  # a lacking one is told before a prior works for hours
     radiance = settings.radiance.scaled(settings.steps_scaler, placed=source == "depth")
     wanted = [] if radiance.normal == 0 else ["normal"]
     taught = apply_prior(capture, prior, fields=wanted, track=track) if wanted else capture
@@ -117,7 +117,7 @@ def reconstruct(
 
 
 def made_with(capture: Capture, prior: Prior, settings: ReconstructionSettings) -> dict[str, Any]:
-    """What a reconstruction is a function of, as plain values: a checkpoint of other values is refused."""
+    """All that a reconstruction is a function of, as plain values: a checkpoint of others is refused."""
     digest = hashlib.sha256()
     for view in capture.train_views:
         digest.update(repr((view.name, view.camera.to_dict())).encode())
@@ -142,7 +142,7 @@ class _Run:
         self.started = time.perf_counter()
         if self.found is not None:
             self.found.require(self.values)
-            log.info("going on from step %d of stage %s", self.found.step, self.found.stage)
+            log.info("resuming from step %d of stage %s", self.found.step, self.found.stage)
 
     def seconds(self) -> float:
         """Spent on the run, interrupted parts included."""
@@ -152,11 +152,7 @@ class _Run:
         """Run a stage to its end, from the checkpoint if that lies in it or behind it."""
         degree, seed = self.settings.initial.kernel_degree, self.settings.seed
         found = self.found
-        if (
-            found is not None
-            and found.stage != plan.name
-            and _ORDER.index(found.stage) > _ORDER.index(plan.name)
-        ):
+        if found is not None and _ORDER.index(found.stage) > _ORDER.index(plan.name):
             # A later stage is under way: this one's surfels are those of the checkpoint.
             return found.surfels(plan.rates, self.device)
         if found is not None and found.stage == plan.name:
@@ -184,6 +180,6 @@ _ORDER = ("radiance", "materials")
 
 
 def _with_baked_color(scene: GaussianScene) -> GaussianScene:
-    """Base color begins as the radiance of all directions, decoded from sRGB (facts.md 4b)."""
+    """Base color begins as the radiance of all directions, decoded from sRGB."""
     baked = srgb_to_linear(np.clip(SH_C0 * scene.sh[:, 0] + 0.5, 0, 1))
     return replace(scene, base_color=baked.astype(np.float32))

@@ -1,7 +1,7 @@
-"""What a reconstruction can be told: its beginning, and stages 1 (radiance), 2 (materials) and 3 (light).
+"""Settings of a reconstruction: its beginning, and stages 1 (radiance), 2 (materials) and 3 (light).
 
-The defaults are those of 3DGRT, which the paper inherits (facts.md section 2): 30,000 steps, then 7,000. A
-machine without a GPU takes fewer of them: ``scaled`` shortens every schedule at once, as gsplat's
+The schedule is that of 3DGRT, which the paper inherits (docs/conventions.md, 15): 30,000 steps, then 7,000.
+A machine without a GPU takes fewer of them: ``scaled`` shortens every schedule at once, as gsplat's
 ``steps_scaler`` does, and lets surfels move and turn faster, since otherwise they would not arrive.
 """
 
@@ -20,13 +20,13 @@ _RATES_OF_PLACE = ("position_rate", "position_rate_final", "rotation_rate")
 
 
 class Settings(BaseModel):
-    """What all settings here share: they do not change, and know no other keys and no infinity."""
+    """Base of all settings here: they do not change, and know no other keys and no infinity."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class InitialSettings(Settings):
-    """Where the first surfels come from."""
+    """First surfels of a capture."""
 
     source: Literal["auto", "points", "depth", "random"] = Field(
         default="auto",
@@ -43,7 +43,7 @@ class InitialSettings(Settings):
 
 
 class DensitySettings(Settings):
-    """Where surfels are added and taken away, after "3D Gaussian Splatting" (Kerbl et al. 2023)."""
+    """Surfels added and removed, after "3D Gaussian Splatting" (Kerbl et al. 2023)."""
 
     start: int = Field(default=500, ge=0, description="First step after which surfels are added.")
     end: int = Field(default=22_000, ge=0, description="Step from which surfels are left alone.")

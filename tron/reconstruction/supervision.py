@@ -1,4 +1,4 @@
-"""What a view asks of the surfels, and how far they are from it: the loss of stages 1 and 2.
+"""Loss of stages 1 and 2: how far the surfels are from what a view shows.
 
 Both stages compare with the same loss, (1 - w) L1 + w (1 - SSIM); they differ in which maps are compared and
 in which parameters may answer. Colours are composited over a background, the photo's by its mask, the
@@ -16,16 +16,16 @@ import torch
 from torch import Tensor
 
 from tron.captures import View
+from tron.gaussians.fields import MATERIALS
 from tron.reconstruction.losses import SSIM_WEIGHT, photometric_loss
 
-MATERIALS = ("base_color", "roughness", "metallic")
 _COMPARED = ("image", "normal", *MATERIALS)
 _SURFACE = 0.5
 
 
 @dataclass(frozen=True)
 class Weights:
-    """What each map counts in the loss; maps that a view lacks count nothing."""
+    """Weight of each map in the loss; maps that a view lacks count nothing."""
 
     rgb: float = 0.0
     normal: float = 0.0
@@ -47,29 +47,23 @@ def targets(view: View, wanted: tuple[str, ...], device: str | torch.device) -> 
 
 
 def loss_of(
-    seen: Mapping[str, Tensor], target: Mapping[str, Tensor], weights: Weights, background: np.ndarray
+    rendered: Mapping[str, Tensor], target: Mapping[str, Tensor], weights: Weights, background: np.ndarray
 ) -> Tensor:
     """The weighted loss of one view, a scalar.
 
     Args:
-        seen: images of :func:`tron.tracing.torch_bridge.render`.
+        rendered: images of :func:`tron.tracing.torch_bridge.render`.
         target: the view's maps (see :func:`targets`).
         weights: what counts.
         background: (3,) display colour behind the surfels.
     """
-    opacity, mask = seen["opacity"], target.get("mask")
+    opacity, mask = rendered["opacity"], target.get("mask")
     total = opacity.new_zeros(())
     if weights.rgb and "image" in target:
-        behind = torch.tensor(background, dtype=torch.float32, device=opacity.device)
-        rgb = seen["rgb"]
-        wanted = target["image"]
-        if mask is not None:
-            wanted = mask[..., None] * wanted + (1 - mask[..., None]) * behind
-        if background.any():
-            rgb = rgb + (1 - opacity[..., None]) * behind
+        rgb, wanted = pictures(rendered, target, background)
         total = total + weights.rgb * photometric_loss(rgb, wanted, ssim_weight=weights.ssim)
     if weights.normal and "normal" in target:
-        total = total + weights.normal * _normal_loss(seen, target, weights.ssim)
+        total = total + weights.normal * _normal_loss(rendered, target, weights.ssim)
     if weights.mask and mask is not None:
         total = total + weights.mask * (opacity - mask).abs().mean()
     surface = opacity.detach() > _SURFACE
@@ -77,17 +71,30 @@ def loss_of(
         surface = surface & (mask > _SURFACE)
     for name in MATERIALS:
         if getattr(weights, name) and name in target:
-            loss = photometric_loss(seen[name], target[name], surface, weights.ssim)
+            loss = photometric_loss(rendered[name], target[name], surface, weights.ssim)
             total = total + getattr(weights, name) * loss
     return total
 
 
-def _normal_loss(seen: Mapping[str, Tensor], target: Mapping[str, Tensor], ssim: float) -> Tensor:
+def pictures(
+    rendered: Mapping[str, Tensor], target: Mapping[str, Tensor], background: np.ndarray
+) -> tuple[Tensor, Tensor]:
+    """The surfels' picture and the view's, (H, W, 3) each, over the same background (3,)."""
+    rgb, wanted, mask = rendered["rgb"], target["image"], target.get("mask")
+    behind = torch.tensor(background, dtype=torch.float32, device=rgb.device)
+    if mask is not None:
+        wanted = mask[..., None] * wanted + (1 - mask[..., None]) * behind
+    if background.any():
+        rgb = rgb + (1 - rendered["opacity"][..., None]) * behind
+    return rgb, wanted
+
+
+def _normal_loss(rendered: Mapping[str, Tensor], target: Mapping[str, Tensor], ssim: float) -> Tensor:
     """Normals as colours, (n + 1) / 2; pixels whose normal nobody knows do not count."""
     wanted = target["normal"]
     known = (wanted * wanted).sum(-1) > 0.25
     if "mask" in target:  # beside the subject is no surface, whatever a prior sees there
         outside = target["mask"] < _SURFACE
         wanted, known = torch.where(outside[..., None], 0, wanted), known | outside
-    normal = seen["normal"] * seen["opacity"][..., None]
+    normal = rendered["normal"] * rendered["opacity"][..., None]
     return photometric_loss(0.5 * normal + 0.5, 0.5 * wanted + 0.5, known, ssim)

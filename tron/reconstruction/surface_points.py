@@ -18,7 +18,7 @@ from tron.seeds import generator
 from tron.shading.guidance import ViewTracer
 
 OPAQUE = 0.5
-"""Less opaque pixels have no median depth, hence no surface point (facts.md 4b)."""
+"""Less opaque pixels have no median depth, hence no surface point (docs/conventions.md, 7)."""
 SKY = 0.5
 """Where the sky mask is at least this, the pixel is sky."""
 
@@ -35,7 +35,7 @@ def surface_mask(view: View, opacity: np.ndarray) -> np.ndarray:
 
 @dataclass
 class PointBatch:
-    """What :class:`tron.shading.transport.Transport` reads of a G-buffer, and the wanted irradiance / pi.
+    """G-buffer for :class:`tron.shading.transport.Transport`, with the wanted irradiance / pi.
 
     ``width`` makes a square of the points, whose neighbours then share out the strata of their rays.
     """

@@ -64,7 +64,7 @@ class LearntSurfels:
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors are."""
+        """Device of the tensors."""
         return self.tensors["means"].device
 
     def rendered(self) -> dict[str, Tensor]:

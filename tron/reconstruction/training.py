@@ -20,7 +20,7 @@ from tron.captures import View
 from tron.errors import TronError
 from tron.reconstruction.density import DensityControl
 from tron.reconstruction.settings import MaterialSettings, RadianceSettings
-from tron.reconstruction.supervision import MATERIALS, Weights, loss_of, targets
+from tron.reconstruction.supervision import MATERIALS, Weights, loss_of, pictures, targets
 from tron.reconstruction.surfels import LearntSurfels
 from tron.seeds import generator
 from tron.tracing.torch_bridge import render
@@ -31,11 +31,14 @@ _PSNR_MEMORY = 0.98
 
 @dataclass(frozen=True)
 class StepSummary:
-    """Where a stage stands after a step.
+    """State of a stage after a step.
 
     Attributes:
-        stage: its name. step, steps: done, and in all.
-        loss: of the step. psnr: of recent steps' pictures, dB, NaN where the stage compares none.
+        stage: its name.
+        step: steps done.
+        steps: in all.
+        loss: of the step.
+        psnr: of recent steps' pictures, dB, NaN where the stage compares none.
         surfels: their number.
         seconds: wall time of the step.
     """
@@ -55,14 +58,16 @@ Watch = Callable[[StepSummary, "Stage"], None]
 
 @dataclass(frozen=True)
 class Plan:
-    """One stage, as the loop sees it.
+    """Stage as the loop sees it.
 
     Attributes:
         name: of the stage; part of the seeds' paths.
         steps: how many.
-        weights: what is compared. rates: Adam's rate of what is learnt.
+        weights: of what is compared.
+        rates: Adam's rate of what is learnt.
         final_rates: rates at the last step, reached log-linearly; the others stay.
-        sh_degree, sh_every: highest degree, and steps after which one more is learnt.
+        sh_degree: highest degree of the harmonics.
+        sh_every: steps after which one more degree is learnt.
         background: behind the surfels.
         density: makes and removes surfels; None leaves their number.
     """
@@ -162,11 +167,11 @@ class Stage:
         view = self._view(self.step)
         target = targets(view, plan.weights.wanted(), surfels.device)
         self._set_rates()
-        seen = render(
+        rendered = render(
             surfels.rendered(), view.camera, kernel_degree=self.kernel_degree, sh_degree=self.sh_degree
         )
         background = self._background()
-        loss = loss_of(seen, target, plan.weights, background)
+        loss = loss_of(rendered, target, plan.weights, background)
         if not loss.requires_grad:
             raise TronError(
                 f"stage {plan.name} has nothing to learn from view {view.name}",
@@ -183,7 +188,7 @@ class Stage:
         if plan.density is not None:
             plan.density.after(surfels, number)
         self.step = number
-        self._remember(seen, target, background)
+        self._remember(rendered, target, background)
         seconds = time.perf_counter() - began
         return StepSummary(plan.name, number, plan.steps, value, self.psnr, len(surfels), seconds)
 
@@ -212,8 +217,10 @@ class Stage:
             self.surfels.set_rate(name, first * (final / first) ** done)
 
     def _guard(self, loss: float, view: View) -> None:
-        """Refuse what is not finite before any parameter is changed, and name the cause before its effects:
-        parameters (surfels whose place is NaN are seen by no ray and spoil no loss), gradients, the loss.
+        """Refuse what is not finite before any parameter is changed.
+
+        The cause is named before its effects: parameters (surfels whose place is NaN are hit by no ray and
+        spoil no loss), gradients, the loss.
         """
         found = {name: self.surfels[name].detach() for name in self.plan.rates}
         gradients = {f"gradient of {name}": self.surfels[name].grad for name in self.plan.rates}
@@ -233,16 +240,14 @@ class Stage:
             "lower the learning rates, or go on from the last checkpoint with another seed",
         )
 
-    def _remember(self, seen: dict[str, Tensor], target: dict[str, Tensor], background: np.ndarray) -> None:
+    def _remember(
+        self, rendered: dict[str, Tensor], target: dict[str, Tensor], background: np.ndarray
+    ) -> None:
         """Running mean of the squared error of the pictures, as PSNR."""
         if not self.plan.weights.rgb or "image" not in target:
             return
         with torch.no_grad():
-            behind = torch.tensor(background, dtype=torch.float32, device=self.surfels.device)
-            picture = seen["rgb"] + (1 - seen["opacity"][..., None]) * behind
-            wanted = target["image"]
-            if "mask" in target:
-                wanted = target["mask"][..., None] * wanted + (1 - target["mask"][..., None]) * behind
+            picture, wanted = pictures(rendered, target, background)
             now = -10 * float(torch.log10(((picture - wanted) ** 2).mean().clamp(min=1e-12)))
         before = self.psnr
         self.psnr = now if np.isnan(before) else _PSNR_MEMORY * before + (1 - _PSNR_MEMORY) * now

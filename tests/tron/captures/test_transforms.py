@@ -124,7 +124,7 @@ def test_images_of_mixed_sizes_have_cameras_of_their_own(
 def test_another_folder_of_images_can_be_named(tmp_path: Path, photos, write, capture: dict) -> None:
     write.photos(tmp_path / "elsewhere", photos, size=(48, 32))
     for images in ("elsewhere", str(tmp_path / "elsewhere")):
-        camera = load_capture(tmp_path, LoadSettings(images=images)).views[0].camera
+        camera = load_capture(tmp_path, LoadSettings(images=Path(images))).views[0].camera
         assert (camera.width, camera.height) == (48, 32)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -64,6 +65,7 @@ def studio() -> EnvironmentMap:
 def captured(tracer: SurfelTracer) -> Callable[..., Capture]:
     """A capture of the spheres: photos under a light; the prior is its irradiance times ``prior_scale``."""
 
+    @cache
     def capture(light: EnvironmentMap, views: int = 8, prior_scale: float = 1.0) -> Capture:
         lighting, exposure = Lighting(light, 64), light.exposure()
         made = []
