@@ -116,7 +116,7 @@ def _changes(capture: Path, recorded: dict[str, FileEntry]) -> Iterator[str]:
 
 
 def _unreadable(capture: Path) -> Iterator[str]:
-    """What TRON itself cannot read: the capture, or the picture or a map of a view."""
+    """Parts that TRON itself cannot read: the capture, or the picture or a map of a view."""
     try:
         views = read_capture_folder(capture).views
     except TronError as error:

@@ -1,4 +1,4 @@
-"""Where objects stand: at rest on the floor z = 0, apart from each other, or not at all.
+"""Places of objects: at rest on the floor z = 0, apart from each other, or not at all.
 
 Objects are settled one by one and moved about until nothing touches; collisions are exact tests of convex
 hulls (FCL). Tries are bounded: an object that finds no place is left out and named.

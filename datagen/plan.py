@@ -1,4 +1,4 @@
-"""What has to be made: the work list, what it takes, and what of it is there already.
+"""Plan of a dataset: the work list, what it takes, and what of it is there already.
 
 One scene is one piece of work. Its shards are its own and numbered by its index, so where a clip lands
 depends on the plan alone: not on who makes it, in which order, or what failed. A scene is finished when its
@@ -73,7 +73,7 @@ class Figures(BaseModel):
 
 
 class Refinement(BaseModel):
-    """What a number of steps made of a scene's surfels."""
+    """Gain of a number of steps on a scene's surfels."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -134,7 +134,7 @@ def find_sources(settings: Settings) -> Sources:
 
 
 def scene_folder(output: Path, name: str) -> Path:
-    """Where a scene's specification, surfels and record lie."""
+    """Folder of a scene's specification, surfels and record."""
     return output / "scenes" / name
 
 

@@ -50,7 +50,7 @@ class FloorSpec(Spec):
 
 
 class CameraSpec(Spec):
-    """Where the cameras go; angles in degrees, lengths in world units.
+    """Paths of the cameras; angles in degrees, lengths in world units.
 
     The spiral is what surfels are made from; the oscillating path is what is path-traced. ``first_frame``
     says, for each light, where on the path its clip begins.

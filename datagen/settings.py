@@ -264,7 +264,7 @@ class Settings(_Model):
         return ["hdri"] if self.environments is not None else list(PROCEDURAL)
 
     def recipe(self) -> dict[str, Any]:
-        """What decides a scene's content, as plain values: not where it goes, who makes it or how many."""
+        """Recipe of a scene's content, as plain values: not where it goes, who makes it or how many."""
         values = self.model_dump(mode="json", exclude=OUTSIDE)
         for name in SPLITS:
             if name in self.used_splits():
@@ -274,7 +274,7 @@ class Settings(_Model):
         return values
 
     def capture_recipe(self) -> dict[str, Any]:
-        """What decides a capture's content, as plain values."""
+        """Recipe of a capture's content, as plain values."""
         return self.model_dump(mode="json", include=CAPTURED)
 
 

@@ -116,7 +116,7 @@ def make_clip(
 
 
 def first_bad_value(frames: Sequence[Frame]) -> str | None:
-    """Where a clip is not finite, in words, or None: such a clip must not reach a shard."""
+    """First place where a clip is not finite, in words, or None: such a clip must not reach a shard."""
     for i, frame in enumerate(frames):
         for member, image in frame.items():
             bad = int((~np.isfinite(image)).sum())

@@ -48,7 +48,7 @@ class StageFailed(Exception):
 
 
 class StageRecord(BaseModel):
-    """What stages.json knows of a stage: its commands as typed, seconds over all attempts, whether it is
+    """Record of a stage in stages.json: its commands as typed, seconds over all attempts, whether it is
     done.
     """
 
@@ -236,7 +236,7 @@ class _Running:
         self._thread.join(PATIENCE)
 
     def words(self) -> str:
-        """What the child said was wrong: the last line that its command speaks in, else its last line."""
+        """The child's own word of what was wrong: the last line that its command speaks in, else its last line."""
         spoken = [line for line in self.last if line.startswith(f"{self.child.script}: ")]
         return (spoken or list(self.last) or [""])[-1]
 

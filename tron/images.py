@@ -240,7 +240,7 @@ def _encode_hdr(image: np.ndarray) -> bytes:
 
 
 def _another_kind(wanted: str, data: bytes) -> TronError:
-    """What to say of a file that is not what its suffix says."""
+    """The error for a file that is not what its suffix says."""
     if not data.strip():
         return TronError(f"not {wanted}: the file is empty", mend=_AGAIN)
     start = data[:256].removeprefix(b"\xef\xbb\xbf").lstrip().lower()

@@ -1,4 +1,4 @@
-"""Where the surfels' shadows are wrong: light that leaks into shadow, and lit surfaces that are darkened.
+"""Errors of the surfels' shadows: light that leaks into shadow, and lit surfaces that are darkened.
 
 The definitions are those of the study in the design notes (guidance). What is in shadow and what is lit is
 the path tracer's to say: its irradiance with shadows over its own without, so that an error of the surfels'

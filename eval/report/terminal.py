@@ -1,4 +1,4 @@
-"""What the command prints at its end: figures on the foreground and the full frame, then the path."""
+"""Printed end of the command: figures on the foreground and the full frame, then the path."""
 
 from __future__ import annotations
 

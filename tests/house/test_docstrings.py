@@ -48,7 +48,7 @@ def test_the_checks_catch():
     assert docstrings('"""One."""\ndef f():\n    """Two."""') == [(1, "One."), (2, "Two.")]
 
 
-ROOMS_TO_COME = pytest.mark.xfail(strict=False, reason="branches of issue 10 that mend theirs are not merged yet")
+ROOMS_TO_COME = pytest.mark.xfail(strict=False, reason="not all rooms of issue 10 are merged yet")
 
 
 @ROOMS_TO_COME
