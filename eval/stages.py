@@ -236,7 +236,7 @@ class _Running:
         self._thread.join(PATIENCE)
 
     def words(self) -> str:
-        """The child's own word of what was wrong: the last line that its command speaks in, else its last line."""
+        """The child's own word of what was wrong: the last line of its command, else its last line."""
         spoken = [line for line in self.last if line.startswith(f"{self.child.script}: ")]
         return (spoken or list(self.last) or [""])[-1]
 
