@@ -22,9 +22,10 @@ UNPUBLISHED = re.compile(
 
 def docstrings(source: str) -> list[tuple[int, str]]:
     """(line, text) of every docstring."""
-    kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, kinds)]
-    found = ((getattr(node, "lineno", 1), ast.get_docstring(node)) for node in nodes)
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            found.append((getattr(node, "lineno", 1), ast.get_docstring(node)))
     return [(line, text) for line, text in found if text]
 
 
