@@ -1,4 +1,4 @@
-"""Printed end of the command: figures on the foreground and the full frame, then the path."""
+"""Results on the terminal: figures on the foreground and the full frame, targets, and the report's path."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def print_results(results: Results, targets: Sequence[Target], report: Path) -> 
             others.add_row(row.metric, with_interval(row), "", "")
     for target in targets:
         if results.find(target.metric) is None:
-            others.add_row(target.metric, "—", f"{target.bound} {target.value:g}", "[red]not measured[/]")
+            others.add_row(target.metric, "—", bound(target, ""), "[red]not measured[/]")
     for table in (pairs, others):
         if table.row_count:
             console.print(table)
