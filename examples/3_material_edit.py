@@ -14,7 +14,8 @@ from tron.shading import Estimation, Lighting, render_guidance
 from tron.tracing import SurfelTracer
 
 chosen = arguments(__doc__, "3_material_edit.jpg")
-scene, lighting = load_scene(chosen), Lighting(load_light(chosen))
+scene, light = load_scene(chosen), load_light(chosen)
+lighting = Lighting(light)
 base_color, roughness, metallic = scene.base_color.copy(), scene.roughness.copy(), scene.metallic.copy()
 if chosen.scene is None:
     ring, ball = scene.object_id == RING, scene.object_id == BALL
@@ -29,5 +30,5 @@ pictures = [
     render_guidance(SurfelTracer(each), camera, lighting, Estimation(rays=64)).shadowed
     for each in (scene, edited)
 ]
-write_image(chosen.output, to_display(np.hstack(pictures), lighting.environment.exposure()))
+write_image(chosen.output, to_display(np.hstack(pictures), light.exposure()))
 print(f"before and after: {chosen.output}")

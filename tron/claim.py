@@ -53,7 +53,7 @@ def require_same(
 
 
 def read_recipe(path: Path) -> dict[str, Any] | None:
-    """What was kept of a recipe as YAML or JSON; None where there is no such file.
+    """Recipe that was kept as YAML or JSON; None where there is no such file.
 
     Raises:
         TronError: the file is unreadable or holds no mapping.

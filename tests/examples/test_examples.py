@@ -60,7 +60,7 @@ def test_1_relight_shows_the_users_scene_in_the_users_light(tmp_path: Path):
 def load_stage() -> tuple[GaussianScene, EnvironmentMap]:
     sys.path.insert(0, str(EXAMPLES))
     try:
-        from stage import make_light, make_scene
+        from stage import make_light, make_scene  # pyright: ignore[reportMissingImports]
     finally:
         sys.path.remove(str(EXAMPLES))
     return make_scene(0.08), make_light()

@@ -94,7 +94,9 @@ class FrameFolder:
         """Write a contact sheet: a column for each of a few frames evenly spread, a row for each picture."""
         columns = np.linspace(0, frames, min(frames, _SHEET_COLUMNS), endpoint=False).astype(int)
         width = min(read_image(self.path(0, names[0], "png")).shape[1], _SHEET_WIDTH)
-        rows = [[thumbnail(self.row(index, [name]), width) for index in columns] for name in names]
+        rows = [
+            [np.asarray(thumbnail(self.row(index, [name]), width)) for index in columns] for name in names
+        ]
         sheet = np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0)
         write_image(path, sheet.astype(np.float32) / 255)
 

@@ -42,7 +42,7 @@ class Settings(ReconstructionSettings, CaptureSettings, Paths):
     )
 
     def of_loading(self) -> LoadSettings:
-        """How the capture is read; poses that are found are kept in the output folder."""
+        """Reading of the capture; poses that are found are kept in the output folder."""
         return LoadSettings(
             **{name: getattr(self, name) for name in CaptureSettings.model_fields},
             workspace=self.output_dir / "structure_from_motion",

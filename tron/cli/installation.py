@@ -102,7 +102,7 @@ class ConsoleScript:
         except TronError as error:
             print(f"{self.name}: {error}", file=sys.stderr)
             sys.exit(2)
-        self.load()(arguments)
+        sys.exit(self.load()(arguments))
 
 
 relight = ConsoleScript("tron-relight", "tron.apps.relight")

@@ -1,4 +1,4 @@
-"""Where the time of a command goes: in Python by cProfile, in kernels by Dr.Jit's own history."""
+"""Profile of a command: in Python by cProfile, in kernels by Dr.Jit's own history."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ LINE_SECONDS = 20.0
 
 
 class Progress:
-    """How much of a long work is done; a context manager.
+    """Bar of a long work; a context manager.
 
     Args:
         label: names the work.
