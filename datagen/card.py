@@ -127,7 +127,7 @@ def card_text(
 
 
 def _refinement(found: Sequence[Refinement]) -> list[str]:
-    """What fitting the surfels to their G-buffers gained, means over scenes."""
+    """Gain of fitting the surfels to their G-buffers, means over scenes."""
     if not found:
         return []
     before, after = (

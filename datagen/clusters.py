@@ -149,7 +149,7 @@ def worker_count(client: Any) -> int:
 
 
 def logs_folder(settings: Settings) -> Path:
-    """Where workers write their logs."""
+    """Folder of the workers' logs."""
     return settings.output_dir / "logs"
 
 

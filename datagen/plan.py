@@ -1,4 +1,4 @@
-"""What has to be made: the work list, what it takes, and what of it is there already.
+"""The plan of a dataset: the list of scenes, the space they take, and which of them are there already.
 
 One scene is one piece of work. Its shards are its own and numbered by its index, so where a clip lands
 depends on the plan alone: not on who makes it, in which order, or what failed. A scene is finished when its
@@ -61,8 +61,10 @@ class Quarantined(BaseModel):
 class Figures(BaseModel):
     """Surfels against the true G-buffers of views that they were not fitted to.
 
-    base_color_psnr in dB, linear, each view and channel scaled by least squares; normal_mae_deg in degrees;
-    silhouette_error is the mean of |opacity - mask|.
+    Attributes:
+        base_color_psnr: dB, linear, each view and channel scaled by least squares.
+        normal_mae_deg: mean angle in degrees.
+        silhouette_error: mean of |opacity - mask|.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -73,7 +75,7 @@ class Figures(BaseModel):
 
 
 class Refinement(BaseModel):
-    """What a number of steps made of a scene's surfels."""
+    """Gain of a scene's surfels by a number of optimisation steps."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -134,7 +136,7 @@ def find_sources(settings: Settings) -> Sources:
 
 
 def scene_folder(output: Path, name: str) -> Path:
-    """Where a scene's specification, surfels and record lie."""
+    """Folder of a scene's specification, surfels and record."""
     return output / "scenes" / name
 
 

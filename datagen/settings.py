@@ -121,7 +121,7 @@ class CaptureSettings(_Model):
 
 
 class Settings(_Model):
-    """Everything that ``tron-datagen`` can be told."""
+    """Settings of ``tron-datagen``."""
 
     output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
     mode: Literal["make", "validate", "captures"] = Field(
@@ -282,7 +282,7 @@ class Settings(_Model):
         return ["hdri"] if self.environments is not None else list(PROCEDURAL)
 
     def recipe(self) -> dict[str, Any]:
-        """What decides a scene's content, as plain values: not where it goes, who makes it or how many."""
+        """Keys that decide a scene's content, plain values: not where it goes, who makes it or how many."""
         values = self.model_dump(mode="json", exclude=OUTSIDE)
         for name in SPLITS:
             if name in self.used_splits():
@@ -292,7 +292,7 @@ class Settings(_Model):
         return values
 
     def capture_recipe(self) -> dict[str, Any]:
-        """What decides a capture's content, as plain values."""
+        """Keys that decide a capture's content, as plain values."""
         return self.model_dump(mode="json", include=CAPTURED)
 
 

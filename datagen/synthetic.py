@@ -1,6 +1,4 @@
-"""The synthetic source: a scene's specification becomes surfels and, light by light, a clip of training
-pairs.
-"""
+"""Surfels of a synthetic scene and, light by light, its clips of training pairs."""
 
 from __future__ import annotations
 
@@ -115,7 +113,7 @@ def make_clip(
 
 
 def first_bad_value(frames: Sequence[Frame]) -> str | None:
-    """Where a clip is not finite, in words, or None: such a clip must not reach a shard."""
+    """First place where a clip is not finite, in words, or None: such a clip must not reach a shard."""
     for i, frame in enumerate(frames):
         for member, image in frame.items():
             bad = int((~np.isfinite(image)).sum())
@@ -135,9 +133,7 @@ def _reference(
     direct: DirectIrradiance,
     environment: EnvironmentMap,
 ) -> Frame:
-    """The reference members of one frame; behind the scene irradiance shows the environment, as guidance
-    does.
-    """
+    """Reference members of one frame; behind the scene irradiance shows the environment, as guidance does."""
     seen = truth.valid[..., None]
     behind = environment.lookup(camera.rays())
     light = {"irradiance": direct.shadowed, "unshadowed": direct.unshadowed}

@@ -83,7 +83,7 @@ class Target(BaseModel):
     what: str = Field(default="", description="the metric in words, for the report")
 
     def margin(self, measured: float) -> float:
-        """How far ``measured`` is on the good side of the bound, in its unit; negative when missed."""
+        """Distance of ``measured`` to the bound, in its unit; negative when the bound is missed."""
         return measured - self.value if self.bound == "at least" else self.value - measured
 
     def reached(self, measured: float) -> bool:

@@ -15,7 +15,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -48,18 +48,15 @@ class StageFailed(Exception):
 
 
 class StageRecord(BaseModel):
-    """What stages.json knows of a stage: its commands as typed, seconds over all attempts, whether it is
-    done.
-    """
+    """One stage in stages.json."""
 
     model_config = ConfigDict(extra="forbid")
 
-    commands: list[list[str]]
-    seconds: NonNegativeFloat = 0.0
+    commands: list[list[str]] = Field(description="as typed")
+    seconds: NonNegativeFloat = Field(default=0.0, description="wall time of all attempts")
     attempts: int = Field(default=0, ge=0)
     finished: bool = False
-    commit: str = ""
-    """Of the checkout that finished it, with a + where that had changes; empty outside a checkout."""
+    commit: str = Field(default="", description="checkout() of the code that finished it")
 
 
 class StageFile(BaseModel):
@@ -72,7 +69,14 @@ class StageFile(BaseModel):
 
 @dataclass(frozen=True)
 class Child:
-    """One command: its label in the log, a script, its arguments, additions to its environment."""
+    """One command.
+
+    Attributes:
+        label: before each of its lines in the log.
+        script: console script.
+        arguments: of the script.
+        environment: additions to its environment.
+    """
 
     label: str
     script: str
@@ -117,14 +121,14 @@ class Stages:
                 self.path.parent,
                 "choose another output_dir, or delete this one to start afresh",
             )
-        if record.finished:
-            _say(name, f"done before, {record.seconds:.0f} s")
-            if record.commit != checkout():
-                made_by = record.commit or "unknown"
-                _say(name, f"made by another commit ({made_by}): delete {self.path.parent} to redo it")
+        if not record.finished:
+            with self.timed(name, commands):
+                run_together(children)
             return record.seconds
-        with self.timed(name, commands):
-            run_together(children)
+        _say(name, f"done before, {record.seconds:.0f} s")
+        if record.commit != checkout():
+            made_by = record.commit or "unknown"
+            _say(name, f"made by another commit ({made_by}): delete {self.path.parent} to redo it")
         return record.seconds
 
     @contextmanager
@@ -164,21 +168,19 @@ def run_together(children: Sequence[Child]) -> None:
         StageFailed: the first child, in the order given, that failed by itself.
     """
     paths = [script_path(child.script) for child in children]
-    running: list[_Running] = []
-    with _termination_unwinds():
-        try:
-            for child, path in zip(children, paths):
-                running.append(_Running(child, path))
-            while any(each.process.poll() is None for each in running):
-                if any(each.process.poll() not in (None, 0) for each in running):
-                    break
-                time.sleep(0.05)
-            failed = next((each for each in running if each.process.poll() not in (None, 0)), None)
-        finally:
-            for each in running:
-                each.end()
-    if failed is not None:
-        raise StageFailed(" ".join(failed.child.typed), failed.process.returncode, failed.words())
+    with _termination_unwinds(), ExitStack() as running:
+        started = [running.enter_context(_running(child, path)) for child, path in zip(children, paths)]
+        while True:
+            codes = [process.poll() for process, _ in started]
+            for child, code, (_, last) in zip(children, codes, started):
+                if code:
+                    running.close()  # which reads their last lines
+                    # the last line that the command itself speaks in, else its last line
+                    spoken = [line for line in last if line.startswith(f"{child.script}: ")]
+                    raise StageFailed(" ".join(child.typed), code, (spoken or [*last] or [""])[-1])
+            if None not in codes:
+                return
+            time.sleep(0.05)
 
 
 @contextmanager
@@ -198,47 +200,41 @@ def _termination_unwinds() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-class _Running:
-    """A child process and the thread that prints its lines (stdout and stderr in one stream)."""
+@contextmanager
+def _running(child: Child, path: str) -> Iterator[tuple[subprocess.Popen[str], deque[str]]]:
+    """A process and the last lines of its output, which a thread prints; the end of the block ends it."""
+    last: deque[str] = deque(maxlen=MESSAGE_LINES)
+    _say(child.label, "$ " + " ".join(child.typed))
+    process = subprocess.Popen(
+        [path, *child.arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        env={**os.environ, "PYTHONUNBUFFERED": "1", **child.environment},
+    )
 
-    def __init__(self, child: Child, path: str):
-        self.child = child
-        self.last: deque[str] = deque(maxlen=MESSAGE_LINES)
-        _say(child.label, "$ " + " ".join(child.typed))
-        self.process = subprocess.Popen(
-            [path, *child.arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-            env={**os.environ, "PYTHONUNBUFFERED": "1", **child.environment},
-        )
-        self._thread = threading.Thread(target=self._stream, daemon=True)
-        self._thread.start()
-
-    def _stream(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
+    def stream() -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
             if text := line.rstrip():
-                self.last.append(text)
-                _say(self.child.label, text)
+                last.append(text)
+                _say(child.label, text)
 
-    def end(self) -> None:
-        """Wait for the process if it has ended, else make it end; then for its last lines."""
-        if self.process.poll() is None:
-            self.process.terminate()
+    thread = threading.Thread(target=stream, daemon=True)
+    thread.start()
+    try:
+        yield process, last
+    finally:
+        if process.poll() is None:
+            process.terminate()
             try:
-                self.process.wait(PATIENCE)
+                process.wait(PATIENCE)
             except subprocess.TimeoutExpired:
-                self.process.kill()
-                self.process.wait()
-        self._thread.join(PATIENCE)
-
-    def words(self) -> str:
-        """What the child said was wrong: the last line that its command speaks in, else its last line."""
-        spoken = [line for line in self.last if line.startswith(f"{self.child.script}: ")]
-        return (spoken or list(self.last) or [""])[-1]
+                process.kill()
+                process.wait()
+        thread.join(PATIENCE)
 
 
 def _say(label: str, text: str) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from eval.relighting.baselines import BASELINES, NEURAL
-from eval.relighting.shadows import direct_light, same_depth, shadow_errors
+from eval.relighting.shadows import frame_shadow_pixels, same_depth
 from eval.report.page import Picture, Pictures
 from tron import metrics
 from tron.color import linear_to_srgb, luminance, to_display
@@ -64,35 +64,33 @@ def middle_frame(clip: Clip, shown: dict[str, np.ndarray], truth: np.ndarray) ->
 def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
     if not clip.has_reference:
         return {}
-    frames = {name: images[k] for name, images in clip.frames.items()}
-    foreground = frames["foreground"] > 0.5
-    ours, truth = (
-        np.where(foreground, to_display(frames[name], clip.meta.exposure), 0)
-        for name in ("irradiance", "irradiance_ref")
-    )
+    frame = {name: images[k] for name, images in clip.frames.items()}
+    foreground = frame["foreground"] > 0.5
+    ours, truth = (to_display(frame[f"irradiance{of}"], clip.meta.exposure) for of in ("", "_ref"))
     pictures = {
         "irradiance, surfels": ours,
         "irradiance, path-traced": truth,
         f"difference ×{ERROR_GAIN}": np.clip(np.abs(ours - truth) * ERROR_GAIN, 0, 1),
+        "shadow errors": _shadow_errors(frame, np.where(foreground, truth, 0)),
     }
-    pictures["shadow errors"] = _shadow_error_picture(frames, truth)
-    for name, title in (("base_color", "base color"), ("normal", "normals")):
-        for member, whose in ((name, "surfels"), (f"{name}_ref", "true")):
-            image = frames[member]
-            if name == "base_color":
-                picture = linear_to_srgb(np.clip(image, 0, 1))
-            else:
-                picture = np.where(np.linalg.norm(image, axis=-1, keepdims=True) > 0.5, image / 2 + 0.5, 0)
-            pictures[f"{title}, {whose}"] = np.clip(np.where(foreground, picture, 0), 0, 1)
-    return pictures
+    for of, whose in (("", "surfels"), ("_ref", "true")):
+        pictures[f"base color, {whose}"] = linear_to_srgb(np.clip(frame[f"base_color{of}"], 0, 1))
+    for of, whose in (("", "surfels"), ("_ref", "true")):
+        normal = frame[f"normal{of}"]
+        there = np.linalg.norm(normal, axis=-1, keepdims=True) > 0.5
+        pictures[f"normals, {whose}"] = np.where(there, np.clip(normal / 2 + 0.5, 0, 1), 0)
+    return {
+        title: image if title == "shadow errors" else np.where(foreground, image, 0)
+        for title, image in pictures.items()
+    }
 
 
-def _shadow_error_picture(frames: dict[str, np.ndarray], truth: np.ndarray) -> np.ndarray:
+def _shadow_errors(frame: dict[str, np.ndarray], truth: np.ndarray) -> np.ndarray:
     """The true irradiance in faint grey, leaking pixels orange, darkened pixels blue."""
-    leaking, darkened = shadow_errors(frames["irradiance"], direct_light(frames), same_depth(frames))
+    found = frame_shadow_pixels(frame, same_depth(frame))
     picture = np.repeat(luminance(truth)[..., None] * 0.6, 3, axis=-1)
-    picture[leaking] = (1.0, 0.5, 0.05)
-    picture[darkened] = (0.2, 0.6, 1.0)
+    picture[found.leaking] = (1.0, 0.5, 0.05)
+    picture[found.darkened] = (0.2, 0.6, 1.0)
     return picture
 
 

@@ -7,19 +7,14 @@ light.
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from eval.confidence import interval, quotient, scene_sums
-from eval.relighting.shadows import (
-    ShadowCounts,
-    both_have_surface,
-    count_shadow_errors,
-    direct_light,
-    same_depth,
-    same_normal,
-)
+from eval.relighting.shadows import both_have_surface, frame_shadow_pixels, same_depth, same_normal
 from eval.results import Row, mean_row
 from tron import metrics
 from tron.color import to_display
@@ -27,6 +22,8 @@ from tron.shards.schema import Clip
 
 JUDGED = {"": same_depth, "_same_normal": same_normal, "_with_silhouettes": both_have_surface}
 """Tail of a row's name -> which pixels of a frame shadows are judged on."""
+FRACTIONS = {"guidance.shadow_leak": (1, 0), "guidance.lit_darkened": (3, 2)}
+"""Metric -> which of the counts of ShadowPixels stand above and below the line."""
 
 
 @dataclass
@@ -35,14 +32,16 @@ class GuidanceScores:
 
     Attributes:
         irradiance_psnr: family of lights -> (scene, dB) of each frame.
-        shadows: key of JUDGED -> family of lights -> (scene, pixels) of each frame.
+        shadows: (key of JUDGED, family of lights) -> (scene, counts of ShadowPixels) of each frame.
         base_color_psnr: (scene, dB) of each view.
         normal_error: (scene, degrees) of each view.
     """
 
-    irradiance_psnr: dict[str, list[tuple[str, float]]] = field(default_factory=dict)
-    shadows: dict[str, dict[str, list[tuple[str, ShadowCounts]]]] = field(
-        default_factory=lambda: {tail: {} for tail in JUDGED}
+    irradiance_psnr: defaultdict[str, list[tuple[str, float]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
+    shadows: defaultdict[tuple[str, str], list[tuple[str, np.ndarray]]] = field(
+        default_factory=lambda: defaultdict(list)
     )
     base_color_psnr: list[tuple[str, float]] = field(default_factory=list)
     normal_error: list[tuple[str, float]] = field(default_factory=list)
@@ -51,40 +50,32 @@ class GuidanceScores:
     def add(self, clip: Clip) -> None:
         """Measure every frame of a clip, on the ground-truth foreground.
 
-        Geometry does not depend on the light: a view (scene and camera) seen under several lights counts
-        once for base color and normals.
+        Geometry does not depend on the light: a view (scene and camera) under several lights counts once for
+        base color and normals.
         """
         if not clip.has_reference:
             return
-        frames, meta = clip.frames, clip.meta
-        for k, foreground in enumerate(frames["foreground"][..., 0] > 0.5):
+        meta = clip.meta
+        for k, foreground in enumerate(clip.frames["foreground"][..., 0] > 0.5):
             if not foreground.any():
                 continue
-            shown, truth = (
-                to_display(frames[name][k], meta.exposure) for name in ("irradiance", "irradiance_ref")
-            )
-            psnr = metrics.capped_psnr(shown, truth, foreground)
-            self.irradiance_psnr.setdefault(meta.light_family, []).append((meta.scene, psnr))
-            self._count_shadows(clip, k)
+            frame = {name: images[k] for name, images in clip.frames.items()}
+            ours, truth = (to_display(frame[f"irradiance{of}"], meta.exposure) for of in ("", "_ref"))
+            psnr = metrics.capped_psnr(ours, truth, foreground)
+            self.irradiance_psnr[meta.light_family].append((meta.scene, psnr))
+            for tail, judged in JUDGED.items():
+                counts = np.array([pixels.sum() for pixels in frame_shadow_pixels(frame, judged(frame))])
+                self.shadows[tail, meta.light_family].append((meta.scene, counts))
             view = f"{meta.scene} {sorted(meta.cameras[k].items())}"
             if view in self._views:
                 continue
             self._views.add(view)
-            ours, truth = (np.clip(frames[name][k], 0, 1) for name in ("base_color", "base_color_ref"))
-            psnr = metrics.capped_psnr(ours, truth, foreground)
-            self.base_color_psnr.append((meta.scene, psnr))
-            ours, truth = frames["normal"][k], frames["normal_ref"][k]
-            lengths = np.minimum(*(np.linalg.norm(n, axis=-1) for n in (ours, truth)))
-            both = foreground & (lengths > 0.5)
+            ours, truth = (np.clip(frame[f"base_color{of}"], 0, 1) for of in ("", "_ref"))
+            self.base_color_psnr.append((meta.scene, metrics.capped_psnr(ours, truth, foreground)))
+            ours, truth = frame["normal"], frame["normal_ref"]
+            both = foreground & (np.minimum(*(np.linalg.norm(n, axis=-1) for n in (ours, truth))) > 0.5)
             if both.any():
-                error = float(metrics.angular_error_deg(ours, truth, both))
-                self.normal_error.append((meta.scene, error))
-
-    def _count_shadows(self, clip: Clip, k: int) -> None:
-        frame = {name: images[k] for name, images in clip.frames.items()}
-        for tail, judged in JUDGED.items():
-            counts = count_shadow_errors(frame["irradiance"], direct_light(frame), judged(frame))
-            self.shadows[tail].setdefault(clip.meta.light_family, []).append((clip.meta.scene, counts))
+                self.normal_error.append((meta.scene, metrics.angular_error_deg(ours, truth, both)))
 
     def rows(self, seed: int = 0) -> list[Row]:
         """``guidance.*`` (all lights, and ``.FAMILY``) and ``surfels.*``; what was not measured has no row.
@@ -95,40 +86,33 @@ class GuidanceScores:
         by its normal, and ``_with_silhouettes`` also judges pixels where they show different surfaces.
         ``seed`` draws the scenes of the intervals.
         """
-        rows: list[Row] = []
-        if self.irradiance_psnr:
-            by_family = {
-                family: mean_row(f"guidance.irradiance_psnr.{family}", "dB", values, seed)
-                for family, values in sorted(self.irradiance_psnr.items())
-            }
-            lowest = min(by_family.values(), key=lambda row: row.value)
-            rows.append(lowest.model_copy(update={"metric": "guidance.irradiance_psnr"}))
-            rows += by_family.values()
-            for tail, counted in self.shadows.items():
-                rows += _fractions(tail, [counts for family in counted.values() for counts in family], seed)
-                for family in by_family:
-                    rows += _fractions(f"{tail}.{family}", counted.get(family, []), seed)
-        for metric, values, unit in (
-            ("surfels.base_color_psnr", self.base_color_psnr, "dB"),
-            ("surfels.normal_mae_deg", self.normal_error, "deg"),
-        ):
-            if values:
-                rows.append(mean_row(metric, unit, values, seed))
+        irradiance = [
+            mean_row(f"guidance.irradiance_psnr.{family}", "dB", values, seed)
+            for family, values in sorted(self.irradiance_psnr.items())
+        ]
+        rows = list(irradiance)
+        if irradiance:
+            lowest = min(irradiance, key=lambda row: row.value)
+            rows.insert(0, lowest.model_copy(update={"metric": "guidance.irradiance_psnr"}))
+        for tail in JUDGED:
+            by_family = {family: self.shadows[tail, family] for family in sorted(self.irradiance_psnr)}
+            rows += shadow_rows(tail, [each for counted in by_family.values() for each in counted], seed)
+            for family, counted in by_family.items():
+                rows += shadow_rows(f"{tail}.{family}", counted, seed)
+        if self.base_color_psnr:
+            rows.append(mean_row("surfels.base_color_psnr", "dB", self.base_color_psnr, seed))
+        if self.normal_error:
+            rows.append(mean_row("surfels.normal_mae_deg", "deg", self.normal_error, seed))
         return rows
 
 
-def _fractions(tail: str, counted: list[tuple[str, ShadowCounts]], seed: int) -> list[Row]:
-    rows = []
-    for metric, bad, of in (
-        ("guidance.shadow_leak", "leaking", "shadowed"),
-        ("guidance.lit_darkened", "darkened", "lit"),
-    ):
-        pixels = np.array([[getattr(counts, bad), getattr(counts, of)] for _, counts in counted], float)
-        pixels = pixels.reshape(len(counted), 2)  # of no frames at all too
-        per_scene = scene_sums([scene for scene, _ in counted], pixels)
-        per_scene = per_scene[per_scene[:, 1] > 0]  # a scene without such pixels says nothing about them
+def shadow_rows(tail: str, counted: Sequence[tuple[str, np.ndarray]], seed: int) -> Iterator[Row]:
+    """The FRACTIONS of frames' pixels; ``counted`` are (scene, counts of ShadowPixels)."""
+    counts = np.array([pixels for _, pixels in counted], float).reshape(len(counted), 4)
+    of_scenes = scene_sums([scene for scene, _ in counted], counts)
+    for metric, (bad, of) in FRACTIONS.items():
+        per_scene = of_scenes[of_scenes[:, of] > 0][:, [bad, of]]  # without such pixels a scene says nothing
         if len(per_scene):
             value = float(quotient(per_scene.sum(0)))
             row = Row(metric=metric + tail, value=value, unit="fraction", n=len(counted))
-            rows.append(row.within(interval(per_scene, quotient, seed)))
-    return rows
+            yield row.within(interval(per_scene, quotient, seed))

@@ -15,7 +15,7 @@ from tron.shards.schema import ClipMeta
 
 @dataclass(frozen=True)
 class Measured:
-    """What the page is made of.
+    """Figures and pictures that the page is made of.
 
     Attributes:
         scores: of every method.

@@ -59,7 +59,7 @@ GROUPS = {
     "best_baseline": [baseline.name for baseline in BASELINES],
 }
 RIVALS = {baseline.name: [baseline.name] for baseline in BASELINES} | GROUPS
-"""What the neural renderer's gains are over: each baseline, and the best of each group."""
+"""Names of what the neural renderer's gains are over: each baseline, and the best of each group."""
 
 
 class Where(NamedTuple):

@@ -7,16 +7,12 @@ from typing import Any
 
 from eval.report.figures import bound, verdict, with_interval
 from eval.report.outcome import Outcome
-from eval.report.page import Cell, Code, Page, Section, Table, Text, Tile
+from eval.report.page import Block, Cell, Code, Page, Section, Table, Text, Tile
 from eval.results import Results, Target
-
-UNITS = {"gain": "dB", "psnr": "dB", "seconds": "s", "deg": "deg", "leak": "fraction", "darkened": "fraction"}
 
 
 def assemble(outcome: Outcome, results: Results, targets: Sequence[Target]) -> Page:
-    """Build the whole page; every figure on it is a row of ``results`` or stands in the benchmark's
-    sections.
-    """
+    """The whole page: every figure on it is a row of ``results`` or stands in the benchmark's sections."""
     reached = sum(1 for t in targets if (v := results.value(t.metric)) is not None and t.reached(v))
     tally = f" {reached} of {len(targets)} targets are reached." if targets else ""
     environment = results.environment
@@ -35,13 +31,6 @@ def assemble(outcome: Outcome, results: Results, targets: Sequence[Target]) -> P
     )
 
 
-def _unit(results: Results, target: Target) -> str:
-    row = results.find(target.metric)
-    if row is not None:
-        return row.unit
-    return next((unit for word, unit in UNITS.items() if word in target.metric), "")
-
-
 def _tiles(headline: dict[str, str], results: Results, targets: Sequence[Target]) -> list[Tile]:
     by_metric = {target.metric: target for target in targets}
     tiles = []
@@ -49,46 +38,34 @@ def _tiles(headline: dict[str, str], results: Results, targets: Sequence[Target]
         row, target = results.find(metric), by_metric.get(metric)
         if row is None:
             continue
-        value = with_interval(row, signed=".gain" in metric)
-        if target is None:
-            tiles.append(Tile(label, value))
-        else:
-            words, tone = verdict(target, row.value, row.unit)
-            tiles.append(Tile(label, value, f"{bound(target, row.unit)}: {words}", tone))
+        words, tone = verdict(target, row.value, row.unit) if target else ("", "plain")
+        held = f"{bound(target, row.unit)}: {words}" if target else ""
+        value, bracket, interval = with_interval(row, signed=".gain" in metric).partition("[")
+        tiles.append(Tile(label, value.strip(), bracket + interval, held, tone))
     return tiles
 
 
 def _targets(results: Results, targets: Sequence[Target]) -> Section:
     rows = []
     for target in targets:
-        row, unit = results.find(target.metric), _unit(results, target)
-        measured = None if row is None else row.value
-        words, tone = verdict(target, measured, unit)
-        rows.append(
-            [
-                Cell(target.what or target.metric),
-                Cell("—" if row is None else with_interval(row, ".gain" in target.metric), "strong"),
-                Cell(bound(target, unit)),
-                Cell(words, tone),
-            ]
-        )
+        row = results.find(target.metric)
+        unit = "" if row is None else row.unit
+        words, tone = verdict(target, None if row is None else row.value, unit)
+        measured = "—" if row is None else with_interval(row, ".gain" in target.metric)
+        name = target.what or target.metric
+        rows.append([name, Cell(measured, "strong"), bound(target, unit), Cell(words, tone)])
     caption = "Bounds set before the measurement; verdicts are on the unrounded figures."
     table = Table(caption, ["Figure", "Measured", "Target", "Verdict"], rows, words=[3])
     return Section("targets", "Targets", [table])
 
 
 def _provenance(environment: dict[str, Any], commit: str, reproduce: Sequence[str]) -> Section:
-    described: dict[str, str] = {"commit": commit}
+    described = {"commit": commit}
     for key, value in {**environment, **environment.get("inputs", {})}.items():
         if key not in ("commit", "dirty", "inputs") and value not in (None, "", {}):
             described[key.replace("_", " ")] = _plain(value)
-    table = Table(
-        "Where and with what this was measured.",
-        ["Property", "Value"],
-        [[Cell(key), Cell(value)] for key, value in described.items()],
-        words=[1],
-    )
-    blocks = [table]
+    caption = "Where and with what this was measured."
+    blocks: list[Block] = [Table(caption, ["Property", "Value"], list(described.items()), words=[1])]
     if reproduce:
         blocks += [Text("To measure it again, from a checkout of that commit:"), Code("\n".join(reproduce))]
     return Section("machine", "Machine, commit and how to reproduce", blocks)

@@ -62,5 +62,5 @@ def verdict(target: Target, measured: float | None, unit: str) -> tuple[str, Ton
 
 
 def bound(target: Target, unit: str) -> str:
-    """The bound itself: ``at least 3.00 dB``."""
-    return f"{target.bound} {format_value(target.value, unit)}"
+    """The bound itself: ``at least 3.00 dB``; without a unit, of what was not measured, ``at least 3``."""
+    return f"{target.bound} {format_value(target.value, unit) if unit else f'{target.value:g}'}"

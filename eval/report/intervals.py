@@ -1,4 +1,4 @@
-"""What the brackets behind a figure are, in plain sentences."""
+"""The brackets behind a figure in plain sentences."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ FEW = 8
 
 
 def interval_note(scenes: int, observed: str = "") -> str:
-    """How to read the brackets of means over so many scenes; ``observed`` names what else was averaged over,
-    such as "60 frames".
+    """A note on the brackets of means over so many scenes.
+
+    ``observed`` names what else was averaged over, such as "60 frames".
     """
     if scenes < 2:
         return "One scene does not say how much another would differ: no interval is given."

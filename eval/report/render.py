@@ -21,9 +21,7 @@ LOSSLESS_PIXELS = 256 * 256
 
 
 def data_uri(image: np.ndarray) -> str:
-    """An image as a ``data:`` URI: (H, W, 3) display values in [0, 1] -> PNG or, when large, JPEG (quality
-    92).
-    """
+    """An image (H, W, 3) in [0, 1] as a ``data:`` URI: PNG or, when large, JPEG of quality 92."""
     clipped = np.clip(image, 0, 1)
     if image.shape[0] * image.shape[1] <= LOSSLESS_PIXELS:
         return "data:image/png;base64," + base64.b64encode(encode_png(clipped)).decode()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from eval.peers.contenders import Contenders
-from eval.relighting.shadows import DirectLight, shadow_classes
+from eval.relighting.shadows import shadow_pixels
 from eval.tracing.irradiance import LitView
 from eval.tracing.measured import FewRays
 from tron.color import luminance
@@ -24,7 +24,7 @@ def measure_few_rays(contenders: Contenders, size: int, light: str, reference_sp
     """Render ``size`` x ``size`` pixels with few rays, ``TRIALS`` times each way, and hold them to many."""
     lit = LitView(contenders, size, light, min(reference_spp, REFERENCE_SPP), seed)
     truth = lit.truth.irradiance
-    shadowed, _ = shadow_classes(DirectLight(truth, lit.truth.unshadowed), lit.surface)
+    shadowed = shadow_pixels(truth, truth, lit.truth.unshadowed, lit.surface).shadowed
     trials = {
         f"{rays}.filtered" if filtered else f"{rays}": lit.trials(TRIALS, rays, filtered)
         for rays in RAYS

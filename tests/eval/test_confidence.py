@@ -10,9 +10,8 @@ import scipy.stats
 
 from eval.confidence import Interval, interval, mean_interval, quotient, scene_sums
 from eval.demo.refinement import refinement
-from eval.relighting.guidance import GuidanceScores, _fractions
+from eval.relighting.guidance import GuidanceScores, shadow_rows
 from eval.relighting.scores import Score, Scores
-from eval.relighting.shadows import ShadowCounts
 from eval.report.figures import with_interval
 from eval.report.intervals import interval_note
 from eval.results import Results, Row
@@ -156,14 +155,14 @@ def test_guidance_is_drawn_by_scene_too(drawn_clip: Callable[..., Clip]):
 
 
 def test_a_scene_without_shadow_says_nothing_of_leaks():
-    shadow, sunny = ShadowCounts(10, 4, 90, 0), ShadowCounts(0, 0, 100, 10)
-    rows = {row.metric: row for row in _fractions("", [("a", shadow), ("b", sunny), ("c", shadow)], seed=0)}
+    shadow, sunny = np.array([10, 4, 90, 0]), np.array([0, 0, 100, 10])  # shadowed, leaking, lit, darkened
+    rows = {row.metric: row for row in shadow_rows("", [("a", shadow), ("b", sunny), ("c", shadow)], seed=0)}
     leak, darkened = rows["guidance.shadow_leak"], rows["guidance.lit_darkened"]
     assert (leak.value, leak.scenes, leak.low, leak.high) == (0.4, 2, 0.4, 0.4)
     assert darkened.scenes == 3
     assert ends(darkened) == (0.0, 0.1)
-    assert [row.metric for row in _fractions("", [("b", sunny)], seed=0)] == ["guidance.lit_darkened"]
-    assert _fractions("", [], seed=0) == []
+    assert [row.metric for row in shadow_rows("", [("b", sunny)], seed=0)] == ["guidance.lit_darkened"]
+    assert list(shadow_rows("", [], seed=0)) == []
 
 
 def test_refinement_is_drawn_by_scene(tmp_path: Path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eval.relighting.guidance import GuidanceScores
-from eval.relighting.shadows import DirectLight, ShadowCounts, count_shadow_errors, same_depth, same_normal
+from eval.relighting.shadows import same_depth, same_normal, shadow_pixels
 from tron.color import agx
 from tron.shards.schema import Clip, clip_members
 
@@ -22,15 +22,19 @@ def test_leaks_and_darkening_follow_their_definitions():
     reference = grey([0.1, 0.1, 0.4, 0.7, 1.0, 1.0, 0.95])  # shadow, shadow, shadow, between, lit, lit, lit
     leak = 0.15 * reference.mean()
     ours = grey([0.1 + 1.01 * leak, 0.1 + 0.99 * leak, 0.0, 0.0, 0.74, 0.76, 2.0])
-    counts = count_shadow_errors(ours, DirectLight(reference, unshadowed), np.ones((1, 7), bool))
-    assert counts == ShadowCounts(shadowed=3, leaking=1, lit=3, darkened=1)
+    found = shadow_pixels(ours, reference, unshadowed, np.ones((1, 7), bool))
+    np.testing.assert_array_equal(found.shadowed[0], [1, 1, 1, 0, 0, 0, 0])
+    np.testing.assert_array_equal(found.leaking[0], [1, 0, 0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(found.lit[0], [0, 0, 0, 0, 1, 1, 1])
+    np.testing.assert_array_equal(found.darkened[0], [0, 0, 0, 0, 1, 0, 0])
 
 
 def test_only_judged_pixels_count():
-    reference, ours = DirectLight(grey([0.1, 1]), grey([1, 1])), grey([1, 0.1])
-    first = count_shadow_errors(ours, reference, np.array([[True, False]]))
-    assert first == ShadowCounts(shadowed=1, leaking=1, lit=0, darkened=0)
-    assert count_shadow_errors(ours, reference, np.zeros((1, 2), bool)) == ShadowCounts(0, 0, 0, 0)
+    ours, reference, unshadowed = grey([1, 0.1]), grey([0.1, 1]), grey([1, 1])
+    first = shadow_pixels(ours, reference, unshadowed, np.array([[True, False]]))
+    assert [pixels.sum() for pixels in first] == [1, 1, 0, 0]
+    none = shadow_pixels(ours, reference, unshadowed, np.zeros((1, 2), bool))
+    assert [pixels.sum() for pixels in none] == [0, 0, 0, 0]
 
 
 def test_an_error_of_the_surfels_own_unshadowed_light_moves_no_pixel_between_classes(drawn_clip: MakeClip):

@@ -24,7 +24,7 @@ def both(images: dict[str, np.ndarray]) -> dict:
 def fitted_and_shown(
     clips: list[Clip], networks: dict[str, Show] | None = None
 ) -> dict[Region, dict[str, np.ndarray]]:
-    """What baselines fitted on clips, and networks, show for the first of them."""
+    """Pictures of the first of some clips by baselines fitted on all of them, and by networks."""
     fits = fit_baselines(clips, seed=0)
     return predictions(clips[0], {name: fitted.show for name, fitted in fits.items()} | (networks or {}))
 
