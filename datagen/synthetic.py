@@ -14,7 +14,6 @@ from datagen.refinement import refine_surfels
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from tron.cameras import Camera
-from tron.estimation import Estimation
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.gaussians.scene import GaussianScene
 from tron.runtime import torch_device
@@ -75,7 +74,7 @@ def make_clip(
     frames: list[Frame] = []
     for i, (camera, truth) in enumerate(zip(cameras, gbuffers(geometry, cameras))):
         guidance = render_guidance(
-            tracer, camera, lighting, Estimation(rays=recipe.guidance_spp), seeds["guidance"][i]
+            tracer, camera, lighting, settings.estimation(spec.split), seeds["guidance"][i]
         )
         frame = {name: guidance[name] for name in guidance.BUFFERS}
         frame |= {"rgb": rgb[i], "foreground": truth.valid.astype(np.float32)}

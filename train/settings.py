@@ -52,7 +52,7 @@ class LossSettings(BaseModel):
 
 
 class DataSettings(BaseModel):
-    """How samples are read and varied."""
+    """Reading and augmenting samples."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
