@@ -109,9 +109,11 @@ def test_a_scheduler_that_is_not_there_is_one_line(tiny, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_a_worker_writes_its_log_until_it_is_taken_away(tmp_path):
+def test_a_worker_writes_its_log_until_it_is_taken_away(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("TRON_LOG_LEVEL", "warning")  # and back again after the test
+    caplog.set_level(logging.WARNING)
     log, names = logging.getLogger("datagen.somewhere"), logging.getLogger().handlers[:]
-    plugin = WorkerLog(tmp_path / "logs", logging.INFO)
+    plugin = WorkerLog(tmp_path / "logs", "info")
     plugin.setup(SimpleNamespace(name="tcp://host:1"))
     log.info("a scene begins")
     log.debug("nobody asked for this")
