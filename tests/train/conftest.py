@@ -82,7 +82,7 @@ def small_settings(dataset: Path, output_dir: Path, **changes: Any) -> dict[str,
         "renderer": {
             "_target_": "tron.neural.renderer.NeuralRenderer",
             "config": {
-                "_target_": "tron.neural.renderer.RendererConfig",
+                "_target_": "tron.neural.configs.RendererConfig",
                 "backbone": {"heads": 1, "head_dim": 12, "layers": 1, "adaln_lora_dim": 4},
             },
         },

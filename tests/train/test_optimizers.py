@@ -7,9 +7,9 @@ import torch
 
 from train.optimizers import CombinedOptimizer, make_optimizer
 from train.settings import OptimizerSettings
-from tron.neural.backbone import BackboneConfig
-from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
-from tron.neural.renderer import NeuralRenderer, RendererConfig
+from tron.neural.configs import BackboneConfig, PixelMLPConfig, RendererConfig
+from tron.neural.pixel_mlp import PixelMLP
+from tron.neural.renderer import NeuralRenderer
 
 RENDERERS = [
     PixelMLP(PixelMLPConfig(width=8)),

@@ -187,7 +187,7 @@ def test_stages_without_steps_are_left_out(train, dataset, tmp_path):
         (
             {
                 "_target_": "tron.neural.renderer.NeuralRenderer",
-                "config": {"_target_": "tron.neural.renderer.RendererConfig", "fusion": "sum"},
+                "config": {"_target_": "tron.neural.configs.RendererConfig", "fusion": "sum"},
             },
             r"renderer\.config\.fusion",
         ),

@@ -2,38 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from diffusers.models.transformers.transformer_cosmos import CosmosTransformer3DModel
-from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
-
-class BackboneConfig(BaseModel):
-    """Shape of a CosmosTransformer3DModel; the defaults are the tiny one that trains in minutes on a CPU.
-
-    Attributes:
-        padding_channel: the published weights expect a padding mask as one more input channel; it is always
-            zero.
-        cross_attention: "frozen" keeps the text branch as loaded; "none" leaves it out. With the null text
-            embedding its output is exactly zero either way, so what differs is only memory and time.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    heads: int = Field(default=3, ge=1)
-    head_dim: int = Field(default=32, ge=6)
-    layers: int = Field(default=4, ge=1)
-    mlp_ratio: float = Field(default=4.0, gt=0)
-    text_embed_dim: int = Field(default=16, ge=1)
-    adaln_lora_dim: int = Field(default=32, ge=1)
-    patch: tuple[int, int, int] = (1, 1, 1)
-    max_size: tuple[int, int, int] = (64, 512, 512)
-    rope_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    padding_channel: bool = False
-    cross_attention: Literal["frozen", "none"] = "none"
-
+from tron.neural.configs import BackboneConfig
 
 COSMOS_0_6B = BackboneConfig(
     heads=20,

@@ -6,17 +6,10 @@ from collections.abc import Mapping
 from itertools import pairwise
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
-from tron.neural.protocols import GuidedConfig, Renderer
-
-
-class PixelMLPConfig(GuidedConfig):
-    """Width and number of hidden layers."""
-
-    width: int = Field(default=64, ge=1)
-    hidden_layers: int = Field(default=3, ge=1)
+from tron.neural.configs import PixelMLPConfig
+from tron.neural.protocols import Renderer
 
 
 class PixelMLP(Renderer):

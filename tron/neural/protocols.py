@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Protocol
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
 from torch import Tensor, nn
 
 from tron.errors import TronError
-from tron.shards.schema import GUIDANCE, MEMBERS, TARGET, clip_members
+from tron.neural.configs import GuidedConfig
 
 
 class Codec(Protocol):
@@ -36,26 +35,6 @@ class Codec(Protocol):
     def calibrate(self, videos: Iterable[Tensor]) -> None:
         """Fit what is fitted before training, to videos (B, 3, K, H, W) in [-1, 1]."""
         ...
-
-
-class GuidedConfig(BaseModel):
-    """Settings of every renderer; they travel inside the weights file."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    guidance: tuple[str, ...] = Field(
-        default=GUIDANCE, description="Members of a clip that are its input, in order; pbr among them."
-    )
-    window: int = Field(default=1, ge=1, description="Frames that render_clip hands over at once.")
-
-    @field_validator("guidance")
-    @classmethod
-    def _colours(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        colours = [name for name in clip_members(reference=False) if MEMBERS[name].color_space]
-        colours.remove(TARGET)
-        if "pbr" not in names or len(set(names)) < len(names) or not set(names) <= set(colours):
-            raise ValueError(f"guidance is pbr and others of {', '.join(colours)}")
-        return names
 
 
 class Renderer(nn.Module):

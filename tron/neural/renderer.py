@@ -3,48 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Literal
 
 import numpy as np
 import torch
-from pydantic import Field, field_validator
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from tron.errors import TronError
-from tron.neural.backbone import Backbone, BackboneConfig
+from tron.neural.backbone import Backbone
 from tron.neural.codecs import CODECS
-from tron.neural.protocols import Codec, GuidedConfig, Renderer
+from tron.neural.configs import RendererConfig
+from tron.neural.protocols import Codec, Renderer
 from tron.neural.windows import check_frames, windows
-
-
-class RendererConfig(GuidedConfig):
-    """Parts of a NeuralRenderer; it travels inside the weights file."""
-
-    codec: str = Field(default="block_dct", description="Video to latents, a name of tron.neural.codecs.")
-    fusion: Literal["concat", "average"] = Field(
-        default="concat",
-        description="concat gives the transformer all latents; average their mean, which keeps the input "
-        "width that published weights expect (the paper's choice, 3 dB worse for the tiny model).",
-    )
-    skip: Literal["pbr", "mean"] = Field(
-        default="pbr", description="Latent that the network's output is added to: pbr's, or the mean of all."
-    )
-    sigma: float | None = Field(
-        default=None,
-        gt=0,
-        description="Noise level of the single denoising step (paper: 250 of 1000, i.e. 0.25): t = sigma / "
-        "(1 + sigma), input (1 - t) z, result (1 - t) z - t net(...). None: the plain residual z + net(z).",
-    )
-    backbone: BackboneConfig = BackboneConfig()
-
-    @field_validator("codec")
-    @classmethod
-    def _known_codec(cls, name: str) -> str:
-        if name not in CODECS:
-            raise ValueError(f"codecs are {', '.join(CODECS)}")
-        return name
-
 
 PLAIN_TIMESTEP = 0.2  # what the tiny transformer is told; any constant will do
 
@@ -58,6 +28,8 @@ class NeuralRenderer(Renderer):
         """config: see RendererConfig; codec: made from the config unless it needs weights, then required."""
         super().__init__()
         self.config = config or RendererConfig()
+        if self.config.codec not in CODECS:
+            raise TronError(f"no codec is called {self.config.codec!r}", mend=f"they are {', '.join(CODECS)}")
         self.codec: Codec = codec if codec is not None else CODECS[self.config.codec](None)
         self.temporal_factor = self.codec.temporal_factor
         check_frames(self.config.window, self.temporal_factor)

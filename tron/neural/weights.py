@@ -19,10 +19,11 @@ from torch import Tensor
 from tron.errors import TronError
 from tron.neural.backbone import COSMOS_0_6B, BackboneConfig, transformer
 from tron.neural.codecs import CODECS
-from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
+from tron.neural.configs import PixelMLPConfig, RendererConfig
+from tron.neural.pixel_mlp import PixelMLP
 from tron.neural.protocols import Codec, Renderer
 from tron.neural.published_files import existing, folder_state, load_strictly, safetensors_state, torch_state
-from tron.neural.renderer import NeuralRenderer, RendererConfig
+from tron.neural.renderer import NeuralRenderer
 from tron.storage import write_atomic
 
 FORMAT = "tron-renderer 1"

@@ -153,7 +153,8 @@ def test_a_plain_3dgs_file_is_relit_with_a_warning(relight, scene_path, light_pa
 
 def test_a_new_renderer_shows_the_pbr_buffer(relight, scene_path, light_path, tmp_path, read_video):
     """Untrained, a renderer gives its PBR input back; what is tested is the way there and back."""
-    from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
+    from tron.neural.configs import PixelMLPConfig
+    from tron.neural.pixel_mlp import PixelMLP
     from tron.neural.weights import save_renderer
 
     checkpoint, out = tmp_path / "renderer.safetensors", tmp_path / "out"
@@ -173,8 +174,8 @@ def test_a_new_renderer_shows_the_pbr_buffer(relight, scene_path, light_path, tm
 def test_a_clip_in_parts_is_the_clip_in_one(tmp_path, monkeypatch):
     import torch
 
-    from tron.neural.backbone import BackboneConfig
-    from tron.neural.renderer import NeuralRenderer, RendererConfig, render_clip
+    from tron.neural.configs import BackboneConfig, RendererConfig
+    from tron.neural.renderer import NeuralRenderer, render_clip
 
     small = BackboneConfig(heads=2, head_dim=12, layers=1, adaln_lora_dim=8)
     renderer = NeuralRenderer(RendererConfig(window=5, backbone=small)).eval()

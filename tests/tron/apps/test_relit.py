@@ -171,7 +171,8 @@ def test_what_has_alpha_is_black_behind_in_videos_and_sheets(
 
 
 def test_a_networks_picture_is_composited_by_the_mask(relight, scene_path, lights, tmp_path):
-    from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
+    from tron.neural.configs import PixelMLPConfig
+    from tron.neural.pixel_mlp import PixelMLP
     from tron.neural.weights import save_renderer
 
     save_renderer(tmp_path / "r.safetensors", PixelMLP(PixelMLPConfig(width=4)))

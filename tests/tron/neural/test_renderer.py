@@ -6,9 +6,10 @@ import torch
 
 from tron import seeds
 from tron.errors import TronError
-from tron.neural.backbone import Backbone, BackboneConfig
-from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
-from tron.neural.renderer import NeuralRenderer, RendererConfig, render_clip
+from tron.neural.backbone import Backbone
+from tron.neural.configs import BackboneConfig, PixelMLPConfig, RendererConfig
+from tron.neural.pixel_mlp import PixelMLP
+from tron.neural.renderer import NeuralRenderer, render_clip
 from tron.neural.windows import windows
 
 SMALL = BackboneConfig(heads=2, head_dim=12, layers=2, adaln_lora_dim=8)

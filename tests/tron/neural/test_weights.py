@@ -10,9 +10,10 @@ from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
 from safetensors.torch import load_file, save_file
 
 from tron.errors import TronError
-from tron.neural.backbone import BackboneConfig, transformer
-from tron.neural.pixel_mlp import PixelMLP, PixelMLPConfig
-from tron.neural.renderer import NeuralRenderer, RendererConfig
+from tron.neural.backbone import transformer
+from tron.neural.configs import BackboneConfig, PixelMLPConfig, RendererConfig
+from tron.neural.pixel_mlp import PixelMLP
+from tron.neural.renderer import NeuralRenderer
 from tron.neural.wan import WanCodec, load_wan
 from tron.neural.weights import load_cosmos, load_renderer, restore_renderer, save_renderer
 

@@ -1,0 +1,85 @@
+"""Settings of the neural renderers; they travel inside the weights file. Loads no torch.
+
+``--help`` and ``--cfg`` of tron-train show them, so that neither waits for torch and diffusers.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from tron.shards.schema import GUIDANCE, MEMBERS, TARGET, clip_members
+
+
+class GuidedConfig(BaseModel):
+    """Settings of every renderer; they travel inside the weights file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    guidance: tuple[str, ...] = Field(
+        default=GUIDANCE, description="Members of a clip that are its input, in order; pbr among them."
+    )
+    window: int = Field(default=1, ge=1, description="Frames that render_clip hands over at once.")
+
+    @field_validator("guidance")
+    @classmethod
+    def _colours(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        colours = [name for name in clip_members(reference=False) if MEMBERS[name].color_space]
+        colours.remove(TARGET)
+        if "pbr" not in names or len(set(names)) < len(names) or not set(names) <= set(colours):
+            raise ValueError(f"guidance is pbr and others of {', '.join(colours)}")
+        return names
+
+
+class BackboneConfig(BaseModel):
+    """Shape of a CosmosTransformer3DModel; the defaults are the tiny one that trains in minutes on a CPU.
+
+    Attributes:
+        padding_channel: the published weights expect a padding mask as one more input channel; it is always
+            zero.
+        cross_attention: "frozen" keeps the text branch as loaded; "none" leaves it out. With the null text
+            embedding its output is exactly zero either way, so what differs is only memory and time.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    heads: int = Field(default=3, ge=1)
+    head_dim: int = Field(default=32, ge=6)
+    layers: int = Field(default=4, ge=1)
+    mlp_ratio: float = Field(default=4.0, gt=0)
+    text_embed_dim: int = Field(default=16, ge=1)
+    adaln_lora_dim: int = Field(default=32, ge=1)
+    patch: tuple[int, int, int] = (1, 1, 1)
+    max_size: tuple[int, int, int] = (64, 512, 512)
+    rope_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    padding_channel: bool = False
+    cross_attention: Literal["frozen", "none"] = "none"
+
+
+class RendererConfig(GuidedConfig):
+    """Parts of a NeuralRenderer; it travels inside the weights file."""
+
+    codec: str = Field(default="block_dct", description="Video to latents, a name of tron.neural.codecs.")
+    fusion: Literal["concat", "average"] = Field(
+        default="concat",
+        description="concat gives the transformer all latents; average their mean, which keeps the input "
+        "width that published weights expect (the paper's choice, 3 dB worse for the tiny model).",
+    )
+    skip: Literal["pbr", "mean"] = Field(
+        default="pbr", description="Latent that the network's output is added to: pbr's, or the mean of all."
+    )
+    sigma: float | None = Field(
+        default=None,
+        gt=0,
+        description="Noise level of the single denoising step (paper: 250 of 1000, i.e. 0.25): t = sigma / "
+        "(1 + sigma), input (1 - t) z, result (1 - t) z - t net(...). None: the plain residual z + net(z).",
+    )
+    backbone: BackboneConfig = BackboneConfig()
+
+
+class PixelMLPConfig(GuidedConfig):
+    """Width and number of hidden layers."""
+
+    width: int = Field(default=64, ge=1)
+    hidden_layers: int = Field(default=3, ge=1)
