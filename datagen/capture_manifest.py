@@ -15,7 +15,7 @@ from tron.storage import sha256, write_if_changed
 
 MANIFEST_NAME = "manifest.json"
 NOT_PIXELS = ("name", "camera", "space")
-"""What a view has beside its picture and its maps."""
+"""Fields of a view beside its picture and its maps."""
 
 
 class FileEntry(BaseModel):
@@ -116,7 +116,7 @@ def _changes(capture: Path, recorded: dict[str, FileEntry]) -> Iterator[str]:
 
 
 def _unreadable(capture: Path) -> Iterator[str]:
-    """Parts that TRON itself cannot read: the capture, or the picture or a map of a view."""
+    """Problems of reading a capture, or the picture or a map of a view."""
     try:
         views = read_capture_folder(capture).views
     except TronError as error:

@@ -15,7 +15,7 @@ def main(settings: Settings) -> int:
     Scenes are drawn from seeds, path-traced by Mitsuba, turned into surfels and rendered again by TRON's
     tracer; the pairs land in tar shards with a manifest. With mode=captures scenes are path-traced from all
     sides instead, with true maps, as folders that tron-reconstruct and nerfstudio read. An interrupted run
-    goes on where it stopped. The exit code is 1 if a scene could not be made (failures.jsonl
+    resumes. The exit code is 1 if a scene could not be made (failures.jsonl
     says why, that of captures lies among them) or if validation found a problem.
     """
     if settings.mode == "validate":

@@ -13,6 +13,7 @@ from typing import Any
 
 from datagen.settings import Settings
 from tron.cli.instantiation import make
+from tron.cli.log import log_level
 from tron.errors import TronError
 
 log = logging.getLogger(__name__)
@@ -107,7 +108,7 @@ def workers(settings: Settings, most: int) -> Iterator[Any]:
                 _where(options),
                 "look at the queue and the workers' logs, or wait longer",
             ) from error
-        log_to = WorkerLog(logs_folder(settings).absolute(), logging.getLogger().getEffectiveLevel())
+        log_to = WorkerLog(logs_folder(settings).absolute(), log_level())
         try:
             made.register_plugin(log_to)
         except OSError as error:

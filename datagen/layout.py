@@ -1,4 +1,4 @@
-"""Places of objects: at rest on the floor z = 0, apart from each other, or not at all.
+"""Places of objects: at rest on the floor z = 0, apart from each other, or left out.
 
 Objects are settled one by one and moved about until nothing touches; collisions are exact tests of convex
 hulls (FCL). Tries are bounded: an object that finds no place is left out and named.
@@ -105,10 +105,10 @@ class _Body:
 
 
 def _support_hull(hull: Trimesh) -> Trimesh:
-    """The hull of the outermost points in SUPPORTS directions: exact for boxes, within GAP / 4 for balls of
-    size 1.
+    """Hull of the outermost points in SUPPORTS directions.
 
-    FCL's distance takes time in proportion to the faces, and curved bodies have thousands.
+    It is exact for boxes and within GAP / 4 for balls of size 1. FCL's distance takes time in proportion to
+    the faces, and curved bodies have thousands.
     """
     k = np.arange(SUPPORTS) + 0.5
     z, angle = 1.0 - 2.0 * k / SUPPORTS, k * np.pi * (3.0 - np.sqrt(5.0))

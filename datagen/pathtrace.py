@@ -205,9 +205,7 @@ def _irradiance_block(
 
 
 def _stratified(lanes: int, count: int, seed: int) -> mi.Point2f:
-    """Jittered points in the unit square, ``count`` in a row sharing one grid: a pixel's samples cover it
-    evenly.
-    """
+    """Jittered points in the unit square, ``count`` in a row on one grid: they cover a pixel evenly."""
     sampler = mi.PCG32(size=lanes, initstate=dr.opaque(mi.UInt64, seed % 2**32))
     columns = max(d for d in range(1, math.isqrt(count) + 1) if count % d == 0)
     cell = dr.arange(mi.UInt32, lanes) % count

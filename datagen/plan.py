@@ -1,4 +1,4 @@
-"""Plan of a dataset: the work list, what it takes, and what of it is there already.
+"""The plan of a dataset: the list of scenes, the space they take, and which of them are there already.
 
 One scene is one piece of work. Its shards are its own and numbered by its index, so where a clip lands
 depends on the plan alone: not on who makes it, in which order, or what failed. A scene is finished when its
@@ -61,8 +61,10 @@ class Quarantined(BaseModel):
 class Figures(BaseModel):
     """Surfels against the true G-buffers of views that they were not fitted to.
 
-    base_color_psnr in dB, linear, each view and channel scaled by least squares; normal_mae_deg in degrees;
-    silhouette_error is the mean of |opacity - mask|.
+    Attributes:
+        base_color_psnr: dB, linear, each view and channel scaled by least squares.
+        normal_mae_deg: mean angle in degrees.
+        silhouette_error: mean of |opacity - mask|.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -73,7 +75,7 @@ class Figures(BaseModel):
 
 
 class Refinement(BaseModel):
-    """Gain of a number of steps on a scene's surfels."""
+    """Gain of a scene's surfels by a number of optimisation steps."""
 
     model_config = ConfigDict(extra="forbid")
 

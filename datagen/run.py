@@ -1,5 +1,4 @@
-"""Making what the plan says: scenes spread over a Dask cluster, results kept as they come, the rest accounted
-for.
+"""Datasets: the scenes of the plan that are missing are made, and all of them accounted for.
 
 Everything a worker leaves behind is whole (atomic writes) and depends on the plan alone, and a scene's record
 is written last. So a run may be killed at any moment and started again: it makes the scenes that have no

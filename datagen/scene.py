@@ -31,9 +31,7 @@ SCENE_RADIUS = 1.45
 
 
 class ObjectSpec(Spec):
-    """One object: a procedural shape with its material, or an asset of the user's scaled to a ball of
-    ``size``.
-    """
+    """One object: a procedural shape with its material, or a user's asset scaled to a ball of ``size``."""
 
     shape: ShapeSpec | None = None
     material: MaterialSpec | None = None
@@ -69,7 +67,7 @@ class CameraSpec(Spec):
 
 
 class SceneSpec(Spec):
-    """A scene: objects on a floor, lights, cameras. ``left_out`` counts objects that found no place."""
+    """One scene: objects on a floor, lights, cameras. ``left_out`` counts objects that found no place."""
 
     version: int = SPEC_VERSION
     name: str

@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 Made = TypeVar("Made")
 Task = Callable[[Work, Settings, Sources], Made]
-"""What makes something of one scene, in a worker; it can be pickled."""
+"""Function that makes something of one scene, in a worker; it can be pickled."""
 
 
 def make_each(
@@ -71,7 +71,9 @@ def outcomes(
                 # A worker that died (killed for memory, crashed in native code) surfaces here, after Dask's
                 # retries.
                 error = future.exception()
-                yield futures[future], Failure.of(error, "worker lost: ") if error else future.result()
+                outcome = Failure.of(error, "worker lost: ") if error else future.result()
+                future.release()  # a result that is still held is computed again when its worker is replaced
+                yield futures[future], outcome
             left -= len(wave)
             if mine and left:
                 recycle(client, settings.worker_timeout)

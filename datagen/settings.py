@@ -18,6 +18,7 @@ from pydantic import (
 
 from datagen.lights import PROCEDURAL, Family, LightChoice
 from datagen.materials import Style
+from tron.estimation import Estimation, Estimator
 
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {"output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "cluster", "captures"}
@@ -67,10 +68,10 @@ class SplitSettings(_Model):
     path_spp: int = Field(
         default=256,
         ge=1,
-        description="Paths a pixel of path-traced frames; rounded up to a product of near numbers.",
+        description="Paths per pixel of path-traced frames; rounded up to a product of near numbers.",
     )
     guidance_spp: int = Field(
-        default=64, ge=2, multiple_of=2, description="Shadow rays a pixel of the surfels' irradiance, even."
+        default=64, ge=2, multiple_of=2, description="Shadow rays per pixel of the surfels' irradiance, even."
     )
     reference_buffers: bool = Field(
         default=False,
@@ -78,7 +79,7 @@ class SplitSettings(_Model):
         "depth, roughness and metallic, and the surfels' own.",
     )
     reference_spp: int = Field(
-        default=128, ge=2, description="Shadow rays a pixel of Mitsuba's direct irradiance."
+        default=128, ge=2, description="Shadow rays per pixel of Mitsuba's direct irradiance."
     )
 
 
@@ -106,9 +107,11 @@ class CaptureSettings(_Model):
     width: int = Field(default=128, ge=8, le=8192, description="View width in pixels.")
     height: int = Field(default=128, ge=8, le=8192, description="View height in pixels.")
     path_spp: int = Field(
-        default=64, ge=1, description="Paths a pixel; rounded up to a product of near numbers, such as 8 x 8."
+        default=64,
+        ge=1,
+        description="Paths per pixel; rounded up to a product of near numbers, such as 8 x 8.",
     )
-    reference_spp: int = Field(default=32, ge=2, description="Shadow rays a pixel of the irradiance maps.")
+    reference_spp: int = Field(default=32, ge=2, description="Shadow rays per pixel of the irradiance maps.")
     points: int | None = Field(
         default=None,
         ge=1,
@@ -118,9 +121,9 @@ class CaptureSettings(_Model):
 
 
 class Settings(_Model):
-    """Everything that ``tron-datagen`` can be told."""
+    """Settings of ``tron-datagen``."""
 
-    output_dir: Path = Field(description="Folder of the dataset; a run that was interrupted goes on in it.")
+    output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
     mode: Literal["make", "validate", "captures"] = Field(
         "make",
         description="make the dataset, validate the one in output_dir and list every problem, or path-trace "
@@ -157,12 +160,22 @@ class Settings(_Model):
     views: int = Field(64, ge=1, description="Spiral views whose G-buffers the surfels are made from.")
     view_width: int = Field(256, ge=8, le=8192, description="Width of those views in pixels.")
     view_height: int = Field(256, ge=8, le=8192, description="Height of those views in pixels.")
-    surfels: int = Field(60_000, ge=100, description="Number of surfels of a scene, about.")
+    surfels: int = Field(60_000, ge=100, description="Approximate number of surfels of a scene.")
     refine_steps: int = Field(
         200,
         ge=0,
         le=100_000,
         description="Optimisation steps that fit a scene's surfels to its G-buffers; 0 takes them as made.",
+    )
+    estimator: Estimator = Field(
+        "ratio",
+        description="Irradiance of the surfels. ratio: unshadowed irradiance times the share of it that "
+        "arrives; plain: the Monte Carlo mean, as in the paper.",
+    )
+    two_sided: bool = Field(
+        True,
+        description="Back faces block the surfels' shadow rays beyond two spacings; false: never, as in the "
+        "paper.",
     )
     mesh_edge: float = Field(
         0.04,
@@ -188,7 +201,7 @@ class Settings(_Model):
     )
     only: list[str] = Field(default_factory=list, description="Make these scenes only, such as train-000012.")
     clips_per_shard: int = Field(
-        64, ge=1, description="Most clips of a shard; a shard never spans two scenes."
+        64, ge=1, description="Maximum number of clips of a shard; no shard spans two scenes."
     )
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = Field(
         "llvm_ad_rgb", description="Mitsuba variant; on cuda_ad_rgb bytes are not repeatable."
@@ -196,7 +209,7 @@ class Settings(_Model):
     workers: int | None = Field(
         None,
         ge=1,
-        description="Worker processes of the cluster; null: one a core with cluster=local.",
+        description="Worker processes of the cluster; null: one per core with cluster=local.",
     )
     worker_timeout: float = Field(
         600.0, gt=0, description="Seconds to wait for the cluster's first worker: jobs may queue for long."
@@ -253,6 +266,11 @@ class Settings(_Model):
         """The settings of one split."""
         return getattr(self, name)
 
+    def estimation(self, split: str) -> Estimation:
+        """Estimation of the surfels' irradiance."""
+        rays = self.split(split).guidance_spp
+        return Estimation(rays=rays, estimator=self.estimator, two_sided=self.two_sided)
+
     def used_splits(self) -> list[Split]:
         """The splits that have scenes."""
         return [name for name in SPLITS if self.split(name).scenes]
@@ -264,7 +282,7 @@ class Settings(_Model):
         return ["hdri"] if self.environments is not None else list(PROCEDURAL)
 
     def recipe(self) -> dict[str, Any]:
-        """Recipe of a scene's content, as plain values: not where it goes, who makes it or how many."""
+        """Keys that decide a scene's content, plain values: not where it goes, who makes it or how many."""
         values = self.model_dump(mode="json", exclude=OUTSIDE)
         for name in SPLITS:
             if name in self.used_splits():
@@ -274,7 +292,7 @@ class Settings(_Model):
         return values
 
     def capture_recipe(self) -> dict[str, Any]:
-        """Recipe of a capture's content, as plain values."""
+        """Keys that decide a capture's content, as plain values."""
         return self.model_dump(mode="json", include=CAPTURED)
 
 

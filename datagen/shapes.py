@@ -59,10 +59,10 @@ def draw_shape(rng: np.random.Generator, style: Style, size: tuple[float, float]
 
 
 def make_mesh(shape: ShapeSpec, edge: float = 0.05) -> Trimesh:
-    """Build the mesh of a shape: closed, outward normals, centred at the origin, edges at most ``edge`` world
-    units.
+    """Build the mesh of a shape, its edges at most ``edge`` world units long.
 
-    Vertices are shared; :func:`split_creases` gives the mesh its shading normals.
+    It is closed and centred at the origin, its normals point outwards. Vertices are shared;
+    :func:`split_creases` gives the mesh its shading normals.
     """
     mesh = _BUILDERS[shape.kind](np.asarray(shape.parameters))
     vertices = np.asarray(mesh.vertices, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Parts of a specification: frozen data whose JSON is the same bytes on every machine.
+"""Specifications: frozen data whose JSON is the same bytes on every machine.
 
 A specification says everything about a thing that is to be made and nothing about how. Its numbers are
 rounded to six decimals when they enter, so that a sine that differs in its last bit between two processors

@@ -1,6 +1,4 @@
-"""The synthetic source: a scene's specification becomes surfels and, light by light, a clip of training
-pairs.
-"""
+"""Surfels of a synthetic scene and, light by light, its clips of training pairs."""
 
 from __future__ import annotations
 
@@ -16,7 +14,6 @@ from datagen.refinement import refine_surfels
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from tron.cameras import Camera
-from tron.estimation import Estimation
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.gaussians.scene import GaussianScene
 from tron.runtime import torch_device
@@ -77,7 +74,7 @@ def make_clip(
     frames: list[Frame] = []
     for i, (camera, truth) in enumerate(zip(cameras, gbuffers(geometry, cameras))):
         guidance = render_guidance(
-            tracer, camera, lighting, Estimation(rays=recipe.guidance_spp), seeds["guidance"][i]
+            tracer, camera, lighting, settings.estimation(spec.split), seeds["guidance"][i]
         )
         frame = {name: guidance[name] for name in guidance.BUFFERS}
         frame |= {"rgb": rgb[i], "foreground": truth.valid.astype(np.float32)}
@@ -136,9 +133,7 @@ def _reference(
     direct: DirectIrradiance,
     environment: EnvironmentMap,
 ) -> Frame:
-    """The reference members of one frame; behind the scene irradiance shows the environment, as guidance
-    does.
-    """
+    """Reference members of one frame; behind the scene irradiance shows the environment, as guidance does."""
     seen = truth.valid[..., None]
     behind = environment.lookup(camera.rays())
     light = {"irradiance": direct.shadowed, "unshadowed": direct.unshadowed}

@@ -1,6 +1,4 @@
-"""Check a dataset folder: are its shards what its manifest says, its scenes what its shards need, and its
-captures what was written?
-"""
+"""Every problem of a dataset folder: of its shards, of the scenes that they need, and of its captures."""
 
 from __future__ import annotations
 

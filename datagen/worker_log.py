@@ -10,6 +10,8 @@ from typing import Any
 
 from dask.distributed import WorkerPlugin
 
+from tron.cli.log import Level, configure_logging
+
 FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 
@@ -18,12 +20,13 @@ class WorkerLog(WorkerPlugin):
 
     Args:
         folder: made where it is missing.
-        level: least severe records that are written, such as logging.INFO.
+        level: that of the command.
     """
 
-    def __init__(self, folder: Path, level: int) -> None:
+    def __init__(self, folder: Path, level: Level) -> None:
         self.name = f"log in {folder}"
-        self._folder, self._level = folder, level
+        self._folder = folder
+        self._level: Level = level
 
     def setup(self, worker: Any) -> None:
         """Begin to write; Dask calls this in every worker that is there or comes."""
@@ -31,11 +34,9 @@ class WorkerLog(WorkerPlugin):
         path = self._folder / f"worker-{re.sub(r'[^0-9A-Za-z.-]+', '-', str(worker.name))}.log"
         self._stream = path.open("a")
         self._handler = logging.StreamHandler(self._stream)
-        self._handler.setLevel(self._level)
         self._handler.setFormatter(logging.Formatter(FORMAT))
-        root = logging.getLogger()
-        root.addHandler(self._handler)
-        root.setLevel(min(root.level, self._level))
+        logging.getLogger().addHandler(self._handler)
+        configure_logging(self._level)  # the root has a handler now, so stderr gets none
         self._crashes = not faulthandler.is_enabled()
         if self._crashes:
             faulthandler.enable(self._stream)

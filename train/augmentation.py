@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from train.settings import DataSettings
-from train.sources import TARGET, Sample
+from train.sources import Sample
 from tron.color import agx, luminance
 from tron.errors import TronError
+from tron.shards.schema import TARGET
 
 
 def augmented(

@@ -1,4 +1,4 @@
-"""What happens around the steps: the clock, the progress bar and metrics.csv."""
+"""Progress of a training run, on a bar and in metrics.csv."""
 
 from __future__ import annotations
 
@@ -11,44 +11,10 @@ import lightning
 from lightning.pytorch.callbacks import Callback
 
 from train.curriculum import Stage, StageClock
-from train.processes import Processes
 from tron.cli.progress import Progress
 from tron.storage import write_atomic
 
 SMOOTHING = 0.98
-
-
-class Clock(Callback):
-    """Runs the stage's clock, and ends the stage when its time is up: by the first process's clock in all."""
-
-    def __init__(self, clock: StageClock, processes: Processes):
-        self.clock, self.processes = clock, processes
-
-    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Start the clock: setting up and loading do not count."""
-        del trainer, pl_module
-        self.clock.start()
-
-    def on_before_optimizer_step(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, optimizer: Any
-    ) -> None:
-        """Look at the clock: learning rate and end of this step follow from what it shows now."""
-        del trainer, pl_module, optimizer
-        if self.clock.seconds_limit is not None:
-            self.clock.shown = self.processes.number_of_first(self.clock.seconds())
-
-    def on_train_batch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, *_args: Any, **_kwargs: Any
-    ) -> None:
-        """Stop the stage where its limit of seconds is reached."""
-        del pl_module
-        if self.clock.seconds_limit is not None and self.clock.progress(trainer.global_step) >= 1:
-            trainer.should_stop = True
-
-    def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Stop the clock."""
-        del trainer, pl_module
-        self.clock.stop()
 
 
 class TrainingLog(Callback):

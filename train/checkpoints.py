@@ -58,13 +58,13 @@ def periodic_checkpoint(folder: Path, number: int, stage: Stage, every: int) -> 
 
 
 def stage_end(folder: Path, number: int, stage: Stage) -> Path:
-    """Where the renderer at a stage's end is kept."""
+    """File of the renderer at a stage's end."""
     return folder / f"{number}-{stage.name}.safetensors"
 
 
 @dataclass(frozen=True)
 class Position:
-    """Where a run stands: the stage to run next (from 0), its first step, and the checkpoint to read."""
+    """Position of a run: the stage to run next (from 0), its first step, and the checkpoint to read."""
 
     stage: int
     step: int = 0

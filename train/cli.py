@@ -9,8 +9,8 @@ from tron.cli.command_line import command
 def main(settings: Settings) -> None:
     """Train a neural renderer on a dataset through the stages of a curriculum.
 
-    Ends with output_dir/renderer.safetensors. A run that was interrupted goes on from its last checkpoint
-    when the same command is given again; a finished one is left as it is.
+    Ends with output_dir/renderer.safetensors. An interrupted run resumes from its last checkpoint when the
+    same command is given again; a finished one is left as it is.
     """
     from train.run import run  # torch, Lightning and diffusers: not for --help or a mistyped key
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -11,7 +12,7 @@ from tron.neural.windows import TEMPORAL_FACTOR
 
 
 class Stage(BaseModel):
-    """One stage of the curriculum: what it trains on and for how long."""
+    """One stage of the curriculum: its data and its length."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -62,17 +63,23 @@ class Stage(BaseModel):
 
 
 class StageClock:
-    """How far a stage has come, from 0 to 1: by its steps, or by its share of a time limit.
+    """Progress of a stage from 0 to 1: by its steps, or by its share of a time limit.
 
     By steps a run is reproducible; by time the schedule anneals to its end within the limit on any machine,
     and the number of steps depends on the machine. Time counts only while the stage runs: `seconds` is what
-    earlier sessions of a resumed run have spent. Progress goes by what the clock last showed, which processes
-    that train together tell each other.
+    earlier sessions of a resumed run have spent. Progress goes by what the clock last showed, which is the
+    first process's time (`agreed`) in all that train together.
     """
 
-    def __init__(self, steps: int, seconds_limit: float | None = None):
+    def __init__(
+        self,
+        steps: int,
+        seconds_limit: float | None = None,
+        agreed: Callable[[float], float] = lambda seconds: seconds,
+    ):
         self.steps = steps
         self.seconds_limit = seconds_limit
+        self._agreed = agreed
         self.spent = 0.0
         self.shown = 0.0
         self._since: float | None = None
@@ -84,6 +91,11 @@ class StageClock:
     def stop(self) -> None:
         """Halt the clock."""
         self.spent, self._since = self.seconds(), None
+
+    def look(self) -> None:
+        """Show the time: learning rate and end of this step follow from it."""
+        if self.seconds_limit is not None:
+            self.shown = self._agreed(self.seconds())
 
     def seconds(self) -> float:
         """Seconds of training in this stage, earlier sessions included."""

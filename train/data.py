@@ -24,7 +24,6 @@ from train.curriculum import Stage
 from train.processes import Processes
 from train.settings import DataSettings, ValidationSettings
 from train.sources import (
-    TARGET,
     CachedSplit,
     Draw,
     Source,
@@ -36,7 +35,7 @@ from train.sources import (
 from tron import seeds
 from tron.errors import TronError
 from tron.shards.manifest import Manifest
-from tron.shards.schema import GUIDANCE, Clip
+from tron.shards.schema import GUIDANCE, TARGET, Clip
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +46,7 @@ SEGMENT = 500  # batches after which a stream starts anew, so that resuming skip
 class Batches(IterableDataset):
     """Endless batches {member: (B, 3, K, h, w)} of one stage, from step `first_step` on.
 
-    Batch s is a function of (seed, stage, s), so a resumed run sees what it would have seen. Ranks share it:
+    Batch s is a function of (seed, stage, s), so that a resumed run has the same ones. Ranks share it:
     together the batches of R ranks are the batch of R times the size that one process would have. A streamed
     split also depends on the number of loader processes, which must then stay the same.
     """
@@ -85,8 +84,9 @@ class Batches(IterableDataset):
             step += workers
 
     def _sources(self, segment: int, step: int, workers: int) -> Callable[[str, int], Source]:
-        """(split, place in the batch) -> where its samples come from: memory, or a stream of this segment,
-        wound forward to `step`. Each place has a stream of its own, so that ranks read what they use.
+        """(split, place in the batch) -> its source: memory, or a stream of this segment, wound to `step`.
+
+        Each place has a stream of its own, so that ranks read what they use.
         """
         streams: dict[tuple[str, int], Source] = {}
         earlier = range(segment * SEGMENT + (step - segment * SEGMENT) % workers, step, workers)
@@ -169,7 +169,7 @@ class TrainingData(lightning.LightningDataModule):
             log.info("No validation: this dataset has no split '%s'", validation.split)
             self.validation_split = None
         elif validation.split is not None:
-            self.manifest.of_split(validation.split)  # a wrong name is told now, not after hours
+            self.manifest.of_split(validation.split)  # a wrong name ends the run now, not after hours
 
     def open(self, stages: Sequence[Stage], guidance: Sequence[str] = GUIDANCE) -> None:
         """Check that every stage finds its splits, frames and sizes; decode the splits that fit in memory.

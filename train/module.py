@@ -11,9 +11,9 @@ from torch import Tensor
 from train.curriculum import Stage, StageClock, learning_rate_factor
 from train.optimizers import make_optimizer
 from train.settings import OptimizerSettings
-from train.sources import TARGET
 from tron.neural.losses import RendererLoss, psnr_per_frame
 from tron.neural.protocols import Renderer
+from tron.shards.schema import TARGET
 
 
 class RendererModule(lightning.LightningModule):
@@ -31,6 +31,24 @@ class RendererModule(lightning.LightningModule):
     def begin(self, stage: Stage, clock: StageClock) -> None:
         """Choose the stage whose optimiser and schedule are made next."""
         self.stage, self.clock = stage, clock
+
+    def on_train_start(self) -> None:
+        """Start the clock: setting up and loading do not count."""
+        self.clock.start()
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Look at the clock."""
+        del optimizer
+        self.clock.look()
+
+    def on_train_batch_end(self, *_args: Any) -> None:
+        """Stop the stage where its limit of seconds is reached."""
+        if self.clock.seconds_limit is not None and self.clock.progress(self.global_step) >= 1:
+            self.trainer.should_stop = True
+
+    def on_train_end(self) -> None:
+        """Stop the clock."""
+        self.clock.stop()
 
     def training_step(self, batch: dict[str, Tensor], _index: int) -> Tensor:
         """The loss of one batch."""

@@ -50,14 +50,14 @@ class Processes:
         return self.rank == 0
 
     def from_first(self, work: Callable[[], Result]) -> Result:
-        """What `work` gives in the first process, which alone does it; its TronError ends all processes."""
+        """Result of `work` in the first process, which alone does it; its TronError ends all processes."""
         outcome = [_outcome(work) if self.first else None]
         if self.count > 1:
             distributed.broadcast_object_list(outcome, src=0, group=self.group)
         return self._unless_failed(outcome[0], [outcome[0]])
 
     def together(self, work: Callable[[], Result]) -> Result:
-        """What `work` gives in this process, done by each; the TronError of any of them ends all."""
+        """Result of `work` in this process, done by each; the TronError of any of them ends all."""
         own = _outcome(work)
         failures: list[Any] = [own if isinstance(own, TronError) else None] * self.count
         if self.count > 1:
@@ -89,8 +89,7 @@ def _outcome(work: Callable[[], Result]) -> Result | TronError:
 
 
 def launch(work: Callable[[Processes, Settings], None], settings: Settings) -> None:
-    """Do `work` in every process of a run: here if it is one, in new processes, or in those that torchrun or
-    srun has started, of which this is one.
+    """Do `work` in every process of a run: this one, new ones, or those that torchrun or srun has started.
 
     Raises:
         TronError: devices, nodes, accelerator or precision that this machine has not; or what any process
@@ -127,7 +126,7 @@ def _outer_launcher() -> Any:
 
 
 def _devices(settings: Settings, outer: Any) -> int:
-    """How many devices of this machine train; TronError where it has fewer."""
+    """Number of devices of this machine that train; TronError where it has fewer."""
     fabric = _fabric(settings, settings.devices, 1)
     on_cpu = fabric.device.type == "cpu"
     if settings.devices == "auto" and on_cpu and outer is not None:

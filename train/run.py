@@ -14,7 +14,7 @@ import yaml
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging
 from lightning.pytorch.strategies import DDPStrategy
 
-from train.callbacks import Clock, TrainingLog
+from train.callbacks import TrainingLog
 from train.checkpoints import (
     AtomicCheckpoints,
     Position,
@@ -54,7 +54,7 @@ def run(settings: Settings) -> None:
 
 
 def train(processes: Processes, settings: Settings) -> None:
-    """What each process of a run does; the first holds the folder and writes."""
+    """Work of each process of a run; the first holds the folder and writes."""
     if settings.threads is not None:
         set_torch_threads(settings.threads)
     stages = [stage for stage in settings.stages if stage.steps > 0]
@@ -133,7 +133,8 @@ def _run_stage(
     number, stage = position.stage + 1, stages[position.stage]
     folder = settings.output_dir / "checkpoints"
     share = stage.steps / sum(each.steps for each in stages)
-    clock = StageClock(stage.steps, settings.max_seconds * share if settings.max_seconds else None)
+    limit = settings.max_seconds * share if settings.max_seconds else None
+    clock = StageClock(stage.steps, limit, processes.number_of_first)
     _announce(number, stages, settings.max_seconds, position.step, data.stands_in(stage.split))
     if position.checkpoint and clock.seconds_limit is None and position.step >= stage.steps:
         # Interrupted between its last step and its end: Lightning would not even start, nor average weights.
@@ -144,7 +145,6 @@ def _run_stage(
     module.begin(stage, clock)
     data.begin(stage, position.step)
     callbacks: list[Callback] = [
-        Clock(clock, processes),
         TrainingLog(settings.output_dir / "metrics.csv", stage, clock, first_step=position.step),
         periodic_checkpoint(folder, number, stage, settings.checkpoint_every),
     ]

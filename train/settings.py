@@ -1,4 +1,4 @@
-"""Everything tron-train can be told, checked before anything heavy is loaded."""
+"""Settings of tron-train, checked before anything heavy is loaded."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class LossSettings(BaseModel):
 
 
 class DataSettings(BaseModel):
-    """How samples are read and varied."""
+    """Reading and augmenting samples."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -114,7 +114,7 @@ It shows that the curriculum works, not what real data would add.
 
 
 class Settings(BaseModel):
-    """Everything tron-train can be told."""
+    """Settings of tron-train."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

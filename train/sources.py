@@ -21,10 +21,7 @@ from tron import seeds
 from tron.errors import TronError
 from tron.shards.manifest import Manifest
 from tron.shards.reader import decode_clip, decode_meta, group_clips, read_clips, tar_files
-from tron.shards.schema import META_SUFFIX, Clip, ClipMeta
-
-TARGET = "rgb"
-"""Member that the network must produce; beside it samples hold its guidance."""
+from tron.shards.schema import META_SUFFIX, TARGET, Clip, ClipMeta
 
 
 def channels_first(frames: np.ndarray) -> np.ndarray:

@@ -47,7 +47,7 @@ _BEGINNINGS = {
     "a ZIP archive": (b"pk\x03\x04",),
     "gzip-compressed": (b"\x1f\x8b",),
 }
-"""What a file is that bears the wrong suffix, by the lower-case beginnings of such files."""
+"""Kinds of files that bear the wrong suffix, by the lower-case beginnings of such files."""
 _AGAIN = "copy or download it again"
 _HALF_MAX = 65504.0
 _JPEG_QUALITY = 95
@@ -240,7 +240,7 @@ def _encode_hdr(image: np.ndarray) -> bytes:
 
 
 def _another_kind(wanted: str, data: bytes) -> TronError:
-    """The error for a file that is not what its suffix says."""
+    """Error for a file that is not what its suffix says."""
     if not data.strip():
         return TronError(f"not {wanted}: the file is empty", mend=_AGAIN)
     start = data[:256].removeprefix(b"\xef\xbb\xbf").lstrip().lower()

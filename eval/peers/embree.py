@@ -27,8 +27,9 @@ MAX_RESTARTS = 512
 
 def quads(scene: GaussianScene) -> mi.Scene:
     """Two triangles a surfel, 2 k and 2 k + 1 for surfel k, in a Mitsuba scene, its hierarchy built."""
-    records = np.array(_geometry(scene)).reshape(len(scene), 4 * GEOMETRY_PACKETS)
-    reach = np.sqrt(np.maximum(records[:, 11], 0.0))
+    geometry = pack(SurfelParameters.from_scene(scene)).geometry
+    # The twelfth float of a surfel's record is the squared radius that counts, in sigmas.
+    reach = np.sqrt(np.maximum(np.array(geometry).reshape(len(scene), 4 * GEOMETRY_PACKETS)[:, 11], 0.0))
     tangent_u, tangent_v = scene.tangents()
     scales = scene.scales() * reach[:, None]
     a, b = tangent_u * scales[:, :1], tangent_v * scales[:, 1:]
@@ -41,11 +42,6 @@ def quads(scene: GaussianScene) -> mi.Scene:
     values["faces"] = faces.astype(np.uint32).ravel()
     values.update()
     return mi.load_dict({"type": "scene", "quads": mesh})
-
-
-def _geometry(scene: GaussianScene) -> mi.Float:
-    """Geometry records, of which the twelfth float is the squared radius that counts, in sigmas."""
-    return pack(SurfelParameters.from_scene(scene)).geometry
 
 
 def tile_rays(view: Camera) -> tuple[mi.Point3f, mi.Vector3f]:

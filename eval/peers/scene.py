@@ -44,7 +44,8 @@ class Recipe:
         degree: kernel degree.
         overlap: summed area of the three-sigma disks over the area of the surface.
         anisotropy: standard deviation of the scales' natural logarithm.
-        tilt: standard deviation of the normals, radians. lift: of the centres off the surface, in sigmas.
+        tilt: standard deviation of the normals, radians.
+        lift: standard deviation of the centres off the surface, in sigmas.
         sh_degree: degree of the radiance's harmonics.
         opacity: the same opacity for all, or None for a spread that favours opaque ones (Beta(2.2, 0.6)).
     """
@@ -72,7 +73,9 @@ class Place:
     Attributes:
         name: in the names of metrics; empty for the usual one.
         floor: what they stand on, or in.
-        eye, target: world, the camera's centre and what it looks at. fov_deg: angle of view.
+        eye: centre of the camera, world.
+        target: point that it looks at, world.
+        fov_deg: horizontal angle of view, degrees.
     """
 
     name: str

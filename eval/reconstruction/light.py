@@ -6,6 +6,7 @@ while a pixel of the map that only a mirror could tell from its neighbour is nob
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +19,23 @@ HEIGHT = 96
 """Rows that maps are averaged to before the sum over texels, which takes a texel's light as a point."""
 
 
-def irradiance(light: EnvironmentMap, normals: np.ndarray) -> np.ndarray:
-    """(N, 3) float64 irradiance / pi on unoccluded surfaces of unit ``normals`` (N, 3): a sum over texels."""
-    small = light.baked().resized(HEIGHT)
-    height, width = small.image.shape[:2]
+def irradiance(lights: Sequence[EnvironmentMap], normals: np.ndarray) -> list[np.ndarray]:
+    """Irradiance / pi under each light on unoccluded surfaces of unit ``normals`` (N, 3): sums over texels.
+
+    Returns:
+        (N, 3) float64 for each light.
+    """
+    small = [light.baked().resized(HEIGHT) for light in lights]
+    height, width = small[0].image.shape[:2]
     polar = np.arange(height)[:, None] * np.pi / (height - 1)  # rows stand on the poles
     around = (np.arange(width) + 0.5)[None] * 2 * np.pi / width  # from +y towards +x
     directions = np.stack(
         np.broadcast_arrays(np.sin(polar) * np.sin(around), np.sin(polar) * np.cos(around), np.cos(polar)),
         axis=-1,
     ).reshape(-1, 3)
-    weights = np.repeat(small.solid_angles(), width) / np.pi
-    cosines = np.maximum(normals @ directions.T, 0)
-    return (cosines * weights) @ small.image.reshape(-1, 3).astype(np.float64)
+    weights = np.repeat(small[0].solid_angles(), width) / np.pi
+    cosines = np.maximum(normals @ directions.T, 0) * weights
+    return [cosines @ light.image.reshape(-1, 3).astype(np.float64) for light in small]
 
 
 def light_errors(found: EnvironmentMap, truth: EnvironmentMap) -> dict[str, float]:
@@ -41,7 +46,7 @@ def light_errors(found: EnvironmentMap, truth: EnvironmentMap) -> dict[str, floa
     """
     normals = generator(0, "reconstruction", "light normals").normal(size=(NORMALS, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    ours, wanted = irradiance(found, normals), irradiance(truth, normals)
+    ours, wanted = irradiance([found, truth], normals)
     energy = float((ours * ours).sum())
     factor = float((ours * wanted).sum()) / energy if energy > 0 else 0.0
     size = float(np.linalg.norm(wanted))

@@ -40,7 +40,9 @@ class ReconstructionSettings(SpeedBenchmark):
     hdris: list[str] = Field(description="files of hdri under which the fox is relit")
     relight: list[str] = Field(description="arguments of tron-relight")
     relit_views: PositiveInt = Field(default=3, description="held-out views of the fox that are shown")
-    relit_enlarged: PositiveInt = Field(default=2, description="pixels of a relit side a pixel of the photo")
+    relit_enlarged: PositiveInt = Field(
+        default=2, description="relit pixels per pixel of the photo, along a side"
+    )
     step_pixels: list[PositiveInt] = Field(
         description="widths of the view of the steps beside the peer; the first is the main one", min_length=1
     )

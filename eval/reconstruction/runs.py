@@ -31,13 +31,11 @@ class _Part(BaseModel):
 
 
 class Point(_Part):
-    """Held-out quality under way: dB after so many seconds of training, with so many surfels."""
+    """Held-out quality under way: dB after so many seconds of training."""
 
-    stage: str
     step: int
     seconds: FiniteFloat
     test_psnr: FiniteFloat
-    surfels: int
 
 
 class Seconds(_Part):

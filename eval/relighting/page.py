@@ -106,31 +106,32 @@ def verdict(measured: Measured) -> str:
 
 
 def _methods(measured: Measured) -> list[Block]:
-    headings = [*(metric.title for metric in METRICS), "neural gains ↑"]
-    groups = [("", 2), *((REGION_WORDS[region], len(headings)) for region in REGIONS)]
-    rows: list[Sequence[Cell | str]] = []
-    for method in measured.scores.methods:
-        tone = "strong" if method is NEURAL else "plain"
-        row = [Cell(method.title, tone), Cell(method.what, "faint")]
-        for where in map(Where, REGIONS):
+    tables = []
+    for where in map(Where, REGIONS):
+        rows: list[Sequence[Cell | str]] = []
+        for method in measured.scores.methods:
+            tone = "strong" if method is NEURAL else "plain"
             names = [f"{method.name}.{metric.name}{where.tail}" for metric in METRICS]
-            row += [row_cell(measured.rows.get(name), tone, unit=False) for name in names]
-            row.append(_gain_cell(measured.rows.get(f"neural.gain_over_{method.name}{where.tail}")))
-        rows.append(row)
-    for group, names in GROUPS.items():
-        row = [Cell(group.replace("_", " "), "strong"), Cell("the one with the highest PSNR", "faint")]
-        for where in map(Where, REGIONS):
+            figures = [row_cell(measured.rows.get(name), tone, unit=False) for name in names]
+            gain = _gain_cell(measured.rows.get(f"neural.gain_over_{method.name}{where.tail}"))
+            rows.append([Cell(method.title, tone), *figures, gain, Cell(method.what, "faint")])
+        for group, names in GROUPS.items():
             best = measured.scores.best(names, where)
-            reached = None if best is None else measured.scores.psnr(best, where)
-            row += [Cell("—" if reached is None else f"{reached:.2f}", "strong")]
-            row += [Cell(TITLES.get(best or "", "—"), "faint"), *([Cell("")] * (len(METRICS) - 2))]
-            row.append(_gain_cell(measured.rows.get(f"neural.gain_over_{group}{where.tail}")))
-        rows.append(row)
-    caption = "Mean over held-out frames, PSNR and gains in dB; an arrow points to the better side."
+            if best is not None:
+                psnr = Cell(f"{measured.scores.psnr(best, where):.2f}", "strong")
+                gain = _gain_cell(measured.rows.get(f"neural.gain_over_{group}{where.tail}"))
+                blank = [""] * (len(METRICS) - 1)
+                rows.append([Cell(group.replace("_", " "), "strong"), psnr, *blank, gain, TITLES[best]])
+        caption = (
+            f"{REGION_WORDS[where.region].capitalize()}: means over held-out frames, PSNR and gains in dB; "
+            "an arrow points to the better side."
+        )
+        headings = ["Method", *(metric.title for metric in METRICS), "neural renderer gains ↑", "What it is"]
+        tables.append(Table(caption, headings, rows, words=[len(headings) - 1]))
     frames, scenes, _ = measured.count()
     notes = (
         f"{' '.join(metric.what for metric in METRICS)} Each is taken of every displayed frame (exposure, "
-        "then the AgX tone curve; peak 1) and averaged over frames. “Neural gains” is the neural renderer's "
+        "then the AgX tone curve; peak 1) and averaged over frames. The gain is the neural renderer's "
         "mean PSNR minus the method's. Foreground is where a ray through the pixel's centre meets true "
         f"geometry. Simple baselines: {SIMPLE}. Products are taken in linear light before the tone curve. "
         "Blends and factors are fitted on the foreground of the training split in float64. On full frames "
@@ -138,7 +139,7 @@ def _methods(measured: Measured) -> list[Block]:
         "that suits surfaces is wrong for the sky, which pbr shows as it is."
     )
     return [
-        Table(caption, ["Method", "What it is", *(headings * len(REGIONS))], rows, groups, words=[1]),
+        *tables,
         Text(f"{interval_note(scenes, f'{frames} frames')} {PAIRED}"),
         Text(notes),
     ]
@@ -208,4 +209,4 @@ def _guidance_section(measured: Measured, pictures: Path) -> list[Section]:
     drawn = {each.meta.light_family: each for each in reversed(measured.examples) if each.guidance}
     groups = [guidance(each) for each in drawn.values()]
     write_strips(groups, [f"{each.meta.key}-guidance" for each in drawn.values()], pictures)
-    return [Section("guidance", "The guidance itself", [*blocks, *groups])]
+    return [Section("guidance", "The surfels and their irradiance", [*blocks, *groups])]

@@ -40,7 +40,8 @@ def _tiles(headline: dict[str, str], results: Results, targets: Sequence[Target]
             continue
         words, tone = verdict(target, row.value, row.unit) if target else ("", "plain")
         held = f"{bound(target, row.unit)}: {words}" if target else ""
-        tiles.append(Tile(label, with_interval(row, signed=".gain" in metric), held, tone))
+        value, bracket, interval = with_interval(row, signed=".gain" in metric).partition("[")
+        tiles.append(Tile(label, value.strip(), bracket + interval, held, tone))
     return tiles
 
 

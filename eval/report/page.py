@@ -114,10 +114,11 @@ class Section:
 
 @dataclass(frozen=True)
 class Tile:
-    """One headline figure: its name, its value, and the verdict on it in words."""
+    """One headline figure: its name, value and interval, and the verdict on it in words."""
 
     label: str
     value: str
+    interval: str = ""
     verdict: str = ""
     tone: Tone = "plain"
 

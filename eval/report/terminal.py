@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from eval.report.figures import bound, verdict, with_interval
 from eval.results import Results, Target
@@ -24,9 +24,10 @@ def print_results(results: Results, targets: Sequence[Target], report: Path) -> 
     Metrics with a ``_full`` twin share a line; rows of one light family stay in results.json and the report.
     Brackets are intervals over scenes.
     """
-    console = Console(width=None if Console().is_terminal else 110, highlight=False)
-    pairs = Table("figure", "foreground", "full frame", box=None, pad_edge=False)
-    others = Table("figure", "measured", "target", "", box=None, pad_edge=False)
+    console = Console(width=None if Console().is_terminal else 120, highlight=False)
+    name = Column("figure", overflow="fold")
+    pairs = Table(name, "foreground", "full frame", box=None, pad_edge=False)
+    others = Table(name.copy(), "measured", "target", "", box=None, pad_edge=False)
     by_metric = {target.metric: target for target in targets}
     for row in results.rows:
         full = results.find(f"{row.metric}_full")

@@ -1,7 +1,7 @@
 """The irradiance pass: its time against Mitsuba's ``direct``, and its noise at equal rays and at equal time.
 
 Noise is measured on the buffer that the neural renderer is given, against the same buffer with thousands of
-rays a pixel, as a share of the light on an unshadowed upward plane. Plain independent sampling, the
+rays per pixel, as a share of the light on an unshadowed upward plane. Plain independent sampling, the
 yardstick, is written again here: the same estimator with random numbers that know nothing of one another.
 
 Errors may be noise, never blocks. For pairs of pixels at one offset, errors correlate as much within an

@@ -33,7 +33,7 @@ def irradiance_section(measured: Measured, output_dir: Path) -> list[Section]:
     if not measured.direct:
         return []
     intro = Text(
-        "64 shadow rays a pixel through the surfels, beside Mitsuba's direct integrator on a triangle mesh "
+        "64 shadow rays per pixel through the surfels, beside Mitsuba's direct integrator on a triangle mesh "
         "of the same surfaces, white and diffuse, with 32 light and 32 BSDF samples: as many rays, but each "
         "ends at the first opaque triangle. Mitsuba's faster setting counts (all samples from one camera "
         "ray, or 32 camera rays with two each). The ratio counts TRON's camera rays and the build of its "
@@ -106,7 +106,7 @@ def few_rays_section(measured: Measured, output_dir: Path) -> list[Section]:
     if not found:
         return []
     intro = Text(
-        "Previews send 2 rays a pixel and filter what they find. Two figures say whether to trust that: "
+        "Previews send 2 rays per pixel and filter what they find. Two figures say whether to trust that: "
         "the mean irradiance of the pixels in shadow (those that less than half of the unshadowed light "
         "reaches in the reference), over the reference's mean there, which is 1 if shadows are as dark as "
         "they should be; and the root mean square error of all pixels, as a share of the light on an "

@@ -21,6 +21,7 @@ VARIANTS = {
     "sh3": "harmonics of degree 3 on both sides",
     "from_gbuffers": "surfels as made from G-buffers: kernel degree 4",
 }
+WITHIN = {"room": "in a room", "ground": "on a ground"}
 STOP = 0.001
 ERROR_GAIN = 4
 
@@ -70,7 +71,7 @@ def camera_section(measured: Measured, output_dir: Path) -> list[Section]:
             "tracer of triangles spends at the least."
         ),
         Table(
-            f"The same at {measured.variants[0].case}, other surfels.",
+            f"Other surfels, {measured.variants[0].count:,} on {measured.variants[0].size}² pixels.",
             ["Surfels", "TRON, Mrays/s", "times as fast as volprim"],
             [
                 [
@@ -109,7 +110,7 @@ def inside_section(measured: Measured, output_dir: Path) -> list[Section]:
                 )
             )
     pictures = [
-        Picture(picture, f"in a {place}", f"radiance from within a {place}")
+        Picture(picture, WITHIN[place], f"radiance of a camera {WITHIN[place]}")
         for place, picture in measured.inside_pictures.items()
     ]
     group = Pictures("Views of the cameras", pictures, columns=2)

@@ -14,6 +14,7 @@ from pydantic import BaseModel
 
 from tron.cli.command_line import Command
 from tron.cli.recipes import (
+    SHARED_GROUP,
     check,
     complete,
     compose_recipe,
@@ -35,7 +36,11 @@ def shipped_recipes() -> Iterator[Any]:
     for path in sorted((ROOT / "conf").rglob("*.yaml")):
         folder, *group, name = path.relative_to(ROOT / "conf").with_suffix("").parts
         overrides = [f"{'/'.join(group)}={name}"] if group else []
-        yield pytest.param(folder, overrides, id=str(path.relative_to(ROOT)))
+        if folder != SHARED_GROUP:
+            yield pytest.param(folder, overrides, id=str(path.relative_to(ROOT)))
+            continue
+        for command in yaml.safe_load(path.read_text()):
+            yield pytest.param(command, [f"{folder}={name}"], id=f"{path.relative_to(ROOT)} of {command}")
 
 
 def load_command(folder: str) -> Command:
@@ -87,9 +92,10 @@ def test_every_seed_follows_the_seed_of_the_run(folder: str, overrides: list[str
     assert seeds == dict.fromkeys(seeds, 7)
 
 
-@pytest.mark.parametrize(
-    "path", sorted((ROOT / "conf").rglob("*.yaml")), ids=lambda p: str(p.relative_to(ROOT))
-)
+FILES = [path for path in sorted((ROOT / "conf").rglob("*.yaml")) if path.parent.name != SHARED_GROUP]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_no_key_is_stated_twice_with_one_value(path: Path):
     """Defaults are the model's: YAML says what differs from the model and from the YAML beneath it."""
     folder, *group, _ = path.relative_to(ROOT / "conf").with_suffix("").parts
@@ -104,6 +110,27 @@ def test_no_key_is_stated_twice_with_one_value(path: Path):
     known = leaves(cast(dict, OmegaConf.to_container(beneath)))
     named = {key: value for key, value in leaves(said).items() if key.rpartition(".")[2] != "_target_"}
     assert {key: value for key, value in named.items() if key in known and known[key] == value} == {}
+
+
+PAPER = {
+    "relight": {"estimator": "plain", "two_sided": False, "denoise": False},
+    "datagen": {"estimator": "plain", "two_sided": False},
+    "reconstruct": {"light.estimator": "plain", "light.two_sided": False, "light.coarsest": 64},
+    "train": {},
+    "eval": {},
+}
+
+
+@pytest.mark.parametrize("folder", sorted(COMMANDS))
+def test_the_papers_fidelity_sets_its_estimators_and_nothing_else(folder: str):
+    command = load_command(folder)
+    options = group_options(command.config_module)
+    assert list(options.get(SHARED_GROUP, {})) == (["paper"] if PAPER[folder] else [])
+    recipes = [
+        leaves(resolve(compose_recipe(command.config_module, command.settings, overrides)))
+        for overrides in ([], [f"{SHARED_GROUP}=paper"] if PAPER[folder] else [])
+    ]
+    assert {key: value for key, value in recipes[1].items() if recipes[0][key] != value} == PAPER[folder]
 
 
 def only_targets(values: dict[str, Any]) -> dict[str, Any]:

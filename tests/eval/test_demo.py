@@ -101,7 +101,8 @@ def test_a_stage_that_fails_ends_the_demo_with_its_words_and_code(
 def test_other_settings_do_not_mix_with_a_finished_data_set(
     stand_ins: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ):
+    (tmp_path / "tron-train").write_text(f"#!{sys.executable}\nraise SystemExit(1)\n")
     out = tmp_path / "demo"
-    assert run(f"output_dir={out}") == 0
+    assert run(f"output_dir={out}") == 1  # the data set is finished, the training is not
     assert run(f"output_dir={out}", 'benchmark.datagen=["experiment=paper"]') == 2
     assert "begun with other settings" in capfd.readouterr().err

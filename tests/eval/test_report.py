@@ -69,7 +69,7 @@ def a_page(tmp_path: Path, text: str = "words") -> Page:
         "title",
         "verdict",
         [text],
-        [Tile("label", "1 dB", "reached", "good")],
+        [Tile("label", "1 dB", "[0, 2]", "reached", "good")],
         [Section("here", "Here", [Text(text), table, pictures, *curves])],
     )
 

@@ -1,4 +1,4 @@
-"""results.json: the schema of facts section 10, and what the file refuses to hold."""
+"""Schema of results.json, and what the file refuses to hold."""
 
 import json
 from pathlib import Path

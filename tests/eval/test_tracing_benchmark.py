@@ -17,7 +17,8 @@ from eval.tracing import agreement
 from eval.tracing.benchmark import Tracing
 from eval.tracing.few_rays import RAYS, measure_few_rays
 from eval.tracing.irradiance import block_correlation, independent_irradiance, relative_rmse
-from eval.tracing.measured import few_rays_rows
+from eval.tracing.measured import ShadowRays, few_rays_rows
+from eval.tracing.page_rays import SHADOW_GROUPS
 from tron import metrics, seeds
 from tron.cameras import Camera
 from tron.shading import EnvironmentLight, irradiance
@@ -153,6 +154,58 @@ def test_a_part_alone_gives_its_rows_alone(tmp_path: Path):
     outcome = benchmark.run(tmp_path)
     assert {row.metric.split(".")[0] for row in outcome.rows} == {"primary", "shadow"}
     assert [section.name for section in outcome.sections] == ["exactness"]
+
+
+SHADOW_COLUMNS = {
+    "random rays, Mrays/s": {
+        "TRON": "shadow.mrays_random",
+        "restarts": "shadow.embree_restart_mrays_random",
+        "closest hit": "shadow.embree_closest_hit_mrays_random",
+        "any hit": "shadow.embree_any_hit_mrays_random",
+        "× restarts": "shadow.ratio_to_embree_restart",
+        "× closest hit": "shadow.ratio_to_embree_closest_hit_random",
+        "× any hit": "shadow.ratio_to_embree_any_hit_random",
+    },
+    "irradiance pass, Mrays/s": {
+        "TRON": "shadow.mrays_irradiance",
+        "closest hit": "shadow.embree_closest_hit_mrays_irradiance",
+        "any hit": "shadow.embree_any_hit_mrays_irradiance",
+        "× closest hit": "shadow.ratio_to_embree_closest_hit",
+        "× any hit": "shadow.ratio_to_embree_any_hit",
+    },
+    "hierarchy, ms": {
+        "build": "bvh.build_ms",
+        "refit": "bvh.refit_ms",
+        "Embree's build": "bvh.embree_build_ms",
+    },
+    "tracing, × time": {"after refit": "bvh.trace_after_refit", "with strays": "shadow.stray_slowdown"},
+}
+
+
+def test_shadow_rays_stand_under_their_headings_and_count_the_build():
+    seconds = {
+        "random tron": 2.0,
+        "random embree_restart": 12.0,
+        "random embree_closest_hit": 6.0,
+        "random embree_any_hit": 1.5,
+        "irradiance tron": 3.0,
+        "irradiance idle": 1.0,
+        "irradiance embree_closest_hit": 7.0,
+        "irradiance embree_any_hit": 2.5,
+        "build": 1.0,
+        "refit": 0.5,
+        "embree_build": 4.0,
+        "rebuilt": 2.0,
+        "refitted": 2.5,
+        "strays": 3.0,
+    }
+    times = {name: Times((value,)) for name, value in seconds.items()}
+    rows = list(ShadowRays(300, 32, times, rays=4_000_000, pass_rays=6_000_000).rows())
+    assert {title: tuple(group) for title, group in SHADOW_COLUMNS.items()} == SHADOW_GROUPS
+    columns = [metric for group in SHADOW_COLUMNS.values() for metric in group.values()]
+    assert [row.metric for row in rows] == [f"{metric}.300" for metric in columns]
+    expected = [2, 1 / 3, 2 / 3, 8 / 3, 4, 2, 0.5, 3, 1, 4, 2, 0.5, 1000, 500, 4000, 1.25, 1.5]
+    assert [row.value for row in rows] == pytest.approx(expected)
 
 
 def test_few_rays_are_held_to_many_in_every_way():

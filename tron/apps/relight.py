@@ -20,7 +20,7 @@ from tron.apps.camera_files import read_cameras
 from tron.apps.clip import Clip, trace
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.framing import plan_cameras, turn_cameras, upright
-from tron.apps.relight_settings import QUALITY, Settings
+from tron.apps.relight_settings import Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
 from tron.cli.command_line import command
@@ -46,8 +46,8 @@ def main(settings: Settings) -> None:
     Writes frames/NNNN.relit.png, relit.mp4 (the neural renderer's pictures where there is a checkpoint,
     otherwise diffuse light with traced shadows plus reflections), what they are made of as
     frames/NNNN.{pbr,irradiance,...}.exr (linear) and .png (AgX), guidance.mp4, contact_sheet.png and
-    relight.json; with a checkpoint also NNNN.neural.png and neural.mp4. A run that was interrupted goes on
-    where it stopped when it is started again.
+    relight.json; with a checkpoint also NNNN.neural.png and neural.mp4. An interrupted run resumes when it is
+    started again.
     """
     from tron.shading.environment import EnvironmentMap  # Mitsuba: not for --help or a mistyped key
 
@@ -78,7 +78,7 @@ def main(settings: Settings) -> None:
     with locked(settings.output_dir):
         for light, clip in zip(lights, clips):
             clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite)
-        trace(scene, cameras, clips, estimation=QUALITY[settings.quality], seed=settings.seed)
+        trace(scene, cameras, clips, estimation=settings.estimation(), seed=settings.seed)
         clock.lap("guidance")
         if renderer is not None:
             for clip in clips:
@@ -168,6 +168,7 @@ def _clip(light: Settings, environment: EnvironmentMap, frames: int, guidance: S
 def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> dict[str, Any]:
     """Recipe of the linear frames: all that their pixels depend on, as JSON values."""
     keys = {"rotation", "trajectory", "quality", "width", "height", "fov", "distance", "seed", "variant"}
+    keys |= {"estimator", "two_sided", "denoise"}
     return {
         "scene_sha256": sha256(light.scene),
         "environment_sha256": sha256(light.light),

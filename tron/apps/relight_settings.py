@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from tron.apps.framing import TrajectoryName
 from tron.apps.relit import Background
 from tron.errors import TronError
-from tron.estimation import Estimation
+from tron.estimation import Estimation, Estimator
 
 BufferName = Literal[
     "pbr",
@@ -65,7 +65,18 @@ class Settings(BaseModel):
         "nerfstudio's camera_path.json",
     )
     quality: Literal["preview", "final"] = Field(
-        "preview", description="preview: 2 shadow rays a pixel, denoised; final: 64"
+        "preview", description="preview: 2 shadow rays per pixel, denoised; final: 64"
+    )
+    estimator: Estimator = Field(
+        "ratio",
+        description="ratio: unshadowed irradiance times the share of it that arrives; plain: the Monte Carlo "
+        "mean, as in the paper",
+    )
+    two_sided: bool = Field(
+        True, description="back faces block shadow rays beyond two spacings; false: never, as in the paper"
+    )
+    denoise: bool | None = Field(
+        None, description="edge-avoiding filter of the shadows; null: with quality=preview alone"
     )
     frames: int = Field(60, ge=1, le=10_000, description="number of frames (those of `cameras` win)")
     width: Side = Field(512, description="pixels")
@@ -112,6 +123,14 @@ class Settings(BaseModel):
                 "out of buffers, or take 'shadowed'"
             )
         return self
+
+    def estimation(self) -> Estimation:
+        """Estimation of the shadows."""
+        chosen = QUALITY[self.quality]
+        filtered = chosen.filtered if self.denoise is None else self.denoise
+        return Estimation(
+            rays=chosen.rays, estimator=self.estimator, two_sided=self.two_sided, filtered=filtered
+        )
 
     def by_light(self) -> list[Settings]:
         """The settings that give each environment's frames alone.

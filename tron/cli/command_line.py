@@ -54,7 +54,7 @@ class Command(Generic[Settings]):
     def _run(self, arguments: Sequence[str]) -> int:
         try:
             require_own_packages()
-            options = _parser(self.name).parse_args(arguments)
+            options = _parser(self.name).parse_intermixed_args(arguments)
             if options.help:
                 print(self._help(options.overrides, options.config_dir), end="")
                 return 0

@@ -75,7 +75,7 @@ def summarize(history: Sequence[dict[str, Any]]) -> dict[str, Any]:
     kernels.sort(key=lambda kernel: kernel["execution_seconds"], reverse=True)
     return {
         "launches": len(history),
-        "kernels": len(launches),
+        "kernels": len({entry["hash"] for entry in history if "hash" in entry}),
         "cache_hits": sum(bool(entry.get("cache_hit")) for entry in history),
         "disk_cache_hits": sum(bool(entry.get("cache_disk")) for entry in history),
         "compile_seconds": round(_seconds(history, "codegen_time") + _seconds(history, "backend_time"), 3),

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin
 
 import pydantic
+import yaml
 from hydra import compose, initialize_config_module
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.config_loader import ConfigLoader
@@ -32,6 +33,7 @@ from tron.nested import nested_items
 Settings = TypeVar("Settings", bound=pydantic.BaseModel)
 
 OWN_PACKAGES = ("tron", "datagen", "train", "eval")  # classes of others keep their defaults to themselves
+SHARED_GROUP = "fidelity"  # beside the folders of the commands: a file has a part for each that it concerns
 SHOWN_CHARACTERS = 80  # of a wrong value, so that the error stays one readable line
 
 
@@ -61,6 +63,9 @@ def compose_recipe(
     search = [] if config_dir is None else [f'hydra.searchpath=["file://{config_dir.resolve()}"]']
     with _loader(config_module) as loader:
         groups = {name: _options(loader, name, config_dir) for name in _groups(loader)}
+        shared = _shared_options(config_module)
+        if shared:
+            groups[SHARED_GROUP] = list(shared)
         for index, each in enumerate(parsed):
             if each.key_or_group in groups and each.value() is None and not each.is_delete():
                 parsed[index] = _parse(f"{each.key_or_group}=none")  # null says the same of a single key
@@ -68,8 +73,13 @@ def compose_recipe(
         for each in selections:
             _require_option(each, groups[each.key_or_group])
         try:
-            shipped = compose("config", overrides=[*search, *(str(each.input_line) for each in selections)])
-            recipe = DictConfig(_merged(model_defaults(settings), OmegaConf.to_container(shipped)))
+            own = [str(each.input_line) for each in selections if each.key_or_group != SHARED_GROUP]
+            shipped = compose("config", overrides=[*search, *own])
+            values = _merged(model_defaults(settings), OmegaConf.to_container(shipped))
+            for each in selections:
+                if each.key_or_group == SHARED_GROUP:
+                    values = _merged(values, shared[str(each.value())][0])
+            recipe = DictConfig(values)
             keys = [each for each in parsed if each.key_or_group not in groups]
             changed = {each.key_or_group for each in keys if not each.is_add() and not each.is_force_add()}
             if not changed <= _keys(recipe):
@@ -191,7 +201,23 @@ def group_options(config_module: str) -> dict[str, dict[str, str]]:
         comment = _comment(root.joinpath(group, f"{name}.yaml").read_text("utf-8"))
         return f"{comment} (default)".strip() if chosen.get(group) == name else comment
 
-    return {group: {name: describe(group, name) for name in names} for group, names in options.items()}
+    described = {group: {name: describe(group, name) for name in names} for group, names in options.items()}
+    shared = {name: comment for name, (_, comment) in _shared_options(config_module).items()}
+    return described | ({SHARED_GROUP: shared} if shared else {})
+
+
+def _shared_options(config_module: str) -> dict[str, tuple[dict[str, Any], str]]:
+    """Options of the group that commands share: this command's part of the file, and the file's comment."""
+    parent, _, command = config_module.rpartition(".")
+    folder = resources.files(parent).joinpath(SHARED_GROUP) if parent else None
+    found: dict[str, tuple[dict[str, Any], str]] = {}
+    for path in folder.iterdir() if folder is not None and folder.is_dir() else ():
+        if path.name.endswith(".yaml"):
+            text = path.read_text("utf-8")
+            parts = yaml.safe_load(text)
+            if command in parts:
+                found[path.name.removesuffix(".yaml")] = (parts[command], _comment(text))
+    return found
 
 
 def unknown_key(key: str, known: Sequence[str]) -> TronError:

@@ -1,4 +1,4 @@
-"""Surfels straight from G-buffers, without optimisation: the recipe measured in guidance.md.
+"""Surfels straight from G-buffers, without optimisation.
 
 All pixels of all views are samples of the surface. A uniform grid, in which a cell also tells apart objects
 and the six directions a surface can face, gathers them; each occupied cell becomes one surfel with the mean
@@ -41,17 +41,19 @@ _CHANNELS = {"position": 3, "normal": 3, "base_color": 3, "roughness": 1, "metal
 
 @dataclass(eq=False)
 class GBufferView:
-    """What one camera sees of a surface, by rays through the pixel centres (never anti-aliased: a mean of two
-    surfaces lies on neither).
+    """View of one camera on a surface, by rays through the pixel centres.
 
-    position    (H, W, 3) world
-    normal      (H, W, 3) unit, world, on the camera's side of the surface
-    base_color  (H, W, 3) linear, in [0, 1]
-    roughness   (H, W)
-    metallic    (H, W)
-    rgb         (H, W, 3) radiance in display space, or None
-    valid       (H, W) bool, True where the ray met a surface; elsewhere nothing is read
-    object_id   (H, W) int, in [0, 2**20)
+    Never anti-aliased: a mean of two surfaces lies on neither.
+
+    Attributes:
+        camera: the view.
+        position: (H, W, 3) world.
+        normal: (H, W, 3) unit, world, on the camera's side of the surface.
+        base_color: (H, W, 3) linear, in [0, 1].
+        roughness, metallic: (H, W).
+        rgb: (H, W, 3) radiance in display space, or None.
+        valid: (H, W) bool, True where the ray hit a surface; elsewhere nothing is read.
+        object_id: (H, W) int, in [0, 2**20).
     """
 
     camera: Camera
@@ -73,16 +75,23 @@ def surfels_from_gbuffers(
     opacity: float = 0.99,
     up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> GaussianScene:
-    """A scene of about `count` surfels through the surfaces that the views see.
+    """A scene of about ``count`` surfels through the surfaces that the views see.
 
-    kernel_degree and scale belong together: a surfel's standard deviation is `scale` times the root mean
-    square distance to the three nearest surfels that face the same way, 0.4 for degree 4 and 0.6 for degree 2
-    (guidance.md). opacity in (0, 1). up: (3,) unit, world. The result does not depend on the order of the
-    views, and holds fewer surfels only where the views have fewer samples. SH degree 0 is the views' mean
-    rgb, display space; without rgb it is the sRGB-encoded base colour.
+    It does not depend on the order of the views, and holds fewer surfels only where the views have fewer
+    samples. SH degree 0 is the views' mean rgb, display space, or else the sRGB-encoded base colour.
 
-    Raises TronError if no view sees a surface, if maps disagree in shape or are not finite, or if only some
-    of the views have rgb.
+    Args:
+        views: of one world.
+        count: surfels wanted.
+        kernel_degree: 2 or 4.
+        scale: standard deviation of a surfel over the root mean square distance to the three nearest that
+            face the same way; it belongs to the degree: 0.4 for 4, 0.6 for 2.
+        opacity: of every surfel, in (0, 1).
+        up: (3,) unit, world.
+
+    Raises:
+        TronError: no view sees a surface, maps disagree in shape or are not finite, or only some of the views
+            have rgb.
     """
     if count < 1:
         raise TronError(f"surfel count is {count}", mend="ask for at least one")

@@ -156,8 +156,9 @@ def read_ply(path: str | Path) -> dict[str, Any]:
 def check_header(path: Path) -> None:
     """Look at the first bytes of a scene's file alone: a wrong one is found before anything is loaded.
 
-    Raises TronError if the file cannot be opened, is no PLY of Gaussians as far as its header tells, or is
-    shorter than the header says.
+    Raises:
+        TronError: it cannot be opened, is no PLY of Gaussians as far as its header tells, or is shorter than
+            the header says.
     """
     try:
         with open(path, "rb") as stream:

@@ -251,8 +251,8 @@ def neighbour_distances(
 def measure_spacing(means: np.ndarray) -> float:
     """The scene's surfel spacing nn: median of neighbour_distances, world units, never zero.
 
-    Shadow rays start and count back faces in units of it (facts.md section 4). Large scenes are measured on
-    an evenly strided part of their surfels, against all of them.
+    Shadow rays start and count back faces in units of it (docs/conventions.md, 8). Large scenes are measured
+    on an evenly strided part of their surfels, against all of them.
     """
     stride = -(-len(means) // SPACING_QUERIES)
     distances = neighbour_distances(means, np.arange(0, len(means), max(stride, 1)))

@@ -52,14 +52,14 @@ class GBufferAppearance:
     def show(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, width: int, seed: int) -> Shown:
         """See :class:`tron.integrators.plugin.Appearance`."""
         del scene, width, seed
-        seen = self.surfels.trace(ray.o, ray.d, active)
-        extra = [part for name in CHANNELS for part in _parts(seen, name)]
-        return Shown(seen.rgb, seen.opacity, extra)
+        surface = self.surfels.trace(ray.o, ray.d, active)
+        extra = [part for name in CHANNELS for part in _parts(surface, name)]
+        return Shown(surface.rgb, surface.opacity, extra)
 
 
-def _parts(seen: Surface, name: str) -> list[mi.Float]:
-    value = getattr(seen, name)
+def _parts(surface: Surface, name: str) -> list[mi.Float]:
+    value = getattr(surface, name)
     if len(CHANNELS[name]) == 1:
         return [value]
-    here = seen.opacity > 0  # without a surfel there is no position, only an origin
+    here = surface.opacity > 0  # without a surfel there is no position, only an origin
     return [dr.select(here, part, 0) for part in value]

@@ -6,7 +6,7 @@
                         object    or from memory: tron.integrators.embed(environment_map)
                                   without either, the Mitsuba scene's own environment emitter
     buffer              string    main channels: pbr (default), irradiance, unshadowed or shadowed
-    shadow_rays         integer   for each camera ray, even (default: 64); of many camera rays a pixel, each
+    shadow_rays         integer   for each camera ray, even (default: 64); of many camera rays per pixel, each
                                   may have fewer: 2 lighten shadows by a hundredth or two, 8 by nothing
     estimator           string    ratio (default) or plain: see tron.estimation
     two_sided           boolean   back faces block shadow rays beyond two spacings (default: true)
@@ -59,15 +59,15 @@ class GuidanceAppearance:
     def show(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, width: int, seed: int) -> Shown:
         """See :class:`tron.integrators.plugin.Appearance`."""
         lighting = self._lighting(scene)
-        seen = self.surfels.trace(ray.o, ray.d, active)
+        surface = self.surfels.trace(ray.o, ray.d, active)
         with dr.suspend_grad():
-            rays = GBuffer.of_rows(dr.detach(seen), width, dr.width(seen.opacity) // width)
+            rays = GBuffer.of_rows(dr.detach(surface), width, dr.width(surface.opacity) // width)
             dr.eval(rays)
             reaching = visibility(self.surfels.tracer, rays, lighting, self.estimation, seed)
             reaching = rays.in_rows(reaching)
-        shaded = shade_surface(seen, reaching, lighting)
+        shaded = shade_surface(surface, reaching, lighting)
         extra = [part for name in self.others for part in shaded[name]]
-        return Shown(shaded[self.buffer], seen.opacity, [*extra, seen.opacity])
+        return Shown(shaded[self.buffer], surface.opacity, [*extra, surface.opacity])
 
     def _lighting(self, scene: mi.Scene) -> Lighting:
         """Prepared once, and again when the scene's light has changed."""

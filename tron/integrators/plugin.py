@@ -18,7 +18,7 @@ from tron.integrators.surfels import Surfels
 
 @dataclass
 class Shown:
-    """What rays show, one lane a ray.
+    """Colours along rays, one lane a ray.
 
     Attributes:
         color: the main channels.
@@ -32,7 +32,7 @@ class Shown:
 
 
 class Appearance(Protocol):
-    """What a plugin shows of its surfels.
+    """View of a plugin on its surfels.
 
     Attributes:
         channels: names of the channels beside color and alpha, as Mitsuba's ``aov`` integrator names its own.
@@ -42,7 +42,7 @@ class Appearance(Protocol):
     channels: list[str]
 
     def show(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, width: int, seed: int) -> Shown:
-        """What rays show; ``width`` rays make a row of an image, ``seed`` is the root of random numbers."""
+        """Colours along rays; ``width`` of them make a row of an image, ``seed`` roots random numbers."""
         ...
 
 

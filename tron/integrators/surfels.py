@@ -28,7 +28,7 @@ def embed(value: Any) -> mi.Object:
 
 
 def unwrap(properties: mi.Properties, name: str, kind: type, plugin: str) -> Any:
-    """What :func:`embed` put into property ``name``.
+    """Content that :func:`embed` put into property ``name``.
 
     Raises:
         TronError: something else is there.
@@ -92,7 +92,7 @@ class Surfels:
         self.tracer.update()
 
     def trace(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> Surface:
-        """What rays see, attached to the parameters where their gradients are wanted."""
+        """Surfaces along rays, attached to the parameters where their gradients are wanted."""
         if dr.grad_enabled(self.parameters.sh):
             self.parameters.sh_degree = MAX_SH_DEGREE
         return self.tracer.trace(origin, direction, active)

@@ -13,9 +13,11 @@ from torch import Tensor, nn
 class BackboneConfig(BaseModel):
     """Shape of a CosmosTransformer3DModel; the defaults are the tiny one that trains in minutes on a CPU.
 
-    padding_channel: the published weights expect a padding mask as one more input channel; it is always zero.
-    cross_attention: "frozen" keeps the text branch as loaded; "none" leaves it out. With the null text
-    embedding its output is exactly zero either way, so what differs is only memory and time.
+    Attributes:
+        padding_channel: the published weights expect a padding mask as one more input channel; it is always
+            zero.
+        cross_attention: "frozen" keeps the text branch as loaded; "none" leaves it out. With the null text
+            embedding its output is exactly zero either way, so what differs is only memory and time.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -50,7 +52,7 @@ COSMOS_0_6B = BackboneConfig(
 
 
 class NoCrossAttention(nn.Module):
-    """What cross-attention over a zero token without biases computes: zero."""
+    """Cross-attention over a zero token without biases: zero."""
 
     def forward(self, hidden_states: Tensor, *_args: Any, **_kwargs: Any) -> Tensor:
         """Return zeros of the hidden states' shape."""

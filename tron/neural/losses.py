@@ -1,4 +1,4 @@
-"""What the renderer is trained on: squared error of display values, and LPIPS if its weights are given."""
+"""The loss of training: squared error of display values, and LPIPS if its weights are given."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What may be exchanged in the neural renderer: the network itself, and the codec inside it."""
+"""The two exchangeable parts: the renderer, and the codec inside it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from torch import Tensor, nn
 
 from tron.errors import TronError
-from tron.shards.schema import GUIDANCE, MEMBERS
+from tron.shards.schema import GUIDANCE, MEMBERS, TARGET, clip_members
 
 
 class Codec(Protocol):
@@ -39,7 +39,7 @@ class Codec(Protocol):
 
 
 class GuidedConfig(BaseModel):
-    """What every renderer is told; it travels inside the weights file."""
+    """Settings of every renderer; they travel inside the weights file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -51,7 +51,8 @@ class GuidedConfig(BaseModel):
     @field_validator("guidance")
     @classmethod
     def _colours(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        colours = [name for name, member in MEMBERS.items() if member.color_space and member.clips == "all"]
+        colours = [name for name in clip_members(reference=False) if MEMBERS[name].color_space]
+        colours.remove(TARGET)
         if "pbr" not in names or len(set(names)) < len(names) or not set(names) <= set(colours):
             raise ValueError(f"guidance is pbr and others of {', '.join(colours)}")
         return names
@@ -76,7 +77,7 @@ class Renderer(nn.Module):
         raise NotImplementedError
 
     def calibrate(self, videos: Iterable[Tensor]) -> None:
-        """Fit what is fitted before training, to videos (B, 3, K, H, W) in [-1, 1]: nothing, unless told."""
+        """Fit what is fitted before training, to videos (B, 3, K, H, W) in [-1, 1]; here nothing."""
 
     def stacked(self, buffers: Mapping[str, Tensor]) -> list[Tensor]:
         """The buffers of `config.guidance`, in order, checked."""

@@ -19,7 +19,7 @@ from tron.neural.windows import check_frames, windows
 
 
 class RendererConfig(GuidedConfig):
-    """What a NeuralRenderer is made of; it travels inside the weights file."""
+    """Parts of a NeuralRenderer; it travels inside the weights file."""
 
     codec: str = Field(default="block_dct", description="Video to latents, a name of tron.neural.codecs.")
     fusion: Literal["concat", "average"] = Field(

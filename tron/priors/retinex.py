@@ -40,7 +40,8 @@ def residual_shading(
         chroma: (H, W, 2) log chromaticity.
         normals: (H, W, 3) unit; neighbours that face apart are on different surfaces.
         surface: (H, W) bool; only these pixels are read.
-        edge, chroma_edge: differences, in log units, from which on a change is reflectance.
+        edge: log difference of luminance from which on a change is reflectance.
+        chroma_edge: log difference of chromaticity, likewise.
         guess: (H, W) log shading where nothing else is known.
         screening: pull towards the guess; it wins over distances beyond 1 / sqrt(screening) pixels.
 

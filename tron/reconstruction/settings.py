@@ -34,7 +34,7 @@ class InitialSettings(Settings):
         "cameras' box; auto: points where there are any, else depth, else random.",
     )
     count: int = Field(
-        default=5000, ge=4, description="Number of surfels made from depth maps or random points, about."
+        default=5000, ge=4, description="Approximate number of surfels made from depth maps or random points."
     )
     opacity: float = Field(default=0.3, gt=0.005, lt=1, description="Opacity of surfels made from points.")
     kernel_degree: Literal[2, 4] = Field(
@@ -45,8 +45,8 @@ class InitialSettings(Settings):
 class DensitySettings(Settings):
     """Surfels added and removed, after "3D Gaussian Splatting" (Kerbl et al. 2023)."""
 
-    start: int = Field(default=500, ge=0, description="First step after which surfels are added.")
-    end: int = Field(default=22_000, ge=0, description="Step from which surfels are left alone.")
+    start: int = Field(default=500, ge=0, description="Step from which surfels are added.")
+    end: int = Field(default=22_000, ge=0, description="Step from which none is added or removed.")
     every: int = Field(default=600, ge=1, description="Steps between two additions.")
     threshold: float = Field(
         default=4e-4,
@@ -55,40 +55,51 @@ class DensitySettings(Settings):
         "surfel is cloned or split.",
     )
     clone_below: float = Field(
-        default=0.01, gt=0, description="Scale in extents up to which surfels are cloned, else split."
+        default=0.01,
+        gt=0,
+        description="Scale, relative to the scene's extent, up to which surfels are cloned; "
+        "larger ones are split.",
     )
     split_shrink: float = Field(default=1.6, gt=1, description="Divisor of a split surfel's scales.")
     prune_every: int = Field(default=100, ge=1, description="Steps between two prunings.")
-    prune_below: float = Field(default=0.005, ge=0, lt=1, description="Least opacity that is kept.")
+    prune_below: float = Field(default=0.005, ge=0, lt=1, description="Prune surfels below this opacity.")
     reset_every: int = Field(
         default=0, ge=0, description="Steps between two resets of all opacities; 0 never resets them."
     )
-    reset_to: float = Field(default=0.01, gt=0, lt=1, description="Greatest opacity after a reset.")
+    reset_to: float = Field(default=0.01, gt=0, lt=1, description="Maximum opacity after a reset.")
     most: int = Field(
-        default=30_000, ge=4, description="Most surfels; those with the largest gradient come first."
+        default=30_000,
+        ge=4,
+        description="Maximum number of surfels; those with the largest gradient come first.",
     )
 
 
 class RadianceSettings(Settings):
-    """Stage 1: geometry and radiance. Rates are Adam's; those of positions are in extents."""
+    """Stage 1: geometry and radiance, with learning rates of Adam."""
 
     steps: int = Field(default=30_000, ge=0, description="Steps; each renders one view.")
-    position_rate: float = Field(default=1.6e-4, gt=0, description="First rate of the positions, in extents.")
-    position_rate_final: float = Field(default=1.6e-6, gt=0, description="Last one; it falls log-linearly.")
-    opacity_rate: float = Field(default=0.05, gt=0, description="Rate of the opacities' logits.")
-    sh_rate: float = Field(default=2.5e-3, gt=0, description="Rate of the constant harmonic.")
-    sh_rest_rate: float = Field(default=1.25e-4, gt=0, description="Rate of the other harmonics.")
-    rotation_rate: float = Field(default=1e-3, gt=0, description="Rate of the quaternions.")
-    scale_rate: float = Field(default=5e-3, gt=0, description="Rate of the scales' logarithms.")
+    position_rate: float = Field(
+        default=1.6e-4, gt=0, description="Initial position learning rate relative to the scene's extent."
+    )
+    position_rate_final: float = Field(
+        default=1.6e-6, gt=0, description="Final position learning rate; the decay is exponential."
+    )
+    opacity_rate: float = Field(default=0.05, gt=0, description="Learning rate of the opacities, as logits.")
+    sh_rate: float = Field(default=2.5e-3, gt=0, description="Learning rate of the harmonic of degree 0.")
+    sh_rest_rate: float = Field(default=1.25e-4, gt=0, description="Learning rate of the other harmonics.")
+    rotation_rate: float = Field(default=1e-3, gt=0, description="Learning rate of the quaternions.")
+    scale_rate: float = Field(default=5e-3, gt=0, description="Learning rate of the scales, as logarithms.")
     sh_degree: int = Field(default=3, ge=0, le=3, description="Highest degree of the radiance's harmonics.")
-    sh_every: int = Field(default=1000, ge=1, description="Steps after which one more degree is learnt.")
-    ssim: float = Field(default=0.2, ge=0, le=1, description="Weight of 1 - SSIM; L1 has the rest.")
+    sh_every: int = Field(default=1000, ge=1, description="Steps between two degrees of the harmonics.")
+    ssim: float = Field(
+        default=0.2, ge=0, le=1, description="Weight of 1 - SSIM; that of L1 is 1 minus this."
+    )
     normal: float = Field(
         default=0.5, ge=0, description="lambda_n: weight of the same loss on a prior's normals."
     )
     mask: float = Field(default=0.2, ge=0, description="Weight of |opacity - mask|, where views have masks.")
     background: Literal["black", "white", "random"] = Field(
-        default="black", description="What lies behind surfels and behind masked subjects."
+        default="black", description="Background behind surfels and masked subjects."
     )
     density: DensitySettings = Field(
         default_factory=lambda: DensitySettings(), description="Surfels added and removed."
@@ -114,14 +125,16 @@ class MaterialSettings(Settings):
     """Stage 2: base color, roughness and metallic from the priors, geometry frozen."""
 
     steps: int = Field(default=7000, ge=0, description="Steps; each renders one view.")
-    rate: float = Field(default=0.01, gt=0, description="First rate of all three, Adam's.")
+    rate: float = Field(default=0.01, gt=0, description="Initial learning rate of all three, Adam's.")
     decay: float = Field(
         default=0.1,
         gt=0,
         le=1,
-        description="Share of it that is left at the last step, falling log-linearly.",
+        description="Final learning rate over the initial one; the decay is exponential.",
     )
-    ssim: float = Field(default=0.2, ge=0, le=1, description="Weight of 1 - SSIM; L1 has the rest.")
+    ssim: float = Field(
+        default=0.2, ge=0, le=1, description="Weight of 1 - SSIM; that of L1 is 1 minus this."
+    )
 
     def scaled(self, factor: float) -> MaterialSettings:
         """The same in ``factor`` times as many steps."""
@@ -132,7 +145,7 @@ class ReconstructionSettings(Settings):
     """Reconstruction of surfels: the paper's, a tenth as long, with what so short a schedule needs."""
 
     initial: InitialSettings = Field(
-        default_factory=lambda: InitialSettings(), description="Where the first surfels come from."
+        default_factory=lambda: InitialSettings(), description="Source of the first surfels."
     )
     radiance: RadianceSettings = Field(default_factory=lambda: RadianceSettings(), description="Stage 1.")
     materials: MaterialSettings = Field(default_factory=lambda: MaterialSettings(), description="Stage 2.")
@@ -152,10 +165,14 @@ class FitSettings(Settings):
 
     resolution: int = Field(default=64, ge=2, description="Texels along a face edge of the cubemap.")
     steps: int = Field(default=1000, ge=1, description="Updates of the cubemap.")
-    rays: int = Field(default=8, ge=2, multiple_of=2, description="Shadow rays a point, even.")
-    pixels: int = Field(default=1024, ge=1, description="Surface points a step, all of one view.")
-    learning_rate: float = Field(default=0.1, gt=0, description="Adam's first rate, in log radiance.")
-    final_learning_rate: float = Field(default=0.01, gt=0, description="Its last rate; falls exponentially.")
+    rays: int = Field(default=8, ge=2, multiple_of=2, description="Shadow rays per point, even.")
+    pixels: int = Field(default=1024, ge=1, description="Surface points per step, all of one view.")
+    learning_rate: float = Field(
+        default=0.1, gt=0, description="Initial learning rate of Adam, in log radiance."
+    )
+    final_learning_rate: float = Field(
+        default=0.01, gt=0, description="Final learning rate; the decay is exponential."
+    )
     estimator: Estimator = Field(
         default="ratio", description="ratio, or plain, the paper's sum, which needs far more rays."
     )
@@ -169,14 +186,20 @@ class FitSettings(Settings):
         description="Texels along a face edge of the coarsest level that log radiance is a sum of; "
         "resolution or more fits each texel by itself, which gives the same irradiance and a noisy map.",
     )
-    points_per_view: int = Field(default=1 << 16, ge=1, description="Most surface points kept of a view.")
-    scale_steps: int = Field(default=200, ge=0, description="Updates of the scale; 0 leaves it at 1.")
-    scale_learning_rate: float = Field(default=0.1, gt=0, description="First rate in log sigma.")
-    scale_views: int = Field(default=8, ge=1, description="Most photos that the scale is fitted to.")
-    scale_pixels: int = Field(
-        default=1 << 14, ge=1, description="Most pixels of each; larger ones are reduced."
+    points_per_view: int = Field(
+        default=1 << 16, ge=1, description="Maximum number of surface points of a view."
     )
-    scale_rays: int = Field(default=16, ge=2, multiple_of=2, description="Shadow rays a pixel there, even.")
+    scale_steps: int = Field(default=200, ge=0, description="Updates of the scale; 0 leaves it at 1.")
+    scale_learning_rate: float = Field(default=0.1, gt=0, description="Initial learning rate, in log sigma.")
+    scale_views: int = Field(
+        default=8, ge=1, description="Maximum number of photos that the scale is fitted to."
+    )
+    scale_pixels: int = Field(
+        default=1 << 14, ge=1, description="Maximum number of pixels of each; larger photos are reduced."
+    )
+    scale_rays: int = Field(
+        default=16, ge=2, multiple_of=2, description="Shadow rays per pixel of these photos, even."
+    )
     split_sum_resolution: Literal[64, 128, 256, 512, 1024] = Field(
         default=512, description="Texels along a face edge of the prefiltered light."
     )

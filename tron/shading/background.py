@@ -1,4 +1,4 @@
-"""How much of what lies behind surfels is seen through them, by their transmittance T.
+"""Share of what lies behind surfels that is seen through them, by their transmittance T.
 
     share(T) = 0                                            T <= 0.01
                T / (1 + exp(1/s - 1/(1 - s)))               s = (T - 0.01) / (0.25 - 0.01)

@@ -156,27 +156,27 @@ def reaching_share(
     return visible_share(shadowed, known if plain else unshadowed)
 
 
-def _normal(seen: Surface) -> mi.Vector3f:
+def _normal(surface: Surface) -> mi.Vector3f:
     # An empty pixel has no normal, and 0 / 0 must not reach a lookup.
-    return dr.select(seen.opacity > 0, mi.Vector3f(seen.normal), mi.Vector3f(0, 0, 1))
+    return dr.select(surface.opacity > 0, mi.Vector3f(surface.normal), mi.Vector3f(0, 0, 1))
 
 
 def shade_surface(
-    seen: Surface, visibility: mi.Color3f, lighting: Lighting, background: Sequence[float] | None = None
+    surface: Surface, visibility: mi.Color3f, lighting: Lighting, background: Sequence[float] | None = None
 ) -> dict[str, mi.Color3f]:
     """Shade what rays see, given the share of the unshadowed irradiance that reaches each of them.
 
     ``background`` as of :func:`render_guidance`. Returns the colours of :class:`Guidance` by name, on the
     device, one lane a ray.
     """
-    normal = _normal(seen)
-    diffuse_color = seen.base_color * (1 - seen.metallic)
-    f0 = DIELECTRIC_F0 * (1 - seen.metallic) + seen.metallic * seen.base_color
+    normal = _normal(surface)
+    diffuse_color = surface.base_color * (1 - surface.metallic)
+    f0 = DIELECTRIC_F0 * (1 - surface.metallic) + surface.metallic * surface.base_color
     unshadowed = lighting.split_sum.diffuse(normal)
-    specular = lighting.split_sum.specular(normal, -seen.direction, seen.roughness, f0)
+    specular = lighting.split_sum.specular(normal, -surface.direction, surface.roughness, f0)
     shadowed = unshadowed * visibility
     if background is None:
-        behind = lighting.light.radiance(seen.direction)
+        behind = lighting.light.radiance(surface.direction)
     else:
         behind = mi.Color3f(*(dr.opaque(mi.Float, float(channel)) for channel in background))
 
@@ -186,7 +186,7 @@ def shade_surface(
         "unshadowed": unshadowed,
         "shadowed": diffuse_color * shadowed + specular,
     }
-    buffers = {name: over_background(color, behind, seen.opacity) for name, color in buffers.items()}
+    buffers = {name: over_background(color, behind, surface.opacity) for name, color in buffers.items()}
     dr.eval(buffers)
     return buffers
 
@@ -197,5 +197,4 @@ def shade(
     """Guidance from a G-buffer and the share of the unshadowed irradiance that reaches each pixel."""
     colors = shade_surface(gbuffer, visibility, lighting, background)
     buffers = gbuffer.numpy()
-    images = {name: gbuffer.image(color) for name, color in colors.items()}
-    return Guidance(**images, mask=buffers["opacity"], gbuffer=buffers)
+    return Guidance(**gbuffer.images(colors), mask=buffers["opacity"], gbuffer=buffers)

@@ -37,7 +37,7 @@ Strategy = Literal["mis", "cosine", "light"]
 
 
 class Occluder(Protocol):
-    """What stands in the way of light: :class:`tron.tracing.SurfelTracer`, or a closed form in a test."""
+    """Occluder of light: :class:`tron.tracing.SurfelTracer`, or a closed form in a test."""
 
     scene: GaussianScene
 
@@ -74,7 +74,7 @@ def irradiance(
         tracer: what blocks light; ``tracer.scene.spacing`` gives the offset of the rays' origins.
         gbuffer: positions and unit normals, world.
         light: the environment.
-        spp: shadow rays a pixel, even: half of each kind (all of one kind where ``strategy`` says so).
+        spp: shadow rays per pixel, even: half of each kind (all of one kind where ``strategy`` says so).
         seed: root of the rays' random numbers.
         strategy: "mis", or one kind of ray alone, for comparison.
 
@@ -117,7 +117,7 @@ def irradiance(
 
 @dataclass
 class RayPlan:
-    """How many rays of which kind a pixel sends: ``count`` by the cosine, then ``count`` by the light."""
+    """Rays of each kind that a pixel sends: ``count`` by the cosine, then ``count`` by the light."""
 
     rays: int
     count: mi.UInt32

@@ -90,7 +90,7 @@ def stratum_order(log_count: int) -> np.ndarray:
 
 @cache
 def row_shift(log_count: int) -> np.ndarray:
-    """What to flip in a pixel's own indices so that rows begin at the first: (2^rows,) by the run's own rows.
+    """Bits to flip in a pixel's own indices so that rows begin at the first: (2^rows,) by the run's own rows.
 
     Rows of the run that begins at ``first`` are those of the first run, exclusive-or ``pascal(first)``. The
     map from indices to strata is linear, so the same exclusive-or undoes it for every index.

@@ -1,4 +1,4 @@
-"""What a clip is on disk: members, their files, and the metadata that travels with them.
+"""A clip on disk: members, their files, and the metadata that travels with them.
 
 A clip is L consecutive frames of one scene, light and trajectory. In a tar shard frame i's members are
 `KEY.f00.pbr.exr`, `KEY.f00.irradiance.exr`, ... and the clip ends with `KEY.meta.json`; the key holds no
@@ -24,6 +24,8 @@ ColorSpace = Literal["linear", "display"]
 
 GUIDANCE = ("pbr", "irradiance")
 """Members that the neural renderer is conditioned on, unless its configuration names others."""
+TARGET = "rgb"
+"""Member that the neural renderer must produce."""
 
 
 @dataclass(frozen=True)

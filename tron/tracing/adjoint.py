@@ -9,7 +9,7 @@ Then, for hit i with ``w_i = T_i alpha_i``:
     d/df_i = w_i g,    d/dalpha_i = T_i (g . f_i) - rest_i / (1 - alpha_i)
 
 Front to back, ``rest`` starts as ``g . F + g_T T`` and loses ``w_i (g . f_i)`` at each hit, so neither a
-second list nor a backward walk is needed. Which surfels are met, and the median, are not differentiated;
+second list nor a backward walk is needed. Which surfels are hit, and the median, are not differentiated;
 where alpha is clipped its derivative is zero.
 """
 
@@ -44,7 +44,7 @@ _RECORDS = ("geometry", "features", "harmonics")
 
 @dataclass
 class _Gradients:
-    """Where gradients are added up, laid out as the records are; None for records that need none."""
+    """Sums of gradients, laid out as the records are; None for records that need none."""
 
     geometry: mi.Float | None
     features: mi.Float | None
@@ -53,7 +53,7 @@ class _Gradients:
 
 @dataclass
 class _Replay:
-    """What the adjoint needs to know of the forward pass, all of it detached."""
+    """The forward pass as the adjoint needs it, all of it detached."""
 
     records: SurfelRecords
     origin: mi.Point3f
@@ -84,7 +84,7 @@ def attach(
 
     Args:
         sums: of each ray, evaluated. records: what they were traced from.
-        origin, direction: the rays. hits: what they met, each ray on one list, for each backward pass.
+        origin, direction: the rays. hits: of theirs, each ray on one list, for each backward pass.
     """
     if not has_gradients(records, direction):
         return sums
@@ -113,12 +113,12 @@ class _Compositing(dr.CustomOp):
         rest = transmittance * replay.sums.transmittance + mean_depth * replay.sums.mean_depth
         for gradient, value in zip(channels, replay.sums.channels, strict=True):
             rest = dr.fma(gradient, value, rest)
-        heard = tuple(not _silent(channels[4 * group : 4 * group + 4]) for group in range(3))
+        has_gradient = tuple(not _silent(channels[4 * group : 4 * group + 4]) for group in range(3))
         dr.eval(channels, mean_depth, rest)
         # Those that nobody asked for, such as the geometry's once it is frozen, cost nothing.
         out = _Gradients(
             **{
-                name: dr.zeros(mi.Float, _room(dr.width(getattr(records, name))))
+                name: dr.zeros(mi.Float, _capacity(dr.width(getattr(records, name))))
                 if name in replay.wanted
                 else None
                 for name in _RECORDS
@@ -134,7 +134,7 @@ class _Compositing(dr.CustomOp):
             basis = sh_basis(direction.x, direction.y, direction.z)
             added = _replay(
                 records, hits, origin, direction, basis, outer, depth,
-                dr.gather(mi.Float, rest, hits.ray), out, heard, len(by_basis),
+                dr.gather(mi.Float, rest, hits.ray), out, has_gradient, len(by_basis),
             )  # fmt: skip
             for target, value in zip(by_basis, added, strict=True):
                 dr.scatter(target, value, hits.ray, hits.count > 0)
@@ -146,8 +146,8 @@ class _Compositing(dr.CustomOp):
             self.set_grad_in("basis", by_basis)
 
 
-def _room(numbers: int) -> int:
-    """Room for ``numbers`` numbers that other numbers share: a quarter of their octave is rounded up.
+def _capacity(numbers: int) -> int:
+    """Capacity for ``numbers`` numbers that other numbers share: a quarter of their octave is rounded up.
 
     Dr.Jit writes the width of what is added to by copies into the kernel, and each width is compiled anew.
     """
@@ -168,7 +168,7 @@ def _add(target: mi.Float | None, packet: mi.UInt32, values: list[mi.Float], act
 
 
 def _reduction(numbers: int) -> dr.ReduceMode:
-    """How to add to ``numbers`` numbers: on CPUs, to a copy of each thread's own, where these fit in memory.
+    """Mode of adding to ``numbers`` numbers: on CPUs, to a copy of each thread's, where these fit in memory.
 
     Left to itself, Dr.Jit stops making copies at a million numbers, which is 22,000 surfels' harmonics, and
     takes two to five times as long from there on.
@@ -182,8 +182,8 @@ def _reduction(numbers: int) -> dr.ReduceMode:
 @dr.syntax
 def _replay(
     records: SurfelRecords, hits: HitList, origin: mi.Point3f, direction: mi.Vector3f, basis: list[mi.Float],
-    outer: list[mi.Float], outer_depth: mi.Float, rest: mi.Float, out: _Gradients, heard: tuple[bool, ...],
-    functions: int,
+    outer: list[mi.Float], outer_depth: mi.Float, rest: mi.Float, out: _Gradients,
+    has_gradient: tuple[bool, ...], functions: int,
 ) -> list[mi.Float]:  # fmt: skip
     """Walk each list front to back and add its gradients to ``out``.
 
@@ -193,7 +193,7 @@ def _replay(
         outer, outer_depth: gradients of the channels and of the mean depth.
         rest: sum of outer gradients times what they belong to (module docstring).
         out: receives the gradients of the records.
-        heard: whether any channel of each packet, and of the radiance, has a gradient at all.
+        has_gradient: whether any channel of each packet, and of the radiance, has a gradient at all.
         functions: how many basis functions, from the second on, to differentiate by.
 
     Returns:
@@ -205,27 +205,27 @@ def _replay(
     active = slot < hits.count
     while active:
         index = dr.gather(mi.UInt32, hits.ids, slot * lists + lane, active)
-        met = intersect(records.geometry, index, origin, direction, records.degree)
-        weight = remaining * met.alpha
-        projected = outer_depth * met.t
+        hit = intersect(records.geometry, index, origin, direction, records.degree)
+        weight = remaining * hit.alpha
+        projected = outer_depth * hit.t
         for packet in range(MATERIAL_PACKETS):
-            if dr.hint(heard[packet], mode="scalar"):
+            if dr.hint(has_gradient[packet], mode="scalar"):
                 at = index * FEATURE_PACKETS + packet
                 feature = dr.gather(mi.Vector4f, records.features, at, active)
                 gradient = outer[4 * packet : 4 * packet + 4]
                 for k in range(4):
                     projected = dr.fma(gradient[k], feature[k], projected)
                 _add(out.features, at, [weight * value for value in gradient], active)
-        if dr.hint(heard[2], mode="scalar"):
+        if dr.hint(has_gradient[2], mode="scalar"):
             color, by_basis = _replay_radiance(
                 records, index, basis, weight, outer[8:11], by_basis, out, active
             )
             for k in range(3):
                 projected = dr.fma(outer[8 + k], color[k], projected)
         rest = dr.fma(-weight, projected, rest)
-        by_alpha = remaining * projected - rest / (1 - met.alpha)
-        _replay_hit(records, index, met, direction, by_alpha, weight * outer_depth, out, active)
-        remaining *= 1 - met.alpha
+        by_alpha = remaining * projected - rest / (1 - hit.alpha)
+        _replay_hit(records, index, hit, direction, by_alpha, weight * outer_depth, out, active)
+        remaining *= 1 - hit.alpha
         slot += 1
         active &= slot < hits.count
     return by_basis
@@ -261,24 +261,24 @@ def _replay_radiance(
 
 
 def _replay_hit(
-    records: SurfelRecords, index: mi.UInt32, met: SurfelHit, direction: mi.Vector3f,
+    records: SurfelRecords, index: mi.UInt32, hit: SurfelHit, direction: mi.Vector3f,
     by_alpha: mi.Float, by_t: mi.Float, out: _Gradients, active: mi.Bool,
 ) -> None:  # fmt: skip
     """Gradients of a geometry record from those of alpha and t: ``kernel.intersect`` in reverse.
 
     t = n . c / (n . d) with n = a x b and c from the origin to the centre; the offset is t d - c.
     """
-    by_alpha = dr.select(met.unclipped < MAX_ALPHA, by_alpha, 0)
-    q = dr.fma(met.u, met.u, met.v * met.v)
-    by_q = by_alpha * met.unclipped * log_response_slope(q, records.degree)
-    by_u, by_v = 2 * met.u * by_q, 2 * met.v * by_q
-    by_offset = by_u * met.u_axis + by_v * met.v_axis
-    along = (by_t + dr.dot(by_offset, direction)) / met.facing
-    by_normal = -along * met.offset
-    by_centre = along * met.normal - by_offset
-    by_a = by_u * met.offset + dr.cross(met.v_axis, by_normal)
-    by_b = by_v * met.offset + dr.cross(by_normal, met.u_axis)
+    by_alpha = dr.select(hit.unclipped < MAX_ALPHA, by_alpha, 0)
+    q = dr.fma(hit.u, hit.u, hit.v * hit.v)
+    by_q = by_alpha * hit.unclipped * log_response_slope(q, records.degree)
+    by_u, by_v = 2 * hit.u * by_q, 2 * hit.v * by_q
+    by_offset = by_u * hit.u_axis + by_v * hit.v_axis
+    along = (by_t + dr.dot(by_offset, direction)) / hit.facing
+    by_normal = -along * hit.offset
+    by_centre = along * hit.normal - by_offset
+    by_a = by_u * hit.offset + dr.cross(hit.v_axis, by_normal)
+    by_b = by_v * hit.offset + dr.cross(by_normal, hit.u_axis)
     base = index * GEOMETRY_PACKETS
-    _add(out.geometry, base, [*by_centre, by_alpha * met.response], active)
+    _add(out.geometry, base, [*by_centre, by_alpha * hit.response], active)
     _add(out.geometry, base + 1, [*by_a, mi.Float(0)], active)
     _add(out.geometry, base + 2, [*by_b, mi.Float(0)], active)

@@ -1,7 +1,8 @@
 """Front-to-back compositing of sorted hits: ``sum_i T_i alpha_i f_i``, ``T_i = prod_{j<i} (1 - alpha_j)``.
 
-(Equation 3 of the TRON paper.)  Compositing ends at the first hit after which T < 0.001.  The ids of the
-composited hits are written out in order, so that the adjoint can replay exactly this list.
+(Equation 3 of the TRON paper; docs/conventions.md, 7.) Compositing ends at the first hit after which T is
+below 0.001. The ids of the composited hits are written out in order, so that the adjoint can replay exactly
+this list.
 """
 
 from __future__ import annotations
@@ -40,30 +41,30 @@ class HitList:
     ray: mi.UInt32
 
     @staticmethod
-    def empty(ray: mi.UInt32, room: int) -> HitList:
-        """Lists of up to ``room`` hits for the rays ``ray``.
+    def empty(ray: mi.UInt32, capacity: int) -> HitList:
+        """Lists of up to ``capacity`` hits for the rays ``ray``.
 
         Raises:
             TronError: more than 32-bit indices can address.
         """
         rays = dr.width(ray)
-        if room * rays >= 1 << 32:
+        if capacity * rays >= 1 << 32:
             raise TronError(
-                f"{rays} rays of up to {room} hits are too many to differentiate at once",
+                f"{rays} rays of up to {capacity} hits are too many to differentiate at once",
                 mend="render the image in parts, or without gradients",
             )
-        return HitList(dr.empty(mi.UInt32, room * rays), dr.zeros(mi.UInt32, rays), ray)
+        return HitList(dr.empty(mi.UInt32, capacity * rays), dr.zeros(mi.UInt32, rays), ray)
 
     @property
-    def room(self) -> int:
+    def capacity(self) -> int:
         """Most hits of a list."""
         return dr.width(self.ids) // dr.width(self.ray)
 
     def rows(self) -> HitRows:
-        """Where compositing writes the ids."""
-        lists, room = dr.width(self.ray), self.room
+        """Memory that compositing writes the ids to."""
+        lists, capacity = dr.width(self.ray), self.capacity
         return HitRows(
-            self.ids, dr.arange(mi.UInt32, lists), dr.opaque(mi.UInt32, lists), dr.opaque(mi.UInt32, room)
+            self.ids, dr.arange(mi.UInt32, lists), dr.opaque(mi.UInt32, lists), dr.opaque(mi.UInt32, capacity)
         )
 
 
@@ -75,13 +76,13 @@ class HitRows:
 
     Attributes:
         ids: mi.UInt32. lane: mi.UInt32, 0, 1, .. one a list.
-        lists, room: mi.UInt32, one number each.
+        lists, capacity: mi.UInt32, one number each.
     """
 
     ids: mi.UInt32
     lane: mi.UInt32
     lists: mi.UInt32
-    room: mi.UInt32
+    capacity: mi.UInt32
 
 
 @dataclass
@@ -104,7 +105,7 @@ class Composite:
 
     @staticmethod
     def start() -> Composite:
-        """Nothing met yet."""
+        """Nothing hit yet."""
         return Composite(
             [mi.Float(0) for _ in range(CHANNELS)], mi.Float(0), mi.Float(1), mi.Float(0), mi.UInt32(0)
         )
@@ -157,7 +158,8 @@ def composite(
     while active:
         alpha, index, t = hits.alpha[slot], hits.index[slot], hits.t[slot]
         if dr.hint(out is not None, mode="scalar"):
-            dr.scatter(out.ids, index, sums.count * out.lists + out.lane, active & (sums.count < out.room))
+            place = sums.count * out.lists + out.lane
+            dr.scatter(out.ids, index, place, active & (sums.count < out.capacity))
         weight = sums.transmittance * alpha
         channels = []
         for packet in range(MATERIAL_PACKETS):

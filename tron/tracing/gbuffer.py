@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
@@ -45,8 +45,8 @@ class GBuffer(Surface):
         """The G-buffer of pixels that come row by row."""
         _, x, y, inside = tile_pixels(width, height)
         pixel = y * dr.opaque(mi.UInt32, width) + x
-        tiled = _fields(surface, lambda value: dr.gather(type(value), value, pixel, inside))
-        return GBuffer(**tiled, width=width, height=height)
+        tiled = dr.gather(Surface, surface, pixel, inside)
+        return GBuffer(**vars(tiled), width=width, height=height)
 
     @property
     def pixel(self) -> mi.UInt32:
@@ -54,28 +54,35 @@ class GBuffer(Surface):
         _, x, y, _ = tile_pixels(self.width, self.height)
         return y * dr.opaque(mi.UInt32, self.width) + x
 
-    def in_rows(self, value: Any) -> Any:
-        """Numbers of each lane (Dr.Jit) -> of each pixel, row by row; differentiable."""
+    def in_rows(self, values: Any) -> Any:
+        """Numbers of each lane (Dr.Jit, or a tree of it) -> of each pixel, row by row; differentiable."""
         lane = lanes_of_pixels(self.width, self.height)
-        return dr.gather(type(value), value, lane, mode=dr.ReduceMode.Permute)
+        return dr.gather(type(values), values, lane, mode=dr.ReduceMode.Permute)
 
     def rows(self) -> Surface:
         """The pixels row by row; differentiable."""
-        return Surface(**_fields(self, self.in_rows))
+        return Surface(**self.in_rows(self._fields()))
 
     def image(self, value: Any) -> np.ndarray:
         """Numbers of each lane (Dr.Jit) as (H, W) or (H, W, C) float32."""
-        array = np.array(dr.detach(self.in_rows(value)))
-        shape = (self.height, self.width) if array.ndim == 1 else (self.height, self.width, -1)
-        return np.ascontiguousarray(array.T.reshape(shape))
+        return self.images({"value": value})["value"]
+
+    def images(self, values: dict[str, Any]) -> dict[str, np.ndarray]:
+        """:meth:`image` of many, made at once."""
+        values = self.in_rows(dr.detach(values))
+        dr.eval(values)
+        return {name: self._pixels(np.array(value)) for name, value in values.items()}
 
     def numpy(self) -> dict[str, np.ndarray]:
         """Every field as (H, W) or (H, W, 3) float32."""
-        return _fields(self, self.image)
+        return self.images(self._fields())
 
+    def _fields(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(Surface)}
 
-def _fields(surface: Surface, change: Callable[[Any], Any]) -> dict[str, Any]:
-    return {field.name: change(getattr(surface, field.name)) for field in fields(Surface)}
+    def _pixels(self, array: np.ndarray) -> np.ndarray:
+        shape = (self.height, self.width) if array.ndim == 1 else (self.height, self.width, -1)
+        return np.ascontiguousarray(array.T.reshape(shape))
 
 
 @dataclass
@@ -119,8 +126,8 @@ def trace_tiles(
     out = None
     if keep_hits:
         # One of two sizes only: the kernel is recorded anew for each size of memory that is not written yet.
-        room = FEW_HITS if int(dr.max(lists.count)[0]) <= FEW_HITS else KEPT_HITS
-        out = HitList.empty(dr.arange(mi.UInt32, dr.width(rays.tile)), room)
+        capacity = FEW_HITS if int(dr.max(lists.count)[0]) <= FEW_HITS else KEPT_HITS
+        out = HitList.empty(dr.arange(mi.UInt32, dr.width(rays.tile)), capacity)
     sums, crowded, kept_hits = stream(
         # Not how many surfels there are, which would be one more thing to record the kernel anew for.
         replace(records, count=0), lists.entries, lists.near, start, count, rays.origin, rays.direction,
@@ -141,9 +148,9 @@ def trace_tiles(
         along = dr.gather(mi.Vector3f, direction, lane)
         return partial(search_list, records, lists.entries, lists.near, first, length, rays.origin, along)
 
-    room = min(int(dr.max(count)[0]), MOST_HITS)
-    fits = keep_hits and room * dr.width(again) <= LISTED_IDS
-    more = HitList.empty(again, room) if fits else None
+    capacity = min(int(dr.max(count)[0]), MOST_HITS)
+    fits = keep_hits and capacity * dr.width(again) <= LISTED_IDS
+    more = HitList.empty(again, capacity) if fits else None
     every = dr.arange(mi.UInt32, dr.width(again))
     traced = composite_rounds(records, search(every), direction, mi.Bool(True), more)
     dr.eval(traced, more)
@@ -172,4 +179,4 @@ def trace_gbuffer(records: SurfelRecords, lists: TileLists, camera: Camera) -> G
     sums = attach(sums, records, rays.origin, rays.direction, hits)
     seen = surface(sums, rays.origin, rays.direction)
     dr.eval(seen)
-    return GBuffer(**_fields(seen, lambda value: value), width=camera.width, height=camera.height)
+    return GBuffer(**vars(seen), width=camera.width, height=camera.height)

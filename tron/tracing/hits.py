@@ -34,7 +34,7 @@ class LocalHits:
 
     @staticmethod
     def none() -> LocalHits:
-        """Room for ``MAX_HITS`` of them, and none."""
+        """Capacity for ``MAX_HITS`` of them, and none."""
         # The last slot takes the writes of rejected candidates: a masked write in a nested loop crashed LLVM.
         return LocalHits(
             dr.alloc_local(mi.Float, MAX_HITS + 1, value=mi.Float(0)),
@@ -46,12 +46,12 @@ class LocalHits:
 
 @dataclass
 class Walk:
-    """How far each lane has gone through its list of candidates, and how far it needs to go.
+    """Progress of each lane through its list of candidates, and how far it needs to go.
 
     Attributes:
         cursor, end: mi.UInt32, the next candidate and the end of the list.
         near: mi.Float, what is still to come lies no nearer than this.
-        product: mi.Float, transmittance of all that was met. farthest: t of the farthest of it.
+        product: mi.Float, transmittance of all that was hit. farthest: t of the farthest of it.
         t_cut: mi.Float, nothing beyond it can matter.
         open: mi.Bool, there may be more to meet.
     """
@@ -102,8 +102,8 @@ def collect(
 ) -> tuple[Walk, LocalHits]:  # fmt: skip
     """Walk on through each lane's candidates, adding its front-facing hits, until there is no room for more.
 
-    Exact early end: once the product of (1 - alpha) over what was met falls below ``stop``, nothing beyond
-    the farthest hit met so far can matter, because those hits alone already stop the ray.  Lists are sorted
+    Exact early end: once the product of (1 - alpha) over what was hit falls below ``stop``, nothing beyond
+    the farthest hit so far can matter, because those hits alone already stop the ray.  Lists are sorted
     by ``near``, so traversal ends at the first candidate that begins beyond that distance.
 
     Args:
@@ -137,7 +137,7 @@ def collect(
 def settle(
     walk: Walk, hits: LocalHits, transmittance: mi.Float, stop: float
 ) -> tuple[Walk, LocalHits, mi.UInt32]:
-    """How many of the sorted ``hits`` are final: no candidate to come can lie before them.
+    """Number of the sorted ``hits`` that are final: no candidate to come can lie before them.
 
     Those behind the one at which the ray stops are dropped; where that is known there may be nothing left to
     walk to, and all that remain are final.

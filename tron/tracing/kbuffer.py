@@ -1,7 +1,7 @@
 """Exact compositing of any number of hits, some of the nearest at a time.
 
 Each round looks for the K nearest hits behind the last one composited; (t, id) orders hits, so coincident
-surfels are neither lost nor met twice. Rays that no tile holds look for them in the hierarchy; the few camera
+surfels are neither lost nor hit twice. Rays that no tile holds look for them in the hierarchy; the few camera
 rays that :mod:`tron.tracing.streaming` has no room for look in the list of their tile. Slower, but nothing
 overflows.
 """
@@ -61,11 +61,11 @@ Search: TypeAlias = "Callable[[_Nearest, mi.Bool], _Nearest]"
 
 
 @dr.syntax
-def _insert(kept: _Nearest, met: SurfelHit, index: mi.UInt32, active: mi.Bool) -> _Nearest:
-    """Keep a surfel that is met, if it is among the nearest."""
-    behind = (met.t > kept.nearest[0]) | ((met.t == kept.nearest[0]) & (index > kept.last))
-    if active & met.within & met.front & behind & (met.t <= kept.farthest[0]):
-        t, alpha = met.t, met.alpha
+def _insert(kept: _Nearest, hit: SurfelHit, index: mi.UInt32, active: mi.Bool) -> _Nearest:
+    """Keep a surfel that is hit, if it is among the nearest."""
+    behind = (hit.t > kept.nearest[0]) | ((hit.t == kept.nearest[0]) & (index > kept.last))
+    if active & hit.within & hit.front & behind & (hit.t <= kept.farthest[0]):
+        t, alpha = hit.t, hit.alpha
         for slot in range(K):
             nearer = (t < kept.t[slot]) | ((t == kept.t[slot]) & (index < kept.index[slot]))
             t_, index_, alpha_ = kept.t[slot], kept.index[slot], kept.alpha[slot]
@@ -85,8 +85,8 @@ def search_hierarchy(bvh: Bvh, origin: mi.Point3f, direction: mi.Vector3f) -> Se
     """Look for hits of any rays, unit directions, in the hierarchy."""
 
     def visit(kept: _Nearest, surfel: mi.UInt32, active: mi.Bool) -> _Nearest:
-        met = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
-        return _insert(kept, met, dr.gather(mi.UInt32, bvh.order, surfel, active), active)
+        hit = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
+        return _insert(kept, hit, dr.gather(mi.UInt32, bvh.order, surfel, active), active)
 
     return lambda kept, active: walk(bvh, origin, [direction], kept, visit, active)
 
@@ -101,8 +101,8 @@ def search_list(
     going = active & (cursor < end)
     while going:
         index = dr.gather(mi.UInt32, entries, cursor, going)
-        met = intersect(records.geometry, index, origin, direction, records.degree)
-        kept = _insert(kept, met, index, going)
+        hit = intersect(records.geometry, index, origin, direction, records.degree)
+        kept = _insert(kept, hit, index, going)
         cursor += 1
         going &= cursor < end
         going &= dr.gather(mi.Float, near, cursor, going) <= kept.farthest[0]

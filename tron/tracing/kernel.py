@@ -8,7 +8,8 @@ opacity is
 
 with ``response(q) = exp(-q / 2)`` for degree 2 (2DGS, Huang et al. 2024) and ``exp(-(4.5 / 81) q^2)`` for
 degree 4 (3DGRT's generalised Gaussian, Moenne-Loccoz et al. 2024). Both reach the same value at three
-sigma. Nothing else evaluates this formula, except the float64 oracle in :mod:`tron.tracing.reference`.
+sigma (docs/conventions.md, 6). Nothing else evaluates this formula, except the float64 oracle in
+:mod:`tron.tracing.reference`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ T_MIN = 1e-3
 GEOMETRY_PACKETS = 3
 """A geometry record is 12 floats: centre, opacity | t_u / s_u, radius | t_v / s_v, q_cut."""
 RADIUS = 7
-"""Where a geometry record holds the radius."""
+"""Place of the radius in a geometry record."""
 FEATURE_PACKETS = 3
 """A feature record is 12 floats: normal, roughness | base color, metallic | radiance of SH degree 0, 0."""
 SH_PACKETS = 12
@@ -157,7 +158,7 @@ def intersect(
     unclipped = centre[3] * value
     return SurfelHit(
         t=t,
-        # dr.select is a quarter of the cost of dr.minimum on LLVM (measured in tracer.md).
+        # dr.select is a quarter of the cost of dr.minimum on LLVM.
         alpha=dr.select(unclipped < MAX_ALPHA, unclipped, MAX_ALPHA),
         within=q <= axis_v[3],
         front=facing < 0.0,

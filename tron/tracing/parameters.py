@@ -1,4 +1,4 @@
-"""What can be optimised about a scene, and how it becomes the records that the tracer reads.
+"""Parameters of a scene that can be optimised, and their packing into the records that the tracer reads.
 
 Packing is Dr.Jit code, so gradients of the records flow back to means, quaternions, log-scales, logits,
 harmonics and materials by ordinary automatic differentiation. The kernel's cut (``q_cut``, ``radius``)

@@ -18,7 +18,7 @@ from tron.tracing.transmittance import BACK_FACE_SPACINGS, OPAQUE_TRANSMITTANCE
 
 
 class Scene(Protocol):
-    """What is read of a ``GaussianScene``; finite differences bring one of float64 arrays."""
+    """Attributes that are read of a ``GaussianScene``; finite differences bring one of float64 arrays."""
 
     means: np.ndarray
     quats: np.ndarray
@@ -155,13 +155,13 @@ def composite(
 def _composite_block(
     scene: Scene, origins: np.ndarray, directions: np.ndarray, views: np.ndarray
 ) -> ReferenceHits:
-    met, rays = _meet(scene, origins, directions), len(origins)
+    hit, rays = _meet(scene, origins, directions), len(origins)
     normals = rotation_matrices(np.asarray(scene.quats, np.float64))[:, :, 2]
     materials = np.concatenate(
         [normals, scene.base_color, scene.roughness[:, None], scene.metallic[:, None]], 1
     ).astype(np.float64)
-    visible = met.counted & met.front & (met.t > T_MIN)
-    along = np.where(visible, met.t, np.inf)
+    visible = hit.counted & hit.front & (hit.t > T_MIN)
+    along = np.where(visible, hit.t, np.inf)
     order = np.argsort(along, axis=1, kind="stable")  # stable: coincident surfels stay in the order of ids
     most = int(visible.sum(1).max(initial=0))
     out = np.zeros((rays, 12))
@@ -170,7 +170,7 @@ def _composite_block(
     for slot in range(most):
         ray = np.flatnonzero((visible.sum(1) > slot) & (remaining >= STOP_TRANSMITTANCE))
         surfel = order[ray, slot]
-        t, alpha = met.t[ray, surfel], met.alpha[ray, surfel]
+        t, alpha = hit.t[ray, surfel], hit.alpha[ray, surfel]
         rgb = eval_sh(np.asarray(scene.sh, np.float64)[surfel], views[ray])
         before, after = remaining[ray], remaining[ray] * (1 - alpha)
         values = np.concatenate([materials[surfel], rgb, t[:, None]], 1)
@@ -184,8 +184,8 @@ def _composite_block(
         hits[ray] += 1
     # What lies behind the hit that stopped a ray is never compared with anything.
     reached = np.where(remaining < STOP_TRANSMITTANCE, last, np.inf)
-    compared = met.front & (met.t > 0) & (met.t <= reached[:, None] + 1e-5)
-    cuts = np.where(compared, met.margin, np.inf).min(1, initial=np.inf)
+    compared = hit.front & (hit.t > 0) & (hit.t <= reached[:, None] + 1e-5)
+    cuts = np.where(compared, hit.margin, np.inf).min(1, initial=np.inf)
     return ReferenceHits(
         normal=out[:, 0:3],
         base_color=out[:, 3:6],
@@ -198,7 +198,7 @@ def _composite_block(
         hits=hits,
         margin=np.minimum(margin, cuts),
         gap=gap,
-        candidates=(met.counted & (met.t > T_MIN)).sum(1),
+        candidates=(hit.counted & (hit.t > T_MIN)).sum(1),
         front=visible.sum(1),
     )
 
@@ -212,13 +212,13 @@ def transmittance(
     which are the scene's, and larger by as much as the surfel's radius is larger than the median.
     """
     origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
-    met = _meet(scene, origins, directions)
-    seen = met.radius[met.radius > 0]
-    larger = np.maximum(met.radius / (np.median(seen) if len(seen) else 1.0), 1)
+    hit = _meet(scene, origins, directions)
+    radii = hit.radius[hit.radius > 0]
+    larger = np.maximum(hit.radius / (np.median(radii) if len(radii) else 1.0), 1)
     reach = BACK_FACE_SPACINGS * scene.spacing * larger
-    blocks = met.counted & np.where(met.front, met.t > 0, two_sided & (met.t > reach))
-    product = np.where(blocks, 1 - met.alpha, 1.0).prod(1)
-    starts = np.where(met.front, np.abs(met.t), np.abs(met.t - reach))
-    nearby = np.minimum(met.margin, np.where(met.counted, starts, np.inf)).min(1, initial=np.inf)
+    blocks = hit.counted & np.where(hit.front, hit.t > 0, two_sided & (hit.t > reach))
+    product = np.where(blocks, 1 - hit.alpha, 1.0).prod(1)
+    starts = np.where(hit.front, np.abs(hit.t), np.abs(hit.t - reach))
+    nearby = np.minimum(hit.margin, np.where(hit.counted, starts, np.inf)).min(1, initial=np.inf)
     margin = np.minimum(nearby, np.abs(product - OPAQUE_TRANSMITTANCE))
     return np.where(product >= OPAQUE_TRANSMITTANCE, product, 0.0), margin

@@ -45,11 +45,11 @@ class RelistedHits:
         self._ray, self._count = ray, count
 
     def __iter__(self) -> Iterator[HitList]:
-        rays, room = dr.width(self._ray), max(1, int(dr.max(self._count)[0]))
-        batch = max(1, LISTED_IDS // room)
+        rays, capacity = dr.width(self._ray), max(1, int(dr.max(self._count)[0]))
+        batch = max(1, LISTED_IDS // capacity)
         for first in range(0, rays, batch):
             lane = dr.arange(mi.UInt32, min(batch, rays - first)) + dr.opaque(mi.UInt32, first)
-            hits = HitList.empty(dr.gather(mi.UInt32, self._ray, lane), room)
+            hits = HitList.empty(dr.gather(mi.UInt32, self._ray, lane), capacity)
             active = dr.gather(mi.UInt32, self._count, lane) > 0
             direction = lanes_of(self._direction, lane)
             hits.count = composite_rounds(self._records, self._search(lane), direction, active, hits).count

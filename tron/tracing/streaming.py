@@ -1,6 +1,6 @@
 """Camera rays along their tiles' lists: hits are collected, sorted and composited, as many at a time as fit.
 
-A list is sorted by a lower bound of distance, so what a ray has met nearer than the next candidate's bound
+A list is sorted by a lower bound of distance, so what a ray has hit nearer than the next candidate's bound
 is final: nothing to come lies before it. Each ray collects until it has ``MAX_HITS`` hits or its list ends,
 sorts them, composites the final ones and keeps the others for the next round. Most rays need one round. It
 fails only where as many hits as fit wait for candidates that might lie before all of them: surfels much
@@ -40,7 +40,7 @@ def stream(
     """
     sums, crowded = _rounds(records, entries, near, Walk.along(start, count), origin, direction, out)
     if out is not None:
-        crowded |= sums.count > out.room
+        crowded |= sums.count > out.capacity
     return sums, crowded, dr.select(crowded, 0, sums.count)
 
 

@@ -1,8 +1,9 @@
 """Sums over hits -> surface points: the normalisation that every ray of the library goes through.
 
 Composited channels are alpha-weighted sums, so materials are divided by opacity and the normal is brought
-back to unit length (facts.md 4b). The surface point is at the median depth; where transmittance never falls
-below one half there is no median, and the alpha-weighted mean depth stands in where opacity is not zero.
+back to unit length (docs/conventions.md, 7). The surface point is at the median depth; where transmittance
+never falls below one half there is no median, and the alpha-weighted mean depth stands in where opacity is
+not zero.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from tron.tracing.compositing import Composite
 
 @dataclass
 class Surface:
-    """What each ray sees, as Dr.Jit arrays of one lane a ray.
+    """Surface that each ray sees, as Dr.Jit arrays of one lane a ray.
 
     Attributes:
         position: mi.Point3f, world; meaningless where opacity is 0.
@@ -45,9 +46,9 @@ class Surface:
 def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surface:
     """Normalise the sums of rays from ``origin`` along unit ``direction``; differentiable in the sums."""
     opacity = 1 - sums.transmittance
-    seen = opacity > 0
+    hit = opacity > 0
     # Divisors of empty rays are replaced before dividing: 0 times an infinite derivative would be NaN.
-    inverse = dr.select(seen, dr.rcp(dr.select(seen, opacity, 1)), 0)
+    inverse = dr.select(hit, dr.rcp(dr.select(hit, opacity, 1)), 0)
     channels = sums.channels
     normal = mi.Normal3f(*channels[0:3])
     squared = dr.squared_norm(normal)

@@ -170,10 +170,10 @@ def _touched_tiles(records: SurfelRecords, camera: Camera) -> _Touched:
     facing = dr.dot(dr.cross(u, v), to_centre) < 0  # a flat disk shows one side to a point
     u, v = half_axes(u, v, q_cut)
 
-    def seen(vector: mi.Vector3f) -> mi.Vector3f:
+    def projected(vector: mi.Vector3f) -> mi.Vector3f:
         return mi.Vector3f(fx * dr.dot(right, vector), fy * dr.dot(down, vector), dr.dot(forward, vector))
 
-    c, a, b = seen(to_centre), seen(u), seen(v)
+    c, a, b = projected(to_centre), projected(u), projected(v)
     ahead = c.z + dr.sqrt(a.z * a.z + b.z * b.z) > 0
     first_x, across = _tile_range(*_screen_bounds(c, a, b, (1, 0), cx), columns)
     first_y, down_count = _tile_range(*_screen_bounds(c, a, b, (0, 1), cy), rows)
@@ -309,7 +309,7 @@ class _Levels:
 
 
 def _runs(keys: mi.UInt32, size: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """Where each of 0..size-1 begins in sorted ``keys``, and how often it occurs there."""
+    """Start of each of 0..size-1 in sorted ``keys``, and how often it occurs there."""
     i, end = dr.arange(mi.UInt32, dr.width(keys)), dr.opaque(mi.UInt32, dr.width(keys) - 1)
     before = dr.gather(mi.UInt32, keys, dr.select(i > 0, i - 1, 0))
     after = dr.gather(mi.UInt32, keys, dr.select(i < end, i + 1, end))

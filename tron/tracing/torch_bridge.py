@@ -49,7 +49,7 @@ def tensors_of(scene: GaussianScene, device: str | torch.device = "cpu") -> dict
 def render(
     surfels: Mapping[str, torch.Tensor], camera: Camera, *, kernel_degree: int = 2, sh_degree: int = 3
 ) -> dict[str, torch.Tensor]:
-    """What ``camera`` sees, differentiable by every tensor that requires gradients.
+    """View of ``camera``, differentiable by every tensor that requires gradients.
 
     Args:
         surfels: contiguous float32 tensors on the device of the active variant, named and shaped as the

@@ -117,7 +117,7 @@ class SurfelTracer:
         return trace_gbuffer(self._attached(), build_tiles(self.records, camera), camera)
 
     def trace(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True) -> Surface:
-        """What any rays see, from ``origin`` along unit ``direction``; inactive lanes see nothing.
+        """Surfaces along any rays, from ``origin`` along unit ``direction``; inactive lanes see nothing.
 
         The same surfels composited in the same order as by :meth:`gbuffer`, without the coherence that makes
         camera rays fast.

@@ -26,14 +26,14 @@ LEAVES_A_TURN = 4
 _GROUPS = 3
 """Groups of leaves, each under one node, that a lane can hold."""
 _ROOT = 2
-"""What is pending at first: child 1 of a node 0 that does not exist."""
+"""Pending at first: child 1 of a node 0 that does not exist."""
 _TINY = 1e-12
 _ROUNDING = 1 + 2.0**-21
 """Covers the float32 rounding of distances (Ize 2013, "Robust BVH Ray Traversal")."""
 
 
 class Intervals(Protocol):
-    """What a walk carries along: at least the distances between which surfels can still matter.
+    """State of a walk: at least the distances between which surfels can still matter.
 
     Attributes:
         nearest, farthest: one of each a ray, world units along the unit ray; a ray is done once farthest is
@@ -65,7 +65,7 @@ def any_of(masks: Sequence[mi.Bool]) -> mi.Bool:
 
 @dataclass
 class Descent:
-    """Where a lane's walk stands.
+    """State of a lane's walk.
 
     Attributes:
         node: the node visited last.
@@ -182,7 +182,7 @@ def _met_children(
     state: Intervals,
     active: mi.Bool,
 ) -> mi.UInt32:
-    """Which children's boxes any ray of the fan meets within its interval: four bits."""
+    """Children whose boxes any ray of the fan meets within its interval: four bits."""
     packets = [
         dr.gather(mi.Vector4u, bvh.nodes, node * NODE_PACKETS + packet, active)
         for packet in range(NODE_PACKETS)

@@ -194,9 +194,20 @@ def test_gradients_of_materials_are_the_finite_differences(surfels, light) -> No
         parameters.update()
 
 
+def test_the_papers_estimate_is_the_librarys(surfels, light) -> None:
+    paper = Estimation(rays=16, estimator="plain", two_sided=False)
+    wanted = render_guidance(SurfelTracer(surfels), CAMERA, Lighting(light), paper, 0).irradiance
+    integrator = plugin(surfels, buffer="irradiance", estimator="plain", two_sided=False)
+    seen = channels(mi.render(scene_of(light.to_mitsuba()), integrator=integrator), integrator)["main"]
+    assert (np.abs(seen - wanted) > 2e-3).mean() < 0.01
+    assert np.abs(ours(surfels, light).irradiance - wanted).max() > 0.1, "the choice changes nothing"
+
+
 def test_mistakes_are_named(surfels, tmp_path) -> None:
     for given, complaint in (
         ({"buffer": "albedo"}, "choose one of pbr, irradiance, unshadowed, shadowed"),
+        ({"estimator": "median"}, "choose ratio or plain"),
+        ({"shadow_rays": 3}, "an even number"),
         ({"environment": str(tmp_path / "missing.exr")}, "missing.exr"),
         ({"environment": integrators.embed(surfels)}, "no EnvironmentMap"),
     ):

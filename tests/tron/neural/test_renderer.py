@@ -198,7 +198,9 @@ def test_a_third_buffer_is_seen_and_a_missing_one_named(fusion):
             renderer(guided(pbr, irradiance))
 
 
-@pytest.mark.parametrize("names", [("irradiance",), ("pbr", "pbr"), ("pbr", "depth"), ("pbr", "nonsense")])
+@pytest.mark.parametrize(
+    "names", [("irradiance",), ("pbr", "pbr"), ("pbr", "depth"), ("pbr", "rgb"), ("pbr", "x")]
+)
 def test_guidance_that_no_network_can_have_is_refused(names):
     for config in (RendererConfig, PixelMLPConfig):
         with pytest.raises(ValueError, match="guidance is pbr and others of pbr, irradiance"):

@@ -78,7 +78,7 @@ def truthful(painted_capture: Capture) -> Reconstruction:
     """Forty steps and forty with the true maps, from depth."""
     longer = settings(
         radiance=settings().radiance.model_copy(update={"steps": 40}),
-        materials=MaterialSettings(steps=40, rate=0.03),
+        materials=MaterialSettings(steps=40, rate=0.03, decay=1),
     )
     return reconstruct(painted_capture, GroundTruth(), longer)
 
@@ -101,7 +101,7 @@ def test_base_color_begins_as_the_radiance(painted_capture: Capture) -> None:
         found = reconstruct(
             without(painted_capture, *prior_maps),
             GroundTruth(),
-            settings(materials=MaterialSettings(steps=steps)),
+            settings(materials=MaterialSettings(steps=steps, decay=1)),
         ).scene
         expected = srgb_to_linear(np.clip(SH_C0 * found.sh[:, 0] + 0.5, 0, 1))
         np.testing.assert_allclose(found.base_color, expected, atol=1e-6)

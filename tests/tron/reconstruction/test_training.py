@@ -216,7 +216,7 @@ def test_materials_are_learnt_and_geometry_does_not_move_by_one_bit(painted, pai
         roughness=np.full_like(painted.roughness, 0.5),
         metallic=np.full_like(painted.metallic, 0.5),
     )
-    plan = materials_plan(MaterialSettings(steps=60, rate=0.03))
+    plan = materials_plan(MaterialSettings(steps=60, rate=0.03, decay=1))
     stage = stage_of(grey, painted_capture.train_views, plan)
     stage.run()
     found = stage.surfels.scene(2, painted.up)
