@@ -52,7 +52,7 @@ def test_20k_surfels_and_their_irradiance_on_held_out_views_of_textured_scenes(i
         ]
         assert metrics.psnr(shown[0], shown[1], seen) >= LEAST_DB[family], family
 
-        # Errors of shadows are counted where both see the same surface (guidance.md, spike q2).
+        # Errors of shadows are counted where both see the same surface.
         depth = np.linalg.norm(truth.position - camera.position, axis=-1)
         same = seen & (np.abs(depth - ours.gbuffer["depth"].reshape(depth.shape)) < 0.03)
         reference, open_sky, estimate = (

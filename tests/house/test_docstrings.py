@@ -49,10 +49,6 @@ def test_the_checks_catch():
     assert docstrings('"""One."""\ndef f():\n    """Two."""') == [(1, "One."), (2, "Two.")]
 
 
-ROOMS_TO_COME = pytest.mark.xfail(strict=False, reason="not all rooms of issue 10 are merged yet")
-
-
-@ROOMS_TO_COME
 @pytest.mark.parametrize("folder", [folder for folder in FOLDERS if folder != "tests"])
 def test_no_docstring_opens_with_a_question(folder: str):
     found = [
@@ -89,7 +85,6 @@ def test_every_number_that_is_cited_is_a_section_of_the_conventions():
     assert wrong == []
 
 
-@ROOMS_TO_COME
 def test_nothing_cites_the_unpublished_design():
     found = [
         f"{path.relative_to(ROOT)}: {match[0]}"

@@ -39,7 +39,7 @@ def paper() -> Settings:
 
 
 def test_the_papers_recipe_is_that_of_the_facts(paper: Settings) -> None:
-    """facts.md sections 1 and 2."""
+    """The numbers of the paper (docs/conventions.md, 15)."""
     radiance, density, materials = paper.radiance, paper.radiance.density, paper.materials
     assert (radiance.steps, materials.steps, paper.steps_scaler) == (30_000, 7000, 1.0)
     assert (radiance.position_rate, radiance.position_rate_final) == (1.6e-4, 1.6e-6)
