@@ -89,8 +89,7 @@ def test_views_do_not_depend_on_their_neighbours(geometry, camera, view):
 def test_constant_light_gives_its_radiance_to_an_open_surface_and_less_beside_the_ball(
     geometry, camera, view
 ):
-    """A floor point at distance s from the foot of a ball that stands on the floor loses the ball's form
-    factor.
+    """A floor point at distance s from the foot of a ball on it loses the ball's form factor.
 
     The ball is wholly above the horizon, so it hides cos(angle) sin^2(half angle) = h r^2 / d^3 of the cosine
     integral, with h = r and d the distance to the ball's centre (Nusselt).

@@ -1,6 +1,4 @@
-"""Real models and real light through the whole engine: path-traced, turned into surfels, relit by another
-map.
-"""
+"""Real models and real light through the whole engine: path-traced, made surfels, relit by another map."""
 
 import json
 import shutil

@@ -101,9 +101,11 @@ def dense_surfels(variant: str) -> DenseSurfels:
 
 @pytest.fixture
 def kernels_of(variant: str) -> Callable[[Callable[[], object]], set[str]]:
-    """Texts of the kernels that some work launches, but for their names and for the alignment of what they
-    read, which is the allocator's chance. Dr.Jit's own ``cache_hit`` is true as well for a kernel that an
-    earlier run left on disk, and so false where a machine is new.
+    """Texts of the kernels that some work launches.
+
+    Left out are their names and the alignment of what they read, which is the allocator's chance. Dr.Jit's
+    own ``cache_hit`` is true as well for a kernel that an earlier run left on disk, and so false where a
+    machine is new.
     """
     import drjit as dr
 

@@ -1,6 +1,7 @@
 """Camera paths: distance, aim and coverage hold for any target and any up direction."""
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,8 +115,9 @@ def test_a_path_of_one_camera_is_its_start():
     [({"radius": 0}, "radius"), ({"elevation_deg": 90}, "elevation"), ({"up": (0, 0, 0)}, "up direction")],
 )
 def test_impossible_paths_are_refused(change: dict, complaint: str):
+    settings: dict[str, Any] = {"target": TARGET, "radius": 1, **VIEW, **change}
     with pytest.raises(TronError, match=complaint):
-        trajectories.orbit(4, **{"target": TARGET, "radius": 1, **VIEW, **change})
+        trajectories.orbit(4, **settings)
 
 
 def test_empty_paths_and_mixed_sizes_are_refused():

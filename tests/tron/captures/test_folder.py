@@ -204,8 +204,9 @@ def test_nothing_is_read_before_it_is_asked_for(folder: Path):
 
 
 def test_views_are_written_one_by_one(tmp_path: Path):
-    """A capture of readers needs the memory of one view: no reader is called before the last one's view is
-    on disk.
+    """A capture of readers needs the memory of one view.
+
+    No reader is called before the last one's view is on disk.
     """
     seen = []
 

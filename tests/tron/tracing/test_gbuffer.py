@@ -1,5 +1,4 @@
-"""Laws of camera rays: agreement with the float64 reference, closed forms, sidedness, ordering, degenerate
-scenes."""
+"""Laws of camera rays: the float64 reference, closed forms, sidedness, ordering, degenerate scenes."""
 
 from __future__ import annotations
 
