@@ -76,7 +76,7 @@ def make_clip(
         guidance = render_guidance(
             tracer, camera, lighting, settings.estimation(spec.split), seeds["guidance"][i]
         )
-        frame = {name: guidance[name] for name in guidance.BUFFERS}
+        frame = {name: guidance[name] for name in guidance.BUFFERS if name in MEMBERS}
         frame |= {"rgb": rgb[i], "foreground": truth.valid.astype(np.float32)}
         if recipe.reference_buffers:
             direct = direct_irradiance(geometry, scene, camera, recipe.reference_spp, seeds["reference"][i])

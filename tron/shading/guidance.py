@@ -2,7 +2,9 @@
 
     pbr         base (1 - m) U + S             unshadowed split-sum
     irradiance  U share of the light           a white diffuse surface, shadows included
-    shadowed    base (1 - m) irradiance + S    the strongest picture that needs no network
+    shadowed    base (1 - m) irradiance + S    direct light alone
+    indirect    irradiance / pi by light that bounced between the surfels (:mod:`tron.shading.bounce`)
+    lit         shadowed + base (1 - m) indirect + reflections of the scene: the whole picture
 
 U is the unshadowed irradiance / pi, S the split-sum specular, F0 = 0.04 (1 - m) + m base. The n-ray
 estimates of shadowed and unshadowed irradiance share their rays, so the share that arrives keeps the shadows
@@ -82,6 +84,8 @@ class Guidance:
         irradiance: (H, W, 3) shadowed irradiance / pi.
         unshadowed: (H, W, 3) the same with nothing in the way.
         shadowed: (H, W, 3) radiance: shadowed diffuse plus split-sum specular.
+        indirect: (H, W, 3) irradiance / pi by bounced light; 0 on surfels where none was baked.
+        lit: (H, W, 3) radiance with bounced light; ``shadowed`` where none was baked.
         mask: (H, W) opacity of the surfels in [0, 1].
         gbuffer: ``GBuffer.numpy()``, which is no buffer of its own.
     """
@@ -90,6 +94,8 @@ class Guidance:
     irradiance: np.ndarray
     unshadowed: np.ndarray
     shadowed: np.ndarray
+    indirect: np.ndarray
+    lit: np.ndarray
     mask: np.ndarray
     gbuffer: dict[str, np.ndarray]
     BUFFERS: ClassVar[tuple[str, ...]]
@@ -185,6 +191,8 @@ def shade_surface(
         "irradiance": shadowed,
         "unshadowed": unshadowed,
         "shadowed": diffuse_color * shadowed + specular,
+        "indirect": mi.Color3f(0),
+        "lit": diffuse_color * shadowed + specular,
     }
     buffers = {name: over_background(color, behind, surface.opacity) for name, color in buffers.items()}
     dr.eval(buffers)

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from tron.color import agx
 from tron.errors import TronError
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 ColorSpace = Literal["linear", "display"]
 
@@ -71,6 +71,7 @@ MEMBERS: dict[str, Member] = {
     "rgb": _light("path-traced radiance, which the network must produce"),
     "unshadowed": _light("irradiance / pi at the surfels, without visibility"),
     "shadowed": _light("base_color (1 - metallic) irradiance, plus the split sum's specular part"),
+    "lit": _light("shadowed, and light that bounced between the surfels: the picture without a network"),
     "mask": _scalar("opacity of the surfels in [0, 1]", "all"),
     "foreground": Member("png", 1, 1, None, "all", "1 where the pixel-centre ray meets true geometry"),
     "irradiance_ref": _light("direct irradiance / pi by Mitsuba, with shadows", "reference"),

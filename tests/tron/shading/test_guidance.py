@@ -36,7 +36,7 @@ def test_buffers_are_finite_float32_images(variant: str, sphere_over_plane, came
         assert buffer.dtype == np.float32
         assert np.isfinite(buffer).all()
         assert buffer.min() >= 0
-    assert set(Guidance.BUFFERS) == {"pbr", "irradiance", "unshadowed", "shadowed", "mask"}
+    assert set(Guidance.BUFFERS) == {"pbr", "irradiance", "unshadowed", "shadowed", "indirect", "lit", "mask"}
     assert guidance["mask"].shape == (48, 48, 1)
     np.testing.assert_array_equal(guidance["mask"][..., 0], guidance.mask)
     with pytest.raises(KeyError):
