@@ -1,12 +1,13 @@
 """G-buffer + environment -> guidance: the buffers that the neural renderer is conditioned on.
 
-    pbr         base (1 - m) U + S             unshadowed split-sum
+    pbr         kd U + S                       unshadowed split-sum
     irradiance  U share of the light           a white diffuse surface, shadows included
-    shadowed    base (1 - m) irradiance + S    direct light alone
+    shadowed    kd irradiance + S              direct light alone
     indirect    irradiance / pi by light that bounced between the surfels (:mod:`tron.shading.bounce`)
-    lit         shadowed + base (1 - m) indirect + reflections of the scene: the whole picture
+    lit         shadowed + kd indirect + reflections of the scene: the whole picture
 
-U is the unshadowed irradiance / pi, S the split-sum specular, F0 = 0.04 (1 - m) + m base. The n-ray
+U is the unshadowed irradiance / pi, S the split-sum specular, kd and the lobe's share in S those of
+:mod:`tron.shading.reflectance`. The n-ray
 estimates of shadowed and unshadowed irradiance share their rays, so the share that arrives keeps the shadows
 and sheds the noise of the light, and U, which has none, puts the light back (Heitz et al. 2018). From 16 rays
 it is their ratio, below a regression that is not biased in shadow (:mod:`tron.shading.few_rays`). At 64 rays
@@ -29,19 +30,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from tron.estimation import Estimation
+from tron.estimation import Diffuse, Estimation
 from tron.shading.background import over_background
 from tron.shading.denoise import atrous
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
 from tron.shading.few_rays import RATIO_FROM_RAYS, grey, regressed_share
 from tron.shading.irradiance import Occluder, irradiance, visible_share
+from tron.shading.reflectance import reflectance
 from tron.shading.split_sum import CUBEMAP_RESOLUTION, SplitSum
 
 if TYPE_CHECKING:
     from tron.cameras import Camera
     from tron.tracing import GBuffer, Surface
 
-DIELECTRIC_F0 = 0.04
 FINAL = Estimation()
 
 
@@ -129,7 +130,8 @@ def render_guidance(
         background: linear RGB radiance behind the surfels; None: the environment.
     """
     gbuffer = tracer.gbuffer(camera)
-    return shade(gbuffer, visibility(tracer, gbuffer, lighting, estimation, seed), lighting, background)
+    reaching = visibility(tracer, gbuffer, lighting, estimation, seed)
+    return shade(gbuffer, reaching, lighting, background, estimation.diffuse)
 
 
 def visibility(
@@ -168,7 +170,11 @@ def _normal(surface: Surface) -> mi.Vector3f:
 
 
 def shade_surface(
-    surface: Surface, visibility: mi.Color3f, lighting: Lighting, background: Sequence[float] | None = None
+    surface: Surface,
+    visibility: mi.Color3f,
+    lighting: Lighting,
+    background: Sequence[float] | None = None,
+    diffuse: Diffuse = "principled",
 ) -> dict[str, mi.Color3f]:
     """Shade what rays see, given the share of the unshadowed irradiance that reaches each of them.
 
@@ -176,10 +182,10 @@ def shade_surface(
     device, one lane a ray.
     """
     normal = _normal(surface)
-    diffuse_color = surface.base_color * (1 - surface.metallic)
-    f0 = DIELECTRIC_F0 * (1 - surface.metallic) + surface.metallic * surface.base_color
-    unshadowed = lighting.split_sum.diffuse(normal)
-    specular = lighting.split_sum.specular(normal, -surface.direction, surface.roughness, f0)
+    split_sum, to_camera = lighting.split_sum, -surface.direction
+    share = reflectance(surface, split_sum.brdf, dr.dot(normal, to_camera), diffuse)
+    unshadowed = split_sum.diffuse(normal)
+    specular = split_sum.reflected(normal, to_camera, surface.roughness) * share.specular
     shadowed = unshadowed * visibility
     if background is None:
         behind = lighting.light.radiance(surface.direction)
@@ -187,12 +193,12 @@ def shade_surface(
         behind = mi.Color3f(*(dr.opaque(mi.Float, float(channel)) for channel in background))
 
     buffers = {
-        "pbr": diffuse_color * unshadowed + specular,
+        "pbr": share.diffuse * unshadowed + specular,
         "irradiance": shadowed,
         "unshadowed": unshadowed,
-        "shadowed": diffuse_color * shadowed + specular,
+        "shadowed": share.diffuse * shadowed + specular,
         "indirect": mi.Color3f(0),
-        "lit": diffuse_color * shadowed + specular,
+        "lit": share.diffuse * shadowed + specular,
     }
     buffers = {name: over_background(color, behind, surface.opacity) for name, color in buffers.items()}
     dr.eval(buffers)
@@ -200,9 +206,13 @@ def shade_surface(
 
 
 def shade(
-    gbuffer: GBuffer, visibility: mi.Color3f, lighting: Lighting, background: Sequence[float] | None = None
+    gbuffer: GBuffer,
+    visibility: mi.Color3f,
+    lighting: Lighting,
+    background: Sequence[float] | None = None,
+    diffuse: Diffuse = "principled",
 ) -> Guidance:
     """Guidance from a G-buffer and the share of the unshadowed irradiance that reaches each pixel."""
-    colors = shade_surface(gbuffer, visibility, lighting, background)
+    colors = shade_surface(gbuffer, visibility, lighting, background, diffuse)
     buffers = gbuffer.numpy()
     return Guidance(**gbuffer.images(colors), mask=buffers["opacity"], gbuffer=buffers)

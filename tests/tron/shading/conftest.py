@@ -117,3 +117,14 @@ def points_gbuffer() -> Callable[[np.ndarray, np.ndarray], SimpleNamespace]:
         )
 
     return make
+
+
+@pytest.fixture
+def material(variant: str) -> Callable[[float, float, float], SimpleNamespace]:
+    """Make a grey material from base color, roughness and metallic, a number each or (N,)."""
+
+    def make(base_color: float, roughness: float, metallic: float) -> SimpleNamespace:
+        base, rough, metal = (mi.Float(np.float32(value)) for value in (base_color, roughness, metallic))
+        return SimpleNamespace(base_color=mi.Color3f(base), roughness=rough, metallic=metal)
+
+    return make
