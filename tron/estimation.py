@@ -54,3 +54,11 @@ class Estimation(BaseModel):
     supersample: Literal[1, 2] = Field(
         default=1, description="2: 2 x 2 sub-pixels with a quarter of the rays each, averaged"
     )
+
+    def of_sub_pixel(self) -> Estimation:
+        """The same for each of a pixel's sub-pixels, which share its rays out."""
+        parts = self.supersample**2
+        if parts == 1:
+            return self
+        rays, reflections = max(2, self.rays // parts // 2 * 2), -(-self.reflections // parts)
+        return self.model_copy(update={"rays": rays, "reflections": reflections, "supersample": 1})

@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.estimation import Diffuse
-from tron.shading.brdf_table import BrdfTable
+from tron.shading.brdf_table import GLASS_INDEX, BrdfTable
 
 DIELECTRIC_F0 = 0.04
 MOST_ALBEDO = 0.99
@@ -59,12 +59,27 @@ def reflectance(
         diffuse: the model.
     """
     scale, bias, factor, glass = table(material.roughness, cosine)
-    base_color, metallic = material.base_color, material.metallic
-    body = base_color * (1 - metallic)
+    body = material.base_color * (1 - material.metallic)
     if diffuse == "lambert":
-        return Reflectance(body, (DIELECTRIC_F0 * (1 - metallic) + metallic * base_color) * scale + bias)
-    specular = (1 - metallic) * glass + metallic * (base_color * scale + bias)
+        return Reflectance(body, _f0(material) * scale + bias)
+    specular = _blend(material, glass, material.base_color * scale + bias)
     return Reflectance(dr.minimum(body * factor, 1 - specular), specular)
+
+
+def fresnel(material: Material, cosine: mi.Float, diffuse: Diffuse = "principled") -> mi.Color3f:
+    """Share that is mirrored at ``cosine`` to the half vector; its mean over a lobe is in ``reflectance``."""
+    weight = (1 - dr.clip(cosine, 0, 1)) ** 5
+    if diffuse == "lambert":
+        return dr.lerp(_f0(material), 1, weight)
+    return _blend(material, mi.fresnel(cosine, GLASS_INDEX)[0], dr.lerp(material.base_color, 1, weight))
+
+
+def _f0(material: Material) -> mi.Color3f:
+    return DIELECTRIC_F0 * (1 - material.metallic) + material.metallic * material.base_color
+
+
+def _blend(material: Material, glass: mi.Float, metal: mi.Color3f) -> mi.Color3f:
+    return (1 - material.metallic) * glass + material.metallic * metal
 
 
 def bounce_albedo(material: Material, table: BrdfTable, diffuse: Diffuse = "principled") -> mi.Color3f:
