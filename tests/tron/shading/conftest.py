@@ -66,6 +66,7 @@ class SphereOverPlane:
             rgb=mi.Color3f(0) * one,
             opacity=one,
             direction=direction,
+            values=[],
         )
         return GBuffer.of_rows(seen, camera.width, camera.height)
 
