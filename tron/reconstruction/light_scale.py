@@ -100,7 +100,10 @@ def fit_scale(
     """
     steps, seed = settings.scale_steps, settings.seed
     estimation = Estimation(
-        rays=settings.scale_rays, estimator=settings.estimator, two_sided=settings.two_sided
+        rays=settings.scale_rays,
+        estimator=settings.estimator,
+        two_sided=settings.two_sided,
+        diffuse=settings.diffuse,
     )
     pairs = []
     for photo in track(photos, "Scale: views"):

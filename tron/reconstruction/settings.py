@@ -12,7 +12,7 @@ from typing import Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.estimation import Estimator
+from tron.estimation import Diffuse, Estimator
 
 Model = TypeVar("Model", bound="Settings")
 
@@ -179,6 +179,10 @@ class FitSettings(Settings):
     two_sided: bool = Field(
         default=True,
         description="Back faces block shadow rays beyond two spacings; false: never, as in the paper.",
+    )
+    diffuse: Diffuse = Field(
+        default="principled",
+        description="Material that the light's scale is fitted with: principled, or lambert, the paper's.",
     )
     coarsest: int = Field(
         default=4,
