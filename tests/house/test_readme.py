@@ -61,7 +61,7 @@ def test_the_python_examples_do_what_they_say(tmp_path, monkeypatch):
     # Above the horizon, where the floor sees it, the light comes back as it was.
     assert np.median(read_image(tmp_path / "fitted.exr")[:16]) == pytest.approx(0.7, rel=0.2)
     picture = np.array(names["picture"])
-    assert picture.shape == (24, 24, 13)  # RGB, three other buffers, opacity
+    assert picture.shape == (24, 24, 19)  # RGB, five other buffers, opacity
     assert 0.3 < picture[12, 12, 0] < 0.45
 
 
