@@ -78,6 +78,33 @@ class RendererConfig(GuidedConfig):
     backbone: BackboneConfig = BackboneConfig()
 
 
+COSMOS_0_6B = BackboneConfig(
+    heads=20,
+    head_dim=64,
+    layers=20,
+    mlp_ratio=4.0,
+    text_embed_dim=1024,
+    adaln_lora_dim=256,
+    patch=(1, 2, 2),
+    max_size=(128, 240, 240),
+    rope_scale=(1.0, 4.0, 4.0),
+    padding_channel=True,
+    cross_attention="frozen",
+)
+"""Cosmos-Predict2 0.6B, 597.5 M parameters with 16 latent channels."""
+
+
+class CosmosConfig(RendererConfig):
+    """Renderer of the paper: published backbone and codec, one step at its noise level, five frames."""
+
+    window: int = Field(default=5, ge=1)
+    codec: str = "wan"
+    fusion: Literal["concat", "average"] = "average"
+    skip: Literal["pbr", "mean"] = "mean"
+    sigma: float | None = Field(default=0.25, gt=0)
+    backbone: BackboneConfig = COSMOS_0_6B
+
+
 class PixelMLPConfig(GuidedConfig):
     """Width and number of hidden layers."""
 
