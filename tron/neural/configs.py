@@ -9,7 +9,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from tron.shards.schema import GUIDANCE, MEMBERS, TARGET, clip_members
+from tron.shards.schema import GUIDANCE, light_members
 
 
 class GuidedConfig(BaseModel):
@@ -25,10 +25,9 @@ class GuidedConfig(BaseModel):
     @field_validator("guidance")
     @classmethod
     def _colours(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        colours = [name for name in clip_members(reference=False) if MEMBERS[name].color_space]
-        colours.remove(TARGET)
-        if "pbr" not in names or len(set(names)) < len(names) or not set(names) <= set(colours):
-            raise ValueError(f"guidance is pbr and others of {', '.join(colours)}")
+        there = light_members()
+        if "pbr" not in names or len(set(names)) < len(names) or not set(names) <= set(there):
+            raise ValueError(f"guidance is pbr and others of {', '.join(there)}")
         return names
 
 
