@@ -1,6 +1,7 @@
 """tron-relight from end to end on a tiny scene: files, laws of light, resuming, and mistakes."""
 
 import json
+from dataclasses import fields
 
 import numpy as np
 import plyfile
@@ -9,6 +10,7 @@ import pytest
 from tron.apps import clip as clips
 from tron.apps.clip import Clip
 from tron.apps.frame_folder import FrameFolder
+from tron.apps.relight_settings import BUFFERS, DEFAULT_BUFFERS, Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
 from tron.color import to_display
@@ -16,7 +18,9 @@ from tron.gaussians.ply import MATERIAL_PROPERTIES
 from tron.images import read_image
 from tron.seeds import generator
 from tron.shading.environment import EnvironmentMap
+from tron.shading.guidance import Guidance
 from tron.shards.schema import GUIDANCE
+from tron.tracing.surface import Surface
 
 SIZE = 32
 
@@ -45,6 +49,13 @@ def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, 
     assert np.linalg.norm(middle) == pytest.approx(1, abs=0.01)
     assert middle[0] > 0.8  # the first camera of an orbit stands on +x and sees the ball's front
     assert mask[SIZE // 2, SIZE // 2, 0] > 0.95
+
+
+def test_every_buffer_of_the_help_is_made_and_all_guidance_is_written_by_default():
+    shaded = {"foreground", "relit"}
+    assert set(BUFFERS) <= {field.name for field in fields(Surface)} | set(Guidance.BUFFERS) | shaded
+    assert set(Guidance.BUFFERS) <= set(DEFAULT_BUFFERS)
+    assert all(name in (Settings.model_fields["buffers"].description or "") for name in BUFFERS)
 
 
 def test_the_papers_fidelity_gives_other_frames(relight, scene_path, light_path, tmp_path):
