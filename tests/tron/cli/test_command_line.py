@@ -343,6 +343,24 @@ def test_a_mistakes_traceback_is_shown_where_it_is_asked_for(run: Run):
     assert "Traceback" in run("framez=3", "--traceback")[2]
 
 
+def test_commands_that_a_command_starts_show_tracebacks_too(run: Run):
+    """As tron-eval's stages do."""
+    child = (
+        "import pydantic; from tron.cli.command_line import command; "
+        "command('tron-child', 'conf.relight', pydantic.BaseModel, print)(['framez=3'])"
+    )
+    said = []
+
+    def start(_):
+        done = subprocess.run([sys.executable, "-c", child], capture_output=True, text=True, check=False)
+        said.append((done.returncode, done.stderr))
+
+    for options in (["--traceback"], []):  # the second is not told what the first was
+        run("output_dir=o", *options, does=start)
+    assert [code for code, _ in said] == [2, 2]
+    assert ["Traceback" in text for _, text in said] == [True, False]
+
+
 def test_a_profile_of_a_command_that_fails_at_work_is_kept(run: Run, tmp_path: Path, monkeypatch):
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
 
