@@ -17,7 +17,7 @@ import yaml
 
 import datagen.run
 from datagen.card import command_line
-from datagen.plan import Sources, Work, plan
+from datagen.plan import Sources, Work, adopt, plan
 from datagen.run import make, make_scene
 from datagen.settings import Settings
 from datagen.synthetic import make_clips
@@ -228,6 +228,18 @@ def test_another_recipe_is_refused_before_anything_is_written(dataset, files_of)
     with pytest.raises(TronError, match=r"path_spp=2, not 3"):
         make(tiny(dataset, "test.path_spp=3"))
     assert files_of(dataset) == before
+
+
+def test_a_key_that_an_older_dataset_did_not_know_has_its_default(tmp_path):
+    adopt(tiny(tmp_path))
+    older = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    del older["recipe"]["estimator"], older["recipe"]["two_sided"], older["recipe"]["train"]["guidance_spp"]
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(older))
+    with pytest.raises(TronError, match=r"a dataset made with train\.guidance_spp=64, not 8"):
+        adopt(tiny(tmp_path, "train.guidance_spp=8"))
+    with pytest.raises(TronError, match="a dataset made with estimator=ratio, not plain"):
+        adopt(tiny(tmp_path, "train.guidance_spp=64", "estimator=plain"))
+    adopt(tiny(tmp_path, "train.guidance_spp=64"))
 
 
 def test_failures_are_listed_and_retried_by_their_command(dataset, unfinished, files_of, monkeypatch, caplog):
