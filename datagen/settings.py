@@ -18,7 +18,7 @@ from pydantic import (
 
 from datagen.lights import PROCEDURAL, Family, LightChoice
 from datagen.materials import Style
-from tron.estimation import Estimation, Estimator
+from tron.estimation import FINAL, Estimation, Estimator
 
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {"output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "cluster", "captures"}
@@ -60,7 +60,8 @@ class SplitSettings(_Model):
         default=["any"] * 4,
         min_length=1,
         max_length=64,
-        description="Light family of each clip of a scene; any draws one of families.",
+        description="Light family of each clip of a scene, one clip for each in the list. any draws one of "
+        "families; hdri takes one of the maps in environments.",
     )
     frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
     width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
@@ -96,7 +97,8 @@ class CaptureSettings(_Model):
         default=["overcast", "studio", "sun"],
         min_length=1,
         max_length=64,
-        description="Light family of each capture, in rotation; any draws one of families.",
+        description="Light family of each capture, in rotation. any draws one of families; hdri takes one of "
+        "the maps in environments.",
     )
     views: int = Field(
         default=64,
@@ -151,11 +153,16 @@ class Settings(_Model):
         93, ge=1, le=100_000, description="Frames of the whole path that clips are cut from."
     )
     objects: tuple[int, int] | None = Field(
-        None, description="Least and greatest number of objects of a scene; null takes the style's own."
+        None,
+        description="Least and greatest number of objects of a scene, such as [2,4]; null takes the style's "
+        "own.",
+        examples=["[2,4]"],
     )
     families: list[Family] | None = Field(
         None,
-        description="What light 'any' chooses from; null: hdri with environments, else the procedural ones.",
+        description="Light families that 'any' draws from, a list as above; null: [hdri] where environments "
+        f"is given, else [{', '.join(PROCEDURAL)}].",
+        examples=["[sun,overcast]"],
     )
     views: int = Field(64, ge=1, description="Spiral views whose G-buffers the surfels are made from.")
     view_width: int = Field(256, ge=8, le=8192, description="Width of those views in pixels.")
@@ -168,12 +175,12 @@ class Settings(_Model):
         description="Optimisation steps that fit a scene's surfels to its G-buffers; 0 takes them as made.",
     )
     estimator: Estimator = Field(
-        "ratio",
+        FINAL.estimator,
         description="Irradiance of the surfels. ratio: unshadowed irradiance times the share of it that "
         "arrives; plain: the Monte Carlo mean, as in the paper.",
     )
     two_sided: bool = Field(
-        True,
+        FINAL.two_sided,
         description="Back faces block the surfels' shadow rays beyond two spacings; false: never, as in the "
         "paper.",
     )

@@ -9,7 +9,7 @@ import pytest
 from tron.cameras import Camera
 from tron.seeds import generator
 from tron.shards.manifest import Manifest
-from tron.shards.schema import Clip, ClipMeta, clip_members
+from tron.shards.schema import Clip, ClipMeta, clip_members, light_members
 from tron.shards.writer import ShardWriter
 
 LIGHTS = {"noon": "sun", "softbox": "studio", "grey": "overcast", "dusk": "sun", "window": "studio"}
@@ -46,7 +46,7 @@ def draw_frame(size: int, seed: int, light: str, frame: int = 0) -> dict[str, np
         return np.where(solid, image, backdrop).astype(np.float32)
 
     noise = generator(seed, "noise", light, frame)
-    return {
+    drawn = {
         "pbr": over(base * unshadowed + gloss),
         "irradiance": over(irradiance),
         "rgb": over(base * irradiance * (1 + 0.25 * base) + gloss * visible),
@@ -67,6 +67,7 @@ def draw_frame(size: int, seed: int, light: str, frame: int = 0) -> dict[str, np
         "metallic_ref": np.where(ball, 0.5, 0).astype(np.float32),
         "metallic": np.where(ball, 0.48, 0).astype(np.float32),
     }
+    return drawn | {name: drawn["pbr"] for name in light_members() if name not in drawn}
 
 
 def describe_clip(key: str, split: str, scene: str, light: str, frames: int, size: int) -> ClipMeta:
@@ -85,7 +86,7 @@ def describe_clip(key: str, split: str, scene: str, light: str, frames: int, siz
         height=size,
         cameras=[camera.to_dict() for camera in cameras],
         exposure=0.4,
-        color_space=dict.fromkeys(("pbr", "irradiance", "rgb", "unshadowed", "shadowed"), "linear"),
+        color_space=dict.fromkeys((*light_members(), "rgb"), "linear"),
     )
 
 
