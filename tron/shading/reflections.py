@@ -1,0 +1,220 @@
+"""What glossy surfaces mirror: rays of each pixel's lobe that meet the scene or escape.
+
+Half vectors h are drawn from the normals that the view v sees (Heitz 2018, "Sampling the GGX Distribution of
+Visible Normals"); a ray l then has the density p(l) = D(h) G_1(v) / (4 n.v) and the weight w = F(v.h) G_1(l),
+with Smith's masking in its separable form as Mitsuba has it. With L the environment's radiance, V its
+visibility and R what a surfel sends back along the ray,
+
+    M = sum_met w R / sum w                  mean radiance over the lobe of what is met
+    o = sum m w L V / sum m w L              share of the environment's light that escapes
+
+by channel: the split sum, which has no noise, keeps the light, the rays decide how much of it is hidden. o is
+taken from as many rays again that are drawn from the light: few of the lobe's see a sun, whose highlight
+would stand in shadows. m = p / (p + p_light) is the balance heuristic (Veach 1997), for rays of both kinds.
+
+A ray of the lobe is stopped by one surfel (:mod:`tron.tracing.first_hit`). R is the composition of
+:mod:`tron.shading.composition` at the surfel's centre with the bake's light, so a mirror shows highlights of
+what it mirrors. A back face shows ``BACK`` of what its front sends out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.estimation import Diffuse
+from tron.seeds import integer
+from tron.shading.bounce import BACK, BouncedLight
+from tron.shading.composition import Response, evenly_bounced
+from tron.shading.irradiance import ORIGIN_OFFSET
+from tron.shading.lighting import Lighting
+from tron.shading.reflectance import Material, fresnel
+from tron.shading.sampling import PixelPoints
+from tron.tracing.centres import centres
+from tron.tracing.first_hit import NOTHING, FirstHit, ray_seeds
+
+if TYPE_CHECKING:
+    from tron.tracing import GBuffer, Surface, SurfelTracer
+
+SMOOTHEST = 0.02
+"""Least roughness of the rays: below, a lobe is narrower than float32 can draw."""
+
+
+def reflections(
+    tracer: SurfelTracer,
+    gbuffer: GBuffer,
+    lighting: Lighting,
+    bounce: BouncedLight,
+    rays: int,
+    seed: int,
+    diffuse: Diffuse = "principled",
+) -> tuple[mi.Color3f, mi.Color3f]:
+    """The share o of the lobe's light that escapes and the mean radiance M of what is met, by pixel.
+
+    Rays stand still where the surface is differentiated, and what they find is a constant.
+
+    Args:
+        tracer: the scene.
+        gbuffer: the pixels.
+        lighting: the prepared environment.
+        bounce: what it is at each surfel.
+        rays: of each pixel.
+        seed: root of their random numbers.
+        diffuse: the model of the material.
+    """
+    with dr.suspend_grad():
+        points = PixelPoints.make(rays, 2, gbuffer.width, seed, "reflections")
+        root = dr.opaque(mi.UInt32, integer(seed, "reflections", "stops"))
+        offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
+        pixel, lobe = gbuffer.pixel, Lobe.of(gbuffer)
+        seen = (gbuffer.opacity > 0) & (lobe.view.z > 0)
+        origin, run = gbuffer.position + gbuffer.normal * offset, points.run(pixel)
+        dr.eval(pixel, lobe, seen, origin, run)
+        none = dr.zeros(mi.Color3f, dr.width(pixel))
+        sums = {name: mi.Color3f(none) for name in ("weight", "met", "light", "escaped")}
+        dr.make_opaque(sums)
+        for first in range(0, rays, points.fan):
+            fan = [dr.opaque(mi.UInt32, first) + k for k in range(points.fan)]
+            drawn = [lobe.draw(points.point(run, ray, mi.UInt32(0))) for ray in fan]
+            directions = [direction for direction, _ in drawn]
+            active = [seen & counts for _, counts in drawn]
+            seeds = [ray_seeds(root, pixel, ray) for ray in fan]
+            dr.eval(directions, active, seeds)
+            hits = tracer.first_hits(origin, directions, active, seeds)
+            for direction, counts, hit in zip(directions, active, hits, strict=True):
+                weight, share, radiance = _weights(lobe, direction, counts, gbuffer, lighting, diffuse)
+                met = hit.surfel != NOTHING
+                returned = _returned(tracer, hit, direction, lighting, bounce, diffuse)
+                sums["weight"] += weight
+                sums["met"] += dr.select(met, weight * returned, 0)
+                sums["light"] += share * radiance
+                sums["escaped"] += dr.select(met, 0, share * radiance)
+            dr.eval(sums)
+            directions = [lighting.light.sample(points.point(run, ray, mi.UInt32(1)))[0] for ray in fan]
+            found = [_weights(lobe, d, seen, gbuffer, lighting, diffuse) for d in directions]
+            values = [share * radiance for _, share, radiance in found]
+            active = [dr.max(value) > 0 for value in values]
+            dr.eval(directions, values, active)
+            for value, visible in zip(values, tracer.transmittances(origin, directions, active), strict=True):
+                sums["light"] += value
+                sums["escaped"] += value * visible
+            dr.eval(sums)
+        openness = ratio(sums["escaped"], sums["light"], 1)
+        mirrored = ratio(sums["met"], sums["weight"], 0)
+        dr.eval(openness, mirrored)
+    return openness, mirrored
+
+
+@dataclass
+class Lobe:
+    """GGX as a view sees it, one lane a pixel.
+
+    Attributes:
+        frame: about the normal.
+        view: unit, towards the camera, local.
+        alpha: of the distribution.
+    """
+
+    frame: mi.Frame3f
+    view: mi.Vector3f
+    alpha: mi.Float
+
+    @classmethod
+    def of(cls, surface: Surface) -> Lobe:
+        """The lobe of a surface along its own rays."""
+        frame = mi.Frame3f(surface.normal)
+        alpha = dr.square(dr.maximum(surface.roughness, SMOOTHEST))
+        return cls(frame, frame.to_local(-surface.direction), alpha)
+
+    def draw(self, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Bool]:
+        """A direction, world, and whether it is above the surface."""
+        half = visible_normal(self.view, self.alpha, u)
+        facing = dr.dot(self.view, half)
+        out = 2 * facing * half - self.view
+        return self.frame.to_world(out), (facing > 0) & (out.z > 0)
+
+    def density(self, half: mi.Vector3f) -> mi.Float:
+        """Density of :meth:`draw`, by solid angle, where the local half vector is ``half``."""
+        alpha2 = dr.square(self.alpha)
+        spread = dr.square(half.z) * (alpha2 - 1) + 1
+        distribution = alpha2 / (dr.pi * dr.square(spread))
+        return distribution * masking(self.view.z, self.alpha) / (4 * self.view.z)
+
+
+def _weights(
+    lobe: Lobe,
+    direction: mi.Vector3f,
+    active: mi.Bool,
+    material: Material,
+    lighting: Lighting,
+    diffuse: Diffuse,
+) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f]:
+    """w, m w and L of rays along ``direction``, however they were drawn; w is 0 where inactive."""
+    out = lobe.frame.to_local(direction)
+    half = dr.normalize(out + lobe.view)
+    facing = dr.dot(lobe.view, half)
+    weight = fresnel(material, facing, diffuse) * masking(out.z, lobe.alpha)
+    weight = dr.select(active & (out.z > 0) & (facing > 0), weight, 0)
+    own, other = lobe.density(half), lighting.light.pdf(direction)
+    total = own + other
+    balance = dr.select(total > 0, own / dr.select(total > 0, total, 1), 0)
+    return weight, weight * balance, lighting.light.radiance(direction)
+
+
+def ratio(part: mi.Color3f, whole: mi.Color3f, otherwise: float) -> mi.Color3f:
+    """Part over whole by channel; ``otherwise`` where there is no whole."""
+    pairs = zip(part, whole, strict=True)
+    return mi.Color3f(*[dr.select(b > 0, a / dr.select(b > 0, b, 1), otherwise) for a, b in pairs])
+
+
+def _returned(
+    tracer: SurfelTracer,
+    hit: FirstHit,
+    direction: mi.Vector3f,
+    lighting: Lighting,
+    bounce: BouncedLight,
+    diffuse: Diffuse,
+) -> mi.Color3f:
+    """Radiance that what is met sends back along ``direction``; 0 where nothing is."""
+    met = hit.surfel != NOTHING
+    front = met & hit.front
+
+    def of(color: mi.Color3f, lanes: mi.Bool) -> mi.Color3f:
+        return mi.Color3f(*[dr.gather(mi.Float, channel, hit.surfel, lanes) for channel in color])
+
+    surface = centres(tracer.records, hit.surfel, front)
+    surface.direction = direction
+    direct, indirect = of(bounce.direct, front), of(bounce.indirect, front)
+    response = Response.of(surface, lighting.split_sum, diffuse)
+    openness = dr.gather(mi.Float, bounce.openness, hit.surfel, front)
+    visibility = ratio(direct, response.unshadowed, 1)
+    bounced = evenly_bounced(indirect, openness, visibility, surface.roughness)
+    shown = response.lit(direct, bounced)
+    return dr.select(hit.front, shown, BACK * of(bounce.outgoing, met & ~hit.front))
+
+
+def visible_normal(view: mi.Vector3f, alpha: mi.Float, u: mi.Point2f) -> mi.Vector3f:
+    """Half vector by the GGX normals that ``view`` sees, both unit and local; Heitz 2018, listing 1."""
+    stretched = dr.normalize(mi.Vector3f(alpha * view.x, alpha * view.y, view.z))
+    length2 = dr.square(stretched.x) + dr.square(stretched.y)
+    aslant = length2 > 1e-12
+    inverse = dr.rsqrt(dr.select(aslant, length2, 1))
+    across = dr.select(
+        aslant, mi.Vector3f(-stretched.y * inverse, stretched.x * inverse, 0), mi.Vector3f(1, 0, 0)
+    )
+    along = dr.cross(stretched, across)
+    radius = dr.sqrt(u.x)
+    sin, cos = dr.sincos(u.y * float(2 * dr.pi))
+    x, y, squeeze = radius * cos, radius * sin, 0.5 * (1 + stretched.z)
+    y = (1 - squeeze) * dr.safe_sqrt(1 - x * x) + squeeze * y
+    normal = x * across + y * along + dr.safe_sqrt(1 - x * x - y * y) * stretched
+    return dr.normalize(mi.Vector3f(alpha * normal.x, alpha * normal.y, dr.maximum(normal.z, 1e-6)))
+
+
+def masking(cosine: mi.Float, alpha: mi.Float) -> mi.Float:
+    """Smith's G_1 of GGX at ``cosine`` to the normal."""
+    alpha2 = dr.square(alpha)
+    return 2 * cosine / (cosine + dr.safe_sqrt(alpha2 + (1 - alpha2) * dr.square(cosine)))
