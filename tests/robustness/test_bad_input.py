@@ -3,6 +3,7 @@
 Each command is run in this process, from its real entry point: starting Python with torch costs seconds.
 """
 
+import json
 import tomllib
 from pathlib import Path
 
@@ -158,7 +159,8 @@ def test_a_dataset_of_an_older_schema_is_refused_by_its_name(variant, version, n
     old = tmp_path / "old"
     old.mkdir()
     if "manifest.json" in kept:
-        (old / "manifest.json").write_text(f'{{"schema_version": {version}, "config_sha256": "", "shards": []}}')
+        empty = {"schema_version": version, "config_sha256": "", "shards": []}
+        (old / "manifest.json").write_text(json.dumps(empty))
     if "config.yaml" in kept:
         said = f"schema: {version}\n" if version > 1 else ""  # the first did not say it
         (old / "config.yaml").write_text(f"{said}recipe: {{}}\nscenes: {{test: 1}}\n")
