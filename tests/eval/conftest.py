@@ -145,7 +145,8 @@ def dataset(tmp_path_factory: pytest.TempPathFactory, write_dataset: Callable[..
 
 @pytest.fixture(scope="session")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with tiny.safetensors and pixel_mlp.safetensors, both untrained: both return pbr unchanged."""
+    """Untrained weights: tiny and pixel_mlp, which return lit, and those of two buffers, which return pbr."""
+    from tron.neural.configs import PAPER_GUIDANCE, PixelMLPConfig, RendererConfig
     from tron.neural.pixel_mlp import PixelMLP
     from tron.neural.renderer import NeuralRenderer
     from tron.neural.weights import save_renderer
@@ -153,4 +154,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("weights")
     save_renderer(folder / "tiny.safetensors", NeuralRenderer())
     save_renderer(folder / "pixel_mlp.safetensors", PixelMLP())
+    two = {"guidance": PAPER_GUIDANCE}
+    save_renderer(folder / "tiny_of_two.safetensors", NeuralRenderer(RendererConfig.model_validate(two)))
+    save_renderer(folder / "pixel_mlp_of_two.safetensors", PixelMLP(PixelMLPConfig.model_validate(two)))
     return folder
