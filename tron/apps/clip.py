@@ -125,6 +125,8 @@ def trace(
         estimation: of the shadows.
         seed: root of their random numbers; a frame's do not depend on the light.
     """
+    from tron.shading.guidance import trace_view
+
     tracer_for = _tracers(scene)
     view: tuple[Camera, SurfelTracer, GBuffer] | None = None
     for index, camera in enumerate(track(cameras, "guidance")):
@@ -133,7 +135,7 @@ def trace(
                 started = time.perf_counter()
                 if view is None or view[0] is not camera:
                     tracer = tracer_for(camera)
-                    view = camera, tracer, tracer.gbuffer(camera)
+                    view = camera, tracer, trace_view(tracer, camera, estimation)
                 lighting = clip.lighting.turned_to(clip.rotations[index])
                 ray_seed = seeds.integer(seed, "relight", index)
                 buffers = _shade(*view[1:], lighting, clip.folder.buffers, estimation, ray_seed)
@@ -161,12 +163,12 @@ def _shade(
     seed: int,
 ) -> dict[str, np.ndarray]:
     """The buffers ``names`` of one frame."""
-    from tron.shading.guidance import shade, visibility
+    from tron.shading.guidance import arriving_light, shade
 
-    reaching = visibility(tracer, gbuffer, lighting, estimation, seed)
-    guidance = shade(gbuffer, reaching, lighting)
+    arriving = arriving_light(tracer, gbuffer, lighting, estimation, seed)
+    guidance = shade(gbuffer, arriving, lighting, estimation=estimation)
     made = guidance.gbuffer | vars(guidance)
     if "foreground" in names:
-        over_black = shade(gbuffer, reaching, lighting, background=(0, 0, 0)).shadowed
+        over_black = shade(gbuffer, arriving, lighting, (0, 0, 0), estimation).shadowed
         made["foreground"] = surfels_alone(over_black, guidance.mask)
     return {name: made[name] for name in names}
