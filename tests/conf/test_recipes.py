@@ -114,7 +114,7 @@ def test_no_key_is_stated_twice_with_one_value(path: Path):
 
 PAPER = {
     "relight": {"estimator": "plain", "two_sided": False, "denoise": False},
-    "datagen": {"estimator": "plain", "two_sided": False},
+    "datagen": {"estimator": "plain", "two_sided": False, "diffuse": "lambert", "bounces": 0},
     "reconstruct": {
         "light.estimator": "plain",
         "light.two_sided": False,

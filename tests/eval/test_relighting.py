@@ -1,4 +1,4 @@
-"""The benchmark `relighting` on a drawn data set, end to end, with untrained networks: they return a buffer."""
+"""The benchmark `relighting` on a drawn data set, end to end; its untrained networks return lit or pbr."""
 
 import json
 from collections.abc import Callable
@@ -263,7 +263,7 @@ def test_data_of_another_kind_gives_rows_of_its_own_by_the_same_fits(
     assert alone["affine_lit.psnr.ood"] == alone["affine_lit.psnr"]
     section = next(section for section in found.sections if section.name == "ood")
     assert "18 frames of 3 scenes" in section.blocks[0].text  # type: ignore[union-attr]
-    assert len([path for path in (tmp_path / "out" / "pictures").glob("ood-*.png")]) == 1
+    assert len(list((tmp_path / "out" / "pictures").glob("ood-*.png"))) == 1
 
 
 def test_a_renderer_of_two_buffers_alone_is_the_one_that_is_reported(
