@@ -46,8 +46,6 @@ CAPTURED = {
     "captures": {"lights", "views", "width", "height", "path_spp", "reference_spp", "points"},
 }
 """Keys that decide what is in a capture."""
-LATER = ("asset_names", "share_maps")
-"""Those of them that the first captures did not have."""
 
 SPLITS: tuple[Split, ...] = ("train", "train_b", "validation", "test")
 
@@ -67,7 +65,8 @@ class SplitSettings(_Model):
         default=["any"] * 4,
         min_length=1,
         max_length=64,
-        description="Light family of each clip of a scene; any draws one of families.",
+        description="Light family of each clip of a scene, one clip for each in the list. any draws one of "
+        "families; hdri takes one of the maps in environments.",
     )
     frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
     width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
@@ -103,7 +102,8 @@ class CaptureSettings(_Model):
         default=["overcast", "studio", "sun"],
         min_length=1,
         max_length=64,
-        description="Light family of each capture, in rotation; any draws one of families.",
+        description="Light family of each capture, in rotation. any draws one of families; hdri takes one of "
+        "the maps in environments.",
     )
     views: int = Field(
         default=64,
@@ -158,11 +158,16 @@ class Settings(_Model):
         93, ge=1, le=100_000, description="Frames of the whole path that clips are cut from."
     )
     objects: tuple[int, int] | None = Field(
-        None, description="Least and greatest number of objects of a scene; null takes the style's own."
+        None,
+        description="Least and greatest number of objects of a scene, such as [2,4]; null takes the style's "
+        "own.",
+        examples=["[2,4]"],
     )
     families: list[Family] | None = Field(
         None,
-        description="What light 'any' chooses from; null: hdri with environments, else the procedural ones.",
+        description="Light families that 'any' draws from, a list as above; null: [hdri] where environments "
+        f"is given, else [{', '.join(PROCEDURAL)}].",
+        examples=["[sun,overcast]"],
     )
     views: int = Field(64, ge=1, description="Spiral views whose G-buffers the surfels are made from.")
     view_width: int = Field(256, ge=8, le=8192, description="Width of those views in pixels.")
@@ -327,15 +332,8 @@ class Settings(_Model):
         return values
 
     def capture_recipe(self) -> dict[str, Any]:
-        """Keys that decide a capture's content, as plain values.
-
-        Those that came after the first captures were made are there if they were chosen: earlier ones resume.
-        """
-        values = self.model_dump(mode="json", include=CAPTURED)
-        for name in LATER:
-            if getattr(self, name) == type(self).model_fields[name].get_default(call_default_factory=True):
-                del values[name]
-        return values
+        """Keys that decide a capture's content, as plain values."""
+        return self.model_dump(mode="json", include=CAPTURED)
 
 
 def _without_scenes(split: Any) -> bool:

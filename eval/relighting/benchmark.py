@@ -65,7 +65,7 @@ class Relighting(Benchmark):
             manifest.of_split(split)
         if self.ood is not None:
             Manifest.load(self.ood).of_split(self.test_split)
-        for path in (*self._weights(), self.vae):
+        for path in (*(path for _, path in self._weights()), self.vae):
             if path is not None and not path.exists():
                 raise TronError("weights not found", path, "give what tron-train wrote")
 
@@ -144,16 +144,18 @@ class Relighting(Benchmark):
         for split in self.train_splits:
             yield from read_clips(self._dataset(), split, MEMBERS)
 
-    def _weights(self) -> list[Path]:
-        """Files of weights that were given."""
-        given = (self.renderer, self.pixel_mlp)
-        return [path for each in given for path in ([each] if isinstance(each, Path) else each or ())]
+    def _weights(self) -> Iterator[tuple[str, Path]]:
+        """Kind of network and file of all weights that were given."""
+        for kind, given in (("neural", self.renderer), ("pixel_mlp", self.pixel_mlp)):
+            for path in [given] if isinstance(given, Path) else given or ():
+                yield kind, path
 
     def _networks(self) -> dict[str, Network]:
-        """Method -> the network of those weights; TronError where two are the same method."""
+        """Method -> the network; TronError where two are the same method."""
         networks: dict[str, Network] = {}
-        for path in self._weights():
-            name, network = load_network(path, self.vae)
+        for kind, path in self._weights():
+            network = load_network(path, self.vae)
+            name = f"{kind}_lit" if network.sees_lit else kind
             if name in networks:
                 raise TronError(
                     f"two weights of {name}, the other is {networks[name].path}", path, "give one of them"
@@ -185,32 +187,29 @@ def _typed_value(value: Any) -> str:
 
 
 class Network(NamedTuple):
-    """A network as a method, and the file of its weights."""
+    """A network as a method, the file of its weights, and whether lit is among its guidance."""
 
     show: Show
     path: Path
+    sees_lit: bool
 
 
-def load_network(path: Path, vae: Path | None = None) -> tuple[str, Network]:
-    """Weights on disk -> name of the method, and the network; torch is imported here and not before.
-
-    The name says what the network is and whether it sees lit: neural, neural_lit, pixel_mlp, pixel_mlp_lit.
+def load_network(path: Path, vae: Path | None = None) -> Network:
+    """Weights on disk -> the network; torch is imported here and not before.
 
     Raises:
         TronError: the file is missing or holds no renderer.
     """
-    from tron.neural.pixel_mlp import PixelMLP
     from tron.neural.renderer import render_clip
     from tron.neural.weights import load_renderer
 
     renderer = load_renderer(path, vae)
     guidance = renderer.config.guidance
-    name = "pixel_mlp" if isinstance(renderer, PixelMLP) else "neural"
 
     def show(buffers: Buffers) -> np.ndarray:
         return render_clip(renderer, {each: buffers.displayed(each) for each in guidance})
 
-    return f"{name}_lit" if "lit" in guidance else name, Network(show, path)
+    return Network(show, path, "lit" in guidance)
 
 
 def choose_clips(scores: Scores, count: int) -> list[str]:

@@ -299,8 +299,6 @@ def test_another_recipe_is_refused_before_anything_is_written(output, change, me
 
 def test_more_captures_may_be_added_and_datasets_do_not_care(output):
     assert tiny(output, "captures.scenes=9").capture_recipe() == tiny(output).capture_recipe()
-    assert "share_maps" not in tiny(output).capture_recipe(), "captures from before it go on"
-    assert tiny(output, "share_maps=true").capture_recipe()["share_maps"] is True
     assert tiny(output, "train.scenes=0", "surfels=999").capture_recipe() == tiny(output).capture_recipe()
     assert tiny(output, "captures.views=99").recipe() == tiny(output).recipe()
 

@@ -18,7 +18,7 @@ import yaml
 
 import datagen.run
 from datagen.card import command_line
-from datagen.plan import Sources, Work, plan
+from datagen.plan import Sources, Work, adopt, plan
 from datagen.run import make, make_scene
 from datagen.scene import SceneSpec
 from datagen.settings import ESTIMATED, Settings
@@ -297,6 +297,18 @@ def test_another_recipe_is_refused_before_anything_is_written(dataset, files_of)
     assert files_of(dataset) == before
 
 
+def test_a_key_that_an_older_dataset_did_not_know_has_its_default(tmp_path):
+    adopt(tiny(tmp_path))
+    older = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    del older["recipe"]["estimator"], older["recipe"]["two_sided"], older["recipe"]["train"]["guidance_spp"]
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(older))
+    with pytest.raises(TronError, match=r"a dataset made with train\.guidance_spp=64, not 8"):
+        adopt(tiny(tmp_path, "train.guidance_spp=8"))
+    with pytest.raises(TronError, match="a dataset made with estimator=ratio, not plain"):
+        adopt(tiny(tmp_path, "train.guidance_spp=64", "estimator=plain"))
+    adopt(tiny(tmp_path, "train.guidance_spp=64"))
+
+
 def test_failures_are_listed_and_retried_by_their_command(dataset, unfinished, files_of, monkeypatch, caplog):
     def fails(spec, *_):
         raise RuntimeError("no memory\nfor this")
@@ -377,7 +389,8 @@ def test_the_command_of_the_card_makes_the_same_settings(dataset, cluster):
 
 def test_previews_are_the_clips_first_frames_side_by_side(dataset):
     sheet = read_image(dataset / "previews" / "train-00000.png")
-    assert sheet.shape == (2 * (12 + 2), 6 * (16 + 2), 3)
+    columns = [name for name in clip_members(reference=False) if name != "foreground"]
+    assert sheet.shape == (2 * (12 + 2), len(columns) * (16 + 2), 3)
     assert sheet.std() > 0.05
 
 

@@ -46,7 +46,7 @@ def draw_frame(size: int, seed: int, light: str, frame: int = 0) -> dict[str, np
         return np.where(solid, image, backdrop).astype(np.float32)
 
     noise = generator(seed, "noise", light, frame)
-    return {
+    drawn = {
         "pbr": over(base * unshadowed + gloss),
         "irradiance": over(irradiance),
         "rgb": over(base * irradiance * (1 + 0.25 * base) + gloss * visible),
@@ -70,6 +70,7 @@ def draw_frame(size: int, seed: int, light: str, frame: int = 0) -> dict[str, np
         "metallic_ref": np.where(ball, 0.5, 0).astype(np.float32),
         "metallic": np.where(ball, 0.48, 0).astype(np.float32),
     }
+    return drawn | {name: drawn["pbr"] for name in light_members() if name not in drawn}
 
 
 def describe_clip(key: str, split: str, scene: str, light: str, frames: int, size: int) -> ClipMeta:

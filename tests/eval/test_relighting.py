@@ -10,7 +10,7 @@ import pytest
 from eval.cli import cli
 from eval.relighting.baselines import BASELINES, FINER, METHODS
 from eval.relighting.benchmark import Relighting, choose_clips
-from eval.relighting.scores import METRICS, Score, Scores
+from eval.relighting.scores import GROUPS, METRICS, Score, Scores
 from eval.report.outcome import Outcome
 from eval.report.page import Pictures, Table
 from eval.results import Results
@@ -20,23 +20,8 @@ from tron.images import read_image
 REQUIRED = [
     *(
         f"{method}.{metric}{region}"
-        for method in (
-            "neural_lit",
-            "neural",
-            "pbr",
-            "pbr_x_irradiance",
-            "shadow_ratio",
-            "shadowed",
-            "affine",
-            "affine_ratio",
-            "pixel_mlp",
-            "lit",
-            "affine_lit",
-            "pixel_mlp_lit",
-            "lit.supersampled",
-            "lit.reflections",
-        )
-        for metric in ("psnr", "ssim")
+        for method in (each.name for each in METHODS)
+        for metric in (each.name for each in METRICS)
         for region in ("", "_full")
     ),
     *(
@@ -109,7 +94,7 @@ def test_networks_score_as_the_buffer_that_they_return(outcome: Outcome):
             assert found[f"{network}.psnr{region}"] == pytest.approx(found[f"pbr.psnr{region}"], abs=1e-3)
             lit = found[f"lit.psnr{region}"]
             assert found[f"{network}_lit.psnr{region}"] == pytest.approx(lit, abs=1e-3)
-        best = max(found[f"{name}.psnr{region}"] for name in ("pbr", "shadow_ratio", "affine"))
+        best = max(found[f"{name}.psnr{region}"] for name in GROUPS["best_simple_baseline"])
         gain = found[f"neural.gain_over_best_simple_baseline{region}"]
         assert gain == pytest.approx(found[f"neural.psnr{region}"] - best, abs=1e-9)
 

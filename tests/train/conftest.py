@@ -9,7 +9,7 @@ import pytest
 
 from tron import seeds
 from tron.shards.manifest import Manifest
-from tron.shards.schema import GUIDANCE, TARGET, ClipMeta
+from tron.shards.schema import GUIDANCE, TARGET, ClipMeta, light_members
 from tron.shards.writer import ShardWriter
 
 
@@ -46,16 +46,8 @@ def _frame(random: np.random.Generator, size: int) -> dict[str, np.ndarray]:
     pbr = 0.1 + random.random(3) * ramp[:, None, None] + np.zeros((size, size, 3))
     irradiance = 0.2 + random.random(3) * ramp[None, :, None] + np.zeros((size, size, 3))
     one = np.ones((size, size, 1))
-    return {
-        "pbr": pbr,
-        "irradiance": irradiance,
-        "rgb": pbr * irradiance,
-        "unshadowed": irradiance,
-        "shadowed": pbr,
-        "lit": pbr,
-        "mask": one,
-        "foreground": one,
-    }
+    images = dict.fromkeys(light_members(), pbr) | {"irradiance": irradiance, "unshadowed": irradiance}
+    return images | {"rgb": pbr * irradiance, "mask": one, "foreground": one}
 
 
 @pytest.fixture(scope="session")
