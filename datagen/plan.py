@@ -124,7 +124,12 @@ def find_sources(settings: Settings) -> Sources:
     """Catalogue the user's assets and environments; raises as ``datagen.assets`` does, before any render."""
     allowed = settings.allow_unlicensed
     assets = (
-        find_assets(settings.assets, catalogue=settings.catalogue, allow_unlicensed=allowed)
+        find_assets(
+            settings.assets,
+            catalogue=settings.catalogue,
+            allow_unlicensed=allowed,
+            names=settings.asset_names,
+        )
         if settings.assets
         else []
     )

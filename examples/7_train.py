@@ -1,6 +1,6 @@
 """Train a neural renderer, the tiny transformer, for a minute, and look at scenes that it has not seen.
 
-The picture shows what it is given, split-sum, then its drawing, then the path tracer's.
+The picture shows what it starts from, lit, then its drawing, then the path tracer's.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ renderer = load_renderer(chosen.output / "renderer.safetensors")
 rows, gains = [], []
 for clip in read_clips(chosen.dataset, "test"):
     drawn = render_clip(renderer, {name: clip.displayed(name) for name in renderer.config.guidance})
-    given, truth = clip.displayed("pbr"), clip.displayed("rgb")
+    given, truth = clip.displayed(renderer.config.skip), clip.displayed("rgb")
     gains += [(capped_psnr(a, c), capped_psnr(b, c)) for a, b, c in zip(given, drawn, truth)]
     rows.append(np.hstack([given[0], drawn[0], truth[0]]))
 write_image(chosen.output / "train.jpg", np.vstack(rows[:3]).repeat(3, axis=0).repeat(3, axis=1))

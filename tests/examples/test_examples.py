@@ -122,12 +122,12 @@ def test_6_a_dataset_has_clips_under_three_lights(trained: Path):
 
 @pytest.mark.long
 def test_7_training_brings_the_drawing_of_what_it_learnt_from_near_the_truth(trained: Path):
-    """Untrained, it draws pbr. One tiny scene teaches nothing of others, which are not judged."""
+    """Untrained, it draws lit. One tiny scene teaches nothing of others, which are not judged."""
     renderer = load_renderer(trained / "renderer" / "renderer.safetensors")
     before, after = [], []
     for clip in read_clips(trained / "dataset", "train"):
         drawn = render_clip(renderer, {name: clip.displayed(name) for name in renderer.config.guidance})
-        before.append(np.square(clip.displayed("pbr") - clip.displayed("rgb")).mean())
+        before.append(np.square(clip.displayed(renderer.config.skip) - clip.displayed("rgb")).mean())
         after.append(np.square(drawn - clip.displayed("rgb")).mean())
     assert np.mean(after) < 0.5 * np.mean(before)  # 0.26 of it
     assert read_image(trained / "renderer" / "train.jpg").shape == (3 * 3 * 24, 3 * 3 * 24, 3)
@@ -139,6 +139,6 @@ def test_8_evaluation_scores_the_renderer_beside_the_baselines(trained: Path, tm
     out = tmp_path / "out"
     run("8_evaluate", out, "--dataset", trained / "dataset", "--renderer", weights)
     metrics = {row["metric"] for row in json.loads((out / "results.json").read_text())["rows"]}
-    assert {"neural.psnr", "pbr.psnr", "affine.psnr"} <= metrics
+    assert {"neural_lit.psnr", "lit.psnr", "pbr.psnr", "affine.psnr"} <= metrics
     assert (out / "report.html").stat().st_size > 10_000
     assert read_image(out / "evaluation.jpg").shape[1] == 800

@@ -9,14 +9,14 @@ import pytest
 
 from tron import seeds
 from tron.shards.manifest import Manifest
-from tron.shards.schema import ClipMeta, light_members
+from tron.shards.schema import GUIDANCE, TARGET, ClipMeta, light_members
 from tron.shards.writer import ShardWriter
 
 
 def write_dataset(
     folder: Path, splits: dict[str, int], frames: int = 6, size: int = 24, shard: int = 2
 ) -> Path:
-    """Clips of smooth colours whose picture is the product of the two buffers, frames x size x size."""
+    """Clips of smooth colours whose picture is the product of pbr and irradiance, frames x size x size."""
     entries = []
     for split, count in splits.items():
         with ShardWriter(folder, split, shard) as writer:
@@ -33,7 +33,7 @@ def write_dataset(
                     height=size,
                     cameras=[{}] * frames,
                     exposure=1.0,
-                    color_space={"pbr": "linear", "irradiance": "linear", "rgb": "linear"},
+                    color_space=dict.fromkeys((*GUIDANCE, TARGET), "linear"),
                 )
                 writer.write(meta, [_frame(random, size) for _ in range(frames)])
         entries += writer.entries
