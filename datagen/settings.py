@@ -18,7 +18,7 @@ from pydantic import (
 
 from datagen.lights import PROCEDURAL, Family, LightChoice
 from datagen.materials import Style
-from tron.estimation import Estimation, Estimator
+from tron.estimation import FINAL, Estimation, Estimator
 
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {"output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "cluster", "captures"}
@@ -168,12 +168,12 @@ class Settings(_Model):
         description="Optimisation steps that fit a scene's surfels to its G-buffers; 0 takes them as made.",
     )
     estimator: Estimator = Field(
-        "ratio",
+        FINAL.estimator,
         description="Irradiance of the surfels. ratio: unshadowed irradiance times the share of it that "
         "arrives; plain: the Monte Carlo mean, as in the paper.",
     )
     two_sided: bool = Field(
-        True,
+        FINAL.two_sided,
         description="Back faces block the surfels' shadow rays beyond two spacings; false: never, as in the "
         "paper.",
     )

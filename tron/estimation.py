@@ -37,3 +37,7 @@ class Estimation(BaseModel):
         description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
     )
     filtered: bool = Field(default=False, description="edge-avoiding filter over the image, for few rays")
+
+
+FINAL = Estimation()
+"""That of final frames; the settings of the commands take their defaults from it."""

@@ -15,6 +15,7 @@ from eval.report.outcome import Outcome
 from eval.report.stage_table import stage_section
 from eval.results import Row, Target
 from eval.stages import Child, Stages, script_path
+from tron.cli.installation import require_own_packages
 from tron.shards.manifest import Manifest
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -46,6 +47,7 @@ class Demo(Benchmark):
 
     def check(self) -> None:
         """Find the commands that the stages call."""
+        require_own_packages("datagen", "train")
         for name in ("tron-datagen", "tron-train"):
             script_path(name)
 

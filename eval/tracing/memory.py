@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -26,8 +27,11 @@ def measure_memory(count: int, size: int, variant: str, seed: int) -> dict[str, 
         TronError: the process failed.
     """
     command = [sys.executable, "-m", "eval.tracing.memory", str(count), str(size), variant, str(seed)]
+    # Ours come first, whatever stands on the path of the user: another eval.py would be started instead.
     root = Path(__file__).resolve().parents[2]
-    result = subprocess.run(command, capture_output=True, text=True, cwd=root)
+    path = os.pathsep.join(filter(None, [str(root), os.environ.get("PYTHONPATH")]))
+    environment = os.environ | {"PYTHONPATH": path}
+    result = subprocess.run(command, capture_output=True, text=True, cwd=root, env=environment)
     if result.returncode != 0:
         raise TronError(f"measuring memory failed: {result.stderr.strip()[-500:]}", " ".join(command))
     return json.loads(result.stdout.splitlines()[-1])

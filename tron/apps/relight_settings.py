@@ -4,32 +4,27 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from tron.apps.framing import TrajectoryName
 from tron.apps.relit import Background
 from tron.errors import TronError
-from tron.estimation import Estimation, Estimator
+from tron.estimation import FINAL, Estimation, Estimator
+from tron.shards.schema import light_members
 
-BufferName = Literal[
-    "pbr",
-    "irradiance",
-    "unshadowed",
-    "shadowed",
-    "foreground",
-    "mask",
-    "base_color",
-    "normal",
-    "depth",
-    "position",
-    "roughness",
-    "metallic",
-    "rgb",
+DEFAULT_BUFFERS = (*light_members(), "foreground", "mask")
+BUFFERS = (
+    *DEFAULT_BUFFERS,
+    *("base_color", "normal", "depth", "position", "roughness", "metallic", "rgb"),  # of the G-buffer
     "relit",
-]
-QUALITY = {"preview": Estimation(rays=2, filtered=True), "final": Estimation(rays=64)}
+)
+if TYPE_CHECKING:
+    BufferName = str
+else:
+    BufferName = Literal[BUFFERS]
+QUALITY = {"preview": Estimation(rays=2, filtered=True), "final": FINAL}
 
 Side = Annotated[int, Field(ge=8, le=8192)]
 
@@ -68,12 +63,13 @@ class Settings(BaseModel):
         "preview", description="preview: 2 shadow rays per pixel, denoised; final: 64"
     )
     estimator: Estimator = Field(
-        "ratio",
+        FINAL.estimator,
         description="ratio: unshadowed irradiance times the share of it that arrives; plain: the Monte Carlo "
         "mean, as in the paper",
     )
     two_sided: bool = Field(
-        True, description="back faces block shadow rays beyond two spacings; false: never, as in the paper"
+        FINAL.two_sided,
+        description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
     )
     denoise: bool | None = Field(
         None, description="edge-avoiding filter of the shadows; null: with quality=preview alone"
@@ -97,8 +93,9 @@ class Settings(BaseModel):
     )
     vae: Path | None = Field(None, description="WAN 2.1 VAE, for checkpoints that were trained with it")
     buffers: tuple[BufferName, ...] = Field(
-        ("pbr", "irradiance", "unshadowed", "shadowed", "foreground", "mask"),
-        description="buffers written as EXR; relit is the relit picture before exposure (without checkpoint)",
+        DEFAULT_BUFFERS,
+        description=f"buffers written as EXR, of {', '.join(BUFFERS)}; relit is the relit picture before "
+        "exposure (without checkpoint)",
         examples=["[pbr]"],
     )
     overwrite: bool = Field(False, description="replace frames that were made with other settings")

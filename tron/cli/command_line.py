@@ -53,7 +53,7 @@ class Command(Generic[Settings]):
 
     def _run(self, arguments: Sequence[str]) -> int:
         try:
-            require_own_packages()
+            require_own_packages(self.config_module, self.settings.__module__)
             options = _parser(self.name).parse_intermixed_args(arguments)
             if options.help:
                 print(self._help(options.overrides, options.config_dir), end="")

@@ -9,7 +9,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from tron.shards.schema import GUIDANCE, MEMBERS, TARGET, clip_members
+from tron.shards.schema import GUIDANCE, light_members
 
 
 class GuidedConfig(BaseModel):
@@ -25,10 +25,9 @@ class GuidedConfig(BaseModel):
     @field_validator("guidance")
     @classmethod
     def _colours(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        colours = [name for name in clip_members(reference=False) if MEMBERS[name].color_space]
-        colours.remove(TARGET)
-        if "pbr" not in names or len(set(names)) < len(names) or not set(names) <= set(colours):
-            raise ValueError(f"guidance is pbr and others of {', '.join(colours)}")
+        there = light_members()
+        if "pbr" not in names or len(set(names)) < len(names) or not set(names) <= set(there):
+            raise ValueError(f"guidance is pbr and others of {', '.join(there)}")
         return names
 
 
@@ -76,6 +75,33 @@ class RendererConfig(GuidedConfig):
         "(1 + sigma), input (1 - t) z, result (1 - t) z - t net(...). None: the plain residual z + net(z).",
     )
     backbone: BackboneConfig = BackboneConfig()
+
+
+COSMOS_0_6B = BackboneConfig(
+    heads=20,
+    head_dim=64,
+    layers=20,
+    mlp_ratio=4.0,
+    text_embed_dim=1024,
+    adaln_lora_dim=256,
+    patch=(1, 2, 2),
+    max_size=(128, 240, 240),
+    rope_scale=(1.0, 4.0, 4.0),
+    padding_channel=True,
+    cross_attention="frozen",
+)
+"""Cosmos-Predict2 0.6B, 597.5 M parameters with 16 latent channels."""
+
+
+class CosmosConfig(RendererConfig):
+    """Renderer of the paper: published backbone and codec, one step at its noise level, five frames."""
+
+    window: int = Field(default=5, ge=1)
+    codec: str = "wan"
+    fusion: Literal["concat", "average"] = "average"
+    skip: Literal["pbr", "mean"] = "mean"
+    sigma: float | None = Field(default=0.25, gt=0)
+    backbone: BackboneConfig = COSMOS_0_6B
 
 
 class PixelMLPConfig(GuidedConfig):

@@ -12,7 +12,7 @@ from typing import Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.estimation import Estimator
+from tron.estimation import FINAL, Estimation, Estimator
 
 Model = TypeVar("Model", bound="Settings")
 
@@ -174,10 +174,10 @@ class FitSettings(Settings):
         default=0.01, gt=0, description="Final learning rate; the decay is exponential."
     )
     estimator: Estimator = Field(
-        default="ratio", description="ratio, or plain, the paper's sum, which needs far more rays."
+        default=FINAL.estimator, description="ratio, or plain, the paper's sum, which needs far more rays."
     )
     two_sided: bool = Field(
-        default=True,
+        default=FINAL.two_sided,
         description="Back faces block shadow rays beyond two spacings; false: never, as in the paper.",
     )
     coarsest: int = Field(
@@ -204,6 +204,10 @@ class FitSettings(Settings):
         default=512, description="Texels along a face edge of the prefiltered light."
     )
     seed: int = Field(default=0, description="Root of every random number.")
+
+    def estimation(self, rays: int, *, filtered: bool = False) -> Estimation:
+        """Estimation of images of the surfels in the light, as that of the fit."""
+        return Estimation(rays=rays, estimator=self.estimator, two_sided=self.two_sided, filtered=filtered)
 
 
 def _scaled(settings: Model, names: tuple[str, ...], factor: float) -> Model:

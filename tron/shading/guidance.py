@@ -29,7 +29,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from tron.estimation import Estimation
+from tron.estimation import FINAL, Estimation
 from tron.shading.background import over_background
 from tron.shading.denoise import atrous
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from tron.tracing import GBuffer, Surface
 
 DIELECTRIC_F0 = 0.04
-FINAL = Estimation()
 
 
 class ViewTracer(Occluder, Protocol):

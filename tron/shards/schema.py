@@ -95,6 +95,13 @@ def clip_members(reference: bool) -> tuple[str, ...]:
     return tuple(name for name, member in MEMBERS.items() if reference or member.clips == "all")
 
 
+def light_members() -> tuple[str, ...]:
+    """Names of the guidance in colour, which tron-relight writes and networks may be given."""
+    return tuple(
+        name for name in clip_members(reference=False) if MEMBERS[name].color_space and name != TARGET
+    )
+
+
 META_SUFFIX = "meta.json"
 
 KEY_PATTERN = re.compile(r"[A-Za-z0-9_-]{1,60}")

@@ -12,6 +12,7 @@ import yaml
 
 from tron.apps import reconstruct_run as app
 from tron.apps.reconstruct import cli
+from tron.apps.reconstruct_pictures import sheet_estimation
 from tron.apps.relight import cli as relight_cli
 from tron.cameras import Camera
 from tron.captures import Capture, View
@@ -135,6 +136,18 @@ def test_it_writes_everything_that_it_says(finished: Path):
     config = yaml.safe_load((finished / "config.yaml").read_text())
     assert config["radiance"]["steps"] == 12
     assert config["prior"]["_target_"] == "tron.priors.GroundTruth"
+
+
+@pytest.mark.parametrize("fidelity", [None, "paper"])
+def test_the_sheet_estimates_shadows_as_the_run_does(fidelity: str | None):
+    chosen = [] if fidelity is None else [f"fidelity={fidelity}"]
+    light = cli.compose("capture=x", "output_dir=y", *chosen).light
+    assert light is not None
+    shown = sheet_estimation(light)
+    paper = fidelity == "paper"
+    assert (shown.estimator, shown.two_sided, shown.filtered) == (
+        ("plain", False, False) if paper else ("ratio", True, True)
+    )
 
 
 def test_the_report_is_whole_and_strict_json(finished: Path):
