@@ -1,4 +1,4 @@
-"""The choices of estimating shadowed irradiance, from the paper's to ours."""
+"""The choices of estimating light on surfels, from the paper's to ours."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 Estimator = Literal["ratio", "plain"]
+Diffuse = Literal["principled", "lambert"]
 
 
 class Estimation(BaseModel):
-    """Choices in estimating shadowed irradiance (docs/conventions.md, 10); by default those of final frames.
+    """Choices in estimating light (docs/conventions.md, 10); by default those of final frames.
 
-    The paper's are ``Estimation(estimator="plain", two_sided=False)``. What each costs, on 10,000 to 20,000
-    surfels of scenes that no benchmark uses:
+    The paper's are ``Estimation(estimator="plain", two_sided=False, bounces=0, diffuse="lambert")``. What
+    each costs, on 10,000 to 20,000 surfels of scenes that no benchmark uses:
 
     * ``rays``: time grows with them. Their noise is below the bias of surfels from 16 on; 64 are converged.
     * ``estimator="plain"``: the noise of the light stays in. Of 64 rays under a sun the relative error is
@@ -37,6 +38,22 @@ class Estimation(BaseModel):
         description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
     )
     filtered: bool = Field(default=False, description="edge-avoiding filter over the image, for few rays")
+    diffuse: Diffuse = Field(
+        default="principled",
+        description="principled: the diffuse part of the material that data are path-traced with, by roughness "
+        "and angle; lambert: base color alone, as in the paper",
+    )
+    bounces: int = Field(
+        default=3, ge=0, le=16, description="times that light bounces between surfels; 0: direct light alone"
+    )
+    reflections: int = Field(
+        default=0,
+        ge=0,
+        description="rays per pixel that find what glossy surfaces mirror; 0: the bounced light around them",
+    )
+    supersample: Literal[1, 2] = Field(
+        default=1, description="2: 2 x 2 sub-pixels with a quarter of the rays each, averaged"
+    )
 
 
 FINAL = Estimation()

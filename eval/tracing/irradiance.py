@@ -26,8 +26,9 @@ from tron import seeds
 from tron.cameras import mitsuba_sensor
 from tron.color import luminance
 from tron.shading import EnvironmentLight, Estimation, Lighting, irradiance, render_guidance
-from tron.shading.guidance import Guidance, reaching_share, shade
+from tron.shading.guidance import Guidance, shade
 from tron.shading.irradiance import ORIGIN_OFFSET
+from tron.shading.visibility import reaching_share
 from tron.tracing import GBuffer, SurfelTracer
 from tron.tracing.bvh import build_bvh
 

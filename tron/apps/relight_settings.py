@@ -64,21 +64,21 @@ class Settings(BaseModel):
     )
     quality: Literal["preview", "final"] = Field(
         "preview",
-        description="preview: 2 shadow rays per pixel, denoised; final: 64, in 2 x 2 parts of the pixel, and 4 "
+        description="preview: 2 shadow rays per pixel, denoised; final: 64, over 2 x 2 sub-pixels, and 4 "
         "rays that look for reflections of the scene in itself",
     )
     bounces: int = Field(
         FINAL.bounces,
         ge=0,
         le=64,
-        description="times that light bounces between the surfels; 0: direct light alone, the relit picture is "
-        "then 'shadowed'",
+        description="times that light bounces between the surfels; 0: direct light alone, and the relit picture "
+        "is 'shadowed'",
     )
     reflections: int | None = Field(
         None, ge=0, description="GGX rays per pixel that meet the scene, for glossy things; null: by quality"
     )
     supersample: Literal[1, 2] | None = Field(
-        None, description="2: each pixel is the mean of 2 x 2, with a quarter of the rays each; null: by quality"
+        None, description="2: the mean of 2 x 2 sub-pixels, with a quarter of the rays each; null: by quality"
     )
     diffuse: Literal["principled", "lambert"] = Field(
         FINAL.diffuse,

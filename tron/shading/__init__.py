@@ -7,13 +7,17 @@ Everything here is linear and scene-referred; exposure and AgX come at the very 
 
 from tron.estimation import Estimation
 from tron.shading.background import background_share
+from tron.shading.bounce import BouncedLight, BounceTransport
 from tron.shading.cubemap import CubemapLight
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
-from tron.shading.guidance import Guidance, Lighting, render_guidance
+from tron.shading.guidance import Guidance, render_guidance
 from tron.shading.irradiance import irradiance
+from tron.shading.lighting import Lighting
 from tron.shading.split_sum import SplitSum
 
 __all__ = [
+    "BounceTransport",
+    "BouncedLight",
     "CubemapLight",
     "EnvironmentLight",
     "EnvironmentMap",

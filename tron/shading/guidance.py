@@ -21,7 +21,6 @@ exposure and AgX are applied when a buffer is looked at or loaded.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
@@ -31,45 +30,20 @@ import numpy as np
 
 from tron.estimation import FINAL, Estimation
 from tron.shading.background import over_background
-from tron.shading.denoise import atrous
-from tron.shading.environment import EnvironmentLight, EnvironmentMap
-from tron.shading.few_rays import RATIO_FROM_RAYS, grey, regressed_share
-from tron.shading.irradiance import Occluder, irradiance, visible_share
-from tron.shading.split_sum import CUBEMAP_RESOLUTION, SplitSum
+from tron.shading.irradiance import Occluder
+from tron.shading.lighting import Lighting
+from tron.shading.reflectance import diffuse_albedo, specular_f0
+from tron.shading.visibility import Shadows, shading_normal, visibility
 
 if TYPE_CHECKING:
     from tron.cameras import Camera
     from tron.tracing import GBuffer, Surface
 
-DIELECTRIC_F0 = 0.04
 
-
-class ViewTracer(Occluder, Protocol):
+class ViewTracer(Occluder, Shadows, Protocol):
     """Camera rays and shadow rays: :class:`tron.tracing.SurfelTracer`, or a closed form in a test."""
 
     def gbuffer(self, camera: Camera) -> GBuffer: ...
-
-    def sided(self, two_sided: bool) -> Occluder: ...
-
-
-class Lighting:
-    """An environment prepared once for every frame that it lights.
-
-    Args:
-        environment: the light.
-        cubemap_resolution: see :class:`SplitSum`.
-    """
-
-    def __init__(self, environment: EnvironmentMap, cubemap_resolution: int = CUBEMAP_RESOLUTION) -> None:
-        self.light = EnvironmentLight(environment)
-        self.split_sum = SplitSum(self.light, cubemap_resolution)
-
-    def turned_to(self, rotation_deg: float) -> Lighting:
-        """The same environment at another rotation about +z, in microseconds: lookups are turned."""
-        other = copy(self)
-        other.light = self.light.turned_to(rotation_deg)
-        other.split_sum = self.split_sum.turned_to(rotation_deg)
-        return other
 
 
 @dataclass
@@ -131,41 +105,6 @@ def render_guidance(
     return shade(gbuffer, visibility(tracer, gbuffer, lighting, estimation, seed), lighting, background)
 
 
-def visibility(
-    tracer: ViewTracer, gbuffer: GBuffer, lighting: Lighting, estimation: Estimation, seed: int
-) -> mi.Color3f:
-    """Share of the unshadowed irradiance that reaches each pixel; arguments as of :func:`render_guidance`."""
-    occluder = tracer.sided(estimation.two_sided)
-    found = irradiance(occluder, gbuffer, lighting.light, estimation.rays, seed)
-    return reaching_share(*found, gbuffer, lighting, occluder.scene.spacing, estimation)
-
-
-def reaching_share(
-    shadowed: mi.Color3f,
-    unshadowed: mi.Color3f,
-    gbuffer: GBuffer,
-    lighting: Lighting,
-    spacing: float,
-    estimation: Estimation,
-) -> mi.Color3f:
-    """The same from what the rays found: :func:`tron.shading.irradiance`'s two estimates."""
-    plain, many = estimation.estimator == "plain", estimation.rays >= RATIO_FROM_RAYS
-    if many and not (plain or estimation.filtered):
-        return visible_share(shadowed, unshadowed)
-    known = lighting.split_sum.diffuse(_normal(gbuffer))
-    if estimation.filtered or not plain:
-        share = regressed_share(shadowed, unshadowed, known, gbuffer, spacing)
-        if not estimation.filtered:
-            return share
-        shadowed, unshadowed = atrous(shadowed, unshadowed, grey(share), gbuffer, spacing)
-    return visible_share(shadowed, known if plain else unshadowed)
-
-
-def _normal(surface: Surface) -> mi.Vector3f:
-    # An empty pixel has no normal, and 0 / 0 must not reach a lookup.
-    return dr.select(surface.opacity > 0, mi.Vector3f(surface.normal), mi.Vector3f(0, 0, 1))
-
-
 def shade_surface(
     surface: Surface, visibility: mi.Color3f, lighting: Lighting, background: Sequence[float] | None = None
 ) -> dict[str, mi.Color3f]:
@@ -174,9 +113,8 @@ def shade_surface(
     ``background`` as of :func:`render_guidance`. Returns the colours of :class:`Guidance` by name, on the
     device, one lane a ray.
     """
-    normal = _normal(surface)
-    diffuse_color = surface.base_color * (1 - surface.metallic)
-    f0 = DIELECTRIC_F0 * (1 - surface.metallic) + surface.metallic * surface.base_color
+    normal = shading_normal(surface)
+    diffuse_color, f0 = diffuse_albedo(surface), specular_f0(surface)
     unshadowed = lighting.split_sum.diffuse(normal)
     specular = lighting.split_sum.specular(normal, -surface.direction, surface.roughness, f0)
     shadowed = unshadowed * visibility

@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.errors import TronError
-from tron.shading.sampling import PixelPoints, has_strata
+from tron.shading.sampling import PixelPoints
 
 if TYPE_CHECKING:
     from tron.gaussians.scene import GaussianScene
@@ -146,9 +146,8 @@ class RayPlan:
 
     @property
     def fan(self) -> int:
-        """Rays that are traced together: consecutive, of one kind, within an eighth of its unit square."""
-        count = self.points.count
-        return next(size for size in (4, 2, 1) if (has_strata(count) and count >= 8 * size) or size == 1)
+        """Rays that are traced together: consecutive and of one kind."""
+        return self.points.fan
 
 
 def visible_share(shadowed: mi.Color3f, unshadowed: mi.Color3f) -> mi.Color3f:

@@ -142,6 +142,11 @@ class PixelPoints:
             across=dr.opaque(mi.UInt32, (width >> BLOCK_BITS) + 1),
         )
 
+    @property
+    def fan(self) -> int:
+        """Rays by these points that are traced together: consecutive, within an eighth of the unit square."""
+        return next(k for k in (4, 2, 1) if (has_strata(self.count) and self.count >= 8 * k) or k == 1)
+
     def run(self, pixel: mi.UInt32) -> mi.UInt32:
         """First index of the run of ``pixel`` (row-major)."""
         x, y = pixel % self.width, pixel // self.width

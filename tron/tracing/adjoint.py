@@ -17,14 +17,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, pairwise
 from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
 
 from tron.gaussians.harmonics import sh_basis
-from tron.tracing.compositing import MATERIAL_PACKETS, Composite, HitList, harmonic_sums
+from tron.tracing.compositing import CHANNELS, MATERIAL_PACKETS, Composite, HitList, harmonic_sums
 from tron.tracing.kernel import (
     FEATURE_PACKETS,
     GEOMETRY_PACKETS,
@@ -34,12 +34,13 @@ from tron.tracing.kernel import (
     SurfelRecords,
     intersect,
     log_response_slope,
+    value_packets,
 )
 from tron.tracing.relisting import lanes_of
 
 COPIED_BYTES = 1 << 30
 """Most memory for the copies into which threads add the gradients of one kind of record."""
-_RECORDS = ("geometry", "features", "harmonics")
+_RECORDS = ("geometry", "features", "harmonics", "values")
 
 
 @dataclass
@@ -49,6 +50,7 @@ class _Gradients:
     geometry: mi.Float | None
     features: mi.Float | None
     harmonics: mi.Float | None
+    values: mi.Float | None
 
 
 @dataclass
@@ -67,7 +69,11 @@ class _Replay:
 def has_gradients(records: SurfelRecords, direction: mi.Vector3f) -> bool:
     """Whether sums over these records, seen along ``direction``, have anything to be differentiated by."""
     view = records.sh_degree > 0 and dr.grad_enabled(direction)
-    return view or dr.grad_enabled(records.geometry, records.features, records.harmonics)
+    return view or any(_differentiable(records, name) for name in _RECORDS)
+
+
+def _differentiable(records: SurfelRecords, name: str) -> bool:
+    return dr.grad_enabled(getattr(records, name))
 
 
 def attach(
@@ -89,20 +95,20 @@ def attach(
     if not has_gradients(records, direction):
         return sums
     view = dr.grad_enabled(direction)
-    wanted = tuple(name for name in _RECORDS if dr.grad_enabled(getattr(records, name)))
+    wanted = tuple(name for name in _RECORDS if _differentiable(records, name))
     basis = sh_basis(direction.x, direction.y, direction.z)[1:] if records.sh_degree > 0 else []
     replay = _Replay(records.detached(), dr.detach(origin), dr.detach(direction), hits, sums, wanted, view)
     channels, mean_depth, transmittance = dr.custom(
-        _Compositing, records.geometry, records.features, records.harmonics, basis, replay
+        _Compositing, records.geometry, records.features, records.harmonics, records.values, basis, replay
     )
     return replace(sums, channels=channels, mean_depth=mean_depth, transmittance=transmittance)
 
 
 class _Compositing(dr.CustomOp):
-    """(geometry, features, harmonics, SH basis but its constant) -> (channels, mean depth, transmittance)."""
+    """Records and the SH basis but its constant -> (channels, mean depth, transmittance)."""
 
-    def eval(self, geometry: Any, features: Any, harmonics: Any, basis: Any, replay: Any) -> Any:
-        del geometry, features, harmonics  # their values are in the sums already
+    def eval(self, geometry: Any, features: Any, harmonics: Any, values: Any, basis: Any, replay: Any) -> Any:
+        del geometry, features, harmonics, values  # their values are in the sums already
         self.basis, self.replay = basis, replay
         sums = self.replay.sums
         return [mi.Float(channel) for channel in sums.channels], sums.mean_depth, sums.transmittance
@@ -113,7 +119,7 @@ class _Compositing(dr.CustomOp):
         rest = transmittance * replay.sums.transmittance + mean_depth * replay.sums.mean_depth
         for gradient, value in zip(channels, replay.sums.channels, strict=True):
             rest = dr.fma(gradient, value, rest)
-        has_gradient = tuple(not _silent(channels[4 * group : 4 * group + 4]) for group in range(3))
+        has_gradient = tuple(not _silent(group) for group in _groups(channels))
         dr.eval(channels, mean_depth, rest)
         # Those that nobody asked for, such as the geometry's once it is frozen, cost nothing.
         out = _Gradients(
@@ -160,6 +166,12 @@ def _silent(gradients: list[mi.Float]) -> bool:
     return all(g.state == dr.VarState.Literal and g[0] == 0 for g in gradients)
 
 
+def _groups(channels: list[mi.Float]) -> list[list[mi.Float]]:
+    """Channels as packets hold them: two of materials, radiance, and packets of values."""
+    ends = [0, 4, 8, CHANNELS, *range(CHANNELS + 4, len(channels) + 4, 4)]
+    return [channels[first:last] for first, last in pairwise(ends)]
+
+
 def _add(target: mi.Float | None, packet: mi.UInt32, values: list[mi.Float], active: mi.Bool) -> None:
     if target is not None:
         dr.scatter_reduce(
@@ -193,7 +205,7 @@ def _replay(
         outer, outer_depth: gradients of the channels and of the mean depth.
         rest: sum of outer gradients times what they belong to (module docstring).
         out: receives the gradients of the records.
-        has_gradient: whether any channel of each packet, and of the radiance, has a gradient at all.
+        has_gradient: of each of :func:`_groups`, whether any channel has a gradient at all.
         functions: how many basis functions, from the second on, to differentiate by.
 
     Returns:
@@ -222,6 +234,14 @@ def _replay(
             )
             for k in range(3):
                 projected = dr.fma(outer[8 + k], color[k], projected)
+        for packet, gradient in enumerate(_groups(outer)[3:]):
+            if dr.hint(has_gradient[3 + packet], mode="scalar"):
+                at = index * value_packets(records.value_count) + packet
+                value = dr.gather(mi.Vector4f, records.values, at, active)
+                for k in range(len(gradient)):
+                    projected = dr.fma(gradient[k], value[k], projected)
+                added = [weight * g for g in gradient] + [mi.Float(0)] * (4 - len(gradient))
+                _add(out.values, at, added, active)
         rest = dr.fma(-weight, projected, rest)
         by_alpha = remaining * projected - rest / (1 - hit.alpha)
         _replay_hit(records, index, hit, direction, by_alpha, weight * outer_depth, out, active)

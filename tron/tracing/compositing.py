@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from tron.errors import TronError
 from tron.tracing.hits import LocalHits
-from tron.tracing.kernel import FEATURE_PACKETS, MIN_ALPHA, SH_PACKETS, SurfelRecords
+from tron.tracing.kernel import FEATURE_PACKETS, MIN_ALPHA, SH_PACKETS, SurfelRecords, value_packets
 
 STOP_TRANSMITTANCE = 1e-3
 MEDIAN_TRANSMITTANCE = 0.5
@@ -90,7 +90,8 @@ class Composite:
     """Sums over the hits of each ray, unnormalised (Dr.Jit).
 
     Attributes:
-        channels: 11 floats: normal, roughness, base color, metallic, rgb of SH radiance.
+        channels: 11 floats: normal, roughness, base color, metallic, rgb of SH radiance; then the records'
+            values.
         mean_depth: sum of ``w t``.
         transmittance: T after the last composited hit.
         median_depth: t of the first hit after which T < 0.5; 0 where T stays above.
@@ -104,11 +105,10 @@ class Composite:
     count: mi.UInt32
 
     @staticmethod
-    def start() -> Composite:
-        """Nothing hit yet."""
-        return Composite(
-            [mi.Float(0) for _ in range(CHANNELS)], mi.Float(0), mi.Float(1), mi.Float(0), mi.UInt32(0)
-        )
+    def start(values: int = 0) -> Composite:
+        """Nothing hit yet, of surfels with so many more values."""
+        channels = [mi.Float(0) for _ in range(CHANNELS + values)]
+        return Composite(channels, mi.Float(0), mi.Float(1), mi.Float(0), mi.UInt32(0))
 
 
 def harmonic_sums(
@@ -140,6 +140,14 @@ def radiance(
     return [dr.select(value > 0, value, 0) for value in total]
 
 
+def values_of(records: SurfelRecords, index: mi.UInt32, active: mi.Bool) -> list[mi.Vector4f]:
+    """The packets of one surfel's values, the last filled up; none where the records have no values."""
+    packets = value_packets(records.value_count)
+    return [
+        dr.gather(mi.Vector4f, records.values, index * packets + packet, active) for packet in range(packets)
+    ]
+
+
 @dr.syntax
 def composite(
     records: SurfelRecords, hits: LocalHits, basis: list[mi.Float], sums: Composite, out: HitRows | None
@@ -166,7 +174,9 @@ def composite(
             feature = dr.gather(mi.Vector4f, records.features, index * FEATURE_PACKETS + packet, active)
             channels += [feature[k] for k in range(4)]
         channels += radiance(records, index, basis, active)
-        for k in range(CHANNELS):
+        for packet in values_of(records, index, active):
+            channels += [packet[k] for k in range(4)]
+        for k in range(len(sums.channels)):
             sums.channels[k] = dr.fma(weight, channels[k], sums.channels[k])
         sums.mean_depth = dr.fma(weight, t, sums.mean_depth)
         after = sums.transmittance * (1 - alpha)

@@ -74,11 +74,11 @@ class GBuffer(Surface):
         return {name: self._pixels(np.array(value)) for name, value in values.items()}
 
     def numpy(self) -> dict[str, np.ndarray]:
-        """Every field as (H, W) or (H, W, 3) float32."""
+        """Every field as (H, W), (H, W, 3) or, where there are C ``values``, (H, W, C) float32."""
         return self.images(self._fields())
 
     def _fields(self) -> dict[str, Any]:
-        return {field.name: getattr(self, field.name) for field in fields(Surface)}
+        return {f.name: getattr(self, f.name) for f in fields(Surface) if f.name != "values" or self.values}
 
     def _pixels(self, array: np.ndarray) -> np.ndarray:
         shape = (self.height, self.width) if array.ndim == 1 else (self.height, self.width, -1)

@@ -130,7 +130,7 @@ def composite_rounds(
     local_t = dr.alloc_local(mi.Float, K, value=mi.Float(0))
     local_index = dr.alloc_local(mi.UInt32, K, value=mi.UInt32(0))
     local_alpha = dr.alloc_local(mi.Float, K, value=mi.Float(0))
-    sums = Composite.start()
+    sums = Composite.start(records.value_count)
     rows = None
     if dr.hint(out is not None, mode="scalar"):
         rows = out.rows()

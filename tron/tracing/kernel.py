@@ -38,6 +38,11 @@ SH_PACKETS = 12
 """An SH record is 48 floats as scenes store them: (red, green, blue) of one coefficient after the other."""
 
 
+def value_packets(count: int) -> int:
+    """Packets of four floats that hold ``count`` values of a surfel."""
+    return -(-count // 4)
+
+
 def cut_radius_squared(opacity: mi.Float, degree: int) -> mi.Float:
     """Largest squared Mahalanobis distance at which a surfel still counts; negative where it never does.
 
@@ -82,6 +87,8 @@ class SurfelRecords:
         count: M; 1 where the scene has no surfel: a record that no ray meets.
         degree: kernel degree, 2 or 4.
         sh_degree: highest SH degree that is evaluated.
+        values: mi.Float, M records of more quantities to composite, up to a whole packet, or None.
+        value_count: how many they are.
     """
 
     geometry: mi.Float
@@ -90,6 +97,8 @@ class SurfelRecords:
     count: int
     degree: int
     sh_degree: int
+    values: mi.Float | None = None
+    value_count: int = 0
 
     def detached(self) -> SurfelRecords:
         """The same buffers, cut off from automatic differentiation."""
@@ -98,6 +107,7 @@ class SurfelRecords:
             geometry=dr.detach(self.geometry),
             features=dr.detach(self.features),
             harmonics=dr.detach(self.harmonics),
+            values=None if self.values is None else dr.detach(self.values),
         )
 
 

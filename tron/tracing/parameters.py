@@ -8,7 +8,8 @@ decides what is visible and is not differentiated.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -16,9 +17,10 @@ import mitsuba as mi
 import numpy as np
 
 from tron.aligned import aligned
+from tron.errors import TronError
 from tron.gaussians.fields import PARAMETERS
 from tron.gaussians.harmonics import SH_C0
-from tron.tracing.kernel import SH_PACKETS, SurfelRecords, cut_radius_squared
+from tron.tracing.kernel import SH_PACKETS, SurfelRecords, cut_radius_squared, value_packets
 
 if TYPE_CHECKING:
     from tron.gaussians.scene import GaussianScene
@@ -114,6 +116,27 @@ def pack(parameters: SurfelParameters) -> SurfelRecords:
     )
     dr.eval(records.geometry, records.features, records.harmonics)
     return records
+
+
+def pack_values(records: SurfelRecords, values: Sequence[mi.Float]) -> SurfelRecords:
+    """The records with ``values`` to composite beside their materials, differentiably.
+
+    Args:
+        records: M surfels.
+        values: each mi.Float of M numbers in the scene's order, or of one for all; none: none.
+
+    Raises:
+        TronError: an array of another length.
+    """
+    if not values:
+        return records
+    for k, value in enumerate(values):
+        if dr.width(value) not in (1, records.count):
+            raise TronError(f"values[{k}] has {dr.width(value)} numbers", mend=f"give {records.count}")
+    columns = [*values, *[mi.Float(0)] * (4 * value_packets(len(values)) - len(values))]
+    packed = _interleave(columns, records.count)
+    dr.eval(packed)
+    return replace(records, values=packed, value_count=len(values))
 
 
 def _frame(quats: mi.Vector4f) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]:

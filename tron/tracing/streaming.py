@@ -20,7 +20,7 @@ from tron.tracing.recording import recorded
 
 
 # Tracing the sorting networks takes as long as 16,000 rays, so the kernel is recorded once for each kind of
-# arguments: degrees, whether hits are kept, and if so for how many. Other sizes are free.
+# arguments: degrees, number of values, whether hits are kept, and if so for how many. Other sizes are free.
 @recorded
 def stream(
     records: SurfelRecords, entries: mi.UInt32, near: mi.Float, start: mi.UInt32, count: mi.UInt32,
@@ -50,7 +50,7 @@ def _rounds(
     origin: mi.Point3f, direction: mi.Vector3f, out: HitRows | None,
 ) -> tuple[Composite, mi.Bool]:  # fmt: skip
     basis = sh_basis(direction.x, direction.y, direction.z)
-    hits, sums, full = LocalHits.none(), Composite.start(), mi.Bool(False)
+    hits, sums, full = LocalHits.none(), Composite.start(records.value_count), mi.Bool(False)
     going = mi.Bool(walk.open)
     while going:
         walk, hits = collect(records, entries, near, origin, direction, STOP_TRANSMITTANCE, walk, hits)

@@ -8,12 +8,12 @@ not zero.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
 
-from tron.tracing.compositing import Composite
+from tron.tracing.compositing import CHANNELS, Composite
 
 
 @dataclass
@@ -30,6 +30,7 @@ class Surface:
         rgb: mi.Color3f, composited SH radiance in display space, premultiplied by opacity.
         opacity: mi.Float, 1 - T.
         direction: mi.Vector3f, the unit ray, world.
+        values: list of mi.Float, what else was composited, in the unit of each; none unless asked for.
     """
 
     position: mi.Point3f
@@ -41,6 +42,7 @@ class Surface:
     rgb: mi.Color3f
     opacity: mi.Float
     direction: mi.Vector3f
+    values: list[mi.Float] = field(default_factory=list, kw_only=True)
 
 
 def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surface:
@@ -65,4 +67,5 @@ def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surf
         rgb=mi.Color3f(*channels[8:11]),
         opacity=opacity,
         direction=direction,
+        values=[value * inverse for value in channels[CHANNELS:]],
     )

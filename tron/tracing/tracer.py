@@ -11,9 +11,10 @@ import mitsuba as mi
 
 from tron.errors import TronError
 from tron.tracing.bvh import build_bvh, refit
+from tron.tracing.first_hit import FirstHit, first_hits
 from tron.tracing.gbuffer import GBuffer, trace_gbuffer
 from tron.tracing.kernel import SurfelRecords
-from tron.tracing.parameters import SurfelParameters, pack
+from tron.tracing.parameters import SurfelParameters, pack, pack_values
 from tron.tracing.rays import trace_rays
 from tron.tracing.shadow_gradient import transmittance_by_opacity
 from tron.tracing.shadow_queue import queued_transmittance
@@ -99,7 +100,7 @@ class SurfelTracer:
             self.bvh = build_bvh(records)
             self._sorted_area = self.bvh.area
 
-    def _attached(self) -> SurfelRecords:
+    def attached(self) -> SurfelRecords:
         """The records, attached to the parameters that have gradients enabled.
 
         Packed anew each time, because a backward pass frees the edges between parameters and records.
@@ -112,17 +113,43 @@ class SurfelTracer:
     def _back_faces(self) -> BackFaces:
         return self._beyond if self._two_sided else BackFaces.never()
 
-    def gbuffer(self, camera: Camera) -> GBuffer:
-        """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it."""
-        return trace_gbuffer(self._attached(), build_tiles(self.records, camera), camera)
+    def gbuffer(self, camera: Camera, values: Sequence[mi.Float] = ()) -> GBuffer:
+        """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it.
 
-    def trace(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True) -> Surface:
+        ``values``: quantities of the surfels to composite as their materials are, each an array of one number
+        a surfel in the scene's order. They come back in ``GBuffer.values``, differentiable.
+        """
+        records = pack_values(self.attached(), values)
+        return trace_gbuffer(records, build_tiles(self.records, camera), camera)
+
+    def trace(
+        self,
+        origin: mi.Point3f,
+        direction: mi.Vector3f,
+        active: mi.Bool | bool = True,
+        values: Sequence[mi.Float] = (),
+    ) -> Surface:
         """Surfaces along any rays, from ``origin`` along unit ``direction``; inactive lanes see nothing.
 
         The same surfels composited in the same order as by :meth:`gbuffer`, without the coherence that makes
-        camera rays fast.
+        camera rays fast; ``values`` as there.
         """
-        return trace_rays(self._attached(), self.bvh, origin, direction, mi.Bool(active))
+        records = pack_values(self.attached(), values)
+        return trace_rays(records, self.bvh, origin, direction, mi.Bool(active))
+
+    def first_hits(
+        self,
+        origin: mi.Point3f,
+        directions: Sequence[mi.Vector3f],
+        active: Sequence[mi.Bool],
+        seeds: Sequence[mi.UInt32],
+    ) -> list[FirstHit]:
+        """One surfel a ray, by chance, each as likely as its weight in compositing: see :mod:`.first_hit`.
+
+        For a fan of rays from each origin, as :meth:`transmittances` has them; back faces count as for shadow
+        rays. ``seeds`` of each ray: :func:`tron.tracing.first_hit.ray_seeds`.
+        """
+        return first_hits(self.bvh, Fans(origin, directions, active), self._back_faces, seeds)
 
     def transmittance(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
@@ -146,4 +173,4 @@ class SurfelTracer:
     ) -> mi.Float:
         """:meth:`transmittance`, differentiable by the opacities; not inside a recorded loop."""
         fans = Fans(dr.detach(origin), [dr.detach(direction)], [mi.Bool(active)])
-        return transmittance_by_opacity(self._attached(), self.bvh, fans, self._back_faces)
+        return transmittance_by_opacity(self.attached(), self.bvh, fans, self._back_faces)

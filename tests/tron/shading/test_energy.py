@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
-from tron.shading.guidance import DIELECTRIC_F0
+from tron.shading.reflectance import DIELECTRIC_F0
 from tron.shading.split_sum import SplitSum, brdf_table
 
 

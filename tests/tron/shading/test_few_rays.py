@@ -10,8 +10,9 @@ from tron.color import luminance
 from tron.estimation import Estimation
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
 from tron.shading.few_rays import RATIO_FROM_RAYS, regressed_share
-from tron.shading.guidance import Lighting, reaching_share, render_guidance
+from tron.shading.guidance import Lighting, render_guidance
 from tron.shading.irradiance import irradiance, visible_share
+from tron.shading.visibility import reaching_share
 
 VIEW = Camera.look_at((-3.0, -2.5, 2.5), (-0.4, 0, 0.1), fov_deg=26, width=96, height=96)
 

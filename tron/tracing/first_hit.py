@@ -1,0 +1,174 @@
+"""Stochastic first hits: one surfel a ray, met with exactly the weight that compositing gives it.
+
+A surfel stops a ray with probability alpha, whatever the others do, and the nearest that does is found. So
+surfel i is found with the probability that it stops the ray and none before it does,
+
+    P(i) = alpha_i prod_{j < i} (1 - alpha_j) = T_i alpha_i,
+
+which is its weight in front-to-back compositing: the value of the surfel that is found is an unbiased
+estimate of the composited value (stochastic transparency: Enderton et al. 2010). Nothing is sorted, no list
+is kept, and what lies behind a stop is culled. Sides count as they do for shadow rays
+(:mod:`tron.tracing.transmittance`), so a ray meets nothing with its transmittance's probability.
+
+Whether a surfel stops a ray is decided by a hash of the ray's seed and of the surfel's place in the scene:
+in which order a walk meets surfels, and how a hierarchy sorts them, changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.tracing.bvh import Bvh
+from tron.tracing.fan_queue import Line, serve, spread
+from tron.tracing.kernel import intersect
+from tron.tracing.recording import recorded
+from tron.tracing.transmittance import BackFaces, Fans, blocks
+from tron.tracing.traversal import any_of, walk
+
+NOTHING = 0xFFFFFFFF
+"""In place of a surfel where a ray meets none."""
+
+
+@dataclass
+class FirstHit:
+    """What stops each ray, one lane a ray.
+
+    Attributes:
+        surfel: mi.UInt32, in the scene's order; ``NOTHING`` where there is none.
+        front: mi.Bool, the ray meets the side that its normal points to.
+        distance: mi.Float, along the unit ray, world units; infinity where there is none.
+    """
+
+    surfel: mi.UInt32
+    front: mi.Bool
+    distance: mi.Float
+
+
+def hashed(word: mi.UInt32) -> mi.UInt32:
+    """A permutation of all words that looks random (``lowbias32``, Wellons 2018)."""
+    word = (word ^ (word >> 16)) * mi.UInt32(0x7FEB352D)
+    word = (word ^ (word >> 15)) * mi.UInt32(0x846CA68B)
+    return word ^ (word >> 16)
+
+
+def ray_seeds(root: mi.UInt32, lane: mi.UInt32, ray: mi.UInt32) -> mi.UInt32:
+    """Seeds for :func:`first_hits`: of ray ``ray`` of ``lane``, below ``root`` of :mod:`tron.seeds`.
+
+    All three opaque, or kernels are compiled for each.
+    """
+    return hashed(hashed(hashed(root) + lane) + ray)
+
+
+@dataclass
+class Stops:
+    """The nearest stop so far of each ray of a fan.
+
+    Attributes:
+        nearest, farthest: as walks have them; farthest is where the ray is stopped.
+        surfel: in the scene's order, or ``NOTHING``. front: which side. seed: the ray's.
+    """
+
+    nearest: list[mi.Float]
+    farthest: list[mi.Float]
+    surfel: list[mi.UInt32]
+    front: list[mi.Bool]
+    seed: list[mi.UInt32]
+
+    @staticmethod
+    def none(active: Sequence[mi.Bool], seeds: Sequence[mi.UInt32]) -> Stops:
+        """Nothing met yet, by the rays that are traced."""
+        return Stops(
+            nearest=[mi.Float(0) for _ in active],
+            farthest=[dr.select(mi.Bool(lanes), mi.Float(dr.inf), -dr.inf) for lanes in active],
+            surfel=[mi.UInt32(NOTHING) for _ in active],
+            front=[mi.Bool(False) for _ in active],
+            seed=[mi.UInt32(seed) for seed in seeds],
+        )
+
+
+def stop(
+    bvh: Bvh, origin: mi.Point3f, directions: Sequence[mi.Vector3f], back_faces: BackFaces
+) -> Callable[[Stops, mi.UInt32, mi.Bool], Stops]:
+    """Visitor of a walk: a surfel may stop each ray."""
+
+    def visit(state: Stops, place: mi.UInt32, active: mi.Bool) -> Stops:
+        surfel = dr.gather(mi.UInt32, bvh.order, place, active)
+        for ray, direction in enumerate(directions):
+            hit = intersect(bvh.geometry, place, origin, direction, bvh.degree)
+            chance = mi.Float(hashed(surfel * mi.UInt32(0x9E3779B1) + state.seed[ray]) >> 8) * float(2.0**-24)
+            before, found = state.farthest[ray], state.surfel[ray]
+            nearer = (hit.t < before) | ((hit.t == before) & (surfel < found))
+            stops = blocks(hit, back_faces) & nearer & (chance < hit.alpha)
+            state.farthest[ray] = dr.select(stops, hit.t, before)
+            state.surfel[ray] = dr.select(stops, surfel, found)
+            state.front[ray] = dr.select(stops, hit.front, state.front[ray])
+        return state
+
+    return visit
+
+
+def first_hits(bvh: Bvh, fans: Fans, back_faces: BackFaces, seeds: Sequence[mi.UInt32]) -> list[FirstHit]:
+    """What stops each ray: a :class:`FirstHit` for each direction of the fans.
+
+    Evaluated at once, unless within a recorded loop.
+
+    Args:
+        bvh: the hierarchy.
+        fans: the rays; inactive ones meet nothing.
+        back_faces: from where on they stop rays.
+        seeds: of each direction, one a lane, no two rays' alike (:func:`ray_seeds`).
+    """
+    if dr.flag(dr.JitFlag.SymbolicScope):
+        start = Stops.none(fans.active, seeds)
+        visit = stop(bvh, fans.origin, fans.directions, back_faces)
+        end = walk(bvh, fans.origin, fans.directions, start, visit, any_of(fans.active))
+        return [
+            FirstHit(surfel, front, dr.select(surfel != NOTHING, distance, dr.inf))
+            for surfel, front, distance in zip(end.surfel, end.front, end.farthest)
+        ]
+    count = dr.width(fans, seeds)
+    fans, seeds = spread(fans, count), [spread(mi.UInt32(seed), count) for seed in seeds]
+    found = [
+        FirstHit(dr.zeros(mi.UInt32, count), dr.zeros(mi.Bool, count), dr.zeros(mi.Float, count))
+        for _ in seeds
+    ]
+    dr.eval(fans, seeds)
+    line = Line.of(count)
+    dr.make_opaque(found)
+    return _trace(bvh, fans, back_faces, seeds, line, found)
+
+
+@recorded
+def _trace(
+    bvh: Bvh,
+    fans: Fans,
+    back_faces: BackFaces,
+    seeds: Sequence[mi.UInt32],
+    line: Line,
+    found: Sequence[FirstHit],
+) -> Sequence[FirstHit]:
+    """Trace all fans; ``found`` receives what stops each ray."""
+
+    def begin(fan: mi.UInt32, going: mi.Bool) -> Stops:
+        return Stops.none(
+            [dr.gather(mi.Bool, lanes, fan, going) for lanes in fans.active],
+            [dr.gather(mi.UInt32, seed, fan, going) for seed in seeds],
+        )
+
+    def visitor(origin: mi.Point3f, along: Sequence[mi.Vector3f]) -> Callable:
+        return stop(bvh, origin, along, back_faces)
+
+    def write(state: Stops, fan: mi.UInt32, done: mi.Bool) -> None:
+        for ray, hit in enumerate(found):
+            met = state.surfel[ray] != NOTHING
+            dr.scatter(hit.surfel, state.surfel[ray], fan, done)
+            dr.scatter(hit.front, state.front[ray], fan, done)
+            dr.scatter(hit.distance, dr.select(met, state.farthest[ray], dr.inf), fan, done)
+
+    nothing = [mi.UInt32(0) for _ in seeds]
+    serve(bvh, fans, line, Stops.none([mi.Bool(False) for _ in seeds], nothing), begin, visitor, write)
+    return found
