@@ -70,9 +70,9 @@ class Settings(BaseModel):
     bounces: int = Field(
         FINAL.bounces,
         ge=0,
-        le=64,
-        description="times that light bounces between the surfels; 0: direct light alone, and the relit picture "
-        "is 'shadowed'",
+        le=16,
+        description="times that light bounces between the surfels; 0: direct light alone, and the relit "
+        "picture is 'shadowed'",
     )
     reflections: int | None = Field(
         None, ge=0, description="GGX rays per pixel that meet the scene, for glossy things; null: by quality"
@@ -153,6 +153,13 @@ class Settings(BaseModel):
         }
         given = {name: value for name, value in said.items() if value is not None}
         return Estimation(**{**QUALITY[self.quality].model_dump(), **given})
+
+    @property
+    def source(self) -> Literal["neural", "lit", "shadowed"]:
+        """What the relit picture is made of."""
+        if self.checkpoint is not None:
+            return "neural"
+        return "lit" if self.bounces else "shadowed"
 
     def by_light(self) -> list[Settings]:
         """The settings that give each environment's frames alone.

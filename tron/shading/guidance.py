@@ -59,6 +59,7 @@ class Guidance:
         shadowed: (H, W, 3) radiance: shadowed diffuse plus split-sum specular.
         indirect: (H, W, 3) irradiance / pi by bounced light; 0 on surfels where none was baked.
         lit: (H, W, 3) radiance with bounced light; ``shadowed`` where none was baked.
+        lit_alone: (H, W, 3) the same of the surfels alone, without what is behind them; 0 where there are none.
         mask: (H, W) opacity of the surfels in [0, 1].
         gbuffer: ``GBuffer.numpy()``, which is no buffer of its own.
     """
@@ -69,6 +70,7 @@ class Guidance:
     shadowed: np.ndarray
     indirect: np.ndarray
     lit: np.ndarray
+    lit_alone: np.ndarray
     mask: np.ndarray
     gbuffer: dict[str, np.ndarray]
     BUFFERS: ClassVar[tuple[str, ...]]
@@ -90,6 +92,7 @@ def render_guidance(
     estimation: Estimation = FINAL,
     seed: int = 0,
     background: Sequence[float] | None = None,
+    bounce=None,
 ) -> Guidance:
     """Trace ``camera``'s view of the surfels and shade it under ``lighting``.
 
@@ -101,7 +104,7 @@ def render_guidance(
         seed: root of the shadow rays' random numbers.
         background: linear RGB radiance behind the surfels; None: the environment.
     """
-    gbuffer = tracer.gbuffer(camera)
+    gbuffer = tracer.gbuffer(camera, bounce.values() if bounce else ())
     return shade(gbuffer, visibility(tracer, gbuffer, lighting, estimation, seed), lighting, background)
 
 
@@ -123,15 +126,21 @@ def shade_surface(
     else:
         behind = mi.Color3f(*(dr.opaque(mi.Float, float(channel)) for channel in background))
 
+    ind, lit = mi.Color3f(0), diffuse_color * shadowed + specular
+    if surface.values:
+        ind, openness = mi.Color3f(*surface.values[:3]), surface.values[3]
+        a, b = lighting.split_sum._brdf(dr.dot(normal, -surface.direction), surface.roughness)
+        lit += diffuse_color * ind + (openness - 1) * specular + (f0 * a + b) * ind
     buffers = {
         "pbr": diffuse_color * unshadowed + specular,
         "irradiance": shadowed,
         "unshadowed": unshadowed,
         "shadowed": diffuse_color * shadowed + specular,
-        "indirect": mi.Color3f(0),
-        "lit": diffuse_color * shadowed + specular,
+        "indirect": ind,
+        "lit": lit,
     }
     buffers = {name: over_background(color, behind, surface.opacity) for name, color in buffers.items()}
+    buffers["lit_alone"] = dr.select(surface.opacity > 0, lit, 0)
     dr.eval(buffers)
     return buffers
 

@@ -1,0 +1,95 @@
+"""A scene ready for every camera and every light of a run: its tracers, and the light that bounces in it.
+
+What bounces depends on the scene, traced once, and on the light and its turn, baked for each; not on the
+camera. Plain 3DGS files have normals without a sign, and their surfels are turned to each camera, which takes
+a tracer a camera. Where their light goes is not traced anew for each, which would take longer than the frame:
+it is traced for both sides of every surfel, and each camera is shown the sides that face it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from tron.cameras import Camera
+from tron.cli.progress import track
+from tron.estimation import Estimation
+from tron.gaussians.scene import GaussianScene
+from tron.shading.bounce import DIRECT, BouncedLight, BounceTransport
+from tron.tracing import SurfelTracer
+
+if TYPE_CHECKING:
+    from tron.shading.guidance import Lighting
+
+Bounced = Callable[[Camera], BouncedLight | None]
+"""Bounced light of one environment as the tracer of a camera takes it; None where nothing bounces."""
+
+
+class LitScene:
+    """Scene of a run.
+
+    Args:
+        scene: the surfels.
+        first: camera that surfels whose normals have no sign are turned to before any other.
+        estimation: of the light; without bounces nothing is traced for them.
+        seed: root of the random numbers of bounces.
+    """
+
+    def __init__(self, scene: GaussianScene, first: Camera, estimation: Estimation, seed: int) -> None:
+        self._sides = [scene]
+        if not scene.oriented:
+            front = scene.facing(first.position)
+            self._sides = [front, front.turned_over(np.ones(len(scene), bool))]
+        self._estimation, self._seed = estimation, seed
+        self._last: tuple[Camera, SurfelTracer] | None = None
+
+    def tracer(self, camera: Camera) -> SurfelTracer:
+        """The tracer for a camera: one for all, unless surfels are turned to each."""
+        scene, *other = self._sides
+        if not other:
+            return self._transport[0].tracer if self._estimation.bounces else self._tracer
+        if self._last is None or self._last[0] is not camera:
+            self._last = camera, SurfelTracer(scene.facing(camera.position))
+        return self._last[1]
+
+    def bake(self, lighting: Lighting) -> Bounced:
+        """Let one environment, at one turn, bounce."""
+        chosen = self._estimation
+        if not chosen.bounces:
+            return lambda _: None
+        direct = chosen.model_copy(update={"rays": DIRECT.rays, "filtered": False})
+        baked = [side.bake(lighting, direct, chosen.bounces, seed=self._seed) for side in self._transport]
+        scene, *other = self._sides
+        if not other:
+            return lambda _: baked[0]
+        return lambda camera: _chosen(scene.looks_away(camera.position), *baked)
+
+    @cached_property
+    def _tracer(self) -> SurfelTracer:
+        return SurfelTracer(self._sides[0])
+
+    @cached_property
+    def _transport(self) -> list[BounceTransport]:
+        """Where the light of each side goes, traced when it is first asked for."""
+        return [
+            BounceTransport.trace(SurfelTracer(side), seed=self._seed, track=partial(track, label="bounces"))
+            for side in self._sides
+        ]
+
+
+def _chosen(back: np.ndarray, front_light: BouncedLight, back_light: BouncedLight) -> BouncedLight:
+    """Of each surfel the light of its front, or where ``back``, (M,) bool, says so of its back."""
+    chosen = mi.Bool(back)
+    shown = BouncedLight(
+        **{
+            name: dr.select(chosen, value, vars(front_light)[name])
+            for name, value in vars(back_light).items()
+        }
+    )
+    dr.eval(shown)
+    return shown
