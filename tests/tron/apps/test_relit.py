@@ -257,7 +257,7 @@ def test_without_bounces_the_picture_is_shadowed_and_nothing_is_traced_for_them(
 def test_bounced_light_fills_the_shadow_and_has_the_colour_of_what_sent_it(
     relight, scene_path, light_path, tmp_path
 ):
-    """A lamp on a reddish ball (base color 0.8, 0.3, 0.2) over a grey floor: the floor beside it turns red."""
+    """A lamp on a reddish ball (base color 0.8, 0.3, 0.2) over a grey floor, which turns red beside it."""
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={tmp_path}", "frames=4"]
     assert relight(*base, "quality=final", "buffers=[indirect,shadowed,lit,normal,position]") == 0
     indirect, lit, shadowed, normal, position = (
