@@ -15,7 +15,8 @@ import json
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ from tron.gaussians.scene import GaussianScene
 from tron.images import write_image
 from tron.runtime import activate, describe_machine
 from tron.seeds import integer
-from tron.shading.bounce import BounceTransport
+from tron.shading.bounce import BouncedLight, BounceTransport
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Lighting, render_guidance
 from tron.storage import write_atomic
@@ -50,6 +51,8 @@ WAYS = {
     "lit_with_reflections": FINAL.model_copy(update={"supersample": 2, "reflections": 4}),
 }
 """Frames of ours that are judged."""
+BEST = "lit_with_reflections"
+"""The way that is shown beside the path tracer."""
 PATHS = (1, 4, 9, 16, 36, 64, 144, 256, 576)
 """Paths a pixel, squares: the sampler rounds others up."""
 
@@ -79,7 +82,7 @@ def measure_equal_error(settings: Settings) -> None:
         write_atomic(settings.output_dir / RESULT_NAME, json.dumps(record, indent=1) + "\n")
 
 
-def _surfels(settings: Settings, item: Work) -> Any:
+def _surfels(settings: Settings, item: Work) -> Path:
     return scene_folder(settings.output_dir, item.name) / "surfels.ply"
 
 
@@ -142,17 +145,18 @@ class _Frame:
         off = (self._shown(image) - self._shown(self._truth))[self._inside].astype(np.float64)
         return math.sqrt(max((off**2).mean() - self._noise, 1e-12))
 
-    def judge(self, tracer: SurfelTracer, transport: BounceTransport, pictures: Any) -> dict[str, Any]:
+    def judge(self, tracer: SurfelTracer, transport: BounceTransport, pictures: Path) -> dict[str, Any]:
         """Times and errors of our frames, and of the path tracer's as far as they are wanted."""
         lighting = Lighting(self._environment)
-        bake: Callable[[], Any] = lambda: transport.bake(lighting)  # noqa: E731
+
+        def bake() -> BouncedLight:
+            return transport.bake(lighting)
+
         bounce = bake()
 
         def ours(estimation: Estimation) -> Callable[[], np.ndarray]:
             def render() -> np.ndarray:
-                found = render_guidance(
-                    tracer, self._camera, lighting, estimation, self._seed, bounce=bounce
-                )
+                found = render_guidance(tracer, self._camera, lighting, estimation, self._seed, bounce=bounce)
                 return found.lit
 
             return render
@@ -180,7 +184,7 @@ class _Frame:
                 "error": error, "seconds": seconds[name], "paths": spp, "path_seconds": theirs,
                 "ratio": seconds[name] / theirs,
             }  # fmt: skip
-        self._write(pictures, images["lit_with_reflections"], ways["lit_with_reflections"], by_paths)
+        self._write(pictures, images[BEST], seconds[BEST], by_paths)
         return {
             "bake_seconds": seconds["bake"],
             "ways": ways,
@@ -190,9 +194,9 @@ class _Frame:
         }
 
     def _write(
-        self, stem: Any, ours: np.ndarray, way: Mapping[str, float], by_paths: Mapping[int, tuple[float, float]]
+        self, stem: Path, ours: np.ndarray, seconds: float, by_paths: Mapping[int, tuple[float, float]]
     ) -> None:
-        affordable = [spp for spp, (_, seconds) in by_paths.items() if seconds <= way["seconds"]]
+        affordable = [spp for spp, (_, theirs) in by_paths.items() if theirs <= seconds]
         same_time = self._paths(max(affordable, default=PATHS[0]))
         shown = [self._shown(image) for image in (ours, same_time, self._truth)]
         write_image(stem.with_suffix(".png"), np.concatenate(shown, axis=1))

@@ -40,8 +40,8 @@ class Estimation(BaseModel):
     filtered: bool = Field(default=False, description="edge-avoiding filter over the image, for few rays")
     diffuse: Diffuse = Field(
         default="principled",
-        description="principled: the diffuse part of the material that data are path-traced with, by roughness "
-        "and angle; lambert: base color alone, as in the paper",
+        description="principled: the material that data are path-traced with, whose diffuse part depends on "
+        "roughness and angle; lambert: that of base color alone, as in the paper",
     )
     bounces: int = Field(
         default=3, ge=0, le=16, description="times that light bounces between surfels; 0: direct light alone"
@@ -54,6 +54,14 @@ class Estimation(BaseModel):
     supersample: Literal[1, 2] = Field(
         default=1, description="2: 2 x 2 sub-pixels with a quarter of the rays each, averaged"
     )
+
+    def of_sub_pixel(self) -> Estimation:
+        """The same for each of a pixel's sub-pixels, which share its rays out."""
+        parts = self.supersample**2
+        if parts == 1:
+            return self
+        rays, reflections = max(2, self.rays // parts // 2 * 2), -(-self.reflections // parts)
+        return self.model_copy(update={"rays": rays, "reflections": reflections, "supersample": 1})
 
 
 FINAL = Estimation()

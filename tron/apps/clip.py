@@ -13,7 +13,7 @@ import numpy as np
 
 from tron import seeds
 from tron.apps.frame_folder import FrameFolder
-from tron.apps.relit import RelitPicture
+from tron.apps.relit import RelitPicture, surfels_alone
 from tron.cameras import Camera
 from tron.cli.progress import track
 from tron.color import to_display
@@ -25,8 +25,10 @@ from tron.shards.schema import GUIDANCE
 if TYPE_CHECKING:
     from tron.apps.lit_scene import Bounced, LitScene
     from tron.neural.protocols import Renderer
+    from tron.shading.bounce import BouncedLight
     from tron.shading.environment import EnvironmentMap
-    from tron.shading.guidance import Lighting
+    from tron.shading.lighting import Lighting
+    from tron.tracing import SurfelTracer
 
 # Frames that the neural renderer gets at once; bounds memory, not its view into the past.
 CLIP_FRAMES = 16
@@ -135,7 +137,6 @@ def trace(
         seed: root of its random numbers; a frame's do not depend on the environment.
     """
     from tron.apps.lit_scene import LitScene
-    from tron.shading.guidance import render_guidance
 
     lit = LitScene(scene, cameras[0], estimation, seeds.integer(seed, "relight", "bounces"))
     for index, camera in enumerate(track(cameras, "guidance")):
@@ -144,10 +145,37 @@ def trace(
                 started = time.perf_counter()
                 lighting, bounced = clip.light(lit, index)
                 ray_seed = seeds.integer(seed, "relight", index)
-                guidance = render_guidance(
-                    lit.tracer(camera), camera, lighting, estimation, ray_seed, bounce=bounced(camera)
+                buffers = _shade(
+                    lit.tracer(camera),
+                    camera,
+                    lighting,
+                    bounced(camera),
+                    clip.folder.buffers,
+                    estimation,
+                    ray_seed,
                 )
                 clip.seconds.append(time.perf_counter() - started)
-                made = guidance.gbuffer | vars(guidance)
-                clip.folder.write(index, made | {"foreground": guidance.lit_alone})
+                clip.folder.write(index, buffers)
             clip.write_pictures(index)
+
+
+def _shade(
+    tracer: SurfelTracer,
+    camera: Camera,
+    lighting: Lighting,
+    bounce: BouncedLight | None,
+    names: Sequence[str],
+    estimation: Estimation,
+    seed: int,
+) -> dict[str, np.ndarray]:
+    """The buffers ``names`` of one frame."""
+    from tron.shading.guidance import arriving_light, shade, trace_view
+
+    view = trace_view(tracer, camera, estimation, bounce)
+    arriving = arriving_light(tracer, view, lighting, estimation, seed, bounce)
+    guidance = shade(view, arriving, lighting, estimation=estimation)
+    made = guidance.gbuffer | vars(guidance)
+    if "foreground" in names:
+        over_black = shade(view, arriving, lighting, (0, 0, 0), estimation).lit
+        made["foreground"] = surfels_alone(over_black, guidance.mask)
+    return {name: made[name] for name in names}

@@ -20,7 +20,7 @@ from tron.cameras import Camera
 from tron.cli.progress import track
 from tron.estimation import Estimation
 from tron.gaussians.scene import GaussianScene
-from tron.shading.bounce import DIRECT, BouncedLight, BounceTransport
+from tron.shading.bounce import BouncedLight, BounceTransport
 from tron.tracing import SurfelTracer
 
 if TYPE_CHECKING:
@@ -59,11 +59,9 @@ class LitScene:
 
     def bake(self, lighting: Lighting) -> Bounced:
         """Let one environment, at one turn, bounce."""
-        chosen = self._estimation
-        if not chosen.bounces:
+        if not self._estimation.bounces:
             return lambda _: None
-        direct = chosen.model_copy(update={"rays": DIRECT.rays, "filtered": False})
-        baked = [side.bake(lighting, direct, chosen.bounces, seed=self._seed) for side in self._transport]
+        baked = [side.bake(lighting, self._estimation, seed=self._seed) for side in self._transport]
         scene, *other = self._sides
         if not other:
             return lambda _: baked[0]

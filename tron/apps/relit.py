@@ -99,3 +99,16 @@ def composite(surfels: np.ndarray, color: Sequence[float], mask: np.ndarray) -> 
 
     share = background_share(1 - mask)
     return (1 - share) * surfels + share * np.asarray(color, np.float32)
+
+
+def surfels_alone(over_black: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Radiance (H, W, 3) of surfels without what is behind them, 0 where there are none.
+
+    Args:
+        over_black: their radiance in front of black.
+        mask: (H, W) their opacity.
+    """
+    from tron.shading.background import background_share
+
+    weight = 1 - background_share(1 - mask)[..., None]
+    return np.divide(over_black, weight, out=np.zeros_like(over_black), where=weight > 0)

@@ -33,7 +33,7 @@ from tron.integrators.environment import environment_of, light_state
 from tron.integrators.plugin import Shown
 from tron.integrators.surfels import Surfels, unwrap
 from tron.shading.environment import EnvironmentMap
-from tron.shading.guidance import Guidance, Lighting, shade_surface, visibility
+from tron.shading.guidance import Guidance, Lighting, arriving_light, shade_surface
 from tron.shading.split_sum import CUBEMAP_RESOLUTION
 from tron.tracing import GBuffer
 
@@ -63,9 +63,9 @@ class GuidanceAppearance:
         with dr.suspend_grad():
             rays = GBuffer.of_rows(dr.detach(surface), width, dr.width(surface.opacity) // width)
             dr.eval(rays)
-            reaching = visibility(self.surfels.tracer, rays, lighting, self.estimation, seed)
-            reaching = rays.in_rows(reaching)
-        shaded = shade_surface(surface, reaching, lighting)
+            arriving = arriving_light(self.surfels.tracer, rays, lighting, self.estimation, seed)
+            arriving = rays.in_rows(arriving)
+        shaded = shade_surface(surface, arriving, lighting, diffuse=self.estimation.diffuse)
         extra = [part for name in self.others for part in shaded[name]]
         return Shown(shaded[self.buffer], surface.opacity, [*extra, surface.opacity])
 

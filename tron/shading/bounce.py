@@ -24,8 +24,9 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.errors import TronError
-from tron.estimation import Estimation
+from tron.estimation import Diffuse, Estimation
 from tron.seeds import integer
+from tron.shading.brdf_table import BrdfTable
 from tron.shading.irradiance import ORIGIN_OFFSET
 from tron.shading.lighting import Lighting
 from tron.shading.reflectance import bounce_albedo
@@ -41,6 +42,7 @@ RAYS = 32
 BOUNCES = 4
 BACK = 0.5
 """Radiance of a back face as a share of its front's."""
+FINAL = Estimation()
 DIRECT = Estimation(rays=8)
 """Direct light at a surfel: more than 8 rays gain nothing, 32 are worth 0.02 dB."""
 AT_ONCE = 1 << 20
@@ -140,10 +142,10 @@ class BounceTransport:
         """(M,) share of each surfel's rays that meet nothing."""
         return _openness(self.met, self.rays, len(self.tracer.scene))
 
-    def albedo(self) -> mi.Color3f:
+    def albedo(self, diffuse: Diffuse = "principled") -> mi.Color3f:
         """(M,) :func:`tron.shading.reflectance.bounce_albedo`, differentiable as the tracer is."""
         every = dr.arange(mi.UInt32, len(self.tracer.scene))
-        return bounce_albedo(centres(self.tracer.attached(), every))
+        return bounce_albedo(centres(self.tracer.attached(), every), BrdfTable.load(), diffuse)
 
     def direct(self, lighting: Lighting, estimation: Estimation = DIRECT, seed: int = 0) -> mi.Color3f:
         """(M,) irradiance / pi of direct light at each surfel, shadows included, linear.
@@ -185,13 +187,23 @@ class BounceTransport:
     def bake(
         self,
         lighting: Lighting,
-        estimation: Estimation = DIRECT,
-        bounces: int = BOUNCES,
+        estimation: Estimation = FINAL,
+        bounces: int | None = None,
         back: float = BACK,
         seed: int = 0,
     ) -> BouncedLight:
-        """What ``lighting`` is at each surfel; arguments as of :meth:`direct` and :meth:`indirect`."""
-        direct, albedo = self.direct(lighting, estimation, seed), self.albedo()
+        """What ``lighting`` is at each surfel.
+
+        Args:
+            lighting: the prepared environment.
+            estimation: of the frames; the surfels have their estimator, sides, material and bounces, but
+                shadow rays of their own (``DIRECT``).
+            bounces: None: those of ``estimation``.
+            back, seed: as of :meth:`indirect` and :meth:`direct`.
+        """
+        own = estimation.model_copy(update={"rays": DIRECT.rays, "filtered": DIRECT.filtered})
+        direct, albedo = self.direct(lighting, own, seed), self.albedo(estimation.diffuse)
+        bounces = estimation.bounces if bounces is None else bounces
         indirect = self.indirect(direct, albedo, bounces, back)
         baked = BouncedLight(direct, indirect, albedo * (direct + indirect), self.openness())
         dr.eval(baked)

@@ -1,12 +1,12 @@
 """G-buffer + environment -> guidance: the buffers that the neural renderer is conditioned on.
 
-    pbr         base (1 - m) U + S             unshadowed split-sum
-    irradiance  U share of the light           a white diffuse surface, shadows included
-    shadowed    base (1 - m) irradiance + S    direct light alone
+    pbr         unshadowed split-sum
+    irradiance  what a white diffuse surface sends out, shadows included: U times the share that arrives
+    shadowed    direct light, with shadows on the diffuse part
     indirect    irradiance / pi by light that bounced between the surfels (:mod:`tron.shading.bounce`)
-    lit         shadowed + base (1 - m) indirect + reflections of the scene: the whole picture
+    lit         all light: what a path tracer shows
 
-U is the unshadowed irradiance / pi, S the split-sum specular, F0 = 0.04 (1 - m) + m base. The n-ray
+The formulas are those of :mod:`tron.shading.composition`; U is the unshadowed irradiance / pi. The n-ray
 estimates of shadowed and unshadowed irradiance share their rays, so the share that arrives keeps the shadows
 and sheds the noise of the light, and U, which has none, puts the light back (Heitz et al. 2018). From 16 rays
 it is their ratio, below a regression that is not biased in shadow (:mod:`tron.shading.few_rays`). At 64 rays
@@ -28,12 +28,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from tron.estimation import FINAL, Estimation
+from tron.estimation import FINAL, Diffuse, Estimation
 from tron.shading.background import over_background
+from tron.shading.bounce import BouncedLight
+from tron.shading.composition import Bounced, Response
 from tron.shading.irradiance import Occluder
 from tron.shading.lighting import Lighting
-from tron.shading.reflectance import diffuse_albedo, specular_f0
-from tron.shading.visibility import Shadows, shading_normal, visibility
+from tron.shading.reflections import reflections
+from tron.shading.supersampling import averaged, averaged_surface
+from tron.shading.visibility import Shadows, visibility
 
 if TYPE_CHECKING:
     from tron.cameras import Camera
@@ -43,14 +46,14 @@ if TYPE_CHECKING:
 class ViewTracer(Occluder, Shadows, Protocol):
     """Camera rays and shadow rays: :class:`tron.tracing.SurfelTracer`, or a closed form in a test."""
 
-    def gbuffer(self, camera: Camera) -> GBuffer: ...
+    def gbuffer(self, camera: Camera, values: Sequence[mi.Float] = ()) -> GBuffer: ...
 
 
 @dataclass
 class Guidance:
     """Buffers of one frame, NumPy float32, linear, in front of the environment; also by name.
 
-    A new buffer is a field here and a formula in :func:`shade_surface`.
+    A new buffer is a field here and a line in :func:`shade_surface`.
 
     Attributes:
         pbr: (H, W, 3) unshadowed split-sum radiance.
@@ -59,9 +62,9 @@ class Guidance:
         shadowed: (H, W, 3) radiance: shadowed diffuse plus split-sum specular.
         indirect: (H, W, 3) irradiance / pi by bounced light; 0 on surfels where none was baked.
         lit: (H, W, 3) radiance with bounced light; ``shadowed`` where none was baked.
-        lit_alone: (H, W, 3) the same of the surfels alone, without what is behind them; 0 where there are none.
         mask: (H, W) opacity of the surfels in [0, 1].
-        gbuffer: ``GBuffer.numpy()``, which is no buffer of its own.
+        gbuffer: ``GBuffer.numpy()``, which is no buffer of its own; of sub-pixels the means
+            (:func:`tron.shading.supersampling.averaged_surface`).
     """
 
     pbr: np.ndarray
@@ -70,7 +73,6 @@ class Guidance:
     shadowed: np.ndarray
     indirect: np.ndarray
     lit: np.ndarray
-    lit_alone: np.ndarray
     mask: np.ndarray
     gbuffer: dict[str, np.ndarray]
     BUFFERS: ClassVar[tuple[str, ...]]
@@ -85,6 +87,19 @@ class Guidance:
 Guidance.BUFFERS = tuple(field.name for field in fields(Guidance) if field.name != "gbuffer")
 
 
+@dataclass
+class Arriving:
+    """Light that reaches surfaces, one lane each.
+
+    Attributes:
+        visibility: share of the unshadowed irradiance, by channel.
+        bounced: light that has met the scene; None where none was baked.
+    """
+
+    visibility: mi.Color3f
+    bounced: Bounced | None = None
+
+
 def render_guidance(
     tracer: ViewTracer,
     camera: Camera,
@@ -92,7 +107,7 @@ def render_guidance(
     estimation: Estimation = FINAL,
     seed: int = 0,
     background: Sequence[float] | None = None,
-    bounce=None,
+    bounce: BouncedLight | None = None,
 ) -> Guidance:
     """Trace ``camera``'s view of the surfels and shade it under ``lighting``.
 
@@ -100,55 +115,95 @@ def render_guidance(
         tracer: the scene.
         camera: the view.
         lighting: the prepared environment.
-        estimation: of the shadows.
-        seed: root of the shadow rays' random numbers.
+        estimation: of the light.
+        seed: root of the rays' random numbers.
         background: linear RGB radiance behind the surfels; None: the environment.
+        bounce: what ``lighting`` is at each surfel (``BounceTransport.bake``); None: no light bounces.
     """
-    gbuffer = tracer.gbuffer(camera, bounce.values() if bounce else ())
-    return shade(gbuffer, visibility(tracer, gbuffer, lighting, estimation, seed), lighting, background)
+    gbuffer = trace_view(tracer, camera, estimation, bounce)
+    arriving = arriving_light(tracer, gbuffer, lighting, estimation, seed, bounce)
+    return shade(gbuffer, arriving, lighting, background, estimation)
+
+
+def trace_view(
+    tracer: ViewTracer, camera: Camera, estimation: Estimation = FINAL, bounce: BouncedLight | None = None
+) -> GBuffer:
+    """The G-buffer that :func:`shade` takes: of sub-pixels, if so, and with the values of ``bounce``."""
+    times = estimation.supersample
+    view = camera if times == 1 else camera.resized(times * camera.width, times * camera.height)
+    return tracer.gbuffer(view) if bounce is None else tracer.gbuffer(view, bounce.values())
+
+
+def arriving_light(
+    tracer: ViewTracer,
+    gbuffer: GBuffer,
+    lighting: Lighting,
+    estimation: Estimation,
+    seed: int,
+    bounce: BouncedLight | None = None,
+) -> Arriving:
+    """Light that reaches the pixels of :func:`trace_view`; arguments as of :func:`render_guidance`."""
+    estimation = estimation.of_sub_pixel()
+    reaching = visibility(tracer, gbuffer, lighting, estimation, seed)
+    if bounce is None:
+        return Arriving(reaching)
+    *indirect, openness = gbuffer.values
+    bounced = Bounced(mi.Color3f(*indirect), mi.Color3f(openness), mi.Color3f(*indirect))
+    if estimation.reflections:
+        occluder = tracer.sided(estimation.two_sided)
+        bounced.openness, bounced.mirrored = reflections(
+            occluder, gbuffer, lighting, bounce, estimation.reflections, seed, estimation.diffuse
+        )
+    return Arriving(reaching, bounced)
 
 
 def shade_surface(
-    surface: Surface, visibility: mi.Color3f, lighting: Lighting, background: Sequence[float] | None = None
+    surface: Surface,
+    arriving: Arriving,
+    lighting: Lighting,
+    background: Sequence[float] | None = None,
+    diffuse: Diffuse = "principled",
 ) -> dict[str, mi.Color3f]:
-    """Shade what rays see, given the share of the unshadowed irradiance that reaches each of them.
+    """Shade what rays see, given the light that reaches each of them.
 
     ``background`` as of :func:`render_guidance`. Returns the colours of :class:`Guidance` by name, on the
     device, one lane a ray.
     """
-    normal = shading_normal(surface)
-    diffuse_color, f0 = diffuse_albedo(surface), specular_f0(surface)
-    unshadowed = lighting.split_sum.diffuse(normal)
-    specular = lighting.split_sum.specular(normal, -surface.direction, surface.roughness, f0)
-    shadowed = unshadowed * visibility
+    response = Response.of(surface, lighting.split_sum, diffuse)
+    irradiance = response.unshadowed * arriving.visibility
+    bounced = arriving.bounced
     if background is None:
         behind = lighting.light.radiance(surface.direction)
     else:
         behind = mi.Color3f(*(dr.opaque(mi.Float, float(channel)) for channel in background))
 
-    ind, lit = mi.Color3f(0), diffuse_color * shadowed + specular
-    if surface.values:
-        ind, openness = mi.Color3f(*surface.values[:3]), surface.values[3]
-        a, b = lighting.split_sum._brdf(dr.dot(normal, -surface.direction), surface.roughness)
-        lit += diffuse_color * ind + (openness - 1) * specular + (f0 * a + b) * ind
     buffers = {
-        "pbr": diffuse_color * unshadowed + specular,
-        "irradiance": shadowed,
-        "unshadowed": unshadowed,
-        "shadowed": diffuse_color * shadowed + specular,
-        "indirect": ind,
-        "lit": lit,
+        "pbr": response.direct(response.unshadowed),
+        "irradiance": irradiance,
+        "unshadowed": response.unshadowed,
+        "shadowed": response.direct(irradiance),
+        "indirect": mi.Color3f(0) if bounced is None else bounced.indirect,
+        "lit": response.direct(irradiance) if bounced is None else response.lit(irradiance, bounced),
     }
     buffers = {name: over_background(color, behind, surface.opacity) for name, color in buffers.items()}
-    buffers["lit_alone"] = dr.select(surface.opacity > 0, lit, 0)
     dr.eval(buffers)
     return buffers
 
 
 def shade(
-    gbuffer: GBuffer, visibility: mi.Color3f, lighting: Lighting, background: Sequence[float] | None = None
+    gbuffer: GBuffer,
+    arriving: Arriving,
+    lighting: Lighting,
+    background: Sequence[float] | None = None,
+    estimation: Estimation = FINAL,
 ) -> Guidance:
-    """Guidance from a G-buffer and the share of the unshadowed irradiance that reaches each pixel."""
-    colors = shade_surface(gbuffer, visibility, lighting, background)
+    """Guidance from a G-buffer of :func:`trace_view` and the light that reaches its pixels.
+
+    Arguments as of :func:`render_guidance`.
+    """
+    colors = gbuffer.images(shade_surface(gbuffer, arriving, lighting, background, estimation.diffuse))
     buffers = gbuffer.numpy()
-    return Guidance(**gbuffer.images(colors), mask=buffers["opacity"], gbuffer=buffers)
+    if estimation.supersample > 1:
+        colors = {name: averaged(color, estimation.supersample) for name, color in colors.items()}
+        buffers = averaged_surface(buffers, estimation.supersample)
+    return Guidance(**colors, mask=buffers["opacity"], gbuffer=buffers)

@@ -1,61 +1,91 @@
-"""Reflectances of a surface's material: the metallic workflow (Burley 2012, Karis 2013).
+"""Reflectance of a material: the share of uniform light that its diffuse part and its lobe send on.
 
-    diffuse    k_d = base (1 - m)
-    specular   F_0 = 0.04 (1 - m) + base m,    at normal incidence
+                "principled", the data engine's                     "lambert", the paper's
+    specular    (1 - metallic) E + metallic (base A + B)            F0 A + B
+    diffuse     min(base (1 - metallic) D, 1 - specular)            base (1 - metallic)
 
-Both linear, by base color and metallic m; the specular lobe's albedo towards a view at cosine c is
-F_0 A(c, roughness) + B(c, roughness) of :func:`tron.shading.split_sum.brdf_table`.
+F0 is 0.04 (1 - metallic) + metallic base; A, B, D and E are those of :mod:`tron.shading.brdf_table`. Burley's
+diffuse part knows nothing of the lobe above it: a white dielectric in a white furnace would shine at 1.02 to
+1.09 where it is faced, and at up to 1.6 at grazing angles. The minimum keeps every surface at what arrives;
+base colors below 0.8 meet it beyond 70 degrees only.
 """
 
 from __future__ import annotations
 
-from functools import cache
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from tron.aligned import aligned
-from tron.shading.split_sum import TABLE_SIZE, brdf_table
-
-if TYPE_CHECKING:
-    from tron.tracing import Surface
+from tron.estimation import Diffuse
+from tron.shading.brdf_table import GLASS_INDEX, BrdfTable
 
 DIELECTRIC_F0 = 0.04
 MOST_ALBEDO = 0.99
 """Largest albedo of a bounce: light dies out."""
 
 
-def diffuse_albedo(surface: Surface) -> mi.Color3f:
-    """Albedo k_d of the diffuse part, linear."""
-    return surface.base_color * (1 - surface.metallic)
+class Material(Protocol):
+    """Base color, linear, roughness and metallic, in [0, 1]; of any number of lanes."""
+
+    base_color: mi.Color3f
+    roughness: mi.Float
+    metallic: mi.Float
 
 
-def specular_f0(surface: Surface) -> mi.Color3f:
-    """Specular reflectance F_0 at normal incidence, linear."""
-    return DIELECTRIC_F0 * (1 - surface.metallic) + surface.metallic * surface.base_color
+@dataclass
+class Reflectance:
+    """Shares of the light, by channel.
 
-
-def bounce_albedo(surface: Surface) -> mi.Color3f:
-    """Share of evenly arriving light that leaves a surface again, its specular lobe included, by channel.
-
-        k_d + F_0 A + B,    with A and B averaged over directions by their cosine
-
-    at most ``MOST_ALBEDO``, because k_d and the lobe are not coupled; differentiable.
+    Attributes:
+        diffuse: factor on irradiance / pi.
+        specular: factor on the lobe's mean radiance.
     """
-    x = dr.clip(surface.roughness * TABLE_SIZE - 0.5, 0, TABLE_SIZE - 1)
-    row = mi.UInt32(x)
-    row = dr.select(row < TABLE_SIZE - 1, row, TABLE_SIZE - 2)
-    table = mi.Float(aligned(_mean_table().ravel()))
-    low, high = (dr.gather(mi.Vector2f, table, row + k) for k in (0, 1))
-    scale, bias = dr.lerp(low, high, x - mi.Float(row))
-    albedo = diffuse_albedo(surface) + specular_f0(surface) * scale + bias
-    return dr.select(albedo < MOST_ALBEDO, albedo, MOST_ALBEDO)
+
+    diffuse: mi.Color3f
+    specular: mi.Color3f
 
 
-@cache
-def _mean_table() -> np.ndarray:
-    """(roughness, 2) float32: ``brdf_table`` averaged over n.v with the cosine's weight."""
-    cosine = (np.arange(TABLE_SIZE) + 0.5) / TABLE_SIZE
-    return np.einsum("rck,c->rk", brdf_table(), cosine / cosine.sum()).astype(np.float32)
+def reflectance(
+    material: Material, table: BrdfTable, cosine: mi.Float | None = None, diffuse: Diffuse = "principled"
+) -> Reflectance:
+    """Reflectance of a material, differentiable in it.
+
+    Args:
+        material: such as a :class:`tron.tracing.Surface`.
+        table: of the active variant.
+        cosine: n.v; None: the mean over all directions of view, by the cosine, as of light that bounces.
+        diffuse: the model.
+    """
+    scale, bias, factor, glass = table(material.roughness, cosine)
+    body = material.base_color * (1 - material.metallic)
+    if diffuse == "lambert":
+        return Reflectance(body, _f0(material) * scale + bias)
+    specular = _blend(material, glass, material.base_color * scale + bias)
+    return Reflectance(dr.minimum(body * factor, 1 - specular), specular)
+
+
+def fresnel(material: Material, cosine: mi.Float, diffuse: Diffuse = "principled") -> mi.Color3f:
+    """Share that is mirrored at ``cosine`` to the half vector; its mean over a lobe is in ``reflectance``."""
+    weight = (1 - dr.clip(cosine, 0, 1)) ** 5
+    if diffuse == "lambert":
+        return dr.lerp(_f0(material), 1, weight)
+    return _blend(material, mi.fresnel(cosine, GLASS_INDEX)[0], dr.lerp(material.base_color, 1, weight))
+
+
+def _f0(material: Material) -> mi.Color3f:
+    return DIELECTRIC_F0 * (1 - material.metallic) + material.metallic * material.base_color
+
+
+def _blend(material: Material, glass: mi.Float, metal: mi.Color3f) -> mi.Color3f:
+    return (1 - material.metallic) * glass + material.metallic * metal
+
+
+def bounce_albedo(material: Material, table: BrdfTable, diffuse: Diffuse = "principled") -> mi.Color3f:
+    """Share of evenly arriving light that leaves a surface again, its lobe included, by channel.
+
+    At most ``MOST_ALBEDO``; differentiable. Arguments as of :func:`reflectance`.
+    """
+    share = reflectance(material, table, diffuse=diffuse)
+    return dr.minimum(share.diffuse + share.specular, MOST_ALBEDO)

@@ -9,7 +9,6 @@ more, at 32 texels a face: its kink at the terminator shows at 16 (4 % off at wo
 from __future__ import annotations
 
 from copy import copy
-from functools import cache
 
 import drjit as dr
 import mitsuba as mi
@@ -17,6 +16,7 @@ import numpy as np
 
 from tron.aligned import aligned
 from tron.errors import TronError
+from tron.shading.brdf_table import BrdfTable
 from tron.shading.cubemap import CubemapLight, bilinear, face_direction
 from tron.shading.environment import EnvironmentLight
 from tron.shading.prefilter import LightTree, ggx_prefilter
@@ -25,9 +25,6 @@ CUBEMAP_RESOLUTION = 128
 """Texels along a face edge of the sharpest level."""
 SMALLEST_LEVEL, DIFFUSE_LEVEL = 16, 32
 SHARPEST_ROUGHNESS, MIDDLE_ROUGHNESS = 0.08, 0.5
-TABLE_SIZE = 256
-TABLE_SAMPLES = 32
-"""Quadrature points along each of the two dimensions of the visible normals."""
 
 
 class SplitSum:
@@ -35,6 +32,9 @@ class SplitSum:
 
     Everything it returns is differentiable with respect to the texels of a :class:`CubemapLight`, through the
     levels; make a new one after each change of the light.
+
+    Attributes:
+        brdf: the table beside the environment.
 
     Args:
         light: on the device.
@@ -66,7 +66,7 @@ class SplitSum:
         self._texels = dr.concat(levels)
         self._offsets = mi.UInt32(aligned(offsets.astype(np.uint32)))
         self._resolutions = mi.UInt32(aligned(np.array(resolutions, np.uint32)))
-        self._table = mi.Float(aligned(brdf_table().ravel()))
+        self.brdf = BrdfTable.load()
         dr.eval(self._texels)
 
     def turned_to(self, rotation_deg: float) -> SplitSum:
@@ -83,23 +83,15 @@ class SplitSum:
         """Unoccluded irradiance / pi: linear radiance of a white diffuse surface of unit ``normal``."""
         return self._level(self._at_rest(mi.Vector3f(normal)), self._last + 1)
 
-    def specular(
-        self, normal: mi.Vector3f, to_camera: mi.Vector3f, roughness: mi.Float, f0: mi.Color3f
-    ) -> mi.Color3f:
-        """Unoccluded specular reflection: prefiltered(R, roughness) (f0 A + B).
+    def reflected(self, normal: mi.Vector3f, to_camera: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
+        """Mean radiance over the unoccluded lobe; times F0 A + B it is the specular reflection.
 
         Args:
             normal, to_camera: unit, world.
             roughness: in [0, 1]; alpha is its square.
-            f0: linear reflectance at normal incidence.
-
-        Returns:
-            linear radiance towards the camera.
         """
         normal, to_camera = mi.Vector3f(normal), mi.Vector3f(to_camera)
-        cosine = dr.dot(normal, to_camera)
-        scale, bias = self._brdf(cosine, roughness)
-        return self.prefiltered(2 * cosine * normal - to_camera, roughness) * (f0 * scale + bias)
+        return self.prefiltered(2 * dr.dot(normal, to_camera) * normal - to_camera, roughness)
 
     def prefiltered(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
         """Environment filtered by the lobe of ``roughness``, trilinear, in unit world ``direction``."""
@@ -124,23 +116,6 @@ class SplitSum:
     def _level(self, direction: mi.Vector3f, level: mi.UInt32) -> mi.Color3f:
         resolution = dr.gather(mi.UInt32, self._resolutions, level)
         return bilinear(self._texels, dr.gather(mi.UInt32, self._offsets, level), resolution, direction)
-
-    def _brdf(self, cosine: mi.Float, roughness: mi.Float) -> tuple[mi.Float, mi.Float]:
-        x = dr.clip(cosine * TABLE_SIZE - 0.5, 0, TABLE_SIZE - 1)
-        y = dr.clip(roughness * TABLE_SIZE - 0.5, 0, TABLE_SIZE - 1)
-        column, row = mi.UInt32(x), mi.UInt32(y)
-        column = dr.select(column < TABLE_SIZE - 1, column, TABLE_SIZE - 2)
-        row = dr.select(row < TABLE_SIZE - 1, row, TABLE_SIZE - 2)
-        first = row * TABLE_SIZE + column
-
-        def texel(index: mi.UInt32) -> mi.Vector2f:
-            return dr.gather(mi.Vector2f, self._table, index)
-
-        fx, fy = x - mi.Float(column), y - mi.Float(row)
-        upper = dr.lerp(texel(first), texel(first + 1), fx)
-        lower = dr.lerp(texel(first + TABLE_SIZE), texel(first + TABLE_SIZE + 1), fx)
-        value = dr.lerp(upper, lower, fy)
-        return value.x, value.y
 
 
 def _at_rest(light: EnvironmentLight, widest: int) -> EnvironmentLight:
@@ -174,53 +149,3 @@ def _prefiltered_level(tree: LightTree, resolution: int, alpha: float) -> mi.Flo
     opening = dr.opaque(mi.Float, 0.35 if resolution > DIFFUSE_LEVEL else 0.1)
     colour = ggx_prefilter(tree, face_direction(face, u, v), dr.opaque(mi.Float, alpha), opening)
     return dr.ravel(mi.Vector4f(*colour, dr.zeros(mi.Float, dr.width(texel))))
-
-
-@cache
-def brdf_table() -> np.ndarray:
-    """(roughness, n.v, 2) float32: A and B of f0 A + B, the albedo of a GGX mirror with Schlick's Fresnel.
-
-    Rows and columns are centred: entry (i, j) is roughness (i + 1/2) / 256 and n.v = (j + 1/2) / 256. Smith's
-    masking in its separable form, as Mitsuba's microfacet materials have it. By midpoint quadrature over the
-    visible normals (Heitz 2018, "Sampling the GGX Distribution of Visible Normals"). Computed once a process.
-    """
-    lane = dr.arange(mi.UInt32, TABLE_SIZE * TABLE_SIZE)
-    cosine = (mi.Float(lane % TABLE_SIZE) + 0.5) / TABLE_SIZE
-    roughness = (mi.Float(lane // TABLE_SIZE) + 0.5) / TABLE_SIZE
-    scale, bias = _directional_albedo(cosine, dr.square(roughness))
-    return np.stack([np.array(scale), np.array(bias)], -1).reshape(TABLE_SIZE, TABLE_SIZE, 2)
-
-
-@dr.syntax
-def _directional_albedo(cosine: mi.Float, alpha: mi.Float) -> tuple[mi.Float, mi.Float]:
-    view = mi.Vector3f(dr.safe_sqrt(1 - cosine * cosine), 0, cosine)
-    # Heitz: stretch the view, sample the projected half disk, map back.
-    stretched = dr.normalize(mi.Vector3f(alpha * view.x, 0, view.z))
-    across = mi.Vector3f(0, 1, 0)
-    along = dr.cross(stretched, across)
-    squeeze = 0.5 * (1 + stretched.z)
-    scale, bias, total = mi.Float(0), mi.Float(0), mi.Float(0)
-    i = mi.UInt32(0)
-    while i < TABLE_SAMPLES * TABLE_SAMPLES:
-        # The rim of the disk is the lobe's long tail: points crowd there, by radius^2 = 1 - x^3.
-        x = (mi.Float(i % TABLE_SAMPLES) + 0.5) / TABLE_SAMPLES
-        radius, share = dr.sqrt(1 - x * x * x), 3 * x * x
-        # Mirror symmetry about the plane of incidence: half a turn is enough.
-        angle = (mi.Float(i // TABLE_SAMPLES) + 0.5) * float(np.pi / TABLE_SAMPLES)
-        sin, cos = dr.sincos(angle - float(np.pi / 2))
-        t1, t2 = radius * cos, radius * sin
-        t2 = (1 - squeeze) * dr.safe_sqrt(1 - t1 * t1) + squeeze * t2
-        t3 = dr.safe_sqrt(1 - t1 * t1 - t2 * t2)
-        h = t1 * across + t2 * along + t3 * stretched
-        h = dr.normalize(mi.Vector3f(alpha * h.x, alpha * h.y, dr.maximum(h.z, 1e-7)))
-        facing = dr.dot(view, h)
-        cosine_out = 2 * facing * h.z - view.z
-        tangent2 = alpha * alpha * (1 - cosine_out * cosine_out)
-        masking = 2 * cosine_out / (cosine_out + dr.safe_sqrt(tangent2 + cosine_out * cosine_out))
-        masking = dr.select((cosine_out > 0) & (facing > 0), masking * share, 0)
-        fresnel = (1 - facing) ** 5
-        scale += masking * (1 - fresnel)
-        bias += masking * fresnel
-        total += share
-        i += 1
-    return scale / total, bias / total

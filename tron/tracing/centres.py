@@ -31,4 +31,5 @@ def centres(records: SurfelRecords, surfel: mi.UInt32, active: mi.Bool | bool = 
         rgb=mi.Color3f(0),
         opacity=dr.select(active, mi.Float(1), 0),
         direction=mi.Vector3f(0),
+        values=[],
     )

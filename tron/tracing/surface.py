@@ -8,7 +8,7 @@ not zero.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -42,7 +42,7 @@ class Surface:
     rgb: mi.Color3f
     opacity: mi.Float
     direction: mi.Vector3f
-    values: list[mi.Float] = field(default_factory=list, kw_only=True)
+    values: list[mi.Float]
 
 
 def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surface:

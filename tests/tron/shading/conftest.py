@@ -66,6 +66,7 @@ class SphereOverPlane:
             rgb=mi.Color3f(0) * one,
             opacity=one,
             direction=direction,
+            values=[],
         )
         return GBuffer.of_rows(seen, camera.width, camera.height)
 
@@ -115,5 +116,16 @@ def points_gbuffer() -> Callable[[np.ndarray, np.ndarray], SimpleNamespace]:
             width=len(positions),
             height=1,
         )
+
+    return make
+
+
+@pytest.fixture
+def material(variant: str) -> Callable[[float, float, float], SimpleNamespace]:
+    """Make a grey material from base color, roughness and metallic, a number each or (N,)."""
+
+    def make(base_color: float, roughness: float, metallic: float) -> SimpleNamespace:
+        base, rough, metal = (mi.Float(np.float32(value)) for value in (base_color, roughness, metallic))
+        return SimpleNamespace(base_color=mi.Color3f(base), roughness=rough, metallic=metal)
 
     return make

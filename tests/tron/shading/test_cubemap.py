@@ -228,7 +228,7 @@ def test_gradients_through_split_sum(variant: str, term: str) -> None:
             "diffuse": lambda: filtered.diffuse(vector(n)),
             "rough": lambda: filtered.prefiltered(vector(n), mi.Float(0.6)),
             "sharp": lambda: filtered.prefiltered(vector(n), mi.Float(0.15)),
-            "specular": lambda: filtered.specular(vector(n), vector(v), mi.Float(0.3), mi.Color3f(0.5)),
+            "specular": lambda: filtered.reflected(vector(n), vector(v), mi.Float(0.3)),
         }[term]()
         return dr.dot(value, weight)
 

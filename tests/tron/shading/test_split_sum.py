@@ -11,7 +11,8 @@ from tron.shading.cubemap import direction_face, face_direction
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
 from tron.shading.guidance import Lighting
 from tron.shading.prefilter import LightTree, ggx_prefilter
-from tron.shading.split_sum import SplitSum, brdf_table
+from tron.shading.reflectance import reflectance
+from tron.shading.split_sum import SplitSum
 
 
 def unit(n: int, seed: int = 0) -> np.ndarray:
@@ -25,6 +26,16 @@ def vector(a: np.ndarray) -> "mi.Vector3f":
 
 def rows(a: object) -> np.ndarray:
     return np.array(a).T.astype(np.float64)
+
+
+def mirrored(
+    material, light: SplitSum, n: np.ndarray, v: np.ndarray, roughness: float | np.ndarray
+) -> "mi.Color3f":
+    """Specular reflection of a white metal."""
+    cosine = dr.dot(vector(n), vector(v))
+    metal = material(1.0, roughness, 1.0)
+    share = reflectance(metal, light.brdf, cosine)
+    return light.reflected(vector(n), vector(v), metal.roughness) * share.specular
 
 
 def random_map(height: int = 16) -> EnvironmentMap:
@@ -117,26 +128,27 @@ def test_a_constant_environment_is_returned_exactly(variant: str, resolution: in
 
 def test_white_metal_in_a_white_furnace_reflects_at_most_all_and_smooth_metal_nearly_all(
     variant: str,
+    material,
 ) -> None:
     light = SplitSum(EnvironmentLight(EnvironmentMap.constant(1.0)), 64)
     n, v = unit(20000), unit(20000, seed=3)
     v *= np.sign((n * v).sum(1))[:, None]
     roughness = generator(4, "roughness").random(20000).astype(np.float32)
-    out = rows(light.specular(vector(n), vector(v), mi.Float(roughness), mi.Color3f(1.0)))
+    out = rows(mirrored(material, light, n, v, roughness))
     assert out.max() <= 1 + 1e-4
     assert out[roughness < 0.2].mean() > 0.99
     assert out[roughness < 0.5].mean() > 0.95
     assert out.min() > 0.3  # what a single bounce between rough facets keeps
 
 
-def test_reflection_looks_where_a_mirror_would(variant: str) -> None:
+def test_reflection_looks_where_a_mirror_would(variant: str, material) -> None:
     environment = EnvironmentMap(random_map().resized(8).image).resized(64)
     light = SplitSum(EnvironmentLight(environment), 128)
     n, v = unit(500), unit(500, seed=3)
     n *= np.sign((n * v).sum(1))[:, None]
-    mirrored = 2 * (n * v).sum(1, keepdims=True) * n - v
-    seen = rows(light.specular(vector(n), vector(v), mi.Float(0.02), mi.Color3f(1.0)))
-    error = np.abs(seen - environment.lookup(mirrored))
+    towards = 2 * (n * v).sum(1, keepdims=True) * n - v
+    seen = rows(mirrored(material, light, n, v, 0.02))
+    error = np.abs(seen - environment.lookup(towards))
     assert error.mean() < 0.01 * seen.mean()
     assert np.quantile(error, 0.99) < 0.1 * seen.mean()  # a mirror looking into the kink at a pole
 
@@ -212,46 +224,6 @@ def test_one_preparation_serves_every_rotation(variant: str) -> None:
     ):
         np.testing.assert_array_equal(rows(one), rows(other))
     assert turned.light.environment.rotation_deg == 130
-
-
-def monte_carlo_albedo(cosine: float, alpha: float, n: int = 400_000) -> tuple[float, float]:
-    """A and B by sampling half vectors from D n.h, float64; independent of visible normals."""
-    random = generator(6, "brdf")
-    u, phi = random.random(n), random.random(n) * 2 * np.pi
-    cos_h = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))
-    sin_h = np.sqrt(1 - cos_h**2)
-    view = np.array([np.sqrt(1 - cosine**2), 0, cosine])
-    facing = view[0] * sin_h * np.cos(phi) + view[2] * cos_h
-    out = 2 * facing * cos_h - cosine
-
-    def smith(c: np.ndarray | float) -> np.ndarray:
-        return 2 * c / (c + np.sqrt(alpha**2 + (1 - alpha**2) * np.square(c)))
-
-    valid = (out > 0) & (facing > 0)
-    weight = np.where(valid, smith(np.maximum(out, 1e-9)) * smith(cosine) * facing / (cosine * cos_h), 0)
-    fresnel = (1 - np.clip(facing, 0, 1)) ** 5
-    return float((weight * (1 - fresnel)).mean()), float((weight * fresnel).mean())
-
-
-@pytest.mark.parametrize("row", [20, 64, 200])
-@pytest.mark.parametrize("column", [12, 128, 250])
-def test_table_is_the_albedo_by_monte_carlo(variant: str, row: int, column: int) -> None:
-    expected = monte_carlo_albedo((column + 0.5) / 256, ((row + 0.5) / 256) ** 2)
-    np.testing.assert_allclose(brdf_table()[row, column], expected, atol=5e-3)
-
-
-@pytest.mark.parametrize("row,column", [(30, 40), (100, 128), (180, 30), (250, 200)])
-def test_table_is_the_albedo_of_mitsubas_rough_conductor(variant: str, row: int, column: int) -> None:
-    alpha, cosine = ((row + 0.5) / 256) ** 2, (column + 0.5) / 256
-    mirror = mi.load_dict(
-        {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": alpha}
-    )
-    n = 1 << 18
-    si = dr.zeros(mi.SurfaceInteraction3f, n)
-    si.wi = mi.Vector3f(float(np.sqrt(1 - cosine**2)), 0, cosine)
-    u = mi.Point2f(generator(7, "u").random((2, n)).astype(np.float32))
-    _, weight = mirror.sample(mi.BSDFContext(), si, mi.Float(0), u)
-    assert brdf_table()[row, column].sum() == pytest.approx(np.array(weight[0]).mean(), abs=3e-3)
 
 
 def test_another_light_of_another_size_compiles_nothing_new(variant: str, kernels_of) -> None:
