@@ -12,14 +12,11 @@ from collections.abc import Callable
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
-import drjit as dr
-import mitsuba as mi
-import numpy as np
-
 from tron.cameras import Camera
 from tron.cli.progress import track
 from tron.estimation import Estimation
 from tron.gaussians.scene import GaussianScene
+from tron.shading.both_sides import BothSides, facing
 from tron.shading.bounce import BouncedLight, BounceTransport
 from tron.tracing import SurfelTracer
 
@@ -41,53 +38,37 @@ class LitScene:
     """
 
     def __init__(self, scene: GaussianScene, first: Camera, estimation: Estimation, seed: int) -> None:
-        self._sides = [scene]
-        if not scene.oriented:
-            front = scene.facing(first.position)
-            self._sides = [front, front.turned_over(np.ones(len(scene), bool))]
+        self._scene = scene if scene.oriented else scene.facing(first.position)
         self._estimation, self._seed = estimation, seed
         self._last: tuple[Camera, SurfelTracer] | None = None
 
     def tracer(self, camera: Camera) -> SurfelTracer:
         """The tracer for a camera: one for all, unless surfels are turned to each."""
-        scene, *other = self._sides
-        if not other:
-            return self._transport[0].tracer if self._estimation.bounces else self._tracer
+        if self._scene.oriented:
+            return self._tracer
         if self._last is None or self._last[0] is not camera:
-            self._last = camera, SurfelTracer(scene.facing(camera.position))
+            self._last = camera, SurfelTracer(self._scene.facing(camera.position))
         return self._last[1]
 
     def bake(self, lighting: Lighting) -> Bounced:
         """Let one environment, at one turn, bounce."""
         if not self._estimation.bounces:
             return lambda _: None
-        baked = [side.bake(lighting, self._estimation, seed=self._seed) for side in self._transport]
-        scene, *other = self._sides
-        if not other:
-            return lambda _: baked[0]
-        return lambda camera: _chosen(scene.looks_away(camera.position), *baked)
+        if self._scene.oriented:
+            baked = self._transport.bake(lighting, self._estimation, seed=self._seed)
+            return lambda _: baked
+        sides = self._both_sides.bake(lighting, self._estimation, self._seed)
+        return lambda camera: facing(*sides, self._scene.looks_away(camera.position))
 
     @cached_property
     def _tracer(self) -> SurfelTracer:
-        return SurfelTracer(self._sides[0])
+        return SurfelTracer(self._scene)
 
     @cached_property
-    def _transport(self) -> list[BounceTransport]:
-        """Where the light of each side goes, traced when it is first asked for."""
-        return [
-            BounceTransport.trace(SurfelTracer(side), seed=self._seed, track=partial(track, label="bounces"))
-            for side in self._sides
-        ]
+    def _transport(self) -> BounceTransport:
+        """Where light goes, traced when it is first asked for."""
+        return BounceTransport.trace(self._tracer, seed=self._seed, track=partial(track, label="bounces"))
 
-
-def _chosen(back: np.ndarray, front_light: BouncedLight, back_light: BouncedLight) -> BouncedLight:
-    """Of each surfel the light of its front, or where ``back``, (M,) bool, says so of its back."""
-    chosen = mi.Bool(back)
-    shown = BouncedLight(
-        **{
-            name: dr.select(chosen, value, vars(front_light)[name])
-            for name, value in vars(back_light).items()
-        }
-    )
-    dr.eval(shown)
-    return shown
+    @cached_property
+    def _both_sides(self) -> BothSides:
+        return BothSides.trace(self._tracer, seed=self._seed, track=partial(track, label="bounces"))

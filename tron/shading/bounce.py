@@ -175,7 +175,7 @@ class BounceTransport:
             bounces: 1 is light that has met one surfel on its way.
             back: radiance of back faces as a share of their fronts'.
         """
-        count = len(self.tracer.scene)
+        count = dr.width(self.met) // self.rays
         share = dr.opaque(mi.Float, back)
         total = dr.zeros(mi.Color3f, count)
         for _ in range(bounces):
