@@ -115,7 +115,12 @@ def test_no_key_is_stated_twice_with_one_value(path: Path):
 PAPER = {
     "relight": {"estimator": "plain", "two_sided": False, "denoise": False},
     "datagen": {"estimator": "plain", "two_sided": False},
-    "reconstruct": {"light.estimator": "plain", "light.two_sided": False, "light.coarsest": 64},
+    "reconstruct": {
+        "light.estimator": "plain",
+        "light.two_sided": False,
+        "light.diffuse": "lambert",
+        "light.coarsest": 64,
+    },
     "train": {},
     "eval": {},
 }

@@ -64,7 +64,7 @@ class GuidanceAppearance:
             rays = GBuffer.of_rows(dr.detach(surface), width, dr.width(surface.opacity) // width)
             dr.eval(rays)
             arriving = arriving_light(self.surfels.tracer, rays, lighting, self.estimation, seed)
-            arriving = rays.in_rows(arriving)
+            arriving = arriving.in_rows(rays)
         shaded = shade_surface(surface, arriving, lighting, diffuse=self.estimation.diffuse)
         extra = [part for name in self.others for part in shaded[name]]
         return Shown(shaded[self.buffer], surface.opacity, [*extra, surface.opacity])

@@ -12,7 +12,7 @@ from typing import Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.estimation import FINAL, Estimation, Estimator
+from tron.estimation import FINAL, Diffuse, Estimation, Estimator
 
 Model = TypeVar("Model", bound="Settings")
 
@@ -180,6 +180,10 @@ class FitSettings(Settings):
         default=FINAL.two_sided,
         description="Back faces block shadow rays beyond two spacings; false: never, as in the paper.",
     )
+    diffuse: Diffuse = Field(
+        default=FINAL.diffuse,
+        description="Material that the light's scale is fitted with: principled, or lambert, the paper's.",
+    )
     coarsest: int = Field(
         default=4,
         ge=2,
@@ -207,7 +211,13 @@ class FitSettings(Settings):
 
     def estimation(self, rays: int, *, filtered: bool = False) -> Estimation:
         """Estimation of images of the surfels in the light, as that of the fit."""
-        return Estimation(rays=rays, estimator=self.estimator, two_sided=self.two_sided, filtered=filtered)
+        return Estimation(
+            rays=rays,
+            estimator=self.estimator,
+            two_sided=self.two_sided,
+            filtered=filtered,
+            diffuse=self.diffuse,
+        )
 
 
 def _scaled(settings: Model, names: tuple[str, ...], factor: float) -> Model:

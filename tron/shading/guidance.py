@@ -99,6 +99,11 @@ class Arriving:
     visibility: mi.Color3f
     bounced: Bounced | None = None
 
+    def in_rows(self, gbuffer: GBuffer) -> Arriving:
+        """Of pixels row by row, where lanes are those of ``gbuffer``."""
+        bounced = None if self.bounced is None else gbuffer.in_rows(self.bounced)
+        return Arriving(gbuffer.in_rows(self.visibility), bounced)
+
 
 def render_guidance(
     tracer: ViewTracer,

@@ -1,22 +1,25 @@
 """What glossy surfaces mirror: rays of each pixel's lobe that meet the scene or escape.
 
-Half vectors are drawn from the normals that the view sees (Heitz 2018, "Sampling the GGX Distribution of
-Visible Normals"); a ray l then has the weight F(v.h) G_1(l), with Smith's masking in its separable form as
-Mitsuba has it. Each ray is stopped by one surfel (:mod:`tron.tracing.first_hit`). With L the environment's
-radiance and R what a surfel sends back along the ray,
+Half vectors h are drawn from the normals that the view v sees (Heitz 2018, "Sampling the GGX Distribution of
+Visible Normals"); a ray l then has the density p(l) = D(h) G_1(v) / (4 n.v) and the weight w = F(v.h) G_1(l),
+with Smith's masking in its separable form as Mitsuba has it. With L the environment's radiance, V its
+visibility and R what a surfel sends back along the ray,
 
-    o = sum_escaped w L / sum w L        share of the environment's light that escapes
-    M = sum_met w R / sum w              mean radiance over the lobe of what is met
+    M = sum_met w R / sum w                  mean radiance over the lobe of what is met
+    o = sum m w L V / sum m w L              share of the environment's light that escapes
 
-by channel: the split sum, which has no noise, keeps the light, the rays decide how much of it is hidden. R is
-the composition of :mod:`tron.shading.composition` at the surfel's centre with the bake's light, so a mirror
-shows highlights of what it mirrors. A back face shows ``BACK`` of what its front sends out.
+by channel: the split sum, which has no noise, keeps the light, the rays decide how much of it is hidden. o is
+taken from as many rays again that are drawn from the light: few of the lobe's see a sun, whose highlight
+would stand in shadows. m = p / (p + p_light) is the balance heuristic (Veach 1997), for rays of both kinds.
 
-A few rays see a sun seldom: then o is the sky's, and a sun's highlight may stand in a shadow.
+A ray of the lobe is stopped by one surfel (:mod:`tron.tracing.first_hit`). R is the composition of
+:mod:`tron.shading.composition` at the surfel's centre with the bake's light, so a mirror shows highlights of
+what it mirrors. A back face shows ``BACK`` of what its front sends out.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -28,13 +31,13 @@ from tron.shading.bounce import BACK, BouncedLight
 from tron.shading.composition import Bounced, Response
 from tron.shading.irradiance import ORIGIN_OFFSET
 from tron.shading.lighting import Lighting
-from tron.shading.reflectance import fresnel
+from tron.shading.reflectance import Material, fresnel
 from tron.shading.sampling import PixelPoints
 from tron.tracing.centres import centres
 from tron.tracing.first_hit import NOTHING, FirstHit, ray_seeds
 
 if TYPE_CHECKING:
-    from tron.tracing import GBuffer, SurfelTracer
+    from tron.tracing import GBuffer, Surface, SurfelTracer
 
 SMOOTHEST = 0.02
 """Least roughness of the rays: below, a lobe is narrower than float32 can draw."""
@@ -63,44 +66,102 @@ def reflections(
         diffuse: the model of the material.
     """
     with dr.suspend_grad():
-        points = PixelPoints.make(rays, 1, gbuffer.width, seed, "reflections")
+        points = PixelPoints.make(rays, 2, gbuffer.width, seed, "reflections")
         root = dr.opaque(mi.UInt32, integer(seed, "reflections", "stops"))
         offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
-        pixel, frame = gbuffer.pixel, mi.Frame3f(gbuffer.normal)
-        view = frame.to_local(-gbuffer.direction)
-        seen = (gbuffer.opacity > 0) & (view.z > 0)
+        pixel, lobe = gbuffer.pixel, Lobe.of(gbuffer)
+        seen = (gbuffer.opacity > 0) & (lobe.view.z > 0)
         origin, run = gbuffer.position + gbuffer.normal * offset, points.run(pixel)
-        alpha = dr.square(dr.maximum(gbuffer.roughness, SMOOTHEST))
-        dr.eval(pixel, frame, view, seen, origin, run, alpha)
-        sums = [dr.zeros(mi.Color3f, dr.width(pixel)) for _ in range(4)]
+        dr.eval(pixel, lobe, seen, origin, run)
+        none = dr.zeros(mi.Color3f, dr.width(pixel))
+        sums = {name: mi.Color3f(none) for name in ("weight", "met", "light", "escaped")}
         dr.make_opaque(sums)
         for first in range(0, rays, points.fan):
-            ray = dr.opaque(mi.UInt32, first)
-            directions, weights, active, seeds = [], [], [], []
-            for k in range(points.fan):
-                half = visible_normal(view, alpha, points.point(run, ray + k, mi.UInt32(0)))
-                facing = dr.dot(view, half)
-                out = 2 * facing * half - view
-                counts = seen & (facing > 0) & (out.z > 0)
-                weight = fresnel(gbuffer, facing, diffuse) * masking(out.z, alpha)
-                directions.append(frame.to_world(out))
-                weights.append(dr.select(counts, weight, 0))
-                active.append(counts)
-                seeds.append(ray_seeds(root, pixel, ray + k))
-            dr.eval(directions, weights, active, seeds)
+            fan = [dr.opaque(mi.UInt32, first) + k for k in range(points.fan)]
+            drawn = [lobe.draw(points.point(run, ray, mi.UInt32(0))) for ray in fan]
+            directions = [direction for direction, _ in drawn]
+            active = [seen & counts for _, counts in drawn]
+            seeds = [ray_seeds(root, pixel, ray) for ray in fan]
+            dr.eval(directions, active, seeds)
             hits = tracer.first_hits(origin, directions, active, seeds)
-            for direction, weight, hit in zip(directions, weights, hits, strict=True):
+            for direction, counts, hit in zip(directions, active, hits, strict=True):
+                weight, share, radiance = _weights(lobe, direction, counts, gbuffer, lighting, diffuse)
                 met = hit.surfel != NOTHING
-                radiance = weight * lighting.light.radiance(direction)
                 returned = _returned(tracer, hit, direction, lighting, bounce, diffuse)
-                terms = (weight, dr.select(met, weight * returned, 0), radiance, dr.select(met, 0, radiance))
-                for total, term in zip(sums, terms, strict=True):
-                    total += term
+                sums["weight"] += weight
+                sums["met"] += dr.select(met, weight * returned, 0)
+                sums["light"] += share * radiance
+                sums["escaped"] += dr.select(met, 0, share * radiance)
             dr.eval(sums)
-        weight, met, light, escaped = sums
-        openness, mirrored = _ratio(escaped, light, 1), _ratio(met, weight, 0)
+            directions = [lighting.light.sample(points.point(run, ray, mi.UInt32(1)))[0] for ray in fan]
+            found = [_weights(lobe, d, seen, gbuffer, lighting, diffuse) for d in directions]
+            values = [share * radiance for _, share, radiance in found]
+            active = [dr.max(value) > 0 for value in values]
+            dr.eval(directions, values, active)
+            for value, visible in zip(values, tracer.transmittances(origin, directions, active), strict=True):
+                sums["light"] += value
+                sums["escaped"] += value * visible
+            dr.eval(sums)
+        openness = _ratio(sums["escaped"], sums["light"], 1)
+        mirrored = _ratio(sums["met"], sums["weight"], 0)
         dr.eval(openness, mirrored)
     return openness, mirrored
+
+
+@dataclass
+class Lobe:
+    """GGX as a view sees it, one lane a pixel.
+
+    Attributes:
+        frame: about the normal.
+        view: unit, towards the camera, local.
+        alpha: of the distribution.
+    """
+
+    frame: mi.Frame3f
+    view: mi.Vector3f
+    alpha: mi.Float
+
+    @classmethod
+    def of(cls, surface: Surface) -> Lobe:
+        """The lobe of a surface along its own rays."""
+        frame = mi.Frame3f(surface.normal)
+        alpha = dr.square(dr.maximum(surface.roughness, SMOOTHEST))
+        return cls(frame, frame.to_local(-surface.direction), alpha)
+
+    def draw(self, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Bool]:
+        """A direction, world, and whether it is above the surface."""
+        half = visible_normal(self.view, self.alpha, u)
+        facing = dr.dot(self.view, half)
+        out = 2 * facing * half - self.view
+        return self.frame.to_world(out), (facing > 0) & (out.z > 0)
+
+    def density(self, half: mi.Vector3f) -> mi.Float:
+        """Density of :meth:`draw`, by solid angle, where the local half vector is ``half``."""
+        alpha2 = dr.square(self.alpha)
+        spread = dr.square(half.z) * (alpha2 - 1) + 1
+        distribution = alpha2 / (dr.pi * dr.square(spread))
+        return distribution * masking(self.view.z, self.alpha) / (4 * self.view.z)
+
+
+def _weights(
+    lobe: Lobe,
+    direction: mi.Vector3f,
+    active: mi.Bool,
+    material: Material,
+    lighting: Lighting,
+    diffuse: Diffuse,
+) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f]:
+    """w, m w and L of rays along ``direction``, however they were drawn; w is 0 where inactive."""
+    out = lobe.frame.to_local(direction)
+    half = dr.normalize(out + lobe.view)
+    facing = dr.dot(lobe.view, half)
+    weight = fresnel(material, facing, diffuse) * masking(out.z, lobe.alpha)
+    weight = dr.select(active & (out.z > 0) & (facing > 0), weight, 0)
+    own, other = lobe.density(half), lighting.light.pdf(direction)
+    total = own + other
+    balance = dr.select(total > 0, own / dr.select(total > 0, total, 1), 0)
+    return weight, weight * balance, lighting.light.radiance(direction)
 
 
 def _ratio(part: mi.Color3f, whole: mi.Color3f, otherwise: float) -> mi.Color3f:

@@ -61,7 +61,7 @@ class GBuffer(Surface):
 
     def rows(self) -> Surface:
         """The pixels row by row; differentiable."""
-        return Surface(**self.in_rows(self._fields()))
+        return Surface(**{"values": []} | self.in_rows(self._fields()))
 
     def image(self, value: Any) -> np.ndarray:
         """Numbers of each lane (Dr.Jit) as (H, W) or (H, W, C) float32."""
