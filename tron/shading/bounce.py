@@ -35,6 +35,7 @@ from tron.shading.visibility import visibility
 from tron.tracing.centres import centres
 from tron.tracing.first_hit import NOTHING, ray_seeds
 from tron.tracing.gbuffer import GBuffer
+from tron.tracing.surface import Surface
 from tron.tracing.tiles import tile_pixels
 from tron.tracing.tracer import SurfelTracer
 
@@ -138,14 +139,17 @@ class BounceTransport:
         """The same rays among surfels that have moved: of ``tracer``, which is ``self.tracer.moved(..)``."""
         return self.trace(tracer, self.rays, self.seed)
 
+    def surfels(self) -> Surface:
+        """(M,) the surfels themselves, each at its centre; differentiable as the tracer is."""
+        return centres(self.tracer.attached(), dr.arange(mi.UInt32, len(self.tracer.scene)))
+
     def openness(self) -> mi.Float:
         """(M,) share of each surfel's rays that meet nothing."""
         return _openness(self.met, self.rays, len(self.tracer.scene))
 
     def albedo(self, diffuse: Diffuse = "principled") -> mi.Color3f:
         """(M,) :func:`tron.shading.reflectance.bounce_albedo`, differentiable as the tracer is."""
-        every = dr.arange(mi.UInt32, len(self.tracer.scene))
-        return bounce_albedo(centres(self.tracer.attached(), every), BrdfTable.load(), diffuse)
+        return bounce_albedo(self.surfels(), BrdfTable.load(), diffuse)
 
     def direct(self, lighting: Lighting, estimation: Estimation = DIRECT, seed: int = 0) -> mi.Color3f:
         """(M,) irradiance / pi of direct light at each surfel, shadows included, linear.

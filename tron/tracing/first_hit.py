@@ -136,10 +136,8 @@ def first_hits(bvh: Bvh, fans: Fans, back_faces: BackFaces, seeds: Sequence[mi.U
         FirstHit(dr.zeros(mi.UInt32, count), dr.zeros(mi.Bool, count), dr.zeros(mi.Float, count))
         for _ in seeds
     ]
-    dr.eval(fans, seeds)
-    line = Line.of(count)
-    dr.make_opaque(found)
-    return _trace(bvh, fans, back_faces, seeds, line, found)
+    dr.make_opaque(fans, seeds, found)
+    return _trace(bvh, fans, back_faces, seeds, Line.of(count), found)
 
 
 @recorded

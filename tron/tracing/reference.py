@@ -211,14 +211,35 @@ def transmittance(
     Front faces count from t = 0, back faces beyond ``BACK_FACE_SPACINGS`` spacings (never, if one-sided),
     which are the scene's, and larger by as much as the surfel's radius is larger than the median.
     """
+    hit, blocks, nearby = _blocking(scene, origins, directions, two_sided)
+    product = np.where(blocks, 1 - hit.alpha, 1.0).prod(1)
+    margin = np.minimum(nearby, np.abs(product - OPAQUE_TRANSMITTANCE))
+    return np.where(product >= OPAQUE_TRANSMITTANCE, product, 0.0), margin
+
+
+def first_hit_probabilities(
+    scene: Scene, origins: np.ndarray, directions: np.ndarray, *, two_sided: bool = True
+) -> np.ndarray:
+    """(P, M) float64 weights T_i alpha_i of each surfel along each ray, sides as of :func:`transmittance`."""
+    hit, blocks, _ = _blocking(scene, origins, directions, two_sided)
+    order = np.argsort(np.where(blocks, hit.t, np.inf), axis=1, kind="stable")
+    alpha = np.take_along_axis(np.where(blocks, hit.alpha, 0.0), order, 1)
+    before = np.cumprod(np.concatenate([np.ones((len(alpha), 1)), 1 - alpha[:, :-1]], 1), 1)
+    weights = np.empty_like(alpha)
+    np.put_along_axis(weights, order, before * alpha, 1)
+    return weights
+
+
+def _blocking(
+    scene: Scene, origins: np.ndarray, directions: np.ndarray, two_sided: bool
+) -> tuple[_Meetings, np.ndarray, np.ndarray]:
+    """Meetings of shadow rays, which of them block (P, M), and each ray's margin to where another would."""
     origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
     hit = _meet(scene, origins, directions)
     radii = hit.radius[hit.radius > 0]
     larger = np.maximum(hit.radius / (np.median(radii) if len(radii) else 1.0), 1)
     reach = BACK_FACE_SPACINGS * scene.spacing * larger
     blocks = hit.counted & np.where(hit.front, hit.t > 0, two_sided & (hit.t > reach))
-    product = np.where(blocks, 1 - hit.alpha, 1.0).prod(1)
     starts = np.where(hit.front, np.abs(hit.t), np.abs(hit.t - reach))
     nearby = np.minimum(hit.margin, np.where(hit.counted, starts, np.inf)).min(1, initial=np.inf)
-    margin = np.minimum(nearby, np.abs(product - OPAQUE_TRANSMITTANCE))
-    return np.where(product >= OPAQUE_TRANSMITTANCE, product, 0.0), margin
+    return hit, blocks, nearby

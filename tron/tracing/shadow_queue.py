@@ -17,9 +17,8 @@ def queued_transmittance(bvh: Bvh, fans: Fans, back_faces: BackFaces) -> list[mi
     """:func:`tron.tracing.transmittance.transmittance`, evaluated at once; not inside a recorded loop."""
     count = dr.width(fans)
     fans = spread(fans, count)
-    dr.eval(fans)
     found = [dr.zeros(mi.Float, count) for _ in fans.directions]
-    dr.make_opaque(found)
+    dr.make_opaque(fans, found)
     found = _trace(bvh, fans, back_faces, Line.of(count), found)
     return [dr.select(lanes, value, 1) for value, lanes in zip(found, fans.active)]
 
