@@ -1,4 +1,4 @@
-"""Laws of the scene of a run: a light bounces in it as it does in the scene that the tracer of a camera has."""
+"""Laws of the scene of a run: a light bounces in it as in the scene that the tracer of a camera has."""
 
 from dataclasses import replace
 
