@@ -31,7 +31,7 @@ import numpy as np
 from tron.estimation import FINAL, Diffuse, Estimation
 from tron.shading.background import over_background
 from tron.shading.bounce import BouncedLight
-from tron.shading.composition import Bounced, Response
+from tron.shading.composition import Bounced, Response, evenly_bounced
 from tron.shading.irradiance import Occluder
 from tron.shading.lighting import Lighting
 from tron.shading.reflections import reflections
@@ -153,7 +153,7 @@ def arriving_light(
     if bounce is None:
         return Arriving(reaching)
     *indirect, openness = gbuffer.values
-    bounced = Bounced(mi.Color3f(*indirect), mi.Color3f(openness), mi.Color3f(*indirect))
+    bounced = evenly_bounced(mi.Color3f(*indirect), openness, reaching, gbuffer.roughness)
     if estimation.reflections:
         occluder = tracer.sided(estimation.two_sided)
         bounced.openness, bounced.mirrored = reflections(

@@ -28,7 +28,7 @@ import mitsuba as mi
 from tron.estimation import Diffuse
 from tron.seeds import integer
 from tron.shading.bounce import BACK, BouncedLight
-from tron.shading.composition import Bounced, Response
+from tron.shading.composition import Response, evenly_bounced
 from tron.shading.irradiance import ORIGIN_OFFSET
 from tron.shading.lighting import Lighting
 from tron.shading.reflectance import Material, fresnel
@@ -102,8 +102,8 @@ def reflections(
                 sums["light"] += value
                 sums["escaped"] += value * visible
             dr.eval(sums)
-        openness = _ratio(sums["escaped"], sums["light"], 1)
-        mirrored = _ratio(sums["met"], sums["weight"], 0)
+        openness = ratio(sums["escaped"], sums["light"], 1)
+        mirrored = ratio(sums["met"], sums["weight"], 0)
         dr.eval(openness, mirrored)
     return openness, mirrored
 
@@ -164,7 +164,8 @@ def _weights(
     return weight, weight * balance, lighting.light.radiance(direction)
 
 
-def _ratio(part: mi.Color3f, whole: mi.Color3f, otherwise: float) -> mi.Color3f:
+def ratio(part: mi.Color3f, whole: mi.Color3f, otherwise: float) -> mi.Color3f:
+    """Part over whole by channel; ``otherwise`` where there is no whole."""
     pairs = zip(part, whole, strict=True)
     return mi.Color3f(*[dr.select(b > 0, a / dr.select(b > 0, b, 1), otherwise) for a, b in pairs])
 
@@ -186,10 +187,12 @@ def _returned(
 
     surface = centres(tracer.records, hit.surfel, front)
     surface.direction = direction
-    indirect = of(bounce.indirect, front)
-    openness = mi.Color3f(dr.gather(mi.Float, bounce.openness, hit.surfel, front))
+    direct, indirect = of(bounce.direct, front), of(bounce.indirect, front)
     response = Response.of(surface, lighting.split_sum, diffuse)
-    shown = response.lit(of(bounce.direct, front), Bounced(indirect, openness, indirect))
+    openness = dr.gather(mi.Float, bounce.openness, hit.surfel, front)
+    visibility = ratio(direct, response.unshadowed, 1)
+    bounced = evenly_bounced(indirect, openness, visibility, surface.roughness)
+    shown = response.lit(direct, bounced)
     return dr.select(hit.front, shown, BACK * of(bounce.outgoing, met & ~hit.front))
 
 
