@@ -21,7 +21,10 @@ from datagen.materials import Style
 from tron.estimation import FINAL, Diffuse, Estimation, Estimator
 
 Split = Literal["train", "train_b", "validation", "test"]
-OUTSIDE = {"output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "cluster", "captures"}
+OUTSIDE = {
+    *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "cluster"),
+    *("captures", "equal_error"),
+}
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
 ESTIMATED = ("estimator", "two_sided", "diffuse", "bounces", "reflections", "supersample")
@@ -127,14 +130,25 @@ class CaptureSettings(_Model):
     )
 
 
+class EqualErrorSettings(_Model):
+    """Comparison of guidance with the path tracer, on the test scenes of a dataset."""
+
+    reference_spp: int = Field(
+        default=2048, ge=2, multiple_of=2, description="Paths per pixel of what counts as the truth."
+    )
+    rounds: int = Field(default=3, ge=1, le=100, description="Times that each frame is rendered, in turns.")
+    threads: int | None = Field(default=None, ge=1, description="Threads of both renderers; null: all.")
+
+
 class Settings(_Model):
     """Settings of ``tron-datagen``."""
 
     output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
-    mode: Literal["make", "validate", "captures"] = Field(
+    mode: Literal["make", "validate", "captures", "equal_error"] = Field(
         "make",
-        description="make the dataset, validate the one in output_dir and list every problem, or path-trace "
-        "captures for tron-reconstruct into output_dir/captures.",
+        description="make the dataset, validate the one in output_dir and list every problem, path-trace "
+        "captures for tron-reconstruct into output_dir/captures, or measure on the test scenes in output_dir "
+        "how long the path tracer takes to be as near the truth as guidance is.",
     )
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."
@@ -153,6 +167,9 @@ class Settings(_Model):
     )
     captures: CaptureSettings = Field(
         CaptureSettings(), description="Captures to reconstruct, of the test scenes."
+    )
+    equal_error: EqualErrorSettings = Field(
+        EqualErrorSettings(), description="Comparison of guidance with the path tracer."
     )
     path_frames: int = Field(
         93, ge=1, le=100_000, description="Frames of the whole path that clips are cut from."

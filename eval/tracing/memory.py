@@ -23,6 +23,8 @@ MEGABYTE = 1e6
 def measure_memory(count: int, size: int, variant: str, seed: int) -> dict[str, float]:
     """Resident set in MB: ``base`` (libraries loaded), ``scene`` (surfels made), ``peak`` (while tracing).
 
+    Beside them ``bounce``: what transport and bake of a light add to what is resident after a frame.
+
     Raises:
         TronError: the process failed.
     """
@@ -54,14 +56,17 @@ def _forget() -> None:
 
 
 def main(count: int, size: int, variant: str, seed: int) -> None:
-    """Make the scene, trace a view and shadow rays from it, and print the peaks as JSON."""
+    """Make the scene, trace a view, shadow rays from it and what bounces; print the peaks as JSON."""
     from tron.runtime import activate
 
     activate(variant)
     import drjit as dr
 
     from eval.peers.scene import camera, surfels
+    from eval.tracing.lights import LIGHTS
     from eval.tracing.shadow_rays import random_rays
+    from tron.shading.bounce import BounceTransport
+    from tron.shading.lighting import Lighting
     from tron.tracing import SurfelTracer
 
     peaks = {"base": _resident()}
@@ -75,6 +80,16 @@ def main(count: int, size: int, variant: str, seed: int) -> None:
     dr.eval(tracer.transmittance(origin, direction))
     dr.sync_thread()
     peaks["peak"] = _resident()
+    del gbuffer, origin, direction
+    lighting = Lighting(LIGHTS["soft"]())
+    gc.collect()
+    dr.flush_malloc_cache()
+    _forget()
+    before = _resident()
+    baked = BounceTransport.trace(tracer).bake(lighting)
+    dr.eval(baked)
+    dr.sync_thread()
+    peaks["bounce"] = _resident() - before
     print(json.dumps(peaks))
 
 

@@ -14,6 +14,7 @@ from tron.images import write_image
 from tron.reconstruction import EnvironmentFit
 from tron.reconstruction.evaluation import picture, wanted_picture
 from tron.reconstruction.settings import FitSettings
+from tron.shading.bounce import BounceTransport
 from tron.shading.guidance import Lighting, render_guidance
 from tron.tracing import SurfelTracer
 
@@ -31,12 +32,15 @@ def write_sheet(
     """Held-out views (training views, if none is) with every channel of the G-buffer and the guidance.
 
     The guidance needs the light and the ``settings`` that it was fitted with: shadows are estimated as there.
+    ``lit`` beside ``photo`` shows how far materials and light explain it, what bounces included.
     """
     views = capture.test_views or capture.train_views
     views = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, SHEET_VIEWS).astype(int))]
     rows: dict[str, list[np.ndarray]] = {}
     lighting = None if light is None else Lighting(light.environment)
-    estimation = None if settings is None else sheet_estimation(settings)
+    estimation, bounce = None if settings is None else sheet_estimation(settings), None
+    if lighting is not None and estimation is not None:
+        bounce = BounceTransport.trace(tracer).bake(lighting, estimation)
     for number, view in enumerate(views):
         buffers = tracer.gbuffer(view.camera).numpy()
         rendered, wanted = picture(buffers), wanted_picture(view)
@@ -54,9 +58,9 @@ def write_sheet(
         }.items():
             rows.setdefault(name, []).append(image)
         if lighting is not None and estimation is not None:
-            guidance = render_guidance(tracer, view.camera, lighting, estimation, number)
-            for name, image in (("pbr", guidance.pbr), ("irradiance", guidance.irradiance)):
-                rows.setdefault(name, []).append(to_display(image, capture.exposure))
+            guidance = render_guidance(tracer, view.camera, lighting, estimation, number, bounce=bounce)
+            for name in ("pbr", "irradiance", "lit"):
+                rows.setdefault(name, []).append(to_display(guidance[name], capture.exposure))
     write_image(path, labelled_sheet(rows, [view.name for view in views]))
 
 

@@ -129,7 +129,7 @@ def test_it_writes_everything_that_it_says(finished: Path):
     assert scene.kernel_degree == 4  # the recipe's
     assert EnvironmentMap.load(finished / "environment.exr").image.min() >= 0
     sheet = read_image(finished / "contact_sheet.png")
-    rows = 12  # photo, radiance, error, opacity, depth, position, normal, three materials, pbr, irradiance
+    rows = 13  # photo, radiance, error, opacity, depth, position, normal, three materials, three of light
     assert sheet.shape == (18 + rows * (180 + 2), 110 + 3 * (180 + 2), 3)
     photo = sheet[18:198, 110:290]
     assert np.ptp(photo) > 0.3

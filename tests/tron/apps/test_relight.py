@@ -30,7 +30,7 @@ def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, 
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=2"]
     assert relight(*base, "buffers=[normal,depth,mask]") == 0
     frames = sorted(path.name for path in (out / "frames").iterdir())
-    buffers = ("depth", "irradiance", "mask", "normal", "pbr", "shadowed")
+    buffers = ("depth", "irradiance", "lit", "mask", "normal", "pbr")
     expected = [f"{i:04d}.{name}.exr" for i in range(2) for name in buffers]
     expected += [f"{i:04d}.{name}.png" for i in range(2) for name in ("irradiance", "pbr", "relit")]
     assert frames == sorted([*expected, "settings.json"])
@@ -42,7 +42,7 @@ def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, 
     assert report["frames"] == report["frames_rendered"] == 2
     assert report["exposure"] == pytest.approx(EnvironmentMap.load(light_path).exposure())
     assert report["scene"]["materials_guessed"] is False
-    assert report["relit"] == "shadowed"
+    assert report["relit"] == "lit"
 
     normal, mask = (read_image(out / "frames" / f"0000.{name}.exr") for name in ("normal", "mask"))
     middle = normal[SIZE // 2, SIZE // 2]
@@ -213,7 +213,7 @@ def test_a_clip_in_parts_is_the_clip_in_one(tmp_path, monkeypatch):
     for index in range(13):
         folder.write(index, {name: rng.uniform(0, 2, (16, 16, 3)) for name in GUIDANCE})
     monkeypatch.setattr(clips, "CLIP_FRAMES", 6)
-    light, picture = EnvironmentMap.constant(1.0), RelitPicture("environment", neural=True)
+    light, picture = EnvironmentMap.constant(1.0), RelitPicture("environment", "neural")
     Clip(light, [0.0] * 13, 0.7, picture, folder).draw(renderer)
     linear = {name: np.stack([folder.read(i, name) for i in range(13)]) for name in GUIDANCE}
     whole = render_clip(renderer, {name: to_display(buffer, 0.7) for name, buffer in linear.items()})
