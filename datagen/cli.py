@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datagen.capture_export import make_captures
+from datagen.equal_error import measure_equal_error
 from datagen.run import make
 from datagen.settings import Settings
 from datagen.validate import validate
@@ -14,7 +15,8 @@ def main(settings: Settings) -> int:
 
     Scenes are drawn from seeds, path-traced by Mitsuba, turned into surfels and rendered again by TRON's
     tracer; the pairs land in tar shards with a manifest. With mode=captures scenes are path-traced from all
-    sides instead, with true maps, as folders that tron-reconstruct and nerfstudio read. An interrupted run
+    sides instead, with true maps, as folders that tron-reconstruct and nerfstudio read. With mode=equal_error
+    guidance of a dataset's test scenes is held against the path tracer: equal_error.json. An interrupted run
     resumes. The exit code is 1 if a scene could not be made (failures.jsonl
     says why, that of captures lies among them) or if validation found a problem.
     """
@@ -22,6 +24,9 @@ def main(settings: Settings) -> int:
         return 1 if validate(settings.output_dir) else 0
     if settings.mode == "captures":
         return 1 if make_captures(settings) else 0
+    if settings.mode == "equal_error":
+        measure_equal_error(settings)
+        return 0
     return 1 if make(settings) else 0
 
 

@@ -62,3 +62,7 @@ class Estimation(BaseModel):
             return self
         rays, reflections = max(2, self.rays // parts // 2 * 2), -(-self.reflections // parts)
         return self.model_copy(update={"rays": rays, "reflections": reflections, "supersample": 1})
+
+
+FINAL = Estimation()
+"""That of final frames; the settings of the commands take their defaults from it."""

@@ -15,6 +15,7 @@ from eval.results import Row
 from eval.tracing import page
 from eval.tracing.accuracy import camera_errors, shadow_errors
 from eval.tracing.agreement import compare_images, hits_a_ray
+from eval.tracing.bounce import measure_bounce, measure_equal_error
 from eval.tracing.camera_rays import measure_camera_rays, time_shapes
 from eval.tracing.few_rays import measure_few_rays
 from eval.tracing.gradients import measure_gradient
@@ -37,7 +38,11 @@ class Tracing(TracingSettings):
         activate(self.variant)
         measured = Measured(self)
         for part in self.parts:
-            getattr(self, f"_measure_{part}")(measured)
+            if part == "equal_error":
+                measured.equal_error = measure_equal_error(self.equal_error, output_dir)
+                _say(measured.equal_error.rows(self.seed))
+            else:
+                getattr(self, f"_measure_{part}")(measured)
         write_times(output_dir / "times.json", measured.timed())
         return page.outcome(measured, output_dir)
 
@@ -150,6 +155,12 @@ class Tracing(TracingSettings):
         measured.error += camera_errors(contenders, size, self.error_rays, self.seed)
         measured.error += shadow_errors(contenders, size, self.error_rays, self.seed)
         _say(measured.error)
+
+    def _measure_bounce(self, measured: Measured) -> None:
+        for count, size in self.bounce:
+            found = measure_bounce(self._contenders(count), size, self.rounds)
+            measured.bounce.append(found)
+            _say(found.rows())
 
     def _measure_memory(self, measured: Measured) -> None:
         measured.memory = measure_memory(self.memory_surfels, self.pixels[-1], self.variant, self.seed)

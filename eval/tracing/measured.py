@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, PositiveInt
 
 from eval.peers.settings import SpeedBenchmark
 from eval.peers.timing import Timed, Times, format_count
-from eval.results import Row
+from eval.results import Row, mean_row
 from tron.color import to_display
 from tron.errors import TronError
 
@@ -29,6 +30,8 @@ Part = Literal[
     "few_rays",
     "error",
     "memory",
+    "bounce",
+    "equal_error",
 ]
 Case = tuple[PositiveInt, PositiveInt]
 
@@ -59,6 +62,10 @@ class TracingSettings(SpeedBenchmark):
     reference_spp: PositiveInt = Field(default=4096, description="rays per pixel of the reference irradiance")
     error_rays: PositiveInt = Field(default=2000, description="rays held against float64")
     memory_surfels: PositiveInt = Field(default=1_000_000, description="scene whose peak memory is measured")
+    bounce: list[Case] = Field(description="(surfels, pixels) of transport, bake and frames with bounces")
+    equal_error: list[str] = Field(
+        description="arguments of tron-datagen for the scenes on which guidance and path tracer are compared"
+    )
 
     @property
     def middle(self) -> tuple[int, int]:
@@ -315,6 +322,53 @@ def few_rays_rows(measured: Sequence[FewRays]) -> Iterator[Row]:
 
 
 @dataclass(frozen=True)
+class BounceTimes(Timed):
+    """Times of "transport", "bake", a "frame" of 64 rays a pixel, and a "lit frame" with what was baked."""
+
+    kind = "bounce"
+
+    def rows(self) -> Iterator[Row]:
+        """Both ratios to a frame, and the seconds of transport and bake."""
+        frame = self.times["frame"]
+        yield self.row("bounce.seconds_ratio_to_frame", self.times["bake"].over(frame), "x")
+        yield self.row("bounce.lit_frame_ratio", self.times["lit frame"].over(frame), "x")
+        for name in ("transport", "bake", "frame"):
+            yield self.row(f"bounce.{name}_seconds", self.times[name].median, "s", name)
+
+
+EQUAL_ERROR = "guidance.ratio_to_path_tracing.equal_error"
+
+
+@dataclass(frozen=True)
+class EqualError:
+    """The data engine's record of frames at the path tracer's error.
+
+    Attributes:
+        cases: one a scene and light: "scene", "light", "surfels", "pixels", "ways", "path_tracer".
+        pictures: files: ours, the path tracer's in our time, the truth, side by side.
+    """
+
+    cases: Sequence[Mapping[str, Any]]
+    pictures: Sequence[Path]
+
+    @property
+    def ways(self) -> list[str]:
+        """Names of our frames; the first is the one that the target holds."""
+        return list(self.cases[0]["ways"])
+
+    def rows(self, seed: int) -> Iterator[Row]:
+        """Time of each of our frames over the path tracer's at its error, over scenes."""
+        for number, way in enumerate(self.ways):
+            found = [(case["scene"], case["ways"][way]) for case in self.cases]
+            suffix = "" if number == 0 else f".{way}"
+            ratios = [(scene, values["ratio"]) for scene, values in found]
+            yield mean_row(f"{EQUAL_ERROR}{suffix}", "x", ratios, seed)
+            for name, unit in (("error", "abs"), ("seconds", "s"), ("paths", "1")):
+                values = [(scene, values[name]) for scene, values in found]
+                yield mean_row(f"guidance.{name}.{way}", unit, values, seed)
+
+
+@dataclass(frozen=True)
 class SamePicture:
     """Radiance of the same surfels along the same rays, (H, W, 3) display values, and their PSNR in dB."""
 
@@ -355,15 +409,17 @@ class Measured:
     few_rays: list[FewRays] = field(default_factory=list)
     error: list[Row] = field(default_factory=list)
     memory: dict[str, float] = field(default_factory=dict)
+    bounce: list[BounceTimes] = field(default_factory=list)
+    equal_error: EqualError | None = None
 
     def timed(self) -> list[Timed]:
         """Every case that was timed."""
         frames = [*self.camera, *self.inside, *self.variants]
-        return [*frames, *self.shadow, *self.gradient, *self.direct]
+        return [*frames, *self.shadow, *self.gradient, *self.direct, *self.bounce]
 
     def rows(self) -> Iterator[Row]:
         """Every figure."""
-        for found in (*self.camera, *self.inside, *self.variants, *self.shadow, *self.gradient):
+        for found in (*self.camera, *self.inside, *self.variants, *self.shadow, *self.gradient, *self.bounce):
             yield from found.rows()
         if self.direct:
             yield from direct_rows(self.direct)
@@ -371,6 +427,8 @@ class Measured:
             yield from noise_rows(self.noise)
         if self.few_rays:
             yield from few_rays_rows(self.few_rays)
+        if self.equal_error:
+            yield from self.equal_error.rows(self.settings.seed)
         yield from self.error
         for stage, value in self.memory.items():
             metric = f"memory.{stage}_mb.{format_count(self.settings.memory_surfels)}"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -22,12 +23,17 @@ MEGABYTE = 1e6
 def measure_memory(count: int, size: int, variant: str, seed: int) -> dict[str, float]:
     """Resident set in MB: ``base`` (libraries loaded), ``scene`` (surfels made), ``peak`` (while tracing).
 
+    Beside them ``bounce``: what transport and bake of a light add to what is resident after a frame.
+
     Raises:
         TronError: the process failed.
     """
     command = [sys.executable, "-m", "eval.tracing.memory", str(count), str(size), variant, str(seed)]
+    # Ours come first, whatever stands on the path of the user: another eval.py would be started instead.
     root = Path(__file__).resolve().parents[2]
-    result = subprocess.run(command, capture_output=True, text=True, cwd=root)
+    path = os.pathsep.join(filter(None, [str(root), os.environ.get("PYTHONPATH")]))
+    environment = os.environ | {"PYTHONPATH": path}
+    result = subprocess.run(command, capture_output=True, text=True, cwd=root, env=environment)
     if result.returncode != 0:
         raise TronError(f"measuring memory failed: {result.stderr.strip()[-500:]}", " ".join(command))
     return json.loads(result.stdout.splitlines()[-1])
@@ -50,14 +56,17 @@ def _forget() -> None:
 
 
 def main(count: int, size: int, variant: str, seed: int) -> None:
-    """Make the scene, trace a view and shadow rays from it, and print the peaks as JSON."""
+    """Make the scene, trace a view, shadow rays from it and what bounces; print the peaks as JSON."""
     from tron.runtime import activate
 
     activate(variant)
     import drjit as dr
 
     from eval.peers.scene import camera, surfels
+    from eval.tracing.lights import LIGHTS
     from eval.tracing.shadow_rays import random_rays
+    from tron.shading.bounce import BounceTransport
+    from tron.shading.lighting import Lighting
     from tron.tracing import SurfelTracer
 
     peaks = {"base": _resident()}
@@ -71,6 +80,16 @@ def main(count: int, size: int, variant: str, seed: int) -> None:
     dr.eval(tracer.transmittance(origin, direction))
     dr.sync_thread()
     peaks["peak"] = _resident()
+    del gbuffer, origin, direction
+    lighting = Lighting(LIGHTS["soft"]())
+    gc.collect()
+    dr.flush_malloc_cache()
+    _forget()
+    before = _resident()
+    baked = BounceTransport.trace(tracer).bake(lighting)
+    dr.eval(baked)
+    dr.sync_thread()
+    peaks["bounce"] = _resident() - before
     print(json.dumps(peaks))
 
 

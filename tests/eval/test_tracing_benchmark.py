@@ -18,6 +18,7 @@ from eval.tracing.benchmark import Tracing
 from eval.tracing.few_rays import RAYS, measure_few_rays
 from eval.tracing.irradiance import block_correlation, independent_irradiance, relative_rmse
 from eval.tracing.measured import ShadowRays, few_rays_rows
+from eval.tracing.memory import measure_memory
 from eval.tracing.page_rays import SHADOW_GROUPS
 from tron import metrics, seeds
 from tron.cameras import Camera
@@ -136,6 +137,13 @@ def test_the_whole_benchmark_runs_and_every_promised_row_is_there(tmp_path: Path
     ):
         assert f'id="{anchor}"' in page
     assert (tmp_path / "pictures" / "camera.png").stat().st_size > 0
+
+
+def test_memory_is_measured_beside_a_foreign_eval(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "eval.py").write_text("raise SystemExit('a decoy was imported')\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("PYTHONSAFEPATH", "1")  # the child's folder is then not first on its path
+    assert measure_memory(100, 16, "llvm_ad_rgb", 0)["peak"] > 0
 
 
 def test_a_part_alone_gives_its_rows_alone(tmp_path: Path):

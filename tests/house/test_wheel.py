@@ -127,6 +127,9 @@ def test_a_foreign_file_of_one_of_our_names_is_one_clear_line(
     (tmp_path / "data").mkdir()  # a folder without __init__.py hides nothing
     refused = start(installed, command, "--help", cwd=tmp_path, PYTHONPATH=str(tmp_path))
     hidden = decoy.partition("/")[0]
+    if hidden.removesuffix(".py") not in ("conf", command.removeprefix("tron-")):  # nothing imports it
+        assert refused.returncode == 0, refused.stderr
+        return
     assert refused.returncode == 2
     assert refused.stdout == ""
     (line,) = refused.stderr.splitlines()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -23,10 +23,12 @@ from tron.images import write_image
 from tron.shards.schema import GUIDANCE
 
 if TYPE_CHECKING:
+    from tron.apps.lit_scene import Bounced, LitScene
     from tron.neural.protocols import Renderer
+    from tron.shading.bounce import BouncedLight
     from tron.shading.environment import EnvironmentMap
-    from tron.shading.guidance import Lighting
-    from tron.tracing import GBuffer, SurfelTracer
+    from tron.shading.lighting import Lighting
+    from tron.tracing import SurfelTracer
 
 # Frames that the neural renderer gets at once; bounds memory, not its view into the past.
 CLIP_FRAMES = 16
@@ -55,13 +57,22 @@ class Clip:
     guidance: Sequence[str] = GUIDANCE
     keeps_linear: bool = False
     seconds: list[float] = field(default_factory=list)
+    _turned: tuple[float, Lighting, Bounced] | None = None
 
     @cached_property
-    def lighting(self) -> Lighting:
+    def _lighting(self) -> Lighting:
         """The environment, prepared when the first frame is traced."""
         from tron.shading.guidance import Lighting
 
         return Lighting(self.environment)
+
+    def light(self, scene: LitScene, index: int) -> tuple[Lighting, Bounced]:
+        """The environment as frame ``index`` has it, and what of it bounces, baked where it has turned."""
+        rotation = self.rotations[index]
+        if self._turned is None or self._turned[0] != rotation:
+            lighting = self._lighting.turned_to(rotation)
+            self._turned = rotation, lighting, scene.bake(lighting)
+        return self._turned[1:]
 
     def write_pictures(self, index: int) -> None:
         """Write the pictures of a frame whose buffers are there, those that need no network."""
@@ -116,59 +127,55 @@ def trace(
     estimation: Estimation,
     seed: int,
 ) -> None:
-    """Trace the frames that are missing, each view once for all lights, and write the pictures of all.
+    """Trace the frames that are missing, and write the pictures of all.
 
     Args:
         scene: the surfels.
         cameras: one a frame.
         clips: one a light.
-        estimation: of the shadows.
-        seed: root of their random numbers; a frame's do not depend on the light.
+        estimation: of the light.
+        seed: root of its random numbers; a frame's do not depend on the environment.
     """
-    from tron.shading.guidance import trace_view
+    from tron.apps.lit_scene import LitScene
 
-    tracer_for = _tracers(scene)
-    view: tuple[Camera, SurfelTracer, GBuffer] | None = None
+    lit = LitScene(scene, cameras[0], estimation, seeds.integer(seed, "relight", "bounces"))
     for index, camera in enumerate(track(cameras, "guidance")):
         for clip in clips:
             if not clip.folder.finished(index):
                 started = time.perf_counter()
-                if view is None or view[0] is not camera:
-                    tracer = tracer_for(camera)
-                    view = camera, tracer, trace_view(tracer, camera, estimation)
-                lighting = clip.lighting.turned_to(clip.rotations[index])
+                lighting, bounced = clip.light(lit, index)
                 ray_seed = seeds.integer(seed, "relight", index)
-                buffers = _shade(*view[1:], lighting, clip.folder.buffers, estimation, ray_seed)
+                buffers = _shade(
+                    lit.tracer(camera),
+                    camera,
+                    lighting,
+                    bounced(camera),
+                    clip.folder.buffers,
+                    estimation,
+                    ray_seed,
+                )
                 clip.seconds.append(time.perf_counter() - started)
                 clip.folder.write(index, buffers)
             clip.write_pictures(index)
 
 
-def _tracers(scene: GaussianScene) -> Callable[[Camera], SurfelTracer]:
-    """The tracer for a camera: one for all, unless normals mean nothing and must be turned to each camera."""
-    from tron.tracing import SurfelTracer
-
-    if scene.oriented:
-        tracer = SurfelTracer(scene)
-        return lambda _: tracer
-    return lambda camera: SurfelTracer(scene.facing(camera.position))
-
-
 def _shade(
     tracer: SurfelTracer,
-    gbuffer: GBuffer,
+    camera: Camera,
     lighting: Lighting,
+    bounce: BouncedLight | None,
     names: Sequence[str],
     estimation: Estimation,
     seed: int,
 ) -> dict[str, np.ndarray]:
     """The buffers ``names`` of one frame."""
-    from tron.shading.guidance import arriving_light, shade
+    from tron.shading.guidance import arriving_light, shade, trace_view
 
-    arriving = arriving_light(tracer, gbuffer, lighting, estimation, seed)
-    guidance = shade(gbuffer, arriving, lighting, estimation=estimation)
+    view = trace_view(tracer, camera, estimation, bounce)
+    arriving = arriving_light(tracer, view, lighting, estimation, seed, bounce)
+    guidance = shade(view, arriving, lighting, estimation=estimation)
     made = guidance.gbuffer | vars(guidance)
     if "foreground" in names:
-        over_black = shade(gbuffer, arriving, lighting, (0, 0, 0), estimation).shadowed
+        over_black = shade(view, arriving, lighting, (0, 0, 0), estimation).lit
         made["foreground"] = surfels_alone(over_black, guidance.mask)
     return {name: made[name] for name in names}

@@ -13,6 +13,8 @@ from tron.estimation import Estimation
 from tron.images import write_image
 from tron.reconstruction import EnvironmentFit
 from tron.reconstruction.evaluation import picture, wanted_picture
+from tron.reconstruction.settings import FitSettings
+from tron.shading.bounce import BounceTransport
 from tron.shading.guidance import Lighting, render_guidance
 from tron.tracing import SurfelTracer
 
@@ -20,12 +22,25 @@ SHEET_VIEWS = 6
 SHADOW_RAYS = 16
 
 
-def write_sheet(path: Path, tracer: SurfelTracer, capture: Capture, light: EnvironmentFit | None) -> None:
-    """Held-out views (training views, if none is) with every channel of the G-buffer and the guidance."""
+def write_sheet(
+    path: Path,
+    tracer: SurfelTracer,
+    capture: Capture,
+    light: EnvironmentFit | None,
+    settings: FitSettings | None,
+) -> None:
+    """Held-out views (training views, if none is) with every channel of the G-buffer and the guidance.
+
+    The guidance needs the light and the ``settings`` that it was fitted with: shadows are estimated as there.
+    ``lit`` beside ``photo`` shows how far materials and light explain it, what bounces included.
+    """
     views = capture.test_views or capture.train_views
     views = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, SHEET_VIEWS).astype(int))]
     rows: dict[str, list[np.ndarray]] = {}
     lighting = None if light is None else Lighting(light.environment)
+    estimation, bounce = None if settings is None else sheet_estimation(settings), None
+    if lighting is not None and estimation is not None:
+        bounce = BounceTransport.trace(tracer).bake(lighting, estimation)
     for number, view in enumerate(views):
         buffers = tracer.gbuffer(view.camera).numpy()
         rendered, wanted = picture(buffers), wanted_picture(view)
@@ -42,12 +57,16 @@ def write_sheet(path: Path, tracer: SurfelTracer, capture: Capture, light: Envir
             "metallic": buffers["metallic"],
         }.items():
             rows.setdefault(name, []).append(image)
-        if lighting is not None:
-            estimation = Estimation(rays=SHADOW_RAYS, filtered=True)
-            guidance = render_guidance(tracer, view.camera, lighting, estimation, number)
-            for name, image in (("pbr", guidance.pbr), ("irradiance", guidance.irradiance)):
-                rows.setdefault(name, []).append(to_display(image, capture.exposure))
+        if lighting is not None and estimation is not None:
+            guidance = render_guidance(tracer, view.camera, lighting, estimation, number, bounce=bounce)
+            for name in ("pbr", "irradiance", "lit"):
+                rows.setdefault(name, []).append(to_display(guidance[name], capture.exposure))
     write_image(path, labelled_sheet(rows, [view.name for view in views]))
+
+
+def sheet_estimation(settings: FitSettings) -> Estimation:
+    """Few rays, filtered where shadows are a ratio: the paper's plain sums are shown as they are."""
+    return settings.estimation(SHADOW_RAYS, filtered=settings.estimator == "ratio")
 
 
 def _relative(values: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:

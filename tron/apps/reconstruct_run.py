@@ -74,7 +74,7 @@ def run(settings: Settings, capture: Capture, prior: Prior, lpips: LPIPS | None)
     test = score_views(tracer, capture.test_views, background, lpips, track)
     some = capture.train_views[:: max(1, len(capture.train_views) // TRAIN_VIEWS_SCORED)]
     train = score_views(tracer, some, background, lpips, track)
-    write_sheet(out / "contact_sheet.png", tracer, capture, light)
+    write_sheet(out / "contact_sheet.png", tracer, capture, light, settings.light)
     if light is not None:
         write_light(out / "light.png", light)
     report = _report(settings, capture, found, light, test, train, seconds)

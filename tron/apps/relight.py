@@ -25,6 +25,7 @@ from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
 from tron.cli.command_line import command
 from tron.cli.installation import require_extra
+from tron.cli.recipes import model_defaults
 from tron.errors import TronError
 from tron.gaussians.foreign_files import refuse_foreign
 from tron.gaussians.ply import check_header
@@ -44,7 +45,7 @@ def main(settings: Settings) -> None:
     """Light a Gaussian scene with environment maps and film it along a camera path.
 
     Writes frames/NNNN.relit.png, relit.mp4 (the neural renderer's pictures where there is a checkpoint,
-    otherwise diffuse light with traced shadows plus reflections), what they are made of as
+    otherwise shadows, reflections and the light that bounces between the surfels), what they are made of as
     frames/NNNN.{pbr,irradiance,...}.exr (linear) and .png (AgX), guidance.mp4, contact_sheet.png and
     relight.json; with a checkpoint also NNNN.neural.png and neural.mp4. An interrupted run resumes when it is
     started again.
@@ -77,7 +78,7 @@ def main(settings: Settings) -> None:
     log.info(clips[0].picture.describe())
     with locked(settings.output_dir):
         for light, clip in zip(lights, clips):
-            clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite)
+            clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite, model_defaults(Settings))
         trace(scene, cameras, clips, estimation=settings.estimation(), seed=settings.seed)
         clock.lap("guidance")
         if renderer is not None:
@@ -152,7 +153,7 @@ def _load_renderer(settings: Settings) -> Renderer | None:
 
 
 def _clip(light: Settings, environment: EnvironmentMap, frames: int, guidance: Sequence[str]) -> Clip:
-    picture = RelitPicture(light.background, neural=light.checkpoint is not None)
+    picture = RelitPicture(light.background, light.source)
     buffers = [name for name in (*guidance, *picture.buffers, *light.buffers) if name != "relit"]
     return Clip(
         environment=environment,
@@ -168,7 +169,6 @@ def _clip(light: Settings, environment: EnvironmentMap, frames: int, guidance: S
 def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> dict[str, Any]:
     """Recipe of the linear frames: all that their pixels depend on, as JSON values."""
     keys = {"rotation", "trajectory", "quality", "width", "height", "fov", "distance", "seed", "variant"}
-    keys |= {"estimator", "two_sided", "denoise"}
     return {
         "scene_sha256": sha256(light.scene),
         "environment_sha256": sha256(light.light),
@@ -176,6 +176,7 @@ def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> 
         "frames": len(cameras),
         "up": [round(float(value), 6) for value in turn[2]],
         **light.model_dump(mode="json", include=keys),
+        **light.estimation().model_dump(mode="json"),
         "version": tron.__version__,
     }
 

@@ -4,32 +4,30 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from tron.apps.framing import TrajectoryName
 from tron.apps.relit import Background
 from tron.errors import TronError
-from tron.estimation import Estimation, Estimator
+from tron.estimation import FINAL, Estimation, Estimator
+from tron.shards.schema import light_members
 
-BufferName = Literal[
-    "pbr",
-    "irradiance",
-    "unshadowed",
-    "shadowed",
-    "foreground",
-    "mask",
-    "base_color",
-    "normal",
-    "depth",
-    "position",
-    "roughness",
-    "metallic",
-    "rgb",
-    "relit",
-]
-QUALITY = {"preview": Estimation(rays=2, filtered=True), "final": Estimation(rays=64)}
+DEFAULT_BUFFERS = (*light_members(), "foreground", "mask")
+BUFFERS = (
+    *DEFAULT_BUFFERS,
+    *("base_color", "normal", "depth", "position", "roughness", "metallic", "rgb"),  # of the G-buffer
+    *("indirect", "relit"),
+)
+if TYPE_CHECKING:
+    BufferName = str
+else:
+    BufferName = Literal[BUFFERS]
+QUALITY = {
+    "preview": Estimation(rays=2, filtered=True),
+    "final": FINAL.model_copy(update={"reflections": 4, "supersample": 2}),
+}
 
 Side = Annotated[int, Field(ge=8, le=8192)]
 
@@ -65,15 +63,35 @@ class Settings(BaseModel):
         "nerfstudio's camera_path.json",
     )
     quality: Literal["preview", "final"] = Field(
-        "preview", description="preview: 2 shadow rays per pixel, denoised; final: 64"
+        "preview",
+        description="preview: 2 shadow rays per pixel, denoised; final: 64, over 2 x 2 sub-pixels, and 4 "
+        "rays that look for reflections of the scene in itself",
+    )
+    bounces: int = Field(
+        FINAL.bounces,
+        ge=0,
+        le=16,
+        description="times that light bounces between the surfels; 0: direct light alone, and the relit "
+        "picture is 'shadowed'",
+    )
+    reflections: int | None = Field(
+        None, ge=0, description="GGX rays per pixel that meet the scene, for glossy things; null: by quality"
+    )
+    supersample: Literal[1, 2] | None = Field(
+        None, description="2: the mean of 2 x 2 sub-pixels, with a quarter of the rays each; null: by quality"
+    )
+    diffuse: Literal["principled", "lambert"] = Field(
+        FINAL.diffuse,
+        description="diffuse reflection: that of the principled material, or Lambert's, as in the paper",
     )
     estimator: Estimator = Field(
-        "ratio",
+        FINAL.estimator,
         description="ratio: unshadowed irradiance times the share of it that arrives; plain: the Monte Carlo "
         "mean, as in the paper",
     )
     two_sided: bool = Field(
-        True, description="back faces block shadow rays beyond two spacings; false: never, as in the paper"
+        FINAL.two_sided,
+        description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
     )
     denoise: bool | None = Field(
         None, description="edge-avoiding filter of the shadows; null: with quality=preview alone"
@@ -97,8 +115,9 @@ class Settings(BaseModel):
     )
     vae: Path | None = Field(None, description="WAN 2.1 VAE, for checkpoints that were trained with it")
     buffers: tuple[BufferName, ...] = Field(
-        ("pbr", "irradiance", "unshadowed", "shadowed", "foreground", "mask"),
-        description="buffers written as EXR; relit is the relit picture before exposure (without checkpoint)",
+        DEFAULT_BUFFERS,
+        description=f"buffers written as EXR, of {', '.join(BUFFERS)}; relit is the relit picture before "
+        "exposure (without checkpoint)",
         examples=["[pbr]"],
     )
     overwrite: bool = Field(False, description="replace frames that were made with other settings")
@@ -125,12 +144,22 @@ class Settings(BaseModel):
         return self
 
     def estimation(self) -> Estimation:
-        """Estimation of the shadows."""
-        chosen = QUALITY[self.quality]
-        filtered = chosen.filtered if self.denoise is None else self.denoise
-        return Estimation(
-            rays=chosen.rays, estimator=self.estimator, two_sided=self.two_sided, filtered=filtered
-        )
+        """Estimation of the light: what quality says, unless the settings do."""
+        said = {
+            "filtered": self.denoise,
+            "reflections": self.reflections,
+            "supersample": self.supersample,
+            **self.model_dump(include={"estimator", "two_sided", "bounces", "diffuse"}),
+        }
+        given = {name: value for name, value in said.items() if value is not None}
+        return Estimation(**{**QUALITY[self.quality].model_dump(), **given})
+
+    @property
+    def source(self) -> Literal["neural", "lit", "shadowed"]:
+        """What the relit picture is made of."""
+        if self.checkpoint is not None:
+            return "neural"
+        return "lit" if self.bounces else "shadowed"
 
     def by_light(self) -> list[Settings]:
         """The settings that give each environment's frames alone.

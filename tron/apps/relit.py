@@ -1,7 +1,7 @@
 """The relit picture: what a run of tron-relight is for, made of the buffers on disk.
 
-With a checkpoint it is the neural picture, without one `shadowed` (diffuse light with traced shadows plus
-split-sum reflections). What stands behind the surfels is chosen:
+With a checkpoint it is the neural picture, without one `lit` (shadows, reflections, and light that bounced
+between the surfels), or `shadowed` where nothing is to bounce. What stands behind the surfels is chosen:
 
     environment  as the buffers have it: the light itself
     transparent  RGBA, straight alpha: alpha is the mask, colours are those of the surfels alone
@@ -34,27 +34,31 @@ class RelitPicture:
 
     Attributes:
         background: behind the surfels: "environment", "transparent" or a display colour, see above.
-        neural: whether a network draws the surfels.
+        source: the picture of the surfels: a network's, or a buffer of guidance.
     """
 
     background: Background
-    neural: bool
+    source: Literal["neural", "lit", "shadowed"]
 
     @property
-    def source(self) -> str:
-        """The picture of the surfels: "neural" or "shadowed"."""
-        return "neural" if self.neural else "shadowed"
+    def neural(self) -> bool:
+        """Whether a network draws the surfels."""
+        return self.source == "neural"
 
     @property
     def buffers(self) -> tuple[str, ...]:
         """Buffers that a frame must have on disk for it."""
         if self.background == "environment":
-            return () if self.neural else ("shadowed",)
+            return () if self.neural else (self.source,)
         return ("mask",) if self.neural else ("mask", "foreground")
 
     def describe(self) -> str:
         """One line for the log."""
-        made = "drawn by the neural renderer" if self.neural else "shadowed guidance (no checkpoint)"
+        made = {
+            "neural": "drawn by the neural renderer",
+            "lit": "light with its bounces (lit; no checkpoint)",
+            "shadowed": "direct light alone (shadowed; no checkpoint)",
+        }[self.source]
         behind = {"environment": "over the environment", "transparent": "with alpha"}
         shown = behind.get(str(self.background)) or f"over the colour {list(self.background)}"
         return f"relit pictures: {made}, {shown}"
@@ -70,7 +74,7 @@ class RelitPicture:
             neural: the network's picture (H, W, 3), display values, if it is the source.
         """
         if self.background == "environment":
-            return to_display(folder.read(index, "shadowed"), exposure) if neural is None else neural
+            return to_display(folder.read(index, self.source), exposure) if neural is None else neural
         surfels = to_display(folder.read(index, "foreground"), exposure) if neural is None else neural
         mask = folder.read(index, "mask")[..., :1]
         if self.background == "transparent":
@@ -84,7 +88,7 @@ class RelitPicture:
         has it; so too for a colour, which has no radiance.
         """
         if self.background == "environment":
-            return folder.read(index, "shadowed")
+            return folder.read(index, self.source)
         mask = folder.read(index, "mask")[..., :1]
         return np.concatenate([folder.read(index, "foreground") * mask, mask], axis=2)
 

@@ -24,10 +24,16 @@ DISTRIBUTION = "tron-relight"
 PACKAGES = ("conf", "datagen", "train", "eval")
 
 
-def require_own_packages() -> None:
-    """Raise TronError where a foreign file or folder shadows one of the packages beside `tron`."""
+def require_own_packages(*modules: str) -> None:
+    """Raise TronError where a foreign file or folder shadows a package beside `tron`.
+
+    Args:
+        modules: names of modules, of whose packages those of PACKAGES are looked at. Those that a command
+            does not import may be hidden: a user's own train.py does not stop tron-relight.
+    """
     home = Path(tron.__file__).resolve().parents[1]
-    for name in PACKAGES:
+    imported = {module.partition(".")[0] for module in modules}
+    for name in (name for name in PACKAGES if name in imported):
         # Not imported: a foreign file may do anything.
         spec = importlib.util.find_spec(name)
         if spec is None:
@@ -97,7 +103,7 @@ class ConsoleScript:
     def __call__(self, arguments: Sequence[str] | None = None) -> NoReturn:
         """Run on `arguments`, those of the process where None; ends in `SystemExit`."""
         try:
-            require_own_packages()
+            require_own_packages("conf", self.module)
             require_extra(self.name, self.name.removeprefix("tron-"))
         except TronError as error:
             print(f"{self.name}: {error}", file=sys.stderr)

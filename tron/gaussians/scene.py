@@ -113,15 +113,21 @@ class GaussianScene:
         return low, high
 
     def facing(self, point: np.ndarray) -> GaussianScene:
-        """The scene with every surfel's normal on the side of a point (3,), world.
+        """The scene with every surfel's normal on the side of a point (3,), world."""
+        return self.turned_over(self.looks_away(point))
 
-        A surfel that looks away is turned half about its tangent u: same disk, other side. Arrays that do not
-        change are shared with this scene.
+    def looks_away(self, point: np.ndarray) -> np.ndarray:
+        """(M,) bool: surfels whose normal is not on the side of a point (3,), world."""
+        return np.einsum("mi,mi->m", self.normals(), self.means - np.asarray(point, np.float32)) > 0
+
+    def turned_over(self, which: np.ndarray) -> GaussianScene:
+        """The scene with some surfels, (M,) bool, turned half about their tangent u: same disk, other side.
+
+        Arrays that do not change are shared with this scene.
         """
-        away = np.einsum("mi,mi->m", self.normals(), self.means - np.asarray(point, np.float32)) > 0
         w, x, y, z = self.quats.T
         turned = np.stack([-x, w, z, -y], axis=-1)
-        return replace(self, quats=np.where(away[:, None], turned, self.quats))
+        return replace(self, quats=np.where(which[:, None], turned, self.quats))
 
     def rotated(self, rotation: np.ndarray) -> GaussianScene:
         """The scene turned about the origin by a (3, 3) rotation: centres, frames, radiance and up."""

@@ -22,13 +22,13 @@ constant, and so is the light.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import drjit as dr
 import mitsuba as mi
 
 from tron.errors import TronError
-from tron.estimation import Estimation
+from tron.estimation import FINAL, Estimation, Estimator
 from tron.integrators.environment import environment_of, light_state
 from tron.integrators.plugin import Shown
 from tron.integrators.surfels import Surfels, unwrap
@@ -79,13 +79,15 @@ class GuidanceAppearance:
 
 
 def _estimation(properties: mi.Properties) -> Estimation:
-    rays = int(properties.get("shadow_rays", 64))
+    rays = int(properties.get("shadow_rays", FINAL.rays))
     if rays < 2 or rays % 2:
         raise TronError(f"shadow_rays is {rays}", mend="give an even number of shadow rays, 2 or more")
-    estimator = properties.get("estimator", "ratio")
-    if estimator not in ("ratio", "plain"):
-        raise TronError(f"tron_guidance has no estimator {estimator!r}", mend="choose ratio or plain")
-    return Estimation(rays=rays, estimator=estimator, two_sided=bool(properties.get("two_sided", True)))
+    estimator = properties.get("estimator", FINAL.estimator)
+    if estimator not in get_args(Estimator):
+        mend = f"choose {' or '.join(get_args(Estimator))}"
+        raise TronError(f"tron_guidance has no estimator {estimator!r}", mend=mend)
+    two_sided = bool(properties.get("two_sided", FINAL.two_sided))
+    return Estimation(rays=rays, estimator=estimator, two_sided=two_sided)
 
 
 def _given_environment(properties: mi.Properties) -> EnvironmentMap | None:

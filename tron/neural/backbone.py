@@ -10,21 +10,6 @@ from torch import Tensor, nn
 
 from tron.neural.configs import BackboneConfig
 
-COSMOS_0_6B = BackboneConfig(
-    heads=20,
-    head_dim=64,
-    layers=20,
-    mlp_ratio=4.0,
-    text_embed_dim=1024,
-    adaln_lora_dim=256,
-    patch=(1, 2, 2),
-    max_size=(128, 240, 240),
-    rope_scale=(1.0, 4.0, 4.0),
-    padding_channel=True,
-    cross_attention="frozen",
-)
-"""Cosmos-Predict2 0.6B, 597.5 M parameters with 16 latent channels."""
-
 
 class NoCrossAttention(nn.Module):
     """Cross-attention over a zero token without biases: zero."""

@@ -17,9 +17,15 @@ from safetensors.torch import save as serialize
 from torch import Tensor
 
 from tron.errors import TronError
-from tron.neural.backbone import COSMOS_0_6B, BackboneConfig, transformer
+from tron.neural.backbone import transformer
 from tron.neural.codecs import CODECS
-from tron.neural.configs import PixelMLPConfig, RendererConfig
+from tron.neural.configs import (
+    PAPER_GUIDANCE,
+    BackboneConfig,
+    CosmosConfig,
+    PixelMLPConfig,
+    RendererConfig,
+)
 from tron.neural.pixel_mlp import PixelMLP
 from tron.neural.protocols import Codec, Renderer
 from tron.neural.published_files import existing, folder_state, load_strictly, safetensors_state, torch_state
@@ -76,7 +82,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 def _build(kind: str, config: dict[str, Any], vae: str | Path | None) -> Renderer:
     # The file chooses among these two and nothing else: a name to import would be code in a data file.
-    config = {"guidance": ("pbr", "irradiance"), **config}  # files before schema 2 do not name it
+    config = {"guidance": PAPER_GUIDANCE, **config}  # files before schema 2 do not name it
     if kind == "pixel_mlp":
         return PixelMLP(PixelMLPConfig.model_validate(config))
     if kind == "neural":
@@ -95,24 +101,14 @@ def load_cosmos(
     Args:
         transformer_path: raw `model.pt` (keys `net.*`) or a diffusers folder with safetensors.
         vae_path: raw `tokenizer.pth` or a diffusers folder.
-        config: default: fusion "average", skip "mean", sigma 0.25, codec "wan", the 0.6B backbone. With
-            fusion "concat" the input layer gets zero columns for every latent but the first, so training
-            starts from that one alone.
+        config: what a mapping leaves out is as in CosmosConfig. With fusion "concat" the input layer gets
+            zero columns for every latent but the first, so training starts from that one alone.
 
     Raises:
         TronError: a path is missing (it names the file to download), unreadable, or of another shape.
     """
-    if config is None:
-        config = {}
     if not isinstance(config, RendererConfig):
-        defaults = {
-            "codec": "wan",
-            "fusion": "average",
-            "skip": "mean",
-            "sigma": 0.25,
-            "backbone": COSMOS_0_6B,
-        }
-        config = RendererConfig.model_validate({**defaults, **config})
+        config = CosmosConfig.model_validate(config or {})
     found = existing(transformer_path, "the Cosmos transformer", COSMOS_FILE)
     codec = CODECS[config.codec](vae_path)
     with torch.device("meta"):  # 2.4 GB of random numbers need not be drawn to be thrown away

@@ -19,7 +19,6 @@ from tron.cameras import Camera
 from tron.captures import View
 from tron.color import agx
 from tron.errors import TronError
-from tron.estimation import Estimation
 from tron.priors import Track, untracked
 from tron.reconstruction.losses import photometric_loss
 from tron.reconstruction.settings import FitSettings
@@ -99,12 +98,7 @@ def fit_scale(
         TronError: no photo shows a surface of the scene, or the loss is not finite.
     """
     steps, seed = settings.scale_steps, settings.seed
-    estimation = Estimation(
-        rays=settings.scale_rays,
-        estimator=settings.estimator,
-        two_sided=settings.two_sided,
-        diffuse=settings.diffuse,
-    )
+    estimation = settings.estimation(settings.scale_rays)
     pairs = []
     for photo in track(photos, "Scale: views"):
         ray_seed = integer(seed, "environment", "scale", photo.view.name)

@@ -1,6 +1,6 @@
 """Settings of a reconstruction: its beginning, and stages 1 (radiance), 2 (materials) and 3 (light).
 
-The schedule is that of 3DGRT, which the paper inherits (docs/conventions.md, 15): 30,000 steps, then 7,000.
+The schedule is that of 3DGRT, which the paper inherits (docs/reconstruction.md): 30,000 steps, then 7,000.
 A machine without a GPU takes fewer of them: ``scaled`` shortens every schedule at once, as gsplat's
 ``steps_scaler`` does, and lets surfels move and turn faster, since otherwise they would not arrive.
 """
@@ -12,7 +12,7 @@ from typing import Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.estimation import Diffuse, Estimator
+from tron.estimation import FINAL, Diffuse, Estimation, Estimator
 
 Model = TypeVar("Model", bound="Settings")
 
@@ -174,14 +174,14 @@ class FitSettings(Settings):
         default=0.01, gt=0, description="Final learning rate; the decay is exponential."
     )
     estimator: Estimator = Field(
-        default="ratio", description="ratio, or plain, the paper's sum, which needs far more rays."
+        default=FINAL.estimator, description="ratio, or plain, the paper's sum, which needs far more rays."
     )
     two_sided: bool = Field(
-        default=True,
+        default=FINAL.two_sided,
         description="Back faces block shadow rays beyond two spacings; false: never, as in the paper.",
     )
     diffuse: Diffuse = Field(
-        default="principled",
+        default=FINAL.diffuse,
         description="Material that the light's scale is fitted with: principled, or lambert, the paper's.",
     )
     coarsest: int = Field(
@@ -208,6 +208,16 @@ class FitSettings(Settings):
         default=512, description="Texels along a face edge of the prefiltered light."
     )
     seed: int = Field(default=0, description="Root of every random number.")
+
+    def estimation(self, rays: int, *, filtered: bool = False) -> Estimation:
+        """Estimation of images of the surfels in the light, as that of the fit."""
+        return Estimation(
+            rays=rays,
+            estimator=self.estimator,
+            two_sided=self.two_sided,
+            diffuse=self.diffuse,
+            filtered=filtered,
+        )
 
 
 def _scaled(settings: Model, names: tuple[str, ...], factor: float) -> Model:

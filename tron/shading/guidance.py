@@ -28,7 +28,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from tron.estimation import Diffuse, Estimation
+from tron.estimation import FINAL, Diffuse, Estimation
 from tron.shading.background import over_background
 from tron.shading.bounce import BouncedLight
 from tron.shading.composition import Bounced, Response, evenly_bounced
@@ -41,8 +41,6 @@ from tron.shading.visibility import Shadows, visibility
 if TYPE_CHECKING:
     from tron.cameras import Camera
     from tron.tracing import GBuffer, Surface
-
-FINAL = Estimation()
 
 
 class ViewTracer(Occluder, Shadows, Protocol):

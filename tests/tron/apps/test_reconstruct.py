@@ -12,6 +12,7 @@ import yaml
 
 from tron.apps import reconstruct_run as app
 from tron.apps.reconstruct import cli
+from tron.apps.reconstruct_pictures import sheet_estimation
 from tron.apps.relight import cli as relight_cli
 from tron.cameras import Camera
 from tron.captures import Capture, View
@@ -128,13 +129,25 @@ def test_it_writes_everything_that_it_says(finished: Path):
     assert scene.kernel_degree == 4  # the recipe's
     assert EnvironmentMap.load(finished / "environment.exr").image.min() >= 0
     sheet = read_image(finished / "contact_sheet.png")
-    rows = 12  # photo, radiance, error, opacity, depth, position, normal, three materials, pbr, irradiance
+    rows = 13  # photo, radiance, error, opacity, depth, position, normal, three materials, three of light
     assert sheet.shape == (18 + rows * (180 + 2), 110 + 3 * (180 + 2), 3)
     photo = sheet[18:198, 110:290]
     assert np.ptp(photo) > 0.3
     config = yaml.safe_load((finished / "config.yaml").read_text())
     assert config["radiance"]["steps"] == 12
     assert config["prior"]["_target_"] == "tron.priors.GroundTruth"
+
+
+@pytest.mark.parametrize("fidelity", [None, "paper"])
+def test_the_sheet_estimates_shadows_as_the_run_does(fidelity: str | None):
+    chosen = [] if fidelity is None else [f"fidelity={fidelity}"]
+    light = cli.compose("capture=x", "output_dir=y", *chosen).light
+    assert light is not None
+    shown = sheet_estimation(light)
+    paper = fidelity == "paper"
+    assert (shown.estimator, shown.two_sided, shown.filtered) == (
+        ("plain", False, False) if paper else ("ratio", True, True)
+    )
 
 
 def test_the_report_is_whole_and_strict_json(finished: Path):

@@ -1,12 +1,12 @@
 """Laws of the relit picture, through the command: what it shows, over what, and in which light."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tron.apps import clip as clips
 from tron.apps.relight_settings import Settings
 from tron.cameras import Camera
 from tron.color import agx, to_display
@@ -41,7 +41,7 @@ def over(variant, scene_path, lights, tmp_path_factory):
         with pytest.raises(SystemExit) as stop:
             cli([f"scene={scene_path}", f"environment={lights[0]}", f"output_dir={base / name}", "frames=1",
                  f"background={background}", f"width={SIZE}", f"height={SIZE}", f"variant={variant}",
-                 "buffers=[relit,mask,foreground,shadowed]"])  # fmt: skip
+                 "buffers=[relit,mask,foreground]"])  # fmt: skip
         assert stop.value.code == 0
     return base
 
@@ -90,7 +90,7 @@ def test_a_white_surface_in_constant_light_shows_the_exposed_value(
     (tmp_path / "view.json").write_text(json.dumps([view.to_dict()]))
     out = tmp_path / "out"
     files = [f"scene={tmp_path / 'a.ply'}", f"environment={tmp_path / 'c.exr'}", f"output_dir={out}"]
-    files += [f"cameras={tmp_path / 'view.json'}", "buffers=[relit]"]
+    files += [f"cameras={tmp_path / 'view.json'}", "buffers=[relit]", "diffuse=lambert"]
     assert relight(*files, f"exposure={exposure}") == 0
     factor = factor or 0.4 / (light @ (0.2126, 0.7152, 0.0722))
 
@@ -130,17 +130,17 @@ def test_opaque_pixels_do_not_depend_on_the_background(over):
 def test_foreground_over_the_sky_is_the_picture_in_the_environment(over, lights):
     """The buffers let anyone composite by the one rule of tron.shading.background."""
     folder = over / "environment"
-    foreground, mask, shadowed, relit = (
-        picture(folder, name, suffix="exr") for name in ("foreground", "mask", "shadowed", "relit")
+    foreground, mask, lit, relit = (
+        picture(folder, name, suffix="exr") for name in ("foreground", "mask", "lit", "relit")
     )
     camera = Camera.from_dict(json.loads((folder / "relight.json").read_text())["cameras"][0])
     share = background_share(1 - mask)
     sky = EnvironmentMap.load(lights[0]).lookup(camera.rays())
     assert ((share > 0.05) & (share < 0.95)).sum() > 10, "rims are tested"
-    np.testing.assert_allclose((1 - share) * foreground + share * sky, shadowed, rtol=0.01, atol=2e-3)
-    np.testing.assert_array_equal(relit, shadowed)
+    np.testing.assert_allclose((1 - share) * foreground + share * sky, lit, rtol=0.01, atol=2e-3)
+    np.testing.assert_array_equal(relit, lit)
     exposure = json.loads((folder / "relight.json").read_text())["exposure"]
-    np.testing.assert_allclose(picture(folder, "relit"), to_display(shadowed, exposure), atol=STEP)
+    np.testing.assert_allclose(picture(folder, "relit"), to_display(lit, exposure), atol=STEP)
 
 
 def test_linear_picture_without_a_sky_is_multiplied_by_its_alpha(over):
@@ -199,18 +199,30 @@ def test_a_turn_starts_at_its_first_angle_and_loops():
     assert turned([90, -90], 2) == [90, 0]
 
 
-def test_a_turning_light_on_a_still_view_is_each_angle_alone(
-    relight, scene_path, lights, tmp_path, monkeypatch
-):
-    """The same bytes; and the view, which stands still, is traced once."""
-    from tron.tracing import SurfelTracer
+@pytest.fixture
+def counted(monkeypatch) -> dict[str, int]:
+    """Calls so far of what bounces cost: "trace" a scene's transport, "bake" a light."""
+    from tron.shading.bounce import BounceTransport
 
-    traced = []
-    gbuffer = SurfelTracer.gbuffer
-    monkeypatch.setattr(SurfelTracer, "gbuffer", lambda *args: traced.append(args) or gbuffer(*args))
+    calls = {"trace": 0, "bake": 0}
+
+    def count(name: str, call: Callable) -> Callable:
+        def counting(*args, **named):
+            calls[name] += 1
+            return call(*args, **named)
+
+        return counting
+
+    monkeypatch.setattr(BounceTransport, "trace", count("trace", BounceTransport.trace))
+    monkeypatch.setattr(BounceTransport, "bake", count("bake", BounceTransport.bake))
+    return calls
+
+
+def test_a_turning_light_on_a_still_view_is_each_angle_alone(relight, scene_path, lights, tmp_path, counted):
+    """The same bytes; what bounces is traced once, and baked for each angle."""
     base = [f"scene={scene_path}", f"environment={lights[0]}", "trajectory=still", "frames=3"]
     assert relight(*base, f"output_dir={tmp_path / 'turning'}", "rotation=[0,360]") == 0
-    assert len(traced) == 1
+    assert counted == {"trace": 1, "bake": 3}
     assert json.loads((tmp_path / "turning" / "relight.json").read_text())["rotations"] == [0, 120, 240]
     assert relight(*base, f"output_dir={tmp_path / 'at'}", "rotation=120") == 0
     turning, alone = (frame_files(tmp_path / name, index=1) for name in ("turning", "at"))
@@ -219,12 +231,63 @@ def test_a_turning_light_on_a_still_view_is_each_angle_alone(
     rays = Camera.from_dict(report["cameras"][1]).rays()
     empty = picture(tmp_path / "turning", "mask", 1, "exr")[..., 0] == 0
     sky = EnvironmentMap.load(lights[0], rotation_deg=120).lookup(rays)[empty]
-    shown = picture(tmp_path / "turning", "shadowed", 1, "exr")[empty]
+    shown = picture(tmp_path / "turning", "lit", 1, "exr")[empty]
     np.testing.assert_allclose(shown, sky, rtol=0.01, atol=2e-3)
     unshadowed = [picture(tmp_path / "turning", "unshadowed", index, "exr") for index in range(2)]
     assert np.abs(unshadowed[0] - unshadowed[1])[~empty].mean() > 0.01, "surfaces see it turn"
     masks = [picture(tmp_path / "turning", "mask", index, "exr") for index in range(3)]
     assert (masks[0] == masks[2]).all()
+
+
+def test_without_bounces_the_picture_is_shadowed_and_nothing_is_traced_for_them(
+    relight, scene_path, lights, tmp_path, counted
+):
+    base = [f"scene={scene_path}", f"environment={lights[0]}", "frames=1", f"output_dir={tmp_path}"]
+    assert relight(*base, "bounces=0", "buffers=[relit,lit,indirect,mask]") == 0
+    assert counted == {"trace": 0, "bake": 0}
+    assert json.loads((tmp_path / "relight.json").read_text())["relit"] == "shadowed"
+    relit, lit, shadowed, indirect, mask = (
+        picture(tmp_path, name, suffix="exr") for name in ("relit", "lit", "shadowed", "indirect", "mask")
+    )
+    np.testing.assert_array_equal(relit, shadowed)
+    np.testing.assert_array_equal(lit, shadowed)
+    assert (indirect[mask[..., 0] > 0.999] == 0).all()
+
+
+def test_bounced_light_fills_the_shadow_and_has_the_colour_of_what_sent_it(
+    relight, scene_path, light_path, tmp_path
+):
+    """A lamp on a reddish ball (base color 0.8, 0.3, 0.2) over a grey floor, which turns red beside it."""
+    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={tmp_path}", "frames=4"]
+    assert relight(*base, "quality=final", "buffers=[indirect,shadowed,lit,normal,position]") == 0
+    indirect, lit, shadowed, normal, position = (
+        picture(tmp_path, name, 0, "exr") for name in ("indirect", "lit", "shadowed", "normal", "position")
+    )
+    on_floor = (normal[..., 2] > 0.99) & (position[..., 2] < 0.05)
+    from_ball = np.linalg.norm(position[..., :2], axis=-1)
+    near, far = on_floor & (from_ball < 0.5), on_floor & (from_ball > 1.2)
+    assert near.sum() > 10
+    assert far.sum() > 10
+    assert indirect[near].mean() > 2 * indirect[far].mean()
+    red = [indirect[where][:, 0].mean() / indirect[where][:, 2].mean() for where in (near, far)]
+    assert red[0] > 1.3
+    assert lit[near].mean() > 1.02 * shadowed[near].mean()
+
+
+def test_a_run_that_is_finished_traces_no_bounces(relight, scene_path, lights, tmp_path, counted):
+    base = [f"scene={scene_path}", f"environment={lights[0]}", "frames=1", f"output_dir={tmp_path}"]
+    assert relight(*base) == 0
+    before = dict(counted)
+    assert relight(*base, "exposure=0.1") == 0
+    assert counted == before
+
+
+@pytest.mark.parametrize("setting", ["bounces=1", "reflections=2", "supersample=2", "diffuse=lambert"])
+def test_other_light_in_the_same_folder_is_refused(relight, scene_path, lights, tmp_path, capsys, setting):
+    base = [f"scene={scene_path}", f"environment={lights[0]}", "frames=1", f"output_dir={tmp_path}"]
+    assert relight(*base) == 0
+    assert relight(*base, setting) == 2
+    assert setting.split("=")[0] in capsys.readouterr().err
 
 
 def frame_files(output_dir: Path, index: int | None = None) -> dict[str, bytes]:
@@ -233,21 +296,15 @@ def frame_files(output_dir: Path, index: int | None = None) -> dict[str, bytes]:
 
 
 def test_several_lights_give_what_each_gives_alone_from_one_scene(
-    relight, scene_path, lights, tmp_path, monkeypatch
+    relight, scene_path, lights, tmp_path, monkeypatch, counted
 ):
-    loaded, views = [], []
-    load, tracers = GaussianScene.load, clips._tracers
+    loaded = []
+    load = GaussianScene.load
     monkeypatch.setattr(GaussianScene, "load", lambda path: loaded.append(path) or load(path))
-
-    def counted(scene):
-        tracer_for = tracers(scene)
-        return lambda camera: views.append(camera) or tracer_for(camera)
-
-    monkeypatch.setattr(clips, "_tracers", counted)
-    base = [f"scene={scene_path}", "frames=2", "rotation=[0,90]"]
+    base = [f"scene={scene_path}", "frames=2"]
     both = f"environment=[{lights[0]},{lights[1]}]"
     assert relight(*base, both, f"output_dir={tmp_path / 'both'}") == 0
-    assert (len(loaded), len(views)) == (1, 2)
+    assert (len(loaded), counted) == (1, {"trace": 1, "bake": 2})
     for light in lights:
         assert relight(*base, f"environment={light}", f"output_dir={tmp_path / light.stem}") == 0
         together, alone = tmp_path / "both" / light.stem, tmp_path / light.stem
@@ -265,6 +322,7 @@ def test_several_lights_give_what_each_gives_alone_from_one_scene(
         for light in lights
     ]
     assert rendered == [0, 1]
+    assert counted == {"trace": 4, "bake": 5}, "only the light of a lost frame is baked again"
     assert lost.read_bytes() == before
 
 

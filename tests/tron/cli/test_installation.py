@@ -14,7 +14,7 @@ REQUIRES = ["numpy>=2", 'tron-relight[light]; extra == "heavy"', 'absent-a>=1; e
 
 
 def test_our_own_packages_are_ours():
-    installation.require_own_packages()
+    installation.require_own_packages(*installation.PACKAGES)
 
 
 @pytest.mark.parametrize("decoy", ["train.py", "conf/__init__.py"])
@@ -26,8 +26,9 @@ def test_a_foreign_package_is_named_and_not_imported(tmp_path: Path, monkeypatch
     for module in [each for each in sys.modules if each.partition(".")[0] == name]:
         monkeypatch.delitem(sys.modules, module)
     with pytest.raises(TronError, match=f"hides TRON's own package '{name}'") as refusal:
-        installation.require_own_packages()
+        installation.require_own_packages("tron.apps", f"{name}.settings")
     assert refusal.value.where == str(tmp_path / decoy.partition("/")[0])
+    installation.require_own_packages("tron.apps", "eval")  # what a command does not import does not stop it
 
 
 def test_an_extra_names_all_that_it_lacks_and_how_to_install_it(monkeypatch):
