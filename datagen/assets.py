@@ -68,6 +68,7 @@ def find_assets(
     suffixes: Sequence[str] = SUFFIXES,
     catalogue: Path | None = None,
     allow_unlicensed: Collection[str] = (),
+    names: Collection[str] = (),
 ) -> list[Asset]:
     """List the usable files of a folder in order of path.
 
@@ -76,10 +77,11 @@ def find_assets(
         suffixes: what counts as an asset.
         catalogue: JSON file; None looks for catalogue.json in the folder.
         allow_unlicensed: ids to accept without a licence.
+        names: ids to list alone; empty: all.
 
     Raises:
-        TronError: the folder or catalogue is missing or unreadable, nothing was found, or a file has no
-            licence and its id is not allowed.
+        TronError: the folder or catalogue is missing or unreadable, nothing was found, an id is not there, or
+            a file has no licence and its id is not allowed.
     """
     if not folder.is_dir():
         raise TronError("folder of assets not found", folder)
@@ -92,10 +94,17 @@ def find_assets(
         catalogue if catalogue is not None else folder / CATALOGUE_NAME, catalogue is not None
     )
     stems = Counter(Path(path).stem for path in paths)
+    found = {
+        Path(path).stem if stems[Path(path).stem] == 1 else str(Path(path).with_suffix("")): path
+        for path in paths
+    }
+    if missing := sorted(set(names) - found.keys()):
+        raise TronError(f"no asset '{missing[0]}'", folder, f"there are {', '.join(found)}")
     assets = []
-    for path in paths:
+    for name, path in found.items():
+        if names and name not in names:
+            continue
         entry = entries.get(path, _Entry(path=path))
-        name = Path(path).stem if stems[Path(path).stem] == 1 else str(Path(path).with_suffix(""))
         if not entry.licence and name not in allow_unlicensed:
             raise TronError(
                 f"asset '{name}' has no licence",

@@ -33,6 +33,7 @@ from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder, write_capture
 from tron.claim import read_recipe, require_same
+from tron.cli.recipes import model_defaults
 from tron.color import to_display
 from tron.errors import TronError
 from tron.images import encode_exr
@@ -237,7 +238,7 @@ def _adopt(settings: Settings, folder: Path) -> None:
     path, recipe = folder / CONFIG_NAME, settings.capture_recipe()
     before = read_recipe(path)
     if before is not None:
-        require_same(before, recipe, folder, "captures")
+        require_same(before, recipe, folder, "captures", defaults=model_defaults(Settings))
     elif folder.is_dir() and any(folder.iterdir()):
         raise TronError(
             "folder holds something else than these captures", folder, "choose another output_dir"

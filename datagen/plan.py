@@ -20,6 +20,7 @@ from datagen.lights import HdriSpec
 from datagen.scene import scene_name
 from datagen.settings import SPLITS, Settings
 from tron.claim import CHOOSE_ANOTHER, read_recipe, require_same
+from tron.cli.recipes import model_defaults
 from tron.errors import TronError
 from tron.shards.manifest import ShardEntry
 from tron.shards.schema import MEMBERS, SCHEMA_VERSION, clip_members, require_schema
@@ -123,7 +124,12 @@ def find_sources(settings: Settings) -> Sources:
     """Catalogue the user's assets and environments; raises as ``datagen.assets`` does, before any render."""
     allowed = settings.allow_unlicensed
     assets = (
-        find_assets(settings.assets, catalogue=settings.catalogue, allow_unlicensed=allowed)
+        find_assets(
+            settings.assets,
+            catalogue=settings.catalogue,
+            allow_unlicensed=allowed,
+            names=settings.asset_names,
+        )
         if settings.assets
         else []
     )
@@ -202,7 +208,7 @@ def adopt(settings: Settings) -> None:
                 now.pop(split, None)
         for split in set(before) & set(SPLITS) - set(now):
             del before[split]  # fewer scenes than there are: that is told below
-        require_same(before, now, settings.output_dir, "a dataset")
+        require_same(before, now, settings.output_dir, "a dataset", defaults=model_defaults(Settings))
         for split in SPLITS:
             if scenes.get(split, 0) > settings.split(split).scenes:
                 raise TronError(

@@ -61,7 +61,7 @@ def index_html(title: str, entries: Sequence[ShardEntry]) -> str:
         "<style>body{font:15px/1.5 system-ui,sans-serif;margin:2rem;background:#fafafa;color:#222}",
         "img{max-width:100%;image-rendering:pixelated;border:1px solid #ccc}code{background:#eee}</style>",
         f"<h1>{escape(title)}</h1><p>First frame of every clip, AgX at the clip's exposure: {columns} ",
-        "(from irradiance_ref on in test splits only). See also <a href='card.md'>card.md</a>.</p>",
+        "(the references in test splits only). See also <a href='card.md'>card.md</a>.</p>",
     ]
     for entry in entries:
         parts.append(

@@ -131,7 +131,9 @@ def draw_and_build(
         style=recipe.style,
         lights=lights,
         families=settings.light_families(),
-        environments=for_split(sources.environments, item.split),
+        environments=sources.environments
+        if settings.share_maps
+        else for_split(sources.environments, item.split),
         assets={name: outline(parts) for name, parts in models.items()},
         asset_share=settings.asset_share,
         objects=settings.objects,

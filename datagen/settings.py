@@ -18,7 +18,7 @@ from pydantic import (
 
 from datagen.lights import PROCEDURAL, Family, LightChoice
 from datagen.materials import Style
-from tron.estimation import FINAL, Estimation, Estimator
+from tron.estimation import FINAL, Diffuse, Estimation, Estimator
 
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
@@ -26,6 +26,9 @@ OUTSIDE = {
     *("captures", "equal_error"),
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
+
+ESTIMATED = ("estimator", "two_sided", "diffuse", "bounces", "reflections", "supersample")
+"""Keys that decide how light on the surfels is estimated, named as in Estimation."""
 
 CAPTURED = {
     "seed": True,
@@ -36,8 +39,10 @@ CAPTURED = {
     "mesh_edge": True,
     "environment_height": True,
     "assets": True,
+    "asset_names": True,
     "asset_share": True,
     "environments": True,
+    "share_maps": True,
     "catalogue": True,
     "allow_unlicensed": True,
     "variant": True,
@@ -63,7 +68,8 @@ class SplitSettings(_Model):
         default=["any"] * 4,
         min_length=1,
         max_length=64,
-        description="Light family of each clip of a scene; any draws one of families.",
+        description="Light family of each clip of a scene, one clip for each in the list. any draws one of "
+        "families; hdri takes one of the maps in environments.",
     )
     frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
     width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
@@ -99,7 +105,8 @@ class CaptureSettings(_Model):
         default=["overcast", "studio", "sun"],
         min_length=1,
         max_length=64,
-        description="Light family of each capture, in rotation; any draws one of families.",
+        description="Light family of each capture, in rotation. any draws one of families; hdri takes one of "
+        "the maps in environments.",
     )
     views: int = Field(
         default=64,
@@ -168,11 +175,16 @@ class Settings(_Model):
         93, ge=1, le=100_000, description="Frames of the whole path that clips are cut from."
     )
     objects: tuple[int, int] | None = Field(
-        None, description="Least and greatest number of objects of a scene; null takes the style's own."
+        None,
+        description="Least and greatest number of objects of a scene, such as [2,4]; null takes the style's "
+        "own.",
+        examples=["[2,4]"],
     )
     families: list[Family] | None = Field(
         None,
-        description="What light 'any' chooses from; null: hdri with environments, else the procedural ones.",
+        description="Light families that 'any' draws from, a list as above; null: [hdri] where environments "
+        f"is given, else [{', '.join(PROCEDURAL)}].",
+        examples=["[sun,overcast]"],
     )
     views: int = Field(64, ge=1, description="Spiral views whose G-buffers the surfels are made from.")
     view_width: int = Field(256, ge=8, le=8192, description="Width of those views in pixels.")
@@ -194,6 +206,26 @@ class Settings(_Model):
         description="Back faces block the surfels' shadow rays beyond two spacings; false: never, as in the "
         "paper.",
     )
+    diffuse: Diffuse = Field(
+        FINAL.diffuse,
+        description="Material that the surfels are shaded with: principled, as the path tracer's; lambert, "
+        "as in the paper.",
+    )
+    bounces: int = Field(
+        FINAL.bounces,
+        ge=0,
+        le=16,
+        description="Times that light bounces between the surfels in lit; 0: lit is direct light alone.",
+    )
+    reflections: int = Field(
+        FINAL.reflections,
+        ge=0,
+        description="Rays per pixel that find what glossy surfels mirror; 0: the bounced light around them.",
+    )
+    supersample: Literal[1, 2] = Field(
+        FINAL.supersample,
+        description="2: guidance on 2 x 2 sub-pixels with a quarter of the rays each, averaged.",
+    )
     mesh_edge: float = Field(
         0.04,
         gt=0,
@@ -204,10 +236,18 @@ class Settings(_Model):
         256, ge=8, le=8192, description="Rows of the lat-long maps that lights are baked to."
     )
     assets: Path | None = Field(None, description="Folder of .gltf, .glb and .obj models to use as objects.")
+    asset_names: list[str] = Field(
+        default_factory=list, description="Names of the assets to use; empty: all in the folder."
+    )
     asset_share: float = Field(
         1.0, ge=0, le=1, description="Share of objects drawn from assets, where given."
     )
     environments: Path | None = Field(None, description="Folder of .hdr and .exr maps to use as lights.")
+    share_maps: bool = Field(
+        False,
+        description="All maps light every split; false: every fourth lights the test split alone, where "
+        "there are four.",
+    )
     catalogue: Path | None = Field(
         None,
         description="JSON list of path, licence, author, source; null: catalogue.json in each folder.",
@@ -284,9 +324,9 @@ class Settings(_Model):
         return getattr(self, name)
 
     def estimation(self, split: str) -> Estimation:
-        """Estimation of the surfels' irradiance."""
-        rays = self.split(split).guidance_spp
-        return Estimation(rays=rays, estimator=self.estimator, two_sided=self.two_sided)
+        """Estimation of the light on the surfels."""
+        chosen = {name: getattr(self, name) for name in ESTIMATED}
+        return Estimation(rays=self.split(split).guidance_spp, **chosen)
 
     def used_splits(self) -> list[Split]:
         """The splits that have scenes."""

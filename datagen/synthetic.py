@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -18,12 +19,15 @@ from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.gaussians.scene import GaussianScene
 from tron.runtime import torch_device
 from tron.seeds import integer
+from tron.shading.bounce import BounceTransport
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
 from tron.shards.schema import MEMBERS, ClipMeta, clip_members
 from tron.tracing import SurfelTracer
 
 Frame = dict[str, np.ndarray]
+REFERENCE_REFLECTIONS = 16
+"""Rays a pixel of the member lit_reflections."""
 
 
 def make_surfels(
@@ -54,15 +58,29 @@ def make_clips(
     both under the same baked map; with reference buffers also what Mitsuba says of the pixel centres.
     """
     tracer = SurfelTracer(surfels)
+    estimation = settings.estimation(spec.split)
+    transport = None
+    if estimation.bounces:
+        seed = integer(spec.seed, spec.split, spec.index, "bounce")
+        transport = BounceTransport.trace(tracer.sided(estimation.two_sided), seed=seed)
     for number in range(len(spec.lights)):
-        yield make_clip(spec, geometry, tracer, number, settings)
+        yield make_clip(spec, geometry, tracer, transport, number, settings)
 
 
 def make_clip(
-    spec: SceneSpec, geometry: Geometry, tracer: SurfelTracer, number: int, settings: Settings
+    spec: SceneSpec,
+    geometry: Geometry,
+    tracer: SurfelTracer,
+    transport: BounceTransport | None,
+    number: int,
+    settings: Settings,
 ) -> tuple[ClipMeta, list[Frame]]:
-    """Render the clip of one light; ``number`` is its place in the scene's list and names its seeds."""
+    """Render the clip of one light; ``number`` is its place in the scene's list and names its seeds.
+
+    ``transport`` carries the light that bounces; None: none does.
+    """
     recipe, light = settings.split(spec.split), spec.lights[number]
+    estimation = settings.estimation(spec.split)
     environment = light.bake(settings.environment_height, settings.environments)
     cameras = spec.clip(number, recipe.frames, recipe.width, recipe.height)
     scene = geometry.lit(environment)
@@ -71,16 +89,22 @@ def make_clip(
 
     rgb = render_frames(scene, cameras, recipe.path_spp, seeds["path"])
     lighting = Lighting(environment)
+    bounce = None
+    if transport is not None:
+        seed = integer(spec.seed, spec.split, spec.index, "light", number, "bounce")
+        bounce = transport.bake(lighting, estimation, seed=seed)
     frames: list[Frame] = []
     for i, (camera, truth) in enumerate(zip(cameras, gbuffers(geometry, cameras))):
-        guidance = render_guidance(
-            tracer, camera, lighting, settings.estimation(spec.split), seeds["guidance"][i]
-        )
+        view = partial(render_guidance, tracer, camera, lighting, seed=seeds["guidance"][i], bounce=bounce)
+        guidance = view(estimation)
         frame = {name: guidance[name] for name in guidance.BUFFERS if name in MEMBERS}
         frame |= {"rgb": rgb[i], "foreground": truth.valid.astype(np.float32)}
         if recipe.reference_buffers:
             direct = direct_irradiance(geometry, scene, camera, recipe.reference_spp, seeds["reference"][i])
             frame |= _reference(camera, truth, guidance, direct, environment)
+            finer = estimation.model_copy(update={"supersample": 2})
+            mirrored = finer.model_copy(update={"reflections": REFERENCE_REFLECTIONS})
+            frame |= {"lit_supersampled": view(finer).lit, "lit_reflections": view(mirrored).lit}
         frames.append(frame)
     spp = {"path": recipe.path_spp, "guidance": recipe.guidance_spp}
     if recipe.reference_buffers:

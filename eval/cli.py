@@ -23,8 +23,13 @@ class Settings(BaseModel):
         default=Path("outputs/eval"), description="folder for results.json, report.html and the pictures"
     )
     dataset: Path | None = Field(default=None, description="data set to evaluate on, made by tron-datagen")
-    renderer: Path | None = Field(default=None, description="weights of the neural renderer (.safetensors)")
-    pixel_mlp: Path | None = Field(default=None, description="weights of the pixel MLP baseline")
+    renderer: Path | list[Path] | None = Field(
+        default=None,
+        description="weights of the neural renderer (.safetensors); [a,b]: one with lit, one of two buffers",
+    )
+    pixel_mlp: Path | list[Path] | None = Field(
+        default=None, description="weights of the pixel MLP baseline, likewise"
+    )
     threads: PositiveInt = Field(default=1, description="threads that the networks use")
     seed: int = Field(default=0, description="seed of every random choice")
 

@@ -154,7 +154,7 @@ def script_path(name: str) -> str:
     folder = Path(sys.executable).parent
     found = shutil.which(name, path=str(folder))
     if found is None:
-        raise TronError(f"command {name} not found", folder, "install TRON with `pip install -e .`")
+        raise TronError(f"command {name} not found", folder, "in TRON's folder: pip install -e '.[all]'")
     return found
 
 

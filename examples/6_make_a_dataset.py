@@ -17,7 +17,7 @@ every += [f"path_spp={rays}", f"guidance_spp={rays}", f"reference_spp={rays}"]
 scenes = {"train": 4, "train_b": 1, "validation": 1, "test": 2}
 settings = cli.compose(
     *(f"{split}.{setting}" for split in scenes for setting in every),
-    *(f"{split}.scenes={1 if chosen.small else count}" for split, count in scenes.items()),
+    *(f"{split}.scenes={min(count // 2, 1) if chosen.small else count}" for split, count in scenes.items()),
     *("path_frames=8", "views=24", f"view_width={side}", f"view_height={side}", f"surfels={surfels}"),
     *("refine_steps=10", "mesh_edge=0.1", "environment_height=64", "cluster=none"),
     f"output_dir={chosen.output}",

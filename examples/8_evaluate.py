@@ -28,11 +28,11 @@ rows = json.loads((chosen.output / "results.json").read_text())["rows"]
 psnr = {row["metric"].split(".")[0]: row["value"] for row in rows if row["metric"].endswith(".psnr")}
 figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
 bars = axes.barh(
-    list(psnr), list(psnr.values()), color=["#c44" if name == "neural" else "#89a" for name in psnr]
+    list(psnr), list(psnr.values()), color=["#c44" if name == "neural_lit" else "#89a" for name in psnr]
 )
 axes.bar_label(bars, fmt="%.1f", padding=3)
 axes.margins(x=0.1)
 axes.invert_yaxis()
 axes.set_xlabel("PSNR of the surfels on unseen scenes, dB")
 figure.savefig(chosen.output / "evaluation.jpg", dpi=100)
-print(f"neural {psnr['neural']:.1f} dB, split-sum {psnr['pbr']:.1f} dB: {chosen.output / 'report.html'}")
+print(f"neural {psnr['neural_lit']:.1f} dB, lit {psnr['lit']:.1f} dB: {chosen.output / 'report.html'}")

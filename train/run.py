@@ -31,6 +31,7 @@ from train.settings import Settings
 from tron import seeds
 from tron.claim import read_recipe, require_same
 from tron.cli.instantiation import make
+from tron.cli.recipes import model_defaults
 from tron.errors import TronError
 from tron.neural.losses import RendererLoss
 from tron.neural.protocols import Renderer
@@ -223,5 +224,6 @@ def _claim_settings(settings: Settings, processes: int) -> None:
         return
     # A run may move; its data are known by their hash.
     kept = [key for key in described if key not in ("output_dir", "dataset", "devices", "nodes")]
-    before, now = ({key: each.get(key) for key in kept} for each in ({"processes": 1} | earlier, described))
-    require_same(before, now, settings.output_dir, "a run")
+    before, now = ({key: each[key] for key in kept if key in each} for each in (earlier, described))
+    defaults = {**model_defaults(Settings), "processes": 1}
+    require_same(before, now, settings.output_dir, "a run", defaults=defaults)

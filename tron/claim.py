@@ -20,12 +20,15 @@ SHOWN_CHARACTERS = 60
 """Characters of a value in a message."""
 
 
-def first_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
+def first_difference(
+    before: Mapping[str, Any], now: Mapping[str, Any], defaults: Mapping[str, Any] | None = None
+) -> str | None:
     """The first key in which two recipes (nested plain values) differ, as `key=old, not new`; None if none.
 
-    A key that one of them lacks counts as null.
+    A key that `before` lacks is younger than that recipe, and has its default; without one, a key that one of
+    the two lacks counts as null.
     """
-    old, new = leaves(before), leaves(now)
+    old, new = leaves(_completed(before, now, defaults or {})), leaves(now)
     for key in dict.fromkeys((*new, *old)):
         if old.get(key) != new.get(key):
             return f"{key}={_shown(old.get(key))}, not {_shown(new.get(key))}"
@@ -33,7 +36,12 @@ def first_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str |
 
 
 def require_same(
-    before: Mapping[str, Any], now: Mapping[str, Any], where: Path, what: str, mend: str = CHOOSE_ANOTHER
+    before: Mapping[str, Any],
+    now: Mapping[str, Any],
+    where: Path,
+    what: str,
+    mend: str = CHOOSE_ANOTHER,
+    defaults: Mapping[str, Any] | None = None,
 ) -> None:
     """Refuse a folder whose contents were made with another recipe.
 
@@ -43,11 +51,13 @@ def require_same(
         where: the folder or file.
         what: what is there, such as "a dataset".
         mend: what the user can do.
+        defaults: values of keys that an older program did not write, as `tron.cli.recipes.model_defaults`
+            gives them.
 
     Raises:
         TronError: the recipes differ; it names the first key.
     """
-    difference = first_difference(before, now)
+    difference = first_difference(before, now, defaults)
     if difference is not None:
         raise TronError(f"output_dir holds {what} made with {difference}", where, mend)
 
@@ -69,6 +79,19 @@ def read_recipe(path: Path) -> dict[str, Any] | None:
     if not isinstance(recipe, dict):
         raise TronError(f"{path.name} is damaged: it holds no settings", path, CHOOSE_ANOTHER)
     return recipe
+
+
+def _completed(
+    before: Mapping[str, Any], now: Mapping[str, Any], defaults: Mapping[str, Any]
+) -> dict[str, Any]:
+    """`before` with the defaults of what only `now` has, at every depth that all three reach."""
+    completed = dict(before)
+    for key in now.keys() & defaults.keys():
+        if key not in before:
+            completed[key] = defaults[key]
+        elif all(isinstance(each[key], Mapping) for each in (before, now, defaults)):
+            completed[key] = _completed(before[key], now[key], defaults[key])
+    return completed
 
 
 def _shown(value: Any) -> str:

@@ -212,5 +212,5 @@ def _normalized(features: torch.Tensor) -> torch.Tensor:
 def _linear_weights() -> Path:
     spec = importlib.util.find_spec("torchmetrics")
     if spec is None or spec.origin is None:
-        raise TronError("LPIPS needs torchmetrics", mend="install it: uv pip install torchmetrics")
+        raise TronError("LPIPS needs torchmetrics", mend="pip install 'tron-relight[train]'")
     return Path(spec.origin).parent / "functional" / "image" / "lpips_models" / "vgg.pth"

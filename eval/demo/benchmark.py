@@ -20,10 +20,16 @@ from tron.shards.manifest import Manifest
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 WORDS = {
-    "datagen": "path-trace scenes, make surfels, render pbr and irradiance",
-    "train": "train the neural renderer and, at the same time, the pixel MLP",
+    "datagen": "path-trace scenes, make surfels, render pbr, irradiance and lit",
+    "train": "train the neural renderer and, at the same time, one of two buffers and the pixel MLP",
     "eval": "fit the baselines, score every held-out frame",
 }
+TRAININGS = {
+    "tiny": ["renderer=tiny"],
+    "tiny_of_two": ["renderer=tiny", "renderer.config.guidance=[pbr,irradiance]"],
+    "pixel_mlp": ["renderer=pixel_mlp"],
+}
+"""Networks that train side by side: own arguments of tron-train."""
 
 
 class Demo(Benchmark):
@@ -34,12 +40,12 @@ class Demo(Benchmark):
     relighting: Relighting = Field(description="settings of the evaluation; its inputs are filled in")
     datagen: list[str] = Field(default=["experiment=demo"], description="arguments of tron-datagen")
     train: list[str] = Field(
-        default=["experiment=demo"], description="arguments of tron-train, for both networks"
+        default=["experiment=demo"], description="arguments of tron-train, for all networks"
     )
     max_seconds: PositiveFloat | None = Field(
         default=None, description="wall time of each training; null leaves it to the training recipe"
     )
-    train_threads: PositiveInt = Field(default=1, description="threads of each of the two trainings")
+    train_threads: PositiveInt = Field(default=1, description="threads of each of the three trainings")
 
     def bounds(self) -> list[Target]:
         """The evaluation's targets, then the demo's own."""
@@ -60,13 +66,13 @@ class Demo(Benchmark):
         folder = output_dir.absolute()
         stages, dataset = Stages(folder), folder / "dataset"
         stages.run("datagen", [Child("datagen", "tron-datagen", [*self.datagen, f"output_dir={dataset}"])])
-        networks = {name: folder / "train" / name for name in ("tiny", "pixel_mlp")}
-        stages.run("train", [self._training(name, dataset, place) for name, place in networks.items()])
+        stages.run("train", [self._training(name, dataset, folder / "train" / name) for name in TRAININGS])
+        weights = {name: folder / "train" / name / "renderer.safetensors" for name in TRAININGS}
         evaluation = self.relighting.model_copy(
             update={
                 "dataset": dataset,
-                "renderer": networks["tiny"] / "renderer.safetensors",
-                "pixel_mlp": networks["pixel_mlp"] / "renderer.safetensors",
+                "renderer": (weights["tiny"], weights["tiny_of_two"]),
+                "pixel_mlp": weights["pixel_mlp"],
             }
         )
         stages.restart("eval")  # never stale: it costs a minute and shows the code as it is now
@@ -94,7 +100,7 @@ class Demo(Benchmark):
         )
 
     def _training(self, name: str, dataset: Path, folder: Path) -> Child:
-        arguments = [*self.train, f"renderer={name}", f"dataset={dataset}", f"output_dir={folder}"]
+        arguments = [*self.train, *TRAININGS[name], f"dataset={dataset}", f"output_dir={folder}"]
         if self.max_seconds is not None:
             arguments.append(f"max_seconds={self.max_seconds:g}")
         threads = {variable: str(self.train_threads) for variable in ONE_THREAD}

@@ -11,10 +11,17 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 - ``shadowed``: base color (1 - metallic) E + split-sum specular, stored with the data.
 - ``affine``: w0 + w1 D(B) + w2 D(E), clipped to [0, 1]; weights of their own for each output channel.
 - ``affine_ratio``: the same with D(B E / E0) as a third input.
-- ``pixel_mlp``: 1x1 convolutions on D(B) and D(E), trained on the same data for the same time.
+- ``lit``: D(L), L being shadowed and the light that bounced between the surfels.
+- ``affine_lit``: affine_ratio with D(L) as a fourth input.
+- ``pixel_mlp``, ``pixel_mlp_lit``: 1x1 convolutions on D(B) and D(E), or on these and D(L).
+
+Baselines whose name says lit use bounced light, the others light that comes straight from the environment.
+``lit.supersampled`` and ``lit.reflections`` are ``lit`` at a higher price a frame: on 2 x 2 sub-pixels, and
+with rays to what surfaces mirror besides. Networks and blends are not given them, so they are no baselines;
+their rows say how far the picture without a network goes.
 
 Blends and s are fitted on the foreground of training data (:mod:`eval.relighting.fits`). A blend of surfaces
-is wrong for the sky, which both buffers show as it is. On full frames the blends and ``pixel_mlp`` are
+is wrong for the sky, which all buffers show as it is. On full frames blends and pixel networks are
 therefore laid over pbr, whose sky is the displayed environment: o x blend + (1 - o) D(B). The other methods
 show the environment by themselves.
 
@@ -55,13 +62,18 @@ def shadow_ratio(buffers: Buffers) -> np.ndarray:
 
 
 def show_pbr(buffers: Buffers) -> np.ndarray:
-    """D(B), (..., 3) in [0, 1]; so the next two."""
+    """D(B), (..., 3) in [0, 1]; so the next ones."""
     return buffers.displayed("pbr")
 
 
 def show_irradiance(buffers: Buffers) -> np.ndarray:
     """D(E)."""
     return buffers.displayed("irradiance")
+
+
+def show_lit(buffers: Buffers) -> np.ndarray:
+    """D(L)."""
+    return buffers.displayed("lit")
 
 
 def show_shadow_ratio(buffers: Buffers) -> np.ndarray:
@@ -84,6 +96,10 @@ class Method:
     what: str
 
 
+SIMPLE, DIRECT, ON_LIT = "best_simple_baseline", "best_direct_baseline", "best_fit_on_lit"
+"""Groups of baselines: simple ones; those of direct light alone; those that fit what lit lacks."""
+
+
 @dataclass(frozen=True)
 class Baseline(Method):
     """A method that the neural renderer is held against.
@@ -92,25 +108,32 @@ class Baseline(Method):
         show: the method; None where it is fitted, or a network whose weights are given.
         fit: starts a fit of the method on training data.
         surfaces: knows surfaces alone, and is laid over pbr on full frames.
-        simple: belongs to the simple baselines, over the best of which a gain is reported.
+        groups: over the best of each of which gains are reported, beside the best of all baselines.
+        optional: the best of a group is known without it.
         pictured: stands among the pictures of the report.
+        needs: member of reference clips that it shows.
     """
 
     show: Show | None = None
     fit: Callable[[], Fit] | None = None
     surfaces: bool = False
-    simple: bool = False
+    groups: tuple[str, ...] = ()
+    optional: bool = False
     pictured: bool = True
+    needs: str | None = None
 
 
-NEURAL = Method("neural", "neural renderer", "a small transformer over pbr and irradiance")
+NEURAL_LIT = Method("neural_lit", "neural renderer", "a small transformer that adds to lit what is missing")
+NEURAL = Method("neural", "neural renderer of two buffers", "the same of pbr and irradiance alone")
+NETWORKS = (NEURAL_LIT, NEURAL)
 BASELINES = (
-    Baseline("pbr", "pbr", "split-sum shading of the surfels, no shadows", show_pbr, simple=True),
+    Baseline("pbr", "pbr", "split-sum shading of the surfels, no shadows", show_pbr, groups=(SIMPLE, DIRECT)),
     Baseline(
         "pbr_x_irradiance",
         "pbr × irradiance",
         "pbr times irradiance times one fitted number",
         fit=ProductFit,
+        groups=(DIRECT,),
         pictured=False,
     ),
     Baseline(
@@ -118,13 +141,14 @@ BASELINES = (
         "shadow ratio",
         "pbr times the share of light that arrives",
         show_shadow_ratio,
-        simple=True,
+        groups=(SIMPLE, DIRECT),
     ),
     Baseline(
         "shadowed",
         "shadowed shading",
         "shadowed diffuse light plus split-sum specular",
         lambda buffers: buffers.displayed("shadowed"),
+        groups=(DIRECT,),
         pictured=False,
     ),
     Baseline(
@@ -133,7 +157,7 @@ BASELINES = (
         "fitted blend of pbr, irradiance and a constant",
         fit=lambda: AffineFit(show_pbr, show_irradiance),
         surfaces=True,
-        simple=True,
+        groups=(SIMPLE, DIRECT),
         pictured=False,
     ),
     Baseline(
@@ -142,15 +166,58 @@ BASELINES = (
         "fitted blend of pbr, irradiance, shadow ratio and a constant",
         fit=lambda: AffineFit(show_pbr, show_irradiance, show_shadow_ratio),
         surfaces=True,
+        groups=(DIRECT,),
     ),
     Baseline(
         "pixel_mlp",
-        "per-pixel network",
-        "a network that sees one pixel at a time, trained for the same time",
+        "per-pixel network of two buffers",
+        "a network that sees pbr and irradiance of one pixel at a time",
         surfaces=True,
+        groups=(DIRECT,),
+        optional=True,
+        pictured=False,
+    ),
+    Baseline(
+        "lit",
+        "lit",
+        "shadowed shading and light that bounced between the surfels",
+        show_lit,
+    ),
+    Baseline(
+        "affine_lit",
+        "affine blend with lit",
+        "fitted blend of pbr, irradiance, shadow ratio, lit and a constant",
+        fit=lambda: AffineFit(show_pbr, show_irradiance, show_shadow_ratio, show_lit),
+        surfaces=True,
+        groups=(ON_LIT,),
+        pictured=False,
+    ),
+    Baseline(
+        "pixel_mlp_lit",
+        "per-pixel network",
+        "a network that sees all buffers of one pixel at a time",
+        surfaces=True,
+        groups=(ON_LIT,),
     ),
 )
-METHODS: tuple[Method, ...] = (NEURAL, *BASELINES)
+FINER = (
+    Baseline(
+        "lit.supersampled",
+        "lit, 2 × 2 sub-pixels",
+        "four times the pixels, a quarter of the rays each",
+        lambda buffers: buffers.displayed("lit_supersampled"),
+        needs="lit_supersampled",
+    ),
+    Baseline(
+        "lit.reflections",
+        "lit, 2 × 2 sub-pixels, reflections",
+        "the same with rays to what surfaces mirror",
+        lambda buffers: buffers.displayed("lit_reflections"),
+        needs="lit_reflections",
+    ),
+)
+"""``lit`` at a higher price a frame, in clips with reference members."""
+METHODS: tuple[Method, ...] = (*NETWORKS, *BASELINES, *FINER)
 
 
 def fit_baselines(clips: Iterable[Clip], seed: int) -> dict[str, Fitted]:
@@ -184,7 +251,7 @@ def fit_baselines(clips: Iterable[Clip], seed: int) -> dict[str, Fitted]:
 
 
 def predictions(clip: Clip, methods: Mapping[str, Show]) -> dict[Region, dict[str, np.ndarray]]:
-    """Pictures of a clip by every baseline that needs no fit and by the ``methods`` given.
+    """Pictures of a clip by every method that needs neither fit nor weights and by the ``methods`` given.
 
     Args:
         clip: with the members MEMBERS.
@@ -195,7 +262,11 @@ def predictions(clip: Clip, methods: Mapping[str, Show]) -> dict[Region, dict[st
         of ``surfaces``, which full frames show over the environment.
     """
     buffers = Buffers.of(clip)
-    plain = {baseline.name: baseline.show for baseline in BASELINES if baseline.show}
+    plain = {
+        each.name: each.show
+        for each in (*BASELINES, *FINER)
+        if each.show and (each.needs is None or each.needs in clip.frames)
+    }
     foreground = {name: show(buffers) for name, show in {**plain, **methods}.items()}
     surfaces = {baseline.name for baseline in BASELINES if baseline.surfaces}
     opacity, pbr = buffers["mask"], buffers.displayed("pbr")

@@ -5,19 +5,19 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from eval.benchmark import Benchmark
 from eval.relighting import page
-from eval.relighting.baselines import NEURAL, fit_baselines, predictions
-from eval.relighting.buffers import MEMBERS
+from eval.relighting.baselines import BASELINES, fit_baselines, predictions
+from eval.relighting.buffers import MEMBERS, Buffers
 from eval.relighting.fits import Show
 from eval.relighting.gallery import Example, middle_frame
 from eval.relighting.guidance import GuidanceScores
-from eval.relighting.measured import Measured
+from eval.relighting.measured import Judged, Measured
 from eval.relighting.scores import Scores, Where
 from eval.report.charts import training_curves
 from eval.report.outcome import Outcome
@@ -30,8 +30,7 @@ from tron.storage import sha256
 
 log = logging.getLogger("tron.eval")
 
-SETTINGS = {"neural": "renderer", "pixel_mlp": "pixel_mlp"}
-"""Network -> the setting that names its weights."""
+Weights = Path | Annotated[tuple[Path, ...], Field(min_length=1)]
 
 
 class Relighting(Benchmark):
@@ -40,8 +39,16 @@ class Relighting(Benchmark):
     name: ClassVar[str] = "relighting"
 
     dataset: Path | None = Field(description="folder that tron-datagen wrote")
-    renderer: Path | None = Field(default=None, description="weights of the neural renderer, .safetensors")
-    pixel_mlp: Path | None = Field(default=None, description="weights of the pixel MLP baseline")
+    renderer: Weights | None = Field(
+        default=None,
+        description="weights of the neural renderer, .safetensors; of two, [a,b], one sees lit, one does not",
+    )
+    pixel_mlp: Weights | None = Field(default=None, description="weights of the pixel MLP baseline, likewise")
+    ood: Path | None = Field(
+        default=None,
+        description="data set of another kind (tron-datagen experiment=models): its test split gives rows "
+        "that end in .ood, by the same weights and fits",
+    )
     vae: Path | None = Field(default=None, description="the WAN 2.1 VAE, where the renderer's codec needs it")
     train_splits: list[str] = Field(
         default=["train"], description="splits that the fitted baselines see", min_length=1
@@ -52,11 +59,13 @@ class Relighting(Benchmark):
     seed: int = 0
 
     def check(self) -> None:
-        """Find the data set, its splits and the weights; TronError names what is missing."""
+        """Find the data sets, their splits and the weights; TronError names what is missing."""
         manifest = Manifest.load(self._dataset())
         for split in (self.test_split, *self.train_splits):
             manifest.of_split(split)
-        for path in (self.renderer, self.pixel_mlp, self.vae):
+        if self.ood is not None:
+            Manifest.load(self.ood).of_split(self.test_split)
+        for path in (*(path for _, path in self._weights()), self.vae):
             if path is not None and not path.exists():
                 raise TronError("weights not found", path, "give what tron-train wrote")
 
@@ -65,27 +74,27 @@ class Relighting(Benchmark):
         self.check()
         dataset = self._dataset()
         set_torch_threads(self.threads)
-        for name in SETTINGS.keys() - self._weights():
-            log.warning("no weights for %s: its rows will be absent", name)
-        networks = {name: load_network(path, self.vae) for name, path in self._weights().items()}
+        for setting in ("renderer", "pixel_mlp"):
+            if getattr(self, setting) is None:
+                log.warning("no %s given: its rows will be absent", setting)
+        networks = self._networks()
         log.info("fitting the baselines on %s", ", ".join(self.train_splits))
         fitted = fit_baselines(self._training_clips(), self.seed)
-        methods = {name: each.show for name, each in fitted.items()} | networks
-        scores, guidance, clips = Scores(), GuidanceScores(), []
-        for clip in read_clips(dataset, self.test_split):
-            scores.add(clip, predictions(clip, methods), clip.displayed("rgb"))
-            guidance.add(clip)
-            clips.append(clip.meta)
-            log.info("scored clip %s (%s, %s)", clip.meta.key, clip.meta.light, clip.meta.light_family)
-        rows = [*scores.rows(self.seed), *guidance.rows(self.seed)]
+        methods = {name: each.show for name, each in fitted.items()}
+        methods |= {name: network.show for name, network in networks.items()}
+        guidance = GuidanceScores()
+        judged = self._judged(dataset, methods, Scores(), guidance)
+        rows = [*judged.scores.rows(self.seed), *guidance.rows(self.seed)]
+        ood = None if self.ood is None else self._judged(self.ood, methods, Scores(tail=".ood"))
+        if ood is not None:
+            rows += ood.scores.rows(self.seed)
         measured = Measured(
-            scores=scores,
+            judged=judged,
+            ood=ood,
             guidance=guidance,
             rows={row.metric: row for row in rows},
-            clips=clips,
-            examples=self._examples(methods, choose_clips(scores, self.pictures)),
             curves=training_curves(
-                {name: path.parent / "metrics.csv" for name, path in self._weights().items()}
+                {name: network.path.parent / "metrics.csv" for name, network in networks.items()}
             ),
         )
         manifest = Manifest.load(dataset)
@@ -93,8 +102,10 @@ class Relighting(Benchmark):
             "dataset_config_sha256": manifest.config_sha256,
             "clips": {entry: sum(s.samples for s in manifest.of_split(entry)) for entry in manifest.splits()},
             "fitted_weights": {name: each.weights.round(4).tolist() for name, each in fitted.items()},
-            **{f"{SETTINGS[name]}_sha256": sha256(path) for name, path in self._weights().items()},
+            **{f"{name}_sha256": sha256(network.path) for name, network in networks.items()},
         }
+        if self.ood is not None:
+            inputs["ood_config_sha256"] = Manifest.load(self.ood).config_sha256
         return Outcome(
             rows=rows,
             title="Relighting held-out scenes under held-out lights",
@@ -106,6 +117,24 @@ class Relighting(Benchmark):
             inputs=inputs,
         )
 
+    def _judged(
+        self,
+        dataset: Path,
+        methods: Mapping[str, Show],
+        scores: Scores,
+        guidance: GuidanceScores | None = None,
+    ) -> Judged:
+        """Every method on the test split of a data set, and pictures of some clips of it."""
+        clips = []
+        for clip in read_clips(dataset, self.test_split):
+            scores.add(clip, predictions(clip, methods), clip.displayed("rgb"))
+            if guidance is not None:
+                guidance.add(clip)
+            clips.append(clip.meta)
+            log.info("scored clip %s (%s, %s)", clip.meta.key, clip.meta.light, clip.meta.light_family)
+        examples = self._examples(dataset, methods, choose_clips(scores, self.pictures))
+        return Judged(scores, clips, examples)
+
     def _dataset(self) -> Path:
         if self.dataset is None:
             raise TronError("no data set to evaluate on", mend="give dataset=DIR, made by tron-datagen")
@@ -115,29 +144,58 @@ class Relighting(Benchmark):
         for split in self.train_splits:
             yield from read_clips(self._dataset(), split, MEMBERS)
 
-    def _weights(self) -> dict[str, Path]:
-        """Network -> the file of its weights, of those that were given."""
-        return {name: path for name, key in SETTINGS.items() if (path := getattr(self, key)) is not None}
+    def _weights(self) -> Iterator[tuple[str, Path]]:
+        """Kind of network and file of all weights that were given."""
+        for kind, given in (("neural", self.renderer), ("pixel_mlp", self.pixel_mlp)):
+            for path in [given] if isinstance(given, Path) else given or ():
+                yield kind, path
+
+    def _networks(self) -> dict[str, Network]:
+        """Method -> the network; TronError where two are the same method."""
+        networks: dict[str, Network] = {}
+        for kind, path in self._weights():
+            network = load_network(path, self.vae)
+            name = f"{kind}_lit" if network.sees_lit else kind
+            if name in networks:
+                raise TronError(
+                    f"two weights of {name}, the other is {networks[name].path}", path, "give one of them"
+                )
+            networks[name] = network
+        return networks
 
     def _typed(self, output_dir: Path) -> str:
-        inputs = {"dataset": self.dataset, "renderer": self.renderer, "pixel_mlp": self.pixel_mlp}
-        given = [f"{name}={path}" for name, path in inputs.items() if path is not None]
+        inputs = {name: getattr(self, name) for name in ("dataset", "renderer", "pixel_mlp")}
+        given = [f"{name}={_typed_value(value)}" for name, value in inputs.items() if value is not None]
+        if self.ood is not None:
+            given.append(f"benchmark.ood={self.ood}")
         return " \\\n    ".join(["tron-eval benchmark=relighting", *given, f"output_dir={output_dir}"])
 
-    def _examples(self, methods: Mapping[str, Show], keys: list[str]) -> list[Example]:
+    def _examples(self, dataset: Path, methods: Mapping[str, Show], keys: list[str]) -> list[Example]:
         """The middle frames of the chosen clips by every method, in that order: a second pass."""
         if not keys:
             return []
         examples = {
             clip.meta.key: middle_frame(clip, predictions(clip, methods)["frame"], clip.displayed("rgb"))
-            for clip in read_clips(self._dataset(), self.test_split)
+            for clip in read_clips(dataset, self.test_split)
             if clip.meta.key in keys
         }
         return [examples[key] for key in keys]
 
 
-def load_network(path: Path, vae: Path | None = None) -> Show:
-    """Weights on disk -> a method; torch is imported here and not before.
+def _typed_value(value: Any) -> str:
+    return f"[{','.join(map(str, value))}]" if isinstance(value, tuple) else str(value)
+
+
+class Network(NamedTuple):
+    """A network as a method, the file of its weights, and whether lit is among its guidance."""
+
+    show: Show
+    path: Path
+    sees_lit: bool
+
+
+def load_network(path: Path, vae: Path | None = None) -> Network:
+    """Weights on disk -> the network; torch is imported here and not before.
 
     Raises:
         TronError: the file is missing or holds no renderer.
@@ -147,20 +205,25 @@ def load_network(path: Path, vae: Path | None = None) -> Show:
 
     renderer = load_renderer(path, vae)
     guidance = renderer.config.guidance
-    return lambda buffers: render_clip(renderer, {name: buffers.displayed(name) for name in guidance})
+
+    def show(buffers: Buffers) -> np.ndarray:
+        return render_clip(renderer, {each: buffers.displayed(each) for each in guidance})
+
+    return Network(show, path, "lit" in guidance)
 
 
 def choose_clips(scores: Scores, count: int) -> list[str]:
     """Clips to show: evenly spaced in the ranking by gain, so that the worst and the best are among them.
 
-    The gain is neural PSNR minus that of the best of the baselines that were scored, foreground; without a
-    neural renderer the clips are ranked by the PSNR of pbr.
+    The gain is the network's PSNR minus that of the best of the baselines that were scored, foreground;
+    without a network the clips are ranked by the PSNR of lit.
     """
-    baselines = [method.name for method in scores.methods if method is not NEURAL]
+    baselines = [method.name for method in scores.methods if method in BASELINES]
 
     def rank(key: str) -> float:
-        of_clip = Where(clip=key)
-        found = (scores.gain(baselines, of_clip), scores.psnr("pbr", of_clip))
+        of_clip, network = Where(clip=key), scores.network
+        gain = None if network is None else scores.gain(network.name, baselines, of_clip)
+        found = (gain, scores.psnr("lit", of_clip), scores.psnr("pbr", of_clip))
         return next((figure for figure in found if figure is not None), -np.inf)
 
     ordered = sorted(scores.clips, key=rank)

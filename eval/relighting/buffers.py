@@ -9,13 +9,11 @@ from typing import Any, Literal
 import numpy as np
 
 from tron.color import to_display
-from tron.shards.schema import GUIDANCE, Clip
+from tron.shards.schema import TARGET, Clip, light_members
 
 Region = Literal["foreground", "frame"]
 REGIONS: tuple[Region, Region] = ("foreground", "frame")
-MEMBERS = tuple(
-    dict.fromkeys((*GUIDANCE, "pbr", "irradiance", "rgb", "unshadowed", "shadowed", "mask", "foreground"))
-)
+MEMBERS = (*light_members(), TARGET, "mask", "foreground")
 """Members of a clip that predictions and their scores need."""
 
 

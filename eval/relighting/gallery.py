@@ -6,7 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eval.relighting.baselines import BASELINES, NEURAL
+from eval.relighting.baselines import (
+    BASELINES,
+    DIRECT,
+    FINER,
+    NETWORKS,
+    NEURAL,
+    NEURAL_LIT,
+    ON_LIT,
+    Method,
+)
 from eval.relighting.shadows import frame_shadow_pixels, same_depth
 from eval.report.page import Picture, Pictures
 from tron import metrics
@@ -14,8 +23,16 @@ from tron.color import linear_to_srgb, luminance, to_display
 from tron.shards.schema import Clip, ClipMeta
 
 ERROR_GAIN = 3
-PICTURED = [baseline for baseline in BASELINES if baseline.pictured]
-
+LIT = next(baseline for baseline in BASELINES if baseline.name == "lit")
+PICTURED: list[Method] = [
+    *(each for each in BASELINES if each.pictured and DIRECT in each.groups),
+    NEURAL,
+    *(each for each in BASELINES if each.pictured and ON_LIT in each.groups),
+    FINER[-1],
+    LIT,
+    NEURAL_LIT,
+]
+"""Methods among the pictures, from the left; lit and the network that starts from it come last."""
 
 IRRADIANCE = "light arriving at each surface, with shadows, as a white surface would show it"
 
@@ -95,20 +112,28 @@ def _shadow_errors(frame: dict[str, np.ndarray], truth: np.ndarray) -> np.ndarra
 
 
 def comparison(example: Example) -> Pictures:
-    """The guidance, baselines and the neural renderer beside the truth, and the last one's error."""
+    """The guidance and the methods beside the truth, and the errors of lit and of the network."""
     where = f"scene {example.meta.scene} under light {example.meta.light}"
-    pictures = [Picture(example.irradiance, "irradiance", f"{IRRADIANCE}, {where}")]
-    chosen = [method for method in (*PICTURED, NEURAL) if method.name in example.methods]
-    for method in chosen:
+    shown = [method for method in PICTURED if method.name in example.methods]
+    network = next((method for method in NETWORKS if method in shown), None)
+    shown.sort(key=lambda method: method is network)
+    judged = shown[-1]
+
+    def picture(method: Method) -> Picture:
         image, figure = example.methods[method.name], f"{example.psnr[method.name]:.1f} dB"
-        picture = Picture(image, method.title, f"{method.what}, {where}", figure, strong=method is NEURAL)
-        pictures.insert(0 if method.name == "pbr" else len(pictures), picture)
-    pictures.append(Picture(example.truth, "path-traced truth", f"path-traced ground truth, {where}"))
-    judged = chosen[-1] if NEURAL in chosen else chosen[0]
-    error = np.clip(np.abs(example.methods[judged.name] - example.truth) * ERROR_GAIN, 0, 1)
-    title = f"|{judged.title} − truth| ×{ERROR_GAIN}"
-    alt = f"absolute error of the {judged.title} times {ERROR_GAIN}, {where}"
-    return Pictures(example.title, [*pictures, Picture(error, title, alt)])
+        return Picture(image, method.title, f"{method.what}, {where}", figure, strong=method is judged)
+
+    def error(method: Method) -> Picture:
+        image = np.clip(np.abs(example.methods[method.name] - example.truth) * ERROR_GAIN, 0, 1)
+        alt = f"absolute error of the {method.title} times {ERROR_GAIN}, {where}"
+        return Picture(image, f"|{method.title} − truth| ×{ERROR_GAIN}", alt)
+
+    pictures = [picture(method) for method in shown]
+    pictures.insert(1, Picture(example.irradiance, "irradiance", f"{IRRADIANCE}, {where}"))
+    if judged in NETWORKS and LIT in shown:
+        pictures.insert(shown.index(LIT) + 1, error(LIT))
+    truth = Picture(example.truth, "path-traced truth", f"path-traced ground truth, {where}")
+    return Pictures(example.title, [*pictures, truth, error(judged)])
 
 
 def guidance(example: Example) -> Pictures:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from eval.relighting.baselines import BASELINES, METHODS, NEURAL
+from eval.relighting.baselines import BASELINES, DIRECT, METHODS, NETWORKS, NEURAL, ON_LIT, SIMPLE
 from eval.relighting.buffers import Region
 from eval.relighting.gallery import comparison, guidance
-from eval.relighting.measured import Measured
+from eval.relighting.measured import Judged, Measured
 from eval.relighting.scores import GROUPS, METRICS, REGIONS, Where
 from eval.relighting.shadows import (
     DARKENED_BELOW,
@@ -20,18 +20,29 @@ from eval.relighting.shadows import (
 )
 from eval.report.figures import MINUS, row_cell, with_interval
 from eval.report.intervals import interval_note
-from eval.report.page import Block, Cell, Section, Table, Text
+from eval.report.page import Block, Cell, Pictures, Section, Table, Text
 from eval.report.strips import write_strips
 from eval.results import Row
 
 TITLES = {method.name: method.title for method in METHODS}
-SIMPLE = ", ".join(TITLES[name] for name in GROUPS["best_simple_baseline"])
+SIMPLE_TITLES = ", ".join(TITLES[name] for name in GROUPS[SIMPLE])
+GROUP_WORDS = {
+    SIMPLE: "best simple baseline",
+    DIRECT: "best baseline of direct light",
+    ON_LIT: "best fit on lit",
+    "best_baseline": "best of all baselines",
+}
 REGION_WORDS: dict[Region, str] = {"foreground": "foreground", "frame": "full frame"}
 HEADLINE = {
-    "neural.psnr": "Neural renderer, foreground PSNR",
-    "neural.gain_over_best_simple_baseline": f"Gain over the best simple baseline ({SIMPLE})",
-    "neural.gain_over_best_baseline": f"Gain over the best of all {len(BASELINES)} baselines",
-    "neural.psnr_full": "Neural renderer, full-frame PSNR",
+    "neural_lit.psnr": "Neural renderer, foreground PSNR",
+    "neural_lit.gain_over_lit": "Gain over lit, the picture without a network",
+    "neural_lit.gain_over_best_fit_on_lit": "Gain over the best fit on lit",
+    "lit.psnr": "lit: no network, one ray a pixel",
+    "lit.reflections.psnr": "lit with 2 × 2 sub-pixels and reflections",
+    "neural.psnr": "Neural renderer of two buffers (the paper's)",
+    "neural.gain_over_best_direct_baseline": "Its gain over the best baseline of direct light",
+    "lit.gain_over_shadowed.ood": "Gain of lit over shadowed shading, real models",
+    "neural_lit.gain_over_best_baseline.ood": "Gain of the neural renderer, real models",
     "guidance.irradiance_psnr": "Irradiance against path tracing, worst kind of light",
     "guidance.shadow_leak": "Shadow pixels of the surfels that leak light",
     "surfels.base_color_psnr": "Base color of the surfels",
@@ -39,12 +50,14 @@ HEADLINE = {
 }
 LEAD = (
     "TRON relights captured 3D worlds. A scene becomes a cloud of small flat disks (surfels) with "
-    "materials; under a new light, a ray tracer turns them into two quick pictures: pbr, shading without "
-    "shadows, and irradiance, the light that arrives at each surface. A neural renderer turns the two into"
-    " a photograph-like image.",
-    "This page measures that last step on scenes and lights that were not trained on, against a path "
-    f"tracer's ground truth and against {len(BASELINES)} simpler ways of using the same two pictures, the "
-    "baselines.",
+    "materials; under a new light, a ray tracer turns them into quick pictures: pbr, shading without "
+    "shadows; irradiance, the light that arrives straight from the environment at each surface; and lit, "
+    "the whole picture with shadows and light that bounced between the surfels. A neural renderer adds to "
+    "lit what it still lacks.",
+    "This page measures lit and that last step on scenes and lights that were not trained on, against a "
+    f"path tracer's ground truth and against {len(BASELINES)} simpler ways of using the same pictures, the "
+    "baselines, of which lit by itself is one. A renderer of two buffers sees pbr and irradiance alone, as "
+    "the paper's does.",
 )
 PAIRED = (
     "A gain's interval is that of the differences on the same frames, not the difference of two intervals. "
@@ -67,19 +80,21 @@ SURFEL_ROWS = {
 
 def sections(measured: Measured, pictures: Path) -> list[Section]:
     """The body of the page; its pictures are also written as files into the folder ``pictures``."""
+    judged = measured.judged
     found = [
         Section("results", "Every method, every held-out frame", _methods(measured)),
         Section("lights", "By kind of light", [_families(measured)]),
     ]
-    if measured.examples:
-        comparisons = [comparison(example) for example in measured.examples]
-        write_strips(comparisons, [example.meta.key for example in measured.examples], pictures)
+    if judged.examples:
         intro = Text(
             "Middle frames of held-out clips, evenly spaced in the ranking by gain: the first is the clip "
             "on which the network gains least, the last the one on which it gains most. Decibels are of the"
             " picture shown, on the foreground; higher is better, and 1 dB is easy to see side by side."
         )
-        found.append(Section("pictures", "Held-out scenes under held-out lights", [intro, *comparisons]))
+        title = "Held-out scenes under held-out lights"
+        found.append(Section("pictures", title, [intro, *_pictures(judged, pictures, "")]))
+    if measured.ood is not None:
+        found.append(_ood_section(measured, measured.ood, pictures))
     found += _guidance_section(measured, pictures)
     if measured.curves:
         found.append(Section("training", "How the training went", measured.curves))
@@ -88,61 +103,92 @@ def sections(measured: Measured, pictures: Path) -> list[Section]:
 
 def verdict(measured: Measured) -> str:
     """The finding in one sentence."""
-    frames, scenes, lights = measured.count()
+    scores, rows = measured.judged.scores, measured.rows
+    frames, scenes, lights = measured.judged.count()
     text = f"On {frames} held-out frames ({scenes} scenes, {lights} lights)"
-    neural, pbr = (measured.rows.get(f"{name}.psnr") for name in ("neural", "pbr"))
-    if neural is None:
-        alone = f" pbr alone reaches {with_interval(pbr)}; no neural renderer was given" if pbr else ""
-        return f"{text}{alone}."
-    text += f" the neural renderer reaches {with_interval(neural)} on the foreground"
-    best = measured.scores.best(GROUPS["best_baseline"])
-    for group, words in (
-        ("best_simple_baseline", f"the best simple baseline ({SIMPLE})"),
+    if lit := rows.get("lit.psnr"):
+        text += f" lit reaches {with_interval(lit)} on the foreground without a network"
+    network = scores.network
+    if network is None:
+        return f"{text}; no neural renderer was given."
+    text += f", the {network.title} {with_interval(rows[f'{network.name}.psnr'])}"
+    best = scores.best(GROUPS["best_baseline"])
+    for rival, words in (
+        ("lit", "lit"),
         ("best_baseline", f"the best of all {len(BASELINES)} baselines ({TITLES.get(best or '')})"),
     ):
-        if gain := measured.rows.get(f"neural.gain_over_{group}"):
+        if gain := rows.get(f"{network.name}.gain_over_{rival}"):
             text += f", {with_interval(gain, signed=True)} over {words}"
+    if network is not NEURAL and (two := rows.get(f"{NEURAL.name}.psnr")):
+        text += f"; the {NEURAL.title} reaches {with_interval(two)}"
     return text + "."
 
 
+def _pictures(judged: Judged, folder: Path, prefix: str) -> list[Pictures]:
+    comparisons = [comparison(example) for example in judged.examples]
+    write_strips(comparisons, [f"{prefix}{example.meta.key}" for example in judged.examples], folder)
+    return comparisons
+
+
+def _table(measured: Measured, judged: Judged, where: Where) -> Table:
+    """Every method with its metrics, and what the network gains over it."""
+    scores, tail = judged.scores, f"{where.tail}{judged.scores.tail}"
+    network = scores.network
+
+    def gain(rival: str) -> Cell:
+        name = f"{network.name}.gain_over_{rival}{tail}" if network else ""
+        return _gain_cell(measured.rows.get(name))
+
+    rows: list[Sequence[Cell | str]] = []
+    for method in scores.methods:
+        tone = "strong" if method in NETWORKS else "plain"
+        names = [f"{method.name}.{metric.name}{tail}" for metric in METRICS]
+        figures = [row_cell(measured.rows.get(name), tone, unit=False) for name in names]
+        rows.append([Cell(method.title, tone), *figures, gain(method.name), Cell(method.what, "faint")])
+    for group, names in GROUPS.items():
+        best = scores.best(names, where)
+        if best is not None:
+            psnr = Cell(f"{scores.psnr(best, where):.2f}", "strong")
+            blank = [""] * (len(METRICS) - 1)
+            rows.append([Cell(GROUP_WORDS[group], "strong"), psnr, *blank, gain(group), TITLES[best]])
+    caption = (
+        f"{REGION_WORDS[where.region].capitalize()}: means over held-out frames, PSNR and gains in dB; "
+        "an arrow points to the better side."
+    )
+    headings = ["Method", *(metric.title for metric in METRICS), "neural renderer gains ↑", "What it is"]
+    return Table(caption, headings, rows, words=[len(headings) - 1])
+
+
 def _methods(measured: Measured) -> list[Block]:
-    tables = []
-    for where in map(Where, REGIONS):
-        rows: list[Sequence[Cell | str]] = []
-        for method in measured.scores.methods:
-            tone = "strong" if method is NEURAL else "plain"
-            names = [f"{method.name}.{metric.name}{where.tail}" for metric in METRICS]
-            figures = [row_cell(measured.rows.get(name), tone, unit=False) for name in names]
-            gain = _gain_cell(measured.rows.get(f"neural.gain_over_{method.name}{where.tail}"))
-            rows.append([Cell(method.title, tone), *figures, gain, Cell(method.what, "faint")])
-        for group, names in GROUPS.items():
-            best = measured.scores.best(names, where)
-            if best is not None:
-                psnr = Cell(f"{measured.scores.psnr(best, where):.2f}", "strong")
-                gain = _gain_cell(measured.rows.get(f"neural.gain_over_{group}{where.tail}"))
-                blank = [""] * (len(METRICS) - 1)
-                rows.append([Cell(group.replace("_", " "), "strong"), psnr, *blank, gain, TITLES[best]])
-        caption = (
-            f"{REGION_WORDS[where.region].capitalize()}: means over held-out frames, PSNR and gains in dB; "
-            "an arrow points to the better side."
-        )
-        headings = ["Method", *(metric.title for metric in METRICS), "neural renderer gains ↑", "What it is"]
-        tables.append(Table(caption, headings, rows, words=[len(headings) - 1]))
-    frames, scenes, _ = measured.count()
+    frames, scenes, _ = measured.judged.count()
     notes = (
         f"{' '.join(metric.what for metric in METRICS)} Each is taken of every displayed frame (exposure, "
         "then the AgX tone curve; peak 1) and averaged over frames. The gain is the neural renderer's "
         "mean PSNR minus the method's. Foreground is where a ray through the pixel's centre meets true "
-        f"geometry. Simple baselines: {SIMPLE}. Products are taken in linear light before the tone curve. "
-        "Blends and factors are fitted on the foreground of the training split in float64. On full frames "
-        "the blends and the per-pixel network are laid over pbr by the surfels' opacity, because a blend "
-        "that suits surfaces is wrong for the sky, which pbr shows as it is."
+        f"geometry. Simple baselines: {SIMPLE_TITLES}. Baselines of direct light do not see lit; fits on lit "
+        "are the blend and the per-pixel network that do. The forms of lit with sub-pixels and reflections "
+        "cost more a frame and are given to no network, so they count as no baselines. Products are taken in "
+        "linear light before the tone curve. Blends and factors are fitted on the foreground of the training "
+        "split in float64. On full frames the blends and per-pixel networks are laid over pbr by opacity, "
+        "because a blend that suits surfaces is wrong for the sky, which pbr shows as it is."
     )
     return [
-        *tables,
+        *(_table(measured, measured.judged, Where(region)) for region in REGIONS),
         Text(f"{interval_note(scenes, f'{frames} frames')} {PAIRED}"),
         Text(notes),
     ]
+
+
+def _ood_section(measured: Measured, ood: Judged, pictures: Path) -> Section:
+    """The same methods on data of another kind; nothing was trained or fitted on anything like it."""
+    frames, scenes, lights = ood.count()
+    intro = Text(
+        f"{frames} frames of {scenes} scenes under {lights} lights of another kind than the training data: "
+        "the same networks, and blends fitted on the same training split."
+    )
+    note = Text(interval_note(scenes, f"{frames} frames"))
+    blocks = [intro, _table(measured, ood, Where()), note, *_pictures(ood, pictures, "ood-")]
+    return Section("ood", "Out of distribution", blocks)
 
 
 def _gain_cell(row: Row | None) -> Cell:
@@ -155,17 +201,19 @@ def _gain_cell(row: Row | None) -> Cell:
 
 
 def _families(measured: Measured) -> Table:
-    families = measured.scores.families
+    scores = measured.judged.scores
+    families, network = scores.families, scores.network
     places = [Where(region, family) for region in REGIONS for family in families]
     rows: list[Sequence[Cell | str]] = []
-    for method in measured.scores.methods:
-        tone = "strong" if method is NEURAL else "plain"
+    for method in scores.methods:
+        tone = "strong" if method in NETWORKS else "plain"
         means = [measured.rows.get(f"{method.name}.psnr{where.tail}") for where in places]
         rows.append([Cell(method.title, tone), *(row_cell(mean, tone, unit=False) for mean in means)])
-    for group in GROUPS:
-        gains = [measured.rows.get(f"neural.gain_over_{group}{where.tail}") for where in places]
-        rows.append([f"gain over the {group.replace('_', ' ')}", *map(_gain_cell, gains)])
-    counts = {family: len(measured.scores.of("pbr", Where("frame", family))) for family in families}
+    name = network.name if network else ""
+    for group, words in GROUP_WORDS.items() if network else ():
+        gains = [measured.rows.get(f"{name}.gain_over_{group}{where.tail}") for where in places]
+        rows.append([f"gain over the {words}", *map(_gain_cell, gains)])
+    counts = {family: len(scores.of("pbr", Where("frame", family))) for family in families}
     frames = ", ".join(f"{family}: {count} frames" for family, count in counts.items())
     groups = [("", 1), *((REGION_WORDS[region], len(families)) for region in REGIONS)]
     return Table(f"PSNR in dB by kind of light ({frames}).", ["Method", *families, *families], rows, groups)
@@ -206,7 +254,7 @@ def _guidance_section(measured: Measured, pictures: Path) -> list[Section]:
     if surfels:
         headings = ["Figure", "Measured", "How"]
         blocks.append(Table("Surfels at held-out views.", headings, surfels, words=[2]))
-    drawn = {each.meta.light_family: each for each in reversed(measured.examples) if each.guidance}
+    drawn = {each.meta.light_family: each for each in reversed(measured.judged.examples) if each.guidance}
     groups = [guidance(each) for each in drawn.values()]
     write_strips(groups, [f"{each.meta.key}-guidance" for each in drawn.values()], pictures)
     return [Section("guidance", "The surfels and their irradiance", [*blocks, *groups])]

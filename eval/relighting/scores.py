@@ -18,7 +18,18 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.confidence import Interval, interval, scene_sums
-from eval.relighting.baselines import BASELINES, METHODS, Method
+from eval.relighting.baselines import (
+    BASELINES,
+    DIRECT,
+    FINER,
+    METHODS,
+    NETWORKS,
+    NEURAL,
+    NEURAL_LIT,
+    ON_LIT,
+    SIMPLE,
+    Method,
+)
 from eval.relighting.buffers import REGIONS, Region, region_mask
 from eval.results import Row, mean_row
 from tron import metrics
@@ -55,11 +66,20 @@ METRICS = (
     Metric("ssim", "SSIM ↑", "1", metrics.ssim, "SSIM compares structure; 1 is identical."),
 )
 GROUPS = {
-    "best_simple_baseline": [baseline.name for baseline in BASELINES if baseline.simple],
+    **{
+        group: [each.name for each in BASELINES if group in each.groups] for group in (SIMPLE, DIRECT, ON_LIT)
+    },
     "best_baseline": [baseline.name for baseline in BASELINES],
 }
-RIVALS = {baseline.name: [baseline.name] for baseline in BASELINES} | GROUPS
-"""Names of what the neural renderer's gains are over: each baseline, and the best of each group."""
+OPTIONAL = {baseline.name for baseline in BASELINES if baseline.optional}
+RIVALS = {each.name: [each.name] for each in (*BASELINES, *FINER)} | GROUPS
+"""Names of what a network's gains are over: each method without it, and the best of each group."""
+GAINS: dict[str, dict[str, list[str]]] = {
+    NEURAL_LIT.name: RIVALS | {NEURAL.name: [NEURAL.name]},
+    NEURAL.name: RIVALS,
+    "lit": {"shadowed": ["shadowed"]},
+}
+"""Method -> what its gains are over."""
 
 
 class Where(NamedTuple):
@@ -90,8 +110,14 @@ class Score:
 
 @dataclass
 class Scores:
-    """All scores of an evaluation: (method, region) -> one for each frame."""
+    """All scores of an evaluation.
 
+    Attributes:
+        kept: (method, region) -> one for each frame.
+        tail: end of the rows' names, after those of :class:`Where`.
+    """
+
+    tail: str = ""
     kept: defaultdict[tuple[str, Region], list[Score]] = field(default_factory=lambda: defaultdict(list))
 
     def add(self, clip: Clip, shown: dict[Region, dict[str, np.ndarray]], truth: np.ndarray) -> None:
@@ -139,20 +165,26 @@ class Scores:
         scores = self.of(method, where)
         return float(np.mean([score.figures["psnr"] for score in scores])) if scores else None
 
+    @property
+    def network(self) -> Method | None:
+        """The network that the report is about: that which sees lit, if it was scored."""
+        return next((method for method in self.methods if method in NETWORKS), None)
+
     def best(self, methods: Sequence[str], where: Where = ALL) -> str | None:
-        """The method with the highest mean PSNR; None unless all of them were scored."""
+        """The method with the highest mean PSNR; None unless all were scored that are not OPTIONAL."""
         means = {method: self.psnr(method, where) for method in methods}
         known = {method: mean for method, mean in means.items() if mean is not None}
-        return max(known, key=known.__getitem__) if len(known) == len(means) > 0 else None
+        missing = means.keys() - known.keys() - OPTIONAL
+        return max(known, key=known.__getitem__) if known and not missing else None
 
-    def gain(self, methods: Sequence[str], where: Where = ALL) -> float | None:
-        """Neural PSNR minus that of the best of the methods, in dB; None unless all were scored."""
-        neural, best = self.psnr("neural", where), self.best(methods, where)
+    def gain(self, method: str, over: Sequence[str], where: Where = ALL) -> float | None:
+        """Mean PSNR of a method minus that of the best of others, in dB; None where one is not known."""
+        ours, best = self.psnr(method, where), self.best(over, where)
         reached = None if best is None else self.psnr(best, where)
-        return None if neural is None or reached is None else neural - reached
+        return None if ours is None or reached is None else ours - reached
 
     def rows(self, seed: int = 0) -> Iterator[Row]:
-        """``METHOD.METRIC`` and ``neural.gain_over_RIVAL``, each with the tails of :class:`Where`.
+        """``METHOD.METRIC`` and ``METHOD.gain_over_RIVAL`` of GAINS, each with the tail of :class:`Where`.
 
         ``seed`` draws the scenes of the intervals.
         """
@@ -160,25 +192,26 @@ class Scores:
             for method in self.methods:
                 scores = self.of(method.name, where)
                 for metric in METRICS if scores else ():
-                    name = f"{method.name}.{metric.name}{where.tail}"
+                    name = f"{method.name}.{metric.name}{where.tail}{self.tail}"
                     found = ((score.scene, score.figures[metric.name]) for score in scores)
                     yield mean_row(name, metric.unit, found, seed)
-            for rival, methods in RIVALS.items():
-                gain = self.gain(methods, where)
-                if gain is not None:
-                    name, n = f"neural.gain_over_{rival}{where.tail}", len(self.of("neural", where))
-                    row = Row(metric=name, value=gain, unit="dB", n=n)
-                    yield row.within(self._gain_interval(methods, where, seed))
+            for method, rivals in GAINS.items():
+                for rival, over in rivals.items():
+                    gain = self.gain(method, over, where)
+                    if gain is not None:
+                        name = f"{method}.gain_over_{rival}{where.tail}{self.tail}"
+                        row = Row(metric=name, value=gain, unit="dB", n=len(self.of(method, where)))
+                        yield row.within(self._gain_interval(method, over, where, seed))
 
-    def _gain_interval(self, methods: Sequence[str], where: Where, seed: int) -> Interval:
-        """The interval of a gain: in each resample over the method that is the best one there."""
-        by_method = [self.of(method, where) for method in ("neural", *methods)]
+    def _gain_interval(self, method: str, over: Sequence[str], where: Where, seed: int) -> Interval:
+        """The interval of a gain: in each resample over the one of the others that is the best there."""
+        by_method = [scores for name in (method, *over) if (scores := self.of(name, where))]
         psnr = [[score.figures["psnr"] for score in scores] for scores in by_method]
         scenes = [score.scene for score in by_method[0]]
         per_scene = scene_sums(scenes, np.array([*psnr, [1.0] * len(scenes)]).T)
 
         def gain(sums: np.ndarray) -> np.ndarray:
-            neural, rivals, frames = sums[..., 0], sums[..., 1:-1], sums[..., -1]
-            return (neural - rivals.max(-1)) / frames
+            ours, others, frames = sums[..., 0], sums[..., 1:-1], sums[..., -1]
+            return (ours - others.max(-1)) / frames
 
         return interval(per_scene, gain, seed)

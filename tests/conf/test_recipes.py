@@ -114,25 +114,25 @@ def test_no_key_is_stated_twice_with_one_value(path: Path):
 
 PAPER = {
     "relight": {"estimator": "plain", "two_sided": False, "denoise": False},
-    "datagen": {"estimator": "plain", "two_sided": False},
+    "datagen": {"estimator": "plain", "two_sided": False, "diffuse": "lambert", "bounces": 0},
     "reconstruct": {
         "light.estimator": "plain",
         "light.two_sided": False,
         "light.diffuse": "lambert",
         "light.coarsest": 64,
     },
-    "train": {},
+    "train": {"renderer.config.guidance": ["pbr", "irradiance"]},
     "eval": {},
 }
 
 
 @pytest.mark.parametrize("folder", sorted(COMMANDS))
-def test_the_papers_fidelity_sets_its_estimators_and_nothing_else(folder: str):
+def test_the_papers_fidelity_sets_its_own_choices_and_nothing_else(folder: str):
     command = load_command(folder)
     options = group_options(command.config_module)
     assert list(options.get(SHARED_GROUP, {})) == (["paper"] if PAPER[folder] else [])
     recipes = [
-        leaves(resolve(compose_recipe(command.config_module, command.settings, overrides)))
+        leaves(resolve(complete(compose_recipe(command.config_module, command.settings, overrides))))
         for overrides in ([], [f"{SHARED_GROUP}=paper"] if PAPER[folder] else [])
     ]
     assert {key: value for key, value in recipes[1].items() if recipes[0][key] != value} == PAPER[folder]

@@ -45,6 +45,13 @@ def test_a_file_without_licence_is_refused_by_name(folder):
     assert {asset.id: asset.licence for asset in allowed}["b"] is None
 
 
+def test_assets_are_chosen_by_name_and_the_others_need_no_licence(folder):
+    catalogue(folder, "sub/b.obj")
+    assert [asset.path for asset in find_assets(folder, names=["b"])] == ["sub/b.obj"]
+    with pytest.raises(TronError, match=r"no asset 'c'.*there are a, sub/a, b"):
+        find_assets(folder, names=["b", "c"])
+
+
 def test_a_catalogue_may_lie_elsewhere(folder, tmp_path_factory):
     elsewhere = catalogue(tmp_path_factory.mktemp("c"), "a.obj", "sub/a.obj", "sub/b.obj", name="mine.json")
     assert len(find_assets(folder, catalogue=elsewhere)) == 3

@@ -13,19 +13,22 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 
 import datagen.run
 from datagen.card import command_line
-from datagen.plan import Sources, Work, plan
+from datagen.plan import Sources, Work, adopt, plan
 from datagen.run import make, make_scene
-from datagen.settings import Settings
+from datagen.scene import SceneSpec
+from datagen.settings import ESTIMATED, Settings
 from datagen.synthetic import make_clips
 from datagen.validate import validate
 from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
+from tron.estimation import FINAL
 from tron.gaussians.scene import GaussianScene
-from tron.images import read_image
+from tron.images import read_image, write_image
 from tron.shards.manifest import Manifest
 from tron.shards.reader import read_clips
 from tron.shards.schema import MEMBERS, clip_members
@@ -133,6 +136,70 @@ def test_guidance_and_frames_see_the_same_light(dataset):
         assert 0.5 < ratio < 2.0
 
 
+def test_lit_is_brighter_than_direct_light_and_equal_to_it_where_nothing_bounces(dataset, variant, tmp_path):
+    assert make(tiny(tmp_path, "bounces=0", "only=[test-000000]")) == 0
+    pairs = list(zip(read_clips(dataset, "test"), read_clips(tmp_path, "test"), strict=True))
+    for clip, direct in pairs:
+        seen = clip.frames["foreground"][..., 0] > 0
+        for name in ("pbr", "irradiance", "unshadowed", "shadowed", "rgb"):
+            np.testing.assert_array_equal(clip.frames[name], direct.frames[name])
+        np.testing.assert_array_equal(direct.frames["lit"], direct.frames["shadowed"])
+        np.testing.assert_array_equal(direct.frames["lit_reflections"], direct.frames["lit_supersampled"])
+        lit, shadowed = (clip.frames[name][seen].mean() for name in ("lit", "shadowed"))
+        assert 1.02 * shadowed < lit < 2 * shadowed
+        # the finer forms show the same scene: other pixels, other reflections
+        for name in ("lit_supersampled", "lit_reflections"):
+            assert clip.frames[name][seen].mean() == pytest.approx(lit, rel=0.15)
+            assert (clip.frames[name] != clip.frames["lit"]).any()
+    assert any((c.frames["lit_reflections"] != c.frames["lit_supersampled"]).any() for c, _ in pairs)
+
+
+def test_light_on_the_surfels_is_estimated_as_everywhere_else_unless_told_otherwise(tmp_path):
+    settings = tiny(tmp_path, "test.guidance_spp=64")
+    assert settings.estimation("test") == FINAL
+    chosen = {"estimator": "plain", "two_sided": False, "diffuse": "lambert", "bounces": 1}
+    chosen |= {"reflections": 4, "supersample": 2}
+    assert set(chosen) == set(ESTIMATED)
+    other = tiny(tmp_path, "test.guidance_spp=64", *(f"{key}={value}" for key, value in chosen.items()))
+    assert other.estimation("test") == FINAL.model_copy(update=chosen)
+
+
+def test_the_recipe_of_models_makes_test_scenes_alone_under_every_map(variant, tmp_path):
+    for number in range(4):
+        (tmp_path / "maps").mkdir(exist_ok=True)
+        sky = np.full((8, 16, 3), 0.2 + 0.2 * number, np.float32)
+        write_image(tmp_path / "maps" / f"sky{number}.hdr", sky)
+    (tmp_path / "models").mkdir()
+    trimesh.creation.box().export(tmp_path / "models" / "box.obj")
+    (tmp_path / "models" / "broken.obj").write_text("v 0 0 0\n")
+    settings = check(
+        compose_recipe(
+            "conf.datagen",
+            Settings,
+            [
+                "experiment=models",
+                *(word for word in TINY if not word.startswith(("train", "validation", "test.lights"))),
+                "test.lights=[hdri,hdri,hdri,hdri,hdri,hdri]",
+                "path_frames=24",
+                f"assets={tmp_path / 'models'}",
+                "asset_names=[box]",
+                f"environments={tmp_path / 'maps'}",
+                "allow_unlicensed=[box,sky0,sky1,sky2,sky3]",
+                f"output_dir={tmp_path / 'out'}",
+            ],
+        ),
+        Settings,
+    )
+    assert (settings.used_splits(), settings.split("test").reference_buffers) == (["test"], True)
+    assert make(settings) == 0
+    clips = list(read_clips(tmp_path / "out", "test", ("lit", "lit_reflections")))
+    assert {clip.meta.light_family for clip in clips} == {"hdri"}
+    # with maps held out only the last of the four would light the test split
+    assert len({clip.meta.extra["light_spec"]["path"] for clip in clips}) > 1
+    spec = SceneSpec.model_validate_json((tmp_path / "out/scenes/test-000000/spec.json").read_text())
+    assert {item.asset for item in spec.objects} == {"box"}
+
+
 def test_a_finished_dataset_is_not_touched(dataset, monkeypatch, files_of):
     def never(*_):
         raise AssertionError("nothing is left to make")
@@ -230,6 +297,18 @@ def test_another_recipe_is_refused_before_anything_is_written(dataset, files_of)
     assert files_of(dataset) == before
 
 
+def test_a_key_that_an_older_dataset_did_not_know_has_its_default(tmp_path):
+    adopt(tiny(tmp_path))
+    older = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    del older["recipe"]["estimator"], older["recipe"]["two_sided"], older["recipe"]["train"]["guidance_spp"]
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(older))
+    with pytest.raises(TronError, match=r"a dataset made with train\.guidance_spp=64, not 8"):
+        adopt(tiny(tmp_path, "train.guidance_spp=8"))
+    with pytest.raises(TronError, match="a dataset made with estimator=ratio, not plain"):
+        adopt(tiny(tmp_path, "train.guidance_spp=64", "estimator=plain"))
+    adopt(tiny(tmp_path, "train.guidance_spp=64"))
+
+
 def test_failures_are_listed_and_retried_by_their_command(dataset, unfinished, files_of, monkeypatch, caplog):
     def fails(spec, *_):
         raise RuntimeError("no memory\nfor this")
@@ -310,7 +389,8 @@ def test_the_command_of_the_card_makes_the_same_settings(dataset, cluster):
 
 def test_previews_are_the_clips_first_frames_side_by_side(dataset):
     sheet = read_image(dataset / "previews" / "train-00000.png")
-    assert sheet.shape == (2 * (12 + 2), 6 * (16 + 2), 3)
+    columns = [name for name in clip_members(reference=False) if name != "foreground"]
+    assert sheet.shape == (2 * (12 + 2), len(columns) * (16 + 2), 3)
     assert sheet.std() > 0.05
 
 

@@ -9,7 +9,7 @@ import pytest
 from tron.cameras import Camera
 from tron.seeds import generator
 from tron.shards.manifest import Manifest
-from tron.shards.schema import Clip, ClipMeta, clip_members
+from tron.shards.schema import TARGET, Clip, ClipMeta, clip_members, light_members
 from tron.shards.writer import ShardWriter
 
 LIGHTS = {"noon": "sun", "softbox": "studio", "grey": "overcast", "dusk": "sun", "window": "studio"}
@@ -46,14 +46,17 @@ def draw_frame(size: int, seed: int, light: str, frame: int = 0) -> dict[str, np
         return np.where(solid, image, backdrop).astype(np.float32)
 
     noise = generator(seed, "noise", light, frame)
-    return {
+    drawn = {
         "pbr": over(base * unshadowed + gloss),
         "irradiance": over(irradiance),
         "rgb": over(base * irradiance * (1 + 0.25 * base) + gloss * visible),
         "unshadowed": over(unshadowed),
         "shadowed": over(base * irradiance + gloss),
+        "lit": over(base * irradiance * (1 + 0.2 * base) + gloss),
         "mask": solid.astype(np.float32),
         "foreground": solid.astype(np.float32),
+        "lit_supersampled": over(base * irradiance * (1 + 0.22 * base) + gloss),
+        "lit_reflections": over(base * irradiance * (1 + 0.24 * base) + gloss * visible),
         "irradiance_ref": over(irradiance * (1 + 0.05 * noise.standard_normal(irradiance.shape))),
         "unshadowed_ref": over(unshadowed),
         "base_color_ref": np.where(solid, base, 0).astype(np.float32),
@@ -67,6 +70,7 @@ def draw_frame(size: int, seed: int, light: str, frame: int = 0) -> dict[str, np
         "metallic_ref": np.where(ball, 0.5, 0).astype(np.float32),
         "metallic": np.where(ball, 0.48, 0).astype(np.float32),
     }
+    return drawn | {name: drawn["pbr"] for name in light_members() if name not in drawn}
 
 
 def describe_clip(key: str, split: str, scene: str, light: str, frames: int, size: int) -> ClipMeta:
@@ -85,7 +89,7 @@ def describe_clip(key: str, split: str, scene: str, light: str, frames: int, siz
         height=size,
         cameras=[camera.to_dict() for camera in cameras],
         exposure=0.4,
-        color_space=dict.fromkeys(("pbr", "irradiance", "rgb", "unshadowed", "shadowed"), "linear"),
+        color_space=dict.fromkeys((*light_members(), TARGET), "linear"),
     )
 
 
@@ -142,7 +146,8 @@ def dataset(tmp_path_factory: pytest.TempPathFactory, write_dataset: Callable[..
 
 @pytest.fixture(scope="session")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with tiny.safetensors and pixel_mlp.safetensors, both untrained: both return pbr unchanged."""
+    """Untrained weights: tiny and pixel_mlp, which return lit, and those of two buffers, which return pbr."""
+    from tron.neural.configs import PAPER_GUIDANCE, PixelMLPConfig, RendererConfig
     from tron.neural.pixel_mlp import PixelMLP
     from tron.neural.renderer import NeuralRenderer
     from tron.neural.weights import save_renderer
@@ -150,4 +155,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("weights")
     save_renderer(folder / "tiny.safetensors", NeuralRenderer())
     save_renderer(folder / "pixel_mlp.safetensors", PixelMLP())
+    two = {"guidance": PAPER_GUIDANCE}
+    save_renderer(folder / "tiny_of_two.safetensors", NeuralRenderer(RendererConfig.model_validate(two)))
+    save_renderer(folder / "pixel_mlp_of_two.safetensors", PixelMLP(PixelMLPConfig.model_validate(two)))
     return folder

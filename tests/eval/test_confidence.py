@@ -11,7 +11,7 @@ import scipy.stats
 from eval.confidence import Interval, interval, mean_interval, quotient, scene_sums
 from eval.demo.refinement import refinement
 from eval.relighting.guidance import GuidanceScores, shadow_rows
-from eval.relighting.scores import Score, Scores
+from eval.relighting.scores import GROUPS, METRICS, Score, Scores
 from eval.report.figures import with_interval
 from eval.report.intervals import interval_note
 from eval.results import Results, Row
@@ -103,7 +103,7 @@ def scored(**psnr: list[list[float]]) -> Scores:
     for method, scenes in psnr.items():
         for number, frames in enumerate(scenes):
             for value in frames:
-                figures = {"psnr": value, "ssim": 0.9}
+                figures = {metric.name: 0.9 for metric in METRICS} | {"psnr": value}
                 scores.kept[method, "foreground"].append(Score("sun", f"s{number}", f"c{number}", figures))
     return scores
 
@@ -128,7 +128,8 @@ def test_the_best_of_a_group_is_chosen_anew_in_every_resample():
     turns = np.where(np.arange(8)[:, None] % 2, 5.0, -5.0)
     neural = 30 + rng.normal(size=(8, 3))
     first, second, third = neural - 3 + turns, neural - 3 - turns, neural - 9
-    given = {"neural": neural, "pbr": first, "shadow_ratio": second, "affine": third}
+    given = {"neural": neural, **dict.fromkeys(GROUPS["best_simple_baseline"], third)}
+    given |= {"pbr": first, "shadow_ratio": second}
     rows = {row.metric: row for row in scored(**{name: psnr.tolist() for name, psnr in given.items()}).rows()}
     best, *each = (
         rows[f"neural.gain_over_{name}"] for name in ("best_simple_baseline", "pbr", "shadow_ratio")

@@ -21,7 +21,8 @@ with open({log!r}, "a") as log:
 MAKE = "shutil.copytree({dataset!r}, out)\nprint('12 clips')"
 TRAIN = """
 out.mkdir(parents=True)
-shutil.copy(pathlib.Path({weights!r}) / (given["renderer"] + ".safetensors"), out / "renderer.safetensors")
+kind = given["renderer"] + ("_of_two" if "renderer.config.guidance" in given else "")
+shutil.copy(pathlib.Path({weights!r}) / (kind + ".safetensors"), out / "renderer.safetensors")
 """
 
 
@@ -53,14 +54,18 @@ def test_the_demo_goes_from_nothing_to_a_report_and_a_second_run_only_evaluates(
     assert run(f"output_dir={out}") == 0
     commands = stand_ins.read_text().splitlines()
     assert commands[0] == f"tron-datagen experiment=demo output_dir={out / 'dataset'}"
-    assert sorted(command.split()[2] for command in commands[1:]) == ["renderer=pixel_mlp", "renderer=tiny"]
+    trained = sorted(command.split()[2:4] for command in commands[1:])
+    assert [words[0] for words in trained] == ["renderer=pixel_mlp", "renderer=tiny", "renderer=tiny"]
+    assert sum("renderer.config.guidance=[pbr,irradiance]" in words for words in trained) == 1
     limits = {word for command in commands[1:] for word in command.split() if word.startswith("max_seconds=")}
-    assert len(limits) == 1, "both networks train for the same time"
+    assert len(limits) == 1, "all networks train for the same time"
     results = Results.load(out / "results.json")
     assert results.benchmark == "demo"
     parts = [results.value(f"demo.{stage}_seconds") for stage in ("datagen", "train", "eval")]
     assert all(parts)
     assert results.value("demo.seconds") == pytest.approx(sum(parts))  # type: ignore[arg-type]
+    for method in ("neural", "neural_lit", "lit", "lit.supersampled", "lit.reflections", "pixel_mlp_lit"):
+        assert results.find(f"{method}.psnr") is not None
     scenes = results.find("datagen.seconds_per_scene.demo")
     assert scenes is not None
     assert scenes.n == 6, "two scenes of each of three splits"

@@ -1,39 +1,39 @@
-"""The benchmark `relighting` on a drawn data set, end to end, with untrained networks: both return pbr."""
+"""The benchmark `relighting` on a drawn data set, end to end; its untrained networks return lit or pbr."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from eval.cli import cli
-from eval.relighting.baselines import BASELINES, METHODS
+from eval.relighting.baselines import BASELINES, FINER, METHODS
 from eval.relighting.benchmark import Relighting, choose_clips
-from eval.relighting.scores import METRICS, Score, Scores
+from eval.relighting.scores import GROUPS, METRICS, Score, Scores
 from eval.report.outcome import Outcome
 from eval.report.page import Pictures, Table
 from eval.results import Results
+from tron.errors import TronError
 from tron.images import read_image
 
 REQUIRED = [
     *(
         f"{method}.{metric}{region}"
-        for method in (
-            "neural",
-            "pbr",
-            "pbr_x_irradiance",
-            "shadow_ratio",
-            "shadowed",
-            "affine",
-            "affine_ratio",
-            "pixel_mlp",
-        )
-        for metric in ("psnr", "ssim")
+        for method in (each.name for each in METHODS)
+        for metric in (each.name for each in METRICS)
         for region in ("", "_full")
     ),
     *(
-        f"neural.gain_over_{group}{region}{family}"
-        for group in ("best_simple_baseline", "best_baseline")
+        f"{network}.gain_over_{group}{region}{family}"
+        for network in ("neural", "neural_lit")
+        for group in (
+            "best_simple_baseline",
+            "best_direct_baseline",
+            "best_fit_on_lit",
+            "best_baseline",
+            "lit",
+        )
         for region in ("", "_full")
         for family in ("", ".sun", ".studio", ".overcast")
     ),
@@ -46,8 +46,8 @@ REQUIRED = [
 def outcome(dataset: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     benchmark = Relighting(
         dataset=dataset,
-        renderer=weights / "tiny.safetensors",
-        pixel_mlp=weights / "pixel_mlp.safetensors",
+        renderer=(weights / "tiny_of_two.safetensors", weights / "tiny.safetensors"),
+        pixel_mlp=(weights / "pixel_mlp.safetensors", weights / "pixel_mlp_of_two.safetensors"),
         pictures=3,
     )
     return benchmark.run(tmp_path_factory.mktemp("output"))
@@ -81,16 +81,20 @@ def test_every_method_and_metric_of_the_lists_is_in_rows_tables_and_pictures(out
         assert {metric.title for metric in METRICS} <= set(table.headings)
     shown = {baseline.title for baseline in BASELINES if baseline.pictured}
     assert shown <= {picture.title for picture in pictures.pictures}
-    for baseline in BASELINES:
+    for baseline in (*BASELINES, *FINER):
         assert f"neural.gain_over_{baseline.name}" in rows
+        assert f"neural_lit.gain_over_{baseline.name}" in rows
+    assert {"neural_lit.gain_over_neural", "lit.gain_over_shadowed"} <= rows
 
 
-def test_networks_that_return_pbr_score_as_pbr(outcome: Outcome):
+def test_networks_score_as_the_buffer_that_they_return(outcome: Outcome):
     found = values(outcome)
     for region in ("", "_full"):
-        assert found[f"neural.psnr{region}"] == pytest.approx(found[f"pbr.psnr{region}"], abs=1e-3)
-        assert found[f"pixel_mlp.psnr{region}"] == pytest.approx(found[f"pbr.psnr{region}"], abs=1e-3)
-        best = max(found[f"{name}.psnr{region}"] for name in ("pbr", "shadow_ratio", "affine"))
+        for network in ("neural", "pixel_mlp"):
+            assert found[f"{network}.psnr{region}"] == pytest.approx(found[f"pbr.psnr{region}"], abs=1e-3)
+            lit = found[f"lit.psnr{region}"]
+            assert found[f"{network}_lit.psnr{region}"] == pytest.approx(lit, abs=1e-3)
+        best = max(found[f"{name}.psnr{region}"] for name in GROUPS["best_simple_baseline"])
         gain = found[f"neural.gain_over_best_simple_baseline{region}"]
         assert gain == pytest.approx(found[f"neural.psnr{region}"] - best, abs=1e-9)
 
@@ -98,7 +102,9 @@ def test_networks_that_return_pbr_score_as_pbr(outcome: Outcome):
 def test_baselines_rank_as_they_must_in_a_world_of_shadows(outcome: Outcome):
     found = values(outcome)
     assert found["pbr.psnr"] < found["shadow_ratio.psnr"] < found["affine_ratio.psnr"]
-    assert found["affine.psnr"] < found["affine_ratio.psnr"]
+    assert found["affine.psnr"] < found["affine_ratio.psnr"] < found["affine_lit.psnr"]
+    assert found["shadowed.psnr"] < found["lit.psnr"] < found["lit.reflections.psnr"]
+    assert found["lit.gain_over_shadowed"] == pytest.approx(found["lit.psnr"] - found["shadowed.psnr"])
 
 
 def test_every_shown_clip_has_its_pictures(outcome: Outcome):
@@ -109,7 +115,14 @@ def test_every_shown_clip_has_its_pictures(outcome: Outcome):
     assert len(groups["pictures"]) == 3
     titles = [picture.title for picture in groups["pictures"][0].pictures]
     assert titles[:2] == ["pbr", "irradiance"]
-    assert titles[-3:] == ["neural renderer", "path-traced truth", "|neural renderer − truth| ×3"]
+    assert titles[-5:] == [
+        "|lit − truth| ×3",
+        "lit",
+        "neural renderer",
+        "path-traced truth",
+        "|neural renderer − truth| ×3",
+    ]
+    assert len(titles) == 12
     assert all(picture.alt for group in groups["pictures"] for picture in group.pictures)
     assert {"irradiance, surfels", "shadow errors", "normals, true"} <= {
         picture.title for picture in groups["guidance"][0].pictures
@@ -134,20 +147,21 @@ def test_the_command_writes_results_report_and_pictures(
     assert results.benchmark == "relighting"
     assert {"cpu", "commit", "packages"} <= set(results.environment)
     metrics = {row.metric for row in results.rows}
-    assert not [name for name in metrics if name.startswith("pixel_mlp") or "best_baseline" in name]
-    assert results.find("neural.gain_over_best_simple_baseline").reference == "target: at least 3 dB"  # type: ignore[union-attr]
+    assert not [name for name in metrics if name.startswith(("pixel_mlp", "neural."))]
+    assert not [name for name in metrics if name.split(".")[-1] in ("best_baseline", "best_fit_on_lit")]
+    assert results.find("neural_lit.gain_over_lit").reference == "target: at least 0.8 dB"  # type: ignore[union-attr]
     assert "null" not in json.dumps([row.value for row in results.rows])
     picture = read_image(next(path for path in (tmp_path / "pictures").glob("*-guidance.png")))
     assert picture.shape == (2 * 32, 4 * 32, 3)
     page = (tmp_path / "report.html").read_text()
     assert "12 frames are 2 independent scenes" in page
-    row = results.find("neural.psnr_full")
+    row = results.find("neural_lit.psnr_full")
     assert row is not None
     assert f"{row.value:.2f} [{row.low:.2f}, {row.high:.2f}]" in page
     out = capsys.readouterr().out
     assert f"{row.value:.2f} dB [{row.low:.2f}, {row.high:.2f}]" in out
     assert f"report: {tmp_path / 'report.html'}" in out
-    assert "neural.psnr" in out
+    assert "neural_lit.psnr" in out
     assert "not measured" in out
     assert (tmp_path / "report.html").stat().st_size > 10_000
 
@@ -158,6 +172,8 @@ def test_the_command_writes_results_report_and_pictures(
         (["benchmark=relighting"], "no data set to evaluate on"),
         (["dataset=/nowhere"], "manifest.json"),
         (["dataset={dataset}", "renderer=/nowhere/x.safetensors"], "/nowhere/x.safetensors"),
+        (["dataset={dataset}", "renderer=[/nowhere/y.safetensors]"], "/nowhere/y.safetensors"),
+        (["dataset={dataset}", "benchmark.ood=/nowhere"], "manifest.json"),
         (["dataset={dataset}", "benchmark.test_split=elsewhere"], "no split 'elsewhere'"),
         (["dataset={dataset}", "benchmark.train_splits=[elsewhere]"], "no split 'elsewhere'"),
         (["benchmark=nonsense"], "unknown benchmark 'nonsense'"),
@@ -182,7 +198,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(
 def test_shown_clips_span_the_ranking_from_the_worst_to_the_best():
     scores = Scores()
     for clip, gain in (("c", 3.0), ("a", 1.0), ("e", 5.0), ("b", 2.0), ("d", 4.0)):
-        for method, psnr in (("neural", 20 + gain), ("pbr", 20.0)):
+        for method, psnr in (("neural_lit", 20 + gain), ("lit", 20.0)):
             scores.kept[method, "foreground"].append(Score("sun", "scene", clip, {"psnr": psnr}))
     assert choose_clips(scores, 3) == ["a", "c", "e"]
     assert choose_clips(scores, 1) == ["a"]
@@ -192,6 +208,56 @@ def test_shown_clips_span_the_ranking_from_the_worst_to_the_best():
 
 def test_evaluation_is_the_same_twice_and_needs_no_network(outcome: Outcome, dataset: Path, tmp_path: Path):
     again, first = values(Relighting(dataset=dataset, pictures=0).run(tmp_path)), values(outcome)
-    assert {name.split(".")[0] for name in first.keys() - again} == {"neural", "pixel_mlp"}
+    missing = {name.split(".")[0] for name in first.keys() - again}
+    assert missing == {"neural", "neural_lit", "pixel_mlp", "pixel_mlp_lit"}
     assert again == {name: first[name] for name in again}
     assert all(np.isfinite(list(first.values())))
+
+
+def test_two_weights_of_one_method_are_refused_by_name(dataset: Path, weights: Path, tmp_path: Path):
+    twice = (weights / "tiny.safetensors", weights / "tiny.safetensors")
+    with pytest.raises(TronError, match="two weights of neural_lit"):
+        Relighting(dataset=dataset, renderer=twice).run(tmp_path)
+
+
+def test_data_of_another_kind_gives_rows_of_its_own_by_the_same_fits(
+    outcome: Outcome, dataset: Path, weights: Path, write_dataset: Callable[..., Path], tmp_path: Path
+):
+    other = write_dataset(tmp_path / "other", scenes=3)
+    benchmark = Relighting(
+        dataset=dataset,
+        renderer=weights / "tiny.safetensors",
+        pixel_mlp=weights / "pixel_mlp.safetensors",
+        ood=other,
+        pictures=1,
+    )
+    found = benchmark.run(tmp_path / "out")
+    rows = {row.metric: row for row in found.rows}
+    for metric in (
+        "lit.psnr",
+        "shadowed.psnr",
+        "lit.gain_over_shadowed",
+        "neural_lit.gain_over_best_baseline",
+    ):
+        assert rows[f"{metric}.ood"].scenes == 3
+        assert rows[metric].value == values(outcome)[metric]
+    assert rows["lit.gain_over_shadowed.ood"].low is not None
+    # its first two scenes are those of the data set itself
+    alone = values(Relighting(dataset=dataset, ood=dataset, pictures=0).run(tmp_path / "same"))
+    assert all(alone[f"{name}.ood"] == value for name, value in alone.items() if f"{name}.ood" in alone)
+    assert alone["affine_lit.psnr.ood"] == alone["affine_lit.psnr"]
+    section = next(section for section in found.sections if section.name == "ood")
+    assert "18 frames of 3 scenes" in section.blocks[0].text  # type: ignore[union-attr]
+    assert len(list((tmp_path / "out" / "pictures").glob("ood-*.png"))) == 1
+
+
+def test_a_renderer_of_two_buffers_alone_is_the_one_that_is_reported(
+    dataset: Path, weights: Path, tmp_path: Path
+):
+    found = Relighting(dataset=dataset, renderer=weights / "tiny_of_two.safetensors", pictures=1).run(
+        tmp_path
+    )
+    assert "the neural renderer of two buffers" in found.verdict
+    assert "neural.gain_over_best_simple_baseline" in values(found)
+    pictures = next(section for section in found.sections if section.name == "pictures").blocks
+    assert pictures[1].pictures[-1].title == "|neural renderer of two buffers − truth| ×3"  # type: ignore[union-attr]

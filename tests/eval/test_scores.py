@@ -8,7 +8,7 @@ import pytest
 from eval.relighting.baselines import fit_baselines, predictions
 from eval.relighting.buffers import Buffers, Region, region_mask
 from eval.relighting.fits import Show
-from eval.relighting.scores import Scores
+from eval.relighting.scores import GROUPS, OPTIONAL, Scores
 from tron.color import to_display
 from tron.errors import TronError
 from tron.metrics import PSNR_CAP
@@ -83,22 +83,32 @@ def test_gains_are_over_the_best_of_their_group_and_absent_without_all_of_it(dra
     def off(error: float) -> np.ndarray:
         return truth + np.float32(error)
 
-    three = {"neural": off(0.01), "pbr": off(0.1), "shadow_ratio": off(0.05), "affine": off(0.02)}
+    # The best of the simple baselines is off by 0.02, the best of those of direct light by 0.015.
+    simple = {name: off(0.1) for name in GROUPS["best_simple_baseline"]} | {"affine": off(0.02)}
+    needed = [name for name in GROUPS["best_direct_baseline"] if name not in {*simple, *OPTIONAL}]
+    direct = {**simple, **{name: off(0.2) for name in needed}, "affine_ratio": off(0.015)}
+    others = {name: off(0.2) for name in GROUPS["best_baseline"] if name not in {*direct, *OPTIONAL}}
+    given = {"neural": off(0.01), **simple}
     scores = Scores()
-    scores.add(clip, both(three), truth)
+    scores.add(clip, both(given), truth)
     rows = rows_of(scores)
     assert rows["neural.gain_over_best_simple_baseline"][0] == pytest.approx(20 * np.log10(2), abs=1e-2)
-    assert not [name for name in rows if "best_baseline" in name]
-    four = {
-        "pbr_x_irradiance": off(0.2),
-        "shadowed": off(0.2),
-        "affine_ratio": off(0.015),
-        "pixel_mlp": off(1),
-    }
+    assert not [name for name in rows if "best_direct_baseline" in name or "best_baseline" in name]
     scores = Scores()
-    scores.add(clip, both({**three, **four}), truth)
-    expected = 20 * np.log10(1.5)
-    assert rows_of(scores)["neural.gain_over_best_baseline_full.sun"][0] == pytest.approx(expected, abs=1e-2)
+    scores.add(clip, both({**given, **direct, "lit": off(0.02)}), truth)
+    rows = rows_of(scores)  # a network of two buffers may be missing among the baselines, one on lit may not
+    gain = 20 * np.log10(1.5)
+    assert rows["neural.gain_over_best_direct_baseline_full.sun"][0] == pytest.approx(gain, abs=1e-2)
+    assert not [name for name in rows if "best_baseline" in name or "best_fit_on_lit" in name]
+    scores = Scores()
+    of_lit = {"pixel_mlp_lit": off(0.005), "neural_lit": off(0.004)}
+    scores.add(clip, both({**given, **direct, **others, **of_lit, "pixel_mlp": off(0.004)}), truth)
+    rows = rows_of(scores)
+    better = 20 * np.log10(2.5)
+    assert rows["neural.gain_over_best_direct_baseline"][0] == pytest.approx(-better, abs=1e-2)
+    assert rows["neural_lit.gain_over_best_baseline"][0] == pytest.approx(0, abs=1e-2)
+    assert rows["neural_lit.gain_over_neural"][0] == pytest.approx(better, abs=1e-2)
+    assert rows["neural_lit.gain_over_best_fit_on_lit"][0] == pytest.approx(20 * np.log10(1.25), abs=1e-2)
 
 
 def test_what_was_not_given_has_no_row(drawn_clip: MakeClip):

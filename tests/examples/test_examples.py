@@ -12,7 +12,10 @@ import pytest
 
 from tron.gaussians import GaussianScene
 from tron.images import read_image
+from tron.neural.renderer import render_clip
+from tron.neural.weights import load_renderer
 from tron.shading import EnvironmentMap
+from tron.shards.reader import read_clips
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SCRIPTS = sorted(EXAMPLES.glob("[0-9]_*.py"))
@@ -106,7 +109,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what 6_make_a_dataset.py and 7_train.py leave."""
     folder = tmp_path_factory.mktemp("trained")
     run("6_make_a_dataset", folder / "dataset")
-    run("7_train", folder / "renderer", "--dataset", folder / "dataset")
+    said = run("7_train", folder / "renderer", "--dataset", folder / "dataset")
+    assert re.search(r"given [\d.]+ dB, drawn [\d.]+ dB", said)
     return folder
 
 
@@ -117,12 +121,16 @@ def test_6_a_dataset_has_clips_under_three_lights(trained: Path):
 
 
 @pytest.mark.long
-def test_7_training_ends_with_a_renderer_that_draws(trained: Path):
-    assert (trained / "renderer" / "renderer.safetensors").stat().st_size > 1000
-    given, drawn, true = np.split(read_image(trained / "renderer" / "train.jpg"), 3, axis=1)
-    # Untrained it draws what it is given; sixty steps on one tiny scene teach it little more than to differ.
-    assert np.abs(drawn - given).mean() > 0.01
-    assert np.abs(drawn - true).mean() < 0.12
+def test_7_training_brings_the_drawing_of_what_it_learnt_from_near_the_truth(trained: Path):
+    """Untrained, it draws lit. One tiny scene teaches nothing of others, which are not judged."""
+    renderer = load_renderer(trained / "renderer" / "renderer.safetensors")
+    before, after = [], []
+    for clip in read_clips(trained / "dataset", "train"):
+        drawn = render_clip(renderer, {name: clip.displayed(name) for name in renderer.config.guidance})
+        before.append(np.square(clip.displayed(renderer.config.skip) - clip.displayed("rgb")).mean())
+        after.append(np.square(drawn - clip.displayed("rgb")).mean())
+    assert np.mean(after) < 0.5 * np.mean(before)  # 0.26 of it
+    assert read_image(trained / "renderer" / "train.jpg").shape == (3 * 3 * 24, 3 * 3 * 24, 3)
 
 
 @pytest.mark.long
@@ -131,6 +139,6 @@ def test_8_evaluation_scores_the_renderer_beside_the_baselines(trained: Path, tm
     out = tmp_path / "out"
     run("8_evaluate", out, "--dataset", trained / "dataset", "--renderer", weights)
     metrics = {row["metric"] for row in json.loads((out / "results.json").read_text())["rows"]}
-    assert {"neural.psnr", "pbr.psnr", "affine.psnr"} <= metrics
+    assert {"neural_lit.psnr", "lit.psnr", "pbr.psnr", "affine.psnr"} <= metrics
     assert (out / "report.html").stat().st_size > 10_000
     assert read_image(out / "evaluation.jpg").shape[1] == 800

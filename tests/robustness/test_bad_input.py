@@ -3,6 +3,7 @@
 Each command is run in this process, from its real entry point: starting Python with torch costs seconds.
 """
 
+import json
 import tomllib
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from hydra.utils import get_object
 
 from tron.gaussians.scene import GaussianScene
 from tron.shading.environment import EnvironmentMap
+from tron.shards.schema import SCHEMA_VERSION
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
@@ -151,14 +153,17 @@ def test_a_bad_file_is_named(run, variant, name, arguments, named):
         ("tron-datagen make", ["config.yaml"]),
     ],
 )
-def test_a_dataset_of_schema_1_is_refused_by_its_name(variant, name, kept, tmp_path, capsys):
-    """Its files, as the version before this one wrote them; config.yaml alone is a run killed half-way."""
+@pytest.mark.parametrize("version", range(1, SCHEMA_VERSION))
+def test_a_dataset_of_an_older_schema_is_refused_by_its_name(variant, version, name, kept, tmp_path, capsys):
+    """Its files, as that version wrote them; config.yaml alone is a run killed half-way."""
     old = tmp_path / "old"
     old.mkdir()
     if "manifest.json" in kept:
-        (old / "manifest.json").write_text('{"schema_version": 1, "config_sha256": "", "shards": []}')
+        empty = {"schema_version": version, "config_sha256": "", "shards": []}
+        (old / "manifest.json").write_text(json.dumps(empty))
     if "config.yaml" in kept:
-        (old / "config.yaml").write_text("recipe: {}\nscenes: {test: 1}\n")
+        said = f"schema: {version}\n" if version > 1 else ""  # the first did not say it
+        (old / "config.yaml").write_text(f"{said}recipe: {{}}\nscenes: {{test: 1}}\n")
     command, _, mode = name.partition(" ")
     arguments = {
         "": [f"dataset={old}", f"output_dir={tmp_path / 'out'}"],
@@ -170,7 +175,7 @@ def test_a_dataset_of_schema_1_is_refused_by_its_name(variant, name, kept, tmp_p
     out, err = capsys.readouterr()
     assert (stop.value.code, out) == (2, "")
     assert err == (
-        f"{command}: dataset of schema 1, this program reads schema 2 ({old}): "
+        f"{command}: dataset of schema {version}, this program reads schema {SCHEMA_VERSION} ({old}): "
         "make it again in a new folder with the tron-datagen command of its card.md\n"
     )
     assert sorted(path.name for path in old.iterdir() if path.name != ".tron.lock") == kept

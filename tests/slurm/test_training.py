@@ -10,7 +10,7 @@ import yaml
 
 from tron import seeds
 from tron.shards.manifest import Manifest
-from tron.shards.schema import ClipMeta
+from tron.shards.schema import TARGET, ClipMeta, light_members
 from tron.shards.writer import ShardWriter
 
 pytestmark = pytest.mark.long
@@ -33,11 +33,11 @@ def dataset(tmp_path_factory) -> Path:
                 height=16,
                 cameras=[{}],
                 exposure=1.0,
-                color_space={"pbr": "linear", "irradiance": "linear", "rgb": "linear"},
+                color_space=dict.fromkeys((*light_members(), TARGET), "linear"),
             )
             noise = seeds.generator(0, "dataset", number).random((16, 16, 3), np.float32)
             one = np.ones((16, 16, 1), np.float32)
-            colours = dict.fromkeys(("pbr", "irradiance", "rgb", "unshadowed", "shadowed"), noise)
+            colours = dict.fromkeys((*light_members(), TARGET), noise)
             writer.write(meta, [{**colours, "mask": one, "foreground": one}])
     Manifest(config_sha256="0" * 64, shards=writer.entries).save(folder)
     return folder

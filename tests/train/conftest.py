@@ -9,14 +9,14 @@ import pytest
 
 from tron import seeds
 from tron.shards.manifest import Manifest
-from tron.shards.schema import ClipMeta
+from tron.shards.schema import GUIDANCE, TARGET, ClipMeta, light_members
 from tron.shards.writer import ShardWriter
 
 
 def write_dataset(
     folder: Path, splits: dict[str, int], frames: int = 6, size: int = 24, shard: int = 2
 ) -> Path:
-    """Clips of smooth colours whose picture is the product of the two buffers, frames x size x size."""
+    """Clips of smooth colours whose picture is the product of pbr and irradiance, frames x size x size."""
     entries = []
     for split, count in splits.items():
         with ShardWriter(folder, split, shard) as writer:
@@ -33,7 +33,7 @@ def write_dataset(
                     height=size,
                     cameras=[{}] * frames,
                     exposure=1.0,
-                    color_space={"pbr": "linear", "irradiance": "linear", "rgb": "linear"},
+                    color_space=dict.fromkeys((*GUIDANCE, TARGET), "linear"),
                 )
                 writer.write(meta, [_frame(random, size) for _ in range(frames)])
         entries += writer.entries
@@ -46,15 +46,8 @@ def _frame(random: np.random.Generator, size: int) -> dict[str, np.ndarray]:
     pbr = 0.1 + random.random(3) * ramp[:, None, None] + np.zeros((size, size, 3))
     irradiance = 0.2 + random.random(3) * ramp[None, :, None] + np.zeros((size, size, 3))
     one = np.ones((size, size, 1))
-    return {
-        "pbr": pbr,
-        "irradiance": irradiance,
-        "rgb": pbr * irradiance,
-        "unshadowed": irradiance,
-        "shadowed": pbr,
-        "mask": one,
-        "foreground": one,
-    }
+    images = dict.fromkeys(light_members(), pbr) | {"irradiance": irradiance, "unshadowed": irradiance}
+    return images | {"rgb": pbr * irradiance, "mask": one, "foreground": one}
 
 
 @pytest.fixture(scope="session")

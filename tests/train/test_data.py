@@ -57,7 +57,7 @@ def test_batches_repeat_and_a_resumed_run_sees_the_same_ones(dataset, monkeypatc
     monkeypatch.setattr(training_data, "SEGMENT", 4)
     whole = take(batches(dataset, stage, cache), 10)
     for step, batch in enumerate(whole):
-        assert batch.shape == (3, stage.batch_size, 3, stage.frames_of(step), 16, 16)
+        assert batch.shape == (len(BUFFERS), stage.batch_size, 3, stage.frames_of(step), 16, 16)
     assert same(whole, take(batches(dataset, stage, cache), 10))
     for first in (1, 3, 4, 7):
         assert same(whole[first:], take(batches(dataset, stage, cache, first_step=first), 10 - first))
@@ -168,7 +168,7 @@ def test_colours_of_photos_are_left_alone():
 
 def test_exposure_and_agx_are_applied_to_linear_members_and_not_to_photos(dataset):
     clip = next(iter(read_clips(dataset, "test")))
-    spaces = {"rgb": "display", "pbr": "linear", "irradiance": "linear"}
+    spaces = dict.fromkeys(GUIDANCE, "linear") | {"rgb": "display"}
     clip.meta = clip.meta.model_copy(update={"exposure": 0.3, "color_space": spaces})
     as_stored = clip.frames["rgb"]
     clip.frames = {name: clip.frames[name] for name in BUFFERS}

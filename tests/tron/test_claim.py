@@ -35,6 +35,25 @@ def test_the_first_key_that_differs_is_named(now, said):
     assert first_difference(RECIPE, now) == said
 
 
+@pytest.mark.parametrize(
+    ("before", "now", "said"),
+    [
+        ({"a": 1}, {"a": 1, "new": 2}, None),
+        ({"a": 1}, {"a": 1, "new": 3}, "new=2, not 3"),
+        ({"a": 1, "new": 3}, {"a": 1, "new": 2}, "new=3, not 2"),
+        ({"part": {"x": 1}}, {"part": {"x": 1, "y": 5}}, None),
+        ({"part": {"x": 1}}, {"part": {"x": 1, "y": 6}}, "part.y=5, not 6"),
+        ({}, {"part": {"x": 0, "y": 5}}, None),
+        ({"part": None}, {"part": {"x": 0, "y": 5}}, "part.x=None, not 0"),
+        ({"new": None}, {"new": 2}, "new=None, not 2"),
+        ({"a": 1}, {"a": 1, "unknown": 2}, "unknown=None, not 2"),
+        ({"old": 1}, {}, "old=1, not None"),
+    ],
+)
+def test_a_key_that_an_older_recipe_lacks_has_its_default(before, now, said):
+    assert first_difference(before, now, {"a": 0, "new": 2, "part": {"x": 0, "y": 5}}) == said
+
+
 def test_a_refusal_is_one_line_with_folder_and_way_out(tmp_path):
     require_same(RECIPE, RECIPE, tmp_path, "a dataset")
     with pytest.raises(TronError) as caught:

@@ -39,17 +39,20 @@ class FrameFolder:
         self.folder = folder
         self.buffers = tuple(buffers)
 
-    def claim(self, made_with: Mapping[str, Any], overwrite: bool) -> None:
+    def claim(
+        self, made_with: Mapping[str, Any], overwrite: bool, defaults: Mapping[str, Any] | None = None
+    ) -> None:
         """Take the folder for frames made with these settings (JSON values), keeping those that already are.
 
-        Raises TronError if it holds frames made with others, unless `overwrite` deletes them.
+        A setting that the record of older frames lacks had its value in `defaults`. Raises TronError if the
+        folder holds frames made with others, unless `overwrite` deletes them.
         """
         record = self.folder / SETTINGS_NAME
         before = read_recipe(record)
         if before is not None and not overwrite:
             mend = "choose another output_dir, or replace them with overwrite=true"
-            require_same(before, made_with, self.folder, "frames", mend)
-        elif before is not None and first_difference(before, made_with) is not None:
+            require_same(before, made_with, self.folder, "frames", mend, defaults)
+        elif before is not None and first_difference(before, made_with, defaults) is not None:
             for path in (*self.folder.glob("*.exr"), *self.folder.glob("*.png")):
                 path.unlink()
         write_atomic(record, json.dumps(made_with, indent=1) + "\n")

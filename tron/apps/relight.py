@@ -25,6 +25,7 @@ from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
 from tron.cli.command_line import command
 from tron.cli.installation import require_extra
+from tron.cli.recipes import model_defaults
 from tron.errors import TronError
 from tron.gaussians.foreign_files import refuse_foreign
 from tron.gaussians.ply import check_header
@@ -77,7 +78,7 @@ def main(settings: Settings) -> None:
     log.info(clips[0].picture.describe())
     with locked(settings.output_dir):
         for light, clip in zip(lights, clips):
-            clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite)
+            clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite, model_defaults(Settings))
         trace(scene, cameras, clips, estimation=settings.estimation(), seed=settings.seed)
         clock.lap("guidance")
         if renderer is not None:

@@ -8,9 +8,11 @@ mend, said in one line on stderr before long work starts; 130 interrupted.
 
 import argparse
 import inspect
+import os
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, NoReturn, TypeVar
@@ -31,6 +33,8 @@ Settings = TypeVar("Settings", bound=pydantic.BaseModel)
 
 USER_ERROR = 2
 INTERRUPTED = 130
+TRACEBACK_VARIABLE = "TRON_TRACEBACK"
+"""Environment variable that stands for --traceback in the commands that a command starts."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,9 @@ class Command(Generic[Settings]):
 
     def __call__(self, arguments: Sequence[str] | None = None) -> NoReturn:
         """Run on `arguments`, those of the process where None."""
-        sys.exit(self._run(sys.argv[1:] if arguments is None else arguments))
+        arguments = sys.argv[1:] if arguments is None else arguments
+        with _tracebacks("--traceback" in arguments):
+            sys.exit(self._run(arguments))
 
     def compose(self, *overrides: str) -> Settings:
         """Checked settings from `key=value` overrides, for `main` called from Python; TronError if wrong."""
@@ -73,7 +79,7 @@ class Command(Generic[Settings]):
                     return self.main(settings) or 0
             return self.main(settings) or 0
         except TronError as error:
-            if "--traceback" in arguments:
+            if TRACEBACK_VARIABLE in os.environ:
                 traceback.print_exc()
             print(f"{self.name}: {error}", file=sys.stderr)
             return USER_ERROR
@@ -107,6 +113,19 @@ def command(
         examples: command lines for `--help`.
     """
     return Command(name, config_module, settings, main, examples)
+
+
+@contextmanager
+def _tracebacks(wanted: bool) -> Iterator[None]:
+    """Show tracebacks of mistakes, here and in the commands that the block starts, where that is wanted."""
+    own = wanted and TRACEBACK_VARIABLE not in os.environ
+    if own:
+        os.environ[TRACEBACK_VARIABLE] = "1"
+    try:
+        yield
+    finally:
+        if own:
+            del os.environ[TRACEBACK_VARIABLE]
 
 
 class _Arguments(argparse.ArgumentParser):

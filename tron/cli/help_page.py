@@ -19,8 +19,10 @@ OPTIONS = {
     "--cfg job": "print the resolved configuration as YAML and stop",
     "--config-dir DIR": "look for your own recipes in DIR first (DIR/experiment/NAME.yaml)",
     "--log-level LEVEL": "debug, info (default), warning or error",
-    "--traceback": "show where in the code a mistake was found, not only its one line",
-    "--profile": "write the times of this process's functions and Dr.Jit kernels to output_dir/profile",
+    "--traceback": "show where in the code a mistake was found, not only its one line; in the commands "
+    "that this one starts too",
+    "--profile": "write the times of functions and Dr.Jit kernels to output_dir/profile; this process only: "
+    "cluster=none shows tron-datagen's kernels",
     "--version": "print the version",
 }
 TYPE_NAMES = {

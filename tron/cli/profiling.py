@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from tron import runtime
-from tron.storage import write_atomic
+from tron.errors import TronError
+from tron.storage import atomic_path, write_atomic
 
 SHOWN_FUNCTIONS = 15
 KEPT_KERNELS = 20
@@ -27,30 +28,51 @@ def profiled(folder: Path, name: str) -> Iterator[None]:
     the functions that took longest, and the sums of the kernels, on stderr. It sees the main thread of this
     process. Dr.Jit's history holds the code of every kernel that was started: long runs need memory for it.
 
+    The block's own error always goes on. A run that was refused leaves no folder behind: after a TronError,
+    the profile is written only where the folder above is there.
+
     Args:
         folder: made if missing.
         name: of the command, which the files are called after.
+
+    Raises:
+        TronError: the block succeeded, and its profile cannot be written.
     """
     profile = cProfile.Profile()
     runtime.keep_kernel_history = True
     profile.enable()
     try:
         yield
-    finally:
-        profile.disable()
-        runtime.keep_kernel_history = False
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{name}.prof"
-        profile.dump_stats(path)
-        pstats.Stats(profile, stream=sys.stderr).strip_dirs().sort_stats("tottime").print_stats(
-            SHOWN_FUNCTIONS
-        )
-        kernels = _kernels()
-        if kernels is not None:
-            write_atomic(folder / f"{name}.kernels.json", json.dumps(kernels, indent=1) + "\n")
-            said = (f"{key.replace('_', ' ')} {value}" for key, value in kernels.items() if key != "slowest")
-            print(f"Dr.Jit: {', '.join(said)}", file=sys.stderr)
-        print(f"profile: {path}", file=sys.stderr)
+    except BaseException as error:
+        kernels = _stop(profile)
+        if not isinstance(error, TronError) or folder.parent.is_dir():
+            try:
+                _write(folder, name, profile, kernels)
+            except TronError as second:
+                print(f"profile: {second}", file=sys.stderr)
+        raise
+    _write(folder, name, profile, _stop(profile))
+
+
+def _stop(profile: cProfile.Profile) -> dict[str, Any] | None:
+    """End the profile and Dr.Jit's history; the summary of the latter, None where Dr.Jit was not used."""
+    profile.disable()
+    runtime.keep_kernel_history = False
+    return _kernels()
+
+
+def _write(folder: Path, name: str, profile: cProfile.Profile, kernels: dict[str, Any] | None) -> None:
+    """Show a profile on stderr and write it; TronError where that cannot be."""
+    pstats.Stats(profile, stream=sys.stderr).strip_dirs().sort_stats("tottime").print_stats(SHOWN_FUNCTIONS)
+    if kernels is not None:
+        said = (f"{key.replace('_', ' ')} {value}" for key, value in kernels.items() if key != "slowest")
+        print(f"Dr.Jit: {', '.join(said)}", file=sys.stderr)
+    path = folder / f"{name}.prof"
+    with atomic_path(path) as temporary:
+        profile.dump_stats(temporary)
+    if kernels is not None:
+        write_atomic(folder / f"{name}.kernels.json", json.dumps(kernels, indent=1) + "\n")
+    print(f"profile: {path}", file=sys.stderr)
 
 
 def summarize(history: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -5,11 +5,19 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from tron.shards.schema import GUIDANCE, light_members
+
+PAPER_GUIDANCE = ("pbr", "irradiance")
+"""Guidance of the paper's network: direct light alone."""
+AUTO = "auto"
+MEAN = "mean"
+"""Start of a network that adds to the mean of all latents."""
+BEST_FIRST = ("lit", "pbr")
+"""Buffers that a network starts from unless told otherwise: the first of them that it is given."""
 
 
 class GuidedConfig(BaseModel):
@@ -17,8 +25,16 @@ class GuidedConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    OTHER_STARTS: ClassVar[tuple[str, ...]] = ()
+
     guidance: tuple[str, ...] = Field(
-        default=GUIDANCE, description="Members of a clip that are its input, in order; pbr among them."
+        default=GUIDANCE, description="Members of a clip that are its input, in order."
+    )
+    skip: str = Field(
+        default=AUTO,
+        validate_default=True,
+        description="Member of guidance that the network's output is added to; auto: lit where it is among "
+        "them, else pbr, else the first.",
     )
     window: int = Field(default=1, ge=1, description="Frames that render_clip hands over at once.")
 
@@ -26,9 +42,22 @@ class GuidedConfig(BaseModel):
     @classmethod
     def _colours(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         there = light_members()
-        if "pbr" not in names or len(set(names)) < len(names) or not set(names) <= set(there):
-            raise ValueError(f"guidance is pbr and others of {', '.join(there)}")
+        if not names or len(set(names)) < len(names) or not set(names) <= set(there):
+            raise ValueError(f"guidance is one or more of {', '.join(there)}")
         return names
+
+    @field_validator("skip")
+    @classmethod
+    def _start(cls, name: str, info: ValidationInfo) -> str:
+        guidance = info.data.get("guidance")
+        if guidance is None:  # refused already
+            return name
+        if name == AUTO:
+            return next((best for best in BEST_FIRST if best in guidance), guidance[0])
+        starts = (*guidance, *cls.OTHER_STARTS)
+        if name not in starts:
+            raise ValueError(f"skip is one of {', '.join((AUTO, *starts))}")
+        return name
 
 
 class BackboneConfig(BaseModel):
@@ -57,16 +86,15 @@ class BackboneConfig(BaseModel):
 
 
 class RendererConfig(GuidedConfig):
-    """Parts of a NeuralRenderer; it travels inside the weights file."""
+    """Parts of a NeuralRenderer; it travels inside the weights file. ``skip`` may be mean: of all latents."""
+
+    OTHER_STARTS: ClassVar[tuple[str, ...]] = (MEAN,)
 
     codec: str = Field(default="block_dct", description="Video to latents, a name of tron.neural.codecs.")
     fusion: Literal["concat", "average"] = Field(
         default="concat",
         description="concat gives the transformer all latents; average their mean, which keeps the input "
         "width that published weights expect (the paper's choice, 3 dB worse for the tiny model).",
-    )
-    skip: Literal["pbr", "mean"] = Field(
-        default="pbr", description="Latent that the network's output is added to: pbr's, or the mean of all."
     )
     sigma: float | None = Field(
         default=None,
@@ -96,10 +124,11 @@ COSMOS_0_6B = BackboneConfig(
 class CosmosConfig(RendererConfig):
     """Renderer of the paper: published backbone and codec, one step at its noise level, five frames."""
 
+    guidance: tuple[str, ...] = PAPER_GUIDANCE
+    skip: str = MEAN
     window: int = Field(default=5, ge=1)
     codec: str = "wan"
     fusion: Literal["concat", "average"] = "average"
-    skip: Literal["pbr", "mean"] = "mean"
     sigma: float | None = Field(default=0.25, gt=0)
     backbone: BackboneConfig = COSMOS_0_6B
 

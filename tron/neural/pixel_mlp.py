@@ -13,7 +13,7 @@ from tron.neural.protocols import Renderer
 
 
 class PixelMLP(Renderer):
-    """1 x 1 convolutions on the guidance (docs/conventions.md, 12), with the residual taken from pbr.
+    """1 x 1 convolutions on the guidance (docs/conventions.md, 12), added to the buffer that `skip` names.
 
     What it cannot do, since it sees one pixel, is what a neural renderer is for: reflections and bounce
     light from elsewhere. It trains through the same tron-train as the renderer.
@@ -37,7 +37,7 @@ class PixelMLP(Renderer):
         """As Renderer.forward."""
         # A linear layer over the last axis is a 1 x 1 convolution, and much faster on a CPU.
         pixels = torch.cat(self.stacked(buffers), 1).movedim(1, -1)
-        return buffers["pbr"] + self.layers(pixels).movedim(-1, 1)
+        return buffers[self.config.skip] + self.layers(pixels).movedim(-1, 1)
 
     def hidden_matrices(self) -> list[nn.Parameter]:
         """Weights between hidden layers, 2-D."""

@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 from tron.errors import TronError
 from tron.neural.backbone import Backbone
 from tron.neural.codecs import CODECS
-from tron.neural.configs import RendererConfig
+from tron.neural.configs import MEAN, RendererConfig
 from tron.neural.protocols import Codec, Renderer
 from tron.neural.windows import check_frames, windows
 
@@ -20,7 +20,7 @@ PLAIN_TIMESTEP = 0.2  # what the tiny transformer is told; any constant will do
 
 
 class NeuralRenderer(Renderer):
-    """Codec, transformer, codec. Freshly made with sigma None it returns the PBR buffer unchanged."""
+    """Codec, transformer, codec. A new one with sigma None returns the buffer that `skip` names."""
 
     config: RendererConfig
 
@@ -49,7 +49,8 @@ class NeuralRenderer(Renderer):
         latents = [self.codec.encode(self._padded(video)) for video in videos]
         mean = torch.stack(latents).mean(0)
         fused = torch.cat(latents, 1) if self.config.fusion == "concat" else mean
-        start = latents[self.config.guidance.index("pbr")] if self.config.skip == "pbr" else mean
+        skip = self.config.skip
+        start = mean if skip == MEAN else latents[self.config.guidance.index(skip)]
         return self.codec.decode(self._denoise(fused, start))[..., :height, :width]
 
     def hidden_matrices(self) -> list[nn.Parameter]:

@@ -19,7 +19,13 @@ from torch import Tensor
 from tron.errors import TronError
 from tron.neural.backbone import transformer
 from tron.neural.codecs import CODECS
-from tron.neural.configs import BackboneConfig, CosmosConfig, PixelMLPConfig, RendererConfig
+from tron.neural.configs import (
+    PAPER_GUIDANCE,
+    BackboneConfig,
+    CosmosConfig,
+    PixelMLPConfig,
+    RendererConfig,
+)
 from tron.neural.pixel_mlp import PixelMLP
 from tron.neural.protocols import Codec, Renderer
 from tron.neural.published_files import existing, folder_state, load_strictly, safetensors_state, torch_state
@@ -76,7 +82,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 def _build(kind: str, config: dict[str, Any], vae: str | Path | None) -> Renderer:
     # The file chooses among these two and nothing else: a name to import would be code in a data file.
-    config = {"guidance": ("pbr", "irradiance"), **config}  # files before schema 2 do not name it
+    config = {"guidance": PAPER_GUIDANCE, **config}  # files before schema 2 do not name it
     if kind == "pixel_mlp":
         return PixelMLP(PixelMLPConfig.model_validate(config))
     if kind == "neural":

@@ -1,6 +1,6 @@
 """Settings of a reconstruction: its beginning, and stages 1 (radiance), 2 (materials) and 3 (light).
 
-The schedule is that of 3DGRT, which the paper inherits (docs/conventions.md, 15): 30,000 steps, then 7,000.
+The schedule is that of 3DGRT, which the paper inherits (docs/reconstruction.md): 30,000 steps, then 7,000.
 A machine without a GPU takes fewer of them: ``scaled`` shortens every schedule at once, as gsplat's
 ``steps_scaler`` does, and lets surfels move and turn faster, since otherwise they would not arrive.
 """
@@ -215,8 +215,8 @@ class FitSettings(Settings):
             rays=rays,
             estimator=self.estimator,
             two_sided=self.two_sided,
-            filtered=filtered,
             diffuse=self.diffuse,
+            filtered=filtered,
         )
 
 

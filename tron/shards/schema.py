@@ -22,8 +22,11 @@ SCHEMA_VERSION = 3
 
 ColorSpace = Literal["linear", "display"]
 
-GUIDANCE = ("pbr", "irradiance")
-"""Members that the neural renderer is conditioned on, unless its configuration names others."""
+GUIDANCE = ("pbr", "irradiance", "lit")
+"""Members that the neural renderer is conditioned on, unless its configuration names others.
+
+The paper's are pbr and irradiance.
+"""
 TARGET = "rgb"
 """Member that the neural renderer must produce."""
 
@@ -74,6 +77,8 @@ MEMBERS: dict[str, Member] = {
     "lit": _light("shadowed, and light that bounced between the surfels: the picture without a network"),
     "mask": _scalar("opacity of the surfels in [0, 1]", "all"),
     "foreground": Member("png", 1, 1, None, "all", "1 where the pixel-centre ray meets true geometry"),
+    "lit_supersampled": _light("lit, on 2 x 2 sub-pixels", "reference"),
+    "lit_reflections": _light("the same with rays to what surfaces mirror", "reference"),
     "irradiance_ref": _light("direct irradiance / pi by Mitsuba, with shadows", "reference"),
     "unshadowed_ref": _light("the same with nothing in the way", "reference"),
     "base_color_ref": _light("true base color", "reference"),

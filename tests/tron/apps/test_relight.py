@@ -1,6 +1,7 @@
 """tron-relight from end to end on a tiny scene: files, laws of light, resuming, and mistakes."""
 
 import json
+from dataclasses import fields
 
 import numpy as np
 import plyfile
@@ -9,6 +10,7 @@ import pytest
 from tron.apps import clip as clips
 from tron.apps.clip import Clip
 from tron.apps.frame_folder import FrameFolder
+from tron.apps.relight_settings import BUFFERS, DEFAULT_BUFFERS, Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
 from tron.color import to_display
@@ -16,7 +18,9 @@ from tron.gaussians.ply import MATERIAL_PROPERTIES
 from tron.images import read_image
 from tron.seeds import generator
 from tron.shading.environment import EnvironmentMap
+from tron.shading.guidance import Guidance
 from tron.shards.schema import GUIDANCE
+from tron.tracing.surface import Surface
 
 SIZE = 32
 
@@ -45,6 +49,13 @@ def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, 
     assert np.linalg.norm(middle) == pytest.approx(1, abs=0.01)
     assert middle[0] > 0.8  # the first camera of an orbit stands on +x and sees the ball's front
     assert mask[SIZE // 2, SIZE // 2, 0] > 0.95
+
+
+def test_every_buffer_of_the_help_is_made_and_all_guidance_is_written_by_default():
+    shaded = {"foreground", "relit"}
+    assert set(BUFFERS) <= {field.name for field in fields(Surface)} | set(Guidance.BUFFERS) | shaded
+    assert set(Guidance.BUFFERS) <= set(DEFAULT_BUFFERS)
+    assert all(name in (Settings.model_fields["buffers"].description or "") for name in BUFFERS)
 
 
 def test_the_papers_fidelity_gives_other_frames(relight, scene_path, light_path, tmp_path):
@@ -120,6 +131,22 @@ def test_other_settings_in_the_same_folder_are_refused(relight, scene_path, ligh
     assert relight(*base, "rotation=45") == 2
     assert "rotation=0.0, not 45.0" in capsys.readouterr().err
     assert relight(*base, "rotation=45", "overwrite=true") == 0
+
+
+def test_frames_of_an_older_release_keep_the_defaults_of_settings_that_it_lacked(
+    relight, scene_path, light_path, tmp_path, capsys
+):
+    out = tmp_path / "out"
+    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=1"]
+    assert relight(*base) == 0
+    record = out / "frames" / "settings.json"
+    whole = json.loads(record.read_text())
+    record.write_text(json.dumps({key: whole[key] for key in whole if key not in ("estimator", "denoise")}))
+    assert relight(*base, "estimator=plain") == 2
+    assert "frames made with estimator=ratio, not plain" in capsys.readouterr().err
+    assert relight(*base) == 0
+    assert json.loads((out / "relight.json").read_text())["frames_rendered"] == 0
+    assert json.loads(record.read_text()) == whole
 
 
 def test_a_plain_3dgs_file_is_relit_with_a_warning(relight, scene_path, light_path, tmp_path, caplog):

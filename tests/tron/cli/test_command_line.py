@@ -343,7 +343,25 @@ def test_a_mistakes_traceback_is_shown_where_it_is_asked_for(run: Run):
     assert "Traceback" in run("framez=3", "--traceback")[2]
 
 
-def test_a_profile_of_a_command_that_fails_is_kept_too(run: Run, tmp_path: Path, monkeypatch):
+def test_commands_that_a_command_starts_show_tracebacks_too(run: Run):
+    """As tron-eval's stages do."""
+    child = (
+        "import pydantic; from tron.cli.command_line import command; "
+        "command('tron-child', 'conf.relight', pydantic.BaseModel, print)(['framez=3'])"
+    )
+    said = []
+
+    def start(_):
+        done = subprocess.run([sys.executable, "-c", child], capture_output=True, text=True, check=False)
+        said.append((done.returncode, done.stderr))
+
+    for options in (["--traceback"], []):  # the second is not told what the first was
+        run("output_dir=o", *options, does=start)
+    assert [code for code, _ in said] == [2, 2]
+    assert ["Traceback" in text for _, text in said] == [True, False]
+
+
+def test_a_profile_of_a_command_that_fails_at_work_is_kept(run: Run, tmp_path: Path, monkeypatch):
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
 
     def slow(_):
@@ -353,12 +371,46 @@ def test_a_profile_of_a_command_that_fails_is_kept_too(run: Run, tmp_path: Path,
         slow(settings)
         raise TronError("no luck")
 
-    assert run("output_dir=o", "--profile", does=fail)[0] == 2
-    _, _, err = run("output_dir=o", "--profile", does=lambda settings: slow(settings) * 0)
+    (tmp_path / "o").mkdir()  # it had begun its work
+    code, _, err = run("output_dir=o", "--profile", does=fail)
+    assert code == 2
     stats = pstats.Stats(str(tmp_path / "o" / "profile" / "tron-toy.prof")).stats  # type: ignore[attr-defined]
     assert "slow" in {function for _, _, function in stats}
     assert "slow" in err
+    assert err.endswith("\ntron-toy: no luck\n")
     assert not (tmp_path / "o" / "profile" / "tron-toy.kernels.json").exists()
+
+
+def test_a_refused_command_leaves_no_profile_behind(run: Run, tmp_path: Path):
+    def refuse(_):
+        raise TronError("file not found", where="a.ply")
+
+    code, _, err = run("output_dir=o", "--profile", does=refuse)
+    assert (code, err) == (2, "tron-toy: file not found (a.ply)\n")
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize("error", [TronError("its own words"), ValueError("its own words")])
+def test_a_profile_that_cannot_be_written_hides_no_error(run: Run, tmp_path: Path, error: Exception):
+    def fail(_):
+        raise error
+
+    (tmp_path / "o").mkdir()
+    (tmp_path / "o" / "profile").touch()  # where its folder would be
+    if isinstance(error, TronError):
+        code, _, err = run("output_dir=o", "--profile", does=fail)
+        assert (code, err.splitlines()[-1]) == (2, "tron-toy: its own words")
+        assert "profile: cannot write" in err
+    else:
+        with pytest.raises(ValueError, match="its own words"):
+            run("output_dir=o", "--profile", does=fail)
+
+
+def test_a_profile_that_cannot_be_written_is_one_line(run: Run, tmp_path: Path):
+    (tmp_path / "o").touch()
+    code, _, err = run("output_dir=o", "--profile", does=lambda _: None)
+    assert code == 2
+    assert err.splitlines()[-1].startswith("tron-toy: cannot write: ")
 
 
 @pytest.mark.usefixtures("variant")

@@ -13,9 +13,11 @@ from tron.errors import TronError
 from tron.neural.backbone import transformer
 from tron.neural.configs import BackboneConfig, PixelMLPConfig, RendererConfig
 from tron.neural.pixel_mlp import PixelMLP
+from tron.neural.protocols import Renderer
 from tron.neural.renderer import NeuralRenderer
 from tron.neural.wan import WanCodec, load_wan
 from tron.neural.weights import load_cosmos, load_renderer, restore_renderer, save_renderer
+from tron.shards.schema import GUIDANCE
 
 SMALL = BackboneConfig(heads=2, head_dim=12, layers=2, adaln_lora_dim=8)
 WAN: dict[str, Any] = {"base_dim": 8, "num_res_blocks": 1}
@@ -47,8 +49,7 @@ RAW_NAMES = [
 
 def inputs(frames: int = 1, size: int = 32):
     generator = torch.Generator().manual_seed(0)
-    names = ("pbr", "irradiance")
-    return {name: torch.rand(1, 3, frames, size, size, generator=generator) * 2 - 1 for name in names}
+    return {name: torch.rand(1, 3, frames, size, size, generator=generator) * 2 - 1 for name in GUIDANCE}
 
 
 @pytest.mark.parametrize(
@@ -75,13 +76,24 @@ def test_a_saved_renderer_loads_again_bit_by_bit(tmp_path, renderer):
         torch.testing.assert_close(again(inputs()), renderer.eval()(inputs()), atol=0, rtol=0)
 
 
-def test_files_from_before_guidance_was_named_are_of_pbr_and_irradiance(tmp_path):
-    renderer = PixelMLP(PixelMLPConfig(width=8))
-    header: dict[str, Any] = {"format": "tron-renderer 1", "kind": "pixel_mlp"}
-    header["config"] = renderer.config.model_dump(mode="json", exclude={"guidance"})
+@pytest.mark.parametrize("named", [False, True], ids=["before schema 2", "before schema 3"])
+@pytest.mark.parametrize("kind", ["pixel_mlp", "neural"])
+def test_files_from_before_lit_render_as_they_did(tmp_path, kind, named):
+    """They start from pbr: a transformer's file says so, a pixel network's says nothing of it."""
+    guidance = ("pbr", "irradiance")
+    renderer: Renderer
+    if kind == "pixel_mlp":
+        renderer, unsaid = PixelMLP(PixelMLPConfig(width=8, guidance=guidance)), {"skip"}
+    else:
+        renderer, unsaid = NeuralRenderer(RendererConfig(backbone=SMALL, guidance=guidance)), set()
+    for parameter in renderer.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    config = renderer.config.model_dump(mode="json", exclude=unsaid | (set() if named else {"guidance"}))
+    assert config.get("skip", "pbr") == "pbr"
+    header = {"format": "tron-renderer 1", "kind": kind, "config": config}
     save_file(renderer.state_dict(), tmp_path / "old.safetensors", {"tron": json.dumps(header)})
     again = load_renderer(tmp_path / "old.safetensors")
-    assert again.config.guidance == ("pbr", "irradiance")
+    assert (again.config.guidance, again.config.skip) == (guidance, "pbr")
     torch.testing.assert_close(again(inputs()), renderer(inputs()), atol=0, rtol=0)
 
 

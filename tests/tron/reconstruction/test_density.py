@@ -177,7 +177,7 @@ def test_a_reset_lowers_the_opaque_alone_and_forgets_their_momentum() -> None:
 
 
 def test_the_papers_schedule_to_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """docs/conventions.md, 15: densify in 500 < step < 15000 every 300, prune every 100, reset each 3000."""
+    """3DGRT's: densify in 500 < step < 15000 every 300, prune every 100, reset each 3000."""
     paper = DensitySettings(end=15_000, every=300, reset_every=3000)
     surfels, density = surfels_of(2), DensityControl(paper, EXTENT, 0)
     added, pruned, reset = [], [], []

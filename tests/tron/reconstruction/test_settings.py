@@ -11,6 +11,7 @@ from tron.apps.reconstruct import Settings
 from tron.cli.recipes import check, compose_recipe
 from tron.reconstruction.settings import (
     DensitySettings,
+    FitSettings,
     MaterialSettings,
     RadianceSettings,
     ReconstructionSettings,
@@ -39,7 +40,7 @@ def paper() -> Settings:
 
 
 def test_the_papers_recipe_is_that_of_the_facts(paper: Settings) -> None:
-    """The numbers of the paper (docs/conventions.md, 15)."""
+    """The numbers of the paper, and those of 3DGRT that it inherits."""
     radiance, density, materials = paper.radiance, paper.radiance.density, paper.materials
     assert (radiance.steps, materials.steps, paper.steps_scaler) == (30_000, 7000, 1.0)
     assert (radiance.position_rate, radiance.position_rate_final) == (1.6e-4, 1.6e-6)
@@ -55,6 +56,24 @@ def test_the_papers_recipe_is_that_of_the_facts(paper: Settings) -> None:
     assert (paper.initial.kernel_degree, paper.initial.count, paper.max_side) == (2, 100_000, None)
     assert paper.light is not None
     assert (paper.light.resolution, paper.light.steps) == (512, 4000)
+
+
+def test_the_papers_recipe_fits_the_light_with_final_shadows_and_large_batches(paper: Settings) -> None:
+    """64 shadow rays are the paper's final quality; it names no batches: they are ours for its size."""
+    light, quick = paper.light, FitSettings()
+    assert light is not None
+    assert (light.rays, light.scale_rays) == (64, 64)
+    assert (light.pixels, light.scale_pixels) == (128**2, 512**2)
+    sizes = {name for name in FitSettings.model_fields if getattr(light, name) != getattr(quick, name)}
+    assert sizes == {"resolution", "steps", "rays", "pixels", "scale_rays", "scale_pixels"}
+
+
+def test_the_papers_recipe_has_room_for_a_million_surfels(paper: Settings) -> None:
+    """Numbers that the paper does not name: 3DGS's initial opacity, a prior's weight, constant rates."""
+    assert (paper.initial.opacity, paper.radiance.density.most) == (0.1, 1_000_000)
+    assert paper.radiance.normal == 0.1
+    assert (paper.materials.rate, paper.materials.decay) == (2.5e-3, 1.0)
+    assert paper.variant == "cuda_ad_rgb"
 
 
 def test_the_defaults_are_the_papers_but_for_what_so_short_a_schedule_needs(paper: Settings) -> None:

@@ -14,7 +14,7 @@ from tron import seeds
 from tron.errors import TronError
 from tron.shards import MEMBERS, ClipMeta, Manifest, ShardWriter, clip_members, read_clips, verify
 from tron.shards.reader import decode_clip, decode_meta, group_clips, tar_files
-from tron.shards.schema import members_table, parse_name
+from tron.shards.schema import SCHEMA_VERSION, members_table, parse_name
 
 
 def meta(key: str, split: str = "train", frames: int = 2) -> ClipMeta:
@@ -331,11 +331,11 @@ def test_a_damaged_manifest_is_one_clear_line(tmp_path, text):
     assert "\n" not in str(caught.value)
 
 
-def test_clips_of_an_older_schema_are_refused_by_its_name(tmp_path):
-    old = meta("a0").model_copy(update={"schema_version": 1})
-    with pytest.raises(
-        TronError, match=r"dataset of schema 1, this program reads schema 2 \(clip a0\): make it"
-    ):
+@pytest.mark.parametrize("version", range(1, SCHEMA_VERSION))
+def test_clips_of_an_older_schema_are_refused_by_its_name(version):
+    old = meta("a0").model_copy(update={"schema_version": version})
+    said = rf"dataset of schema {version}, this program reads schema {SCHEMA_VERSION} \(clip a0\): make it"
+    with pytest.raises(TronError, match=said):
         decode_meta(old.model_dump_json().encode())
 
 
@@ -348,7 +348,7 @@ def test_a_manifest_cannot_name_files_outside_its_folder(tmp_path):
         "bytes": 1,
         "sha256": "0" * 64,
     }
-    (tmp_path / "manifest.json").write_text(json.dumps({"schema_version": 2, "shards": [entry]}))
+    (tmp_path / "manifest.json").write_text(json.dumps({"schema_version": SCHEMA_VERSION, "shards": [entry]}))
     with pytest.raises(TronError, match="name"):
         Manifest.load(tmp_path)
 
