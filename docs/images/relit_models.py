@@ -32,13 +32,14 @@ ESTIMATION = Estimation(rays=64, reflections=4, supersample=2)
 SURFELS = 1_200_000
 VIEWS, VIEW_SIDE = 40, 896
 PATHS = 256
-MODELS = {  # file, radius, (x, y), turn about up in degrees
-    "FlightHelmet/FlightHelmet.gltf": (1.15, (0.12, 0.2), 10),
-    "cat/cat.glb": (1.0, (-1.0, 0.1), 30),
-    "spot/spot.obj": (0.8, (1.12, -0.15), 140),
-}
+MODELS = [  # file, radius, (x, y), turn about up in degrees
+    ("FlightHelmet/FlightHelmet.gltf", 1.15, (0.12, 0.2), 10),
+    ("cat/cat.glb", 1.0, (-1.0, 0.1), 30),
+    ("spot/spot.obj", 0.8, (1.12, -0.15), 140),
+    ("spot/spot.obj", 0.27, (0.42, -0.72), 200),
+]
 FLOOR = {"color_a": (0.55, 0.24, 0.13), "color_b": (0.55, 0.24, 0.13), "roughness": (0.4, 0.4)}
-LIGHT, TURN_DEG, BRIGHTER = "venice_sunset_1k", 30, 1.8
+LIGHT, TURN_DEG, BRIGHTER = "venice_sunset_1k", 30, 1.6
 
 
 def standing(parts: list, size: float, at: tuple[float, float], turn_deg: float) -> Placement:
@@ -67,10 +68,10 @@ def view(width: int, height: int) -> Camera:
 
 def models_on_a_table(data: Path) -> Geometry:
     """The meshes and materials."""
-    models = {name: load_model(data / "assets" / name) for name in MODELS}
+    models = {name: load_model(data / "assets" / name) for name, *_ in MODELS}
     objects = [
         ObjectSpec(asset=name, size=size, placement=standing(models[name], size, at, turn))
-        for name, (size, at, turn) in MODELS.items()
+        for name, size, at, turn in MODELS
     ]
     drawn = draw_scene(0, "train", 0, style="A", lights=["overcast"])
     floor = drawn.floor.model_copy(
