@@ -323,6 +323,22 @@ def test_what_cannot_be_traced_is_refused(dense_surfels) -> None:
         BounceTransport.trace(tracer, rays=1).moved(fewer)
 
 
+def test_surfels_treated_in_parts_meet_what_they_meet_at_once(dense_surfels, white, monkeypatch) -> None:
+    """Which rays there are does not depend on the parts; shadow rays do, in the noise."""
+    scene = lambert_scene(dense_surfels, still_life(dense_surfels))
+    found = []
+    for at_once in (1 << 20, 1 << 12):
+        monkeypatch.setattr("tron.shading.bounce_rays.AT_ONCE", at_once)
+        transport = BounceTransport.trace(SurfelTracer(scene), rays=8)
+        ones = everywhere(transport, 1.0)
+        met = numbers(transport.openness()), numbers(transport.indirect(ones, ones * 0.5))
+        found.append((*met, numbers(transport.direct(white))))
+    assert len(scene) > 2 << 12
+    for whole, in_parts in list(zip(*found))[:2]:
+        np.testing.assert_array_equal(in_parts, whole)
+    np.testing.assert_allclose(found[1][2].mean(), found[0][2].mean(), rtol=2e-3)
+
+
 @pytest.mark.parametrize("rays", [1, 3, 8])
 def test_few_surfels_and_rays_are_enough(dense_surfels, white, rays: int) -> None:
     """One surfel, and two that face each other, of any number of rays."""
@@ -337,9 +353,9 @@ def test_few_surfels_and_rays_are_enough(dense_surfels, white, rays: int) -> Non
 def test_other_lights_and_scenes_compile_no_new_kernel(dense_surfels, sun_map, kernels_of) -> None:
     lights = [Lighting(sun_map), Lighting(EnvironmentMap(sun_map.image * 0.5, rotation_deg=30))]
     tracers = [SurfelTracer(dense_surfels.scene(dense_surfels.sphere(spacing))) for spacing in (0.16, 0.17)]
+    dr.eval([tracer.bvh for tracer in tracers])
 
     def bake(number: int) -> None:
-        dr.eval(tracers[number].bvh)
         BounceTransport.trace(tracers[number], seed=number).bake(lights[number], back=0.1 * number)
 
     bake(0)
