@@ -47,8 +47,7 @@ def test_guidance_is_judged_by_the_scenes_of_a_dataset(tmp_path: Path, capsys: p
         f"output_dir={tmp_path}", "train.scenes=0", "train_b.scenes=0", "validation.scenes=0",
         "test.scenes=1", "test.lights=[sun]", "test.frames=1", "test.width=32", "test.height=32",
         "test.path_spp=4", "test.guidance_spp=2", "test.reference_buffers=false", "path_frames=4",
-        "surfels=4000",
-        "views=12",
+        "surfels=4000", "views=12",
         "view_width=64", "view_height=64", "refine_steps=0", "mesh_edge=0.2", "environment_height=32",
         "equal_error.reference_spp=256", "equal_error.rounds=1",
     ]  # fmt: skip

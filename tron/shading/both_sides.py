@@ -53,7 +53,7 @@ class BothSides:
     def bake(
         self, lighting: Lighting, estimation: Estimation = FINAL, seed: int = 0
     ) -> tuple[BouncedLight, BouncedLight]:
-        """What ``lighting`` is at the fronts, and at the backs: see :meth:`BounceTransport.bake`."""
+        """Light of ``lighting`` at the fronts, and at the backs: see :meth:`BounceTransport.bake`."""
         sides = [side.bake(lighting, estimation, bounces=0, seed=seed) for side in (self.front, self.back)]
         albedo = self.front.albedo(estimation.diffuse)
         albedo, direct = _joined(albedo, albedo), _joined(*(side.direct for side in sides))
@@ -69,7 +69,7 @@ class BothSides:
 
 
 def _of_faces(front: mi.UInt32, back: mi.UInt32, count: int) -> mi.UInt32:
-    """What the rays of all faces meet, as ``SurfelRays.met``, of what those of either side meet."""
+    """Codes of ``SurfelRays.met`` for the rays of all faces, from those of either side."""
     surfels = dr.opaque(mi.UInt32, count)
     place = dr.arange(mi.UInt32, dr.width(front) + dr.width(back))
     ray, face = place // (2 * surfels), place % (2 * surfels)

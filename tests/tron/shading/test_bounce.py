@@ -18,6 +18,7 @@ from tron.estimation import Estimation
 from tron.gaussians.edit import moved
 from tron.seeds import generator
 from tron.shading.bounce import BounceTransport
+from tron.shading.brdf_table import BrdfTable
 from tron.shading.cubemap import CubemapLight
 from tron.shading.environment import EnvironmentMap
 from tron.shading.lighting import Lighting
@@ -405,7 +406,7 @@ def test_gradients_of_bounced_light_are_differences(dense_surfels, sun_map, cube
     def loss(base: mi.Color3f, roughness: mi.Float, metallic: mi.Float, texels: mi.Float) -> mi.Float:
         there = replace(surfels, base_color=base, roughness=roughness, metallic=metallic)
         direct = still if texels is cubemap.texels else direct_of(texels)
-        indirect = transport.indirect(direct, bounce_albedo(there), bounces)
+        indirect = transport.indirect(direct, bounce_albedo(there, BrdfTable.load()), bounces)
         return dr.sum(dr.sum(weights * indirect))
 
     given = [surfels.base_color, surfels.roughness, surfels.metallic, cubemap.texels]
