@@ -8,7 +8,6 @@ import numpy as np
 
 from eval.relighting.baselines import (
     BASELINES,
-    DIRECT,
     FINER,
     NETWORKS,
     NEURAL,
@@ -25,7 +24,7 @@ from tron.shards.schema import Clip, ClipMeta
 ERROR_GAIN = 3
 LIT = next(baseline for baseline in BASELINES if baseline.name == "lit")
 PICTURED: list[Method] = [
-    *(each for each in BASELINES if each.pictured and DIRECT in each.groups),
+    *(each for each in BASELINES if each.pictured and each is not LIT and ON_LIT not in each.groups),
     NEURAL,
     *(each for each in BASELINES if each.pictured and ON_LIT in each.groups),
     FINER[-1],
