@@ -101,7 +101,7 @@ def _judge_scene(
         frame = _Frame(geometry, camera, environment, wanted, integer(spec.seed, spec.name, number, "equal"))
         case = {
             "scene": spec.name,
-            "light": light.name if light.family == "hdri" else light.family,
+            "light": Path(light.path).stem if light.family == "hdri" else light.family,
             "pixels": camera.width * camera.height,
             "surfels": len(scene),
             "transport_seconds": seconds,

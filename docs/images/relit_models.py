@@ -1,8 +1,9 @@
-"""The first picture of README.md: three real models as surfels, under four environment maps.
+"""The first picture of README.md: real models as surfels, `lit` under an environment map, no network.
 
-    python docs/images/relit_models.py ../shared/data docs/images/relit-models.jpg
+    cd docs/images; python relit_models.py ../../../shared/data relit-models.jpg guidance-path-traced.jpg
 
-Two and a half minutes on two cores. Surfels are made from the models' true G-buffers.
+The second picture, of docs/guidance.md, shows it smaller, beside the path tracer's of the same models.
+Surfels are made from the models' true G-buffers.
 """
 
 import sys
@@ -14,27 +15,31 @@ from tron.runtime import activate
 
 activate("llvm_ad_rgb")
 
-from datagen.build import build  # noqa: E402
+from datagen.build import Geometry, build  # noqa: E402
 from datagen.layout import Placement  # noqa: E402
 from datagen.models import load_model  # noqa: E402
-from datagen.pathtrace import gbuffers  # noqa: E402
+from datagen.pathtrace import gbuffers, render_frames  # noqa: E402
 from datagen.scene import ObjectSpec, draw_scene  # noqa: E402
 from tron.cameras import Camera  # noqa: E402
 from tron.color import to_display  # noqa: E402
 from tron.gaussians.initialize import surfels_from_gbuffers  # noqa: E402
 from tron.images import write_image  # noqa: E402
-from tron.shading import EnvironmentMap, Estimation, Lighting, render_guidance  # noqa: E402
+from tron.shading import BounceTransport, EnvironmentMap, Estimation, Lighting, render_guidance  # noqa: E402
 from tron.tracing import SurfelTracer  # noqa: E402
 
-SIZE = (640, 440)
-SUPERSAMPLES = 2
-SURFELS = 600_000
-MODELS = {  # file, radius, (x, y), turn about up in degrees
-    "FlightHelmet/FlightHelmet.gltf": (1.15, (0.0, 0.0), 10),
-    "cat/cat.glb": (1.0, (-1.35, 0.35), 35),
-    "spot/spot.obj": (0.85, (1.25, -0.25), 140),
-}
-LIGHTS = {"venice_sunset_1k": 0, "kiara_1_dawn_1k": 60, "studio_small_03_1k": 180, "forest_slope_1k": 0}
+SIZE = (1280, 720)
+ESTIMATION = Estimation(rays=64, reflections=4, supersample=2)
+SURFELS = 1_200_000
+VIEWS, VIEW_SIDE = 40, 896
+PATHS = 256
+MODELS = [  # file, radius, (x, y), turn about up in degrees
+    ("FlightHelmet/FlightHelmet.gltf", 1.15, (0.12, 0.2), 10),
+    ("cat/cat.glb", 1.0, (-1.0, 0.1), 30),
+    ("spot/spot.obj", 0.8, (1.12, -0.15), 140),
+    ("spot/spot.obj", 0.27, (0.42, -0.72), 200),
+]
+FLOOR = {"color_a": (0.55, 0.24, 0.13), "color_b": (0.55, 0.24, 0.13), "roughness": (0.4, 0.4)}
+LIGHT, TURN_DEG, BRIGHTER = "venice_sunset_1k", 30, 1.6
 
 
 def standing(parts: list, size: float, at: tuple[float, float], turn_deg: float) -> Placement:
@@ -44,47 +49,54 @@ def standing(parts: list, size: float, at: tuple[float, float], turn_deg: float)
     return Placement(quaternion=(np.cos(half), 0, 0, np.sin(half)), position=(*at, height))
 
 
-def around(count: int) -> list[Camera]:
+def around(count: int, side: int) -> list[Camera]:
     """Cameras spread evenly over the upper hemisphere (a golden spiral)."""
     z = 0.03 + 0.95 * (np.arange(count) + 0.5) / count
     phi = (np.arange(count) + 0.5) * np.pi * (3 - np.sqrt(5))
     directions = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1)
-    target = np.array([0, 0, 0.6])
+    target = np.array([0, 0, 0.5])
     return [
-        Camera.look_at(4.6 * d + target, target=target, fov_deg=46, width=512, height=512) for d in directions
+        Camera.look_at(4.4 * d + target, target=target, fov_deg=46, width=side, height=side)
+        for d in directions
     ]
 
 
-def main(data: Path, output: Path) -> None:
-    """Make the surfels, light them, write the picture."""
-    models = {name: load_model(data / "assets" / name) for name in MODELS}
+def view(width: int, height: int) -> Camera:
+    """The camera of the picture."""
+    return Camera.look_at((0.35, -5.3, 1.5), (0.06, 0, 0.82), fov_deg=38.5, width=width, height=height)
+
+
+def models_on_a_table(data: Path) -> Geometry:
+    """The meshes and materials."""
+    models = {name: load_model(data / "assets" / name) for name, *_ in MODELS}
     objects = [
         ObjectSpec(asset=name, size=size, placement=standing(models[name], size, at, turn))
-        for name, (size, at, turn) in MODELS.items()
+        for name, size, at, turn in MODELS
     ]
     drawn = draw_scene(0, "train", 0, style="A", lights=["overcast"])
-    grey = {"color_a": (0.42, 0.4, 0.37), "color_b": (0.42, 0.4, 0.37), "roughness": (0.45, 0.45)}
     floor = drawn.floor.model_copy(
-        update={"half_size": 4.0, "material": drawn.floor.material.model_copy(update=grey)}
+        update={"half_size": 2.6, "material": drawn.floor.material.model_copy(update=FLOOR)}
     )
-    spec = drawn.model_copy(update={"objects": tuple(objects), "floor": floor})
-    scene = surfels_from_gbuffers(gbuffers(build(spec, models, 0.1), around(60)), count=SURFELS)
-    tracer = SurfelTracer(scene)
-    width, height = (SUPERSAMPLES * side for side in SIZE)
-    camera = Camera.look_at((0.25, -4.9, 1.75), target=(0, 0, 0.72), fov_deg=40, width=width, height=height)
-    pictures = []
-    for name, rotation in LIGHTS.items():
-        environment = EnvironmentMap.load(data / "hdri" / f"{name}.hdr", rotation)
-        guidance = render_guidance(tracer, camera, Lighting(environment), Estimation(rays=32))
-        shown = to_display(guidance.shadowed, environment.exposure())
-        pictures.append(
-            shown.reshape(SIZE[1], SUPERSAMPLES, SIZE[0], SUPERSAMPLES, 3)
-            .mean(axis=(1, 3))
-            .astype(np.float32)
-        )
-    rows = [np.concatenate(pictures[i : i + 2], axis=1) for i in (0, 2)]
-    write_image(output, np.concatenate(rows, axis=0).astype(np.float32))
+    return build(drawn.model_copy(update={"objects": tuple(objects), "floor": floor}), models, 0.1)
+
+
+def main(data: Path, output: Path, comparison: Path) -> None:
+    """Make the surfels, light them, write the pictures."""
+    geometry = models_on_a_table(data)
+    environment = EnvironmentMap.load(data / "hdri" / f"{LIGHT}.hdr", TURN_DEG)
+    scene = surfels_from_gbuffers(gbuffers(geometry, around(VIEWS, VIEW_SIDE)), count=SURFELS)
+    tracer, lighting = SurfelTracer(scene), Lighting(environment)
+    bounce = BounceTransport.trace(tracer).bake(lighting, ESTIMATION)
+    lit = render_guidance(tracer, view(*SIZE), lighting, ESTIMATION, bounce=bounce).lit
+    exposure = BRIGHTER * environment.exposure()
+    write_image(output, to_display(lit, exposure))
+
+    width, height = (side // 2 for side in SIZE)
+    small = lit.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
+    (truth,) = render_frames(geometry.lit(environment), [view(width, height)], PATHS, [0])
+    pair = [to_display(image, exposure) for image in (small, truth)]
+    write_image(comparison, np.concatenate(pair, axis=1).astype(np.float32))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(*map(Path, sys.argv[1:4]))

@@ -10,6 +10,7 @@ from eval.report.outcome import Outcome
 from eval.report.page import Section, Table, Text
 from eval.results import Row
 from eval.tracing.measured import Measured
+from eval.tracing.page_bounce import bounce_section, equal_error_section
 from eval.tracing.page_light import few_rays_section, irradiance_section, noise_section
 from eval.tracing.page_rays import (
     camera_section,
@@ -39,6 +40,8 @@ HEADLINE = {
     "gradient.ratio_to_volprim": "Gradient step: times as fast as Mitsuba's volprim",
     "irradiance.seconds_ratio_to_mitsuba_direct": "64-ray irradiance: times as long as Mitsuba's direct",
     "primary.max_error": "Camera rays: largest error against float64",
+    "bounce.seconds_ratio_to_frame": "Bake of a light: times as long as a frame of guidance",
+    "guidance.ratio_to_path_tracing": "A lit frame: time over path tracing's at the same error",
 }
 
 
@@ -68,6 +71,8 @@ def outcome(measured: Measured, output_dir: Path) -> Outcome:
         *irradiance_section(measured, output_dir),
         *noise_section(measured, output_dir),
         *few_rays_section(measured, output_dir),
+        *bounce_section(measured),
+        *equal_error_section(measured, found),
         *_exactness(found),
         *_memory(measured),
     ]
@@ -131,6 +136,7 @@ def _memory(measured: Measured) -> list[Section]:
         f"A process of its own that holds {settings.memory_surfels:,} surfels, traces one frame of "
         f"{settings.pixels[-1]}² pixels and as many shadow rays reaches a resident set of "
         f"{memory['peak']:.0f} MB. Python, Mitsuba and LLVM alone hold {memory['base']:.0f} MB, and with the "
-        f"surfels made, in NumPy, before tracing, it is {memory['scene']:.0f} MB."
+        f"surfels made, in NumPy, before tracing, it is {memory['scene']:.0f} MB. Transport and bake of a "
+        f"light add {memory['bounce']:.0f} MB to what is resident after the frame."
     )
     return [Section("memory", "Memory", [text])]

@@ -113,7 +113,15 @@ def test_no_key_is_stated_twice_with_one_value(path: Path):
 
 
 PAPER = {
-    "relight": {"estimator": "plain", "two_sided": False, "denoise": False},
+    "relight": {
+        "estimator": "plain",
+        "two_sided": False,
+        "denoise": False,
+        "bounces": 0,
+        "reflections": 0,
+        "supersample": 1,
+        "diffuse": "lambert",
+    },
     "datagen": {"estimator": "plain", "two_sided": False, "diffuse": "lambert", "bounces": 0},
     "reconstruct": {
         "light.estimator": "plain",

@@ -40,6 +40,7 @@ TOY = {
     "irradiance": "[300,32]",
     "noise": "[300,32]",
     "few_rays": "[300,32]",
+    "bounce": "[[300,32]]",
     "reference_spp": "64",
     "error_rays": "50",
     "memory_surfels": "500",
@@ -87,6 +88,10 @@ ROWS = [
     "primary.rays_at_a_threshold",
     "shadow.max_error",
     "memory.peak_mb.500",
+    "memory.bounce_mb.500",
+    "bounce.seconds_ratio_to_frame.300_32",
+    "bounce.lit_frame_ratio.300_32",
+    "bounce.transport_seconds.300_32",
 ]
 
 

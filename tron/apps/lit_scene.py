@@ -66,7 +66,7 @@ class LitScene:
 
     @cached_property
     def _transport(self) -> BounceTransport:
-        """Where light goes, traced when it is first asked for."""
+        """Ways of light through the scene, traced when they are first asked for."""
         return BounceTransport.trace(self._tracer, seed=self._seed, track=partial(track, label="bounces"))
 
     @cached_property

@@ -156,7 +156,7 @@ class Settings(BaseModel):
 
     @property
     def source(self) -> Literal["neural", "lit", "shadowed"]:
-        """What the relit picture is made of."""
+        """Origin of the relit picture."""
         if self.checkpoint is not None:
             return "neural"
         return "lit" if self.bounces else "shadowed"

@@ -1,0 +1,57 @@
+"""Laws of the rays of a lobe: their mean weight is the table's albedo, their density that of their draws."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tron.seeds import generator
+from tron.shading.brdf_table import BrdfTable
+from tron.shading.reflectance import fresnel, reflectance
+from tron.shading.reflections import Lobe, masking
+
+N = 1 << 18
+
+
+def lobe_of(cosine: float, roughness: float) -> Lobe:
+    view = mi.Vector3f(float(np.sqrt(1 - cosine**2)), 0, cosine)
+    return Lobe(mi.Frame3f(mi.Normal3f(0, 0, 1)), view, mi.Float(roughness**2))
+
+
+def uniform() -> mi.Point2f:
+    return mi.Point2f(generator(3, "tests", "lobe").random((2, N)).astype(np.float32))
+
+
+@pytest.mark.parametrize("diffuse", ["principled", "lambert"])
+@pytest.mark.parametrize("metallic", [0.0, 0.6, 1.0])
+@pytest.mark.parametrize(("cosine", "roughness"), [(0.2, 0.5), (0.7, 0.15), (0.9, 0.9)])
+def test_the_mean_weight_of_rays_is_the_albedo_of_the_lobe(
+    variant: str, material, cosine: float, roughness: float, metallic: float, diffuse: str
+) -> None:
+    surface, lobe = material(0.6, roughness, metallic), lobe_of(cosine, roughness)
+    out, above = lobe.draw(uniform())
+    half = dr.normalize(out + lobe.view)
+    weight = fresnel(surface, dr.dot(half, lobe.view), diffuse) * masking(out.z, lobe.alpha)
+    mean = np.array(dr.select(above, weight, 0)).mean(1)
+    share = reflectance(surface, BrdfTable.load(), mi.Float(cosine), diffuse)
+    np.testing.assert_allclose(mean, np.array(share.specular)[:, 0], atol=4e-3)
+
+
+@pytest.mark.parametrize(("cosine", "roughness"), [(0.2, 0.5), (0.7, 0.3), (0.9, 0.9)])
+def test_rays_are_drawn_by_their_density(variant: str, cosine: float, roughness: float) -> None:
+    """Share of the draws in parts of the hemisphere, and the integral of the density over them."""
+    lobe = lobe_of(cosine, roughness)
+    out, above = lobe.draw(uniform())
+    everywhere = mi.warp.square_to_uniform_hemisphere(uniform())
+    density = lobe.density(dr.normalize(everywhere + lobe.view)) * float(2 * np.pi)
+    for part in (
+        lambda d: d.z > 0,
+        lambda d: (d.z > 0) & (d.x < 0),
+        lambda d: d.z > 0.8,
+        lambda d: (d.z > 0) & (d.y > 0.3),
+    ):
+        drawn = np.array(above & part(out)).mean()
+        integral = np.array(dr.select(part(everywhere), density, 0), np.float64).mean()
+        assert drawn == pytest.approx(integral, abs=0.015)
