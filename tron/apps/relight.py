@@ -214,6 +214,7 @@ cli = command(
     main,
     examples=(
         "tron-relight scene=surfels.ply environment=studio.hdr output_dir=outputs/relit",
+        "tron-relight scene=surfels.ply environment=studio.hdr quality=final reflections=16 output_dir=out",
         "tron-relight scene=scan.ply up=[0,0,1] environment=[dawn.hdr,night.hdr] output_dir=out",
         "tron-relight scene=surfels.ply environment=a.hdr trajectory=still rotation=[0,360] output_dir=out",
         "tron-relight scene=surfels.ply environment=a.hdr background=transparent output_dir=out",

@@ -186,13 +186,27 @@ class BounceTransport:
             bounces: None: those of ``estimation``.
             back, seed: as of :meth:`indirect` and :meth:`direct`.
         """
-        own = estimation.model_copy(update={"rays": DIRECT.rays, "filtered": DIRECT.filtered})
-        direct, albedo = self.direct(lighting, own, seed), self.albedo(estimation.diffuse)
+        return self.bounced(self.direct(lighting, at_surfels(estimation), seed), estimation, bounces, back)
+
+    def bounced(
+        self,
+        direct: mi.Color3f,
+        estimation: Estimation = FINAL,
+        bounces: int | None = None,
+        back: float = BACK,
+    ) -> BouncedLight:
+        """:meth:`bake` of :meth:`direct` light; differentiable in it and, as the tracer is, in materials."""
         bounces = estimation.bounces if bounces is None else bounces
+        albedo = self.albedo(estimation.diffuse)
         indirect = self.indirect(direct, albedo, bounces, back)
         baked = BouncedLight(direct, indirect, albedo * (direct + indirect), self.openness())
         dr.eval(baked)
         return baked
+
+
+def at_surfels(estimation: Estimation) -> Estimation:
+    """Of direct light at surfels, where frames are estimated by ``estimation``."""
+    return estimation.model_copy(update={"rays": DIRECT.rays, "filtered": DIRECT.filtered})
 
 
 def _packed(color: mi.Color3f) -> mi.Float:
