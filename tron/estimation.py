@@ -22,6 +22,8 @@ class Estimation(BaseModel):
     * ``two_sided=False``: light leaks through undersides that no camera saw, 16 to 18 % of the pixels in
       shadow; against path-traced irradiance 26.7 dB instead of 28.4 under a sun, 23.8 instead of 26.6 in a
       studio. It saves no time to speak of.
+    * ``bounces``: 1 / 2 / 4 / 6 are 0.76 / 0.93 / 0.99 / 0.998 of what bounces in scenes like the demo's;
+      each takes 2 ms. Data are path-traced with 4.
     * ``filtered=True``: six passes over the image. It takes the error of 2 rays from 0.081 to 0.030 under a
       sun, from 0.171 to 0.038 in soft light, and blurs more than it cleans at 64.
     """
@@ -44,7 +46,7 @@ class Estimation(BaseModel):
         "roughness and angle; lambert: that of base color alone, as in the paper",
     )
     bounces: int = Field(
-        default=3, ge=0, le=16, description="times that light bounces between surfels; 0: direct light alone"
+        default=4, ge=0, le=16, description="times that light bounces between surfels; 0: direct light alone"
     )
     reflections: int = Field(
         default=0,

@@ -38,7 +38,7 @@ def measure_bounce(contenders: Contenders, size: int, rounds: Rounds) -> BounceT
         return render_guidance(tracer, view, lighting, FINAL, bounce=bounce)
 
     contestants = {
-        "transport": lambda: BounceTransport.trace(tracer).met,
+        "transport": lambda: BounceTransport.trace(tracer).rays.met,
         "bake": lambda: transport.bake(lighting),
         "frame": lambda: frame(None),
         "lit frame": lambda: frame(baked),

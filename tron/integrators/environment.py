@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from tron.errors import TronError
+from tron.integrators.held import Held
 from tron.shading.environment import EnvironmentMap
 
 SAMPLED_HEIGHT = 512
@@ -50,18 +51,7 @@ def light_state(scene: mi.Scene) -> list[Any]:
     emitter = scene.environment()
     if emitter is None:
         return []
-    return [emitter.ptr, *(_Held(value) for _, value in mi.traverse(emitter))]
-
-
-class _Held:
-    """A parameter, equal to itself while its variables are the same; held, so that none takes their place."""
-
-    def __init__(self, value: Any) -> None:
-        self._value = dr.detach(value) if dr.is_array_v(value) else value
-        self._identity = mi.util._jit_id_hash(value)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Held) and self._identity == other._identity
+    return [emitter.ptr, *(Held(value) for _, value in mi.traverse(emitter))]
 
 
 def _turn_about_z(to_world: np.ndarray) -> float | None:

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -16,6 +17,7 @@ import mitsuba as mi
 from tron.errors import TronError
 from tron.gaussians.fields import PARAMETERS
 from tron.gaussians.scene import GaussianScene
+from tron.integrators.held import Held
 from tron.tracing import Surface, SurfelTracer
 from tron.tracing.parameters import SurfelParameters
 
@@ -91,8 +93,21 @@ class Surfels:
         self.parameters.sh_degree = MAX_SH_DEGREE
         self.tracer.update()
 
-    def trace(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> Surface:
-        """Surfaces along rays, attached to the parameters where their gradients are wanted."""
+    def state(self, *names: str) -> list[Held]:
+        """Equal for equal states of these parameters."""
+        return [Held(getattr(self.parameters, name)) for name in names]
+
+    def trace(
+        self,
+        origin: mi.Point3f,
+        direction: mi.Vector3f,
+        active: mi.Bool,
+        values: Sequence[mi.Float] = (),
+    ) -> Surface:
+        """Surfaces along rays, attached to the parameters where their gradients are wanted.
+
+        ``values`` as of :meth:`tron.tracing.SurfelTracer.trace`.
+        """
         if dr.grad_enabled(self.parameters.sh):
             self.parameters.sh_degree = MAX_SH_DEGREE
-        return self.tracer.trace(origin, direction, active)
+        return self.tracer.trace(origin, direction, active, values)

@@ -8,7 +8,7 @@ once for the scene turned over; a camera is then given the faces that it sees.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -47,7 +47,8 @@ class BothSides:
         scene = tracer.scene
         over = SurfelTracer(scene.turned_over(np.ones(len(scene), bool)))
         front, back = (BounceTransport.trace(side, rays, seed, track) for side in (tracer, over))
-        return cls(front, back, replace(front, met=_of_faces(front.met, back.met, len(scene))))
+        met = _of_faces(front.rays.met, back.rays.met, len(scene))
+        return cls(front, back, BounceTransport(front.rays.meeting(met)))
 
     def bake(
         self, lighting: Lighting, estimation: Estimation = FINAL, seed: int = 0
@@ -68,7 +69,7 @@ class BothSides:
 
 
 def _of_faces(front: mi.UInt32, back: mi.UInt32, count: int) -> mi.UInt32:
-    """Codes of ``BounceTransport.met`` for the rays of all faces, from those of either side."""
+    """Codes of ``SurfelRays.met`` for the rays of all faces, from those of either side."""
     surfels = dr.opaque(mi.UInt32, count)
     place = dr.arange(mi.UInt32, dr.width(front) + dr.width(back))
     ray, face = place // (2 * surfels), place % (2 * surfels)

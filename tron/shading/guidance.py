@@ -34,7 +34,7 @@ from tron.shading.bounce import BouncedLight
 from tron.shading.composition import Bounced, Response, evenly_bounced
 from tron.shading.irradiance import Occluder
 from tron.shading.lighting import Lighting
-from tron.shading.reflections import reflections
+from tron.shading.reflections import Mirror, reflections
 from tron.shading.supersampling import averaged, averaged_surface
 from tron.shading.visibility import Shadows, visibility
 
@@ -89,20 +89,20 @@ Guidance.BUFFERS = tuple(field.name for field in fields(Guidance) if field.name 
 
 @dataclass
 class Arriving:
-    """Light that reaches surfaces, one lane each.
+    """What rays from surfaces have found, one lane each.
 
     Attributes:
-        visibility: share of the unshadowed irradiance, by channel.
-        bounced: light that has met the scene; None where none was baked.
+        visibility: share of the unshadowed irradiance that arrives, by channel.
+        mirror: by reflection rays; None without.
     """
 
     visibility: mi.Color3f
-    bounced: Bounced | None = None
+    mirror: Mirror | None = None
 
     def in_rows(self, gbuffer: GBuffer) -> Arriving:
         """Of pixels row by row, where lanes are those of ``gbuffer``."""
-        bounced = None if self.bounced is None else gbuffer.in_rows(self.bounced)
-        return Arriving(gbuffer.in_rows(self.visibility), bounced)
+        mirror = None if self.mirror is None else gbuffer.in_rows(self.mirror)
+        return Arriving(gbuffer.in_rows(self.visibility), mirror)
 
 
 def render_guidance(
@@ -149,17 +149,13 @@ def arriving_light(
 ) -> Arriving:
     """Light that reaches the pixels of :func:`trace_view`; arguments as of :func:`render_guidance`."""
     estimation = estimation.of_sub_pixel()
-    reaching = visibility(tracer, gbuffer, lighting, estimation, seed)
-    if bounce is None:
-        return Arriving(reaching)
-    *indirect, openness = gbuffer.values
-    bounced = evenly_bounced(mi.Color3f(*indirect), openness, reaching, gbuffer.roughness)
-    if estimation.reflections:
+    arriving = Arriving(visibility(tracer, gbuffer, lighting, estimation, seed))
+    if bounce is not None and estimation.reflections:
         occluder = tracer.sided(estimation.two_sided)
-        bounced.openness, bounced.mirrored = reflections(
+        arriving.mirror = reflections(
             occluder, gbuffer, lighting, bounce, estimation.reflections, seed, estimation.diffuse
         )
-    return Arriving(reaching, bounced)
+    return arriving
 
 
 def shade_surface(
@@ -171,12 +167,12 @@ def shade_surface(
 ) -> dict[str, mi.Color3f]:
     """Shade what rays see, given the light that reaches each of them.
 
-    ``background`` as of :func:`render_guidance`. Returns the colours of :class:`Guidance` by name, on the
-    device, one lane a ray.
+    Light bounces where ``surface`` has the values of a bake (``BouncedLight.values``). ``background`` as of
+    :func:`render_guidance`. Returns the colours of :class:`Guidance` by name, on the device, one lane a ray.
     """
     response = Response.of(surface, lighting.split_sum, diffuse)
     irradiance = response.unshadowed * arriving.visibility
-    bounced = arriving.bounced
+    bounced = _bounced(surface, arriving)
     if background is None:
         behind = lighting.light.radiance(surface.direction)
     else:
@@ -193,6 +189,15 @@ def shade_surface(
     buffers = {name: over_background(color, behind, surface.opacity) for name, color in buffers.items()}
     dr.eval(buffers)
     return buffers
+
+
+def _bounced(surface: Surface, arriving: Arriving) -> Bounced | None:
+    if not surface.values:
+        return None
+    indirect, openness = mi.Color3f(*surface.values[:3]), surface.values[3]
+    if arriving.mirror is None:
+        return evenly_bounced(indirect, openness, arriving.visibility, surface.roughness)
+    return Bounced(indirect, arriving.mirror.openness, arriving.mirror.radiance)
 
 
 def shade(

@@ -43,6 +43,19 @@ SMOOTHEST = 0.02
 """Least roughness of the rays: below, a lobe is narrower than float32 can draw."""
 
 
+@dataclass
+class Mirror:
+    """What a lobe sees, one lane a pixel, by channel.
+
+    Attributes:
+        openness: o, share of the environment's light that escapes.
+        radiance: M, mean over the lobe of what is met, linear.
+    """
+
+    openness: mi.Color3f
+    radiance: mi.Color3f
+
+
 def reflections(
     tracer: SurfelTracer,
     gbuffer: GBuffer,
@@ -51,8 +64,8 @@ def reflections(
     rays: int,
     seed: int,
     diffuse: Diffuse = "principled",
-) -> tuple[mi.Color3f, mi.Color3f]:
-    """The share o of the lobe's light that escapes and the mean radiance M of what is met, by pixel.
+) -> Mirror:
+    """What the lobe of each pixel sees.
 
     Rays stand still where the surface is differentiated, and what they find is a constant.
 
@@ -102,10 +115,9 @@ def reflections(
                 sums["light"] += value
                 sums["escaped"] += value * visible
             dr.eval(sums)
-        openness = ratio(sums["escaped"], sums["light"], 1)
-        mirrored = ratio(sums["met"], sums["weight"], 0)
-        dr.eval(openness, mirrored)
-    return openness, mirrored
+        mirror = Mirror(ratio(sums["escaped"], sums["light"], 1), ratio(sums["met"], sums["weight"], 0))
+        dr.eval(mirror)
+    return mirror
 
 
 @dataclass

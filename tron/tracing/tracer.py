@@ -110,7 +110,7 @@ class SurfelTracer:
         return pack(self._parameters)
 
     @property
-    def _back_faces(self) -> BackFaces:
+    def back_faces(self) -> BackFaces:
         return self._beyond if self._two_sided else BackFaces.never()
 
     def gbuffer(self, camera: Camera, values: Sequence[mi.Float] = ()) -> GBuffer:
@@ -149,7 +149,7 @@ class SurfelTracer:
         For a fan of rays from each origin, as :meth:`transmittances` has them; back faces count as for shadow
         rays. ``seeds`` of each ray: :func:`tron.tracing.first_hit.ray_seeds`.
         """
-        return first_hits(self.bvh, Fans(origin, directions, active), self._back_faces, seeds)
+        return first_hits(self.bvh, Fans(origin, directions, active), self.back_faces, seeds)
 
     def transmittance(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
@@ -166,11 +166,11 @@ class SurfelTracer:
         """
         recorded = dr.flag(dr.JitFlag.SymbolicScope)
         trace = transmittance if recorded else queued_transmittance
-        return trace(self.bvh, Fans(origin, directions, active), self._back_faces)
+        return trace(self.bvh, Fans(origin, directions, active), self.back_faces)
 
     def transmittance_by_opacity(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
     ) -> mi.Float:
         """:meth:`transmittance`, differentiable by the opacities; not inside a recorded loop."""
         fans = Fans(dr.detach(origin), [dr.detach(direction)], [mi.Bool(active)])
-        return transmittance_by_opacity(self.attached(), self.bvh, fans, self._back_faces)
+        return transmittance_by_opacity(self.attached(), self.bvh, fans, self.back_faces)

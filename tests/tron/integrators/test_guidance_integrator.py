@@ -16,13 +16,14 @@ from tron.estimation import Estimation
 from tron.gaussians.scene import GaussianScene
 from tron.integrators.environment import environment_of
 from tron.seeds import generator
+from tron.shading.bounce import BounceTransport
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
 from tron.tracing import SurfelTracer
 
 CAMERA = Camera.look_at((1.5, -2.5, 1.6), (0, 0, 0.3), fov_deg=45, width=36, height=24)
 CENTRES = {"type": "stratified", "jitter": False, "sample_count": 1}
-BUFFERS = ("pbr", "irradiance", "unshadowed", "shadowed")
+BUFFERS = ("pbr", "irradiance", "unshadowed", "shadowed", "indirect", "lit")
 
 
 @pytest.fixture
@@ -59,11 +60,13 @@ def channels(image: mi.TensorXf, integrator: mi.Integrator) -> dict[str, np.ndar
     return found
 
 
-def ours(surfels: GaussianScene, light: EnvironmentMap) -> Guidance:
-    return render_guidance(SurfelTracer(surfels), CAMERA, Lighting(light), Estimation(rays=16), 0)
+def ours(surfels: GaussianScene, light: EnvironmentMap, **chosen: Any) -> Guidance:
+    tracer, lighting, estimation = SurfelTracer(surfels), Lighting(light), Estimation(rays=16, **chosen)
+    bounce = BounceTransport.trace(tracer).bake(lighting, estimation)
+    return render_guidance(tracer, CAMERA, lighting, estimation, 0, bounce=bounce)
 
 
-@pytest.mark.parametrize("buffer", BUFFERS)
+@pytest.mark.parametrize("buffer", ["pbr", "irradiance", "lit"])
 def test_pixel_centres_see_the_librarys_guidance(surfels, light, buffer: str) -> None:
     integrator = plugin(surfels, buffer=buffer)
     seen = channels(mi.render(scene_of(light.to_mitsuba()), integrator=integrator), integrator)
@@ -76,6 +79,51 @@ def test_pixel_centres_see_the_librarys_guidance(surfels, light, buffer: str) ->
     np.testing.assert_allclose(seen["A"], truth.mask, atol=1e-4)
     np.testing.assert_array_equal(seen["A"], seen["opacity"])
     assert (truth.irradiance < 0.9 * truth.unshadowed)[truth.mask > 0.9].any()
+    assert (truth.lit > 1.02 * truth.shadowed)[truth.mask > 0.9].any()
+
+
+def test_choices_about_bounced_light_are_the_librarys(surfels, light) -> None:
+    chosen = {"bounces": 1, "reflections": 4, "diffuse": "lambert"}
+    integrator = plugin(surfels, buffer="lit", **chosen)
+    seen = channels(mi.render(scene_of(light.to_mitsuba()), integrator=integrator), integrator)["main"]
+    assert (np.abs(seen - ours(surfels, light, **chosen).lit) > 5e-3).mean() < 0.02
+    assert (np.abs(seen - ours(surfels, light).lit) > 5e-3).mean() > 0.1, "the choices change nothing"
+    integrator = plugin(surfels, bounces=0)
+    seen = channels(mi.render(scene_of(light.to_mitsuba()), integrator=integrator), integrator)
+    np.testing.assert_array_equal(seen["lit"], seen["shadowed"])
+
+
+def test_transport_is_traced_once_and_light_baked_once(surfels, light, monkeypatch) -> None:
+    calls: list[str] = []
+    for name in ("trace", "direct"):
+        plain = getattr(BounceTransport, name)
+
+        def counted(*args: Any, name: str = name, plain: Any = plain, **named: Any) -> Any:
+            calls.append(name)
+            return plain(*args, **named)
+
+        monkeypatch.setattr(BounceTransport, name, counted)
+    scene, integrator = scene_of(light.to_mitsuba()), plugin(surfels)
+    parameters, emitter = mi.traverse(integrator), mi.traverse(scene)
+
+    def lit() -> np.ndarray:
+        return channels(mi.render(scene, integrator=integrator), integrator)["lit"]
+
+    first = lit()
+    np.testing.assert_array_equal(lit(), first)
+    assert calls == ["trace", "direct"]
+    emitter["light.scale"] = 2.0
+    emitter.update()
+    np.testing.assert_allclose(lit(), 2 * first, rtol=1e-3, atol=1e-3)
+    assert calls == ["trace", "direct", "direct"]
+    parameters["base_color"] = mi.Float(np.array(parameters["base_color"]) * 0.5)
+    parameters.update()
+    assert lit().mean() < 1.9 * first.mean()
+    assert calls == ["trace", "direct", "direct"], "what is met does not depend on materials"
+    parameters["means"] = mi.Float(np.array(parameters["means"]) + np.float32(0.01))
+    parameters.update()
+    lit()
+    assert calls == ["trace", "direct", "direct", "trace", "direct"]
 
 
 def test_many_rays_a_pixel_average_the_same_light(surfels, light) -> None:
@@ -167,29 +215,35 @@ def test_a_given_environment_takes_the_place_of_the_scenes(surfels, light, tmp_p
         assert (np.abs(seen - truth) > 2e-3).mean() < 0.01
 
 
-def test_gradients_of_materials_are_the_finite_differences(surfels, light) -> None:
-    integrator, scene = plugin(surfels, buffer="pbr"), scene_of(light.to_mitsuba())
+@pytest.mark.parametrize("buffer", ["pbr", "lit"])
+def test_gradients_of_materials_are_the_finite_differences(surfels, light, buffer: str) -> None:
+    """Of lit also through the light that surfels send to one another; shadow rays are the same for both."""
+    integrator, scene = plugin(surfels, buffer=buffer), scene_of(light.to_mitsuba())
     parameters = mi.traverse(integrator)
     weight = generator(0, "tests", "weight").normal(size=(24, 36, 3)).astype(np.float32)
+    parameters["roughness"] = mi.Float(
+        np.full(len(surfels), 0.4, np.float32)
+    )  # the levels have a kink at 0.5
 
-    def loss() -> mi.TensorXf:
-        image = mi.render(scene, parameters, integrator=integrator, spp=1)
+    def loss(**seeds: int) -> mi.TensorXf:
+        image = mi.render(scene, parameters, integrator=integrator, spp=1, **seeds)
         return dr.sum(mi.TensorXf(weight) * image[..., :3], axis=None)
 
-    for name in ("base_color", "metallic"):
+    # The levels and the table are linear between their entries.
+    for name, within in (("base_color", 0.02), ("metallic", 0.02), ("roughness", 0.05)):
         start = np.array(parameters[name])
         towards = generator(1, "tests", name).normal(size=start.shape)
         ends = []
         for sign in (1, -1):
             parameters[name] = mi.Float((start + sign * 0.02 * towards).astype(np.float32))
             parameters.update()
-            ends.append(float(loss().array[0]))
+            ends.append(float(loss(seed=1).array[0]))
         parameters[name] = mi.Float(start)
         dr.enable_grad(parameters[name])
         parameters.update()
-        dr.backward(loss())
+        dr.backward(loss(seed=0, seed_grad=1))
         found = np.array(dr.grad(parameters[name]), np.float64) @ towards
-        assert found == pytest.approx((ends[0] - ends[1]) / 0.04, rel=0.02, abs=0.02), name
+        assert found == pytest.approx((ends[0] - ends[1]) / 0.04, rel=within, abs=0.02), name
         dr.disable_grad(parameters[name])
         parameters.update()
 
@@ -207,6 +261,8 @@ def test_mistakes_are_named(surfels, tmp_path) -> None:
     for given, complaint in (
         ({"buffer": "albedo"}, "choose one of pbr, irradiance, unshadowed, shadowed"),
         ({"estimator": "median"}, "choose ratio or plain"),
+        ({"diffuse": "velvet"}, "choose principled or lambert"),
+        ({"bounces": -1}, "give 0 to 16"),
         ({"shadow_rays": 3}, "an even number"),
         ({"environment": str(tmp_path / "missing.exr")}, "missing.exr"),
         ({"environment": integrators.embed(surfels)}, "no EnvironmentMap"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,9 +18,14 @@ from tron.estimation import Estimation
 from tron.gaussians.edit import moved
 from tron.seeds import generator
 from tron.shading.bounce import BounceTransport
+from tron.shading.brdf_table import BrdfTable
+from tron.shading.cubemap import CubemapLight
 from tron.shading.environment import EnvironmentMap
 from tron.shading.lighting import Lighting
+from tron.shading.reflectance import bounce_albedo
+from tron.shading.split_sum import SplitSum
 from tron.tracing import SurfelTracer
+from tron.tracing.parameters import SurfelParameters
 
 SPACING = 0.05
 
@@ -57,10 +63,9 @@ def test_a_furnace_converges_to_one_over_one_minus_albedo(dense_surfels, room: s
     assert once.mean() == pytest.approx(albedo, rel=0.01)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_no_scene_gains_energy(seed: int, sun_map, dense_surfels) -> None:
-    """Surfels at random, of random materials: n bounces are at most the direct light's a + .. + a^n."""
-    rng = generator(seed, "tests", "energy")
+def cloud_of(dense_surfels, seed: int) -> Any:
+    """Surfels at random, of random materials."""
+    rng = generator(seed, "tests", "cloud")
     normals = rng.normal(size=(600, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     cloud = SimpleNamespace(points=rng.uniform(-0.5, 0.5, (600, 3)), normals=normals)
@@ -69,7 +74,18 @@ def test_no_scene_gains_energy(seed: int, sun_map, dense_surfels) -> None:
         "roughness": rng.random(600),
         "metallic": rng.choice([0.0, 0.5, 1.0], 600),
     }
-    transport = BounceTransport.trace(SurfelTracer(dense_surfels.scene(cloud, spacing=0.1, **materials)))
+    return dense_surfels.scene(cloud, spacing=0.1, **materials)
+
+
+@pytest.fixture
+def random_surfels(dense_surfels) -> Any:
+    return cloud_of(dense_surfels, 0)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_no_scene_gains_energy(seed: int, sun_map, dense_surfels) -> None:
+    """Of n bounces at most a + .. + a^n of the brightest direct light, a the largest albedo."""
+    transport = BounceTransport.trace(SurfelTracer(cloud_of(dense_surfels, seed)))
     albedo = numbers(transport.albedo())
     assert (albedo >= 0).all()
     assert 0.98 < albedo.max() < 1
@@ -277,9 +293,155 @@ def test_an_object_that_has_moved_bounces_as_if_baked_there(dense_surfels, sun_m
     np.testing.assert_allclose(found.mean(0), fresh.mean(0), rtol=0.01)
 
 
+@pytest.mark.parametrize("share", [0.01, 0.3, 1.0])
+def test_tracing_what_has_changed_is_tracing_all_anew(random_surfels, share: float) -> None:
+    """To the byte, where the hierarchy keeps its order, however many surfels have moved, and wherever to."""
+    which = np.arange(len(random_surfels)) < share * len(random_surfels)
+    turn = Rotation.from_euler("xyz", [20, 40, 60], degrees=True).as_matrix()
+    there = moved(random_surfels, which, rotation=turn, translation=np.array([0.1, 0.05, -0.1]))
+    before = BounceTransport.trace(SurfelTracer(random_surfels), rays=16)
+    tracer = before.tracer.moved(there)
+    found, anew = (
+        [numbers(transport.openness()), numbers(transport.indirect(ones, ones * 0.5))]
+        for transport in (before.moved(tracer), BounceTransport.trace(tracer, rays=16))
+        for ones in [everywhere(transport, 1.0)]
+    )
+    for value, expected in zip(found, anew):
+        np.testing.assert_array_equal(value, expected)
+    assert (numbers(before.openness()) != anew[0]).mean() > 0.3 * share
+    back = before.moved(tracer).moved(tracer.moved(random_surfels))
+    np.testing.assert_array_equal(numbers(back.openness()), numbers(before.openness()))
+
+
 def test_what_cannot_be_traced_is_refused(dense_surfels) -> None:
     tracer = SurfelTracer(dense_surfels.scene(dense_surfels.plane(half=0.2)))
     with pytest.raises(TronError, match="rays is 0"):
         BounceTransport.trace(tracer, rays=0)
     with pytest.raises(TronError, match="too many"):
         BounceTransport.trace(tracer, rays=1 << 30)
+    fewer = SurfelTracer(dense_surfels.scene(dense_surfels.plane(half=0.1)))
+    with pytest.raises(TronError, match="come or gone"):
+        BounceTransport.trace(tracer, rays=1).moved(fewer)
+
+
+def test_surfels_treated_in_parts_meet_what_they_meet_at_once(dense_surfels, white, monkeypatch) -> None:
+    """Which rays there are does not depend on the parts; shadow rays do, in the noise."""
+    scene = lambert_scene(dense_surfels, still_life(dense_surfels))
+    found = []
+    for at_once in (1 << 20, 1 << 12):
+        monkeypatch.setattr("tron.shading.bounce_rays.AT_ONCE", at_once)
+        transport = BounceTransport.trace(SurfelTracer(scene), rays=8)
+        ones = everywhere(transport, 1.0)
+        met = numbers(transport.openness()), numbers(transport.indirect(ones, ones * 0.5))
+        found.append((*met, numbers(transport.direct(white))))
+    assert len(scene) > 2 << 12
+    for whole, in_parts in list(zip(*found))[:2]:
+        np.testing.assert_array_equal(in_parts, whole)
+    np.testing.assert_allclose(found[1][2].mean(), found[0][2].mean(), rtol=2e-3)
+
+
+@pytest.mark.parametrize("rays", [1, 3, 8])
+def test_few_surfels_and_rays_are_enough(dense_surfels, white, rays: int) -> None:
+    """One surfel, and two that face each other, of any number of rays."""
+    points, normals = np.array([[0, 0, 0], [0, 0, 0.02]]), np.array([[0, 0, 1], [0, 0, -1]])
+    for count, meets in ((1, False), (2, True)):
+        part = SimpleNamespace(points=points[:count], normals=normals[:count])
+        baked = BounceTransport.trace(SurfelTracer(dense_surfels.scene(part)), rays=rays).bake(white)
+        assert (numbers(baked.openness) < 1).all() == meets
+        assert np.isfinite(numbers(baked.outgoing)).all()
+
+
+def test_other_lights_and_scenes_compile_no_new_kernel(dense_surfels, sun_map, kernels_of) -> None:
+    lights = [Lighting(sun_map), Lighting(EnvironmentMap(sun_map.image * 0.5, rotation_deg=30))]
+    tracers = [SurfelTracer(dense_surfels.scene(dense_surfels.sphere(spacing))) for spacing in (0.16, 0.17)]
+    dr.eval([tracer.bvh for tracer in tracers])
+
+    def bake(number: int) -> None:
+        BounceTransport.trace(tracers[number], seed=number).bake(lights[number], back=0.1 * number)
+
+    bake(0)
+    first = kernels_of(lambda: bake(0))
+    assert kernels_of(lambda: bake(1)) <= first, "compiled anew"
+
+
+def room(dense_surfels) -> Any:
+    """A small floor, wall and ball, some of each shiny and metallic."""
+    wall = dense_surfels.turned(
+        dense_surfels.plane(0.1, half=0.5), Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    )
+    sheets = [
+        dense_surfels.plane(0.1, half=0.8),
+        SimpleNamespace(points=wall.points + np.array([0, 0.5, 0.5]), normals=wall.normals),
+        dense_surfels.sphere(0.1, radius=0.3, height=0.5),
+    ]
+    count = sum(len(sheet.points) for sheet in sheets)
+    rng = generator(0, "tests", "materials")
+    materials = {
+        "base_color": rng.uniform(0.2, 0.7, (count, 3)),
+        "roughness": rng.uniform(0.2, 0.9, count),
+        "metallic": rng.uniform(0.1, 0.9, count),
+    }
+    return dense_surfels.scene(*sheets, spacing=0.1, **materials)
+
+
+@pytest.mark.parametrize("bounces", [1, 4])
+def test_gradients_of_bounced_light_are_differences(dense_surfels, sun_map, cubemap_of, bounces: int) -> None:
+    """By base color, roughness, metallic and the light's texels; what rays meet stands still."""
+    scene = room(dense_surfels)
+    transport = BounceTransport.trace(SurfelTracer(scene))
+    visible = transport.visible(Lighting(sun_map))
+    bands = generator(1, "tests", "bands").random((4, 8, 3)).astype(np.float32)
+    cubemap = cubemap_of(EnvironmentMap(bands).resized(32), 64)
+    rng = generator(0, "tests", "loss")
+    weights = mi.Color3f(*[mi.Float(row) for row in rng.normal(size=(3, len(scene))).astype(np.float32)])
+    surfels = transport.surfels()
+    dr.eval(surfels)
+
+    def direct_of(texels: mi.Float) -> mi.Color3f:
+        return SplitSum(CubemapLight(texels, 64), 64).diffuse(surfels.normal) * visible
+
+    still = direct_of(cubemap.texels)
+    dr.eval(still)
+
+    def loss(base: mi.Color3f, roughness: mi.Float, metallic: mi.Float, texels: mi.Float) -> mi.Float:
+        there = replace(surfels, base_color=base, roughness=roughness, metallic=metallic)
+        direct = still if texels is cubemap.texels else direct_of(texels)
+        indirect = transport.indirect(direct, bounce_albedo(there, BrdfTable.load()), bounces)
+        return dr.sum(dr.sum(weights * indirect))
+
+    given = [surfels.base_color, surfels.roughness, surfels.metallic, cubemap.texels]
+    for k in range(4):
+        arguments = list(given)
+        arguments[k] = type(given[k])(given[k])
+        dr.enable_grad(arguments[k])
+        dr.backward(loss(*arguments))
+        found = np.atleast_2d(np.array(dr.grad(arguments[k])))
+        direction = rng.normal(size=found.shape).astype(np.float32)
+        size = 2e-3
+        ends = []
+        for sign in (1, -1):
+            moved_by = [mi.Float(row) for row in sign * size * direction]
+            shifted = list(given)
+            shifted[k] = given[k] + (mi.Color3f(*moved_by) if k == 0 else moved_by[0])
+            ends.append(float(loss(*shifted)[0]))
+        expected = (ends[0] - ends[1]) / (2 * size)
+        scale = float(np.linalg.norm(found))  # what a random direction's derivative is of the size of
+        assert scale > 0
+        assert float((found * direction).sum()) == pytest.approx(expected, abs=0.01 * scale)
+
+
+def test_gradients_reach_a_tracers_parameters(dense_surfels, sun_map) -> None:
+    scene = room(dense_surfels)
+    parameters = SurfelParameters.from_scene(scene)
+    dr.enable_grad(parameters.base_color)
+    transport = BounceTransport.trace(SurfelTracer(scene, parameters=parameters))
+    lighting = Lighting(sun_map)
+    for _ in range(2):  # as often as they are asked for
+        baked = transport.bake(lighting)
+        view = Camera.look_at((0.5, -1.5, 1.5), (0, 0, 0.3), fov_deg=50, width=16, height=16)
+        seen = transport.tracer.gbuffer(view, baked.values())
+        dr.backward(dr.sum(seen.values[0] + seen.values[1]))
+        gradient = np.array(dr.grad(parameters.base_color)).reshape(-1, 3)
+        assert (gradient[:, :2] > 0).mean() > 0.5
+        np.testing.assert_array_equal(gradient[:, 2], 0)
+        dr.set_grad(parameters.base_color, 0)
