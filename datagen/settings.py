@@ -134,7 +134,7 @@ class EqualErrorSettings(_Model):
     """Comparison of guidance with the path tracer, on the test scenes of a dataset."""
 
     reference_spp: int = Field(
-        default=2048, ge=2, multiple_of=2, description="Paths per pixel of what counts as the truth."
+        default=1024, ge=2, multiple_of=2, description="Paths per pixel of what counts as the truth."
     )
     rounds: int = Field(default=3, ge=1, le=100, description="Times that each frame is rendered, in turns.")
     threads: int | None = Field(default=None, ge=1, description="Threads of both renderers; null: all.")

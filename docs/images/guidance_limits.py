@@ -34,9 +34,9 @@ from tron.tracing import SurfelTracer  # noqa: E402
 from tron.trajectories import spiral  # noqa: E402
 
 SIZE = (288, 216)
-PATHS = 400
+PATHS = 196
 SURFELS = 60_000
-ESTIMATION = Estimation(rays=64, reflections=16, supersample=2)
+ESTIMATION = Estimation(rays=64, reflections=8, supersample=2)
 VIEW = Camera.look_at((0.6, -4.4, 2.3), target=(0, 0, 0.35), fov_deg=32, width=SIZE[0], height=SIZE[1])
 GLASS_AT, GLASS_RADIUS = (-0.55, 0.0, 0.55), 0.55
 

@@ -353,7 +353,7 @@ class EqualError:
 
     @property
     def ways(self) -> list[str]:
-        """Names of our frames; the first is the one that the target holds."""
+        """Names of our frames; the target holds the first."""
         return list(self.cases[0]["ways"])
 
     def rows(self, seed: int) -> Iterator[Row]:

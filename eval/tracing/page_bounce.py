@@ -12,8 +12,8 @@ from eval.tracing.measured import EQUAL_ERROR, EqualError, Measured
 from tron.images import read_image
 
 WAY_WORDS = {
-    "lit": "lit, 64 shadow rays",
     "lit_16_rays": "lit, 16 shadow rays",
+    "lit_64_rays": "lit, 64 shadow rays",
     "lit_supersampled": "lit, 64 rays over 2 × 2 sub-pixels",
     "lit_with_reflections": "the same, and 4 reflection rays",
 }

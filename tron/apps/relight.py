@@ -69,7 +69,9 @@ def main(settings: Settings) -> None:
         path = settings.trajectory, settings.frames
         cameras = plan_cameras(scene, *path, **view, distance=settings.distance)
     activate(settings.variant, settings.threads)
-    guidance = GUIDANCE if renderer is None else renderer.config.guidance
+    # Without a network the relit picture is one of them, and is shown as such.
+    guidance = [name for name in GUIDANCE if name != settings.source]
+    guidance = guidance if renderer is None else renderer.config.guidance
     clips = [_clip(*each, len(cameras), guidance) for each in zip(lights, environments)]
     clock.lap("loading")
 
@@ -214,6 +216,7 @@ cli = command(
     main,
     examples=(
         "tron-relight scene=surfels.ply environment=studio.hdr output_dir=outputs/relit",
+        "tron-relight scene=surfels.ply environment=studio.hdr quality=final reflections=16 output_dir=out",
         "tron-relight scene=scan.ply up=[0,0,1] environment=[dawn.hdr,night.hdr] output_dir=out",
         "tron-relight scene=surfels.ply environment=a.hdr trajectory=still rotation=[0,360] output_dir=out",
         "tron-relight scene=surfels.ply environment=a.hdr background=transparent output_dir=out",

@@ -14,11 +14,11 @@ from tron.errors import TronError
 from tron.estimation import FINAL, Estimation, Estimator
 from tron.shards.schema import light_members
 
-DEFAULT_BUFFERS = (*light_members(), "foreground", "mask")
+DEFAULT_BUFFERS = (*light_members(), "indirect", "foreground", "mask")
 BUFFERS = (
     *DEFAULT_BUFFERS,
     *("base_color", "normal", "depth", "position", "roughness", "metallic", "rgb"),  # of the G-buffer
-    *("indirect", "relit"),
+    "relit",
 )
 if TYPE_CHECKING:
     BufferName = str

@@ -178,8 +178,8 @@ def test_a_plain_3dgs_file_is_relit_with_a_warning(relight, scene_path, light_pa
     assert json.loads((silent / "frames" / "settings.json").read_text())["up"] == [0, -1, 0]
 
 
-def test_a_new_renderer_shows_the_pbr_buffer(relight, scene_path, light_path, tmp_path, read_video):
-    """Untrained, a renderer gives its PBR input back; what is tested is the way there and back."""
+def test_a_new_renderer_is_given_lit_and_shows_it(relight, scene_path, light_path, tmp_path, read_video):
+    """Untrained, a renderer gives back what it starts from; what is tested is the way there and back."""
     from tron.neural.configs import PixelMLPConfig
     from tron.neural.pixel_mlp import PixelMLP
     from tron.neural.weights import save_renderer
@@ -189,12 +189,15 @@ def test_a_new_renderer_shows_the_pbr_buffer(relight, scene_path, light_path, tm
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=2"]
     assert relight(*base, f"checkpoint={checkpoint}") == 0
     for index in range(2):
-        neural, pbr = (read_image(out / "frames" / f"{index:04d}.{name}.png") for name in ("neural", "pbr"))
-        np.testing.assert_allclose(neural, pbr, atol=1.01 / 255)
+        neural, lit, pbr = (
+            read_image(out / "frames" / f"{index:04d}.{name}.png") for name in ("neural", "lit", "pbr")
+        )
+        np.testing.assert_allclose(neural, lit, atol=1.01 / 255)
+        assert np.abs(lit - pbr).max() > 0.05
         relit = out / "frames" / f"{index:04d}.relit.png"
         assert relit.read_bytes() == relit.with_name(f"{index:04d}.neural.png").read_bytes()
     assert json.loads((out / "relight.json").read_text())["relit"] == "neural"
-    assert read_video(out / "guidance.mp4").shape == (2, SIZE, 3 * SIZE, 3)
+    assert read_video(out / "guidance.mp4").shape == (2, SIZE, 4 * SIZE, 3)
     assert read_video(out / "neural.mp4").shape == (2, SIZE, SIZE, 3)
 
 
