@@ -427,7 +427,9 @@ def test_gradients_of_bounced_light_are_differences(dense_surfels, sun_map, cube
         expected = (ends[0] - ends[1]) / (2 * size)
         scale = float(np.linalg.norm(found))  # what a random direction's derivative is of the size of
         assert scale > 0
-        assert float((found * direction).sum()) == pytest.approx(expected, abs=0.01 * scale)
+        # The reflectance table is linear between entries of roughness: kinks lie within a difference.
+        exact = 0.05 if k == 1 else 0.01
+        assert float((found * direction).sum()) == pytest.approx(expected, abs=exact * scale)
 
 
 def test_gradients_reach_a_tracers_parameters(dense_surfels, sun_map) -> None:
