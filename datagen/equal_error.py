@@ -23,6 +23,7 @@ import numpy as np
 
 from datagen.assets import load_models
 from datagen.build import Geometry, build
+from datagen.lights import HdriSpec
 from datagen.pathtrace import gbuffers, render_frames
 from datagen.plan import Work, chosen, find_sources, plan, scene_folder
 from datagen.scene import SceneSpec
@@ -101,7 +102,7 @@ def _judge_scene(
         frame = _Frame(geometry, camera, environment, wanted, integer(spec.seed, spec.name, number, "equal"))
         case = {
             "scene": spec.name,
-            "light": Path(light.path).stem if light.family == "hdri" else light.family,
+            "light": Path(light.path).stem if isinstance(light, HdriSpec) else light.family,
             "pixels": camera.width * camera.height,
             "surfels": len(scene),
             "transport_seconds": seconds,

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from eval import stages
 from eval.cli import cli
 from eval.peers import embree, scene, volprim
 from eval.peers.contenders import Contenders
@@ -22,6 +23,7 @@ from eval.tracing.memory import measure_memory
 from eval.tracing.page_rays import SHADOW_GROUPS
 from tron import metrics, seeds
 from tron.cameras import Camera
+from tron.images import write_image
 from tron.shading import EnvironmentLight, irradiance
 from tron.tracing import reference
 
@@ -139,6 +141,7 @@ def test_the_whole_benchmark_runs_and_every_promised_row_is_there(tmp_path: Path
         "few-rays",
         "exactness",
         "memory",
+        "bounce",
     ):
         assert f'id="{anchor}"' in page
     assert (tmp_path / "pictures" / "camera.png").stat().st_size > 0
@@ -162,6 +165,8 @@ def test_a_part_alone_gives_its_rows_alone(tmp_path: Path):
         irradiance=(300, 32),
         noise=(300, 32),
         few_rays=(300, 32),
+        bounce=[],
+        equal_error=[],
         error_rays=20,
     )
     outcome = benchmark.run(tmp_path)
@@ -193,6 +198,46 @@ SHADOW_COLUMNS = {
     },
     "tracing, × time": {"after refit": "bvh.trace_after_refit", "with strays": "shadow.stray_slowdown"},
 }
+
+
+def test_equal_errors_are_the_data_engines_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The data engine is asked to make scenes once, and to judge them every time; its ratios become rows."""
+    asked = []
+
+    def work(children):
+        (child,) = children
+        asked.append(child.arguments)
+        dataset = tmp_path / "models"
+        (dataset / "equal_error").mkdir(parents=True, exist_ok=True)
+        write_image(dataset / "equal_error" / "a-l0.png", np.full((4, 12, 3), 0.5, np.float32))
+        ways = {
+            name: {"error": 0.02, "seconds": 1.0, "paths": 8.0, "path_seconds": 2.5, "ratio": ratio}
+            for name, ratio in (("lit_16_rays", 0.4), ("lit_64_rays", 1.2))
+        }
+        cases = [{"scene": name, "light": "dusk", "ways": ways} for name in ("a", "b")]
+        (dataset / "equal_error.json").write_text(json.dumps({"cases": cases}))
+
+    monkeypatch.setattr(stages, "run_together", work)
+    command = [
+        "benchmark=tracing", "benchmark.parts=[equal_error]", f"output_dir={tmp_path}",
+        'benchmark.equal_error=["experiment=models","assets=x"]',
+    ]  # fmt: skip
+    for _ in range(2):
+        with pytest.raises(SystemExit) as end:
+            cli(command)
+        assert end.value.code == 0
+    folder = f"output_dir={tmp_path / 'models'}"
+    making = ["experiment=models", "assets=x", folder]
+    judging = [*making, "mode=equal_error"]
+    assert [list(each) for each in asked] == [making, judging, judging]
+    results = Results.load(tmp_path / "results.json")
+    row = results.find("guidance.ratio_to_path_tracing.equal_error")
+    assert row is not None
+    assert (row.value, row.scenes, row.ratio) == (0.4, 2, 0.8)
+    assert results.value("guidance.ratio_to_path_tracing.equal_error.lit_64_rays") == 1.2
+    page = (tmp_path / "report.html").read_text()
+    assert 'id="equal-error"' in page
+    assert "a, dusk" in page
 
 
 def test_shadow_rays_stand_under_their_headings_and_count_the_build():
