@@ -34,7 +34,7 @@ class Bounces:
         self._direct: tuple[Any, mi.Color3f] | None = None
 
     def bake(self, lighting: Lighting) -> BouncedLight:
-        """What ``lighting`` is at each surfel, attached to the materials where their gradients are wanted."""
+        """The light of ``lighting`` at each surfel, attached to materials whose gradients are wanted."""
         geometry = self.surfels.state(*GEOMETRY)
         with dr.suspend_grad():
             if self._transport is None or self._transport[0] != geometry:

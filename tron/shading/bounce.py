@@ -45,7 +45,7 @@ DIRECT = Estimation(rays=8)
 
 @dataclass
 class BouncedLight:
-    """What one light is at each surfel, M lanes in the scene's order, linear.
+    """One light at each surfel, M lanes in the scene's order, linear.
 
     Attributes:
         direct: mi.Color3f, irradiance / pi of the environment, shadows included.
@@ -65,7 +65,7 @@ class BouncedLight:
 
 
 class BounceTransport:
-    """What the cosine-distributed rays of each of M surfels meet; make one by :meth:`trace`.
+    """Hits of the cosine-distributed rays of each of M surfels; made by :meth:`trace`.
 
     Attributes:
         rays: those rays, and what stops each of them.
@@ -177,7 +177,7 @@ class BounceTransport:
         back: float = BACK,
         seed: int = 0,
     ) -> BouncedLight:
-        """What ``lighting`` is at each surfel.
+        """The light of ``lighting`` at each surfel.
 
         Args:
             lighting: the prepared environment.

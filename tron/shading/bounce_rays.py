@@ -71,7 +71,7 @@ def parts(tracer: SurfelTracer) -> Iterator[Part]:
 
 @dataclass
 class _Lanes:
-    """Where the rays of some lanes begin, one surfel a lane."""
+    """Beginnings of the rays of some lanes, one surfel a lane."""
 
     surfel: mi.UInt32
     active: mi.Bool
@@ -209,7 +209,7 @@ class SurfelRays:
 
 
 def _code(hit: FirstHit) -> mi.UInt32:
-    """What is kept of a hit: :attr:`SurfelRays.met`."""
+    """A hit as it is kept: :attr:`SurfelRays.met`."""
     code = 2 * hit.surfel + dr.select(hit.front, mi.UInt32(0), 1)
     return dr.select(hit.surfel == NOTHING, NOTHING, code)
 

@@ -89,7 +89,7 @@ Guidance.BUFFERS = tuple(field.name for field in fields(Guidance) if field.name 
 
 @dataclass
 class Arriving:
-    """What rays from surfaces have found, one lane each.
+    """Findings of rays from surfaces, one lane each.
 
     Attributes:
         visibility: share of the unshadowed irradiance that arrives, by channel.

@@ -1,4 +1,4 @@
-"""What glossy surfaces mirror: rays of each pixel's lobe that meet the scene or escape.
+"""Mirror images of the scene in glossy surfaces: rays of each pixel's lobe that meet it or escape.
 
 Half vectors h are drawn from the normals that the view v sees (Heitz 2018, "Sampling the GGX Distribution of
 Visible Normals"); a ray l then has the density p(l) = D(h) G_1(v) / (4 n.v) and the weight w = F(v.h) G_1(l),
@@ -45,7 +45,7 @@ SMOOTHEST = 0.02
 
 @dataclass
 class Mirror:
-    """What a lobe sees, one lane a pixel, by channel.
+    """The view of a lobe, one lane a pixel, by channel.
 
     Attributes:
         openness: o, share of the environment's light that escapes.
@@ -65,7 +65,7 @@ def reflections(
     seed: int,
     diffuse: Diffuse = "principled",
 ) -> Mirror:
-    """What the lobe of each pixel sees.
+    """The view of each pixel's lobe.
 
     Rays stand still where the surface is differentiated, and what they find is a constant.
 

@@ -35,7 +35,7 @@ NOTHING = 0xFFFFFFFF
 
 @dataclass
 class FirstHit:
-    """What stops each ray, one lane a ray.
+    """The surfel that stops each ray, one lane a ray.
 
     Attributes:
         surfel: mi.UInt32, in the scene's order; ``NOTHING`` where there is none.
@@ -112,7 +112,7 @@ def stop(
 
 
 def first_hits(bvh: Bvh, fans: Fans, back_faces: BackFaces, seeds: Sequence[mi.UInt32]) -> list[FirstHit]:
-    """What stops each ray: a :class:`FirstHit` for each direction of the fans.
+    """The stop of each ray: a :class:`FirstHit` for each direction of the fans.
 
     Evaluated at once, unless within a recorded loop.
 

@@ -403,32 +403,32 @@ def test_gradients_of_bounced_light_are_differences(dense_surfels, sun_map, cube
     still = direct_of(cubemap.texels)
     dr.eval(still)
 
-    def loss(base: mi.Color3f, roughness: mi.Float, metallic: mi.Float, texels: mi.Float) -> mi.Float:
+    def lit(base: mi.Color3f, roughness: mi.Float, metallic: mi.Float, texels: mi.Float) -> mi.Color3f:
         there = replace(surfels, base_color=base, roughness=roughness, metallic=metallic)
         direct = still if texels is cubemap.texels else direct_of(texels)
         indirect = transport.indirect(direct, bounce_albedo(there, BrdfTable.load()), bounces)
-        return dr.sum(dr.sum(weights * indirect))
+        return weights * indirect
 
     given = [surfels.base_color, surfels.roughness, surfels.metallic, cubemap.texels]
     for k in range(4):
         arguments = list(given)
         arguments[k] = type(given[k])(given[k])
         dr.enable_grad(arguments[k])
-        dr.backward(loss(*arguments))
+        dr.backward(dr.sum(dr.sum(lit(*arguments))))
         found = np.atleast_2d(np.array(dr.grad(arguments[k])))
         direction = rng.normal(size=found.shape).astype(np.float32)
-        size = 2e-3
+        size = 2e-2 if k == 3 else 2e-3  # light is all but linear in its texels
         ends = []
         for sign in (1, -1):
             moved_by = [mi.Float(row) for row in sign * size * direction]
             shifted = list(given)
             shifted[k] = given[k] + (mi.Color3f(*moved_by) if k == 0 else moved_by[0])
-            ends.append(float(loss(*shifted)[0]))
+            ends.append(np.array(lit(*shifted), np.float64).sum())  # float32 would round the difference away
         expected = (ends[0] - ends[1]) / (2 * size)
         scale = float(np.linalg.norm(found))  # what a random direction's derivative is of the size of
         assert scale > 0
         # The reflectance table is linear between entries of roughness: kinks lie within a difference.
-        exact = 0.05 if k == 1 else 0.01
+        exact = 0.02 if k == 1 else 0.002
         assert float((found * direction).sum()) == pytest.approx(expected, abs=exact * scale)
 
 
