@@ -22,7 +22,7 @@ from datagen.layout import Placement  # noqa: E402
 from datagen.materials import MaterialSpec  # noqa: E402
 from datagen.pathtrace import gbuffers, render_frames  # noqa: E402
 from datagen.scene import ObjectSpec, SceneSpec, draw_scene  # noqa: E402
-from datagen.shapes import ShapeSpec  # noqa: E402
+from datagen.shapes import ShapeKind, ShapeSpec  # noqa: E402
 from tron.apps.labelled_sheet import labelled_sheet  # noqa: E402
 from tron.cameras import Camera  # noqa: E402
 from tron.color import to_display  # noqa: E402
@@ -49,7 +49,7 @@ def plain(color: tuple[float, float, float], roughness: float, metallic: float) 
     )  # fmt: skip
 
 
-def thing(kind: str, size: float, at: tuple[float, float, float], material: MaterialSpec) -> ObjectSpec:
+def thing(kind: ShapeKind, size: float, at: tuple[float, float, float], material: MaterialSpec) -> ObjectSpec:
     """A procedural object, upright."""
     shape = ShapeSpec(kind=kind, size=size, parameters=(0.2, 0.5, 0.5, 0.5))
     return ObjectSpec(

@@ -11,7 +11,7 @@ import pytest
 
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.images import read_image, write_image
-from tron.shards.schema import light_members
+from tron.shading import Guidance
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 PYTHON = README.parent / "docs/python.md"
@@ -64,7 +64,7 @@ def test_the_python_examples_do_what_they_say(tmp_path, monkeypatch):
     # Above the horizon, where the floor sees it, the light comes back as it was.
     assert np.median(read_image(tmp_path / "fitted.exr")[:16]) == pytest.approx(0.7, rel=0.2)
     picture = np.array(names["picture"])
-    assert picture.shape == (24, 24, 3 * len(light_members()) + 1)  # buffers, opacity
+    assert picture.shape == (24, 24, 3 * (len(Guidance.BUFFERS) - 1) + 1)  # buffers, opacity
     assert 0.3 < picture[12, 12, 0] < 0.45
 
 

@@ -139,6 +139,8 @@ def trace(
     from tron.apps.lit_scene import LitScene
 
     lit = LitScene(scene, cameras[0], estimation, seeds.integer(seed, "relight", "bounces"))
+    if not all(clip.folder.finished(index) for clip in clips for index in range(len(cameras))):
+        lit.prepare()
     for index, camera in enumerate(track(cameras, "guidance")):
         for clip in clips:
             if not clip.folder.finished(index):

@@ -50,6 +50,11 @@ class LitScene:
             self._last = camera, SurfelTracer(self._scene.facing(camera.position))
         return self._last[1]
 
+    def prepare(self) -> None:
+        """Trace what does not depend on lights, with a bar of its own: before another's begins."""
+        if self._estimation.bounces:
+            _ = self._transport if self._scene.oriented else self._both_sides
+
     def bake(self, lighting: Lighting) -> Bounced:
         """Let one environment, at one turn, bounce."""
         if not self._estimation.bounces:
