@@ -72,7 +72,8 @@ class LitScene:
     @cached_property
     def _transport(self) -> BounceTransport:
         """Ways of light through the scene, traced when they are first asked for."""
-        return BounceTransport.trace(self._tracer, seed=self._seed, track=partial(track, label="bounces"))
+        tracer = self._tracer.sided(self._estimation.two_sided)
+        return BounceTransport.trace(tracer, seed=self._seed, track=partial(track, label="bounces"))
 
     @cached_property
     def _both_sides(self) -> BothSides:
