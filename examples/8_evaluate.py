@@ -25,7 +25,7 @@ main(
     )
 )
 rows = json.loads((chosen.output / "results.json").read_text())["rows"]
-psnr = {row["metric"].split(".")[0]: row["value"] for row in rows if row["metric"].endswith(".psnr")}
+psnr = {row["metric"].removesuffix(".psnr"): row["value"] for row in rows if row["metric"].endswith(".psnr")}
 figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
 bars = axes.barh(
     list(psnr), list(psnr.values()), color=["#c44" if name == "neural_lit" else "#89a" for name in psnr]

@@ -8,7 +8,7 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
   everywhere else, so that s means the same under a dim and a bright light; where no surfel is, both buffers
   hold the environment, whose square would be a straw man.
 - ``shadow_ratio``: D(B E / E0), the ratio being clamped (see :func:`shadow_ratio`).
-- ``shadowed``: base color (1 - metallic) E + split-sum specular, stored with the data.
+- ``shadowed``: kd E + split-sum specular, stored with the data.
 - ``affine``: w0 + w1 D(B) + w2 D(E), clipped to [0, 1]; weights of their own for each output channel.
 - ``affine_ratio``: the same with D(B E / E0) as a third input.
 - ``lit``: D(L), L being shadowed and the light that bounced between the surfels.

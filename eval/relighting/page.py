@@ -115,7 +115,7 @@ def verdict(measured: Measured) -> str:
     best = scores.best(GROUPS["best_baseline"])
     for rival, words in (
         ("lit", "lit"),
-        ("best_baseline", f"the best of all {len(BASELINES)} baselines ({TITLES.get(best or '')})"),
+        ("best_baseline", f"the best of all baselines ({TITLES.get(best or '')})"),
     ):
         if gain := rows.get(f"{network.name}.gain_over_{rival}"):
             text += f", {with_interval(gain, signed=True)} over {words}"

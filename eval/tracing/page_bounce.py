@@ -12,8 +12,8 @@ from eval.tracing.measured import EQUAL_ERROR, EqualError, Measured
 from tron.images import read_image
 
 WAY_WORDS = {
-    "lit_16_rays": "lit, 16 shadow rays",
     "lit_64_rays": "lit, 64 shadow rays",
+    "lit_16_rays": "lit, 16 shadow rays",
     "lit_supersampled": "lit, 64 rays over 2 × 2 sub-pixels",
     "lit_with_reflections": "the same, and 4 reflection rays",
 }
@@ -52,7 +52,9 @@ def equal_error_section(measured: Measured, found: Mapping[str, Row]) -> list[Se
     intro = Text(
         "How long Mitsuba's path tracer takes until its error is ours: root mean square of what is seen, "
         "after exposure and AgX, on the pixels that meet the scene, against the same path tracer converged. "
-        "The mean ratio is over scenes; below 1 our frame is the faster way to that error."
+        "The mean ratio is over scenes; below 1 our frame is the faster way to that error. What is done once "
+        "a scene and once a light (transport, bake, prefiltered map) is in none of these times: one still "
+        "picture costs that much more."
     )
     means = [
         [

@@ -40,7 +40,7 @@ def write_sheet(
     lighting = None if light is None else Lighting(light.environment)
     estimation, bounce = None if settings is None else sheet_estimation(settings), None
     if lighting is not None and estimation is not None:
-        bounce = BounceTransport.trace(tracer).bake(lighting, estimation)
+        bounce = BounceTransport.trace(tracer.sided(estimation.two_sided)).bake(lighting, estimation)
     for number, view in enumerate(views):
         buffers = tracer.gbuffer(view.camera).numpy()
         rendered, wanted = picture(buffers), wanted_picture(view)

@@ -34,11 +34,17 @@ class Bounces:
         self._direct: tuple[Any, mi.Color3f] | None = None
 
     def bake(self, lighting: Lighting) -> BouncedLight:
-        """The light of ``lighting`` at each surfel, attached to materials whose gradients are wanted."""
+        """The light of ``lighting`` at each surfel, attached to materials whose gradients are wanted.
+
+        Its rays are those of seed 0, whatever the sensor's.
+        """
         geometry = self.surfels.state(*GEOMETRY)
         with dr.suspend_grad():
             if self._transport is None or self._transport[0] != geometry:
-                self._transport = geometry, BounceTransport.trace(self.surfels.tracer)
+                self._transport = (
+                    geometry,
+                    BounceTransport.trace(self.surfels.tracer.sided(self.estimation.two_sided)),
+                )
                 self._direct = None
             transport = self._transport[1]
             if self._direct is None or self._direct[0] is not lighting:

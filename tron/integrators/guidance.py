@@ -10,7 +10,7 @@
                                   may have fewer: 2 lighten shadows by a hundredth or two, 8 by nothing
     estimator           string    ratio (default) or plain: see tron.estimation
     two_sided           boolean   back faces block shadow rays beyond two spacings (default: true)
-    bounces             integer   times that light bounces between surfels (default: 3; 0: never)
+    bounces             integer   times that light bounces between surfels (default: 4; 0: never)
     reflections         integer   for each camera ray, rays that find what glossy surfaces mirror (default: 0)
     diffuse             string    material: principled (default), as Mitsuba has it, or lambert
     cubemap_resolution  integer   of the prefiltered environment

@@ -90,5 +90,6 @@ def facing(fronts: BouncedLight, backs: BouncedLight, turned: np.ndarray) -> Bou
     """Of each surfel the light of its front, or where it is ``turned`` over, (M,) bool, of its back."""
     over, front = mi.Bool(turned), vars(fronts)
     shown = BouncedLight(**{name: dr.select(over, light, front[name]) for name, light in vars(backs).items()})
+    shown.behind = dr.select(over, fronts.outgoing, backs.outgoing)
     dr.eval(shown)
     return shown

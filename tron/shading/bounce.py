@@ -12,7 +12,8 @@ it meets a back: an underside that no camera saw, which stands for one that is t
 :mod:`tron.tracing.first_hit`, so each estimates the composited radiance without bias.
 
 Memory: 4 bytes a ray are kept, 128 MB of a million surfels with 32 rays each. While rays are traced,
-a million surfels at a time take another 250 bytes each: 380 MB in all, measured.
+a million surfels at a time take another 250 bytes each: 380 MB in all, measured. Surfels of two faces
+(:mod:`tron.shading.both_sides`) take more than three times that.
 """
 
 from __future__ import annotations
@@ -50,13 +51,15 @@ class BouncedLight:
     Attributes:
         direct: mi.Color3f, irradiance / pi of the environment, shadows included.
         indirect: mi.Color3f, irradiance / pi of light that has met surfels.
-        outgoing: mi.Color3f, radiance that the surfel sends out, taken as the same in all directions.
+        outgoing: mi.Color3f, radiance that the surfel's front sends out, taken as the same in all directions.
+        behind: mi.Color3f, radiance that its back sends out, likewise.
         openness: mi.Float in [0, 1], share of the surfel's rays that meet nothing.
     """
 
     direct: mi.Color3f
     indirect: mi.Color3f
     outgoing: mi.Color3f
+    behind: mi.Color3f
     openness: mi.Float
 
     def values(self) -> list[mi.Float]:
@@ -199,7 +202,8 @@ class BounceTransport:
         bounces = estimation.bounces if bounces is None else bounces
         albedo = self.albedo(estimation.diffuse)
         indirect = self.indirect(direct, albedo, bounces, back)
-        baked = BouncedLight(direct, indirect, albedo * (direct + indirect), self.openness())
+        outgoing = albedo * (direct + indirect)
+        baked = BouncedLight(direct, indirect, outgoing, back * outgoing, self.openness())
         dr.eval(baked)
         return baked
 

@@ -90,8 +90,10 @@ class FixedRays:
             lighting: of any light; gradients reach the texels of a :class:`CubemapLight`.
             background: linear RGB radiance behind the surfels; None: the environment.
         """
-        baked = self.bounce.bounced(self._direct(lighting), self.estimation)
-        gbuffer = self.tracer.gbuffer(self.camera, baked.values())
+        values = ()
+        if self.estimation.bounces:
+            values = self.bounce.bounced(self._direct(lighting), self.estimation).values()
+        gbuffer = self.tracer.gbuffer(self.camera, values)
         arriving = Arriving(visible_share(*self.pixels.irradiance(lighting.light)))
         return gbuffer, shade_surface(gbuffer, arriving, lighting, background, self.estimation.diffuse)
 

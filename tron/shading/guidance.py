@@ -123,7 +123,8 @@ def render_guidance(
         estimation: of the light.
         seed: root of the rays' random numbers.
         background: linear RGB radiance behind the surfels; None: the environment.
-        bounce: what ``lighting`` is at each surfel (``BounceTransport.bake``); None: no light bounces.
+        bounce: what ``lighting`` is at each surfel (``BounceTransport.bake``); None, or with no bounces in
+            ``estimation``: no light bounces.
     """
     gbuffer = trace_view(tracer, camera, estimation, bounce)
     arriving = arriving_light(tracer, gbuffer, lighting, estimation, seed, bounce)
@@ -135,6 +136,7 @@ def trace_view(
 ) -> GBuffer:
     """The G-buffer that :func:`shade` takes: of sub-pixels, if so, and with the values of ``bounce``."""
     times = estimation.supersample
+    bounce = bounce if estimation.bounces else None
     view = camera if times == 1 else camera.resized(times * camera.width, times * camera.height)
     return tracer.gbuffer(view) if bounce is None else tracer.gbuffer(view, bounce.values())
 
@@ -150,7 +152,7 @@ def arriving_light(
     """Light that reaches the pixels of :func:`trace_view`; arguments as of :func:`render_guidance`."""
     estimation = estimation.of_sub_pixel()
     arriving = Arriving(visibility(tracer, gbuffer, lighting, estimation, seed))
-    if bounce is not None and estimation.reflections:
+    if bounce is not None and estimation.bounces and estimation.reflections:
         occluder = tracer.sided(estimation.two_sided)
         arriving.mirror = reflections(
             occluder, gbuffer, lighting, bounce, estimation.reflections, seed, estimation.diffuse

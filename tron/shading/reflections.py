@@ -14,7 +14,7 @@ would stand in shadows. m = p / (p + p_light) is the balance heuristic (Veach 19
 
 A ray of the lobe is stopped by one surfel (:mod:`tron.tracing.first_hit`). R is the composition of
 :mod:`tron.shading.composition` at the surfel's centre with the bake's light, so a mirror shows highlights of
-what it mirrors. A back face shows ``BACK`` of what its front sends out.
+what it mirrors. A back face shows what ``BouncedLight.behind`` says.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import mitsuba as mi
 
 from tron.estimation import Diffuse
 from tron.seeds import integer
-from tron.shading.bounce import BACK, BouncedLight
+from tron.shading.bounce import BouncedLight
 from tron.shading.composition import Response, evenly_bounced
 from tron.shading.irradiance import ORIGIN_OFFSET
 from tron.shading.lighting import Lighting
@@ -205,7 +205,7 @@ def _returned(
     visibility = ratio(direct, response.unshadowed, 1)
     bounced = evenly_bounced(indirect, openness, visibility, surface.roughness)
     shown = response.lit(direct, bounced)
-    return dr.select(hit.front, shown, BACK * of(bounce.outgoing, met & ~hit.front))
+    return dr.select(hit.front, shown, of(bounce.behind, met & ~hit.front))
 
 
 def visible_normal(view: mi.Vector3f, alpha: mi.Float, u: mi.Point2f) -> mi.Vector3f:

@@ -45,6 +45,30 @@ def test_normals_without_a_sign_get_the_light_of_the_side_that_a_camera_sees(lig
         assert error < 0.1, f"relative error {error:.3f}"
 
 
+def test_mirrors_show_the_light_of_the_side_that_they_see(lighting, ball_on_floor):
+    """A far side that no camera sees is seen in the mirror below it, by its own light."""
+    scene = ball_on_floor()
+    metal = replace(
+        scene, metallic=np.ones_like(scene.metallic), roughness=np.full_like(scene.roughness, 0.15)
+    )
+    estimation = FINAL.model_copy(update={"reflections": 16})
+    means = []
+    for each in (metal, replace(metal, oriented=False)):
+        lit = LitScene(each, VIEWS[0], estimation, 0)
+        bounce = lit.bake(lighting)(VIEWS[0])
+        guidance = render_guidance(lit.tracer(VIEWS[0]), VIEWS[0], lighting, estimation, bounce=bounce)
+        means.append(guidance.lit[guidance.mask > 0.9].mean())
+    assert means[1] == pytest.approx(means[0], rel=0.05)
+
+
+def test_without_bounces_lit_is_shadowed_whatever_was_baked(lighting, ball_on_floor):
+    lit = LitScene(ball_on_floor(), VIEWS[0], FINAL, 0)
+    bounce = lit.bake(lighting)(VIEWS[0])
+    direct = FINAL.model_copy(update={"bounces": 0})
+    guidance = render_guidance(lit.tracer(VIEWS[0]), VIEWS[0], lighting, direct, bounce=bounce)
+    np.testing.assert_array_equal(guidance.lit, guidance.shadowed)
+
+
 def test_a_scene_without_bounces_bakes_nothing(lighting, ball_on_floor):
     lit = LitScene(ball_on_floor(), VIEWS[0], FINAL.model_copy(update={"bounces": 0}), 0)
     assert lit.bake(lighting)(VIEWS[0]) is None
