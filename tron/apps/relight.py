@@ -69,8 +69,8 @@ def main(settings: Settings) -> None:
         path = settings.trajectory, settings.frames
         cameras = plan_cameras(scene, *path, **view, distance=settings.distance)
     activate(settings.variant, settings.threads)
-    # Without a network the relit picture is one of them, and is shown as such.
-    guidance = [name for name in GUIDANCE if name != settings.source]
+    # Without a network the relit picture is one of them, and is shown as such; so is lit if nothing bounces.
+    guidance = [name for name in GUIDANCE if name != settings.source and (settings.bounces or name != "lit")]
     guidance = guidance if renderer is None else renderer.config.guidance
     clips = [_clip(*each, len(cameras), guidance) for each in zip(lights, environments)]
     clock.lap("loading")

@@ -240,7 +240,7 @@ def test_a_turning_light_on_a_still_view_is_each_angle_alone(relight, scene_path
 
 
 def test_without_bounces_the_picture_is_shadowed_and_nothing_is_traced_for_them(
-    relight, scene_path, lights, tmp_path, counted
+    relight, scene_path, lights, tmp_path, counted, read_video
 ):
     base = [f"scene={scene_path}", f"environment={lights[0]}", "frames=1", f"output_dir={tmp_path}"]
     assert relight(*base, "bounces=0", "buffers=[relit,lit,indirect,mask]") == 0
@@ -252,6 +252,8 @@ def test_without_bounces_the_picture_is_shadowed_and_nothing_is_traced_for_them(
     np.testing.assert_array_equal(relit, shadowed)
     np.testing.assert_array_equal(lit, shadowed)
     assert (indirect[mask[..., 0] > 0.999] == 0).all()
+    assert read_video(tmp_path / "guidance.mp4").shape[1:3] == (SIZE, 2 * SIZE), "pbr and irradiance"
+    assert read_image(tmp_path / "contact_sheet.png").shape[0] == 3 * SIZE, "the relit picture and those"
 
 
 def test_bounced_light_fills_the_shadow_and_has_the_colour_of_what_sent_it(
