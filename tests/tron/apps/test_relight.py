@@ -201,6 +201,27 @@ def test_a_new_renderer_is_given_lit_and_shows_it(relight, scene_path, light_pat
     assert read_video(out / "neural.mp4").shape == (2, SIZE, SIZE, 3)
 
 
+def test_without_bounces_a_renderer_that_is_given_lit_is_refused(
+    relight, scene_path, light_path, tmp_path, capsys
+):
+    """`lit` would be `shadowed` under another name; a renderer of pbr and irradiance is no worse off."""
+    from tron.neural.configs import PixelMLPConfig
+    from tron.neural.pixel_mlp import PixelMLP
+    from tron.neural.weights import save_renderer
+
+    checkpoint, out = tmp_path / "renderer.safetensors", tmp_path / "out"
+    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=1", "bounces=0"]
+    save_renderer(checkpoint, PixelMLP(PixelMLPConfig(width=4)))
+    assert relight(*base, f"checkpoint={checkpoint}") == 2
+    error = capsys.readouterr().err.strip()
+    assert "no bounced light with bounces=0" in error
+    assert error.endswith("leave bounces as it is, or take a checkpoint of pbr and irradiance")
+    assert "\n" not in error
+    assert not out.exists()
+    save_renderer(checkpoint, PixelMLP(PixelMLPConfig(width=4, guidance=("pbr", "irradiance"))))
+    assert relight(*base, f"checkpoint={checkpoint}") == 0
+
+
 def test_a_clip_in_parts_is_the_clip_in_one(tmp_path, monkeypatch):
     import torch
 
