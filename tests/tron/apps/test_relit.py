@@ -143,6 +143,25 @@ def test_foreground_over_the_sky_is_the_picture_in_the_environment(over, lights)
     np.testing.assert_allclose(picture(folder, "relit"), to_display(lit, exposure), atol=STEP)
 
 
+def test_foreground_over_one_radiance_is_the_picture_of_sub_pixels_too(relight, scene_path, tmp_path):
+    """The share is the mean of those of sub-pixels, which at rims is not the share of their mean opacity."""
+    radiance = np.array([2.0, 4.0, 8.0])
+    EnvironmentMap.constant(radiance).save(tmp_path / "c.exr")
+    files = [f"scene={scene_path}", f"environment={tmp_path / 'c.exr'}", f"output_dir={tmp_path}", "frames=1"]
+    assert relight(*files, "supersample=2") == 0
+    foreground, mask, share, lit = (
+        picture(tmp_path, name, suffix="exr") for name in ("foreground", "mask", "share", "lit")
+    )
+    of_mean = background_share(1 - mask)
+    assert (np.abs(share - of_mean) > 0.005).sum() > 10, "rims are tested"
+    np.testing.assert_allclose((1 - share) * foreground + share * radiance, lit, rtol=2e-3, atol=2e-3)
+    assert relight(*files, "supersample=2", "background=[0.2,0.9,0.4]") == 0
+    assert json.loads((tmp_path / "relight.json").read_text())["frames_rendered"] == 0
+    shown = to_display(foreground, json.loads((tmp_path / "relight.json").read_text())["exposure"])
+    expected = (1 - share) * shown + share * np.array([0.2, 0.9, 0.4])
+    np.testing.assert_allclose(picture(tmp_path, "relit"), expected, atol=STEP)
+
+
 def test_linear_picture_without_a_sky_is_multiplied_by_its_alpha(over):
     relit, foreground, mask = (
         picture(over / "transparent", name, suffix="exr") for name in ("relit", "foreground", "mask")
