@@ -171,13 +171,18 @@ def _shade(
     seed: int,
 ) -> dict[str, np.ndarray]:
     """The buffers ``names`` of one frame."""
+    from tron.shading.background import background_share
     from tron.shading.guidance import arriving_light, shade, trace_view
+    from tron.shading.supersampling import averaged
 
     view = trace_view(tracer, camera, estimation, bounce)
     arriving = arriving_light(tracer, view, lighting, estimation, seed, bounce)
     guidance = shade(view, arriving, lighting, estimation=estimation)
-    made = guidance.gbuffer | vars(guidance)
+    # The share is no linear function of opacity: a pixel has the mean of those of its sub-pixels.
+    transmittance = 1 - view.images({"opacity": view.opacity})["opacity"]
+    share = averaged(background_share(transmittance), estimation.supersample)
+    made = guidance.gbuffer | vars(guidance) | {"share": share.astype(np.float32)}
     if "foreground" in names:
         over_black = shade(view, arriving, lighting, (0, 0, 0), estimation).lit
-        made["foreground"] = surfels_alone(over_black, guidance.mask)
+        made["foreground"] = surfels_alone(over_black, made["share"])
     return {name: made[name] for name in names}

@@ -69,8 +69,8 @@ def main(settings: Settings) -> None:
         path = settings.trajectory, settings.frames
         cameras = plan_cameras(scene, *path, **view, distance=settings.distance)
     activate(settings.variant, settings.threads)
-    # Without a network the relit picture is one of them, and is shown as such.
-    guidance = [name for name in GUIDANCE if name != settings.source]
+    # Without a network the relit picture is one of them, and is shown as such; so is lit if nothing bounces.
+    guidance = [name for name in GUIDANCE if name != settings.source and (settings.bounces or name != "lit")]
     guidance = guidance if renderer is None else renderer.config.guidance
     clips = [_clip(*each, len(cameras), guidance) for each in zip(lights, environments)]
     clock.lap("loading")
@@ -151,7 +151,12 @@ def _load_renderer(settings: Settings) -> Renderer | None:
 
     if settings.threads is not None:
         set_torch_threads(settings.threads)
-    return load_renderer(settings.checkpoint, settings.vae).to(torch_device(settings.variant))
+    renderer = load_renderer(settings.checkpoint, settings.vae)
+    if settings.bounces == 0 and "lit" in renderer.config.guidance:
+        what = "the network is given lit, which has no bounced light with bounces=0"
+        mend = "leave bounces as it is, or take a checkpoint of pbr and irradiance"
+        raise TronError(what, settings.checkpoint, mend)
+    return renderer.to(torch_device(settings.variant))
 
 
 def _clip(light: Settings, environment: EnvironmentMap, frames: int, guidance: Sequence[str]) -> Clip:

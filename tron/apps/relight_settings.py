@@ -14,7 +14,7 @@ from tron.errors import TronError
 from tron.estimation import FINAL, Estimation, Estimator
 from tron.shards.schema import light_members
 
-DEFAULT_BUFFERS = (*light_members(), "indirect", "foreground", "mask")
+DEFAULT_BUFFERS = (*light_members(), "indirect", "foreground", "mask", "share")
 BUFFERS = (
     *DEFAULT_BUFFERS,
     *("base_color", "normal", "depth", "position", "roughness", "metallic", "rgb"),  # of the G-buffer

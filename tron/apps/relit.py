@@ -8,8 +8,9 @@ between the surfels), or `shadowed` where nothing is to bounce. What stands behi
     [r, g, b]    one colour, in display values as a picture on the screen has them (sRGB, 0 to 1)
 
 A colour is composited after AgX, so that an empty pixel shows it exactly; it has the background's share of
-tron.shading.background, which is none behind opaque surfels. A network draws surfels and sky as one: at the
-rim of the surfels its colours hold some of the light's, whatever stands behind.
+tron.shading.background, which is none behind opaque surfels. The buffer `share` holds it: the mean over a
+pixel's sub-pixels, not the share of their mean opacity. A network draws surfels and sky as one: at the rim of
+the surfels its colours hold some of the light's, whatever stands behind.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ class RelitPicture:
         """Buffers that a frame must have on disk for it."""
         if self.background == "environment":
             return () if self.neural else (self.source,)
-        return ("mask",) if self.neural else ("mask", "foreground")
+        surfels = () if self.neural else ("foreground",)
+        return ("mask", *surfels) if self.background == "transparent" else ("mask", "share", *surfels)
 
     def describe(self) -> str:
         """One line for the log."""
@@ -76,10 +78,9 @@ class RelitPicture:
         if self.background == "environment":
             return to_display(folder.read(index, self.source), exposure) if neural is None else neural
         surfels = to_display(folder.read(index, "foreground"), exposure) if neural is None else neural
-        mask = folder.read(index, "mask")[..., :1]
         if self.background == "transparent":
-            return np.concatenate([surfels, mask], axis=2)
-        return composite(surfels, self.background, mask)
+            return np.concatenate([surfels, folder.read(index, "mask")[..., :1]], axis=2)
+        return composite(surfels, self.background, folder.read(index, "share")[..., :1])
 
     def linear(self, folder: FrameFolder, index: int) -> np.ndarray:
         """Radiance of frame ``index`` before exposure.
@@ -93,22 +94,17 @@ class RelitPicture:
         return np.concatenate([folder.read(index, "foreground") * mask, mask], axis=2)
 
 
-def composite(surfels: np.ndarray, color: Sequence[float], mask: np.ndarray) -> np.ndarray:
-    """Display values (H, W, 3) of surfels over one colour; ``mask`` (H, W, 1) is their opacity."""
-    from tron.shading.background import background_share
-
-    share = background_share(1 - mask)
+def composite(surfels: np.ndarray, color: Sequence[float], share: np.ndarray) -> np.ndarray:
+    """Display values (H, W, 3) of surfels over one colour, which has the weight ``share`` (H, W, 1)."""
     return (1 - share) * surfels + share * np.asarray(color, np.float32)
 
 
-def surfels_alone(over_black: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def surfels_alone(over_black: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Radiance (H, W, 3) of surfels without what is behind them, 0 where there are none.
 
     Args:
         over_black: their radiance in front of black.
-        mask: (H, W) their opacity.
+        share: (H, W) weight of what is behind them.
     """
-    from tron.shading.background import background_share
-
-    weight = 1 - background_share(1 - mask)[..., None]
+    weight = 1 - share[..., None]
     return np.divide(over_black, weight, out=np.zeros_like(over_black), where=weight > 0)

@@ -52,7 +52,7 @@ def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, 
 
 
 def test_every_buffer_of_the_help_is_made_and_all_guidance_is_written_by_default():
-    shaded = {"foreground", "relit"}
+    shaded = {"foreground", "share", "relit"}
     assert set(BUFFERS) <= {field.name for field in fields(Surface)} | set(Guidance.BUFFERS) | shaded
     assert set(Guidance.BUFFERS) <= set(DEFAULT_BUFFERS)
     assert all(name in (Settings.model_fields["buffers"].description or "") for name in BUFFERS)
@@ -199,6 +199,27 @@ def test_a_new_renderer_is_given_lit_and_shows_it(relight, scene_path, light_pat
     assert json.loads((out / "relight.json").read_text())["relit"] == "neural"
     assert read_video(out / "guidance.mp4").shape == (2, SIZE, 4 * SIZE, 3)
     assert read_video(out / "neural.mp4").shape == (2, SIZE, SIZE, 3)
+
+
+def test_without_bounces_a_renderer_that_is_given_lit_is_refused(
+    relight, scene_path, light_path, tmp_path, capsys
+):
+    """`lit` would be `shadowed` under another name; a renderer of pbr and irradiance is no worse off."""
+    from tron.neural.configs import PixelMLPConfig
+    from tron.neural.pixel_mlp import PixelMLP
+    from tron.neural.weights import save_renderer
+
+    checkpoint, out = tmp_path / "renderer.safetensors", tmp_path / "out"
+    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=1", "bounces=0"]
+    save_renderer(checkpoint, PixelMLP(PixelMLPConfig(width=4)))
+    assert relight(*base, f"checkpoint={checkpoint}") == 2
+    error = capsys.readouterr().err.strip()
+    assert "no bounced light with bounces=0" in error
+    assert error.endswith("leave bounces as it is, or take a checkpoint of pbr and irradiance")
+    assert "\n" not in error
+    assert not out.exists()
+    save_renderer(checkpoint, PixelMLP(PixelMLPConfig(width=4, guidance=("pbr", "irradiance"))))
+    assert relight(*base, f"checkpoint={checkpoint}") == 0
 
 
 def test_a_clip_in_parts_is_the_clip_in_one(tmp_path, monkeypatch):

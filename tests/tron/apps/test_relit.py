@@ -143,6 +143,25 @@ def test_foreground_over_the_sky_is_the_picture_in_the_environment(over, lights)
     np.testing.assert_allclose(picture(folder, "relit"), to_display(lit, exposure), atol=STEP)
 
 
+def test_foreground_over_one_radiance_is_the_picture_of_sub_pixels_too(relight, scene_path, tmp_path):
+    """The share is the mean of those of sub-pixels, which at rims is not the share of their mean opacity."""
+    radiance = np.array([2.0, 4.0, 8.0])
+    EnvironmentMap.constant(radiance).save(tmp_path / "c.exr")
+    files = [f"scene={scene_path}", f"environment={tmp_path / 'c.exr'}", f"output_dir={tmp_path}", "frames=1"]
+    assert relight(*files, "supersample=2") == 0
+    foreground, mask, share, lit = (
+        picture(tmp_path, name, suffix="exr") for name in ("foreground", "mask", "share", "lit")
+    )
+    of_mean = background_share(1 - mask)
+    assert (np.abs(share - of_mean) > 0.005).sum() > 10, "rims are tested"
+    np.testing.assert_allclose((1 - share) * foreground + share * radiance, lit, rtol=2e-3, atol=2e-3)
+    assert relight(*files, "supersample=2", "background=[0.2,0.9,0.4]") == 0
+    assert json.loads((tmp_path / "relight.json").read_text())["frames_rendered"] == 0
+    shown = to_display(foreground, json.loads((tmp_path / "relight.json").read_text())["exposure"])
+    expected = (1 - share) * shown + share * np.array([0.2, 0.9, 0.4])
+    np.testing.assert_allclose(picture(tmp_path, "relit"), expected, atol=STEP)
+
+
 def test_linear_picture_without_a_sky_is_multiplied_by_its_alpha(over):
     relit, foreground, mask = (
         picture(over / "transparent", name, suffix="exr") for name in ("relit", "foreground", "mask")
@@ -240,7 +259,7 @@ def test_a_turning_light_on_a_still_view_is_each_angle_alone(relight, scene_path
 
 
 def test_without_bounces_the_picture_is_shadowed_and_nothing_is_traced_for_them(
-    relight, scene_path, lights, tmp_path, counted
+    relight, scene_path, lights, tmp_path, counted, read_video
 ):
     base = [f"scene={scene_path}", f"environment={lights[0]}", "frames=1", f"output_dir={tmp_path}"]
     assert relight(*base, "bounces=0", "buffers=[relit,lit,indirect,mask]") == 0
@@ -252,6 +271,8 @@ def test_without_bounces_the_picture_is_shadowed_and_nothing_is_traced_for_them(
     np.testing.assert_array_equal(relit, shadowed)
     np.testing.assert_array_equal(lit, shadowed)
     assert (indirect[mask[..., 0] > 0.999] == 0).all()
+    assert read_video(tmp_path / "guidance.mp4").shape[1:3] == (SIZE, 2 * SIZE), "pbr and irradiance"
+    assert read_image(tmp_path / "contact_sheet.png").shape[0] == 3 * SIZE, "the relit picture and those"
 
 
 def test_bounced_light_fills_the_shadow_and_has_the_colour_of_what_sent_it(
