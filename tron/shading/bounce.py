@@ -203,7 +203,7 @@ class BounceTransport:
         albedo = self.albedo(estimation.diffuse)
         indirect = self.indirect(direct, albedo, bounces, back)
         outgoing = albedo * (direct + indirect)
-        baked = BouncedLight(direct, indirect, outgoing, back * outgoing, self.openness())
+        baked = BouncedLight(direct, indirect, outgoing, dr.opaque(mi.Float, back) * outgoing, self.openness())
         dr.eval(baked)
         return baked
 
