@@ -203,7 +203,8 @@ class BounceTransport:
         albedo = self.albedo(estimation.diffuse)
         indirect = self.indirect(direct, albedo, bounces, back)
         outgoing = albedo * (direct + indirect)
-        baked = BouncedLight(direct, indirect, outgoing, dr.opaque(mi.Float, back) * outgoing, self.openness())
+        behind = dr.opaque(mi.Float, back) * outgoing
+        baked = BouncedLight(direct, indirect, outgoing, behind, self.openness())
         dr.eval(baked)
         return baked
 

@@ -73,9 +73,7 @@ MEMBERS: dict[str, Member] = {
     "irradiance": _light("irradiance / pi at the surfels, with shadows"),
     "rgb": _light("path-traced radiance, which the network must produce"),
     "unshadowed": _light("irradiance / pi at the surfels, without visibility"),
-    "shadowed": _light(
-        "direct light: diffuse with shadows, plus the split sum's specular part"
-    ),
+    "shadowed": _light("direct light: diffuse with shadows, plus the split sum's specular part"),
     "lit": _light("shadowed, and light that bounced between the surfels: the picture without a network"),
     "mask": _scalar("opacity of the surfels in [0, 1]", "all"),
     "foreground": Member("png", 1, 1, None, "all", "1 where the pixel-centre ray meets true geometry"),
