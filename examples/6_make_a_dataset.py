@@ -1,6 +1,6 @@
 """Make a dataset for the neural renderer: scenes of random shapes, path-traced, with our guidance.
 
-The picture shows three clips: what the network is given (split-sum and irradiance), and what it is to draw.
+The picture shows three clips: of what the network is given split-sum and irradiance, and what it is to draw.
 """
 
 import numpy as np
