@@ -26,7 +26,7 @@ from tron import seeds
 from tron.cameras import mitsuba_sensor
 from tron.color import luminance
 from tron.shading import EnvironmentLight, Estimation, Lighting, irradiance, render_guidance
-from tron.shading.guidance import Guidance, shade
+from tron.shading.guidance import Arriving, Guidance, shade
 from tron.shading.irradiance import ORIGIN_OFFSET
 from tron.shading.visibility import reaching_share
 from tron.tracing import GBuffer, SurfelTracer
@@ -120,7 +120,7 @@ def measure_noise(contenders: Contenders, size: int, light: str, reference_spp: 
             sums = independent_irradiance(tracer, gbuffer, lighting.light, rays, seed + k)
             estimation = Estimation(rays=rays)
             share = reaching_share(*sums, gbuffer, lighting, tracer.scene.spacing, estimation)
-            images.append(shade(gbuffer, share, lighting).irradiance)
+            images.append(shade(gbuffer, Arriving(share), lighting).irradiance)
         return images
 
     times = interleaved(
