@@ -73,8 +73,12 @@ class LitScene:
     def _transport(self) -> BounceTransport:
         """Ways of light through the scene, traced when they are first asked for."""
         tracer = self._tracer.sided(self._estimation.two_sided)
-        return BounceTransport.trace(tracer, seed=self._seed, track=partial(track, label="bounces"))
+        return BounceTransport.trace(
+            tracer, seed=self._seed, track=partial(track, label="rays of the surfels")
+        )
 
     @cached_property
     def _both_sides(self) -> BothSides:
-        return BothSides.trace(self._tracer, seed=self._seed, track=partial(track, label="bounces"))
+        return BothSides.trace(
+            self._tracer, seed=self._seed, track=partial(track, label="rays of the surfels")
+        )
