@@ -3,6 +3,7 @@
 import csv
 import importlib
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -109,18 +110,28 @@ def free(folder: Path) -> bool:
         return False
 
 
+def kill_at_a_checkpoint(command: list[str], output: Path) -> str:
+    """Start a run and kill its first process once a checkpoint is there; gives what it said."""
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: list((output / "checkpoints").glob("1-one-*0.ckpt")) or process.poll() is not None)
+    process.send_signal(signal.SIGKILL)
+    _, said = process.communicate()
+    wait_for(lambda: free(output))  # the processes that it started notice and end
+    return said
+
+
 @two_cores
 @pytest.mark.long
 def test_two_processes_killed_and_resumed_equal_one_with_twice_the_batch(alone, typed, tmp_path):
     output = tmp_path / "two"
     # In float64, but for the samples; the tiny renderer has layers in float32 whatever it is told.
     command = typed(output, "renderer=pixel_mlp", precision="64-true", stages=LONGER)
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    wait_for(lambda: list((output / "checkpoints").glob("1-one-*0.ckpt")) or process.poll() is not None)
-    process.send_signal(signal.SIGKILL)
-    _, said = process.communicate()
-    wait_for(lambda: free(output))  # the processes that it started notice and end
-    position = find_position(output / "checkpoints", [Stage.model_validate(stage) for stage in STAGES])
+    for _ in range(3):  # on a crowded machine a run may end before this process gets to kill it
+        said = kill_at_a_checkpoint(command, output)
+        position = find_position(output / "checkpoints", [Stage.model_validate(stage) for stage in STAGES])
+        if position.stage == 0:
+            break
+        shutil.rmtree(output)
     assert (position.stage, position.step % 10) == (0, 0), said
     assert 0 < position.step < 200, said
     again = subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=LONGEST, check=False)
