@@ -31,7 +31,7 @@ from datagen.settings import EqualErrorSettings, Settings
 from tron.cameras import Camera
 from tron.color import to_display
 from tron.errors import TronError
-from tron.estimation import FINAL, PREVIEW, Estimation
+from tron.estimation import FINAL, FINEST, PREVIEW, Estimation
 from tron.gaussians.scene import GaussianScene
 from tron.images import write_image
 from tron.runtime import activate, describe_machine
@@ -50,7 +50,7 @@ WAYS = {
     "lit_64_rays": FINAL,
     "lit_16_rays": FINAL.model_copy(update={"rays": 16}),
     "lit_supersampled": FINAL.model_copy(update={"supersample": 2}),
-    "lit_with_reflections": FINAL.model_copy(update={"supersample": 2, "reflections": 4}),
+    "lit_with_reflections": FINEST,
 }
 """Frames of ours that are judged; the first is tron-relight's default, which the target holds."""
 BEST = "lit_with_reflections"

@@ -67,6 +67,8 @@ class Estimation(BaseModel):
 
 
 FINAL = Estimation()
-"""That of final frames; the settings of the commands take their defaults from it."""
+"""That of a frame at one sample a pixel; the settings of the commands take their defaults from it."""
 PREVIEW = Estimation(rays=2, filtered=True)
-"""That of frames while one looks for the right one, tron-relight's unless told otherwise."""
+"""``quality=preview`` of tron-relight, its default."""
+FINEST = Estimation(reflections=4, supersample=2)
+"""``quality=final`` of tron-relight."""

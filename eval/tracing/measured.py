@@ -356,18 +356,23 @@ class EqualError:
         """Names of our frames; the target holds the first."""
         return list(self.cases[0]["ways"])
 
+    def metrics(self, way: str) -> dict[str, tuple[str, str]]:
+        """Names and units of a way's rows, by their names in the record."""
+        suffix = "" if way == self.ways[0] else f".{way}"
+        return {
+            "ratio": (f"{EQUAL_ERROR}{suffix}", "x"),
+            "ratio_with_bake": (f"{EQUAL_ERROR}.with_bake{suffix}", "x"),
+            "error": (f"guidance.error.{way}", "abs"),
+            "seconds": (f"guidance.seconds.{way}", "s"),
+            "paths": (f"guidance.paths.{way}", "1"),
+        }
+
     def rows(self, seed: int) -> Iterator[Row]:
-        """Time of each of our frames over the path tracer's at its error, over scenes."""
-        for number, way in enumerate(self.ways):
-            found = [(case["scene"], case["ways"][way]) for case in self.cases]
-            suffix = "" if number == 0 else f".{way}"
-            ratios = [(scene, values["ratio"]) for scene, values in found]
-            yield mean_row(f"{EQUAL_ERROR}{suffix}", "x", ratios, seed)
-            baked = [(scene, values["ratio_with_bake"]) for scene, values in found]
-            yield mean_row(f"{EQUAL_ERROR}.with_bake{suffix}", "x", baked, seed)
-            for name, unit in (("error", "abs"), ("seconds", "s"), ("paths", "1")):
-                values = [(scene, values[name]) for scene, values in found]
-                yield mean_row(f"guidance.{name}.{way}", unit, values, seed)
+        """Means over scenes: time of our frames over the path tracer's at their error, and the rest."""
+        for way in self.ways:
+            for name, (metric, unit) in self.metrics(way).items():
+                values = [(case["scene"], case["ways"][way][name]) for case in self.cases]
+                yield mean_row(metric, unit, values, seed)
 
 
 @dataclass(frozen=True)

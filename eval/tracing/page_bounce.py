@@ -8,7 +8,7 @@ from eval.report.figures import row_cell
 from eval.report.intervals import interval_note
 from eval.report.page import Block, Cell, Picture, Pictures, Section, Table, Text
 from eval.results import Row
-from eval.tracing.measured import EQUAL_ERROR, EqualError, Measured
+from eval.tracing.measured import EqualError, Measured
 from tron.images import read_image
 
 WAY_WORDS = {
@@ -57,15 +57,10 @@ def equal_error_section(measured: Measured, found: Mapping[str, Row]) -> list[Se
         "ratio of one still picture, for which the light is baked as well. What is done once a scene and the "
         "prefiltered map are in neither."
     )
-    means = [
-        [
-            WAY_WORDS.get(way, way),
-            row_cell(found[f"{EQUAL_ERROR}{'' if number == 0 else f'.{way}'}"], "strong"),
-            row_cell(found[f"{EQUAL_ERROR}.with_bake{'' if number == 0 else f'.{way}'}"]),
-            *(row_cell(found[f"guidance.{name}.{way}"]) for name in ("error", "seconds", "paths")),
-        ]
-        for number, way in enumerate(record.ways)
-    ]
+    means = []
+    for way in record.ways:
+        ratio, *others = (row_cell(found[metric]) for metric, _ in record.metrics(way).values())
+        means.append([WAY_WORDS.get(way, way), Cell(ratio.text, "strong"), *others])
     headings = ["Frame", "Our time / theirs", "With the bake", "Error", "Our seconds", "Their paths a pixel"]
     scenes = len({case["scene"] for case in record.cases})
     blocks: list[Block] = [

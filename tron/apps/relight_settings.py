@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from tron.apps.framing import TrajectoryName
 from tron.apps.relit import Background
 from tron.errors import TronError
-from tron.estimation import FINAL, PREVIEW, Estimation, Estimator
+from tron.estimation import FINAL, FINEST, PREVIEW, Estimation, Estimator
 from tron.shards.schema import light_members
 
 DEFAULT_BUFFERS = (*light_members(), "indirect", "foreground", "mask", "share")
@@ -24,10 +24,7 @@ if TYPE_CHECKING:
     BufferName = str
 else:
     BufferName = Literal[BUFFERS]
-QUALITY = {
-    "preview": PREVIEW,
-    "final": FINAL.model_copy(update={"reflections": 4, "supersample": 2}),
-}
+QUALITY = {"preview": PREVIEW, "final": FINEST}
 
 Side = Annotated[int, Field(ge=8, le=8192)]
 
