@@ -12,6 +12,7 @@ import numpy as np
 
 import tron
 from tron.apps.reconstruct_pictures import write_light, write_sheet
+from tron.apps.reconstruct_report import write_page
 from tron.apps.reconstruct_settings import Settings
 from tron.captures import Capture
 from tron.cli.progress import Progress, track
@@ -28,6 +29,7 @@ from tron.tracing import SurfelTracer
 log = logging.getLogger(__name__)
 
 CHECKPOINT = "checkpoint.safetensors"
+PAGE = "report.html"
 TRAIN_VIEWS_SCORED = 8
 
 
@@ -80,6 +82,9 @@ def run(settings: Settings, capture: Capture, prior: Prior, lpips: LPIPS | None)
     report = _report(settings, capture, found, light, test, train, seconds)
     if curve is not None:
         report["curve"] = curve.points
+    if settings.report is not None:
+        environment = None if light is None else light.environment
+        write_page(out / PAGE, settings.report, report, found.scene, capture, environment)
     write_atomic(out / "metrics.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
     return report
 
