@@ -147,7 +147,7 @@ def held_out_cameras(spec: SceneSpec, settings: CaptureSettings) -> dict[str, Ca
 
 
 def taken(spec: SceneSpec, settings: CaptureSettings) -> dict[str, Photograph]:
-    """How each training view was photographed; nothing where captures are true renders."""
+    """Photograph of each training view; nothing where captures are true renders."""
     if not settings.photographs:
         return {}
     names = [name for number, name in enumerate(view_names(settings)) if number % HELD_OUT]

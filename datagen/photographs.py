@@ -1,4 +1,4 @@
-"""What a camera makes of path-traced light: photos with an exposure, a white balance and noise of their own.
+"""Photographs of path-traced light: photos with an exposure, a white balance and noise of their own.
 
 A phone meters each photo anew, so that one surface has other values in the next; its sensor counts electrons.
 Training views are photographed so. Held-out views stay as the path tracer made them: nobody can know how a
@@ -19,7 +19,7 @@ from tron.seeds import generator
 
 @dataclass(frozen=True)
 class Photograph:
-    """How one photo was taken.
+    """Circumstances of one photo.
 
     Attributes:
         exposure_stops: power of two on the light that the sensor collects.

@@ -26,7 +26,7 @@ DEGREE2 = "degree2"
 
 
 class Made(NamedTuple):
-    """What a command left of one scene, and its wall seconds."""
+    """Files that a command left of one scene, and its wall seconds."""
 
     scene: str
     way: str

@@ -216,7 +216,7 @@ def _light(light: EnvironmentMap | None) -> list[Section]:
 
 
 def _sureness(report: Mapping[str, Any], capture: Capture, light: EnvironmentMap | None) -> Section:
-    """What is known about each result, and from what."""
+    """Table of where each result comes from, and how far it can be trusted."""
     truth = {field for view in capture.test_views for field in TRUTH if view.has(field)}
     learnt = set(report["materials_learnt"])
     rows = [["Radiance", "held-out photos", "as sure as its figures above"]]

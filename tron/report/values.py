@@ -32,5 +32,5 @@ def format_value(value: float, unit: str, signed: bool = False) -> str:
 
 
 def suffix(unit: str) -> str:
-    """What :func:`format_value` writes behind the number: a percent sign, a degree sign, `` dB``."""
+    """Sign or words that :func:`format_value` writes behind the number: ``%``, ``°``, `` dB``."""
     return _STYLES.get(unit, (1, 2, f" {unit}"))[2]
