@@ -132,6 +132,7 @@ def _report(
             "transform": capture.transform.tolist(),
         },
         "surfels": len(found.scene),
+        "first_surfels": {"source": found.source, "stereo_confident": found.confident},
         "materials_learnt": list(found.learnt),
         "test": mean_figures(test) if test else None,
         "train": mean_figures(train),

@@ -24,7 +24,7 @@ from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
 from tron.priors import Prior, Track, apply_prior, untracked
 from tron.reconstruction.checkpoint import Checkpoint, save_checkpoint
-from tron.reconstruction.initial import extent_of, initial_surfels, source_of
+from tron.reconstruction.initial import Beginning, beginning, extent_of, place_of, source_of
 from tron.reconstruction.settings import ReconstructionSettings
 from tron.reconstruction.surfels import LearntSurfels
 from tron.reconstruction.training import Plan, Stage, StepSummary, Watch, materials_plan, radiance_plan
@@ -42,12 +42,17 @@ class Reconstruction:
         capture: the capture whose training views carry the prior's maps.
         seconds: of the stages, those before an interruption included.
         learnt: the materials that a prior taught; the others are what surfels begin with.
+        source: of the first surfels.
+        confident: share of the subject's pixels whose depth stereo found and other photos confirm; None where
+            stereo was not asked.
     """
 
     scene: GaussianScene
     capture: Capture
     seconds: float
     learnt: tuple[str, ...]
+    source: str
+    confident: float | None
 
 
 def reconstruct(
@@ -89,15 +94,15 @@ def reconstruct(
         )
     run = _Run(settings, made_with(capture, prior, settings), checkpoint, device, watch)
     extent = extent_of(views)
-    source = source_of(capture, settings.initial)  # a lacking one is told before a prior works for hours
-    radiance = settings.radiance.scaled(settings.steps_scaler, placed=source == "depth")
-    wanted = [] if radiance.normal == 0 else ["normal"]
+    source_of(capture, settings.initial)  # a lacking one is told before a prior works for hours
+    wanted = [] if settings.radiance.normal == 0 else ["normal"]
     taught = apply_prior(capture, prior, fields=wanted, track=track) if wanted else capture
-    plan = radiance_plan(radiance, extent, settings.seed)
-    most = radiance.density.most
-    surfels = run.stage(
-        plan, taught.train_views, lambda: initial_surfels(taught, settings.initial, settings.seed, most)
-    )
+    most = settings.radiance.density.most
+    first = run.begin(lambda: beginning(taught, settings.initial, settings.seed, most, device, track))
+    radiance = settings.radiance.scaled(settings.steps_scaler, place_of(run.begun["source"]))
+    given = any(view.has("normal") for view in taught.train_views) and bool(wanted)
+    plan = radiance_plan(radiance, extent, settings.seed, normals_given=given)
+    surfels = run.stage(plan, taught.train_views, first)
     scene = surfels.scene(settings.initial.kernel_degree, capture.up)
 
     tracer = SurfelTracer(scene)
@@ -113,7 +118,7 @@ def reconstruct(
         scene = run.stage(plan, learners, lambda: scene).scene(settings.initial.kernel_degree, capture.up)
     for name in (name for name in MATERIALS if name not in fields):
         log.warning("no prior for %s: it stays what surfels begin with", name)
-    return Reconstruction(scene.validate(), taught, run.seconds(), fields)
+    return Reconstruction(scene.validate(), taught, run.seconds(), fields, **run.begun)
 
 
 def made_with(capture: Capture, prior: Prior, settings: ReconstructionSettings) -> dict[str, Any]:
@@ -139,10 +144,19 @@ class _Run:
         self.settings, self.values, self.path, self.device, self.watch = settings, values, path, device, watch
         self.found = Checkpoint(path) if path is not None and path.exists() else None
         self.before = self.found.seconds if self.found else 0.0
+        self.begun: dict[str, Any] = self.found.begun if self.found else {}
         self.started = time.perf_counter()
         if self.found is not None:
             self.found.require(self.values)
             log.info("resuming from step %d of stage %s", self.found.step, self.found.stage)
+
+    def begin(self, find: Callable[[], Beginning]) -> Callable[[], GaussianScene]:
+        """What gives the first surfels: found now, unless a checkpoint has gone on from them already."""
+        if self.found is not None:
+            return lambda: find().scene
+        first = find()
+        self.begun = {"source": first.source, "confident": first.confident}
+        return lambda: first.scene
 
     def seconds(self) -> float:
         """Spent on the run, interrupted parts included."""
@@ -173,7 +187,7 @@ class _Run:
 
     def _save(self, stage: Stage) -> None:
         if self.path is not None:
-            save_checkpoint(self.path, stage, self.values, self.seconds())
+            save_checkpoint(self.path, stage, self.values, self.seconds(), self.begun)
 
 
 _ORDER = ("radiance", "materials")

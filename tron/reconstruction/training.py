@@ -18,8 +18,9 @@ from torch import Tensor
 
 from tron.captures import View
 from tron.errors import TronError
+from tron.reconstruction.consistency import FusedNormals
 from tron.reconstruction.density import DensityControl
-from tron.reconstruction.settings import MaterialSettings, RadianceSettings
+from tron.reconstruction.settings import ConsistencySettings, MaterialSettings, RadianceSettings
 from tron.reconstruction.supervision import MATERIALS, Weights, loss_of, pictures, targets
 from tron.reconstruction.surfels import LearntSurfels
 from tron.seeds import generator
@@ -70,6 +71,7 @@ class Plan:
         sh_every: steps after which one more degree is learnt.
         background: behind the surfels.
         density: makes and removes surfels; None leaves their number.
+        consistency: pulls normals to those that the views' depths agree on; None does not.
     """
 
     name: str
@@ -81,6 +83,7 @@ class Plan:
     sh_every: int = 1
     background: Background = "black"
     density: DensityControl | None = None
+    consistency: ConsistencySettings | None = None
 
     def learning(self, names: Collection[str]) -> Plan:
         """The same plan, learning these parameters alone."""
@@ -89,8 +92,14 @@ class Plan:
         return replace(self, rates=kept, final_rates=final)
 
 
-def radiance_plan(settings: RadianceSettings, extent: float, seed: int) -> Plan:
-    """Stage 1: geometry and radiance; ``extent`` in world units scales the rate of the positions."""
+def radiance_plan(
+    settings: RadianceSettings, extent: float, seed: int, *, normals_given: bool = False
+) -> Plan:
+    """Stage 1: geometry and radiance; ``extent`` in world units scales the rate of the positions.
+
+    Normals are pulled to those that the views' depths agree on unless a prior gives some (``normals_given``).
+    """
+    own = settings.consistency.weight if not normals_given else 0.0
     rates = {
         "means": settings.position_rate * extent,
         "quats": settings.rotation_rate,
@@ -103,13 +112,16 @@ def radiance_plan(settings: RadianceSettings, extent: float, seed: int) -> Plan:
     return Plan(
         name="radiance",
         steps=settings.steps,
-        weights=Weights(rgb=1.0, normal=settings.normal, mask=settings.mask, ssim=settings.ssim),
+        weights=Weights(
+            rgb=1.0, normal=settings.normal, mask=settings.mask, ssim=settings.ssim, consistency=own
+        ),
         rates=rates,
         final_rates={"means": settings.position_rate_final * extent},
         sh_degree=settings.sh_degree,
         sh_every=settings.sh_every,
         background=settings.background,
         density=DensityControl(settings.density, extent, seed),
+        consistency=settings.consistency if own else None,
     )
 
 
@@ -147,6 +159,9 @@ class Stage:
         self.kernel_degree, self.seed = kernel_degree, seed
         self.step = 0
         self.psnr = float("nan")
+        self.fused: FusedNormals | None = None
+        if plan.consistency is not None:
+            self.fused = FusedNormals(plan.consistency, views, kernel_degree)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
     def run(self, watch: Watch | None = None) -> None:
@@ -166,6 +181,9 @@ class Stage:
         plan, surfels, number = self.plan, self.surfels, self.step + 1
         view = self._view(self.step)
         target = targets(view, plan.weights.wanted(), surfels.device)
+        if self.fused is not None:
+            self.fused.before(surfels, self.step)
+            target |= self.fused.of(view)
         self._set_rates()
         rendered = render(
             surfels.rendered(), view.camera, kernel_degree=self.kernel_degree, sh_degree=self.sh_degree
