@@ -14,6 +14,7 @@ from tron.apps.reconstruct_settings import Settings
 from tron.captures import Capture, load_capture
 from tron.cli.command_line import command
 from tron.cli.instantiation import make
+from tron.reconstruction.joint import Joint
 from tron.runtime import activate, set_torch_threads
 from tron.storage import locked, require_free_space, write_atomic
 
@@ -45,7 +46,8 @@ def main(settings: Settings) -> None:
         len(capture.views), len(capture.test), capture.views[0].camera.width,
         capture.views[0].camera.height, len(capture.skipped),
     )  # fmt: skip
-    prior.fields(capture)  # what cannot be had is said before long work
+    if not isinstance(prior, Joint):
+        prior.fields(capture)  # what cannot be had is said before long work
     # Dr.Jit has the cores; the loss is small, and torch's threads would wait for theirs.
     set_torch_threads(1)
     with locked(settings.output_dir):
@@ -68,7 +70,7 @@ def _load_lpips(settings: Settings) -> LPIPS | None:
     return LPIPS.load(settings.lpips_weights)
 
 
-def _claim(settings: Settings, capture: Capture, prior: Prior) -> None:
+def _claim(settings: Settings, capture: Capture, prior: Prior | Joint) -> None:
     """Keep the resolved configuration, and clear the way for a new run where that is asked for.
 
     Raises:
