@@ -62,6 +62,8 @@ CONFIG_NAME = "config.yaml"
 ENVIRONMENT_NAME = "environment.exr"
 SPEC_NAME = "spec.json"
 PHOTOGRAPHS_NAME = "photographs.json"
+PHOTOGRAPHED = ("image", "mask")
+"""Fields of a view that is a photograph: no map tells anyone more of it."""
 PIXEL_BYTES = 4 + 2 * (3 + 3 + 1 + 1 + 3) + 4
 RELIT_PIXEL_BYTES = 2 * 4
 
@@ -165,14 +167,15 @@ def captured(
     """The capture of a scene under a light; views are rendered when they are read, best in their order.
 
     Images are AgX of straight (not premultiplied) radiance times the light's exposure, with anti-aliased
-    coverage as their mask; those that ``photographs`` names are what a camera made of that radiance. Maps are
-    of the pixel centres, zero where there is no surface.
+    coverage as their mask; those that ``photographs`` names are what a camera made of that radiance, and no
+    map tells more of them. Maps are of the pixel centres, zero where there is no surface.
     """
     cameras = spec.spiral(settings.views, settings.width, settings.height)
     shots = _Shots(spec, geometry, environment, cameras, settings, photographs or {})
     views = []
     for number, (name, camera) in enumerate(zip(view_names(settings), cameras)):
-        fields: dict[str, Any] = {field: partial(shots.read, number, field) for field in _Shots.FIELDS}
+        known = PHOTOGRAPHED if photographs and name in photographs else _Shots.FIELDS
+        fields: dict[str, Any] = {field: partial(shots.read, number, field) for field in known}
         views.append(View(name, camera, space="display", **fields))
     test = frozenset(view.name for view in views[::HELD_OUT])
     return Capture(tuple(views), test, up=np.array([0.0, 0.0, 1.0]), exposure=environment.exposure())

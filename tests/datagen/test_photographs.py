@@ -88,11 +88,14 @@ def test_training_views_drift_by_what_the_file_says_and_held_out_views_do_not(ou
     levels = np.linspace(0, 4, 20_000)
     curve = to_display(np.repeat(levels[:, None], 3, 1), 1.0)[:, 0]
     for photo, render in zip(photos.views, true.views):
-        inside = photo.read("mask") == 1
-        for field in ("mask", "normal", "base_color", "depth", "irradiance"):
-            np.testing.assert_array_equal(photo.read(field), render.read(field))
-        if photo.name in photos.test:
-            np.testing.assert_array_equal(photo.read(), render.read())
+        inside, held_out = photo.read("mask") == 1, photo.name in photos.test
+        np.testing.assert_array_equal(photo.read("mask"), render.read("mask"))
+        for field in ("normal", "base_color", "depth", "irradiance", "roughness", "metallic"):
+            assert render.has(field)
+            assert photo.has(field) == held_out, "a photograph comes without truth"
+        if held_out:
+            for field in ("image", "normal", "base_color", "depth", "irradiance"):
+                np.testing.assert_array_equal(photo.read(field), render.read(field))
             continue
         # Inset by AgX's matrix grey stays grey: gains are read off the luminance's curve.
         taken = told[photo.name]

@@ -16,6 +16,7 @@ from tron.captures import Capture, load_capture
 from tron.cli.command_line import command
 from tron.cli.instantiation import make
 from tron.cli.progress import track
+from tron.reconstruction.joint import Joint
 from tron.runtime import activate, set_torch_threads
 from tron.storage import locked, require_free_space, write_atomic
 
@@ -51,7 +52,8 @@ def main(settings: Settings) -> None:
         len(capture.views), len(capture.test), capture.views[0].camera.width,
         capture.views[0].camera.height, len(capture.skipped),
     )  # fmt: skip
-    prior.fields(capture)  # what cannot be had is said before long work
+    if not isinstance(prior, Joint):
+        prior.fields(capture)  # what cannot be had is said before long work
     # Dr.Jit has the cores; the loss is small, and torch's threads would wait for theirs.
     set_torch_threads(1)
     with locked(settings.output_dir):
@@ -82,7 +84,7 @@ def _load_lpips(settings: Settings) -> LPIPS | None:
     return LPIPS.load(settings.lpips_weights)
 
 
-def _claim(settings: Settings, capture: Capture, prior: Prior) -> None:
+def _claim(settings: Settings, capture: Capture, prior: Prior | Joint) -> None:
     """Keep the resolved configuration, and clear the way for a new run where that is asked for.
 
     Raises:

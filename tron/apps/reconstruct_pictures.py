@@ -11,10 +11,10 @@ from tron.captures import Capture, View
 from tron.color import linear_to_srgb, to_display
 from tron.estimation import Estimation
 from tron.images import write_image
-from tron.reconstruction import EnvironmentFit
 from tron.reconstruction.evaluation import picture, wanted_picture
 from tron.reconstruction.settings import FitSettings
 from tron.shading.bounce import BounceTransport
+from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Lighting, render_guidance
 from tron.tracing import SurfelTracer
 
@@ -26,17 +26,17 @@ def write_sheet(
     path: Path,
     tracer: SurfelTracer,
     capture: Capture,
-    light: EnvironmentFit | None,
+    environment: EnvironmentMap | None,
     settings: FitSettings | None,
 ) -> None:
     """Held-out views (training views, if none is) with every channel of the G-buffer and the guidance.
 
-    The guidance needs the light and the ``settings`` that it was fitted with: shadows are estimated as there.
+    The guidance needs the ``environment`` and the ``settings`` of shadows.
     ``lit`` beside ``photo`` shows how far materials and light explain it, what bounces included.
     """
     views = chosen_views(capture, SHEET_VIEWS)
     rows: dict[str, list[np.ndarray]] = {}
-    lighting = None if light is None else Lighting(light.environment)
+    lighting = None if environment is None else Lighting(environment)
     estimation, bounce = None if settings is None else sheet_estimation(settings), None
     if lighting is not None and estimation is not None:
         bounce = BounceTransport.trace(tracer.sided(estimation.two_sided)).bake(lighting, estimation)
@@ -89,6 +89,6 @@ def _relative(values: np.ndarray, known: np.ndarray | None = None) -> np.ndarray
     return np.where(known if values.ndim == 2 else known[..., None], spread, 0)
 
 
-def write_light(path: Path, light: EnvironmentFit) -> None:
+def write_light(path: Path, environment: EnvironmentMap) -> None:
     """The environment map, exposed as tron-relight would."""
-    write_image(path, to_display(light.environment.image, light.environment.exposure()))
+    write_image(path, to_display(environment.image, environment.exposure()))

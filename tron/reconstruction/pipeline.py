@@ -24,7 +24,9 @@ from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
 from tron.priors import Prior, Track, apply_prior, untracked
 from tron.reconstruction.checkpoint import Checkpoint, save_checkpoint
+from tron.reconstruction.explanation import Explanation, explain
 from tron.reconstruction.initial import Beginning, beginning, extent_of, place_of, source_of
+from tron.reconstruction.joint import Joint
 from tron.reconstruction.settings import ReconstructionSettings
 from tron.reconstruction.surfels import LearntSurfels
 from tron.reconstruction.training import Plan, Stage, StepSummary, Watch, materials_plan, radiance_plan
@@ -39,12 +41,13 @@ class Reconstruction:
 
     Attributes:
         scene: surfels with radiance and materials.
-        capture: the capture whose training views carry the prior's maps.
+        capture: the capture; its training views carry the prior's maps, if it gives any.
         seconds: of the stages, those before an interruption included.
-        learnt: the materials that a prior taught; the others are what surfels begin with.
+        learnt: the materials that were learnt; the others are what surfels begin with.
         source: of the first surfels.
         confident: share of the subject's pixels whose depth stereo found and other photos confirm; None where
             stereo was not asked.
+        explanation: light and materials together, where the prior is :class:`Joint`.
     """
 
     scene: GaussianScene
@@ -53,11 +56,12 @@ class Reconstruction:
     learnt: tuple[str, ...]
     source: str
     confident: float | None
+    explanation: Explanation | None = None
 
 
 def reconstruct(
     capture: Capture,
-    prior: Prior,
+    prior: Prior | Joint,
     settings: ReconstructionSettings,
     *,
     checkpoint: Path | None = None,
@@ -69,7 +73,8 @@ def reconstruct(
 
     Args:
         capture: training views are learnt from, the others never looked at.
-        prior: gives normals to stage 1 and materials to stage 2, as far as it can.
+        prior: gives normals to stage 1 and materials to stage 2, as far as it can; ``Joint`` finds materials
+            and light together after stage 1.
         settings: schedules, rates, seed.
         checkpoint: file to keep the state in and to go on from; None keeps none.
         device: torch's, that of the active Mitsuba variant.
@@ -95,15 +100,21 @@ def reconstruct(
     run = _Run(settings, made_with(capture, prior, settings), checkpoint, device, watch)
     extent = extent_of(views)
     source_of(capture, settings.initial)  # a lacking one is told before a prior works for hours
-    wanted = [] if settings.radiance.normal == 0 else ["normal"]
-    taught = apply_prior(capture, prior, fields=wanted, track=track) if wanted else capture
+    taught, given = capture, False
+    if settings.radiance.normal > 0 and not isinstance(prior, Joint):
+        taught = apply_prior(capture, prior, fields=["normal"], track=track)
+        given = any(view.has("normal") for view in taught.train_views)
     most = settings.radiance.density.most
     first = run.begin(lambda: beginning(taught, settings.initial, settings.seed, most, device, track))
     radiance = settings.radiance.scaled(settings.steps_scaler, place_of(run.begun["source"]))
-    given = any(view.has("normal") for view in taught.train_views) and bool(wanted)
     plan = radiance_plan(radiance, extent, settings.seed, normals_given=given)
     surfels = run.stage(plan, taught.train_views, first)
     scene = surfels.scene(settings.initial.kernel_degree, capture.up)
+    if isinstance(prior, Joint):
+        found = explain(capture, scene, prior, settings.seed, device, track)
+        return Reconstruction(
+            found.scene.validate(), capture, run.seconds(), MATERIALS, explanation=found, **run.begun
+        )
 
     tracer = SurfelTracer(scene)
     taught = apply_prior(
@@ -121,7 +132,7 @@ def reconstruct(
     return Reconstruction(scene.validate(), taught, run.seconds(), fields, **run.begun)
 
 
-def made_with(capture: Capture, prior: Prior, settings: ReconstructionSettings) -> dict[str, Any]:
+def made_with(capture: Capture, prior: Prior | Joint, settings: ReconstructionSettings) -> dict[str, Any]:
     """All that a reconstruction is a function of, as plain values: a checkpoint of others is refused."""
     digest = hashlib.sha256()
     for view in capture.train_views:

@@ -291,6 +291,20 @@ def test_without_priors_for_light_there_is_no_light_and_it_is_said(
 
 def test_the_default_prior_needs_nothing_but_photos(reconstruct, tmp_path: Path):
     out = tmp_path / "out"
+    assert cli.compose("capture=x", "output_dir=y").prior["_target_"] == "tron.reconstruction.Joint"
+    few = ("prior.refinement.steps=3", "prior.rounds=1", "prior.light.steps=10")
+    assert reconstruct(out, *few, prior="joint") == 0
+    report = json.loads((out / "metrics.json").read_text())
+    assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
+    assert report["light"]["surfels_seen"] > 0.5
+    found = GaussianScene.load(out / "scene.ply")
+    assert np.ptp(found.base_color) > 0.05
+    light = EnvironmentMap.load(out / "environment.exr")
+    assert light.image.min() >= 0 < light.image.max()
+
+
+def test_the_classical_prior_gives_maps_to_learn_from(reconstruct, tmp_path: Path):
+    out = tmp_path / "out"
     assert reconstruct(out, prior="classical") == 0
     report = json.loads((out / "metrics.json").read_text())
     assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
