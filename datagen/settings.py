@@ -166,7 +166,7 @@ class CaptureSettings(_Model):
         description="Other lights, by family, under which the held-out views are path-traced as well, into "
         "output_dir/relit: the truth of relighting.",
     )
-    relight_spp: int = Field(default=256, ge=1, description="Paths per pixel of those.")
+    relight_spp: int = Field(default=144, ge=1, description="Paths per pixel of those.")
 
 
 class EqualErrorSettings(_Model):

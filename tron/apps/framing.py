@@ -96,7 +96,7 @@ def plan_cameras(
     """A camera path around the scene's subject.
 
     Args:
-        scene: the surfels, upright: paths go about +z (:func:`upright`).
+        scene: the surfels, and which way is up.
         trajectory: name of a path in tron.trajectories.
         frames: number of cameras.
         width, height: pixels.

@@ -57,9 +57,7 @@ def film_cameras(scene: GaussianScene, capture: Capture, frames: int, side: int)
     photographed = [view.camera for view in capture.views]
     centre = find_subject(scene).centre
     if _widest_gap(photographed, centre, scene.up) <= GAP_DEG:
-        turn = upright(scene.up)
-        size = {"width": side, "height": side, "fov_deg": FOV_DEG}
-        return turn_cameras(plan_cameras(scene.rotated(turn), "orbit", frames, **size), turn.T)
+        return plan_cameras(scene, "orbit", frames, width=side, height=side, fov_deg=FOV_DEG)
     stops = np.unique(np.linspace(0, len(photographed) - 1, STOPS).astype(int))
     forth = keyframed([_square(photographed[i], side) for i in stops], frames // 2 + 1)
     return [*forth, *forth[-2:0:-1]]

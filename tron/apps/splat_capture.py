@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -16,7 +17,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import KDTree
 
-from tron.apps.framing import has_floor, plan_cameras, turn_cameras, upright
+from tron.apps.framing import has_floor, plan_cameras
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.errors import TronError
@@ -27,6 +28,7 @@ from tron.seeds import generator
 
 if TYPE_CHECKING:
     from tron.priors import Track
+    from tron.reconstruction.settings import ConsistencySettings
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +42,8 @@ INSIDE_ELEVATIONS_DEG = (-20.0, 10.0)
 PLACES_TRIED = 2000
 TRIMMED = 0.05
 """Share of the splats beyond each side of the box that places inside are drawn from."""
+SOLID = 0.5
+"""Opacity from which a pixel shows a surface."""
 THIN = 0.02
 """Opacity below which a pixel's colour is not known."""
 
@@ -68,19 +72,24 @@ def film_splats(
     settings: SplatSettings,
     up: Sequence[float] | None,
     test_every: int,
+    fusion: ConsistencySettings,
     seed: int,
+    device: str,
     track: Track,
 ) -> Capture:
     """The capture of a file of splats, in its own world.
 
-    Images are display values with the splats' opacity as their mask; depths are those of the median hit.
+    Images are display values with the splats' opacity as their mask. Depths, of training views alone, are
+    those of the median hit where these views agree: they are fused, and rays walked to the surface.
 
     Args:
         path: a 3DGS, 2DGS or TRON PLY.
         settings: of the cameras.
         up: direction in the file's world; None: what the file says.
         test_every: each view of this distance is held out, from the first; 0 holds out none.
+        fusion: of the depths.
         seed: root of the places inside.
+        device: torch's.
         track: shows progress.
 
     Raises:
@@ -98,12 +107,14 @@ def film_splats(
             path,
         )
     cameras = virtual_cameras(scene, settings, seed)
-    views = tuple(
+    views = [
         _filmed(scene, f"film_{number:05d}", camera)
         for number, camera in enumerate(track(cameras, "filming splats"))
-    )
+    ]
     test = frozenset(view.name for view in views[::test_every]) if test_every else frozenset()
-    return Capture(views, test, up=scene.up)
+    agreed = iter(_agreeing([view for view in views if view.name not in test], fusion, device))
+    views = [replace(view, depth=None) if view.name in test else next(agreed) for view in views]
+    return Capture(tuple(views), test, up=scene.up)
 
 
 def virtual_cameras(scene: GaussianScene, settings: SplatSettings, seed: int) -> list[Camera]:
@@ -113,10 +124,7 @@ def virtual_cameras(scene: GaussianScene, settings: SplatSettings, seed: int) ->
     if outside:
         elevation_deg = (LOWEST_DEG[has_floor(scene)], HIGHEST_DEG)
         view = {"width": settings.side, "height": settings.side, "fov_deg": FOV_DEG}
-        turn = upright(scene.up)
-        standing = scene.rotated(turn)
-        path = plan_cameras(standing, "spiral", outside, **view, elevation_deg=elevation_deg)
-        cameras += turn_cameras(path, turn.T)
+        cameras += plan_cameras(scene, "spiral", outside, **view, elevation_deg=elevation_deg)
     if inside := settings.views - outside:
         cameras += _inside(scene, inside, settings.side, seed)
     return cameras
@@ -154,6 +162,28 @@ def _level(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     east = np.cross(np.eye(3)[np.abs(up).argmin()], up)
     east /= np.linalg.norm(east)
     return east, np.cross(up, east)
+
+
+def _agreeing(views: Sequence[View], settings: ConsistencySettings, device: str) -> list[View]:
+    """The views with the depths that they agree on, 0 elsewhere; without any where there is no surface."""
+    import torch
+
+    from tron.reconstruction.consensus import consensus
+    from tron.reconstruction.fusion import DepthMap, empty_rays, fuse, pixel_footprint
+
+    def tensor(values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(device)
+
+    maps = []
+    for view in views:
+        subject, depth = view.read("mask") > SOLID, view.read("depth")
+        rays, empty = tensor(view.camera.rays()), empty_rays(torch.from_numpy(subject).to(device))
+        maps.append(DepthMap(view.camera, rays, tensor(depth), tensor(subject & (depth > 0)), empty))
+    field = fuse(maps, pixel_footprint(maps), settings.truncation, settings.most_voxels)
+    if field is None:
+        return [replace(view, depth=None) for view in views]
+    agreed = consensus(field, maps, settings.sigma)
+    return [replace(view, depth=depth.cpu().numpy()) for view, (depth, _) in zip(views, agreed)]
 
 
 def _filmed(scene: GaussianScene, name: str, camera: Camera) -> View:

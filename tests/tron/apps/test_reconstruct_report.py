@@ -10,6 +10,7 @@ import av
 import numpy as np
 import pytest
 
+from tron.apps.framing import turn_cameras
 from tron.apps.reconstruct_film import film_cameras, showcase_films
 from tron.apps.reconstruct_report import mean_interval, write_page
 from tron.apps.reconstruct_settings import ReportSettings
@@ -113,8 +114,9 @@ def test_films_hold_every_frame_and_differ_between_lights(variant, ball_on_floor
 
 def test_a_scene_that_lies_on_its_side_is_filmed_from_above_its_own_floor(variant, ball_on_floor):
     scene = ball_on_floor(spacing=0.12)
-    capture = capture_of(around(9, 360), scene)
-    lying = scene.rotated(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
+    turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    lying = scene.rotated(turn)
+    capture = capture_of(turn_cameras(around(9, 360), turn), lying)
     cameras = film_cameras(lying, replace(capture, up=lying.up), 8, 32)
     heights = [camera.position @ lying.up for camera in cameras]
     assert min(heights) > 0.3

@@ -13,6 +13,7 @@ from tron.errors import TronError
 from tron.gaussians.ply import MATERIAL_PROPERTIES
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.priors import untracked
+from tron.reconstruction.settings import ConsistencySettings
 from tron.seeds import generator
 from tron.tracing import SurfelTracer
 
@@ -42,18 +43,39 @@ def plain(ball_on_floor, tmp_path_factory) -> Path:
 
 
 def test_pictures_and_depths_are_those_of_the_oriented_surfaces(variant, ball_on_floor, plain):
-    capture = film_splats(plain, SMALL, (0, 0, 2), 8, 0, untracked)
+    settings = SplatSettings(views=17, side=48)
+    capture = film_splats(plain, settings, (0, 0, 2), 8, ConsistencySettings(), 0, "cpu", untracked)
     tracer = SurfelTracer(dense(ball_on_floor()))
+    assert capture.up.tolist() == [0, 0, 1]
+    assert capture.test == {"film_00000", "film_00008", "film_00016"}
     for view in capture.views:
         assert view.camera.position[2] > 0
         true = tracer.gbuffer(view.camera).numpy()
         solid = (true["opacity"] > 0.99) & (view.read("mask") > 0.99)
         assert solid.mean() > 0.3
-        # The ball's far side now faces the camera too, behind its near one.
-        np.testing.assert_allclose(view.read("depth")[solid], true["depth"][solid], atol=0.12)
         assert np.abs(view.read() - true["rgb"])[solid].mean() < 0.02
-    assert capture.up.tolist() == [0, 0, 1]
-    assert capture.test == {"film_00000", "film_00008"}
+        assert view.has("depth") == (view.name not in capture.test)
+        if view.has("depth"):
+            known = solid & (view.read("depth") > 0)
+            assert known.sum() > 0.7 * solid.sum()
+            # The ball's far side faces the camera too, behind its near one: at its rim they meet.
+            assert np.quantile(np.abs(view.read("depth") - true["depth"])[known], 0.9) < 0.06
+
+
+def test_a_depth_that_other_views_contradict_is_not_believed(variant, ball_on_floor, plain, monkeypatch):
+    import tron.apps.splat_capture as module
+
+    settings, real = SplatSettings(views=17, side=48), module._filmed
+
+    def spoilt(scene, name, camera):
+        view = real(scene, name, camera)
+        return replace(view, depth=0.7 * view.read("depth")) if name == "film_00003" else view
+
+    monkeypatch.setattr(module, "_filmed", spoilt)
+    views = film_splats(plain, settings, None, 8, ConsistencySettings(), 0, "cpu", untracked).train_views
+    known = {view.name: (view.read("depth") > 0).sum() / (view.read("mask") > 0.5).sum() for view in views}
+    assert known["film_00003"] < 0.4
+    assert np.median(list(known.values())) > 0.7
 
 
 def test_every_side_of_a_thing_is_filmed_and_nothing_from_below_a_floor(ball_on_floor):
@@ -123,11 +145,11 @@ def test_what_is_no_plain_file_of_splats_is_one_line(tmp_path, plain):
     packed.write_bytes(b"\x1f\x8b")
     assert is_splats(packed)
     with pytest.raises(TronError, match=r"Niantic's \.spz.*splat-transform"):
-        film_splats(packed, SMALL, None, 8, 0, untracked)
+        film_splats(packed, SMALL, None, 8, ConsistencySettings(), 0, "cpu", untracked)
     points = tmp_path / "points.ply"
     points.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
     with pytest.raises(TronError, match="lacks y"):
-        film_splats(points, SMALL, None, 8, 0, untracked)
+        film_splats(points, SMALL, None, 8, ConsistencySettings(), 0, "cpu", untracked)
     assert not is_splats(tmp_path)
 
 
@@ -142,7 +164,11 @@ QUICK = [
 
 
 def test_a_file_that_does_not_say_its_up_is_told(variant, plain, caplog):
-    assert film_splats(plain, SMALL, None, 0, 0, untracked).up.tolist() == [0, -1, 0]
+    assert film_splats(plain, SMALL, None, 0, ConsistencySettings(), 0, "cpu", untracked).up.tolist() == [
+        0,
+        -1,
+        0,
+    ]
     assert "does not say which way is up" in caplog.text
 
 
