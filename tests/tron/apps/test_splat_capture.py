@@ -164,11 +164,9 @@ QUICK = [
 
 
 def test_a_file_that_does_not_say_its_up_is_told(variant, plain, caplog):
-    assert film_splats(plain, SMALL, None, 0, ConsistencySettings(), 0, "cpu", untracked).up.tolist() == [
-        0,
-        -1,
-        0,
-    ]
+    capture = film_splats(plain, SMALL, None, 0, ConsistencySettings(), 0, "cpu", untracked)
+    assert capture.up.tolist() == [0, -1, 0]
+    assert not capture.test
     assert "does not say which way is up" in caplog.text
 
 
