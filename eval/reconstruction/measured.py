@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
 from eval.peers.settings import SpeedBenchmark
 from eval.peers.timing import Timed
-from eval.reconstruction.runs import Run, light_rows, rows_of
+from eval.reconstruction.runs import Run, gain_rows, light_rows, rows_of
 from eval.reconstruction.scans import Scan, scan_rows
 from eval.results import Row
 from eval.stages import Stages
@@ -51,6 +51,7 @@ class ReconstructionSettings(SpeedBenchmark):
     photos: dict[Name, list[str]] = Field(
         description="further arguments of each way to reconstruct the photographs, none of which is a way's"
     )
+    before: Name = Field(default="classical", description="way over which photographs' gain is told")
     relit: list[Name] = Field(description="ways whose surfels are relit, beside those of photographs")
     splats: SplatSettings = Field(description="scans of plain splats, made and taken as captures")
     real_data: Path | None = Field(description="folder with captures/fox and hdri; null: no fox")
@@ -222,6 +223,9 @@ class Measured:
         for way, runs in self.runs.items():
             yield from rows_of(self.prefix(way), runs, self.settings.seed)
             yield from light_rows(self.prefix(way), runs, self.settings.seed)
+            if way in self.settings.photos:
+                before = self.runs.get(self.settings.before, [])
+                yield from gain_rows(self.prefix(way), runs, before, self.settings.seed)
         for way, scans in self.scans.items():
             yield from scan_rows(way, scans, self.settings.seed)
         if self.fox is not None:

@@ -176,6 +176,18 @@ def light_rows(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]
         yield mean_row(f"{prefix}.sun_direction_deg", "deg", values, seed)
 
 
+def gain_rows(prefix: str, runs: Sequence[Run], over: Sequence[Run], seed: int = 0) -> Iterator[Row]:
+    """Gain of relit pictures over another way's, scene by scene, dB; none where either was not relit."""
+    before = {run.name: run.relit.psnr for run in over if run.relit is not None}
+    gains = [
+        (run.name, run.relit.psnr - before[run.name])
+        for run in runs
+        if run.relit is not None and run.name in before
+    ]
+    if gains:
+        yield mean_row(f"{prefix}.relight_gain", "dB", gains, seed)
+
+
 def _figures(runs: Sequence[Run]) -> Iterator[tuple[str, str, dict[str, float]]]:
     """Metric, unit, scene -> value."""
     for key, (metric, unit) in FIGURES.items():

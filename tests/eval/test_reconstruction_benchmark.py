@@ -15,7 +15,8 @@ from eval.peers import volprim
 from eval.peers.timing import Rounds
 from eval.reconstruction import step
 from eval.reconstruction.light import brightest_direction, irradiance, light_errors, sun_error_deg, texels
-from eval.reconstruction.runs import Report, Run, light_rows, read_report, rows_of
+from eval.reconstruction.relighting import Relit, RelitLight
+from eval.reconstruction.runs import Report, Run, gain_rows, light_rows, read_report, rows_of
 from eval.reconstruction.subjects import drawn
 from eval.results import Results
 from tron.captures import Capture, View
@@ -83,6 +84,20 @@ def test_the_brightest_spot_is_found_finer_than_a_texel(variant: str):
     # A turn about z moves a direction by less than its angle, the less the higher it stands.
     chord = 2 * np.sqrt(1 - straight_up**2) * np.sin(np.radians(20))
     assert turned == pytest.approx(np.degrees(2 * np.arcsin(chord / 2)), abs=0.8)
+
+
+def test_the_gain_is_scene_by_scene_where_both_were_relit():
+    here = Path()
+
+    def relit(name: str, psnr: float | None) -> Run:
+        light = None if psnr is None else Relit({"sun": RelitLight(psnr, np.zeros(1), np.zeros(1))}, 1.0)
+        return Run(name, here, here, report(), 1.0, relit=light)
+
+    runs = [relit("a-1", 25.0), relit("b-2", 24.0), relit("c-3", None), relit("d-4", 30.0)]
+    before = [relit("b-2", 22.0), relit("a-1", 20.0), relit("c-3", 10.0), relit("d-4", None)]
+    (row,) = gain_rows("reconstruction.photos", runs, before)
+    assert (row.metric, row.value, row.n) == ("reconstruction.photos.relight_gain", 3.5, 2)
+    assert not list(gain_rows("reconstruction.photos", runs, []))
 
 
 def test_light_rows_keep_suns_apart():
@@ -367,6 +382,7 @@ def test_photographs_and_scans_are_relit_and_have_rows(stand_ins: Path, tmp_path
     for prefix in ("reconstruction", "reconstruction.classical", "reconstruction.photos"):
         for name in ("relight_psnr", "relight_psnr_sun", "relight_psnr_studio", "irradiance_error"):
             assert results.find(f"{prefix}.{name}") is not None
+    assert results.value("reconstruction.photos.relight_gain") == pytest.approx(0, abs=1e-9)  # one stand-in
     for prefix in ("splats", "splats.raw"):
         for name in ("normal_mae_deg", "normal_median_deg", "relight_psnr", "surfels", "seconds"):
             assert results.find(f"{prefix}.{name}") is not None
