@@ -12,6 +12,7 @@ with N fixed: 2DGS takes it from the depth of the one view, which is noise until
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -20,13 +21,17 @@ from tron.captures import View
 from tron.gaussians.fields import FIELDS, PARAMETERS
 from tron.reconstruction.consensus import consensus
 from tron.reconstruction.fusion import DepthMap, empty_rays, fuse, pixel_footprint
+from tron.reconstruction.matching import Photograph
+from tron.reconstruction.refinement import refined_depth
 from tron.reconstruction.settings import ConsistencySettings
 from tron.reconstruction.surfels import LearntSurfels
+from tron.reconstruction.sweep import neighbours
 from tron.tracing.torch_bridge import render
 
 _SURFACE = 0.5
 _GEOMETRY = ("means", "quats", "log_scales", "opacity_logits")
 _STATE = "fused."
+_EVERY = 31  # pixels between those that tell which photos see the same
 
 
 def normal_consistency(rendered: Mapping[str, Tensor], fused: Tensor) -> Tensor:
@@ -81,14 +86,32 @@ class FusedNormals:
     @torch.no_grad()
     def _make(self, tensors: Mapping[str, Tensor]) -> None:
         self._made_from = dict(tensors)
-        maps = [self._depth_map(view) for view in self.views]
         s = self.settings
+        maps = [self._depth_map(view) for view in self.views]
+        if s.refine > 0:
+            maps = self._refined(maps)
         field = fuse(maps, pixel_footprint(maps), s.truncation, s.most_voxels)
         self._normals = {}
         if field is not None:
             for view, (_, normal) in zip(self.views, consensus(field, maps, s.sigma), strict=True):
                 # Half precision is a hundredth of a degree, and half the memory of many large views.
                 self._normals[view.name] = normal.half()
+
+    def _refined(self, maps: list[DepthMap]) -> list[DepthMap]:
+        s = self.settings
+        photographs = [
+            Photograph.of(view, max(view.camera.width, view.camera.height), each.depth.device)
+            for view, each in zip(self.views, maps)
+        ]
+        points = torch.cat([each.points()[::_EVERY] for each in maps]).double().cpu().numpy()
+        if not len(points):
+            return maps
+        beside = neighbours(photographs, points, s.photos)
+        depths = [
+            refined_depth(photographs, beside[k], k, each.depth, s.refine, s.refine_steps, s.photos)
+            for k, each in enumerate(maps)
+        ]
+        return [replace(each, depth=depth) for each, depth in zip(maps, depths)]
 
     def _depth_map(self, view: View) -> DepthMap:
         seen = render(

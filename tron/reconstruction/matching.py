@@ -25,6 +25,7 @@ COLOUR_LIMIT = 0.08
 _SUBJECT = 0.5
 _FLAT = 1e-4  # variance of a window in which 8 bits hold nothing but noise
 _NEAREST = 1e-3
+_ROUNDING = 1 / 255
 _CHUNK = 1 << 20  # hypotheses compared at once: some 60 bytes each
 
 
@@ -67,10 +68,15 @@ class Photograph:
         """(H, W) cosine between each ray and the optical axis: z over distance."""
         return self.rays @ self.rays.new_tensor(self.camera.forward)
 
-    @property
+    @cached_property
     def grey(self) -> Tensor:
         """(H, W) mean of the channels."""
         return self.image.mean(0)
+
+    def textured(self, radius: int) -> Tensor:
+        """(H, W) bool, windows that differ from one grey by more than 8 bits' rounding."""
+        mean, square = window_mean(torch.stack([self.grey, self.grey**2]), radius)
+        return square - mean * mean > _ROUNDING**2
 
 
 def window_mean(maps: Tensor, radius: int) -> Tensor:

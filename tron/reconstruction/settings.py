@@ -134,6 +134,16 @@ class ConsistencySettings(Settings):
     most_voxels: int = Field(
         default=160, ge=8, le=1024, description="Maximum number of voxels along the scene's longest side."
     )
+    refine: float = Field(
+        default=0.0,
+        ge=0,
+        description="Widths of a pixel by which depths may move to where photos agree best before they are "
+        "fused; 0 leaves them.",
+    )
+    refine_steps: int = Field(default=4, ge=1, description="Depths that are tried to either side.")
+    photos: StereoSettings = Field(
+        default_factory=lambda: StereoSettings(), description="How photos are compared for that."
+    )
 
 
 class RadianceSettings(Settings):

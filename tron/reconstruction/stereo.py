@@ -9,9 +9,10 @@ is used.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import drjit as dr
 import numpy as np
 import torch
 from torch import Tensor
@@ -70,10 +71,13 @@ def stereo_maps(
     points = capture.points if seeded else random_points(capture, _BOUNDING_POINTS, seed)
     points = np.asarray(points, np.float64)
     beside = neighbours(photographs, points, settings)
-    found: list[Swept] = [
-        swept(photographs, beside, index, points, settings, seeded=seeded)
-        for index in _numbers(track(views, "stereo"))
-    ]
+
+    def sweep(index: int) -> Swept:
+        return swept(photographs, beside, index, points, settings, seeded=seeded)
+
+    # The cores are the renderer's, which stands still: torch itself runs on one thread each.
+    with ThreadPoolExecutor(dr.thread_count()) as pool:
+        found = [each for _, each in zip(track(views, "stereo"), pool.map(sweep, range(len(views))))]
     known = [
         ok & (each.cost < 1 - settings.confident) & each.textured
         for ok, each in zip(confirmed(photographs, beside, found), found)
@@ -97,10 +101,6 @@ def stereo_maps(
         ),
         confident,
     )
-
-
-def _numbers(items: Iterable[View]) -> Iterable[int]:
-    return (index for index, _ in enumerate(items))
 
 
 def _with_maps(view: View, photograph: Photograph, depth: Tensor, normal: Tensor) -> View:

@@ -34,7 +34,6 @@ _SHARED = 0.3
 _CLOSE = 1.5  # planes that two photographs' depths may lie apart
 _CONFIRMED_BY = 2
 _SEED = 0.3
-_ROUNDING = 1 / 255
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +115,8 @@ def swept(
     step = float(inverse[1] - inverse[0])
     depth = 1 / (inverse[0] + place * step) / photograph.along
     at = cost.gather(0, place.round().long()[None])[0]
-    mean, square = window_mean(torch.stack([photograph.grey, photograph.grey**2]), settings.radius)
-    textured = square - mean * mean > _ROUNDING**2
-    return Swept(torch.where(photograph.subject, depth, 0.0), at, textured, abs(step))
+    depth = torch.where(photograph.subject, depth, 0.0)
+    return Swept(depth, at, photograph.textured(settings.radius), abs(step))
 
 
 def plane_depths(photograph: Photograph, points: np.ndarray, planes: int) -> Tensor:

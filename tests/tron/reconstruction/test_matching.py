@@ -17,6 +17,8 @@ from tron.reconstruction.matching import (
     refined_minimum,
     window_mean,
 )
+from tron.reconstruction.refinement import refined_depth
+from tron.reconstruction.settings import StereoSettings
 from tron.seeds import generator
 
 SIZE = 40
@@ -137,3 +139,22 @@ def test_a_large_photograph_is_reduced_and_its_camera_with_it() -> None:
     assert (small.image[:, :, :8] == 0).all()
     assert (small.image[:, :, 8:] == 1).all()
     np.testing.assert_allclose(small.camera.fov_deg, camera.fov_deg)
+
+
+@pytest.mark.parametrize("slant", [0.0, 0.8])
+def test_a_depth_that_is_off_moves_to_where_the_photos_agree(slant: float) -> None:
+    photographs = [wall_view(x, slant=slant) for x in (0.0, -0.6, 0.6)]
+    truth = hypotheses(photographs[0], [1.0], slant)[0]
+    pixel = truth / photographs[0].camera.fx
+    settings = StereoSettings(best=2)
+    for off in (-1.5, 0.7):
+        wrong = truth + off * pixel
+        found = refined_depth(photographs, [1, 2], 0, wrong, 3.0, 4, settings)
+        error = ((found - truth) / pixel)[8:-8, 8:-8].abs()
+        assert float(error.median()) < 0.2, off
+
+
+def test_a_depth_stays_where_the_photos_say_nothing() -> None:
+    photographs = [wall_view(x, flat=True) for x in (0.0, -0.6, 0.6)]
+    wrong = 1.02 * hypotheses(photographs[0], [1.0])[0]
+    assert torch.equal(refined_depth(photographs, [1, 2], 0, wrong, 3.0, 4, StereoSettings()), wrong)
