@@ -19,9 +19,6 @@ class Joint(Settings):
     same_exposure: bool = Field(
         default=False, description="All photos are exposed and white-balanced alike; false: each by itself."
     )
-    brightest: float = Field(
-        default=0.8, gt=0, le=1, description="Base color of the 95th percentile, largest channel."
-    )
     roughness: float = Field(default=0.6, ge=0, le=1, description="Roughness where no lobe is seen.")
     sun: float = Field(
         default=0.02, ge=0, le=1,

@@ -16,8 +16,9 @@ chromaticity, and with how many points face the same way. They are drawn anew af
 never a variable, so there is nothing to alternate.
 
 log L is a sum of cubemaps of 1, 2, 4, ... texels a face edge, luminance and two chromas apart. Priors, each a
-setting: fine levels are small (``smooth``), colours grey (``grey``), directions that no point looks into dark
-(``dark``, ``darkness``), and directions whose radiance the photos show as they show it (``sky``).
+setting: the 95th percentile of base color is ``brightest``, as few surfaces reflect more (``scale``; what
+bounces says it too, but weakly); fine levels are small (``smooth``), colours grey (``grey``), directions that
+no point looks into dark (``dark``, ``darkness``), and those that photos show are as they show them (``sky``).
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from tron.seeds import generator
 
 _NEAR, _ALIKE = 60, 200
 """Neighbours in space and in chromaticity that partners are drawn from."""
+_PERCENTILE = 95
 _TURN = 0.01  # share of the scene's size that opposite normals count in the distance between points
 
 
@@ -46,13 +48,17 @@ class LightSettings(Settings):
     """Fit of the light to pairs of points."""
 
     resolution: int = Field(default=8, ge=2, le=32, description="Texels along a face edge of the cubemap.")
-    points: int = Field(default=8000, ge=100, description="Maximum number of surfels that are compared.")
+    points: int = Field(default=5000, ge=100, description="Maximum number of surfels that are compared.")
     partners: int = Field(default=8, ge=1, description="Partners of each point, of either kind.")
-    rounds: int = Field(default=3, ge=1, description="Times that the pairs are drawn.")
+    rounds: int = Field(default=2, ge=1, description="Times that the pairs are drawn.")
     steps: int = Field(default=150, ge=1, description="Steps of Adam a round.")
     rate: float = Field(default=0.05, gt=0, description="Learning rate, in log radiance.")
     robust: float = Field(default=0.08, gt=0, description="Log difference beyond which a pair is doubted.")
     alike: float = Field(default=0.12, gt=0, description="Log chromaticity that like materials differ by.")
+    brightest: float = Field(
+        default=0.8, gt=0, le=1, description="Base color of the 95th percentile, largest channel."
+    )
+    scale: float = Field(default=0.05, ge=0, description="Weight of base color being as bright as that.")
     smooth: float = Field(default=1e-2, ge=0, description="Weight of fine levels being small.")
     grey: float = Field(default=0.02, ge=0, description="Weight of the light being grey.")
     dark: float = Field(default=0.02, ge=0, description="Weight of unseen directions being dark.")
@@ -212,18 +218,23 @@ class _Fit:
         i, j = np.tile(i, 2), np.concatenate(partners)
         weight = np.repeat([1.0, 0.5], len(i) // 2) * (self.rare[i] + self.rare[j])
         weight *= np.exp(-(((chroma[i] - chroma[j]) / settings.alike) ** 2).sum(1))
-        self.pairs = [torch.from_numpy(index).to(self.log_color.device) for index in (i, j)]
-        self.weight = self.tensor(weight / weight.sum())[:, None] / 3
+        # By point: the first of a pair then needs no gather, whose adjoint is the slowest part of a step.
+        shape = (2, count, settings.partners)
+        j, weight = (np.moveaxis(values.reshape(shape), 0, 1).reshape(count, -1) for values in (j, weight))
+        self.partner = torch.from_numpy(j.ravel()).to(self.log_color.device)
+        self.weight = self.tensor(weight / weight.sum())[..., None] / 3
 
     def step(self) -> None:
         """Take one step of Adam."""
-        settings, (i, j) = self.settings, self.pairs
+        settings = self.settings
         light, base = self.log_light(), self.log_base_color()
-        off = (base[i] - base[j]).abs()
+        off = (base[:, None] - base.index_select(0, self.partner).view(*self.weight.shape[:2], 3)).abs()
         loss = (self.weight * settings.robust * torch.log1p(off / settings.robust)).sum()
         loss = loss + settings.smooth * sum((z**2).mean() * 2.0**k for k, z in enumerate(self.grey[1:]))
         loss = loss + settings.grey * sum((z**2).mean() for z in self.chroma[1:])
         loss = loss + settings.grey * 0.05 * (self.chroma[0] ** 2).mean()
+        bright = torch.quantile(base.amax(1), _PERCENTILE / 100)
+        loss = loss + settings.scale * (bright - float(np.log(settings.brightest))) ** 2
         brightness = light.mean(1)
         mean = torch.log(torch.exp(brightness).mean()).detach()
         above = (brightness - mean - float(np.log(settings.darkness))) ** 2
