@@ -226,25 +226,39 @@ def _sureness(report: Mapping[str, Any], capture: Capture, light: EnvironmentMap
     if begun.get("stereo_confident") is not None:
         source += f"; {begun['stereo_confident']:.0%} of the pixels have a depth that other photos confirm"
     rows.append(["Normals and depth", source, known])
+    said = report["light"] or {}
+    evidence = "prior or photos"
+    if "surfels_seen" in said:
+        evidence = f"photos, which see {said['surfels_seen']:.0%} of the surfels"
     for name, title in (("base_color", "Base color"), ("roughness", "Roughness"), ("metallic", "Metallic")):
         if name not in learnt:
             rows.append([title, "nothing: it is what surfels begin with", "not to be relied on"])
             continue
-        rows.append([title, "prior or photos", "held against the truth above" if name in truth else NO_TRUTH])
+        rows.append([title, evidence, "held against the truth above" if name in truth else NO_TRUTH])
+    if "spread" in said:
+        words = (
+            f"a surfel's colour differs by a factor of {np.exp(said['spread']):.2f} between photos (median)"
+        )
+        rows.append(["Colours over the photos", "the photos", f"{words}: highlights, wrong depth and noise"])
     if light is None:
         rows.append(["Light", "—", "none was found"])
     else:
-        said = ", ".join(f"{key.replace('_', ' ')} {value:.3g}" for key, value in _numbers(report["light"]))
-        rows.append(["Light", said or "the photos", "up to one factor that base color may share"])
+        rows.append(
+            ["Light", _sun(said, report["capture"]["up"]), "up to one factor that base color may share"]
+        )
     caption = "Where each result comes from, and how far it can be trusted."
     table = Table(caption, ["Result", "From", "How sure"], rows, words=[1, 2])
     return Section("sure", "How sure it is", [table])
 
 
-def _numbers(values: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    for key, value in values.items():
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            yield key, float(value)
+def _sun(said: Mapping[str, Any], up: Sequence[float]) -> str:
+    """Words on the sun that was found, if one was looked for."""
+    if "sun" not in said:
+        return "the photos"
+    if said["sun"] is None:
+        return "the photos; no sun explains their shadows"
+    height = np.degrees(np.arcsin(np.clip(np.dot(said["sun"]["direction"], up), -1, 1)))
+    return f"the photos; a sun {said['sun']['width_deg']:.1f}° wide stands {height:.0f}° high"
 
 
 def _skipped(report: Mapping[str, Any]) -> list[Section]:

@@ -45,7 +45,7 @@ def described() -> dict:
     return {
         "version": "1.2.3",
         "capture": {
-            "path": "a/fox <b>", "views": 9, "held_out": ["v0", "v4"], "skipped": {"lost.jpg": "not found"},
+            "path": "a/fox <b>", "up": [0, 0, 1], "views": 9, "held_out": ["v0", "v4"], "skipped": {"lost.jpg": "not found"},
         },
         "surfels": 1234,
         "materials_learnt": ["base_color"],
@@ -147,6 +147,19 @@ def test_the_page_says_what_was_found_and_how_sure_it_is(variant, ball_on_floor,
     sure = page[page.index('id="sure"') : page.index('id="skipped"')]
     assert sure.count("not to be relied on") == 2  # roughness and metallic, that nobody taught
     assert "no truth in this capture" in sure
+
+
+def test_what_the_joint_fit_says_of_itself_is_told(variant, ball_on_floor, described, tmp_path):
+    scene = ball_on_floor(spacing=0.12)
+    settings, capture = SMALL.model_copy(update={"frames": 0}), capture_of(around(9, 360), scene)
+    told = {"sun": {"direction": [0.0, 0.866, 0.5], "width_deg": 3.2}, "surfels_seen": 0.93, "spread": 0.07}
+    lights = {"a sun 3.2° wide stands 30° high": told, "no sun explains": told | {"sun": None}}
+    for words, light in lights.items():
+        described |= {"light": light}
+        write_page(tmp_path / "r.html", settings, described, scene, capture, EnvironmentMap.constant(1.0, 16))
+        page = (tmp_path / "r.html").read_text()
+        for each in (words, "which see 93% of the surfels", "a factor of 1.07"):
+            assert each in page
 
 
 def test_a_page_without_light_films_or_held_out_views_says_so(variant, ball_on_floor, described, tmp_path):
