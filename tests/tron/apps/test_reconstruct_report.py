@@ -45,7 +45,8 @@ def described() -> dict:
     return {
         "version": "1.2.3",
         "capture": {
-            "path": "a/fox <b>", "up": [0, 0, 1], "views": 9, "held_out": ["v0", "v4"], "skipped": {"lost.jpg": "not found"},
+            "path": "a/fox <b>", "up": [0, 0, 1], "views": 9,
+            "held_out": ["v0", "v4"], "skipped": {"lost.jpg": "not found"},
         },
         "surfels": 1234,
         "materials_learnt": ["base_color"],
