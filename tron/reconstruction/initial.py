@@ -52,12 +52,12 @@ class Beginning:
 
     @property
     def place(self) -> Place:
-        """How far the surfels may have to go."""
+        """Distance that the surfels may have to go."""
         return place_of(self.source)
 
 
 def place_of(source: Source) -> Place:
-    """How far surfels of a source may have to go."""
+    """Distance that surfels of a source may have to go."""
     return {"depth": "in place", "stereo": "near"}.get(source, "anywhere")
 
 
