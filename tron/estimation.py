@@ -68,3 +68,5 @@ class Estimation(BaseModel):
 
 FINAL = Estimation()
 """That of final frames; the settings of the commands take their defaults from it."""
+PREVIEW = Estimation(rays=2, filtered=True)
+"""That of frames while one looks for the right one, tron-relight's unless told otherwise."""

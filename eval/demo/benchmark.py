@@ -45,6 +45,10 @@ class Demo(Benchmark):
     max_seconds: PositiveFloat | None = Field(
         default=None, description="wall time of each training; null leaves it to the training recipe"
     )
+    pixel_mlp_seconds: PositiveFloat | None = Field(
+        default=None,
+        description="wall time of the per-pixel network's, if it needs less; null: as the others",
+    )
     train_threads: PositiveInt = Field(default=1, description="threads of each of the three trainings")
 
     def bounds(self) -> list[Target]:
@@ -101,8 +105,9 @@ class Demo(Benchmark):
 
     def _training(self, name: str, dataset: Path, folder: Path) -> Child:
         arguments = [*self.train, *TRAININGS[name], f"dataset={dataset}", f"output_dir={folder}"]
-        if self.max_seconds is not None:
-            arguments.append(f"max_seconds={self.max_seconds:g}")
+        seconds = (self.pixel_mlp_seconds if name == "pixel_mlp" else None) or self.max_seconds
+        if seconds is not None:
+            arguments.append(f"max_seconds={seconds:g}")
         threads = {variable: str(self.train_threads) for variable in ONE_THREAD}
         return Child(name, "tron-train", arguments, threads)
 

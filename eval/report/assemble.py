@@ -13,8 +13,6 @@ from eval.results import Results, Target
 
 def assemble(outcome: Outcome, results: Results, targets: Sequence[Target]) -> Page:
     """The whole page: every figure on it is a row of ``results`` or stands in the benchmark's sections."""
-    reached = sum(1 for t in targets if (v := results.value(t.metric)) is not None and t.reached(v))
-    tally = f" {reached} of {len(targets)} targets are reached." if targets else ""
     environment = results.environment
     commit = str(environment.get("commit") or "unknown")
     if environment.get("dirty"):
@@ -23,12 +21,22 @@ def assemble(outcome: Outcome, results: Results, targets: Sequence[Target]) -> P
     sections.append(_provenance(environment, commit, outcome.reproduce))
     return Page(
         title=outcome.title,
-        verdict=outcome.verdict + tally,
+        verdict=outcome.verdict + _tally(results, targets),
         lead=outcome.lead,
         tiles=_tiles(outcome.headline, results, targets),
         sections=sections,
         footer=f"Benchmark {results.benchmark}, commit {commit}. All figures: results.json beside this page.",
     )
+
+
+def _tally(results: Results, targets: Sequence[Target]) -> str:
+    values = [(target, results.value(target.metric)) for target in targets]
+    verdicts = [target.reached(value) for target, value in values if value is not None]
+    if not verdicts:
+        return ""
+    missing = len(targets) - len(verdicts)
+    more = f"; {missing} not measured" if missing else ""
+    return f" {sum(verdicts)} of {len(verdicts)} targets are reached{more}."
 
 
 def _tiles(headline: dict[str, str], results: Results, targets: Sequence[Target]) -> list[Tile]:

@@ -53,7 +53,7 @@ def row_cell(row: Row | None, tone: Tone = "plain", unit: bool = True) -> Cell:
 def verdict(target: Target, measured: float | None, unit: str) -> tuple[str, Tone]:
     """The finding on one target in words, with its tone: reached or missed, and by how much."""
     if measured is None:
-        return "not measured", "bad"
+        return "not measured", "plain"
     margin = target.margin(measured)
     amount = format_value(abs(margin), unit) if unit != "s" else f"{abs(margin):.0f} s"
     if target.reached(measured):

@@ -363,6 +363,8 @@ class EqualError:
             suffix = "" if number == 0 else f".{way}"
             ratios = [(scene, values["ratio"]) for scene, values in found]
             yield mean_row(f"{EQUAL_ERROR}{suffix}", "x", ratios, seed)
+            baked = [(scene, values["ratio_with_bake"]) for scene, values in found]
+            yield mean_row(f"{EQUAL_ERROR}.with_bake{suffix}", "x", baked, seed)
             for name, unit in (("error", "abs"), ("seconds", "s"), ("paths", "1")):
                 values = [(scene, values[name]) for scene, values in found]
                 yield mean_row(f"guidance.{name}.{way}", unit, values, seed)

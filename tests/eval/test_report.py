@@ -146,7 +146,7 @@ def test_verdicts_say_by_how_much():
     gain = Target(metric="neural.gain", bound="at least", value=3.0)
     assert verdict(gain, 3.7, "dB") == ("reached, 0.70 dB to spare", "good")
     assert verdict(gain, 2.5, "dB") == ("missed by 0.50 dB", "bad")
-    assert verdict(gain, None, "dB") == ("not measured", "bad")
+    assert verdict(gain, None, "dB") == ("not measured", "plain")
     leak = Target(metric="guidance.leak", bound="at most", value=0.02)
     assert verdict(leak, 0.03, "fraction") == ("missed by 1.00%", "bad")
 
@@ -166,7 +166,7 @@ def test_the_assembled_page_names_targets_missed_and_unmeasured():
     outcome = Outcome(rows, "t", "v.", [], [], {"neural.psnr": "PSNR"}, ["make demo"])
     html = render(assemble(outcome, results, targets))
     text = " ".join(Collector(html).text.split())
-    assert "v. 1 of 3 targets are reached." in text
+    assert "v. 1 of 2 targets are reached; 1 not measured." in text
     assert "missed by 1.00 dB" in text
     assert "not measured" in text
     assert "abc123 with uncommitted changes" in text

@@ -211,8 +211,15 @@ def test_equal_errors_are_the_data_engines_record(tmp_path: Path, monkeypatch: p
         (dataset / "equal_error").mkdir(parents=True, exist_ok=True)
         write_image(dataset / "equal_error" / "a-l0.png", np.full((4, 12, 3), 0.5, np.float32))
         ways = {
-            name: {"error": 0.02, "seconds": 1.0, "paths": 8.0, "path_seconds": 2.5, "ratio": ratio}
-            for name, ratio in (("lit_64_rays", 0.4), ("lit_16_rays", 1.2))
+            name: {
+                "error": 0.02,
+                "seconds": 1.0,
+                "paths": 8.0,
+                "path_seconds": 2.5,
+                "ratio": ratio,
+                "ratio_with_bake": ratio + 0.1,
+            }
+            for name, ratio in (("lit_preview", 0.4), ("lit_16_rays", 1.2))
         }
         cases = [{"scene": name, "light": "dusk", "ways": ways} for name in ("a", "b")]
         (dataset / "equal_error.json").write_text(json.dumps({"cases": cases}))
@@ -235,6 +242,7 @@ def test_equal_errors_are_the_data_engines_record(tmp_path: Path, monkeypatch: p
     assert row is not None
     assert (row.value, row.scenes, row.ratio) == (0.4, 2, 0.8)
     assert results.value("guidance.ratio_to_path_tracing.equal_error.lit_16_rays") == 1.2
+    assert results.value("guidance.ratio_to_path_tracing.equal_error.with_bake") == 0.5
     page = (tmp_path / "report.html").read_text()
     assert 'id="equal-error"' in page
     assert "a, dusk" in page

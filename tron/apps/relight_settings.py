@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from tron.apps.framing import TrajectoryName
 from tron.apps.relit import Background
 from tron.errors import TronError
-from tron.estimation import FINAL, Estimation, Estimator
+from tron.estimation import FINAL, PREVIEW, Estimation, Estimator
 from tron.shards.schema import light_members
 
 DEFAULT_BUFFERS = (*light_members(), "indirect", "foreground", "mask", "share")
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 else:
     BufferName = Literal[BUFFERS]
 QUALITY = {
-    "preview": Estimation(rays=2, filtered=True),
+    "preview": PREVIEW,
     "final": FINAL.model_copy(update={"reflections": 4, "supersample": 2}),
 }
 
