@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 
 _BOUNDING_POINTS = 4000
 _FEWEST_POINTS = 100
+_MOST_POINTS = 50_000
 _MOST_PIXELS = 1 << 25  # of all photographs together: some 60 bytes each
 _MOST_THREADS = 4  # each holds its photograph's costs on all planes some ten times
 
@@ -73,7 +74,7 @@ def stereo_maps(
     photographs = [Photograph.of(view, side, device) for view in views]
     seeded = capture.points is not None and len(capture.points) >= _FEWEST_POINTS
     points = capture.points if seeded else random_points(capture, _BOUNDING_POINTS, seed)
-    points = np.asarray(points, np.float64)
+    points = np.asarray(points, np.float64)[:: max(len(points) // _MOST_POINTS, 1)]
     beside = neighbours(photographs, points, settings)
 
     def sweep(index: int) -> Swept:

@@ -160,6 +160,7 @@ def test_the_report_is_whole_and_strict_json(finished: Path):
     )
     assert {"albedo_scaling", "seconds", "settings", "machine", "curve"} < set(report)
     assert report["capture"]["held_out"] == ["00", "03", "06"]
+    assert report["first_surfels"] == {"source": "depth", "stereo_confident": None}
     assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
     figures = {"psnr", "psnr_subject", "ssim", "normal_mae_deg", "base_color_psnr"}
     figures |= {"roughness_mae", "metallic_mae"}
@@ -291,6 +292,7 @@ def test_the_default_prior_needs_nothing_but_photos(reconstruct, tmp_path: Path)
     out = tmp_path / "out"
     assert reconstruct(out, prior="classical") == 0
     report = json.loads((out / "metrics.json").read_text())
+    assert report["first_surfels"] == {"source": "depth", "stereo_confident": None}
     assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
     assert report["light"]["sigma"] > 0
     assert (out / "environment.exr").exists()
