@@ -17,7 +17,7 @@ from tron.reconstruction.initial import beginning
 from tron.reconstruction.matching import Photograph
 from tron.reconstruction.settings import InitialSettings, StereoSettings
 from tron.reconstruction.stereo import StereoMaps, most_side, stereo_maps
-from tron.reconstruction.sweep import Swept, confirmed, neighbours, plane_depths
+from tron.reconstruction.sweep import Swept, confirmed, neighbours, plane_depths, swept
 from tron.seeds import generator
 
 SIZE = 48
@@ -123,6 +123,22 @@ def test_sparse_points_bound_the_planes_of_a_view(truth: Capture) -> None:
     assert z[-1] == pytest.approx(1.05 * 2.995, rel=1e-3)
     inverse = 1 / z
     np.testing.assert_allclose(np.diff(inverse), inverse[1] - inverse[0], rtol=1e-3)
+
+
+def test_sparse_points_decide_where_photos_say_nothing(truth: Capture) -> None:
+    flat = photos(truth, masks=False, flat=True)
+    photographs = [Photograph.of(view, 512, "cpu") for view in flat.views]
+    ball = generator(0, "ball").normal(size=(3000, 3))
+    ball *= 0.7 / np.linalg.norm(ball, axis=1, keepdims=True)
+    facing = ball @ photographs[0].camera.position > 1.5 * np.linalg.norm(ball, axis=1)
+    beside = neighbours(photographs, ball, SETTINGS)
+    depth = truth.views[0].read("depth")
+    error = []
+    for seeded in (True, False):
+        found = swept(photographs, beside, 0, ball[facing], SETTINGS, seeded=seeded)
+        error.append(float(np.median(np.abs(found.depth.numpy() - depth)[depth > 0])))
+    assert error[0] < 0.05
+    assert error[1] > 3 * error[0]
 
 
 def test_neighbours_are_those_near_the_wanted_angle(truth: Capture) -> None:
