@@ -32,7 +32,8 @@ def consensus(field: DistanceField, maps: Sequence[DepthMap], sigma: float) -> l
 def _walked(field: DistanceField, grids: Tensor, view: DepthMap) -> tuple[Tensor, Tensor]:
     starts = view.depth > 0
     origin = view.depth.new_tensor(view.camera.position)
-    rays, depth = view.rays[starts], view.depth[starts]
+    every = view.rays
+    rays, depth = every[starts], view.depth[starts]
     for _ in range(_STEPS):
         value = field.sample(grids[:1], origin + depth[:, None] * rays)[:, 0]
         depth = depth + _STRIDE * field.reach * value
@@ -43,7 +44,7 @@ def _walked(field: DistanceField, grids: Tensor, view: DepthMap) -> tuple[Tensor
     agreed = (found[:, 0].abs() < _CLOSE) & (slope * field.reach > _STEEP) & (found[:, 4] > _SEEN)
     agreed &= (normal * rays).sum(-1) < 0
     depths = torch.zeros_like(view.depth)
-    normals = torch.zeros_like(view.rays)
+    normals = torch.zeros_like(every)
     depths[starts] = depth * agreed
     normals[starts] = normal * agreed[:, None]
     return depths, normals

@@ -121,13 +121,7 @@ class FusedNormals:
         empty = None
         if view.has("mask"):
             empty = empty_rays(torch.from_numpy(view.read("mask")).to(depth.device) > _SURFACE)
-        return DepthMap(
-            view.camera,
-            torch.from_numpy(view.camera.rays()).to(depth.device),
-            depth,
-            (depth > 0).float(),
-            empty,
-        )
+        return DepthMap(view.camera, depth, (depth > 0).float(), empty)
 
 
 def _without_radiance(geometry: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -27,21 +27,24 @@ _SAMPLED = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """What one view knows of distances.
+    """Distances that one view knows.
 
     Attributes:
         camera: the view.
-        rays: (H, W, 3) unit directions through the pixel centres, world.
         depth: (H, W) distance along the ray, world units; 0 where there is none.
         weight: (H, W) what each pixel counts in the fusion, 0 and up.
         empty: (H, W) bool, rays that meet nothing, or None where that is not known (see :func:`empty_rays`).
     """
 
     camera: Camera
-    rays: Tensor
     depth: Tensor
     weight: Tensor
     empty: Tensor | None = None
+
+    @property
+    def rays(self) -> Tensor:
+        """(H, W, 3) unit directions through the pixel centres, world."""
+        return torch.from_numpy(self.camera.rays()).to(self.depth.device)
 
     def points(self) -> Tensor:
         """(N, 3) of the pixels that count, world."""
@@ -117,10 +120,10 @@ def fuse(maps: Sequence[DepthMap], voxel: float, truncation: float, most_voxels:
         truncation: voxels at which distances are cut off.
         most_voxels: see above.
     """
-    points = torch.cat([each.points() for each in maps])
+    every = max(sum(each.depth.numel() for each in maps) // _SAMPLED, 1)
+    points = torch.cat([each.points()[::every] for each in maps])
     if len(points) < 4:
         return None
-    points = points[:: max(len(points) // _SAMPLED, 1)]
     ordered = points.sort(0).values
     cut = int(_OUTLIERS * (len(points) - 1))
     low, high = ordered[cut], ordered[len(points) - 1 - cut]

@@ -32,6 +32,7 @@ Source = Literal["points", "depth", "stereo", "random"]
 _EXTENT_MARGIN = 1.1
 _SAME_PLACE = 1e-9  # rounding moves cameras that turn on the spot by about 1e-16
 _ABOUT = 0.99  # surfels from depth maps are as many as asked for within half a percent
+_SOME = 10_000  # points that tell how far away they all are
 _DENSE = 2.0  # pixels between points that cover surfaces; structure from motion's lie farther apart
 
 
@@ -52,12 +53,12 @@ class Beginning:
 
     @property
     def place(self) -> Place:
-        """How far the surfels may have to go."""
+        """Distance that the surfels may have to go."""
         return place_of(self.source)
 
 
 def place_of(source: Source) -> Place:
-    """How far surfels of a source may have to go."""
+    """Distance that surfels of a source may have to go."""
     return {"depth": "in place", "stereo": "near"}.get(source, "anywhere")
 
 
@@ -154,9 +155,9 @@ def _dense(capture: Capture) -> bool:
     points = capture.points
     if points is None or len(points) < 4:
         return False
-    spacing = float(np.median(neighbour_distances(points)))
+    spacing, some = measure_spacing(points), points[:: max(len(points) // _SOME, 1)]
     widths = [
-        np.median(view.camera.project(points)[1].clip(0)) / view.camera.fx for view in capture.train_views
+        np.median(view.camera.project(some)[1].clip(0)) / view.camera.fx for view in capture.train_views
     ]
     return spacing <= _DENSE * float(np.median(widths))
 

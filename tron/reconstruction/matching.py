@@ -1,4 +1,4 @@
-"""How alike two photographs are where a surface at some distance would show the same in both.
+"""Likeness of two photographs where a surface at some distance would show the same in both.
 
 A pixel of one photograph and a distance along its ray make a point; the other photograph shows that point
 somewhere. Windows around the two places are compared by half 1 - ZNCC of their greys, which is blind to
@@ -10,7 +10,6 @@ PatchMatch stereo (Bleyer et al. 2011) and in PGSR (Chen et al. 2024), which war
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -58,24 +57,25 @@ class Photograph:
             image, mask = both[:3], both[3]
         return Photograph(camera, image.to(device), (mask > _SUBJECT).to(device))
 
-    @cached_property
+    @property
     def rays(self) -> Tensor:
         """(H, W, 3) unit directions through the pixel centres, world."""
         return torch.from_numpy(self.camera.rays()).to(self.image.device)
 
-    @cached_property
+    @property
     def along(self) -> Tensor:
         """(H, W) cosine between each ray and the optical axis: z over distance."""
         return self.rays @ self.rays.new_tensor(self.camera.forward)
 
-    @cached_property
+    @property
     def grey(self) -> Tensor:
         """(H, W) mean of the channels."""
         return self.image.mean(0)
 
     def textured(self, radius: int) -> Tensor:
         """(H, W) bool, windows that differ from one grey by more than 8 bits' rounding."""
-        mean, square = window_mean(torch.stack([self.grey, self.grey**2]), radius)
+        grey = self.grey
+        mean, square = window_mean(torch.stack([grey, grey**2]), radius)
         return square - mean * mean > _ROUNDING**2
 
 
@@ -133,10 +133,10 @@ def matching_cost(reference: Photograph, other: Photograph, distances: Tensor, r
     mean, square = window_mean(torch.stack([grey, grey * grey]), radius)
     variance = (square - mean * mean).clamp(min=0)
     shown = torch.cat([other.image, other.subject[None].float()])
-    position = grey.new_tensor(reference.camera.position)
+    position, rays = grey.new_tensor(reference.camera.position), reference.rays
     costs = []
     for some in distances.split(at_once):
-        pixels, z = project(other.camera, position + some[..., None] * reference.rays)
+        pixels, z = project(other.camera, position + some[..., None] * rays)
         warped = sample(shown, pixels)
         g = warped[:, :3].mean(1)
         apart = (warped[:, :3] - reference.image).abs().mean(1)

@@ -162,7 +162,7 @@ class _Run:
             log.info("resuming from step %d of stage %s", self.found.step, self.found.stage)
 
     def begin(self, find: Callable[[], Beginning]) -> Callable[[], GaussianScene]:
-        """What gives the first surfels: found now, unless a checkpoint has gone on from them already."""
+        """Maker of the first surfels: they are found now, unless a checkpoint has gone on from them."""
         if self.found is not None:
             return lambda: find().scene
         first = find()

@@ -16,7 +16,7 @@ from tron.estimation import FINAL, Diffuse, Estimation, Estimator
 Model = TypeVar("Model", bound="Settings")
 
 Place = Literal["in place", "near", "anywhere"]
-"""Where surfels begin: on the surface (depth maps), near it (stereo), or anywhere."""
+"""Place that surfels begin at: on the surface (depth maps), near it (stereo), or anywhere."""
 
 _FASTER: dict[Place, tuple[float, float]] = {"in place": (0, 0), "near": (0.25, 0.5), "anywhere": (0.5, 0.5)}
 """Powers of the number of steps by which positions and rotations learn faster in fewer."""

@@ -9,6 +9,7 @@ is used.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -30,11 +31,14 @@ log = logging.getLogger(__name__)
 
 _BOUNDING_POINTS = 4000
 _FEWEST_POINTS = 100
+_MOST_POINTS = 50_000
+_MOST_PIXELS = 1 << 25  # of all photographs together: some 60 bytes each
+_MOST_THREADS = 4  # each holds its photograph's costs on all planes some ten times
 
 
 @dataclass(frozen=True, eq=False)
 class StereoMaps:
-    """What stereo found.
+    """Result of stereo.
 
     Attributes:
         views: the training views with depth and normals, zero where the views do not agree; large photographs
@@ -66,17 +70,18 @@ def stereo_maps(
         TronError: no part of space is seen by several cameras.
     """
     views = capture.train_views
-    photographs = [Photograph.of(view, settings.most_side, device) for view in views]
+    side = most_side(views, settings.most_side)
+    photographs = [Photograph.of(view, side, device) for view in views]
     seeded = capture.points is not None and len(capture.points) >= _FEWEST_POINTS
     points = capture.points if seeded else random_points(capture, _BOUNDING_POINTS, seed)
-    points = np.asarray(points, np.float64)
+    points = np.asarray(points, np.float64)[:: max(len(points) // _MOST_POINTS, 1)]
     beside = neighbours(photographs, points, settings)
 
     def sweep(index: int) -> Swept:
         return swept(photographs, beside, index, points, settings, seeded=seeded)
 
     # The cores are the renderer's, which stands still: torch itself runs on one thread each.
-    with ThreadPoolExecutor(dr.thread_count()) as pool:
+    with ThreadPoolExecutor(min(dr.thread_count(), _MOST_THREADS)) as pool:
         found = [each for _, each in zip(track(views, "stereo"), pool.map(sweep, range(len(views))))]
     known = [
         ok & (each.cost < 1 - settings.confident) & each.textured
@@ -86,7 +91,7 @@ def stereo_maps(
     confident = sum(int(each.sum()) for each in known) / max(subject, 1)
     maps = [
         DepthMap(
-            photograph.camera, photograph.rays, each.depth, ok.float(),
+            photograph.camera, each.depth, ok.float(),
             empty_rays(photograph.subject) if view.has("mask") else None,
         )
         for view, photograph, each, ok in zip(views, photographs, found, known)
@@ -101,6 +106,16 @@ def stereo_maps(
         ),
         confident,
     )
+
+
+def most_side(views: Sequence[View], wanted: int) -> int:
+    """Longest side that photographs are reduced to: less than wanted where there are very many."""
+    longest = [max(view.camera.width, view.camera.height) for view in views]
+    pixels = sum(
+        view.camera.width * view.camera.height * min(wanted / side, 1) ** 2
+        for view, side in zip(views, longest)
+    )
+    return max(int(min(wanted, max(longest)) * min((_MOST_PIXELS / pixels) ** 0.5, 1)), 1)
 
 
 def _with_maps(view: View, photograph: Photograph, depth: Tensor, normal: Tensor) -> View:

@@ -165,7 +165,7 @@ def _favoured(cost: Tensor, photograph: Photograph, points: np.ndarray, inverse:
     inside = (plane >= 0) & (plane < len(inverse))
     cost = cost.clone()
     index = (plane[inside], row[inside], column[inside])
-    cost[index] = (cost[index] - _SEED).clamp(min=0)
+    cost[index] = cost[index] - _SEED
     return cost
 
 

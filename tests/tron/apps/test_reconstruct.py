@@ -162,6 +162,7 @@ def test_the_report_is_whole_and_strict_json(finished: Path):
     )
     assert {"albedo_scaling", "seconds", "settings", "machine", "curve"} < set(report)
     assert report["capture"]["held_out"] == ["00", "03", "06"]
+    assert report["first_surfels"] == {"source": "depth", "stereo_confident": None}
     assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
     figures = {"psnr", "psnr_subject", "ssim", "normal_mae_deg", "normal_median_deg"}
     figures |= {"base_color_psnr", "roughness_mae", "metallic_mae"}
@@ -307,6 +308,7 @@ def test_the_classical_prior_gives_maps_to_learn_from(reconstruct, tmp_path: Pat
     out = tmp_path / "out"
     assert reconstruct(out, prior="classical") == 0
     report = json.loads((out / "metrics.json").read_text())
+    assert report["first_surfels"] == {"source": "depth", "stereo_confident": None}
     assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
     assert report["light"]["sigma"] > 0
     assert (out / "environment.exr").exists()

@@ -28,7 +28,6 @@ def ball_map(camera: Camera, noise: float = 0.0, index: int = 0) -> DepthMap:
     known = torch.from_numpy(depth > 0)
     return DepthMap(
         camera,
-        torch.from_numpy(camera.rays()),
         torch.from_numpy(depth).float(),
         known.float(),
         empty_rays(known),
