@@ -119,13 +119,21 @@ def materials_of(
             loss = np.bincount(surfel, np.log1p(off / _ROBUST), count)
             bases.append(base)
             losses.append(loss)
-    return _chosen(scene, evidence, np.stack(bases), np.stack(losses), prior_roughness)
+    return choose(scene, evidence, np.stack(bases), np.stack(losses), prior_roughness)
 
 
-def _chosen(
+def choose(
     scene: GaussianScene, evidence: Evidence, bases: np.ndarray, losses: np.ndarray, prior_roughness: float
 ) -> Materials:
-    """Of (K, M, 3) base colors and (K, M) summed losses of the materials."""
+    """The materials of M surfels among K candidates, dielectrics of all roughnesses before metals.
+
+    Args:
+        scene: geometry.
+        evidence: of its surfels.
+        bases: (K, M, 3) base color of each candidate.
+        losses: (K, M) loss of each, summed over the surfel's photos.
+        prior_roughness: where nothing is known.
+    """
     seen = np.flatnonzero(evidence.seen)
     log = np.log(np.maximum(evidence.color, FLOOR))
     place = np.concatenate([scene.means / scene.spacing, log / _CHROMA], 1)

@@ -23,8 +23,8 @@ from tron.shading.guidance import ViewTracer
 CLIPPED = 0.985
 """Display values from here on hold no radiance: the photo's white."""
 _FACING = 0.2  # least n.v: flatter views show too few pixels of a surfel
-_NEAR = 2.0  # surfel spacings between a centre and the surface in front of the camera
-_INSIDE = 0.95  # least mask around a colour
+_NEAR = 1.5  # surfel spacings between a centre and the surface in front of the camera
+_STEP = 2.0  # spacings along the normal that the surface may lie farther or nearer in the next pixel
 
 
 @dataclass(frozen=True)
@@ -86,14 +86,16 @@ def observe(
             continue
         solid = seen["opacity"] > OPAQUE
         if view.has("mask"):
-            solid &= view.read("mask") > _INSIDE
+            solid &= view.read("mask") > OPAQUE
         far = np.where(solid, seen["depth"], np.inf)
         near = np.where(solid, seen["depth"], 0.0)
         column, row = np.floor(pixel[index]).astype(int).T
-        reach = _NEAR * spacing / facing[index]
+        off = np.abs(far[row, column] - distance[index])
+        kept = off < _NEAR * spacing / np.maximum(facing[index], 0.5)
         # Of the pixel and its neighbours: beside a silhouette one of them is nearer, farther or empty.
         behind, before = maximum_filter(far, 3)[row, column], minimum_filter(near, 3)[row, column]
-        kept = (behind - distance[index] < reach) & (distance[index] - before < reach)
+        reach = _STEP * spacing / facing[index]
+        kept &= (behind - distance[index] < reach) & (distance[index] - before < reach)
         index = index[kept]
         factor = max(1, int(np.median(spacing * camera.fx / distance[index]))) if len(index) else 1
         color = reduced(linear_light(view, exposure, curve), factor)
