@@ -16,7 +16,8 @@ from tron.captures.capture import Capture
 from tron.captures.distortion import Lens
 from tron.captures.image_folder import view_names
 from tron.captures.orientation import estimate_up
-from tron.captures.photographs import Decode, PhotoCache, PhotoHeader, PhotoReader, inspect_photo
+from tron.captures.photo_files import PhotoHeader, exposure_of, inspect_photo, require_decoders
+from tron.captures.photographs import Decode, PhotoCache, PhotoReader
 from tron.captures.settings import PhotoSettings
 from tron.captures.view import View
 from tron.errors import TronError
@@ -81,6 +82,7 @@ def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> C
     """
     if not posed.photos:
         raise TronError("the file names no photos", posed.source)
+    require_decoders(photo.path for photo in posed.photos)
     cache = PhotoCache(cache_bytes)
     skipped = dict(posed.skipped)
     views: dict[str, View] = {}

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
+from tron.captures.content import content_hash
 from tron.captures.view import View
 from tron.errors import TronError
 
@@ -83,6 +85,11 @@ class Capture:
     def train_views(self) -> Sequence[View]:
         """The views that are learnt from, in order."""
         return [view for view in self.views if view.name not in self.test]
+
+    @cached_property
+    def content(self) -> str:
+        """Hash of all that the training views show (see :func:`content_hash`)."""
+        return content_hash(self.train_views)
 
     @property
     def test_views(self) -> Sequence[View]:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-from tron.captures.photographs import SUFFIXES
+from tron.captures.photo_files import SUFFIXES
 from tron.errors import TronError
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tron.captures.photographs import SUFFIXES
+from tron.captures.photo_files import SUFFIXES
 from tron.errors import TronError
 from tron.gaussians.foreign_files import PACKED_SPLATS, VIDEOS, packed_splats, photos_of_video
 

@@ -30,6 +30,12 @@ class PhotoSettings(BaseModel):
         description="every n-th photo is held out, the first included, unless the capture says itself which "
         "are; 0 holds out none",
     )
+    exr_exposure: float | None = Field(
+        default=None,
+        gt=0,
+        description="factor on linear photos (EXR) before the sRGB curve, with which they are shown and learnt "
+        "from; null: one for all, such that 98 % of what they show lie below 0.9",
+    )
     up: tuple[float, float, float] | None = Field(
         default=None, description="up direction in the capture's world; null: estimated from the cameras"
     )

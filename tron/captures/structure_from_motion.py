@@ -11,7 +11,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,7 +21,7 @@ from pydantic import BaseModel, Field
 from tron.captures.assembly import PosedPhoto, PosedPhotos
 from tron.captures.colmap import points_of, posed_by, read_model
 from tron.captures.image_folder import photos_in
-from tron.captures.photographs import inspect_photo
+from tron.captures.photo_files import PhotoHeader, exposure_of, inspect_photo, open_photo, require_decoders
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
 from tron.storage import locked, sha256, write_atomic
@@ -93,11 +93,12 @@ def pose_photos(path: Path, settings: PosingSettings, progress: Progress = log.i
     folder = path / (settings.images or ("images" if photos_in(path / "images") else "."))
     workspace = settings.workspace or folder / WORKSPACE
     skipped: dict[str, str] = {}
-    photos: list[Path] = []
-    for path in photos_in(folder):
+    photos: dict[Path, PhotoHeader] = {}
+    found = photos_in(folder)
+    require_decoders(found)
+    for path in found:
         try:
-            inspect_photo(path)
-            photos.append(path)
+            photos[path] = inspect_photo(path)
         except TronError as error:
             skipped[path.name] = error.what
     if len(photos) < _FEWEST:
@@ -120,7 +121,7 @@ def pose_photos(path: Path, settings: PosingSettings, progress: Progress = log.i
 
 
 def _posed_copies(
-    photos: Sequence[Path], workspace: Path, settings: PosingSettings, progress: Progress
+    photos: Mapping[Path, PhotoHeader], workspace: Path, settings: PosingSettings, progress: Progress
 ) -> dict[str, str]:
     """Names of photos by those of their posed copies; makes the model unless it is kept."""
     record = workspace / "photos.json"
@@ -138,7 +139,7 @@ def _posed_copies(
     record.unlink(missing_ok=True)
     _clear(workspace, "images", "models", "sparse")
     progress(f"copying {len(photos)} photos for feature extraction")
-    copies = _copy(photos, workspace / "images", settings.feature_side)
+    copies = _copy(photos, workspace / "images", settings.feature_side, settings.exr_exposure)
     _map(workspace, len(photos), settings, progress)
     write_atomic(record, json.dumps({"wanted": wanted, "copies": copies}, indent=1))
     _clear(workspace, "images", "models")
@@ -160,12 +161,15 @@ def _kept(record: Path) -> dict[str, Any]:
     return kept if isinstance(kept, dict) and isinstance(kept.get("copies"), dict) else {}
 
 
-def _copy(photos: Sequence[Path], folder: Path, max_side: int) -> dict[str, str]:
+def _copy(
+    photos: Mapping[Path, PhotoHeader], folder: Path, max_side: int, exr_exposure: float | None = None
+) -> dict[str, str]:
     """Write upright 8-bit copies, those of one camera into one folder; their names below ``folder``."""
+    exposure = exposure_of(photos, exr_exposure)
     cameras: dict[tuple[Any, ...], str] = {}
     copies = {}
-    for index, path in enumerate(photos):
-        with Image.open(path) as picture:
+    for index, (path, header) in enumerate(photos.items()):
+        with open_photo(path, header, exposure) as picture:
             exif = picture.getexif()
             lens = exif.get_ifd(_EXIF_FOLDER)
             upright = ImageOps.exif_transpose(picture)

@@ -6,7 +6,6 @@ settings and checkpoint goes on where the last call was cut off.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -118,11 +117,8 @@ def reconstruct(
 
 def made_with(capture: Capture, prior: Prior, settings: ReconstructionSettings) -> dict[str, Any]:
     """All that a reconstruction is a function of, as plain values: a checkpoint of others is refused."""
-    digest = hashlib.sha256()
-    for view in capture.train_views:
-        digest.update(repr((view.name, view.camera.to_dict())).encode())
     values = settings.model_dump(mode="json", exclude={"checkpoint_every"})
-    return {"capture": digest.hexdigest(), "prior": repr(prior), **values}
+    return {"capture": capture.content, "prior": repr(prior), **values}
 
 
 class _Run:
