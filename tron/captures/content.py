@@ -1,4 +1,4 @@
-"""What views show, as one hash: photos, masks or maps that were replaced under their names are known by it."""
+"""What views show, as one hash: what was replaced under its old name is known by it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from tron.captures.view import MAPS, View
 def content_hash(views: Iterable[View]) -> str:
     """SHA-256 of the views' names, cameras, images and maps, as 64 hexadecimal digits.
 
-    Values are hashed as they are read, so that whatever changes them counts: a file that was replaced, its size,
-    the exposure of an EXR, the way that masks are taken.
+    Values are hashed as they are read, so that whatever changes them counts: a file that was replaced, its
+    size, the exposure of an EXR, the way that masks are taken.
 
     Raises:
         TronError: an image or map that cannot be read.

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import ConfigDict, Field
 
-from tron.captures.assembly import PosedPhotos, assemble
+from tron.captures.assembly import assemble
 from tron.captures.capture import Capture
 from tron.captures.colmap import model_folder, read_colmap
 from tron.captures.folder import is_capture_folder, load_traced
 from tron.captures.not_a_capture import refusal
+from tron.captures.posed_photos import PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.captures.structure_from_motion import MatchingSettings, PosingSettings, has_photos, pose_photos
 from tron.captures.tensoir import TensoirSettings, is_tensoir, read_tensoir

@@ -19,7 +19,6 @@ _MODEL = (
 )
 _KINDS: dict[str, tuple[str, str]] = {
     **dict.fromkeys(SUFFIXES, _PHOTO),
-    ".heic": ("a photo in HEIC", "save all photos of the scene as JPEG and give their folder"),
     ".ply": ("a PLY of splats or points, not photos", "tron-relight scene=FILE takes splats"),
     **dict.fromkeys((".zip", ".tar", ".gz", ".tgz", ".7z"), _ARCHIVE),
     **dict.fromkeys((".hdr", ".exr"), _ENVIRONMENT),

@@ -1,8 +1,9 @@
 """Files of photos: what their headers say, whether they are whole, and their pixels.
 
-JPEG, PNG, WebP, TIFF and BMP hold display values; so does HEIC, which needs the extra ``heic`` (pillow-heif). OpenEXR
-holds linear radiance, which :func:`shown` encodes for display. Input is not trusted: sizes are checked before anything
-is decoded, and a file that is damaged is refused, for most decoders would fill its rest with grey and say nothing.
+JPEG, PNG, WebP, TIFF and BMP hold display values; so does HEIC, which needs the extra ``heic`` (pillow-heif).
+OpenEXR holds linear radiance, which :func:`shown` encodes for display. Input is not trusted: sizes are
+checked before anything is decoded, and a file that is damaged is refused, for most decoders would fill its
+rest with grey and say nothing.
 """
 
 from __future__ import annotations
@@ -79,8 +80,8 @@ def inspect_photo(path: Path) -> PhotoHeader:
 
     Of a PNG the checksums are looked at; any other file is decoded once, a JPEG at an eighth of its size and
     strictly: bytes that are no code of its, or too many or too few of them, are damage. (Random bytes in the
-    middle of a JPEG may happen to be codes: of 64 overwritten bytes a quarter went unnoticed, of 4,096 missing
-    or zeroed ones none.)
+    middle of a JPEG may happen to be codes: of 64 overwritten bytes a quarter went unnoticed, of 4,096
+    missing or zeroed ones none.)
 
     Raises:
         TronError: the file is missing, not such an image, cut short, damaged or too large.
@@ -153,8 +154,8 @@ def open_photo(path: Path, header: PhotoHeader, exposure: float = 1.0) -> Image.
 def shown(linear: np.ndarray, exposure: float) -> np.ndarray:
     """Display values of linear radiance: ``exposure x radiance`` through the sRGB curve, clipped to [0, 1].
 
-    The curve is the one that photos are decoded with (tron.priors.linear_light), so that what is learnt from them
-    meets the radiance again.
+    The curve is the one that photos are decoded with (tron.priors.linear_light), so that what is learnt from
+    them meets the radiance again.
     """
     return np.clip(linear_to_srgb(np.maximum(linear, 0) * np.float32(exposure)), 0, 1)
 
@@ -171,11 +172,14 @@ def exposure_of(paths: Iterable[Path], asked: float | None) -> float:
         return 1.0 if asked is None else asked
     values = []
     for index in np.unique(np.linspace(0, len(linear) - 1, _SAMPLED_FILES).astype(int)):
-        pixels = decode_exr(linear[index].read_bytes())
+        try:
+            pixels = decode_exr(linear[index].read_bytes())
+        except (OSError, TronError):
+            continue  # whoever uses the photo says what is wrong with it
         rows, columns = (max(1, side // _SAMPLED_SIDE) for side in pixels.shape[:2])
         color = pixels[::rows, ::columns, :3].max(-1)
         values.append(color[np.isfinite(color)])
-    bright = float(np.quantile(np.concatenate(values), _BRIGHT_SHARE))
+    bright = float(np.quantile(np.concatenate(values or [np.ones(1)]), _BRIGHT_SHARE))
     if not bright > 0:
         raise TronError("EXR photos hold no light", linear[0])
     return _BRIGHT / bright
@@ -197,11 +201,11 @@ def _inspect_heic(data: bytes) -> PhotoHeader:
     picture = _heic(data)
     width, height = picture.size
     check_size(width, height, 4, len(data))
-    picture.load()
+    _ = picture.data  # decodes it
     return PhotoHeader(width, height, alpha=picture.has_alpha)
 
 
-def _heic(data: bytes):  # noqa: ANN202 (pillow-heif is optional)
+def _heic(data: bytes):
     """The file's primary picture, 8 bits, turned as the file says: HEIC holds no picture that is not."""
     import pillow_heif
 

@@ -16,6 +16,7 @@ import numpy as np
 from cachetools import LRUCache
 
 from tron.captures.distortion import Lens
+from tron.captures.masks import MaskMeaning, mask_values
 from tron.captures.photo_files import PhotoHeader, decode_photo
 
 Decode = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -61,6 +62,7 @@ class PhotoReader:
         size: width and height of what is read; not larger than the photo.
         cache: shared by the photos of a capture.
         upright: turn the photo as its EXIF tag says. Poses of files belong to the pixels as stored, hence no.
+        mask: the photo is a mask, with this meaning (see :func:`tron.captures.masks.mask_values`).
         exposure: that a linear photo is shown with (see :func:`tron.captures.photo_files.shown`).
     """
 
@@ -70,6 +72,7 @@ class PhotoReader:
     size: tuple[int, int]
     cache: PhotoCache
     upright: bool = False
+    mask: MaskMeaning | None = None
     exposure: float = 1.0
 
     def color(self) -> np.ndarray:
@@ -82,6 +85,10 @@ class PhotoReader:
         pixels = self._pixels()
         return pixels[..., 3] if pixels.shape[2] == 4 else np.ones(pixels.shape[:2], np.float32)
 
+    def grey(self) -> np.ndarray:
+        """(H, W) float32 in [0, 1]: the first channel."""
+        return self._pixels()[..., 0]
+
     def decoded(self, decode: Decode) -> np.ndarray:
         """A map that the file encodes."""
         return decode(self.color(), self.alpha())
@@ -93,6 +100,8 @@ class PhotoReader:
 
     def _read(self) -> np.ndarray:
         pixels = decode_photo(self.path, self.header, self.exposure)
+        if self.mask is not None:
+            pixels = mask_values(pixels, self.mask)
         if self.upright:
             pixels = _turned(pixels, self.header.orientation)
         if pixels.shape[2] == 4:

@@ -18,7 +18,7 @@ from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import write_capture
 from tron.gaussians import GaussianScene
-from tron.images import read_image
+from tron.images import read_image, write_image
 from tron.shading.environment import EnvironmentMap
 from tron.tracing import SurfelTracer
 
@@ -272,6 +272,19 @@ def test_other_settings_are_refused_and_change_nothing_unless_told_to(
     assert (out / "scene.ply").read_bytes() != before["scene.ply"]
     assert not (out / "environment.exr").exists()  # the old light is not the new scene's
     assert json.loads((out / "metrics.json").read_text())["light"] is None
+
+
+def test_photos_replaced_under_their_names_are_another_capture(
+    reconstruct, steps, capture_path, copied: Path, tmp_path: Path, capsys
+):
+    other = Path(shutil.copytree(capture_path, tmp_path / "capture"))
+    photo = other / "images" / "01.png"
+    write_image(photo, read_image(photo, 4)[:, ::-1].copy())
+    capsys.readouterr()
+    assert reconstruct(copied, f"capture={other}") == 2
+    assert "a checkpoint made with capture=" in capsys.readouterr().err
+    assert reconstruct(copied) == 0  # the same photos are still the same capture
+    assert not steps
 
 
 def test_without_priors_for_light_there_is_no_light_and_it_is_said(
