@@ -61,7 +61,7 @@ def test_the_demo_goes_from_nothing_to_a_report_and_a_second_run_only_evaluates(
         name: {command.split()[-1] for command in commands if name in command}
         for name in ("tiny", "pixel_mlp")
     }
-    assert limits == {"tiny": {"max_seconds=275"}, "pixel_mlp": {"max_seconds=110"}}
+    assert limits == {"tiny": {"max_seconds=250"}, "pixel_mlp": {"max_seconds=100"}}
     results = Results.load(out / "results.json")
     assert results.benchmark == "demo"
     parts = [results.value(f"demo.{stage}_seconds") for stage in ("datagen", "train", "eval")]
