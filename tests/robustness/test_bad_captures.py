@@ -231,8 +231,6 @@ FOREIGN = {
     "biker.splat": ("splats", "tron-relight scene="),
     "biker.spz": ("splats", "tron-relight scene="),
     "biker.ply": ("splats or points", "tron-relight scene="),
-    "walk.MP4": ("a video", "ffmpeg"),
-    "walk.mov": ("a video", "matching=sequential"),
     "photos.zip": ("an archive", "unpack"),
     "venice.hdr": ("environment map", "tron-relight environment="),
     "cameras.bin": ("COLMAP", "sparse/0"),

@@ -47,7 +47,9 @@ Split = Literal["train", "test"]
 
 def has_transforms(path: Path) -> bool:
     """Whether a path is, or a folder holds, a file of poses that :func:`read_transforms` reads."""
-    return path.is_file() or any((path / f"transforms{end}.json").is_file() for end in ("", "_train"))
+    if not path.is_dir():
+        return path.suffix.lower() == ".json"
+    return any((path / f"transforms{end}.json").is_file() for end in ("", "_train"))
 
 
 def read_transforms(path: Path, settings: PhotoSettings) -> PosedPhotos:

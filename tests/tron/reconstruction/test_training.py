@@ -199,8 +199,7 @@ def test_normals_beside_the_subject_ask_for_nothing(painted, painted_capture) ->
 
 @pytest.mark.parametrize("ssim", [0.0, 0.2])
 def test_nothing_is_learnt_where_the_photo_is_not_believed(painted_capture, ssim: float) -> None:
-    """Of masked-out pixels nothing is asked, whatever stands there; nor does it change what is asked of
-    others.
+    """Of masked-out pixels nothing is asked, whatever stands there; others are asked what they were.
 
     (SSIM's windows reach over the mask's edge and see the same there on both sides: less is asked beside it.)
     """
