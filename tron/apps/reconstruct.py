@@ -23,7 +23,15 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-RESULTS = ("scene.ply", "environment.exr", "metrics.json", "curve.json", "light.png", "contact_sheet.png")
+RESULTS = (
+    "scene.ply",
+    "cameras.json",
+    "environment.exr",
+    "metrics.json",
+    "curve.json",
+    "light.png",
+    "contact_sheet.png",
+)
 SURFEL_BYTES = 1600  # PLY, checkpoint with Adam's moments, and their temporary copies
 
 
@@ -31,7 +39,8 @@ def main(settings: Settings) -> None:
     """Turn posed photos, bare photos or path-traced views into surfels with materials, and find their light.
 
     Writes scene.ply, which tron-relight and every 3DGS viewer open, environment.exr, metrics.json (held-out
-    and training views), contact_sheet.png (held-out views and every channel), light.png and config.yaml. A
+    and training views), contact_sheet.png (held-out views and every channel), light.png, cameras.json (where
+    the photos were taken, for tron-relight) and config.yaml. A
     run that was interrupted resumes when it is started again.
     """
     prior = make(settings.prior, "prior")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 import tron
+from tron.apps.filmed_space import write_cameras
 from tron.apps.reconstruct_pictures import write_light, write_sheet
 from tron.apps.reconstruct_settings import Settings
 from tron.captures import Capture
@@ -59,6 +60,7 @@ def run(settings: Settings, capture: Capture, prior: Prior, lpips: LPIPS | None)
     finally:
         bars.close()
     found.scene.save(out / "scene.ply")
+    write_cameras(out, capture.views)
     tracer = SurfelTracer(found.scene)
     started = time.perf_counter()
     light: EnvironmentFit | None = None

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from tron.apps import reconstruct_run as app
+from tron.apps.camera_files import cameras_of
 from tron.apps.reconstruct import cli
 from tron.apps.reconstruct_pictures import sheet_estimation
 from tron.apps.relight import cli as relight_cli
@@ -116,6 +117,7 @@ def copied(finished: Path, tmp_path: Path) -> Path:
 def test_it_writes_everything_that_it_says(finished: Path):
     assert {path.name for path in finished.iterdir() if not path.name.startswith(".")} == {
         "scene.ply",
+        "cameras.json",
         "environment.exr",
         "metrics.json",
         "curve.json",
@@ -180,6 +182,10 @@ def test_what_it_writes_can_be_relit(variant, finished: Path, tmp_path: Path):
     assert not exit_info.value.code
     report = json.loads((out / "relight.json").read_text())
     assert report["scene"]["materials_guessed"] is False
+    filmed = np.stack([camera.position for camera in cameras_of(finished / "cameras.json")])
+    place = Camera.from_dict(report["cameras"][0]).position
+    assert filmed.min(axis=0)[2] < place[2] < filmed.max(axis=0)[2]
+    assert np.linalg.norm(place[:2]) == pytest.approx(3, abs=0.1)  # as far as the photos were taken from
     assert read_image(out / "frames" / "0000.mask.exr").max() > 0.9
 
 
