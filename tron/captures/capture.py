@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from tron.captures.content import content_hash
-from tron.captures.view import View
+from tron.captures.view import ToneCurve, View
 from tron.errors import TronError
 
 
@@ -28,6 +28,7 @@ class Capture:
         exposure: what linear radiance is multiplied by before AgX to look like the images; one number for
             all, because all show one light. Radiance of unknown scale has 1.
         skipped: what the files name and the capture lacks: name -> why, such as "image not found".
+        tone_curve: that display images went through.
 
     Raises:
         TronError: no views, names that repeat, a held-out name that no view has, no view left to train on,
@@ -42,6 +43,7 @@ class Capture:
     exposure: float = 1.0
     transform: np.ndarray = field(default_factory=lambda: np.eye(4))
     skipped: Mapping[str, str] = field(default_factory=dict)
+    tone_curve: ToneCurve = "srgb"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "views", tuple(self.views))

@@ -202,6 +202,7 @@ def read_capture_folder(path: str | os.PathLike[str]) -> Capture:
             exposure=tron.exposure,
             transform=np.array(tron.transform),
             skipped=tron.skipped,
+            tone_curve="agx",
         )
 
 

@@ -13,6 +13,9 @@ from tron.errors import TronError
 
 ColorSpace = Literal["linear", "display"]
 
+ToneCurve = Literal["srgb", "agx"]
+"""Curve that display values went through: a camera's, taken for sRGB, or AgX, that of path-traced views."""
+
 Pixels = np.ndarray | Callable[[], np.ndarray]
 """An array, or what reads one when it is asked for, such as ``partial(read_image, path)``."""
 

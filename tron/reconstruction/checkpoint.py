@@ -37,6 +37,8 @@ def save_checkpoint(path: Path, stage: Stage, made_with: Mapping[str, Any], seco
     tensors = stage.surfels.state()
     if stage.plan.density is not None:
         tensors |= stage.plan.density.state()
+    for part in (stage.exposures, stage.bystanders):
+        tensors |= part.state() if part is not None else {}
     about = {"stage": stage.plan.name, "step": stage.step, "psnr": stage.psnr, "seconds": seconds}
     metadata = {
         "format": _FORMAT,
@@ -90,3 +92,6 @@ class Checkpoint:
         stage.step, stage.psnr = self.step, self.psnr
         if stage.plan.density is not None:
             stage.plan.density.restore(self.tensors, stage.surfels.device)
+        for part in (stage.exposures, stage.bystanders):
+            if part is not None:
+                part.restore(self.tensors)

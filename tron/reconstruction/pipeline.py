@@ -92,7 +92,7 @@ def reconstruct(
     radiance = settings.radiance.scaled(settings.steps_scaler, placed=source == "depth")
     wanted = [] if radiance.normal == 0 else ["normal"]
     taught = apply_prior(capture, prior, fields=wanted, track=track) if wanted else capture
-    plan = radiance_plan(radiance, extent, settings.seed)
+    plan = radiance_plan(radiance, extent, settings.seed, capture.tone_curve)
     most = radiance.density.most
     surfels = run.stage(
         plan, taught.train_views, lambda: initial_surfels(taught, settings.initial, settings.seed, most)

@@ -17,8 +17,11 @@ import torch
 from torch import Tensor
 
 from tron.captures import View
+from tron.captures.view import ToneCurve
 from tron.errors import TronError
+from tron.reconstruction.bystanders import Bystanders
 from tron.reconstruction.density import DensityControl
+from tron.reconstruction.photo_exposure import PhotoExposures
 from tron.reconstruction.settings import MaterialSettings, RadianceSettings
 from tron.reconstruction.supervision import MATERIALS, Weights, loss_of, pictures, targets
 from tron.reconstruction.surfels import LearntSurfels
@@ -27,6 +30,9 @@ from tron.tracing.torch_bridge import render
 
 Background = Literal["black", "white", "random"]
 _PSNR_MEMORY = 0.98
+_EXPOSURES_FROM = 0.1
+_BYSTANDERS_FROM = 0.3
+"""Parts of the steps after which photos are compared with what the others say: before, that is little."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,8 @@ class Plan:
         sh_every: steps after which one more degree is learnt.
         background: behind the surfels.
         density: makes and removes surfels; None leaves their number.
+        exposures: curve of the photos whose exposures are found; None takes them as exposed alike.
+        bystanders: ratio of :class:`Bystanders`; 0 leaves out nobody.
     """
 
     name: str
@@ -81,6 +89,8 @@ class Plan:
     sh_every: int = 1
     background: Background = "black"
     density: DensityControl | None = None
+    exposures: ToneCurve | None = None
+    bystanders: float = 0.0
 
     def learning(self, names: Collection[str]) -> Plan:
         """The same plan, learning these parameters alone."""
@@ -89,8 +99,13 @@ class Plan:
         return replace(self, rates=kept, final_rates=final)
 
 
-def radiance_plan(settings: RadianceSettings, extent: float, seed: int) -> Plan:
-    """Stage 1: geometry and radiance; ``extent`` in world units scales the rate of the positions."""
+def radiance_plan(
+    settings: RadianceSettings, extent: float, seed: int, tone_curve: ToneCurve = "srgb"
+) -> Plan:
+    """Stage 1: geometry and radiance.
+
+    ``extent`` in world units scales the rate of the positions; ``tone_curve`` is that of the photos.
+    """
     rates = {
         "means": settings.position_rate * extent,
         "quats": settings.rotation_rate,
@@ -110,6 +125,8 @@ def radiance_plan(settings: RadianceSettings, extent: float, seed: int) -> Plan:
         sh_every=settings.sh_every,
         background=settings.background,
         density=DensityControl(settings.density, extent, seed),
+        exposures=tone_curve if settings.exposures else None,
+        bystanders=settings.bystanders,
     )
 
 
@@ -147,6 +164,12 @@ class Stage:
         self.kernel_degree, self.seed = kernel_degree, seed
         self.step = 0
         self.psnr = float("nan")
+        self.exposures: PhotoExposures | None = None
+        self.bystanders: Bystanders | None = None
+        if plan.exposures is not None:
+            self.exposures = PhotoExposures(views, plan.exposures, round(_EXPOSURES_FROM * plan.steps))
+        if plan.bystanders > 0:
+            self.bystanders = Bystanders(plan.bystanders, round(_BYSTANDERS_FROM * plan.steps))
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
     def run(self, watch: Watch | None = None) -> None:
@@ -171,6 +194,11 @@ class Stage:
             surfels.rendered(), view.camera, kernel_degree=self.kernel_degree, sh_degree=self.sh_degree
         )
         background = self._background()
+        if self.exposures is not None:
+            stored, target = target, self.exposures.balanced(view, target)
+            self.exposures.observe(view, self.step, rendered, stored)
+        if self.bystanders is not None and "image" in target:
+            target = self.bystanders.without(self.step, *pictures(rendered, target, background), target)
         loss = loss_of(rendered, target, plan.weights, background)
         if not loss.requires_grad:
             raise TronError(
