@@ -59,7 +59,7 @@ def main(settings: Settings) -> None:
     set_torch_threads(1)
     with locked(settings.output_dir):
         _claim(settings, capture, prior)
-        report = _finished(settings)
+        report = _finished(settings, capture)
         if report is None:
             from tron.apps.reconstruct_run import run
 
@@ -97,11 +97,13 @@ def _claim(settings: Settings, capture: Capture, prior: Prior) -> None:
     write_atomic(settings.output_dir / "config.yaml", text)
 
 
-def _finished(settings: Settings) -> dict[str, Any] | None:
-    """The report of a run with these settings that came to its end, all its files still there; else None."""
+def _finished(settings: Settings, capture: Capture) -> dict[str, Any] | None:
+    """The report of a run with these settings and photos that came to its end, all its files there."""
+    from tron.apps.reconstruct_run import shown_by
+
     try:
         report = json.loads((settings.output_dir / "metrics.json").read_text("utf-8"))
-        same = report["settings"] == settings.kept()
+        same = report["settings"] == settings.kept() and report["capture"]["content"] == shown_by(capture)
         files = [
             "scene.ply",
             "contact_sheet.png",

@@ -15,6 +15,7 @@ from tron.apps.filmed_space import write_cameras
 from tron.apps.reconstruct_pictures import write_light, write_sheet
 from tron.apps.reconstruct_settings import Settings
 from tron.captures import Capture
+from tron.captures.content import content_hash
 from tron.cli.progress import Progress, track
 from tron.metrics import LPIPS
 from tron.priors import Prior
@@ -86,6 +87,11 @@ def run(settings: Settings, capture: Capture, prior: Prior, lpips: LPIPS | None)
     return report
 
 
+def shown_by(capture: Capture) -> list[str]:
+    """Hashes of what training and held-out views show, by which a capture is known again."""
+    return [capture.content, content_hash(capture.test_views)]
+
+
 class StageBars:
     """A bar for each stage as it comes."""
 
@@ -127,6 +133,7 @@ def _report(
             "skipped": dict(capture.skipped),
             "up": capture.up.tolist(),
             "transform": capture.transform.tolist(),
+            "content": shown_by(capture),
         },
         "surfels": len(found.scene),
         "materials_learnt": list(found.learnt),

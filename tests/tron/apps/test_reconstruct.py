@@ -291,6 +291,14 @@ def test_photos_replaced_under_their_names_are_another_capture(
     assert "a checkpoint made with capture=" in capsys.readouterr().err
     assert reconstruct(copied) == 0  # the same photos are still the same capture
     assert not steps
+    report = json.loads((copied / "metrics.json").read_text())
+    report["capture"]["content"][1] = "another held-out photo"
+    (copied / "metrics.json").write_text(json.dumps(report))
+    assert reconstruct(copied) == 0
+    assert not steps  # what was learnt stays, what was scored does not
+    assert (
+        json.loads((copied / "metrics.json").read_text())["capture"]["content"][1] != "another held-out photo"
+    )
 
 
 def test_without_priors_for_light_there_is_no_light_and_it_is_said(
