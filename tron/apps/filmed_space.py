@@ -60,8 +60,8 @@ def filmed_orbit(
 ) -> list[Camera]:
     """A path that loops, from where the photos were taken.
 
-    Around what the photos look at if they were taken from all sides; to and fro, slowing down at the ends, if
-    they leave a gap of more than 60 degrees. Height, distance and what is looked at are, for each direction,
+    Around what the photos look at if they were taken from all sides; to and fro from the middle, slowing down
+    at the ends, if they leave a gap of more than 60 degrees. Height, distance and what is looked at are, for each direction,
     those of the photos taken from about there (means with a Gaussian of 15 degrees), so that the path lies
     between them. Where photos look outwards, as in a room, it goes through their cameras one after another.
 
@@ -105,7 +105,7 @@ def _angles(azimuth: np.ndarray, n: int) -> np.ndarray:
     if gaps[widest] < _AROUND_DEG:
         return 360 * np.arange(n) / n
     first, span = ordered[(widest + 1) % len(ordered)], 360 - gaps[widest]
-    return first + span * (0.5 - 0.5 * np.cos(2 * np.pi * np.arange(n) / n))
+    return first + span * (0.5 + 0.5 * np.sin(2 * np.pi * np.arange(n) / n))
 
 
 def _level(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -41,9 +41,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-STILL_OF = 8
-"""A clip that stands still is taken from a quarter of the way around an orbit of so many frames."""
-
 
 def main(settings: Settings) -> None:
     """Light a Gaussian scene with environment maps and film it along a camera path.
@@ -119,7 +116,7 @@ def _planned(settings: Settings, scene: GaussianScene, turn: np.ndarray) -> list
     filmed = turn_cameras(filmed, turn)
     if settings.trajectory == "orbit":
         return filmed_orbit(filmed, settings.frames, up=scene.up, **view)
-    return filmed_orbit(filmed, STILL_OF, up=scene.up, **view)[STILL_OF // 4 :][:1] * settings.frames
+    return filmed_orbit(filmed, 1, up=scene.up, **view) * settings.frames
 
 
 class _Clock:

@@ -20,8 +20,11 @@ from tron.captures.view import ToneCurve
 from tron.color import agx, linear_to_srgb, srgb_to_linear
 from tron.priors.linear_light import inverse_agx
 
-_SAMPLES = 4096
-_FEWEST = 100
+_SAMPLES = 1 << 16
+_PATCHES = 16
+"""Patches along the longer side of a photo."""
+_FEWEST = 8
+_USABLE = 0.5
 _COVERED = 0.9
 _UNCLIPPED = (0.05, 0.95)
 _BLEND = 0.5
@@ -81,28 +84,46 @@ class PhotoExposures:
         """
         if step < self.begin or "image" not in target:
             return
-        opacity = rendered["opacity"].detach()
+        opacity, photo = rendered["opacity"].detach(), target["image"]
         usable = opacity > _COVERED
         for name, least in (("mask", _COVERED), ("valid", 0.5)):
             if name in target:
                 usable = usable & (target[name] > least)
         picture = rendered["rgb"].detach() / opacity.clamp(min=_COVERED)[..., None]
-        photo = target["image"]
         low, high = _UNCLIPPED
         for image in (photo, picture):
             usable = usable & (image > low).all(-1) & (image < high).all(-1)
-        places = torch.nonzero(usable.reshape(-1))[:, 0]
-        if len(places) < _FEWEST:
+        found = self._compared(*(each.cpu().numpy() for each in (photo, picture, usable)))
+        if found is None:
             return
-        places = places[:: max(1, len(places) // _SAMPLES)]
-        shown, seen = (
-            np.log(np.maximum(self._decoded(image.reshape(-1, 3)[places].cpu().numpy()), 1e-4))
-            for image in (photo, picture)
-        )
-        found = np.median(shown - seen, axis=0)
         index = self._place[view.name]
         before = self._log[index]
         self._log[index] = found if np.isnan(before[0]) else before + _BLEND * (found - before)
+
+    def _compared(self, photo: np.ndarray, picture: np.ndarray, usable: np.ndarray) -> np.ndarray | None:
+        """(3,) median over patches of log(photo / picture), linear; None where too few patches can be used.
+
+        Patches, because surfels are blurred photos for long: the mean of a patch is what a blur keeps, the
+        median of its logarithm is not.
+        """
+        step = max(1, round((photo[..., 0].size / _SAMPLES) ** 0.5))
+        photo, picture, usable = (each[::step, ::step] for each in (photo, picture, usable))
+        side = max(2, max(usable.shape) // _PATCHES)
+        rows, columns = (length // side for length in usable.shape)
+        weights = usable[: rows * side, : columns * side, None].astype(np.float64)
+
+        def sums(values: np.ndarray) -> np.ndarray:
+            return values.reshape(rows, side, columns, side, -1).sum((1, 3)).reshape(rows * columns, -1)
+
+        share = sums(weights)[:, 0] / side**2
+        kept = share > _USABLE
+        if kept.sum() < _FEWEST:
+            return None
+        light = [
+            sums(self._decoded(each[: rows * side, : columns * side]) * weights)[kept]
+            for each in (photo, picture)
+        ]
+        return np.median(np.log(light[0]) - np.log(light[1]), axis=0)
 
     def state(self) -> dict[str, Tensor]:
         """Tensors for a checkpoint."""
