@@ -60,10 +60,11 @@ def filmed_orbit(
 ) -> list[Camera]:
     """A path that loops, from where the photos were taken.
 
-    Around what the photos look at if they were taken from all sides; to and fro from the middle, slowing down at
-    the ends, if they leave a gap of more than 60 degrees. Height, distance and what is looked at are, for each
-    direction, those of the photos taken from about there (means with a Gaussian of 15 degrees), so that the path
-    lies between them. Where photos look outwards, as in a room, it goes through their cameras in order.
+    Around what the photos look at if they were taken from all sides; to and fro from the middle, slowing
+    down at the ends, if they leave a gap of more than 60 degrees. Height, distance and what is looked at
+    are, for each direction, those of the photos taken from about there (means with a Gaussian of 15
+    degrees), so that the path lies between them. Where photos look outwards, as in a room, it goes through
+    their cameras in order.
 
     Args:
         filmed: at least one camera.
