@@ -102,7 +102,7 @@ class RadianceSettings(Settings):
         default="black", description="Background behind surfels and masked subjects."
     )
     exposures: bool = Field(
-        default=False,
+        default=True,
         description="Find the exposure and white balance of each photo; false takes all as exposed alike.",
     )
     bystanders: float = Field(
