@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 RESULTS = (
-    *("scene.ply", "environment.exr", "metrics.json", "curve.json"),
+    *("scene.ply", "cameras.json", "environment.exr", "metrics.json", "curve.json"),
     *("light.png", "contact_sheet.png", "report.html"),
 )
 SURFEL_BYTES = 1600  # PLY, checkpoint with Adam's moments, and their temporary copies
@@ -38,8 +38,8 @@ def main(settings: Settings) -> None:
 
     Writes scene.ply, which tron-relight and every 3DGS viewer open, environment.exr, metrics.json (held-out
     and training views), report.html (the scene relit, its G-buffers, its light, how sure each figure is),
-    contact_sheet.png (held-out views and every channel), light.png and config.yaml. A run that was
-    interrupted resumes when it is started again.
+    contact_sheet.png (held-out views and every channel), light.png, cameras.json (where the photos were
+    taken, for tron-relight) and config.yaml. A run that was interrupted resumes when it is started again.
     """
     prior = make(settings.prior, "prior")
     lpips = _load_lpips(settings)
@@ -58,7 +58,7 @@ def main(settings: Settings) -> None:
     set_torch_threads(1)
     with locked(settings.output_dir):
         _claim(settings, capture, prior)
-        report = _finished(settings)
+        report = _finished(settings, capture)
         if report is None:
             from tron.apps.reconstruct_run import run
 
@@ -105,11 +105,13 @@ def _claim(settings: Settings, capture: Capture, prior: Prior | Joint) -> None:
     write_atomic(settings.output_dir / "config.yaml", text)
 
 
-def _finished(settings: Settings) -> dict[str, Any] | None:
-    """The report of a run with these settings that came to its end, all its files still there; else None."""
+def _finished(settings: Settings, capture: Capture) -> dict[str, Any] | None:
+    """The report of a run with these settings and photos that came to its end, all its files there."""
+    from tron.apps.reconstruct_run import shown_by
+
     try:
         report = json.loads((settings.output_dir / "metrics.json").read_text("utf-8"))
-        same = report["settings"] == settings.kept()
+        same = report["settings"] == settings.kept() and report["capture"]["content"] == shown_by(capture)
         files = [
             "scene.ply",
             "contact_sheet.png",

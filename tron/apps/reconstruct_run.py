@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 
 import tron
+from tron.apps.filmed_space import write_cameras
 from tron.apps.reconstruct_pictures import write_light, write_sheet
 from tron.apps.reconstruct_report import write_page
 from tron.apps.reconstruct_settings import Settings
 from tron.captures import Capture
+from tron.captures.content import content_hash
 from tron.cli.progress import Progress, track
 from tron.metrics import LPIPS
 from tron.priors import Prior
@@ -61,6 +63,7 @@ def run(settings: Settings, capture: Capture, prior: Prior | Joint, lpips: LPIPS
     finally:
         bars.close()
     found.scene.save(out / "scene.ply")
+    write_cameras(out, capture.views)
     tracer = SurfelTracer(found.scene)
     started = time.perf_counter()
     environment, said = None, None
@@ -91,6 +94,11 @@ def run(settings: Settings, capture: Capture, prior: Prior | Joint, lpips: LPIPS
         write_page(out / PAGE, settings.report, report, found.scene, capture, environment)
     write_atomic(out / "metrics.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
     return report
+
+
+def shown_by(capture: Capture) -> list[str]:
+    """Hashes of what training and held-out views show, by which a capture is known again."""
+    return [capture.content, content_hash(capture.test_views)]
 
 
 class StageBars:
@@ -134,6 +142,7 @@ def _report(
             "skipped": dict(capture.skipped),
             "up": capture.up.tolist(),
             "transform": capture.transform.tolist(),
+            "content": shown_by(capture),
         },
         "surfels": len(found.scene),
         "first_surfels": {"source": found.source, "stereo_confident": found.confident},

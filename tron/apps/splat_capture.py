@@ -177,8 +177,8 @@ def _agreeing(views: Sequence[View], settings: ConsistencySettings, device: str)
     maps = []
     for view in views:
         subject, depth = view.read("mask") > SOLID, view.read("depth")
-        rays, empty = tensor(view.camera.rays()), empty_rays(torch.from_numpy(subject).to(device))
-        maps.append(DepthMap(view.camera, rays, tensor(depth), tensor(subject & (depth > 0)), empty))
+        empty = empty_rays(torch.from_numpy(subject).to(device))
+        maps.append(DepthMap(view.camera, tensor(depth), tensor(subject & (depth > 0)), empty))
     field = fuse(maps, pixel_footprint(maps), settings.truncation, settings.most_voxels)
     if field is None:
         return [replace(view, depth=None) for view in views]

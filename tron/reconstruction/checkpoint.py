@@ -44,8 +44,8 @@ def save_checkpoint(
     tensors = stage.surfels.state()
     if stage.plan.density is not None:
         tensors |= stage.plan.density.state()
-    if stage.fused is not None:
-        tensors |= stage.fused.state()
+    for part in (stage.fused, stage.exposures, stage.bystanders):
+        tensors |= part.state() if part is not None else {}
     about = {
         **{"stage": stage.plan.name, "step": stage.step, "psnr": stage.psnr, "seconds": seconds},
         "begun": dict(begun or {}),
@@ -105,3 +105,6 @@ class Checkpoint:
             stage.plan.density.restore(self.tensors, stage.surfels.device)
         if stage.fused is not None:
             stage.fused.restore(self.tensors, stage.surfels.device)
+        for part in (stage.exposures, stage.bystanders):
+            if part is not None:
+                part.restore(self.tensors)

@@ -6,7 +6,6 @@ settings and checkpoint goes on where the last call was cut off.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -107,7 +106,7 @@ def reconstruct(
     most = settings.radiance.density.most
     first = run.begin(lambda: beginning(taught, settings.initial, settings.seed, most, device, track))
     radiance = settings.radiance.scaled(settings.steps_scaler, place_of(run.begun["source"]))
-    plan = radiance_plan(radiance, extent, settings.seed, normals_given=given)
+    plan = radiance_plan(radiance, extent, settings.seed, capture.tone_curve, normals_given=given)
     surfels = run.stage(plan, taught.train_views, first)
     scene = surfels.scene(settings.initial.kernel_degree, capture.up)
     if isinstance(prior, Joint):
@@ -134,11 +133,8 @@ def reconstruct(
 
 def made_with(capture: Capture, prior: Prior | Joint, settings: ReconstructionSettings) -> dict[str, Any]:
     """All that a reconstruction is a function of, as plain values: a checkpoint of others is refused."""
-    digest = hashlib.sha256()
-    for view in capture.train_views:
-        digest.update(repr((view.name, view.camera.to_dict())).encode())
     values = settings.model_dump(mode="json", exclude={"checkpoint_every"})
-    return {"capture": digest.hexdigest(), "prior": repr(prior), **values}
+    return {"capture": capture.content, "prior": repr(prior), **values}
 
 
 class _Run:

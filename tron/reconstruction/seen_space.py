@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tron.cameras import focus_of
 from tron.captures import Capture, View
 from tron.errors import TronError
 from tron.seeds import generator
@@ -26,7 +27,7 @@ def random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
     may be so small that fewer points are found.
     """
     views = capture.train_views
-    focus, outward = _focus([view.camera.camera_to_world for view in views])
+    focus, outward = focus_of([view.camera.camera_to_world for view in views])
     reach = np.abs(np.stack([view.camera.position for view in views]) - focus).max(axis=0)
     reach = np.maximum(reach, 0.1 * reach.max()) * (_OUTWARD if outward else 1)
     masks = [view.read("mask") > 0.5 if view.has("mask") else None for view in views]
@@ -74,22 +75,3 @@ def pixels_of(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
         within = (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
         column, row = np.where(within[:, None], pixels, 0).astype(int).T
     return column, row, within
-
-
-def _focus(camera_to_world: Sequence[np.ndarray]) -> tuple[np.ndarray, bool]:
-    """(3,) the point nearest to all optical axes, and whether these diverge.
-
-    Nearest by least squares; in front of the cameras if the axes diverge.
-    """
-    matrices = np.stack(camera_to_world)
-    origins, axes = matrices[:, :3, 3], matrices[:, :3, 2]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    normal = across.sum(0)
-    centre = origins.mean(0)
-    spread = np.linalg.norm(origins - centre, axis=1).mean()
-    # Parallel axes meet nowhere: a little pull towards a point before the cameras decides.
-    ahead = centre + axes.mean(0) * spread
-    pull = 1e-3 * len(origins)
-    point = np.linalg.solve(normal + pull * np.eye(3), np.einsum("nij,nj->i", across, origins) + pull * ahead)
-    in_front = np.einsum("ni,ni->n", point - origins, axes) > 0
-    return (point, False) if in_front.mean() > 0.5 else (ahead, True)

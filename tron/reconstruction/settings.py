@@ -173,6 +173,16 @@ class RadianceSettings(Settings):
     background: Literal["black", "white", "random"] = Field(
         default="black", description="Background behind surfels and masked subjects."
     )
+    exposures: bool = Field(
+        default=True,
+        description="Find the exposure and white balance of each photo; false takes all as exposed alike.",
+    )
+    bystanders: float = Field(
+        default=0.0,
+        ge=0,
+        description="Leave out patches of a photo whose error is so many times the usual one (3 is a good "
+        "number), as passers-by have; 0 leaves out none.",
+    )
     density: DensitySettings = Field(
         default_factory=lambda: DensitySettings(), description="Surfels added and removed."
     )

@@ -17,9 +17,12 @@ import torch
 from torch import Tensor
 
 from tron.captures import View
+from tron.captures.view import ToneCurve
 from tron.errors import TronError
+from tron.reconstruction.bystanders import Bystanders
 from tron.reconstruction.consistency import FusedNormals
 from tron.reconstruction.density import DensityControl
+from tron.reconstruction.photo_exposure import PhotoExposures
 from tron.reconstruction.settings import ConsistencySettings, MaterialSettings, RadianceSettings
 from tron.reconstruction.supervision import MATERIALS, Weights, loss_of, pictures, targets
 from tron.reconstruction.surfels import LearntSurfels
@@ -28,6 +31,9 @@ from tron.tracing.torch_bridge import render
 
 Background = Literal["black", "white", "random"]
 _PSNR_MEMORY = 0.98
+_EXPOSURES_FROM = 0.1
+_BYSTANDERS_FROM = 0.3
+"""Parts of the steps after which photos are compared with what the others say: before, that is little."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,8 @@ class Plan:
         background: behind the surfels.
         density: makes and removes surfels; None leaves their number.
         consistency: pulls normals to those that the views' depths agree on; None does not.
+        exposures: curve of the photos whose exposures are found; None takes them as exposed alike.
+        bystanders: ratio of :class:`Bystanders`; 0 leaves out nobody.
     """
 
     name: str
@@ -84,6 +92,8 @@ class Plan:
     background: Background = "black"
     density: DensityControl | None = None
     consistency: ConsistencySettings | None = None
+    exposures: ToneCurve | None = None
+    bystanders: float = 0.0
 
     def learning(self, names: Collection[str]) -> Plan:
         """The same plan, learning these parameters alone."""
@@ -93,11 +103,17 @@ class Plan:
 
 
 def radiance_plan(
-    settings: RadianceSettings, extent: float, seed: int, *, normals_given: bool = False
+    settings: RadianceSettings,
+    extent: float,
+    seed: int,
+    tone_curve: ToneCurve = "srgb",
+    *,
+    normals_given: bool = False,
 ) -> Plan:
-    """Stage 1: geometry and radiance; ``extent`` in world units scales the rate of the positions.
+    """Stage 1: geometry and radiance.
 
-    Normals are pulled to those that the views' depths agree on unless a prior gives some (``normals_given``).
+    ``extent`` in world units scales the rate of the positions; ``tone_curve`` is that of the photos. Normals
+    are pulled to those that the views' depths agree on unless a prior gives some (``normals_given``).
     """
     own = settings.consistency.weight if not normals_given else 0.0
     rates = {
@@ -122,6 +138,8 @@ def radiance_plan(
         background=settings.background,
         density=DensityControl(settings.density, extent, seed),
         consistency=settings.consistency if own else None,
+        exposures=tone_curve if settings.exposures else None,
+        bystanders=settings.bystanders,
     )
 
 
@@ -162,6 +180,12 @@ class Stage:
         self.fused: FusedNormals | None = None
         if plan.consistency is not None:
             self.fused = FusedNormals(plan.consistency, views, kernel_degree)
+        self.exposures: PhotoExposures | None = None
+        self.bystanders: Bystanders | None = None
+        if plan.exposures is not None:
+            self.exposures = PhotoExposures(views, plan.exposures, round(_EXPOSURES_FROM * plan.steps))
+        if plan.bystanders > 0:
+            self.bystanders = Bystanders(plan.bystanders, round(_BYSTANDERS_FROM * plan.steps))
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
     def run(self, watch: Watch | None = None) -> None:
@@ -189,6 +213,11 @@ class Stage:
             surfels.rendered(), view.camera, kernel_degree=self.kernel_degree, sh_degree=self.sh_degree
         )
         background = self._background()
+        if self.exposures is not None:
+            stored, target = target, self.exposures.balanced(view, target)
+            self.exposures.observe(view, self.step, rendered, stored)
+        if self.bystanders is not None and "image" in target:
+            target = self.bystanders.without(self.step, *pictures(rendered, target, background), target)
         loss = loss_of(rendered, target, plan.weights, background)
         if not loss.requires_grad:
             raise TronError(

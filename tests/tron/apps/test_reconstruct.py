@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from tron.apps import reconstruct_run as app
+from tron.apps.camera_files import cameras_of
 from tron.apps.reconstruct import cli
 from tron.apps.reconstruct_pictures import sheet_estimation
 from tron.apps.relight import cli as relight_cli
@@ -18,7 +19,7 @@ from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import write_capture
 from tron.gaussians import GaussianScene
-from tron.images import read_image
+from tron.images import read_image, write_image
 from tron.shading.environment import EnvironmentMap
 from tron.tracing import SurfelTracer
 
@@ -117,6 +118,7 @@ def copied(finished: Path, tmp_path: Path) -> Path:
 def test_it_writes_everything_that_it_says(finished: Path):
     assert {path.name for path in finished.iterdir() if not path.name.startswith(".")} == {
         "scene.ply",
+        "cameras.json",
         "environment.exr",
         "metrics.json",
         "curve.json",
@@ -183,6 +185,10 @@ def test_what_it_writes_can_be_relit(variant, finished: Path, tmp_path: Path):
     assert not exit_info.value.code
     report = json.loads((out / "relight.json").read_text())
     assert report["scene"]["materials_guessed"] is False
+    filmed = np.stack([camera.position for camera in cameras_of(finished / "cameras.json")])
+    place = Camera.from_dict(report["cameras"][0]).position
+    assert filmed.min(axis=0)[2] < place[2] < filmed.max(axis=0)[2]
+    assert np.linalg.norm(place[:2]) == pytest.approx(3, abs=0.1)  # as far as the photos were taken from
     assert read_image(out / "frames" / "0000.mask.exr").max() > 0.9
 
 
@@ -275,6 +281,27 @@ def test_other_settings_are_refused_and_change_nothing_unless_told_to(
     assert (out / "scene.ply").read_bytes() != before["scene.ply"]
     assert not (out / "environment.exr").exists()  # the old light is not the new scene's
     assert json.loads((out / "metrics.json").read_text())["light"] is None
+
+
+def test_photos_replaced_under_their_names_are_another_capture(
+    reconstruct, steps, capture_path, copied: Path, tmp_path: Path, capsys
+):
+    other = Path(shutil.copytree(capture_path, tmp_path / "capture"))
+    photo = other / "images" / "01.png"
+    write_image(photo, read_image(photo, 4)[:, ::-1].copy())
+    capsys.readouterr()
+    assert reconstruct(copied, f"capture={other}") == 2
+    assert "a checkpoint made with capture=" in capsys.readouterr().err
+    assert reconstruct(copied) == 0  # the same photos are still the same capture
+    assert not steps
+    report = json.loads((copied / "metrics.json").read_text())
+    report["capture"]["content"][1] = "another held-out photo"
+    (copied / "metrics.json").write_text(json.dumps(report))
+    assert reconstruct(copied) == 0
+    assert not steps  # what was learnt stays, what was scored does not
+    assert (
+        json.loads((copied / "metrics.json").read_text())["capture"]["content"][1] != "another held-out photo"
+    )
 
 
 def test_without_priors_for_light_there_is_no_light_and_it_is_said(

@@ -21,7 +21,7 @@ from tron.reconstruction.photographed_sky import photographed_sky
 from tron.seeds import generator
 from tron.shading.bounce import BounceTransport
 from tron.shading.cubemap import direction_face
-from tron.shading.environment import EnvironmentMap
+from tron.shading.environment import EnvironmentLight, EnvironmentMap
 from tron.shading.guidance import render_guidance
 from tron.shading.lighting import Lighting
 from tron.tracing import SurfelTracer
@@ -146,6 +146,7 @@ def test_the_sky_behind_the_scene_is_the_environment(
     known = sky.trust > 0.8
     assert 0.1 < known.mean() < 0.9
     centres = _texel_centres(8)
+    assert isinstance(lighting.light, EnvironmentLight)
     shown = lighting.light.environment.lookup(centres)
     off = np.abs(np.log(sky.radiance[known] / shown[known]))
     assert np.median(off) < 0.1
