@@ -9,7 +9,6 @@ import pytest
 
 from tron.apps.reconstruct import cli
 from tron.apps.splat_capture import SplatSettings, film_splats, is_splats, virtual_cameras
-from tron.captures import View
 from tron.errors import TronError
 from tron.gaussians.ply import MATERIAL_PROPERTIES
 from tron.gaussians.scene import GaussianScene, quats_from_normals
@@ -61,27 +60,6 @@ def test_pictures_and_depths_are_those_of_the_oriented_surfaces(variant, ball_on
             assert known.sum() > 0.7 * solid.sum()
             # The ball's far side faces the camera too, behind its near one: at its rim they meet.
             assert np.quantile(np.abs(view.read("depth") - true["depth"])[known], 0.9) < 0.06
-
-
-def test_a_depth_that_other_views_contradict_is_not_believed(variant, ball_on_floor, plain, monkeypatch):
-    import tron.apps.splat_capture as module
-
-    settings, real = SplatSettings(views=17, side=48), module._filmed
-    true: list[View] = []
-
-    def spoilt(scene, name, camera):
-        view = real(scene, name, camera)
-        if name != "film_00003":
-            return view
-        true.append(view)
-        return replace(view, depth=0.8 * view.read("depth"))
-
-    monkeypatch.setattr(module, "_filmed", spoilt)
-    views = film_splats(plain, settings, None, 8, ConsistencySettings(), 0, "cpu", untracked).train_views
-    (found,) = [view.read("depth") for view in views if view.name == "film_00003"]
-    known = (found > 0) & (true[0].read("mask") > 0.99)
-    # Its rays were walked on to where the others saw the surface, or given up.
-    assert np.quantile(np.abs(found - true[0].read("depth"))[known], 0.9) < 0.06
 
 
 def test_every_side_of_a_thing_is_filmed_and_nothing_from_below_a_floor(ball_on_floor):
