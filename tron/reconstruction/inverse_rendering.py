@@ -51,9 +51,7 @@ _CHROMA = 0.3  # log colour that counts as one spacing
 class RefinementSettings(Settings):
     """Refinement of materials against the photos."""
 
-    steps: int = Field(
-        default=200, ge=0, description="Steps; each shades one photo; 0 leaves materials alone."
-    )
+    steps: int = Field(default=0, ge=0, description="Steps; each shades one photo; 0 leaves materials alone.")
     views: int = Field(default=48, ge=1, description="Maximum number of photos.")
     pixels: int = Field(default=1 << 14, ge=1, description="Maximum pixels of each; larger ones are reduced.")
     rays: int = Field(default=16, ge=2, multiple_of=2, description="Shadow rays per pixel, even.")
