@@ -7,7 +7,6 @@ from pathlib import Path
 
 from eval.report.figures import row_cell
 from eval.report.outcome import Outcome
-from eval.report.page import Section, Table, Text
 from eval.results import Row
 from eval.tracing.measured import Measured
 from eval.tracing.page_bounce import bounce_section, equal_error_section
@@ -20,6 +19,7 @@ from eval.tracing.page_rays import (
     inside_section,
     shadow_section,
 )
+from tron.report.page import Section, Table, Text
 
 LEAD = (
     "TRON holds a captured scene as surfels: small flat disks whose opacity falls off like a Gaussian, with "

@@ -150,9 +150,10 @@ def _load_scene(settings: Settings) -> GaussianScene:
     scene = GaussianScene.load(settings.scene)
     if scene.materials_guessed:
         log.warning(
-            "%s has no materials: they are guessed from its colours, which keep the light it was captured in",
-            settings.scene,
-        )
+            "%s has no materials%s: they are guessed from its colours, which keep the light it was captured "
+            "in; tron-reconstruct capture=%s output_dir=OUT finds surfaces, materials and light",
+            settings.scene, "" if scene.oriented else " and normals without a sign", settings.scene,
+        )  # fmt: skip
     if settings.up is not None:
         scene.up = np.array(settings.up) / np.linalg.norm(settings.up)
     elif scene.up_guessed:

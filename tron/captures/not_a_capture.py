@@ -19,7 +19,10 @@ _MODEL = (
 )
 _KINDS: dict[str, tuple[str, str]] = {
     **dict.fromkeys(SUFFIXES, _PHOTO),
-    ".ply": ("a PLY of splats or points, not photos", "tron-relight scene=FILE takes splats"),
+    ".ply": (
+        "a PLY of splats or points, not photos",
+        "tron-reconstruct capture=FILE.ply and tron-relight scene=FILE.ply take splats",
+    ),
     **dict.fromkeys((".zip", ".tar", ".gz", ".tgz", ".7z"), _ARCHIVE),
     **dict.fromkeys((".hdr", ".exr"), _ENVIRONMENT),
     **dict.fromkeys((".obj", ".glb", ".gltf", ".fbx", ".stl"), _MODEL),

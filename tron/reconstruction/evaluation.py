@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tron.captures import View
-from tron.metrics import LPIPS, angular_error_deg, capped_psnr, scale_albedo, ssim
+from tron.metrics import LPIPS, angular_errors_deg, capped_psnr, scale_albedo, ssim
 from tron.priors import Track, untracked
 from tron.shading.guidance import ViewTracer
 
@@ -47,8 +47,9 @@ def score_views(
     """Score what the surfels show from each view.
 
     Figures: ``psnr``, ``ssim``, ``lpips`` of the whole frame; ``psnr_subject`` where the view has a mask;
-    ``normal_mae_deg``, ``base_color_psnr`` (linear, scaled), ``roughness_mae``, ``metallic_mae`` where the
-    view has the truth, over its subject. All are finite: a PSNR is at most PSNR_CAP of :mod:`tron.metrics`.
+    ``normal_mae_deg``, ``normal_median_deg``, ``base_color_psnr`` (linear, scaled), ``roughness_mae``,
+    ``metallic_mae`` where the view has the truth, over its subject. All are finite: a PSNR is at most
+    PSNR_CAP of :mod:`tron.metrics`.
 
     Args:
         tracer: the surfels.
@@ -110,7 +111,9 @@ def _figures(
         normal = view.read("normal")
         known = subject & normal.any(axis=-1)
         if known.any():
-            yield "normal_mae_deg", angular_error_deg(buffers["normal"], normal, known)
+            angles = angular_errors_deg(buffers["normal"], normal, known)
+            yield "normal_mae_deg", float(angles.mean())
+            yield "normal_median_deg", float(np.median(angles))
     if view.has("base_color"):
         truth = view.read("base_color")
         scaled = scale_albedo(buffers["base_color"], truth, subject)

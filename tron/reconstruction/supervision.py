@@ -17,6 +17,7 @@ from torch import Tensor
 
 from tron.captures import View
 from tron.gaussians.fields import MATERIALS
+from tron.reconstruction.consistency import normal_consistency
 from tron.reconstruction.losses import SSIM_WEIGHT, photometric_loss
 
 _COMPARED = ("image", "normal", *MATERIALS)
@@ -34,6 +35,7 @@ class Weights:
     roughness: float = 0.0
     metallic: float = 0.0
     ssim: float = SSIM_WEIGHT
+    consistency: float = 0.0
 
     def wanted(self) -> tuple[str, ...]:
         """The maps of a view that count, the mask and what is to be believed always among them."""
@@ -59,7 +61,7 @@ def loss_of(
 
     Args:
         rendered: images of :func:`tron.tracing.torch_bridge.render`.
-        target: the view's maps (see :func:`targets`).
+        target: the view's maps (see :func:`targets`), and ``fused_normal`` (see :mod:`.consistency`).
         weights: what counts.
         background: (3,) display colour behind the surfels.
     """
@@ -72,6 +74,8 @@ def loss_of(
         total = total + weights.normal * _normal_loss(rendered, target, weights.ssim)
     if weights.mask and mask is not None:
         total = total + weights.mask * (opacity - mask).abs().mean()
+    if weights.consistency and "fused_normal" in target:
+        total = total + weights.consistency * normal_consistency(rendered, target["fused_normal"])
     surface = opacity.detach() > _SURFACE
     if valid is not None:
         surface = surface & valid

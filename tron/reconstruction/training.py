@@ -20,9 +20,10 @@ from tron.captures import View
 from tron.captures.view import ToneCurve
 from tron.errors import TronError
 from tron.reconstruction.bystanders import Bystanders
+from tron.reconstruction.consistency import FusedNormals
 from tron.reconstruction.density import DensityControl
 from tron.reconstruction.photo_exposure import PhotoExposures
-from tron.reconstruction.settings import MaterialSettings, RadianceSettings
+from tron.reconstruction.settings import ConsistencySettings, MaterialSettings, RadianceSettings
 from tron.reconstruction.supervision import MATERIALS, Weights, loss_of, pictures, targets
 from tron.reconstruction.surfels import LearntSurfels
 from tron.seeds import generator
@@ -78,6 +79,7 @@ class Plan:
         density: makes and removes surfels; None leaves their number.
         exposures: curve of the photos whose exposures are found; None takes them as exposed alike.
         bystanders: ratio of :class:`Bystanders`; 0 leaves out nobody.
+        consistency: pulls normals to those that the views' depths agree on; None does not.
     """
 
     name: str
@@ -91,6 +93,7 @@ class Plan:
     density: DensityControl | None = None
     exposures: ToneCurve | None = None
     bystanders: float = 0.0
+    consistency: ConsistencySettings | None = None
 
     def learning(self, names: Collection[str]) -> Plan:
         """The same plan, learning these parameters alone."""
@@ -100,12 +103,19 @@ class Plan:
 
 
 def radiance_plan(
-    settings: RadianceSettings, extent: float, seed: int, tone_curve: ToneCurve = "srgb"
+    settings: RadianceSettings,
+    extent: float,
+    seed: int,
+    *,
+    normals_given: bool = False,
+    tone_curve: ToneCurve = "srgb",
 ) -> Plan:
-    """Stage 1: geometry and radiance.
+    """Stage 1: geometry and radiance; ``extent`` in world units scales the rate of the positions.
 
-    ``extent`` in world units scales the rate of the positions; ``tone_curve`` is that of the photos.
+    Normals are pulled to those that the views' depths agree on unless a prior gives some (``normals_given``);
+    ``tone_curve`` is that of the photos.
     """
+    own = settings.consistency.weight if not normals_given else 0.0
     rates = {
         "means": settings.position_rate * extent,
         "quats": settings.rotation_rate,
@@ -118,7 +128,9 @@ def radiance_plan(
     return Plan(
         name="radiance",
         steps=settings.steps,
-        weights=Weights(rgb=1.0, normal=settings.normal, mask=settings.mask, ssim=settings.ssim),
+        weights=Weights(
+            rgb=1.0, normal=settings.normal, mask=settings.mask, ssim=settings.ssim, consistency=own
+        ),
         rates=rates,
         final_rates={"means": settings.position_rate_final * extent},
         sh_degree=settings.sh_degree,
@@ -127,6 +139,7 @@ def radiance_plan(
         density=DensityControl(settings.density, extent, seed),
         exposures=tone_curve if settings.exposures else None,
         bystanders=settings.bystanders,
+        consistency=settings.consistency if own else None,
     )
 
 
@@ -170,6 +183,9 @@ class Stage:
             self.exposures = PhotoExposures(views, plan.exposures, round(_EXPOSURES_FROM * plan.steps))
         if plan.bystanders > 0:
             self.bystanders = Bystanders(plan.bystanders, round(_BYSTANDERS_FROM * plan.steps))
+        self.fused: FusedNormals | None = None
+        if plan.consistency is not None:
+            self.fused = FusedNormals(plan.consistency, views, kernel_degree)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
     def run(self, watch: Watch | None = None) -> None:
@@ -189,6 +205,9 @@ class Stage:
         plan, surfels, number = self.plan, self.surfels, self.step + 1
         view = self._view(self.step)
         target = targets(view, plan.weights.wanted(), surfels.device)
+        if self.fused is not None:
+            self.fused.before(surfels, self.step)
+            target |= self.fused.of(view)
         self._set_rates()
         rendered = render(
             surfels.rendered(), view.camera, kernel_degree=self.kernel_degree, sh_degree=self.sh_degree

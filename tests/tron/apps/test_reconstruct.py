@@ -30,6 +30,7 @@ TINY = (
     "radiance.density.threshold=1e-5", "radiance.density.most=340", "materials.steps=6",
     "light.steps=6", "light.resolution=8", "light.rays=4", "light.pixels=64", "light.scale_steps=3",
     "light.scale_pixels=256", "light.scale_rays=4", "light.split_sum_resolution=64",
+    "report.frames=4", "report.side=32", "report.views=2",
 )  # fmt: skip
 
 
@@ -123,6 +124,7 @@ def test_it_writes_everything_that_it_says(finished: Path):
         "curve.json",
         "contact_sheet.png",
         "light.png",
+        "report.html",
         "config.yaml",
         "checkpoint.safetensors",
     }
@@ -163,8 +165,8 @@ def test_the_report_is_whole_and_strict_json(finished: Path):
     assert {"albedo_scaling", "seconds", "settings", "machine", "curve"} < set(report)
     assert report["capture"]["held_out"] == ["00", "03", "06"]
     assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
-    figures = {"psnr", "psnr_subject", "ssim", "normal_mae_deg", "base_color_psnr"}
-    figures |= {"roughness_mae", "metallic_mae"}
+    figures = {"psnr", "psnr_subject", "ssim", "normal_mae_deg", "normal_median_deg"}
+    figures |= {"base_color_psnr", "roughness_mae", "metallic_mae"}
     assert set(report["test"]) == set(report["train"]) == figures | {"views"}
     assert (report["test"]["views"], report["train"]["views"]) == (3, 6)
     assert report["test"]["psnr"] > 18  # from depth maps: good before it begins
@@ -315,6 +317,20 @@ def test_without_priors_for_light_there_is_no_light_and_it_is_said(
 
 
 def test_the_default_prior_needs_nothing_but_photos(reconstruct, tmp_path: Path):
+    out = tmp_path / "out"
+    assert cli.compose("capture=x", "output_dir=y").prior["_target_"] == "tron.reconstruction.Joint"
+    few = ("prior.refinement.steps=3", "prior.rounds=1", "prior.light.steps=10")
+    assert reconstruct(out, *few, prior="joint") == 0
+    report = json.loads((out / "metrics.json").read_text())
+    assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
+    assert report["light"]["surfels_seen"] > 0.5
+    found = GaussianScene.load(out / "scene.ply")
+    assert np.ptp(found.base_color) > 0.05
+    light = EnvironmentMap.load(out / "environment.exr")
+    assert light.image.min() >= 0 < light.image.max()
+
+
+def test_the_classical_prior_gives_maps_to_learn_from(reconstruct, tmp_path: Path):
     out = tmp_path / "out"
     assert reconstruct(out, prior="classical") == 0
     report = json.loads((out / "metrics.json").read_text())
