@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import numpy as np
 from pydantic import BaseModel, Field
 
@@ -95,6 +94,8 @@ def choose_frames(path: Path, count: int) -> list[np.ndarray]:
 
 def sharpness(grey: np.ndarray) -> float:
     """Variance of the Laplacian of a picture (H, W): blur takes it away (Pech-Pacheco et al. 2000)."""
+    import cv2
+
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())
 
 
@@ -104,6 +105,8 @@ def motion(frames: Sequence[np.ndarray]) -> float:
     Corners are followed from frame to frame (Lucas and Kanade 1981, Bouguet's pyramids). Frames without
     corners, or whose corners are lost, count as moved: whether they can be posed is another question.
     """
+    import cv2
+
     greys = [_small(frame) for frame in frames]
     largest = 0.0
     for before, after in pairwise(greys):
@@ -120,6 +123,8 @@ def motion(frames: Sequence[np.ndarray]) -> float:
 
 
 def _small(frame: np.ndarray) -> np.ndarray:
+    import cv2
+
     grey = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
     width = min(_WIDTH, grey.shape[1])
     return cv2.resize(grey, (width, max(2, round(grey.shape[0] * width / grey.shape[1]))))
