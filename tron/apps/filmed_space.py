@@ -11,14 +11,17 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tron.apps.camera_files import cameras_of
 from tron.cameras import Camera, focus_of
-from tron.captures import View
 from tron.storage import write_atomic
 from tron.trajectories import keyframed
+
+if TYPE_CHECKING:
+    from tron.captures import View
 
 CAMERAS = "cameras.json"
 
