@@ -1,4 +1,4 @@
-"""Where a scene was filmed from: cameras.json beside it, and camera paths that stay in between these cameras.
+"""Where a scene was filmed from, and camera paths that stay there.
 
 Beside and behind the photos there is nothing to see but guesses: surfels were learnt from where photos were
 taken.

@@ -1,4 +1,4 @@
-"""What views show, as one hash: what was replaced under its old name is known by it."""
+"""Hash of what views show, by which replaced files are known."""
 
 from __future__ import annotations
 
