@@ -1,4 +1,4 @@
-"""Where a scene was filmed from, and camera paths that stay there.
+"""Cameras that a scene was filmed with, and camera paths between them.
 
 Beside and behind the photos there is nothing to see but guesses: surfels were learnt from where photos were
 taken.
