@@ -38,8 +38,9 @@ def main(settings: Settings) -> None:
 
     Writes scene.ply, which tron-relight and every 3DGS viewer open, environment.exr, metrics.json (held-out
     and training views), report.html (the scene relit, its G-buffers, its light, how sure each figure is),
-    contact_sheet.png (held-out views and every channel), light.png, cameras.json (where the photos were
-    taken, for tron-relight) and config.yaml. A run that was interrupted resumes when it is started again.
+    contact_sheet.png (held-out views and every channel), light.png, cameras.json (where the photos
+    were taken, for tron-relight) and config.yaml. A run that was interrupted resumes when it is started
+    again.
     """
     prior = make(settings.prior, "prior")
     lpips = _load_lpips(settings)

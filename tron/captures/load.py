@@ -31,7 +31,7 @@ class CaptureFormat:
 
     Attributes:
         holds: what lies in the folder, for help and errors.
-        detect: whether a folder (or a file, where ``from_file``) is of this format.
+        detect: whether a folder (or a file, of ``files``) is of this format.
         read: the photos that a path names, with their poses, or a whole capture; takes the
             :class:`LoadSettings`. A format's own settings are a model of its file that
             :class:`CaptureSettings` inherits.

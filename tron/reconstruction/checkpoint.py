@@ -44,8 +44,10 @@ def save_checkpoint(
     tensors = stage.surfels.state()
     if stage.plan.density is not None:
         tensors |= stage.plan.density.state()
-    for part in (stage.fused, stage.exposures, stage.bystanders):
+    for part in (stage.exposures, stage.bystanders):
         tensors |= part.state() if part is not None else {}
+    if stage.fused is not None:
+        tensors |= stage.fused.state()
     about = {
         **{"stage": stage.plan.name, "step": stage.step, "psnr": stage.psnr, "seconds": seconds},
         "begun": dict(begun or {}),
@@ -103,8 +105,8 @@ class Checkpoint:
         stage.step, stage.psnr = self.step, self.psnr
         if stage.plan.density is not None:
             stage.plan.density.restore(self.tensors, stage.surfels.device)
-        if stage.fused is not None:
-            stage.fused.restore(self.tensors, stage.surfels.device)
         for part in (stage.exposures, stage.bystanders):
             if part is not None:
                 part.restore(self.tensors)
+        if stage.fused is not None:
+            stage.fused.restore(self.tensors, stage.surfels.device)

@@ -48,6 +48,7 @@ class Photograph:
         camera = view.camera
         image = torch.from_numpy(view.read("image")).movedim(-1, 0)
         mask = torch.from_numpy(view.read("mask")) if view.has("mask") else torch.ones(image.shape[1:])
+        mask = mask * torch.from_numpy(view.believed())
         shrink = most_side / max(camera.width, camera.height)
         if shrink < 1:
             width, height = (max(round(side * shrink), 1) for side in (camera.width, camera.height))

@@ -87,6 +87,7 @@ def observe(
         solid = seen["opacity"] > OPAQUE
         if view.has("mask"):
             solid &= view.read("mask") > OPAQUE
+        solid &= view.believed()
         far = np.where(solid, seen["depth"], np.inf)
         near = np.where(solid, seen["depth"], 0.0)
         column, row = np.floor(pixel[index]).astype(int).T

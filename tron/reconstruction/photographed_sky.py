@@ -63,7 +63,8 @@ def photographed_sky(
     for view, gain in zip(track(views, "sky"), gains, strict=True):
         if view.has("mask"):
             continue
-        empty = np.flatnonzero(tracer.gbuffer(view.camera).numpy()["opacity"] < _EMPTY)
+        open_sky = tracer.gbuffer(view.camera).numpy()["opacity"] < _EMPTY
+        empty = np.flatnonzero(open_sky & view.believed())
         draw = generator(seed, "photographed sky", view.name)
         empty = draw.permutation(empty)[:_PER_VIEW]
         texels.append(_texel(view.camera.rays().reshape(-1, 3)[empty], resolution))

@@ -106,7 +106,7 @@ def reconstruct(
     most = settings.radiance.density.most
     first = run.begin(lambda: beginning(taught, settings.initial, settings.seed, most, device, track))
     radiance = settings.radiance.scaled(settings.steps_scaler, place_of(run.begun["source"]))
-    plan = radiance_plan(radiance, extent, settings.seed, capture.tone_curve, normals_given=given)
+    plan = radiance_plan(radiance, extent, settings.seed, normals_given=given, tone_curve=capture.tone_curve)
     surfels = run.stage(plan, taught.train_views, first)
     scene = surfels.scene(settings.initial.kernel_degree, capture.up)
     if isinstance(prior, Joint):

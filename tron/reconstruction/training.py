@@ -77,9 +77,9 @@ class Plan:
         sh_every: steps after which one more degree is learnt.
         background: behind the surfels.
         density: makes and removes surfels; None leaves their number.
-        consistency: pulls normals to those that the views' depths agree on; None does not.
         exposures: curve of the photos whose exposures are found; None takes them as exposed alike.
         bystanders: ratio of :class:`Bystanders`; 0 leaves out nobody.
+        consistency: pulls normals to those that the views' depths agree on; None does not.
     """
 
     name: str
@@ -91,9 +91,9 @@ class Plan:
     sh_every: int = 1
     background: Background = "black"
     density: DensityControl | None = None
-    consistency: ConsistencySettings | None = None
     exposures: ToneCurve | None = None
     bystanders: float = 0.0
+    consistency: ConsistencySettings | None = None
 
     def learning(self, names: Collection[str]) -> Plan:
         """The same plan, learning these parameters alone."""
@@ -106,14 +106,14 @@ def radiance_plan(
     settings: RadianceSettings,
     extent: float,
     seed: int,
-    tone_curve: ToneCurve = "srgb",
     *,
     normals_given: bool = False,
+    tone_curve: ToneCurve = "srgb",
 ) -> Plan:
-    """Stage 1: geometry and radiance.
+    """Stage 1: geometry and radiance; ``extent`` in world units scales the rate of the positions.
 
-    ``extent`` in world units scales the rate of the positions; ``tone_curve`` is that of the photos. Normals
-    are pulled to those that the views' depths agree on unless a prior gives some (``normals_given``).
+    Normals are pulled to those that the views' depths agree on unless a prior gives some (``normals_given``);
+    ``tone_curve`` is that of the photos.
     """
     own = settings.consistency.weight if not normals_given else 0.0
     rates = {
@@ -137,9 +137,9 @@ def radiance_plan(
         sh_every=settings.sh_every,
         background=settings.background,
         density=DensityControl(settings.density, extent, seed),
-        consistency=settings.consistency if own else None,
         exposures=tone_curve if settings.exposures else None,
         bystanders=settings.bystanders,
+        consistency=settings.consistency if own else None,
     )
 
 
@@ -177,15 +177,15 @@ class Stage:
         self.kernel_degree, self.seed = kernel_degree, seed
         self.step = 0
         self.psnr = float("nan")
-        self.fused: FusedNormals | None = None
-        if plan.consistency is not None:
-            self.fused = FusedNormals(plan.consistency, views, kernel_degree)
         self.exposures: PhotoExposures | None = None
         self.bystanders: Bystanders | None = None
         if plan.exposures is not None:
             self.exposures = PhotoExposures(views, plan.exposures, round(_EXPOSURES_FROM * plan.steps))
         if plan.bystanders > 0:
             self.bystanders = Bystanders(plan.bystanders, round(_BYSTANDERS_FROM * plan.steps))
+        self.fused: FusedNormals | None = None
+        if plan.consistency is not None:
+            self.fused = FusedNormals(plan.consistency, views, kernel_degree)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
     def run(self, watch: Watch | None = None) -> None:
