@@ -23,7 +23,7 @@ _TRUSTED = 20.0  # observations that a photo's exposure needs to be half believe
 
 @dataclass(frozen=True)
 class Evidence:
-    """What photos agree on.
+    """Colours that photos agree on.
 
     Attributes:
         color: (M, 3) float32 linear light of each surfel, of the mean photo's exposure: a median over its

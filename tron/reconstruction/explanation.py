@@ -44,7 +44,7 @@ _RAYS = 64  # shadow rays of a surfel
 
 @dataclass(frozen=True)
 class Explanation:
-    """What explains a capture's photos.
+    """Light and materials that explain a capture's photos.
 
     Attributes:
         scene: the surfels with materials.

@@ -1,4 +1,4 @@
-"""What the photos show of every surfel: linear colours, and the directions they were seen from.
+"""Colours of every surfel in the photos, linear, and the directions they were seen from.
 
 A surfel's centre is projected into each photo. It counts as seen where it faces the camera, lies on the
 surface that the surfels show there (median depth) and is away from silhouettes, whose pixels mix surfaces.

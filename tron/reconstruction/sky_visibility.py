@@ -1,4 +1,4 @@
-"""What surface points see of the sky: shadow rays in given directions, and transport to a cubemap's texels.
+"""Visibility of the sky at surface points: shadow rays in given directions, and transport to cubemap texels.
 
     T_pj = V(p, w_j) (n_p . w_j)+ solid_j / pi
 

@@ -102,7 +102,7 @@ class SunSearch:
         return best[0], best[1]
 
     def loss(self, light: Light, points: Points) -> float:
-        """How badly a light explains the neighbours: mean robust log difference, over that of like points."""
+        """Misfit of a light to the neighbours: mean robust log difference, over that of like points."""
         received = (light.irradiance(points) + points.bounced).mean(1)
         return self._loss(np.log(np.maximum(received, 1e-5)))
 

@@ -24,11 +24,9 @@ QUICK = LightSettings(points=1500)
 
 
 @pytest.fixture(scope="module")
-def scene(variant: str):
+def scene(dense_surfels):
     """A ball on a floor, of materials in patches."""
-    from tests.tron.conftest import DenseSurfels
-
-    dense = DenseSurfels()
+    dense = dense_surfels
     made = dense.scene(dense.plane(0.1, 1.5), dense.sphere(0.1, 0.5, 0.55), spacing=0.1)
     patch = np.floor(made.means * 3).astype(int) % 3
     colors = generator(0, "tests", "patches").uniform(0.15, 0.75, (27, 3))

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.tron.reconstruction.conftest import cameras_around
 from tron.captures import Capture, View
 from tron.estimation import Estimation
 from tron.gaussians import GaussianScene
@@ -37,11 +36,9 @@ def lighting(variant: str) -> Lighting:
 
 
 @pytest.fixture(scope="module")
-def scene(variant: str) -> GaussianScene:
+def scene(dense_surfels) -> GaussianScene:
     """A glossy ball, metal on its left half, above a rough floor in patches."""
-    from tests.tron.conftest import DenseSurfels
-
-    dense = DenseSurfels()
+    dense = dense_surfels
     made = dense.scene(dense.plane(0.12, 1.2), dense.sphere(0.12, 0.6, 0.65), spacing=0.12)
     ball = made.means[:, 2] > 0.01
     patch = np.floor(made.means[:, :2] * 2).astype(int).sum(1) % 2 == 0
@@ -53,11 +50,11 @@ def scene(variant: str) -> GaussianScene:
 
 
 @pytest.fixture(scope="module")
-def capture(scene: GaussianScene, lighting: Lighting) -> Capture:
+def capture(scene: GaussianScene, lighting: Lighting, around) -> Capture:
     """Linear pictures of ``lit``, the environment behind them."""
     tracer, views = SurfelTracer(scene), []
     bounce = BounceTransport.trace(tracer).bake(lighting)
-    for i, camera in enumerate(cameras_around(24, size=40)):
+    for i, camera in enumerate(around(24, size=40)):
         if camera.position[2] < 0:
             continue
         found = render_guidance(tracer, camera, lighting, Estimation(rays=32), i, bounce=bounce)
