@@ -1,14 +1,17 @@
 """Scenes as captures to reconstruct: path-traced views from all sides under one light, with the true maps.
 
 What a photographer would have brought home, and what he could not: alpha, normals, materials, irradiance,
-depth and the light itself. A capture is the test split's scene of the same index; its folder appears whole
-(``tron.captures.folder``), so it is finished when it is there.
+depth and the light itself, and the held-out views under lights that were not there (:mod:`datagen.relit`). A
+capture is the test split's scene of the same index; its folder appears whole (``tron.captures.folder``) and
+after those, so it is finished when it is there.
 """
 
 from __future__ import annotations
 
 import gc
+import json
 import logging
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +27,9 @@ from datagen.capture_manifest import CaptureManifest
 from datagen.clusters import logs_folder, require_cluster
 from datagen.failures import record_failures, summary
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
+from datagen.photographs import Photograph, described, drift
 from datagen.plan import Sources, Work, chosen, find_sources
+from datagen.relit import RELIT, record_relit, relit_folders, straightened, write_relit
 from datagen.run import draw_and_build
 from datagen.scene import SceneSpec, scene_name
 from datagen.scheduling import make_each
@@ -56,7 +61,11 @@ CAPTURES = "captures"
 CONFIG_NAME = "config.yaml"
 ENVIRONMENT_NAME = "environment.exr"
 SPEC_NAME = "spec.json"
+PHOTOGRAPHS_NAME = "photographs.json"
+PHOTOGRAPHED = ("image", "mask")
+"""Fields of a view that is a photograph: no map tells anyone more of it."""
 PIXEL_BYTES = 4 + 2 * (3 + 3 + 1 + 1 + 3) + 4
+RELIT_PIXEL_BYTES = 2 * 4
 
 
 def make_captures(settings: Settings) -> int:
@@ -84,6 +93,7 @@ def make_captures(settings: Settings) -> int:
             if item in missing or item.name not in manifest.captures:  # made now, or by an older engine
                 manifest.record(folder / item.name)
         manifest.save(folder)
+        record_relit(settings.output_dir / RELIT, [item.name for item in finished], wanted.relights)
         failures = record_failures(folder, settings, items, failed, {item.name: () for item in finished})
     log.info("%d of %d captures are in %s", len(finished), len(items), folder)
     if failures:
@@ -101,14 +111,21 @@ def make_capture(item: Work, settings: Settings, sources: Sources) -> Path:
     wanted = settings.captures
     folder = settings.output_dir / CAPTURES / item.name
     family = wanted.lights[item.index % len(wanted.lights)]
-    spec, geometry = draw_and_build(item, settings, sources, [family])
-    environment = spec.lights[0].bake(settings.environment_height, settings.environments).baked()
+    spec, geometry = draw_and_build(item, settings, sources, [family, *wanted.relights])
+    environment, *others = (
+        light.bake(settings.environment_height, settings.environments).baked() for light in spec.lights
+    )
+    write_relit(settings.output_dir / RELIT, spec, geometry, others, held_out_cameras(spec, wanted), wanted)
+    photographs = taken(spec, wanted)
     beside = {
         SPEC_NAME: spec.to_json().encode(),
         ENVIRONMENT_NAME: encode_exr(environment.image, half=False),
     }
+    if photographs:
+        text = json.dumps(described(list(photographs.items())), indent=1) + "\n"
+        beside[PHOTOGRAPHS_NAME] = text.encode()
     write = partial(write_capture, folder, overwrite=True, beside=beside)
-    write(captured(spec, geometry, environment, wanted))
+    write(captured(spec, geometry, environment, wanted, photographs))
     if wanted.points is not None:
         # Read back, for points have the colours of the pictures, and views are not held in memory.
         capture = read_capture_folder(folder)
@@ -120,20 +137,46 @@ def make_capture(item: Work, settings: Settings, sources: Sources) -> Path:
     return folder
 
 
+def view_names(settings: CaptureSettings) -> list[str]:
+    """Names of a capture's views, in order."""
+    return [f"view_{number:05d}" for number in range(settings.views)]
+
+
+def held_out_cameras(spec: SceneSpec, settings: CaptureSettings) -> dict[str, Camera]:
+    """The held-out views by their names."""
+    cameras = spec.spiral(settings.views, settings.width, settings.height)
+    return dict(list(zip(view_names(settings), cameras))[::HELD_OUT])
+
+
+def taken(spec: SceneSpec, settings: CaptureSettings) -> dict[str, Photograph]:
+    """Photograph of each training view; nothing where captures are true renders."""
+    if not settings.photographs:
+        return {}
+    names = [name for number, name in enumerate(view_names(settings)) if number % HELD_OUT]
+    path = (spec.split, spec.index, "capture")
+    return dict(zip(names, drift(len(names), settings.sensor, spec.seed, *path)))
+
+
 def captured(
-    spec: SceneSpec, geometry: Geometry, environment: EnvironmentMap, settings: CaptureSettings
+    spec: SceneSpec,
+    geometry: Geometry,
+    environment: EnvironmentMap,
+    settings: CaptureSettings,
+    photographs: Mapping[str, Photograph] | None = None,
 ) -> Capture:
     """The capture of a scene under a light; views are rendered when they are read, best in their order.
 
     Images are AgX of straight (not premultiplied) radiance times the light's exposure, with anti-aliased
-    coverage as their mask. Maps are of the pixel centres, zero where there is no surface.
+    coverage as their mask; those that ``photographs`` names are what a camera made of that radiance, and no
+    map tells more of them. Maps are of the pixel centres, zero where there is no surface.
     """
     cameras = spec.spiral(settings.views, settings.width, settings.height)
-    shots = _Shots(spec, geometry, environment, cameras, settings)
+    shots = _Shots(spec, geometry, environment, cameras, settings, photographs or {})
     views = []
-    for number, camera in enumerate(cameras):
-        fields: dict[str, Any] = {field: partial(shots.read, number, field) for field in _Shots.FIELDS}
-        views.append(View(f"view_{number:05d}", camera, space="display", **fields))
+    for number, (name, camera) in enumerate(zip(view_names(settings), cameras)):
+        known = PHOTOGRAPHED if photographs and name in photographs else _Shots.FIELDS
+        fields: dict[str, Any] = {field: partial(shots.read, number, field) for field in known}
+        views.append(View(name, camera, space="display", **fields))
     test = frozenset(view.name for view in views[::HELD_OUT])
     return Capture(tuple(views), test, up=np.array([0.0, 0.0, 1.0]), exposure=environment.exposure())
 
@@ -165,8 +208,10 @@ class _Shots:
         environment: EnvironmentMap,
         cameras: list[Camera],
         settings: CaptureSettings,
+        photographs: Mapping[str, Photograph],
     ) -> None:
         self._spec, self._geometry, self._cameras, self._settings = spec, geometry, cameras, settings
+        self._names, self._photographs = view_names(settings), photographs
         self._scene: mi.Scene = geometry.lit(environment)
         self._exposure = environment.exposure()
         self._size = max(GROUP_PIXELS // (settings.width * settings.height), 1)
@@ -206,31 +251,24 @@ class _Shots:
             maps = {
                 name: np.where(seen if x.ndim == 2 else seen[..., None], x, 0) for name, x in maps.items()
             }
-            image, mask = develop(frame, self._exposure, f"view {first + i} of {self._spec.name}")
+            straight, mask = straightened(frame, f"view {first + i} of {self._spec.name}")
+            image = self._picture(first + i, straight, mask)
             shots.append({"image": image, "mask": mask, **maps})
         return shots
+
+    def _picture(self, number: int, straight: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """Display values of straight linear radiance; what is not covered is black."""
+        photograph, spec = self._photographs.get(self._names[number]), self._spec
+        if photograph is None:
+            shown = to_display(straight, self._exposure)
+        else:
+            rng = generator(spec.seed, spec.split, spec.index, "capture", number, "noise")
+            shown = to_display(photograph.take(self._exposure * straight, self._settings.sensor, rng), 1.0)
+        return np.where(mask[..., None] > 0, shown, 0.0)
 
     def _seed(self, number: int, what: str) -> int:
         spec = self._spec
         return integer(spec.seed, spec.split, spec.index, "capture", number, what)
-
-
-def develop(frame: np.ndarray, exposure: float, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Premultiplied linear radiance and coverage (H, W, 4) -> straight AgX picture (H, W, 3), mask (H, W).
-
-    The tone curve bends, so colours are straightened before it: the rim of an object has the object's
-    colours, not darker ones. What is not covered is black.
-
-    Raises:
-        TronError: the frame is not finite, which the tone curve would hide.
-    """
-    bad = int((~np.isfinite(frame)).sum())
-    if bad:
-        raise TronError(f"the path-traced frame has {bad} values that are not finite", where)
-    mask = np.clip(frame[..., 3], 0.0, 1.0)
-    covered = mask[..., None] > 0
-    straight = np.where(covered, frame[..., :3] / np.where(covered, mask[..., None], 1.0), 0.0)
-    return np.where(covered, to_display(straight, exposure), 0.0), mask
 
 
 def _adopt(settings: Settings, folder: Path) -> None:
@@ -249,6 +287,8 @@ def _adopt(settings: Settings, folder: Path) -> None:
 def _finished(folder: Path, settings: CaptureSettings) -> bool:
     try:
         capture = read_capture_folder(folder)
+        for relit in relit_folders(folder.parent.parent / RELIT, folder.name, settings.relights):
+            read_capture_folder(relit)
     except TronError:
         return False
     return settings.points is None or capture.points is not None
@@ -257,4 +297,5 @@ def _finished(folder: Path, settings: CaptureSettings) -> bool:
 def _estimate_bytes(settings: Settings) -> int:
     wanted = settings.captures
     pixels = wanted.views * wanted.width * wanted.height
-    return pixels * PIXEL_BYTES + wanted.views * 10_000 + settings.environment_height**2 * 2 * 12
+    relit = pixels // HELD_OUT * len(wanted.relights) * RELIT_PIXEL_BYTES
+    return relit + pixels * PIXEL_BYTES + wanted.views * 10_000 + settings.environment_height**2 * 2 * 12

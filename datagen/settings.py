@@ -46,7 +46,10 @@ CAPTURED = {
     "catalogue": True,
     "allow_unlicensed": True,
     "variant": True,
-    "captures": {"lights", "views", "width", "height", "path_spp", "reference_spp", "points"},
+    "captures": {
+        *("lights", "views", "width", "height", "path_spp", "reference_spp", "points"),
+        *("photographs", "sensor", "relights", "relight_spp"),
+    },
 }
 """Keys that decide what is in a capture."""
 
@@ -92,6 +95,29 @@ class SplitSettings(_Model):
     )
 
 
+class SensorSettings(_Model):
+    """Camera that photographs are taken with: its exposure and white balance, and its noise."""
+
+    exposure_stops: float = Field(
+        default=0.25,
+        ge=0,
+        le=4,
+        description="Standard deviation of photos' exposures, stops; mean 0.",
+    )
+    white_balance: float = Field(
+        default=0.05,
+        ge=0,
+        le=1,
+        description="Standard deviation of log gains on red and blue.",
+    )
+    electrons: float = Field(
+        default=5000.0,
+        gt=0,
+        description="Electrons that the sensor counts where light times exposure is 1; middle grey is 0.18.",
+    )
+    read_noise: float = Field(default=3.0, ge=0, description="Standard deviation of reading them, electrons.")
+
+
 class CaptureSettings(_Model):
     """Scenes of the test split as captures: spiral views under one light, path-traced, with true maps."""
 
@@ -128,6 +154,19 @@ class CaptureSettings(_Model):
         le=10_000_000,
         description="Also store about so many points on surfaces, with their colours, as photos would give.",
     )
+    photographs: bool = Field(
+        default=False,
+        description="Take training views as photographs, each with its own exposure, white balance and noise "
+        "by sensor; held-out views stay true renders, which reconstructions are judged by.",
+    )
+    sensor: SensorSettings = Field(default=SensorSettings(), description="Camera of the photographs.")
+    relights: list[LightChoice] = Field(
+        default=[],
+        max_length=16,
+        description="Other lights, by family, under which the held-out views are path-traced as well, into "
+        "output_dir/relit: the truth of relighting.",
+    )
+    relight_spp: int = Field(default=144, ge=1, description="Paths per pixel of those.")
 
 
 class EqualErrorSettings(_Model):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from datagen.capture_export import CAPTURES
 from datagen.capture_manifest import capture_names, verify_captures
+from datagen.relit import RELIT
 from tron.shards.manifest import MANIFEST_NAME, Manifest
 from tron.shards.verify import verify
 
@@ -23,7 +24,12 @@ def validate(folder: Path) -> int:
         TronError: the folder holds neither a dataset nor captures.
     """
     captures = folder / CAPTURES
-    problems = [f"{CAPTURES}/{problem}" for problem in verify_captures(captures)] if captures.is_dir() else []
+    problems = [
+        f"{name}/{problem}"
+        for name in (CAPTURES, RELIT)
+        if (folder / name).is_dir()
+        for problem in verify_captures(folder / name)
+    ]
     if (folder / MANIFEST_NAME).exists() or not captures.is_dir():
         problems = _dataset_problems(folder) + problems
     else:

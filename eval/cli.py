@@ -40,10 +40,10 @@ def main(settings: Settings) -> int:
     Exits with 0 whether or not the targets are reached: the report says so, and by how much.
     """
     from eval.report.assemble import assemble
-    from eval.report.render import write_report
     from eval.report.terminal import print_results
     from eval.results import Results
     from eval.stages import StageFailed
+    from tron.report.render import write_report
     from tron.runtime import describe_machine
 
     benchmark = make(settings.benchmark, "benchmark")

@@ -207,6 +207,28 @@ def _unit(vector: np.ndarray, complaint: str) -> np.ndarray:
     return vector / length
 
 
+def focus_of(cameras_to_world: Sequence[np.ndarray]) -> tuple[np.ndarray, bool]:
+    """(3,) the point nearest to all optical axes, and whether these diverge.
+
+    Nearest by least squares; in front of the cameras if the axes diverge.
+
+    Args:
+        cameras_to_world: (4, 4) matrices, OpenCV camera axes.
+    """
+    matrices = np.stack(cameras_to_world)
+    origins, axes = matrices[:, :3, 3], matrices[:, :3, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    centre = origins.mean(0)
+    spread = np.linalg.norm(origins - centre, axis=1).mean()
+    # Parallel axes meet nowhere: a little pull towards a point before the cameras decides.
+    ahead = centre + axes.mean(0) * spread
+    pull = 1e-3 * len(origins)
+    sums = np.einsum("nij,nj->i", across, origins) + pull * ahead
+    point = np.linalg.solve(across.sum(0) + pull * np.eye(3), sums)
+    in_front = np.einsum("ni,ni->n", point - origins, axes) > 0
+    return (point, False) if in_front.mean() > 0.5 else (ahead, True)
+
+
 def opengl_to_opencv(camera_to_world: np.ndarray) -> np.ndarray:
     """OpenGL camera-to-world (..., 4, 4) -> OpenCV camera-to-world (..., 4, 4); its own inverse."""
     return np.asarray(camera_to_world, dtype=np.float64) @ _FLIP_YZ

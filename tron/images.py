@@ -173,6 +173,11 @@ def encode_png(image: np.ndarray) -> bytes:
     return _encode_display(image, "PNG")
 
 
+def encode_jpeg(image: np.ndarray) -> bytes:
+    """Encode display values in [0, 1] (clipped), or uint8, of 1 or 3 channels as a JPEG of quality 95."""
+    return _encode_display(image, "JPEG")
+
+
 def decode_png(data: bytes) -> np.ndarray:
     """Decode a PNG or JPEG to (H, W, C) float32 display values in [0, 1]; orientation tags are not applied.
 

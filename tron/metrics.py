@@ -62,7 +62,15 @@ def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
 
 
 def angular_error_deg(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Mean angle in degrees between two normal maps (H, W, 3) of any length; a zero vector counts as 90.
+    """Mean of :func:`angular_errors_deg`."""
+    return float(angular_errors_deg(a, b, mask).mean())
+
+
+def angular_errors_deg(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """Angles in degrees between two normal maps (H, W, 3) of any length; a zero vector counts as 90.
+
+    Returns:
+        (N,) float64, of the N pixels that the mask selects, row by row.
 
     Raises:
         TronError: the mask selects nothing.
@@ -73,7 +81,7 @@ def angular_error_deg(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = No
     # The arc tangent is exact for small angles, where the arc cosine loses half its digits.
     angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(axis=-1))
     missing = ~(a.any(axis=-1) & b.any(axis=-1))
-    return float(np.degrees(_selected(np.where(missing, np.pi / 2, angle), mask).mean()))
+    return np.degrees(_selected(np.where(missing, np.pi / 2, angle), mask)).ravel()
 
 
 def scale_albedo(

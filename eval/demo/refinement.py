@@ -7,9 +7,9 @@ from pathlib import Path
 
 from eval.report.figures import row_cell
 from eval.report.intervals import interval_note
-from eval.report.page import Cell, Section, Table, Text
 from eval.results import Row, mean_row
 from tron.errors import TronError
+from tron.report.page import Cell, Section, Table, Text
 
 FIGURES = {
     "base_color_psnr": ("base color PSNR", "dB", "linear, scaled a view and channel by least squares"),

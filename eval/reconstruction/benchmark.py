@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from eval.peers.timing import write_times
 from eval.reconstruction import page
@@ -16,8 +19,30 @@ from tron.errors import TronError
 
 log = logging.getLogger("tron.eval")
 
+PHOTOGRAPHS = "photographs"
+"""Folder of the captures that are photographs, and of the truth of relighting."""
 DEGREE2 = "degree2"
 """Folder of the scene of the steps with the peer's own kernel, beside those of the ways."""
+
+
+class Made(NamedTuple):
+    """Files that a command left of one scene, and its wall seconds."""
+
+    scene: str
+    way: str
+    capture: Path
+    folder: Path
+    seconds: float
+
+
+def scene_names(dataset: Path) -> list[str]:
+    """Names of the captures in a folder of tron-datagen."""
+    return sorted(path.parent.name for path in (dataset / "captures").glob("*/transforms.json"))
+
+
+def relit_truths(dataset: Path, scene: str) -> list[Path]:
+    """Folders of a scene's held-out views under other lights."""
+    return sorted(path.parent for path in (dataset / "relit").glob(f"{scene}_*/transforms.json"))
 
 
 class Reconstruction(ReconstructionSettings):
@@ -30,6 +55,9 @@ class Reconstruction(ReconstructionSettings):
         """Find the commands that the parts call."""
         if not self.ways:
             raise TronError("no way to reconstruct", "benchmark.ways", "give at least one")
+        both = sorted(set(self.ways) & set(self.photos))
+        if both:
+            raise TronError(f"way {both[0]} is of photos and of scenes", "benchmark.photos", "rename it")
         for name in ("tron-datagen", "tron-reconstruct", "tron-relight"):
             script_path(name)
 
@@ -43,7 +71,10 @@ class Reconstruction(ReconstructionSettings):
         folder = output_dir.absolute()
         measured = Measured(self, Stages(folder))
         # Commands first: what comes after them is done in this process, anew each time.
-        seconds = self._reconstruct_scenes(measured.stages, folder) if "scenes" in self.parts else {}
+        runs = self._reconstruct_scenes(measured.stages, folder) if "scenes" in self.parts else []
+        if "photos" in self.parts:
+            runs += self._reconstruct_photos(measured.stages, folder)
+        scans = self._reconstruct_splats(measured.stages, folder) if "splats" in self.parts else []
         if "steps" in self.parts:
             self._reconstruct_for_steps(measured.stages, folder)
         fox = self._reconstruct_fox(measured, folder) if "fox" in self.parts else None
@@ -51,7 +82,8 @@ class Reconstruction(ReconstructionSettings):
 
         activate(self.variant)
         set_torch_threads(1)  # as tron-reconstruct does: Dr.Jit has the cores
-        self._collect_scenes(seconds, folder, measured)
+        self._collect_scenes(runs, folder, measured)
+        self._collect_scans(scans, folder, measured)
         if fox is not None:
             measured.fox = collect_fox(fox)
         if "steps" in self.parts:
@@ -60,22 +92,59 @@ class Reconstruction(ReconstructionSettings):
             write_times(folder / "times.json", [*measured.steps, *measured.growth])
         return page.outcome(measured, output_dir)
 
-    def _reconstruct_scenes(self, stages: Stages, folder: Path) -> dict[tuple[str, str], float]:
-        """(way, scene) -> wall seconds, every scene in every way."""
+    def _reconstruct_scenes(self, stages: Stages, folder: Path) -> list[Made]:
+        """Every scene in every way."""
+        return self._reconstruct_all(stages, folder, self._dataset(stages, folder), self.ways)
+
+    def _reconstruct_photos(self, stages: Stages, folder: Path) -> list[Made]:
+        """The same scenes from photographs, without any prior."""
+        return self._reconstruct_all(stages, folder, self._photographs(stages, folder), self.photos)
+
+    def _dataset(self, stages: Stages, folder: Path) -> Path:
         dataset = folder / "dataset"
         stages.run("datagen", [Child("datagen", "tron-datagen", [*self.datagen, f"output_dir={dataset}"])])
-        scenes = sorted(path.parent.name for path in (dataset / "captures").glob("*/transforms.json"))
-        return {
-            (way, scene): self._reconstruct_scene(stages, folder, scene, way, arguments)
-            for scene in scenes
-            for way, arguments in self.ways.items()
-        }
+        return dataset
+
+    def _photographs(self, stages: Stages, folder: Path) -> Path:
+        """Captures of photographs, and their held-out views under other lights."""
+        dataset = folder / PHOTOGRAPHS
+        arguments = [*self.photographs, f"output_dir={dataset}"]
+        stages.run("photographs", [Child("photographs", "tron-datagen", arguments)])
+        return dataset
+
+    def _reconstruct_all(
+        self, stages: Stages, folder: Path, dataset: Path, ways: Mapping[str, list[str]]
+    ) -> list[Made]:
+        return [
+            self._reconstruct_scene(stages, folder, dataset, scene, way, arguments)
+            for scene in scene_names(dataset)
+            for way, arguments in ways.items()
+        ]
 
     def _reconstruct_scene(
-        self, stages: Stages, folder: Path, scene: str, way: str, arguments: list[str]
-    ) -> float:
-        capture, out = folder / "dataset" / "captures" / scene, folder / "scenes" / scene / way
-        return self._run(stages, f"{scene} {way}", capture, [*self.reconstruct, *arguments], out)
+        self, stages: Stages, folder: Path, dataset: Path, scene: str, way: str, arguments: list[str]
+    ) -> Made:
+        capture, out = dataset / "captures" / scene, folder / "scenes" / scene / way
+        seconds = self._run(stages, f"{scene} {way}", capture, [*self.reconstruct, *arguments], out)
+        return Made(scene, way, capture, out, seconds)
+
+    def _reconstruct_splats(self, stages: Stages, folder: Path) -> list[Made]:
+        """Scans of some scenes, raw and reconstructed."""
+        from eval.reconstruction.scans import write_scan
+        from tron.gaussians.scene import GaussianScene
+
+        dataset, made = self._dataset(stages, folder), []
+        self._photographs(stages, folder)
+        for scene in scene_names(dataset)[: self.splats.scenes]:
+            scanned = self._reconstruct_scene(stages, folder, dataset, scene, "scan", self.splats.scan)
+            raw = folder / "scans" / scene / "scene.ply"
+            if not raw.is_file():
+                write_scan(raw, GaussianScene.load(scanned.folder / "scene.ply"), self.seed)
+            out = folder / "scenes" / scene / "splats"
+            seconds = self._run(stages, f"{scene} splats", raw, self.splats.reconstruct, out)
+            made.append(Made(scene, "raw", scanned.capture, raw.parent, scanned.seconds))
+            made.append(Made(scene, "splats", scanned.capture, out, seconds))
+        return made
 
     def _run(
         self, stages: Stages, label: str, capture: Path, arguments: list[str], output_dir: Path
@@ -90,23 +159,34 @@ class Reconstruction(ReconstructionSettings):
         from eval.reconstruction.subjects import first_trained
 
         way, arguments = next(iter(self.ways.items()))
-        scene = first_trained(folder, way)
-        self._reconstruct_scene(stages, folder, scene, DEGREE2, [*arguments, *self.step_degree2])
+        scene, dataset = first_trained(folder, way), folder / "dataset"
+        self._reconstruct_scene(stages, folder, dataset, scene, DEGREE2, [*arguments, *self.step_degree2])
 
-    def _collect_scenes(
-        self, seconds: dict[tuple[str, str], float], folder: Path, measured: Measured
-    ) -> None:
+    def _collect_scenes(self, made: Sequence[Made], folder: Path, measured: Measured) -> None:
         from eval.reconstruction.pictures import compare_scene, write_sheet
+        from eval.reconstruction.relighting import relight
 
         scenes: dict[str, dict[str, Run]] = {}
-        for (way, scene), taken in seconds.items():
-            capture, out = folder / "dataset" / "captures" / scene, folder / "scenes" / scene / way
-            run = collect_run(scene, out, capture, taken)
-            measured.runs.setdefault(way, []).append(run)
-            scenes.setdefault(scene, {})[way] = run
+        for each in made:
+            run = collect_run(each.scene, each.folder, each.capture, each.seconds)
+            truths = relit_truths(folder / PHOTOGRAPHS, each.scene)
+            if truths and (each.way in self.photos or each.way in self.relit):
+                relit = relight(each.folder / "scene.ply", truths)
+                log.info("%s %s: relit %.2f dB", each.scene, each.way, relit.psnr)
+                run = replace(run, relit=relit)
+            measured.runs.setdefault(each.way, []).append(run)
+            scenes.setdefault(each.scene, {})[each.way] = run
         measured.compared += [compare_scene(ways) for ways in scenes.values()]
         for compared in measured.compared:
             write_sheet(folder / "pictures", compared)
+
+    def _collect_scans(self, made: Sequence[Made], folder: Path, measured: Measured) -> None:
+        from eval.reconstruction.scans import collect_scan
+
+        for each in made:
+            truths = relit_truths(folder / PHOTOGRAPHS, each.scene)
+            scan = collect_scan(each.scene, each.folder / "scene.ply", each.capture, truths, each.seconds)
+            measured.scans.setdefault(each.way, []).append(scan)
 
     def _reconstruct_fox(self, measured: Measured, folder: Path) -> FoxRun | None:
         """Reconstruct and relight the fox; None, with the reason in ``measured``, if that cannot be."""

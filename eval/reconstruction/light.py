@@ -11,10 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
+from tron.color import luminance
 from tron.seeds import generator
 from tron.shading.environment import EnvironmentMap
 
 NORMALS = 500
+SPOT_DEG = 10.0
+SPOT_HEIGHT = 64
+"""Rows of the maps in which the brightest spot is looked for."""
 HEIGHT = 96
 """Rows that maps are averaged to before the sum over texels, which takes a texel's light as a point."""
 
@@ -26,16 +30,34 @@ def irradiance(lights: Sequence[EnvironmentMap], normals: np.ndarray) -> list[np
         (N, 3) float64 for each light.
     """
     small = [light.baked().resized(HEIGHT) for light in lights]
-    height, width = small[0].image.shape[:2]
-    polar = np.arange(height)[:, None] * np.pi / (height - 1)  # rows stand on the poles
-    around = (np.arange(width) + 0.5)[None] * 2 * np.pi / width  # from +y towards +x
-    directions = np.stack(
-        np.broadcast_arrays(np.sin(polar) * np.sin(around), np.sin(polar) * np.cos(around), np.cos(polar)),
-        axis=-1,
-    ).reshape(-1, 3)
-    weights = np.repeat(small[0].solid_angles(), width) / np.pi
-    cosines = np.maximum(normals @ directions.T, 0) * weights
+    directions, solid_angles = texels(small[0])
+    cosines = np.maximum(normals @ directions.T, 0) * (solid_angles / np.pi)
     return [cosines @ light.image.reshape(-1, 3).astype(np.float64) for light in small]
+
+
+def texels(light: EnvironmentMap) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions (H W, 3) of a baked map's texels, row by row, and their solid angles (H W,)."""
+    return light.directions().reshape(-1, 3), np.repeat(light.solid_angles(), light.image.shape[1])
+
+
+def brightest_direction(light: EnvironmentMap) -> np.ndarray:
+    """(3,) unit direction of the light's brightest spot: where a cone of SPOT_DEG holds the most light.
+
+    The centre of that light, not of the cone, so that it is finer than a texel.
+    """
+    small = light.baked().resized(SPOT_HEIGHT)
+    directions, solid_angles = texels(small)
+    power = solid_angles * luminance(small.image.reshape(-1, 3).astype(np.float64))
+    near = directions @ directions.T > np.cos(np.radians(SPOT_DEG))
+    cone = near[np.argmax(near @ power)]
+    centre = (cone * power) @ directions
+    return centre / np.linalg.norm(centre)
+
+
+def sun_error_deg(found: EnvironmentMap, truth: EnvironmentMap) -> float:
+    """Angle between the brightest spots of two lights, degrees."""
+    a, b = brightest_direction(found), brightest_direction(truth)
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
 def light_errors(found: EnvironmentMap, truth: EnvironmentMap) -> dict[str, float]:

@@ -11,18 +11,29 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
 from eval.peers.settings import SpeedBenchmark
 from eval.peers.timing import Timed
-from eval.reconstruction.runs import Run, rows_of
+from eval.reconstruction.runs import Run, gain_rows, light_rows, rows_of
+from eval.reconstruction.scans import Scan, scan_rows
 from eval.results import Row
 from eval.stages import Stages
 
-Part = Literal["scenes", "fox", "steps"]
+Part = Literal["scenes", "photos", "splats", "fox", "steps"]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 TRON, VOLPRIM, SHIPPED = "tron", "volprim", "volprim_as_shipped"
 CHANNELS = ("radiance", "normal", "base color", "light")
+
+
+class SplatSettings(BaseModel):
+    """Scans of some scenes as other programs leave them, and what tron-reconstruct makes of those."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    scenes: PositiveInt = Field(default=1, description="scenes, from the first")
+    scan: list[str] = Field(description="arguments of tron-reconstruct for what becomes the scan")
+    reconstruct: list[str] = Field(description="arguments of tron-reconstruct for the scan as a capture")
 
 
 class ReconstructionSettings(SpeedBenchmark):
@@ -34,6 +45,15 @@ class ReconstructionSettings(SpeedBenchmark):
     datagen: list[str] = Field(description="arguments of tron-datagen, which makes the captures")
     reconstruct: list[str] = Field(description="arguments of tron-reconstruct for every scene and way")
     ways: dict[Name, list[str]] = Field(description="further ones of each way; the first is the main one")
+    photographs: list[str] = Field(
+        description="arguments of tron-datagen, which makes the same scenes as photographs, and relights them"
+    )
+    photos: dict[Name, list[str]] = Field(
+        description="further arguments of each way to reconstruct the photographs, none of which is a way's"
+    )
+    before: Name = Field(default="classical", description="way over which photographs' gain is told")
+    relit: list[Name] = Field(description="ways whose surfels are relit, beside those of photographs")
+    splats: SplatSettings = Field(description="scans of plain splats, made and taken as captures")
     real_data: Path | None = Field(description="folder with captures/fox and hdri; null: no fox")
     fox_downscale: PositiveFloat = Field(default=8, description="factor by which the photos are reduced")
     fox: list[str] = Field(description="further arguments of tron-reconstruct for the fox")
@@ -176,6 +196,7 @@ class Measured:
         settings: of the run.
         stages: the commands.
         runs: way -> a reconstruction of each scene.
+        scans: way -> a scan of each scene; "raw" as it is, "splats" as tron-reconstruct made it anew.
         compared: pictures of each scene.
         fox: the real capture; None with the reason in ``no_fox``.
         steps: beside the peer, on a scene reconstructed with either kernel.
@@ -185,6 +206,7 @@ class Measured:
     settings: ReconstructionSettings
     stages: Stages
     runs: dict[str, list[Run]] = field(default_factory=dict)
+    scans: dict[str, list[Scan]] = field(default_factory=dict)
     compared: list[Compared] = field(default_factory=list)
     fox: Fox | None = None
     no_fox: str = ""
@@ -193,12 +215,19 @@ class Measured:
 
     def prefix(self, way: str) -> str:
         """Beginning of the metrics of a way: the first one's name no way."""
-        return "reconstruction" if way == next(iter(self.runs)) else f"reconstruction.{way}"
+        first = next(iter(self.settings.ways), None)
+        return "reconstruction" if way == first else f"reconstruction.{way}"
 
     def rows(self) -> Iterator[Row]:
         """Every figure."""
         for way, runs in self.runs.items():
             yield from rows_of(self.prefix(way), runs, self.settings.seed)
+            yield from light_rows(self.prefix(way), runs, self.settings.seed)
+            if way in self.settings.photos:
+                before = self.runs.get(self.settings.before, [])
+                yield from gain_rows(self.prefix(way), runs, before, self.settings.seed)
+        for way, scans in self.scans.items():
+            yield from scan_rows(way, scans, self.settings.seed)
         if self.fox is not None:
             yield from self.fox.rows()
         main = {steps.degree: steps for steps in reversed(self.steps)}  # the first size of each degree

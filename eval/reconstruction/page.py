@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import get_args
 
-from eval.reconstruction.measured import Measured
+from eval.reconstruction.measured import Measured, Part
 from eval.reconstruction.page_fox import fox_section
+from eval.reconstruction.page_relit import relit_section, splats_section
 from eval.reconstruction.page_scenes import light_section, scenes_section, views_section
 from eval.reconstruction.page_steps import steps_section
 from eval.report.figures import with_interval
 from eval.report.outcome import Outcome
-from eval.report.page import Section, Text
 from eval.report.stage_table import stage_section
 from eval.results import Row
+from tron.report.page import Section, Text
 
 LEAD = (
     "A photo shows a thing in the light of that day. To show it in another light one must know what it is "
@@ -32,6 +34,11 @@ HEADLINE = {
     "reconstruction.base_color_psnr": "Base color, true prior",
     "reconstruction.normal_mae_deg": "Normals, true prior",
     "reconstruction.seconds": "Slowest path-traced scene",
+    "reconstruction.photos.relight_psnr": "Photographs without a prior, relit",
+    "reconstruction.relight_psnr": "True priors, relit: the ceiling",
+    "reconstruction.photos.normal_mae_deg": "Photographs without a prior, normals",
+    "reconstruction.photos.test_psnr": "Photographs without a prior, held-out views",
+    "splats.relight_psnr": "A plain 3DGS file, relit",
     "fox.test_psnr": "The fox, held-out photos",
     "fox.seconds": "The fox, from photos to surfels and light",
     "step.ratio_to_volprim.degree2": "A step: times as fast as with Mitsuba's volprim, its own kernel",
@@ -47,6 +54,8 @@ def outcome(measured: Measured, output_dir: Path) -> Outcome:
         *scenes_section(measured, found),
         *views_section(measured),
         *light_section(measured),
+        *relit_section(measured, found),
+        *splats_section(measured, found),
         *fox_section(measured, found),
         *steps_section(measured),
         _limits(measured),
@@ -72,6 +81,11 @@ def _verdict(found: Mapping[str, Row]) -> str:
             f"From random points, path-traced scenes reach {texts['reconstruction.test_psnr']} on held-out "
             f"views, in at most {texts['reconstruction.seconds']} a scene."
         )
+    if "reconstruction.photos.relight_psnr" in found:
+        parts.append(
+            "Photographs with drift and noise, without any prior, become surfels that under two other lights "
+            f"lie {texts['reconstruction.photos.relight_psnr']} from the path tracer."
+        )
     if "fox.test_psnr" in found:
         parts.append(f"The photographed fox reaches {texts['fox.test_psnr']} after {texts['fox.seconds']}.")
     ratios = [found[name].value for name in STEP_RATIOS if name in found]
@@ -85,9 +99,9 @@ def _verdict(found: Mapping[str, Row]) -> str:
 
 def _limits(measured: Measured) -> Section:
     texts = [
-        "The path-traced scenes are small, made of a few procedural objects on a floor, photographed without "
-        "noise, blur or changing exposure, with poses and masks that are exact. Real captures have none of "
-        "that, and the fox stands for them alone.",
+        "The path-traced scenes are small, made of a few procedural objects on a floor, with poses and masks "
+        "that are exact and without blur; exposure, white balance and noise are those of a camera in the "
+        "photographs alone. For all that real captures add, the fox stands alone.",
         "The true prior is a teacher that no photograph comes with: figures under it say what the method can "
         "do with perfect normals and materials, not what a user gets. The classical prior is what needs no "
         "weights; it guesses one roughness and metallic for everything and cannot tell paint from shade.",
@@ -104,6 +118,6 @@ def _limits(measured: Measured) -> Section:
             "PSNR beside the times says how alike they are."
         )
     parts = measured.settings.parts
-    if not all(part in parts for part in ("scenes", "fox", "steps")):
+    if not all(part in parts for part in get_args(Part)):
         texts.append(f"Only these parts were run: {', '.join(parts)}.")
     return Section("limits", "What these figures do not say", [Text(text) for text in texts])

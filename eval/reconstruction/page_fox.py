@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from eval.reconstruction.measured import Fox, Measured
 from eval.report.charts import line_chart
 from eval.report.figures import row_cell
-from eval.report.page import Block, Picture, Pictures, Section, Table, Text
 from eval.results import Row
 from tron.images import read_image
+from tron.report.page import Block, Picture, Pictures, Section, Table, Text
 
 WORDS = {
     "fox.test_psnr": "PSNR of held-out photos",
@@ -24,8 +24,8 @@ WORDS = {
 }
 
 RELIT = (
-    "Made by tron-relight of the same scene.ply, as are those below: traced shadows and split-sum "
-    "reflections, no neural renderer; the environment is seen where there are no surfels."
+    "Made by tron-relight of the same scene.ply, as are those below: shadows, reflections and light that "
+    "bounces between the surfels, no neural renderer; the environment is seen where there are no surfels."
 )
 
 

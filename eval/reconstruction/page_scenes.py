@@ -9,22 +9,25 @@ import numpy as np
 from eval.reconstruction.measured import Compared, Measured
 from eval.reconstruction.runs import Run
 from eval.report.charts import line_chart
-from eval.report.figures import format_value, row_cell
+from eval.report.figures import row_cell
 from eval.report.intervals import interval_note
-from eval.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
 from eval.results import Row
+from tron.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
+from tron.report.values import format_value
 
 WAYS = {
     "random": "random points, true prior",
     "depth_init": "depth maps, true prior",
     "classical": "random points, classical prior",
+    "photos": "photographs, no prior",
 }
 COLUMNS = {
     "test_psnr": "Held-out PSNR",
     "test_psnr_subject": "on the subject",
     "test_ssim": "SSIM",
     "train_psnr": "Training PSNR",
-    "normal_mae_deg": "Normals",
+    "normal_mae_deg": "Normals, mean",
+    "normal_median_deg": "median",
     "base_color_psnr": "Base color",
     "roughness_mae": "Roughness",
     "metallic_mae": "Metallic",
@@ -56,7 +59,9 @@ def scenes_section(measured: Measured, found: Mapping[str, Row]) -> list[Section
         "masks; from depth maps surfels begin on the true surfaces. The true prior gives normals, base "
         "color, roughness, metallic and irradiance of the training views; the classical one computes "
         "what it can from the photos. Normals are off by a mean angle; base color is PSNR on linear "
-        "values after one factor a view and channel; roughness and metallic are mean absolute errors."
+        "values after one factor a view and channel; roughness and metallic are mean absolute errors. "
+        "Photographs are the same views, each with its own exposure, white balance and noise; held-out views "
+        "are true renders in every way, so no exposure of theirs has to be guessed."
     )
     means = [[way_title(way), *_figures(found, measured.prefix(way) + ".{}")] for way in measured.runs]
     caption = "Means over the scenes; surfels and time (the whole command) are of the scene with the most."
@@ -165,6 +170,7 @@ def light_section(measured: Measured) -> list[Section]:
             way_title(way),
             Cell(format_value(run.light["irradiance_error"], "fraction"), "strong"),
             format_value(run.light["scaled_error"], "fraction"),
+            format_value(run.light["sun_direction_deg"], "deg") if "sun_direction_deg" in run.light else "—",
         ]
         for way, runs in measured.runs.items()
         for run in runs
@@ -176,7 +182,7 @@ def light_section(measured: Measured) -> list[Section]:
         "The light that each run found, held against the one that the scene was path-traced under: the "
         "relative difference (L2) of the irradiance that either gives to unoccluded surfaces of all normals. "
         "The second figure is after one factor on the whole light, which leaves errors of colour and "
-        "direction. No target was set."
+        "direction. The sun's direction is that of the brightest spot."
     )
-    headings = ["Scene", "True light", "Begun from", "Irradiance off by", "after one factor"]
+    headings = ["Scene", "True light", "Begun from", "Irradiance off by", "after one factor", "Sun off by"]
     return [Section("light", "The light", [intro, Table("Fitted lights.", headings, table, words=[1, 2])])]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from eval.reconstruction.measured import SHIPPED, TRON, VOLPRIM, Measured
 from eval.report.charts import line_chart
-from eval.report.figures import format_value
-from eval.report.page import Block, Cell, Chart, Section, Table, Text
+from tron.report.page import Block, Cell, Chart, Section, Table, Text
+from tron.report.values import format_value
 
 
 def steps_section(measured: Measured) -> list[Section]:

@@ -74,13 +74,13 @@ def collect_fox(made: FoxRun) -> Fox:
 
 
 def relit_frames(folder: Path, frames: int) -> list[np.ndarray]:
-    """Frames of tron-relight as pictures, display values: shadowed shading, through its exposure and AgX."""
+    """Frames of tron-relight as pictures, display values: ``lit``, through its exposure and AgX."""
     path = folder / "relight.json"
     try:
         exposure = float(json.loads(path.read_text("utf-8"))["exposure"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TronError(f"not tron-relight's report: {error}", path) from error
     return [
-        to_display(read_image(folder / "frames" / f"{index:04d}.shadowed.exr"), exposure)
+        to_display(read_image(folder / "frames" / f"{index:04d}.lit.exr"), exposure)
         for index in range(frames)
     ]

@@ -10,7 +10,8 @@ from pathlib import Path
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from eval.reconstruction.light import light_errors, read_light
+from eval.reconstruction.light import light_errors, read_light, sun_error_deg
+from eval.reconstruction.relighting import Relit
 from eval.results import Row, mean_row
 from tron.errors import TronError
 
@@ -19,11 +20,16 @@ FIGURES = {
     "psnr_subject": ("test_psnr_subject", "dB"),
     "ssim": ("test_ssim", "1"),
     "normal_mae_deg": ("normal_mae_deg", "deg"),
+    "normal_median_deg": ("normal_median_deg", "deg"),
     "base_color_psnr": ("base_color_psnr", "dB"),
     "roughness_mae": ("roughness_mae", "1"),
     "metallic_mae": ("metallic_mae", "1"),
 }
 """Figure of metrics.json's held-out views -> its name in the rows, and its unit."""
+
+
+SUN = "sun"
+"""Family of lights that have a direction."""
 
 
 class _Part(BaseModel):
@@ -77,6 +83,7 @@ class Run:
         seconds: wall time of the command from start to end.
         light: figures of its light against the true one, name -> value; empty where either is unknown.
         family: of the true light, such as "sun"; empty if unknown.
+        relit: the surfels under other lights; None where that was not measured.
     """
 
     name: str
@@ -86,6 +93,7 @@ class Run:
     seconds: float
     light: dict[str, float] = field(default_factory=dict)
     family: str = ""
+    relit: Relit | None = None
 
     def curve(self) -> list[tuple[float, float]]:
         """(seconds of training, dB) of held-out views."""
@@ -109,9 +117,13 @@ def read_report(folder: Path) -> Report:
 
 def collect_run(name: str, folder: Path, capture: Path, seconds: float) -> Run:
     """A finished reconstruction; its light is held against the capture's where both are known."""
-    found, truth = read_light(folder), read_light(capture)
-    light = light_errors(found, truth) if found is not None and truth is not None else {}
-    return Run(name, folder, capture, read_report(folder), seconds, light, light_family(capture))
+    found, truth, family = read_light(folder), read_light(capture), light_family(capture)
+    light = {}
+    if found is not None and truth is not None:
+        light = light_errors(found, truth)
+        if family == SUN:
+            light["sun_direction_deg"] = sun_error_deg(found, truth)
+    return Run(name, folder, capture, read_report(folder), seconds, light, family)
 
 
 def light_family(capture: Path) -> str:
@@ -143,6 +155,39 @@ def rows_of(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
                 yield Row(metric=name, value=values[run.name], unit=unit, n=n)
 
 
+def light_rows(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
+    """Errors of irradiance after one factor, of all scenes and by kind of light, and of the sun's direction.
+
+    Light is soft where it is no sun's: a disk in the sky is another task than a glow.
+    """
+    lit = [run for run in runs if run.light]
+    sunny = [run for run in lit if run.family == SUN]
+    soft = [run for run in lit if run.family != SUN]
+    for name, some in (
+        ("irradiance_error", lit),
+        ("irradiance_error_soft", soft),
+        ("irradiance_error_sun", sunny),
+    ):
+        if some:
+            values = [(run.name, run.light["scaled_error"]) for run in some]
+            yield mean_row(f"{prefix}.{name}", "fraction", values, seed)
+    if sunny:
+        values = [(run.name, run.light["sun_direction_deg"]) for run in sunny]
+        yield mean_row(f"{prefix}.sun_direction_deg", "deg", values, seed)
+
+
+def gain_rows(prefix: str, runs: Sequence[Run], over: Sequence[Run], seed: int = 0) -> Iterator[Row]:
+    """Gain of relit pictures over another way's, scene by scene, dB; none where either was not relit."""
+    before = {run.name: run.relit.psnr for run in over if run.relit is not None}
+    gains = [
+        (run.name, run.relit.psnr - before[run.name])
+        for run in runs
+        if run.relit is not None and run.name in before
+    ]
+    if gains:
+        yield mean_row(f"{prefix}.relight_gain", "dB", gains, seed)
+
+
 def _figures(runs: Sequence[Run]) -> Iterator[tuple[str, str, dict[str, float]]]:
     """Metric, unit, scene -> value."""
     for key, (metric, unit) in FIGURES.items():
@@ -156,4 +201,10 @@ def _figures(runs: Sequence[Run]) -> Iterator[tuple[str, str, dict[str, float]]]
     yield "light_seconds", "s", {run.name: run.report.seconds.light for run in runs}
     for metric in dict.fromkeys(name for run in runs for name in run.light):
         values = {run.name: run.light[metric] for run in runs if metric in run.light}
-        yield f"light.{metric}", "fraction", values
+        yield f"light.{metric}", "deg" if metric.endswith("_deg") else "fraction", values
+    relit = {run.name: run.relit for run in runs if run.relit is not None}
+    if relit:
+        yield "relight_psnr", "dB", {name: each.psnr for name, each in relit.items()}
+        for light in dict.fromkeys(light for each in relit.values() for light in each.lights):
+            values = {name: each.lights[light].psnr for name, each in relit.items() if light in each.lights}
+            yield f"relight_psnr_{light}", "dB", values

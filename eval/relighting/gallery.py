@@ -16,9 +16,9 @@ from eval.relighting.baselines import (
     Method,
 )
 from eval.relighting.shadows import frame_shadow_pixels, same_depth
-from eval.report.page import Picture, Pictures
 from tron import metrics
 from tron.color import linear_to_srgb, luminance, to_display
+from tron.report.page import Picture, Pictures
 from tron.shards.schema import Clip, ClipMeta
 
 ERROR_GAIN = 3

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from eval.relighting.gallery import Example
 from eval.relighting.guidance import GuidanceScores
 from eval.relighting.scores import Scores
-from eval.report.page import Chart
 from eval.results import Row
+from tron.report.page import Chart
 from tron.shards.schema import ClipMeta
 
 

@@ -18,11 +18,12 @@ from eval.relighting.shadows import (
     SAME_NORMAL_DEG,
     SHADOWED_BELOW,
 )
-from eval.report.figures import MINUS, row_cell, with_interval
+from eval.report.figures import row_cell, with_interval
 from eval.report.intervals import interval_note
-from eval.report.page import Block, Cell, Pictures, Section, Table, Text
 from eval.report.strips import write_strips
 from eval.results import Row
+from tron.report.page import Block, Cell, Pictures, Section, Table, Text
+from tron.report.values import MINUS
 
 TITLES = {method.name: method.title for method in METHODS}
 SIMPLE_TITLES = ", ".join(TITLES[name] for name in GROUPS[SIMPLE])

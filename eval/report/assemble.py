@@ -7,8 +7,8 @@ from typing import Any
 
 from eval.report.figures import bound, verdict, with_interval
 from eval.report.outcome import Outcome
-from eval.report.page import Block, Cell, Code, Page, Section, Table, Text, Tile
 from eval.results import Results, Target
+from tron.report.page import Block, Cell, Code, Page, Section, Table, Text, Tile
 
 
 def assemble(outcome: Outcome, results: Results, targets: Sequence[Target]) -> Page:

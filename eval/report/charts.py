@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from eval.report.page import Chart
+from tron.report.page import Chart
 
 INK = "#123456"
 """Stands for the page's text colour while matplotlib draws; replaced by ``currentColor`` afterwards."""

@@ -2,36 +2,9 @@
 
 from __future__ import annotations
 
-from eval.report.page import Cell, Tone
 from eval.results import Row, Target
-
-MINUS = "\N{MINUS SIGN}"
-_STYLES = {
-    "fraction": (100, 2, "%"),
-    "s": (1, 0, " s"),
-    "deg": (1, 2, "°"),
-    "1": (1, 3, ""),
-    "x": (1, 2, "×"),
-    "surfels": (1, 0, " surfels"),
-    "views": (1, 0, " views"),
-}
-"""Unit -> factor, decimals, what is written behind the number."""
-
-
-def format_value(value: float, unit: str, signed: bool = False) -> str:
-    """A figure with its unit: fractions as percent, seconds beyond a minute as minutes too, factors with ×.
-
-    >>> format_value(0.0123, "fraction"), format_value(31.456, "dB"), format_value(754, "s")
-    ('1.23%', '31.46 dB', '12 min 34 s')
-    """
-    if unit == "s" and not signed and abs(value) >= 60:
-        minutes, seconds = divmod(round(value), 60)
-        return f"{minutes} min {seconds} s"
-    if unit == "abs":  # errors of computation, many orders below one
-        return f"{value:.1e}".replace("-", MINUS)
-    scale, digits, suffix = _STYLES.get(unit, (1, 2, f" {unit}"))
-    value = round(scale * value, digits) + 0.0  # adding zero turns a negative zero into zero
-    return f"{value:{'+' if signed and value else ''}.{digits}f}{suffix}".replace("-", MINUS)
+from tron.report.page import Cell, Tone
+from tron.report.values import format_value, suffix
 
 
 def with_interval(row: Row, signed: bool = False) -> str:
@@ -39,8 +12,8 @@ def with_interval(row: Row, signed: bool = False) -> str:
     figure = format_value(row.value, row.unit, signed)
     if row.low is None or row.high is None:
         return figure
-    suffix = _STYLES.get(row.unit, (1, 2, f" {row.unit}"))[2]
-    low, high = (format_value(end, row.unit, signed).removesuffix(suffix) for end in (row.low, row.high))
+    unit = suffix(row.unit)
+    low, high = (format_value(end, row.unit, signed).removesuffix(unit) for end in (row.low, row.high))
     return f"{figure} [{low}, {high}]"
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from eval.report.page import Section
 from eval.results import Row
+from tron.report.page import Section
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from eval.report.figures import format_value
-from eval.report.page import Cell, Section, Table
 from eval.stages import StageRecord
+from tron.report.page import Cell, Section, Table
+from tron.report.values import format_value
 
 
 def stage_section(

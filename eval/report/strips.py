@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from eval.report.page import Pictures
 from tron.images import write_image
+from tron.report.page import Pictures
 
 
 def write_strips(groups: Sequence[Pictures], names: Sequence[str], folder: Path) -> None:

@@ -13,7 +13,7 @@ from eval.report.figures import bound, verdict, with_interval
 from eval.results import Results, Target
 
 _LISTED = re.compile(
-    r"(demo|surfels|guidance|irradiance|fox|step|reconstruction(\.(classical|depth_init|light))?)\.[a-z_]\w*"
+    r"(demo|surfels|guidance|irradiance|fox|step|reconstruction(\.(classical|depth_init|photos|light))?|splats(\.raw)?)\.[a-z_]\w*"
 )
 """Rows without a target that are listed all the same; rows of one scene end in another segment."""
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from eval.report.figures import row_cell
 from eval.report.outcome import Outcome
-from eval.report.page import Section, Table, Text
 from eval.results import Row
 from eval.tracing.measured import Measured
 from eval.tracing.page_bounce import bounce_section, equal_error_section
@@ -20,6 +19,7 @@ from eval.tracing.page_rays import (
     inside_section,
     shadow_section,
 )
+from tron.report.page import Section, Table, Text
 
 LEAD = (
     "TRON holds a captured scene as surfels: small flat disks whose opacity falls off like a Gaussian, with "
@@ -41,7 +41,7 @@ HEADLINE = {
     "irradiance.seconds_ratio_to_mitsuba_direct": "64-ray irradiance: times as long as Mitsuba's direct",
     "primary.max_error": "Camera rays: largest error against float64",
     "bounce.seconds_ratio_to_frame": "Bake of a light: times as long as a frame of guidance",
-    "guidance.ratio_to_path_tracing": "A lit frame (64 rays): time over path tracing's at the same error",
+    "guidance.ratio_to_path_tracing": "A lit frame (tron-relight's default): time over path tracing's at the same error",
 }
 
 

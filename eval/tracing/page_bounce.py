@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 
 from eval.report.figures import row_cell
 from eval.report.intervals import interval_note
-from eval.report.page import Block, Cell, Picture, Pictures, Section, Table, Text
 from eval.results import Row
 from eval.tracing.measured import EqualError, Measured
 from tron.images import read_image
+from tron.report.page import Block, Cell, Picture, Pictures, Section, Table, Text
 
 WAY_WORDS = {
     "lit_preview": "lit, 2 shadow rays, denoised: tron-relight's default",

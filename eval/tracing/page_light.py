@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from eval.report.page import Block, Cell, Picture, Pictures, Section, Table, Text
 from eval.report.strips import write_strips
 from eval.tracing.measured import TRON, LitImages, Measured
+from tron.report.page import Block, Cell, Picture, Pictures, Section, Table, Text
 
 NOISE_WORDS = {
     "rmse_2spp": "TRON, 2 rays",

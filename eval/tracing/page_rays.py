@@ -10,11 +10,11 @@ import numpy as np
 from eval.peers.contenders import PEERS
 from eval.peers.timing import Times
 from eval.report.charts import line_chart
-from eval.report.figures import format_value
-from eval.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
 from eval.report.strips import write_strips
 from eval.results import Row
 from eval.tracing.measured import BINNING, TRON, USUAL, CameraRays, Measured, SamePicture
+from tron.report.page import Block, Cell, Chart, Picture, Pictures, Section, Table, Text
+from tron.report.values import format_value
 
 TITLES = {TRON: "TRON", **{peer.name: peer.title for peer in PEERS}}
 VARIANTS = {

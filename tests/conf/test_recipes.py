@@ -128,6 +128,7 @@ PAPER = {
         "light.two_sided": False,
         "light.diffuse": "lambert",
         "light.coarsest": 64,
+        "radiance.exposures": False,
     },
     "train": {"renderer.config.guidance": ["pbr", "irradiance"]},
     "eval": {},

@@ -10,9 +10,10 @@ import pytest
 
 import datagen.capture_export
 from datagen.build import build
-from datagen.capture_export import develop, make_capture, make_captures
+from datagen.capture_export import make_capture, make_captures
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.plan import Work
+from datagen.relit import straightened
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from datagen.validate import validate
@@ -163,15 +164,15 @@ def inverse_display(image: np.ndarray, exposure: float) -> np.ndarray:
     return np.maximum(inset @ np.linalg.inv(basis), 0) / exposure
 
 
-def test_developing_straightens_colours_before_the_tone_curve():
+def test_colours_are_straightened_before_the_tone_curve():
     radiance, coverage = np.array([0.2, 0.4, 0.8]), np.array([[0.0, 0.25, 1.0]])
     frame = np.concatenate([radiance * coverage[..., None], coverage[..., None]], axis=-1)
-    image, mask = develop(frame, 2.0, "here")
+    straight, mask = straightened(frame, "here")
     np.testing.assert_array_equal(mask, coverage)
-    np.testing.assert_allclose(image[0, 1:], [to_display(radiance, 2.0)] * 2, atol=1e-12)
-    assert not image[0, 0].any()
+    np.testing.assert_allclose(straight[0, 1:], [radiance] * 2, atol=1e-12)
+    assert not straight[0, 0].any()
     with pytest.raises(TronError, match=r"1 values that are not finite.*here"):
-        develop(np.where(np.arange(12).reshape(1, 3, 4) == 5, np.nan, frame), 2.0, "here")
+        straightened(np.where(np.arange(12).reshape(1, 3, 4) == 5, np.nan, frame), "here")
 
 
 def test_nothing_that_is_not_finite_is_stored(tmp_path, monkeypatch):
@@ -188,7 +189,7 @@ def test_nothing_that_is_not_finite_is_stored(tmp_path, monkeypatch):
     assert {path.name for path in (tmp_path / "captures").iterdir()} == {
         "config.yaml", "manifest.json", "failures.jsonl", "failures",
     }  # fmt: skip
-    assert "in develop" in (tmp_path / "captures/failures/test-000000.txt").read_text()
+    assert "in straightened" in (tmp_path / "captures/failures/test-000000.txt").read_text()
     assert validate(tmp_path) == 0, "tracebacks are no capture"
     told = json.loads(listed.read_text())
     assert told["scene"] == "test-000000"

@@ -8,9 +8,9 @@ import pytest
 
 from eval.relighting.benchmark import Relighting
 from eval.report.assemble import assemble
-from eval.report.render import write_report
 from eval.results import Results
 from tron.images import read_image
+from tron.report.render import write_report
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None

@@ -14,8 +14,9 @@ from eval.cli import cli
 from eval.peers import volprim
 from eval.peers.timing import Rounds
 from eval.reconstruction import step
-from eval.reconstruction.light import irradiance, light_errors
-from eval.reconstruction.runs import Report, Run, read_report, rows_of
+from eval.reconstruction.light import brightest_direction, irradiance, light_errors, sun_error_deg, texels
+from eval.reconstruction.relighting import Relit, RelitLight
+from eval.reconstruction.runs import Report, Run, gain_rows, light_rows, read_report, rows_of
 from eval.reconstruction.subjects import drawn
 from eval.results import Results
 from tron.captures import Capture, View
@@ -70,6 +71,52 @@ def test_light_errors_know_scale_from_direction(variant: str):
     assert turned["scaled_error"] > 0.1
     assert turned["scaled_error"] <= turned["irradiance_error"]
     assert light_errors(replace(light, image=0 * light.image), light)["irradiance_error"] == 1
+
+
+def test_the_brightest_spot_is_found_finer_than_a_texel(variant: str):
+    directions, _ = texels(EnvironmentMap.constant(0.3, 96))
+    for towards in unit(5):
+        near = (directions @ towards > np.cos(np.radians(4.0))).reshape(96, 192, 1)
+        sun = replace(EnvironmentMap.constant(0.3, 96), image=np.float32(0.3 + 300 * near) * np.ones(3, "f4"))
+        assert np.degrees(np.arccos(brightest_direction(sun) @ towards)) < 0.8
+    straight_up = brightest_direction(sun)[2]
+    turned = sun_error_deg(sun.rotated(40), sun)
+    # A turn about z moves a direction by less than its angle, the less the higher it stands.
+    chord = 2 * np.sqrt(1 - straight_up**2) * np.sin(np.radians(20))
+    assert turned == pytest.approx(np.degrees(2 * np.arcsin(chord / 2)), abs=0.8)
+
+
+def test_the_gain_is_scene_by_scene_where_both_were_relit():
+    here = Path()
+
+    def relit(name: str, psnr: float | None) -> Run:
+        light = None if psnr is None else Relit({"sun": RelitLight(psnr, np.zeros(1), np.zeros(1))}, 1.0)
+        return Run(name, here, here, report(), 1.0, relit=light)
+
+    runs = [relit("a-1", 25.0), relit("b-2", 24.0), relit("c-3", None), relit("d-4", 30.0)]
+    before = [relit("b-2", 22.0), relit("a-1", 20.0), relit("c-3", 10.0), relit("d-4", None)]
+    (row,) = gain_rows("reconstruction.photos", runs, before)
+    assert (row.metric, row.value, row.n) == ("reconstruction.photos.relight_gain", 3.5, 2)
+    assert not list(gain_rows("reconstruction.photos", runs, []))
+
+
+def test_light_rows_keep_suns_apart():
+    here, light = Path(), {"irradiance_error": 9.0, "scaled_error": 0.1}
+    runs = [
+        Run("a-1", here, here, report(), 7.0, light, "overcast"),
+        Run("b-2", here, here, report(), 7.0, light | {"scaled_error": 0.5, "sun_direction_deg": 4.0}, "sun"),
+        Run("c-3", here, here, report(), 7.0),
+    ]
+    found = {row.metric: row.value for row in light_rows("reconstruction.photos", runs)}
+    assert found == pytest.approx(
+        {
+            "reconstruction.photos.irradiance_error": 0.3,
+            "reconstruction.photos.irradiance_error_soft": 0.1,
+            "reconstruction.photos.irradiance_error_sun": 0.5,
+            "reconstruction.photos.sun_direction_deg": 4.0,
+        }
+    )
+    assert not list(light_rows("reconstruction.photos", runs[2:]))
 
 
 def report(**test: float) -> Report:
@@ -207,6 +254,11 @@ def stand_ins(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     light = EnvironmentMap.constant(0.5, 16)
     beside = {"environment.exr": encode_exr(light.image, half=False)}
     write_capture(made["tron-datagen"] / "captures" / SCENE, small_capture(), beside=beside)
+    (made["tron-datagen"] / "relit").mkdir()
+    for name in ("1_sun", "2_studio"):
+        relit = made["tron-datagen"] / "relit" / f"{SCENE}_{name}"
+        views = [replace(view, space="linear") for view in small_capture().test_views]
+        write_capture(relit, Capture(tuple(views)), beside=beside)
     write_capture(tmp_path / "real" / "captures" / "fox", small_capture())
     light.save(tmp_path / "real" / "noon.exr")
     (tmp_path / "real" / "hdri").mkdir()
@@ -235,7 +287,7 @@ def stand_ins(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     frames = made["tron-relight"] / "frames"
     frames.mkdir(parents=True)
     for index in range(2):
-        write_image(frames / f"{index:04d}.shadowed.exr", np.full((64, 48, 3), 0.2), half=True)
+        write_image(frames / f"{index:04d}.lit.exr", np.full((64, 48, 3), 0.2), half=True)
     (frames.parent / "relight.json").write_text('{"exposure": 0.8}')
 
     log = tmp_path / "commands.txt"
@@ -306,6 +358,47 @@ def test_every_scene_in_every_way_and_the_fox_are_run_once(stand_ins: Path, tmp_
     assert stand_ins.read_text().splitlines() == commands
 
 
+def test_photographs_and_scans_are_relit_and_have_rows(stand_ins: Path, tmp_path: Path):
+    parts = "benchmark.parts=[scenes,photos,splats]"
+    assert run(tmp_path, parts, "~benchmark.ways.depth_init") == 0
+    out = tmp_path / "out"
+    commands = [line.split() for line in stand_ins.read_text().splitlines()]
+    assert [command[1] for command in commands if command[0] == "tron-datagen"] == [
+        "experiment=captures",
+        "experiment=photographs",
+    ]
+    made = {command[-1].partition("=")[2]: command for command in commands}
+    photos = made[str(out / "scenes" / SCENE / "photos")]
+    assert photos[1] == f"capture={out / 'photographs' / 'captures' / SCENE}"
+    assert not [argument for argument in photos if argument.startswith("prior=ground_truth")]
+    splats = made[str(out / "scenes" / SCENE / "splats")]
+    assert splats[1] == f"capture={out / 'scans' / SCENE / 'scene.ply'}"
+    assert made[str(out / "scenes" / SCENE / "scan")][1] == f"capture={out / 'dataset' / 'captures' / SCENE}"
+    header = (out / "scans" / SCENE / "scene.ply").read_bytes().partition(b"end_header")[0]
+    assert b"tron" not in header
+    assert b"base_color" not in header
+
+    results = Results.load(out / "results.json")
+    for prefix in ("reconstruction", "reconstruction.classical", "reconstruction.photos"):
+        for name in ("relight_psnr", "relight_psnr_sun", "relight_psnr_studio", "irradiance_error"):
+            assert results.find(f"{prefix}.{name}") is not None
+    assert results.value("reconstruction.photos.relight_gain") == pytest.approx(0, abs=1e-9)  # one stand-in
+    for prefix in ("splats", "splats.raw"):
+        for name in ("normal_mae_deg", "normal_median_deg", "relight_psnr", "surfels", "seconds"):
+            assert results.find(f"{prefix}.{name}") is not None
+    assert results.value("splats.normal_mae_deg") == pytest.approx(0, abs=0.5)  # the stand-in is the truth
+    page = (out / "report.html").read_text()
+    for anchor in ("relit", "splats"):
+        assert f'id="{anchor}"' in page
+    assert run(tmp_path, parts, "~benchmark.ways.depth_init") == 0
+    assert len(stand_ins.read_text().splitlines()) == len(commands)
+
+
+def test_a_way_is_of_scenes_or_of_photos(stand_ins: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    assert run(tmp_path, '+benchmark.photos.classical=["prior=classical"]') == 2
+    assert "way classical is of photos and of scenes" in capfd.readouterr().err
+
+
 def test_without_real_data_the_fox_has_no_rows_and_the_page_says_so(stand_ins: Path, tmp_path: Path):
     assert run(tmp_path, "benchmark.parts=[fox]", f"benchmark.real_data={tmp_path / 'nowhere'}") == 0
     results = Results.load(tmp_path / "out" / "results.json")
@@ -325,12 +418,15 @@ def test_steps_without_a_scene_are_one_line(
 
 QUICK = (
     '"steps_scaler=0.002","light.resolution=8","light.steps=5","light.scale_steps=3","light.pixels=64",'
-    '"light.split_sum_resolution=64","score_every=10","radiance.density.most=600","initial.count=300"'
+    '"light.split_sum_resolution=64","score_every=10","radiance.density.most=600","initial.count=300","report.frames=2","report.side=32"'
 )
 CAPTURES = (
     '"experiment=captures","captures.scenes=1","captures.views=9","captures.width=32","captures.height=32",'
     '"captures.path_spp=4","captures.reference_spp=4","mesh_edge=0.2","environment_height=32","cluster=null"'
 )
+
+RELIT = '"captures.relight_spp=4"'
+SPLATS = '"up=[0,0,1]","splats.views=9","splats.side=32"'
 
 
 @pytest.mark.long
@@ -347,6 +443,10 @@ def test_the_whole_benchmark_with_the_real_commands(shared_data: Path, tmp_path:
                 f"benchmark.reconstruct=[{QUICK}]",
                 "~benchmark.ways.depth_init",
                 "~benchmark.ways.classical",
+                f"benchmark.photographs=[{CAPTURES.replace('captures', 'photographs', 1)},{RELIT}]",
+                f"benchmark.photos.photos=[{QUICK}]",
+                f'benchmark.splats.scan=[{QUICK},"initial.kernel_degree=2","light=null"]',
+                f"benchmark.splats.reconstruct=[{QUICK},{SPLATS}]",
                 "benchmark.fox_downscale=32",
                 f"benchmark.fox=[{QUICK}]",
                 'benchmark.relight=["quality=preview"]',
@@ -365,6 +465,8 @@ def test_the_whole_benchmark_with_the_real_commands(shared_data: Path, tmp_path:
     results = Results.load(tmp_path / "results.json")
     found = {row.metric for row in results.rows}
     assert {f"reconstruction.{name}" for name in SCENE_FIGURES} <= found
+    assert {f"reconstruction.photos.{name}" for name in (*SCENE_FIGURES, "relight_psnr")} <= found
+    assert {f"splats.{name}" for name in ("normal_mae_deg", "relight_psnr", "raw.relight_psnr")} <= found
     assert {"fox.test_psnr", "fox.seconds", "fox.ssim", "fox.surfels", "fox.relight_seconds"} <= found
     for degree in ("degree2", "degree4"):
         assert {f"step.ratio_to_volprim.{degree}", f"step.ratio_to_volprim.{degree}_32"} <= found
@@ -378,6 +480,17 @@ def test_the_whole_benchmark_with_the_real_commands(shared_data: Path, tmp_path:
     assert {"step.seconds.200_32", "step.seconds.400_32", "step.seconds.200_64"} <= found
     assert results.value("fox.views") == 50
     page = (tmp_path / "report.html").read_text()
-    for anchor in ("targets", "scenes", "views", "light", "fox", "steps", "limits", "stages"):
+    for anchor in (
+        "targets",
+        "scenes",
+        "views",
+        "light",
+        "relit",
+        "splats",
+        "fox",
+        "steps",
+        "limits",
+        "stages",
+    ):
         assert f'id="{anchor}"' in page
     assert len(json.loads((tmp_path / "times.json").read_text())["step degree4_32"]["tron"]) == 1

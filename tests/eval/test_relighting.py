@@ -12,10 +12,10 @@ from eval.relighting.baselines import BASELINES, FINER, METHODS
 from eval.relighting.benchmark import Relighting, choose_clips
 from eval.relighting.scores import GROUPS, METRICS, Score, Scores
 from eval.report.outcome import Outcome
-from eval.report.page import Pictures, Table
 from eval.results import Results
 from tron.errors import TronError
 from tron.images import read_image
+from tron.report.page import Pictures, Table
 
 REQUIRED = [
     *(

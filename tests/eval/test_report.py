@@ -9,11 +9,12 @@ import pytest
 
 from eval.report.assemble import assemble
 from eval.report.charts import read_metrics, training_curves
-from eval.report.figures import format_value, verdict
+from eval.report.figures import verdict
 from eval.report.outcome import Outcome
-from eval.report.page import Cell, Page, Picture, Pictures, Section, Table, Text, Tile
-from eval.report.render import data_uri, render
 from eval.results import Results, Row, Target
+from tron.report.page import Cell, Page, Picture, Pictures, Section, Table, Text, Tile
+from tron.report.render import data_uri, render
+from tron.report.values import format_value
 
 METRICS = """stage,step,seconds,loss,learning_rate,val_psnr,val_psnr_full
 synthetic,50,10.0,0.05,0.001,,

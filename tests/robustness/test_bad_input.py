@@ -37,7 +37,7 @@ BAD_FILES = [
     ("tron-relight", ["environment={inputs}/text.xyz"], ["text.xyz"]),
     ("tron-relight", ["environment=[{inputs}/good.exr,{inputs}/absent.hdr]"], ["absent.hdr"]),
     ("tron-relight", ["environment={inputs}/walk.mp4"], ["a video cannot hold", "walk.mp4"]),
-    ("tron-relight", ["scene={inputs}/walk.mp4"], ["a video", "ffmpeg -i walk.mp4", "tron-reconstruct"]),
+    ("tron-relight", ["scene={inputs}/walk.mp4"], ["a video", "tron-reconstruct capture=walk.mp4"]),
     ("tron-relight", ["scene={inputs}/cat.splat"], ["antimatter15", "splat-transform cat.splat cat.ply"]),
     ("tron-relight", ["scene={inputs}/cat.spz"], ["Niantic", "splat-transform cat.spz cat.ply"]),
     ("tron-relight", ["scene={inputs}/cat.compressed.ply"], ["PlayCanvas", "cat.compressed.ply cat.ply"]),

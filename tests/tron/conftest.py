@@ -94,7 +94,7 @@ def _transform() -> Any:
     return mi.ScalarTransform4f()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def dense_surfels(variant: str) -> DenseSurfels:
     return DenseSurfels()
 

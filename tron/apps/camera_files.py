@@ -22,6 +22,21 @@ def read_cameras(path: Path, width: int, height: int) -> list[Camera]:
 
     Raises TronError if the file is missing, is no such JSON, holds no camera, or has another aspect ratio.
     """
+    cameras = cameras_of(path)
+    for camera in cameras:
+        if abs(camera.width * height - camera.height * width) > max(width, height):
+            scale = max(width, height) / max(camera.width, camera.height)
+            fit = [2 * round(scale * side / 2) for side in (camera.width, camera.height)]
+            raise TronError(
+                f"cameras are {camera.width} x {camera.height}, frames {width} x {height}",
+                path,
+                f"choose the same aspect ratio, such as width={fit[0]} height={fit[1]}",
+            )
+    return [camera.resized(width, height) for camera in cameras]
+
+
+def cameras_of(path: Path) -> list[Camera]:
+    """Cameras of a JSON file (see :func:`read_cameras`) at their own size; TronError likewise."""
     try:
         content = json.loads(path.read_text("utf-8"))
     except OSError as error:
@@ -35,17 +50,9 @@ def read_cameras(path: Path, width: int, height: int) -> list[Camera]:
         mend = 'give a list, {"cameras": [...]} as in relight.json, or nerfstudio\'s camera_path.json'
         raise TronError("no cameras found", path, mend)
     try:
-        cameras = _nerfstudio(content) if saved_by_viewer else [Camera.from_dict(entry) for entry in entries]
+        return _nerfstudio(content) if saved_by_viewer else [Camera.from_dict(entry) for entry in entries]
     except TronError as error:
         raise TronError(error.what, path, error.mend) from error
-    for camera in cameras:
-        if abs(camera.width * height - camera.height * width) > max(width, height):
-            raise TronError(
-                f"cameras are {camera.width} x {camera.height}, frames {width} x {height}",
-                path,
-                "choose width and height of the same aspect ratio",
-            )
-    return [camera.resized(width, height) for camera in cameras]
 
 
 def _nerfstudio(content: dict[str, Any]) -> list[Camera]:

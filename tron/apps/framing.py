@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -58,6 +58,11 @@ def find_subject(scene: GaussianScene) -> Subject:
     return Subject(shown[from_centre <= radius], centre, max(radius, scene.spacing))
 
 
+def has_floor(scene: GaussianScene) -> bool:
+    """Whether part of the scene is a floor that the rest stands on."""
+    return not _off_floor(scene).all()
+
+
 def _off_floor(scene: GaussianScene) -> np.ndarray:
     """(M,) bool: surfels that stand on or above the floor; all of them where no floor is found."""
     everything = np.ones(len(scene), dtype=bool)
@@ -86,6 +91,7 @@ def plan_cameras(
     height: int,
     fov_deg: float,
     distance: float = 1.0,
+    **path: Any,
 ) -> list[Camera]:
     """A camera path around the scene's subject.
 
@@ -96,12 +102,13 @@ def plan_cameras(
         width, height: pixels.
         fov_deg: horizontal field of view, degrees.
         distance: factor on the automatic distance.
+        path: what the trajectory is told beside, such as its elevations.
     """
     subject = find_subject(scene)
     view = {"target": subject.centre, "up": scene.up, "width": width, "height": height, "fov_deg": fov_deg}
 
     def at(radius: float) -> list[Camera]:
-        return getattr(trajectories, trajectory)(frames, radius=radius, **view)
+        return getattr(trajectories, trajectory)(frames, radius=radius, **view, **path)
 
     probes = subject.points[:: max(1, len(subject.points) // _PROBES)]
     # From the far end a sphere around the subject fits into any frame; bisection of the logarithm from there.

@@ -11,10 +11,13 @@ import yaml
 
 import tron
 from tron.apps.reconstruct_settings import Settings
+from tron.apps.splat_capture import film_splats, is_splats
 from tron.captures import Capture, load_capture
 from tron.cli.command_line import command
 from tron.cli.instantiation import make
-from tron.runtime import activate, set_torch_threads
+from tron.cli.progress import track
+from tron.reconstruction.joint import Joint
+from tron.runtime import activate, set_torch_threads, torch_device
 from tron.storage import locked, require_free_space, write_atomic
 
 if TYPE_CHECKING:
@@ -23,34 +26,40 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-RESULTS = ("scene.ply", "environment.exr", "metrics.json", "curve.json", "light.png", "contact_sheet.png")
+RESULTS = (
+    *("scene.ply", "cameras.json", "environment.exr", "metrics.json", "curve.json"),
+    *("light.png", "contact_sheet.png", "report.html"),
+)
 SURFEL_BYTES = 1600  # PLY, checkpoint with Adam's moments, and their temporary copies
 
 
 def main(settings: Settings) -> None:
-    """Turn posed photos, bare photos or path-traced views into surfels with materials, and find their light.
+    """Turn posed photos, bare photos, path-traced views or splats into surfels with materials and a light.
 
     Writes scene.ply, which tron-relight and every 3DGS viewer open, environment.exr, metrics.json (held-out
-    and training views), contact_sheet.png (held-out views and every channel), light.png and config.yaml. A
-    run that was interrupted resumes when it is started again.
+    and training views), report.html (the scene relit, its G-buffers, its light, how sure each figure is),
+    contact_sheet.png (held-out views and every channel), light.png, cameras.json (where the photos
+    were taken, for tron-relight) and config.yaml. A run that was interrupted resumes when it is started
+    again.
     """
     prior = make(settings.prior, "prior")
     lpips = _load_lpips(settings)
     require_free_space(settings.output_dir, settings.radiance.density.most * SURFEL_BYTES)
     activate(settings.variant, settings.threads)
     # Photos without poses take minutes to load: whatever can be refused without them is refused by now.
-    capture = load_capture(settings.capture, settings.of_loading())
+    capture = _load_capture(settings)
     log.info(
         "%d views, %d of them held out, %d x %d, %d skipped",
         len(capture.views), len(capture.test), capture.views[0].camera.width,
         capture.views[0].camera.height, len(capture.skipped),
     )  # fmt: skip
-    prior.fields(capture)  # what cannot be had is said before long work
+    if not isinstance(prior, Joint):
+        prior.fields(capture)  # what cannot be had is said before long work
     # Dr.Jit has the cores; the loss is small, and torch's threads would wait for theirs.
     set_torch_threads(1)
     with locked(settings.output_dir):
         _claim(settings, capture, prior)
-        report = _finished(settings)
+        report = _finished(settings, capture)
         if report is None:
             from tron.apps.reconstruct_run import run
 
@@ -58,6 +67,15 @@ def main(settings: Settings) -> None:
         else:
             log.info("finished before; overwrite=true begins anew")
         _log_summary(report, settings.output_dir)
+
+
+def _load_capture(settings: Settings) -> Capture:
+    if not is_splats(settings.capture):
+        return load_capture(settings.capture, settings.of_loading())
+    return film_splats(
+        settings.capture, settings.splats, settings.up, settings.test_every, settings.radiance.consistency,
+        settings.seed, torch_device(settings.variant), track,
+    )  # fmt: skip
 
 
 def _load_lpips(settings: Settings) -> LPIPS | None:
@@ -68,7 +86,7 @@ def _load_lpips(settings: Settings) -> LPIPS | None:
     return LPIPS.load(settings.lpips_weights)
 
 
-def _claim(settings: Settings, capture: Capture, prior: Prior) -> None:
+def _claim(settings: Settings, capture: Capture, prior: Prior | Joint) -> None:
     """Keep the resolved configuration, and clear the way for a new run where that is asked for.
 
     Raises:
@@ -88,15 +106,18 @@ def _claim(settings: Settings, capture: Capture, prior: Prior) -> None:
     write_atomic(settings.output_dir / "config.yaml", text)
 
 
-def _finished(settings: Settings) -> dict[str, Any] | None:
-    """The report of a run with these settings that came to its end, all its files still there; else None."""
+def _finished(settings: Settings, capture: Capture) -> dict[str, Any] | None:
+    """The report of a run with these settings and photos that came to its end, all its files there."""
+    from tron.apps.reconstruct_run import shown_by
+
     try:
         report = json.loads((settings.output_dir / "metrics.json").read_text("utf-8"))
-        same = report["settings"] == settings.kept()
+        same = report["settings"] == settings.kept() and report["capture"]["content"] == shown_by(capture)
         files = [
             "scene.ply",
             "contact_sheet.png",
             *(["environment.exr", "light.png"] if report["light"] else []),
+            *(["report.html"] if settings.report else []),
         ]
         complete = report["version"] == tron.__version__ and all(
             (settings.output_dir / name).is_file() for name in files
@@ -113,7 +134,8 @@ def _log_summary(report: dict[str, Any], out: Path) -> None:
             said = ", ".join(f"{key} {value:.4g}" for key, value in figures.items() if key != "views")
             log.info("%s, %d views: %s", name, figures["views"], said)
     log.info("%d surfels in %s", report["surfels"], out / "scene.ply")
-    log.info("pictures: %s", out / "contact_sheet.png")
+    pages = [out / name for name in ("report.html", "contact_sheet.png") if (out / name).is_file()]
+    log.info("look at %s", pages[0])
 
 
 cli = command(
@@ -125,6 +147,7 @@ cli = command(
         "tron-reconstruct capture=photos output_dir=outputs/mine",
         "tron-reconstruct experiment=photos capture=fox downscale=8 output_dir=outputs/fox",
         "tron-reconstruct capture=scene prior=ground_truth initial.source=depth output_dir=out",
+        "tron-reconstruct capture=scan.ply up=[0,0,1] output_dir=outputs/relightable",
         "tron-reconstruct capture=garden prior=precomputed prior.folder=maps experiment=paper output_dir=out",
     ),
 )

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from tron.apps.labelled_sheet import labelled_sheet
-from tron.captures import Capture
+from tron.captures import Capture, View
 from tron.color import linear_to_srgb, to_display
 from tron.estimation import Estimation
 from tron.images import write_image
-from tron.reconstruction import EnvironmentFit
 from tron.reconstruction.evaluation import picture, wanted_picture
 from tron.reconstruction.settings import FitSettings
 from tron.shading.bounce import BounceTransport
+from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Lighting, render_guidance
 from tron.tracing import SurfelTracer
 
@@ -26,42 +26,52 @@ def write_sheet(
     path: Path,
     tracer: SurfelTracer,
     capture: Capture,
-    light: EnvironmentFit | None,
+    environment: EnvironmentMap | None,
     settings: FitSettings | None,
 ) -> None:
     """Held-out views (training views, if none is) with every channel of the G-buffer and the guidance.
 
-    The guidance needs the light and the ``settings`` that it was fitted with: shadows are estimated as there.
+    The guidance needs the ``environment`` and the ``settings`` of shadows.
     ``lit`` beside ``photo`` shows how far materials and light explain it, what bounces included.
     """
-    views = capture.test_views or capture.train_views
-    views = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, SHEET_VIEWS).astype(int))]
+    views = chosen_views(capture, SHEET_VIEWS)
     rows: dict[str, list[np.ndarray]] = {}
-    lighting = None if light is None else Lighting(light.environment)
+    lighting = None if environment is None else Lighting(environment)
     estimation, bounce = None if settings is None else sheet_estimation(settings), None
     if lighting is not None and estimation is not None:
         bounce = BounceTransport.trace(tracer.sided(estimation.two_sided)).bake(lighting, estimation)
     for number, view in enumerate(views):
-        buffers = tracer.gbuffer(view.camera).numpy()
-        rendered, wanted = picture(buffers), wanted_picture(view)
-        for name, image in {
-            "photo": wanted,
-            "radiance": rendered,
-            "error x 4": 4 * np.abs(rendered - wanted),
-            "opacity": buffers["opacity"],
-            "depth": _relative(buffers["depth"]),
-            "position": _relative(buffers["position"], buffers["opacity"] > 0.5),
-            "normal": 0.5 * buffers["normal"] + 0.5,
-            "base color": linear_to_srgb(np.clip(buffers["base_color"], 0, 1)),
-            "roughness": buffers["roughness"],
-            "metallic": buffers["metallic"],
-        }.items():
+        for name, image in view_pictures(tracer, view).items():
             rows.setdefault(name, []).append(image)
         if lighting is not None and estimation is not None:
             guidance = render_guidance(tracer, view.camera, lighting, estimation, number, bounce=bounce)
             for name in ("pbr", "irradiance", "lit"):
                 rows.setdefault(name, []).append(to_display(guidance[name], capture.exposure))
     write_image(path, labelled_sheet(rows, [view.name for view in views]))
+
+
+def chosen_views(capture: Capture, count: int) -> list[View]:
+    """At most ``count`` of the held-out views, evenly spread; of the training views, if none is held out."""
+    views = capture.test_views or capture.train_views
+    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, count).astype(int))]
+
+
+def view_pictures(tracer: SurfelTracer, view: View) -> dict[str, np.ndarray]:
+    """A view's photo and what the surfels show of it: channel -> (H, W) or (H, W, 3) display values."""
+    buffers = tracer.gbuffer(view.camera).numpy()
+    rendered, wanted = picture(buffers), wanted_picture(view)
+    return {
+        "photo": wanted,
+        "radiance": rendered,
+        "error x 4": 4 * np.abs(rendered - wanted),
+        "opacity": buffers["opacity"],
+        "depth": _relative(buffers["depth"]),
+        "position": _relative(buffers["position"], buffers["opacity"] > 0.5),
+        "normal": 0.5 * buffers["normal"] + 0.5,
+        "base color": linear_to_srgb(np.clip(buffers["base_color"], 0, 1)),
+        "roughness": buffers["roughness"],
+        "metallic": buffers["metallic"],
+    }
 
 
 def sheet_estimation(settings: FitSettings) -> Estimation:
@@ -79,6 +89,6 @@ def _relative(values: np.ndarray, known: np.ndarray | None = None) -> np.ndarray
     return np.where(known if values.ndim == 2 else known[..., None], spread, 0)
 
 
-def write_light(path: Path, light: EnvironmentFit) -> None:
+def write_light(path: Path, environment: EnvironmentMap) -> None:
     """The environment map, exposed as tron-relight would."""
-    write_image(path, to_display(light.environment.image, light.environment.exposure()))
+    write_image(path, to_display(environment.image, environment.exposure()))

@@ -11,13 +11,16 @@ from typing import Any
 import numpy as np
 
 import tron
+from tron.apps.filmed_space import write_cameras
 from tron.apps.reconstruct_pictures import write_light, write_sheet
+from tron.apps.reconstruct_report import write_page
 from tron.apps.reconstruct_settings import Settings
 from tron.captures import Capture
+from tron.captures.content import content_hash
 from tron.cli.progress import Progress, track
 from tron.metrics import LPIPS
 from tron.priors import Prior
-from tron.reconstruction import EnvironmentFit, Reconstruction, fit_environment, reconstruct
+from tron.reconstruction import Joint, Reconstruction, fit_environment, reconstruct
 from tron.reconstruction.curve import Curve
 from tron.reconstruction.evaluation import ViewScore, mean_figures, score_views
 from tron.reconstruction.training import Stage, StepSummary
@@ -28,10 +31,11 @@ from tron.tracing import SurfelTracer
 log = logging.getLogger(__name__)
 
 CHECKPOINT = "checkpoint.safetensors"
+PAGE = "report.html"
 TRAIN_VIEWS_SCORED = 8
 
 
-def run(settings: Settings, capture: Capture, prior: Prior, lpips: LPIPS | None) -> dict[str, Any]:
+def run(settings: Settings, capture: Capture, prior: Prior | Joint, lpips: LPIPS | None) -> dict[str, Any]:
     """Reconstruct a capture into the output folder; the report, which metrics.json holds.
 
     Args:
@@ -59,29 +63,42 @@ def run(settings: Settings, capture: Capture, prior: Prior, lpips: LPIPS | None)
     finally:
         bars.close()
     found.scene.save(out / "scene.ply")
+    write_cameras(out, capture.views)
     tracer = SurfelTracer(found.scene)
     started = time.perf_counter()
-    light: EnvironmentFit | None = None
+    environment, said = None, None
     if settings.light is None:
         log.info("no light is fitted: light=null")
+    elif found.explanation is not None:
+        environment, said = found.explanation.environment, found.explanation.said()
     elif not any(view.has("irradiance") for view in found.capture.train_views):
         log.warning("the prior gives no irradiance, so no light can be fitted: there is no environment.exr")
     else:
         light = fit_environment(found.capture, tracer, settings.light, track)
-        light.environment.save(out / "environment.exr")
+        environment = light.environment
+        said = {"sigma": light.scale.sigma, "irradiance_l1": float(np.mean(light.cubemap.loss[-50:]))}
+    if environment is not None:
+        environment.save(out / "environment.exr")
     seconds = {"surfels": round(found.seconds, 2), "light": round(time.perf_counter() - started, 2)}
     background = settings.radiance.background
     test = score_views(tracer, capture.test_views, background, lpips, track)
     some = capture.train_views[:: max(1, len(capture.train_views) // TRAIN_VIEWS_SCORED)]
     train = score_views(tracer, some, background, lpips, track)
-    write_sheet(out / "contact_sheet.png", tracer, capture, light, settings.light)
-    if light is not None:
-        write_light(out / "light.png", light)
-    report = _report(settings, capture, found, light, test, train, seconds)
+    write_sheet(out / "contact_sheet.png", tracer, capture, environment, settings.light)
+    if environment is not None:
+        write_light(out / "light.png", environment)
+    report = _report(settings, capture, found, said, test, train, seconds)
     if curve is not None:
         report["curve"] = curve.points
+    if settings.report is not None:
+        write_page(out / PAGE, settings.report, report, found.scene, capture, environment)
     write_atomic(out / "metrics.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
     return report
+
+
+def shown_by(capture: Capture) -> list[str]:
+    """Hashes of what training and held-out views show, by which a capture is known again."""
+    return [capture.content, content_hash(capture.test_views)]
 
 
 class StageBars:
@@ -111,7 +128,7 @@ def _report(
     settings: Settings,
     capture: Capture,
     found: Reconstruction,
-    light: EnvironmentFit | None,
+    light: dict[str, Any] | None,
     test: Sequence[ViewScore],
     train: Sequence[ViewScore],
     seconds: dict[str, float],
@@ -125,16 +142,16 @@ def _report(
             "skipped": dict(capture.skipped),
             "up": capture.up.tolist(),
             "transform": capture.transform.tolist(),
+            "content": shown_by(capture),
         },
         "surfels": len(found.scene),
+        "first_surfels": {"source": found.source, "stereo_confident": found.confident},
         "materials_learnt": list(found.learnt),
         "test": mean_figures(test) if test else None,
         "train": mean_figures(train),
         "views": {score.view: dict(score.figures) for score in (*test, *train)},
         "albedo_scaling": "per view and channel, least squares on the subject",
-        "light": None
-        if light is None
-        else {"sigma": light.scale.sigma, "irradiance_l1": float(np.mean(light.cubemap.loss[-50:]))},
+        "light": light,
         "seconds": seconds,
         "settings": settings.kept(),
         "machine": describe_machine(),

@@ -18,6 +18,7 @@ import numpy as np
 import tron
 from tron.apps.camera_files import read_cameras
 from tron.apps.clip import Clip, trace
+from tron.apps.filmed_space import CAMERAS, filmed_cameras, filmed_orbit
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.framing import plan_cameras, turn_cameras, upright
 from tron.apps.relight_settings import Settings
@@ -65,9 +66,7 @@ def main(settings: Settings) -> None:
     if given is not None:
         cameras = turn_cameras(given, turn)
     else:
-        view = {"width": settings.width, "height": settings.height, "fov_deg": settings.fov}
-        path = settings.trajectory, settings.frames
-        cameras = plan_cameras(scene, *path, **view, distance=settings.distance)
+        cameras = _planned(settings, scene, turn)
     activate(settings.variant, settings.threads)
     # Without a network the relit picture is one of them, and is shown as such; so is lit if nothing bounces.
     guidance = [name for name in GUIDANCE if name != settings.source and (settings.bounces or name != "lit")]
@@ -95,6 +94,29 @@ def main(settings: Settings) -> None:
             write_atomic(light.output_dir / "relight.json", json.dumps(report, indent=1) + "\n")
             made = len(cameras), len(clip.seconds), light.output_dir / "relit.mp4"
             log.info("%d frames, %d of them rendered now: look at %s", *made)
+
+
+def _planned(settings: Settings, scene: GaussianScene, turn: np.ndarray) -> list[Camera]:
+    """The camera path that the settings name, in the world in which up is +z."""
+    view = {
+        "width": settings.width,
+        "height": settings.height,
+        "fov_deg": settings.fov,
+        "distance": settings.distance,
+    }
+    filmed = None
+    if settings.trajectory in ("orbit", "still"):
+        try:
+            filmed = filmed_cameras(settings.scene)
+        except TronError as error:
+            log.warning("%s; the orbit is planned without it", error)
+    if filmed is None:
+        return plan_cameras(scene, settings.trajectory, settings.frames, **view)
+    log.info("the orbit stays between the %d cameras of %s", len(filmed), settings.scene.with_name(CAMERAS))
+    filmed = turn_cameras(filmed, turn)
+    if settings.trajectory == "orbit":
+        return filmed_orbit(filmed, settings.frames, up=scene.up, **view)
+    return filmed_orbit(filmed, 1, up=scene.up, **view) * settings.frames
 
 
 class _Clock:
@@ -128,9 +150,10 @@ def _load_scene(settings: Settings) -> GaussianScene:
     scene = GaussianScene.load(settings.scene)
     if scene.materials_guessed:
         log.warning(
-            "%s has no materials: they are guessed from its colours, which keep the light it was captured in",
-            settings.scene,
-        )
+            "%s has no materials%s: they are guessed from its colours, which keep the light it was captured "
+            "in; tron-reconstruct capture=%s output_dir=OUT finds surfaces, materials and light",
+            settings.scene, "" if scene.oriented else " and normals without a sign", settings.scene,
+        )  # fmt: skip
     if settings.up is not None:
         scene.up = np.array(settings.up) / np.linalg.norm(settings.up)
     elif scene.up_guessed:
@@ -175,10 +198,12 @@ def _clip(light: Settings, environment: EnvironmentMap, frames: int, guidance: S
 
 def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> dict[str, Any]:
     """Recipe of the linear frames: all that their pixels depend on, as JSON values."""
+    filmed = light.scene.with_name(CAMERAS)
     keys = {"rotation", "trajectory", "quality", "width", "height", "fov", "distance", "seed", "variant"}
     return {
         "scene_sha256": sha256(light.scene),
         "environment_sha256": sha256(light.light),
+        "filmed_sha256": sha256(filmed) if light.cameras is None and filmed.is_file() else None,
         "cameras_sha256": None if light.cameras is None else sha256(light.cameras),
         "frames": len(cameras),
         "up": [round(float(value), 6) for value in turn[2]],

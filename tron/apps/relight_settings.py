@@ -53,7 +53,11 @@ class Settings(BaseModel):
         "turns it evenly over the clip, whose end is left out so that it loops: frame i of n is at 360 i/n",
         examples=["[0,360]"],
     )
-    trajectory: TrajectoryName = Field("orbit", description="camera path around the scene; still: no motion")
+    trajectory: TrajectoryName = Field(
+        "orbit",
+        description="camera path around the scene; still: no motion. Where cameras.json lies beside the "
+        "scene, orbit and still keep between its cameras",
+    )
     cameras: Path | None = Field(
         None,
         description="JSON to use instead of a trajectory: a list of cameras (as in relight.json), or "

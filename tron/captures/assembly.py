@@ -4,70 +4,25 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from tron.captures.capture import Capture
-from tron.captures.distortion import Lens
 from tron.captures.image_folder import view_names
 from tron.captures.orientation import estimate_up
-from tron.captures.photographs import Decode, PhotoCache, PhotoHeader, PhotoReader, inspect_photo
+from tron.captures.photo_files import LINEAR_SUFFIXES, exposure_of, require_decoders
+from tron.captures.photo_views import PhotoViews
+from tron.captures.photographs import PhotoCache
+from tron.captures.posed_photos import PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.captures.view import View
 from tron.errors import TronError
 
 log = logging.getLogger(__name__)
 
-_SHAPE_TOLERANCE = 0.02
 _SHOWN = 5
-
-
-@dataclass(frozen=True)
-class PosedPhoto:
-    """Photo as its file describes it; nothing is checked yet.
-
-    Attributes:
-        name: as the file has it.
-        path: the image, None if it was not found.
-        camera_to_world: matrix to the capture's world, OpenCV camera axes; anything (4, 4) or (3, 4).
-        lens: of the photo, or what gives the lens for a photo of this width and height.
-        split: whether the file holds the photo out; None where it does not say.
-        maps: more images of the same pixels, by field of :class:`View`, with what they encode.
-        refused: why the photo cannot be used, if the file itself shows that.
-    """
-
-    name: str
-    path: Path | None
-    camera_to_world: object
-    lens: Lens | Callable[[int, int], Lens] | None
-    split: Literal["train", "test"] | None = None
-    maps: Mapping[str, tuple[Path, Decode]] = field(default_factory=dict)
-    refused: str | None = None
-
-
-@dataclass(frozen=True)
-class PosedPhotos:
-    """Photos and points of a file of poses; fields as in :class:`Capture`.
-
-    Attributes:
-        source: the file or folder, for messages.
-        upright: the poses belong to photos turned as their EXIF tags say.
-        names: of the views, in the order of photos; None names them after their images.
-    """
-
-    source: Path
-    photos: Sequence[PosedPhoto]
-    points: np.ndarray | None = None
-    point_colors: np.ndarray | None = None
-    transform: np.ndarray = field(default_factory=lambda: np.eye(4))
-    skipped: Mapping[str, str] = field(default_factory=dict)
-    upright: bool = False
-    names: Sequence[str] | None = None
 
 
 def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> Capture:
@@ -81,25 +36,27 @@ def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> C
     """
     if not posed.photos:
         raise TronError("the file names no photos", posed.source)
+    require_decoders(photo.path for photo in posed.photos)
     cache = PhotoCache(cache_bytes)
     skipped = dict(posed.skipped)
     views: dict[str, View] = {}
     splits: dict[str, str | None] = {}
     claimed: set[str | Path] = set()
-    lost_maps: list[str] = []
-    reduced: list[tuple[tuple[int, int], tuple[int, int]]] = []
+    whole = [photo.path for photo in posed.photos if photo.path is not None]
+    made = PhotoViews(settings, cache, posed.upright, exposure_of(whole, settings.exr_exposure))
     names = posed.names or view_names([photo.name for photo in posed.photos])
     for name, photo in zip(names, posed.photos):
         try:
             if name in claimed or photo.path in claimed:
                 raise TronError("named more than once")
             claimed |= {name} if photo.path is None else {name, photo.path}
-            views[name] = _view(name, photo, posed.upright, settings, cache, lost_maps, reduced)
+            views[name] = made.view(name, photo)
             splits[name] = photo.split
         except TronError as error:
             skipped[_free(name, skipped, views)] = error.what + (f": {error.mend}" if error.mend else "")
-    _report(posed, skipped, len(views), lost_maps)
-    _log_reduced(posed.source, len(views), reduced, settings)
+    _report(posed, skipped, len(views), made.lost_maps)
+    _log_kinds(posed.source, made, sum(path.suffix.lower() in LINEAR_SUFFIXES for path in whole), settings)
+    _log_reduced(posed.source, len(views), made.reduced, settings)
     ordered = tuple(views[name] for name in sorted(views))
     up = (
         estimate_up([view.camera for view in ordered])
@@ -115,86 +72,6 @@ def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> C
         transform=posed.transform,
         skipped=skipped,
     )
-
-
-def _view(
-    name: str,
-    photo: PosedPhoto,
-    upright: bool,
-    settings: PhotoSettings,
-    cache: PhotoCache,
-    lost_maps: list[str],
-    reduced: list[tuple[tuple[int, int], tuple[int, int]]],
-) -> View:
-    if photo.refused or photo.lens is None:
-        raise TronError(photo.refused or "no camera")
-    if photo.path is None:
-        raise TronError("image not found")
-    world_to_camera = np.linalg.inv(rigid_pose(photo.camera_to_world))
-    header = inspect_photo(photo.path)
-    width, height = header.size(upright)
-    lens = photo.lens(width, height) if callable(photo.lens) else photo.lens
-    # Halved sizes are rounded, so shapes may differ by a pixel.
-    if abs(width * lens.height - height * lens.width) > max(
-        _SHAPE_TOLERANCE * width * lens.height, lens.width, lens.height
-    ):
-        raise TronError(
-            f"image has {width} x {height} pixels, its intrinsics are for {lens.width:g} x {lens.height:g}"
-        )
-    size = settings.size_of(width, height)
-    camera = lens.camera(world_to_camera, width, height).resized(*size)
-    read = partial(PhotoReader, lens=lens, size=size, cache=cache, upright=upright)
-    photo_reader = read(photo.path, header)
-    maps = {}
-    for field_name, (path, decode) in photo.maps.items():
-        try:
-            maps[field_name] = partial(_map_reader(read, path, header).decoded, decode)
-        except TronError as error:
-            lost_maps.append(f"{field_name} of {name} ({error.what})")
-    if header.alpha:
-        maps["mask"] = photo_reader.alpha
-    if size != (width, height):
-        reduced.append(((width, height), size))
-    return View(name, camera, photo_reader.color, "display", **maps)
-
-
-def _map_reader(read: Callable[..., PhotoReader], path: Path, photo: PhotoHeader) -> PhotoReader:
-    header = inspect_photo(path)
-    if (header.width, header.height) != (photo.width, photo.height):
-        raise TronError(
-            f"{header.width} x {header.height} pixels, the photo has {photo.width} x {photo.height}"
-        )
-    return read(path, header)
-
-
-def rigid_pose(matrix: object) -> np.ndarray:
-    """(4, 4) float64 rigid transform from a (4, 4) or (3, 4) matrix as files have it.
-
-    A uniform scale of the axes is divided out, the position kept; rounding is removed by taking the nearest
-    rotation.
-
-    Raises:
-        TronError: another shape, NaN, a mirrored, sheared or unevenly scaled matrix.
-    """
-    try:
-        pose = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise TronError("pose is not a matrix of numbers") from error
-    if pose.shape not in ((4, 4), (3, 4)):
-        raise TronError(f"pose has shape {pose.shape}, not (4, 4)")
-    if not np.isfinite(pose).all():
-        raise TronError("pose holds NaN or infinity")
-    if pose.shape == (4, 4) and not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-6):
-        raise TronError("last row of the pose is not 0 0 0 1")
-    u, scales, vt = np.linalg.svd(pose[:3, :3])
-    if scales[0] < 1e-9 or scales[0] - scales[2] > 0.01 * scales[0]:
-        raise TronError("pose is no rotation: its axes are not at right angles and of one length")
-    if np.linalg.det(pose[:3, :3]) < 0:
-        raise TronError("pose is mirrored: its axes are left-handed")
-    rigid = np.eye(4)
-    rigid[:3, :3] = u @ vt
-    rigid[:3, 3] = pose[:3, 3]
-    return rigid
 
 
 def _held_out(splits: Mapping[str, str | None], test_every: int, source: Path) -> frozenset[str]:
@@ -233,6 +110,17 @@ def _report(posed: PosedPhotos, skipped: Mapping[str, str], usable: int, lost_ma
         log.warning("%s: %d of %d photos skipped: %s%s", posed.source, len(skipped), total, shown, rest)
     if lost_maps:
         log.warning("%s: %d maps left out, first %s", posed.source, len(lost_maps), lost_maps[0])
+
+
+def _log_kinds(source: Path, made: PhotoViews, linear: int, settings: PhotoSettings) -> None:
+    """Say how masks are taken and how linear photos are shown: neither is seen in the files' names."""
+    if made.masked:
+        meaning = {"ignore": "is not learnt from", "subject": "is empty background"}[str(settings.masks)]
+        log.info("%s: what is black in the masks of %d photos %s (masks=ignore, subject or null)",
+                 source, made.masked, meaning)  # fmt: skip
+    if linear:
+        log.info("%s: %d EXR photos are shown with exposure %.4g (exr_exposure) and the sRGB curve",
+                 source, linear, made.exposure)  # fmt: skip
 
 
 def _log_reduced(

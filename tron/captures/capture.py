@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
-from tron.captures.view import View
+from tron.captures.content import content_hash
+from tron.captures.view import ToneCurve, View
 from tron.errors import TronError
 
 
@@ -26,6 +28,7 @@ class Capture:
         exposure: what linear radiance is multiplied by before AgX to look like the images; one number for
             all, because all show one light. Radiance of unknown scale has 1.
         skipped: what the files name and the capture lacks: name -> why, such as "image not found".
+        tone_curve: that display images went through.
 
     Raises:
         TronError: no views, names that repeat, a held-out name that no view has, no view left to train on,
@@ -40,6 +43,7 @@ class Capture:
     exposure: float = 1.0
     transform: np.ndarray = field(default_factory=lambda: np.eye(4))
     skipped: Mapping[str, str] = field(default_factory=dict)
+    tone_curve: ToneCurve = "srgb"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "views", tuple(self.views))
@@ -83,6 +87,11 @@ class Capture:
     def train_views(self) -> Sequence[View]:
         """The views that are learnt from, in order."""
         return [view for view in self.views if view.name not in self.test]
+
+    @cached_property
+    def content(self) -> str:
+        """Hash of all that the training views show (see :func:`content_hash`)."""
+        return content_hash(self.train_views)
 
     @property
     def test_views(self) -> Sequence[View]:

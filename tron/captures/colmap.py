@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tron.captures.assembly import PosedPhoto, PosedPhotos
 from tron.captures.colmap_files import require_whole
 from tron.captures.distortion import Lens
 from tron.captures.image_folder import ImageFolder, photos_in, view_names
+from tron.captures.posed_photos import PosedPhoto, PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
 

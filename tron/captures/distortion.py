@@ -90,6 +90,14 @@ class Lens:
         """
         import cv2
 
+        floats = (self.places(width, height) - 0.5).astype(np.float32)
+        return cv2.convertMaps(floats, None, cv2.CV_16SC2)  # type: ignore[arg-type]
+
+    def places(self, width: int, height: int) -> np.ndarray:
+        """Places in the stored image of the centres of the undistorted pixels, (height, width, 2) float64.
+
+        Column, then row, of a stored image of this size; the centre of its first pixel is at (0.5, 0.5).
+        """
         fx, fy, cx, cy = _pinhole(self)
         sx, sy = width / self.width, height / self.height
         x = ((np.arange(width) + 0.5) / sx - cx) / fx
@@ -97,9 +105,8 @@ class Lens:
         rays = np.ones((height * width, 3))
         rays[:, 0] = np.tile(x, height)
         rays[:, 1] = np.repeat(y, width)
-        pixels = np.asarray(_colmap_camera(self).img_from_cam(rays, False)) * (sx, sy) - 0.5
-        floats = pixels.astype(np.float32).reshape(height, width, 2)
-        return cv2.convertMaps(floats, None, cv2.CV_16SC2)  # type: ignore[arg-type]
+        pixels = np.asarray(_colmap_camera(self).img_from_cam(rays, False)) * (sx, sy)
+        return pixels.reshape(height, width, 2)
 
 
 def opencv_lens(

@@ -3,7 +3,7 @@
     transforms.json     intrinsics, OpenGL camera-to-world matrices, the split, and the object "tron"
     images/NAME.png     8 bits, RGBA with straight colours where a view has a mask (linear images: half EXR)
     FIELD/NAME.exr      normal, base_color, roughness, metallic, irradiance: half; depth: float32
-    sky_mask/NAME.png   8 bits
+    sky_mask/NAME.png   8 bits; valid/NAME.png likewise
     points.ply          points on surfaces and their colours, if some are known
 
 nerfstudio and instant-ngp read the cameras, images, split and points and pass over the rest. The object
@@ -40,11 +40,11 @@ POINTS_NAME = "points.ply"
 FORMAT_VERSION = 1
 LARGEST_JSON = 2**28
 
-MapName = Literal["normal", "base_color", "roughness", "metallic", "irradiance", "depth", "sky_mask"]
+MapName = Literal["normal", "base_color", "roughness", "metallic", "irradiance", "depth", "sky_mask", "valid"]
 
 
 _MAPS: tuple[MapName, ...] = get_args(MapName)
-_IN_8_BITS = ("sky_mask",)
+_IN_8_BITS = ("sky_mask", "valid")
 _IN_FLOAT32 = ("depth",)  # half a millimetre at a metre is too coarse for surfaces
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
@@ -202,6 +202,7 @@ def read_capture_folder(path: str | os.PathLike[str]) -> Capture:
             exposure=tron.exposure,
             transform=np.array(tron.transform),
             skipped=tron.skipped,
+            tone_curve="agx",
         )
 
 

@@ -7,7 +7,8 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-from tron.captures.photographs import SUFFIXES
+from tron.captures.masks import is_mask
+from tron.captures.photo_files import SUFFIXES
 from tron.errors import TronError
 
 
@@ -103,11 +104,15 @@ def relative_parts(name: str) -> tuple[str, ...]:
 
 
 def photos_in(folder: Path) -> list[Path]:
-    """Image files that lie directly in a folder, sorted by name; none if there is no such folder."""
+    """Image files that lie directly in a folder, sorted by name; none if there is no such folder.
+
+    ``NAME_mask.png`` beside a photo is its mask and no photo.
+    """
     if not folder.is_dir():
         return []
     found = [each for each in folder.iterdir() if each.suffix.lower() in SUFFIXES and each.is_file()]
-    return sorted(each for each in found if not each.name.startswith("."))
+    stems = {each.stem for each in found}
+    return sorted(each for each in found if not (each.name.startswith(".") or is_mask(each, stems)))
 
 
 def view_names(names: Sequence[str]) -> list[str]:

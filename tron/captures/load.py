@@ -10,16 +10,19 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import ConfigDict, Field
 
-from tron.captures.assembly import PosedPhotos, assemble
+from tron.captures.assembly import assemble
 from tron.captures.capture import Capture
 from tron.captures.colmap import model_folder, read_colmap
 from tron.captures.folder import is_capture_folder, load_traced
 from tron.captures.not_a_capture import refusal
+from tron.captures.posed_photos import PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.captures.structure_from_motion import MatchingSettings, PosingSettings, has_photos, pose_photos
 from tron.captures.tensoir import TensoirSettings, is_tensoir, read_tensoir
 from tron.captures.transforms import has_transforms, read_transforms
+from tron.captures.video import FrameSettings, is_video, read_video
 from tron.errors import TronError
+from tron.gaussians.foreign_files import VIDEOS
 
 
 @dataclass(frozen=True)
@@ -28,26 +31,31 @@ class CaptureFormat:
 
     Attributes:
         holds: what lies in the folder, for help and errors.
-        detect: whether a folder (or a file, where ``from_file``) is of this format.
+        detect: whether a folder (or a file, of ``files``) is of this format.
         read: the photos that a path names, with their poses, or a whole capture; takes the
             :class:`LoadSettings`. A format's own settings are a model of its file that
             :class:`CaptureSettings` inherits.
-        from_file: whether a single ``.json`` file is taken in place of a folder.
+        files: suffixes of single files that are taken in place of a folder.
     """
 
     holds: str
     detect: Callable[[Path], object]
     read: Callable[[Path, Any], PosedPhotos | Capture]
-    from_file: bool = False
+    files: tuple[str, ...] = ()
+
+    def takes(self, path: Path) -> bool:
+        """Whether a path is of the kind that the format is read from, by its name alone."""
+        return path.is_dir() or path.suffix.lower() in self.files
 
 
 FORMATS = {
-    "tron": CaptureFormat("tron-datagen's views", is_capture_folder, load_traced, from_file=True),
+    "tron": CaptureFormat("tron-datagen's views", is_capture_folder, load_traced, (".json",)),
     "transforms": CaptureFormat(
-        "transforms.json of NeRF, instant-ngp, nerfstudio, DL3DV", has_transforms, read_transforms, True
+        "transforms.json of NeRF, instant-ngp, nerfstudio, DL3DV", has_transforms, read_transforms, (".json",)
     ),
     "colmap": CaptureFormat("COLMAP's sparse/0", model_folder, read_colmap),
     "tensoir": CaptureFormat("TensoIR's folders train_000, ...", is_tensoir, read_tensoir),
+    "video": CaptureFormat("a video file, whose sharpest frames are posed", is_video, read_video, VIDEOS),
     "photos": CaptureFormat("photos, posed by structure from motion", has_photos, pose_photos),
 }
 """Formats by the names that ``format=`` takes, in the order in which ``auto`` looks for them."""
@@ -60,7 +68,7 @@ else:
     FormatName = Literal[("auto", *FORMATS)]
 
 
-class CaptureSettings(MatchingSettings, TensoirSettings, PhotoSettings):
+class CaptureSettings(FrameSettings, MatchingSettings, TensoirSettings, PhotoSettings):
     """Choices of how a capture is read; path-traced views (``tron``) have their own split and heed ``up``."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -82,7 +90,7 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
     What the files name and cannot be used is in ``Capture.skipped`` and is logged in one line.
 
     Args:
-        path: the capture's folder, or its transforms file.
+        path: the capture's folder, its transforms file, or a video.
         settings: see :class:`LoadSettings`.
 
     Raises:
@@ -93,10 +101,10 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
     settings = settings or LoadSettings()
     if not path.exists():
         raise TronError("capture not found", path)
-    if path.is_file() and path.suffix.lower() != ".json":
+    if not any(each.takes(path) for each in FORMATS.values()):
         raise refusal(path, HOLDS)
     name = _detected(path) if settings.format == "auto" else settings.format
-    if not (path.is_dir() or FORMATS[name].from_file):
+    if not FORMATS[name].takes(path):
         raise TronError(f"a capture of format {name} is a folder", path)
     found = FORMATS[name].read(path, settings)
     return found if isinstance(found, Capture) else assemble(found, settings, settings.cache_bytes)
@@ -104,6 +112,6 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
 
 def _detected(path: Path) -> str:
     for name, each in FORMATS.items():
-        if (path.is_dir() or each.from_file) and each.detect(path):
+        if each.takes(path) and each.detect(path):
             return name
     raise refusal(path, HOLDS)

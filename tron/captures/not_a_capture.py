@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tron.captures.photographs import SUFFIXES
+from tron.captures.photo_files import SUFFIXES
 from tron.errors import TronError
-from tron.gaussians.foreign_files import PACKED_SPLATS, VIDEOS, packed_splats, photos_of_video
+from tron.gaussians.foreign_files import PACKED_SPLATS, VIDEOS, packed_splats
 
 _PHOTO = ("one photo", "give the folder of all photos of the scene")
 _ARCHIVE = ("an archive", "unpack it and give the folder")
@@ -19,8 +19,10 @@ _MODEL = (
 )
 _KINDS: dict[str, tuple[str, str]] = {
     **dict.fromkeys(SUFFIXES, _PHOTO),
-    ".heic": ("a photo in HEIC", "save all photos of the scene as JPEG and give their folder"),
-    ".ply": ("a PLY of splats or points, not photos", "tron-relight scene=FILE takes splats"),
+    ".ply": (
+        "a PLY of splats or points, not photos",
+        "tron-reconstruct capture=FILE.ply and tron-relight scene=FILE.ply take splats",
+    ),
     **dict.fromkeys((".zip", ".tar", ".gz", ".tgz", ".7z"), _ARCHIVE),
     **dict.fromkeys((".hdr", ".exr"), _ENVIRONMENT),
     **dict.fromkeys((".obj", ".glb", ".gltf", ".fbx", ".stl"), _MODEL),
@@ -54,7 +56,7 @@ def _kind(file: Path) -> tuple[str, str] | None:
     """Kind of a file by its name, and what to do with it; None of an unknown kind."""
     suffix = file.suffix.lower()
     if suffix in VIDEOS:
-        return "a video", f"{photos_of_video(file)}; then capture=photos matching=sequential"
+        return "a video", f"give the file itself, capture={file}"
     if suffix in PACKED_SPLATS:
         mend = (
             f"they are a scene already, for tron-relight scene=FILE.ply: {packed_splats(file, suffix).mend}"

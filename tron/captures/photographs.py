@@ -6,7 +6,6 @@ kept at the reduced size, in the file's own 8 or 16 bits, in one cache of bounde
 
 from __future__ import annotations
 
-import io
 import threading
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
@@ -15,96 +14,13 @@ from typing import Any
 
 import numpy as np
 from cachetools import LRUCache
-from PIL import Image, UnidentifiedImageError
 
 from tron.captures.distortion import Lens
-from tron.errors import TronError
-from tron.images import check_size
-
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
-
-_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
-_ORIENTATION_TAG = 0x0112
-_TAIL_BYTES = 4096
-_CHECK_SIDE = 64
-_BIT_DEPTH_AT = 24
-"""Byte of a PNG that holds its bit depth: behind signature, length and name of IHDR, width and height."""
+from tron.captures.masks import MaskMeaning, mask_values
+from tron.captures.photo_files import PhotoHeader, decode_photo
 
 Decode = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """What a map's file means: stored values (H, W, 3) and alpha (H, W), both in [0, 1] -> the map."""
-
-
-@dataclass(frozen=True)
-class PhotoHeader:
-    """Header of a photo's file.
-
-    Attributes:
-        width: pixels as stored, before any turning.
-        height: likewise.
-        alpha: whether it has transparency.
-        orientation: EXIF's 1 to 8; 1 is upright as stored.
-    """
-
-    width: int
-    height: int
-    alpha: bool = False
-    orientation: int = 1
-
-    def size(self, upright: bool) -> tuple[int, int]:
-        """Width and height, of the photo turned as its EXIF tag says if ``upright``."""
-        turned = upright and self.orientation >= 5
-        return (self.height, self.width) if turned else (self.width, self.height)
-
-
-def inspect_photo(path: Path) -> PhotoHeader:
-    """Read a photo's header and make sure that its file is whole, without decoding it if that can be told.
-
-    A JPEG or PNG that ends with its end marker is taken to be whole; any other file is decoded once.
-
-    Raises:
-        TronError: the file is missing, not such an image, cut short, damaged or too large.
-    """
-    try:
-        with open(path, "rb") as file:
-            n_bytes = file.seek(0, io.SEEK_END)
-            file.seek(max(0, n_bytes - _TAIL_BYTES))
-            tail = file.read()
-            file.seek(0)
-            with Image.open(file, formats=_FORMATS) as picture:
-                check_size(*picture.size, len(picture.getbands()), n_bytes)
-                header = PhotoHeader(
-                    *picture.size,
-                    alpha="A" in picture.getbands() or "transparency" in picture.info,
-                    orientation=int(picture.getexif().get(_ORIENTATION_TAG, 1) or 1),
-                )
-                if not _has_end(picture.format or "", tail):
-                    _decode_whole(path)
-    except TronError as error:
-        raise TronError(error.what, path, error.mend) from error
-    except UnidentifiedImageError as error:
-        raise TronError("not an image of a known format", path, f"use {', '.join(SUFFIXES)}") from error
-    except OSError as error:
-        raise TronError(f"cannot read image: {error.strerror or error}", path) from error
-    except Exception as error:  # damaged files raise almost anything: SyntaxError, struct.error, ...
-        raise TronError(f"not a readable image: {error}", path) from error
-    return header
-
-
-def _has_end(image_format: str, tail: bytes) -> bool:
-    if image_format in ("JPEG", "MPO"):
-        return tail.endswith(b"\xff\xd9")
-    return image_format == "PNG" and b"IEND\xaeB`\x82" in tail
-
-
-def _decode_whole(path: Path) -> None:
-    # An interrupted copy may be filled up with zeros, which a decoder takes for grey.
-    data = path.read_bytes().rstrip(b"\0") if path.suffix.lower() in (".jpg", ".jpeg") else path.read_bytes()
-    with Image.open(io.BytesIO(data), formats=_FORMATS) as picture:
-        picture.draft("RGB", (_CHECK_SIDE, _CHECK_SIDE))
-        try:
-            picture.load()
-        except OSError as error:
-            raise TronError(f"image is damaged or cut short: {error}") from error
 
 
 class PhotoCache:
@@ -146,6 +62,8 @@ class PhotoReader:
         size: width and height of what is read; not larger than the photo.
         cache: shared by the photos of a capture.
         upright: turn the photo as its EXIF tag says. Poses of files belong to the pixels as stored, hence no.
+        mask: the photo is a mask, with this meaning (see :func:`tron.captures.masks.mask_values`).
+        exposure: that a linear photo is shown with (see :func:`tron.captures.photo_files.shown`).
     """
 
     path: Path
@@ -154,6 +72,8 @@ class PhotoReader:
     size: tuple[int, int]
     cache: PhotoCache
     upright: bool = False
+    mask: MaskMeaning | None = None
+    exposure: float = 1.0
 
     def color(self) -> np.ndarray:
         """(H, W, 3) float32, stored values in [0, 1]; of a photo with alpha, straight (not premultiplied)."""
@@ -165,6 +85,10 @@ class PhotoReader:
         pixels = self._pixels()
         return pixels[..., 3] if pixels.shape[2] == 4 else np.ones(pixels.shape[:2], np.float32)
 
+    def grey(self) -> np.ndarray:
+        """(H, W) float32 in [0, 1]: the first channel."""
+        return self._pixels()[..., 0]
+
     def decoded(self, decode: Decode) -> np.ndarray:
         """A map that the file encodes."""
         return decode(self.color(), self.alpha())
@@ -175,7 +99,9 @@ class PhotoReader:
         return stored.astype(np.float32) / np.iinfo(stored.dtype).max
 
     def _read(self) -> np.ndarray:
-        pixels = _decode(self.path, self.header)
+        pixels = decode_photo(self.path, self.header, self.exposure)
+        if self.mask is not None:
+            pixels = mask_values(pixels, self.mask)
         if self.upright:
             pixels = _turned(pixels, self.header.orientation)
         if pixels.shape[2] == 4:
@@ -201,49 +127,6 @@ class PhotoReader:
         height, width = pixels.shape[:2]
         maps = self.cache.get((self.lens, width, height), lambda: self.lens.undistortion_maps(width, height))
         return cv2.remap(pixels, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-
-def _decode(path: Path, header: PhotoHeader) -> np.ndarray:
-    """(H, W, 1, 3 or 4) uint8 or uint16 as stored, RGB or RGBA."""
-    import cv2
-
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # damage is ours to report
-    try:
-        pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    except OSError as error:
-        raise TronError(f"cannot read image: {error.strerror or error}", path) from error
-    except cv2.error as error:
-        raise TronError(f"not a readable image: {error.err}", path) from error
-    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
-        raise TronError("image is damaged or has neither 8 nor 16 bits", path)
-    if pixels.shape[:2] != (header.height, header.width):
-        raise TronError("image has changed since the capture was loaded", path, "load the capture again")
-    if pixels.ndim == 2:
-        return _with_hidden_grey(path, pixels) if header.alpha else pixels[..., None]
-    if pixels.shape[2] == 2:
-        return np.concatenate([np.repeat(pixels[..., :1], 3, axis=2), pixels[..., 1:]], axis=2)
-    swapped = cv2.COLOR_BGRA2RGBA if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB
-    return cv2.cvtColor(pixels, swapped)
-
-
-def _with_hidden_grey(path: Path, pixels: np.ndarray) -> np.ndarray:
-    """Grey (H, W) and the transparency that a PNG gives one of its values (chunk tRNS) -> RGBA, as stored.
-
-    OpenCV passes over that chunk of grey files.
-    """
-    with Image.open(path, formats=("PNG",)) as picture:
-        hidden = picture.info.get("transparency")
-    alpha = np.full_like(pixels, np.iinfo(pixels.dtype).max)
-    if isinstance(hidden, int):
-        alpha[pixels == hidden * _steps_of_grey(path)] = 0
-    return np.stack([pixels, pixels, pixels, alpha], axis=2)
-
-
-def _steps_of_grey(path: Path) -> int:
-    """Steps of 8 bits in one step of a grey PNG of 1, 2 or 4 bits, which is decoded to 8; else 1."""
-    with open(path, "rb") as file:
-        bits = file.read(_BIT_DEPTH_AT + 1)[_BIT_DEPTH_AT]
-    return 255 // (2**bits - 1) if bits < 8 else 1
 
 
 def _turned(pixels: np.ndarray, orientation: int) -> np.ndarray:

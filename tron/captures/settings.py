@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
+from tron.captures.masks import MaskMeaning
+
 
 class PhotoSettings(BaseModel):
     """Photos of a capture: where they lie, how large they are made, which are held out."""
@@ -29,6 +31,22 @@ class PhotoSettings(BaseModel):
         ge=0,
         description="every n-th photo is held out, the first included, unless the capture says itself which "
         "are; 0 holds out none",
+    )
+    masks: MaskMeaning | None = Field(
+        default="ignore",
+        description="black in a photo's mask (mask_path, masks/NAME.png, NAME_mask.png): ignore, it is not "
+        "learnt from; subject, it is empty background; null: masks are not read",
+    )
+    depth_unit: float = Field(
+        default=0.001,
+        gt=0,
+        description="world units of one step of the depth files that transforms.json names",
+    )
+    exr_exposure: float | None = Field(
+        default=None,
+        gt=0,
+        description="factor on linear photos (EXR) before the sRGB curve, as they are learnt from; null: one "
+        "for all, such that 98 % of what they show lie below 0.9",
     )
     up: tuple[float, float, float] | None = Field(
         default=None, description="up direction in the capture's world; null: estimated from the cameras"

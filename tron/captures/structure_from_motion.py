@@ -11,17 +11,26 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from PIL import Image, ImageOps
 from pydantic import BaseModel, Field
 
-from tron.captures.assembly import PosedPhoto, PosedPhotos
 from tron.captures.colmap import points_of, posed_by, read_model
 from tron.captures.image_folder import photos_in
-from tron.captures.photographs import inspect_photo
+from tron.captures.masks import mask_values
+from tron.captures.photo_files import (
+    PhotoHeader,
+    decode_photo,
+    exposure_of,
+    inspect_photo,
+    open_photo,
+    require_decoders,
+)
+from tron.captures.photo_views import mask_of
+from tron.captures.posed_photos import PosedPhoto, PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
 from tron.storage import locked, sha256, write_atomic
@@ -34,7 +43,7 @@ log = logging.getLogger(__name__)
 Progress = Callable[[str], None]
 
 WORKSPACE = "structure_from_motion"
-_VERSION = 1
+_VERSION = 2
 _EXIF_FOLDER = 0x8769
 _CAMERA_TAGS = (0x010F, 0x0110)  # make, model
 _LENS_TAGS = (0x920A, 0xA405, 0xA404)  # focal length, the same for 35 mm film, digital zoom
@@ -93,11 +102,17 @@ def pose_photos(path: Path, settings: PosingSettings, progress: Progress = log.i
     folder = path / (settings.images or ("images" if photos_in(path / "images") else "."))
     workspace = settings.workspace or folder / WORKSPACE
     skipped: dict[str, str] = {}
-    photos: list[Path] = []
-    for path in photos_in(folder):
+    photos: dict[Path, PhotoHeader] = {}
+    masks: dict[Path, Path] = {}
+    found = photos_in(folder)
+    require_decoders(found)
+    for path in found:
         try:
-            inspect_photo(path)
-            photos.append(path)
+            header = inspect_photo(path)
+            mask = mask_of(path, header, settings.masks, upright=True)
+            photos[path] = header
+            if mask is not None and settings.masks == "ignore":
+                masks[path] = mask[0]
         except TronError as error:
             skipped[path.name] = error.what
     if len(photos) < _FEWEST:
@@ -107,7 +122,7 @@ def pose_photos(path: Path, settings: PosingSettings, progress: Progress = log.i
             f"posing photos needs at least {_FEWEST}, overlapping",
         )
     with locked(workspace):
-        copies = _posed_copies(photos, workspace, settings, progress)
+        copies = _posed_copies(photos, masks, workspace, settings, progress)
         model = read_model(workspace / "sparse")
     by_name = {path.name: path for path in photos}
     posed = []
@@ -120,13 +135,18 @@ def pose_photos(path: Path, settings: PosingSettings, progress: Progress = log.i
 
 
 def _posed_copies(
-    photos: Sequence[Path], workspace: Path, settings: PosingSettings, progress: Progress
+    photos: Mapping[Path, PhotoHeader],
+    masks: Mapping[Path, Path],
+    workspace: Path,
+    settings: PosingSettings,
+    progress: Progress,
 ) -> dict[str, str]:
     """Names of photos by those of their posed copies; makes the model unless it is kept."""
     record = workspace / "photos.json"
     wanted = {
         "version": _VERSION,
         "photos": {path.name: sha256(path) for path in photos},
+        "masks": {path.name: sha256(mask) for path, mask in masks.items()},
         "matching": settings.matching,
         "max_side": settings.feature_side,
         "seed": settings.seed,
@@ -136,12 +156,14 @@ def _posed_copies(
         progress(f"poses of {len(photos)} photos taken from {workspace}")
         return kept["copies"]
     record.unlink(missing_ok=True)
-    _clear(workspace, "images", "models", "sparse")
+    _clear(workspace, "images", "masks", "models", "sparse")
     progress(f"copying {len(photos)} photos for feature extraction")
-    copies = _copy(photos, workspace / "images", settings.feature_side)
+    copies = _copy(photos, workspace / "images", settings.feature_side, settings.exr_exposure)
+    if masks:
+        _copy_masks({copies[name]: name for name in copies}, masks, workspace)
     _map(workspace, len(photos), settings, progress)
     write_atomic(record, json.dumps({"wanted": wanted, "copies": copies}, indent=1))
-    _clear(workspace, "images", "models")
+    _clear(workspace, "images", "masks", "models")
     return copies
 
 
@@ -160,12 +182,15 @@ def _kept(record: Path) -> dict[str, Any]:
     return kept if isinstance(kept, dict) and isinstance(kept.get("copies"), dict) else {}
 
 
-def _copy(photos: Sequence[Path], folder: Path, max_side: int) -> dict[str, str]:
+def _copy(
+    photos: Mapping[Path, PhotoHeader], folder: Path, max_side: int, exr_exposure: float | None = None
+) -> dict[str, str]:
     """Write upright 8-bit copies, those of one camera into one folder; their names below ``folder``."""
+    exposure = exposure_of(photos, exr_exposure)
     cameras: dict[tuple[Any, ...], str] = {}
     copies = {}
-    for index, path in enumerate(photos):
-        with Image.open(path) as picture:
+    for index, (path, header) in enumerate(photos.items()):
+        with open_photo(path, header, exposure) as picture:
             exif = picture.getexif()
             lens = exif.get_ifd(_EXIF_FOLDER)
             upright = ImageOps.exif_transpose(picture)
@@ -187,6 +212,21 @@ def _copy(photos: Sequence[Path], folder: Path, max_side: int) -> dict[str, str]
     return copies
 
 
+def _copy_masks(copies: Mapping[str, str], masks: Mapping[Path, Path], workspace: Path) -> None:
+    """Write a mask beside each copy, by the photos' names: features are sought where it is not black."""
+    by_photo = {photo.name: mask for photo, mask in masks.items()}
+    for photo, copy in copies.items():
+        with Image.open(workspace / "images" / copy) as picture:
+            size = picture.size
+        mask = Image.new("L", size, 255)
+        if photo in by_photo:
+            values = mask_values(decode_photo(by_photo[photo], inspect_photo(by_photo[photo])), "ignore")
+            mask = Image.fromarray(values[..., 0]).resize(size, Image.Resampling.NEAREST)
+        path = workspace / "masks" / f"{copy}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        mask.save(path)
+
+
 def _eight_bits(picture: Image.Image) -> Image.Image:
     if picture.mode.startswith(("I", "F")):  # 16 bits of grey, which Pillow would clip
         return picture.point(lambda value: value / 257).convert("L").convert("RGB")
@@ -203,6 +243,8 @@ def _map(workspace: Path, count: int, settings: PosingSettings, progress: Progre
     database, images = workspace / "database.db", workspace / "images"
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "OPENCV"
+    if (workspace / "masks").is_dir():
+        reader.mask_path = workspace / "masks"
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads, extraction.use_gpu = threads, False
     matching = pycolmap.FeatureMatchingOptions()

@@ -14,9 +14,9 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from tron.cameras import opengl_to_opencv
-from tron.captures.assembly import PosedPhoto, PosedPhotos, rigid_pose
 from tron.captures.distortion import Lens, opencv_lens
 from tron.captures.image_folder import relative_parts
+from tron.captures.posed_photos import PosedPhoto, PosedPhotos, rigid_pose
 from tron.captures.transforms import read_json
 from tron.errors import TronError
 

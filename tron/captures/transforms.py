@@ -10,7 +10,7 @@ The dialects agree on OpenGL camera-to-world matrices; they differ in what else 
 
 With p the world of COLMAP and q that of the file, nerfstudio wrote q = scale (A p + t); it is undone, so that
 the capture's world is p. Its points are written in q and taken along; where there are none, a COLMAP model
-that lies beside gives its own. ``mask_path`` and ``depth_file_path`` are not read.
+that lies beside gives its own. ``mask_path`` and ``depth_file_path`` are nerfstudio's.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from typing import Any, Literal
 import numpy as np
 
 from tron.cameras import opengl_to_opencv
-from tron.captures.assembly import PosedPhoto, PosedPhotos, rigid_pose
 from tron.captures.distortion import Lens, opencv_lens
 from tron.captures.image_folder import ImageFolder, relative_parts
 from tron.captures.not_a_capture import require_poses_of_photos
 from tron.captures.points import read_points
+from tron.captures.posed_photos import PosedPhoto, PosedPhotos, rigid_pose
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
 
@@ -47,7 +47,9 @@ Split = Literal["train", "test"]
 
 def has_transforms(path: Path) -> bool:
     """Whether a path is, or a folder holds, a file of poses that :func:`read_transforms` reads."""
-    return path.is_file() or any((path / f"transforms{end}.json").is_file() for end in ("", "_train"))
+    if not path.is_dir():
+        return path.suffix.lower() == ".json"
+    return any((path / f"transforms{end}.json").is_file() for end in ("", "_train"))
 
 
 def read_transforms(path: Path, settings: PhotoSettings) -> PosedPhotos:
@@ -123,9 +125,30 @@ def _photo(
         camera_to_world = transform @ opengl_to_opencv(rigid_pose(matrix))
     except TronError as error:
         refused = error.what
+    mask, depth = (_beside(frame, key, where, folder.root) for key in ("mask_path", "depth_file_path"))
     return PosedPhoto(
-        name, image, camera_to_world, _lens_maker({**_shared(meta, frame), **frame}), refused=refused
+        name,
+        image,
+        camera_to_world,
+        _lens_maker({**_shared(meta, frame), **frame}),
+        mask=mask,
+        depth=depth,
+        depth_scale=float(np.cbrt(np.linalg.det(transform[:3, :3]))),
+        refused=refused,
     )
+
+
+def _beside(frame: Mapping[str, Any], key: str, where: str, root: Path) -> Path | None:
+    """File of one more image of the frame's pixels, in the capture's folder; None where none is named."""
+    name = frame.get(key)
+    if name is None:
+        return None
+    if not isinstance(name, str):
+        raise TronError(f"{key} is {name!r}, not a name", where)
+    try:
+        return root.joinpath(*relative_parts(name))
+    except TronError as error:
+        raise TronError(error.what.replace("image name", key), where, error.mend) from error
 
 
 def _shared(meta: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,6 +13,9 @@ from tron.errors import TronError
 
 ColorSpace = Literal["linear", "display"]
 
+ToneCurve = Literal["srgb", "agx"]
+"""Curve that display values went through: a camera's, taken for sRGB, or AgX, that of path-traced views."""
+
 Pixels = np.ndarray | Callable[[], np.ndarray]
 """An array, or what reads one when it is asked for, such as ``partial(read_image, path)``."""
 
@@ -34,10 +37,13 @@ MAPS = {
     "irradiance": Map(3),
     "mask": Map(1, high=1.0),
     "sky_mask": Map(1, high=1.0),
+    "valid": Map(1, high=1.0),
     "depth": Map(1),
 }
 """The image and the maps of a view by the names of its fields; those of display images are at most 1."""
 _TOLERANCE = 1e-3
+_WHOLE = 0.99
+"""A pixel of a reduced photo is believed if all of its pixels are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +62,8 @@ class View:
         irradiance: (H, W, 3) linear irradiance / pi, the radiance of a white diffuse surface.
         mask: (H, W) in [0, 1], 1 on the subject; the alpha of an RGBA picture, whose colours are straight.
         sky_mask: (H, W) in [0, 1], 1 on the sky.
+        valid: (H, W) in [0, 1], below 1 where the image is not to be believed, such as on a passer-by:
+            nothing is learnt from these pixels, nothing is judged by them.
         depth: (H, W) distance from the camera's position along the pixel's ray, world units; 0 where nothing
             is known.
 
@@ -75,6 +83,7 @@ class View:
     irradiance: Pixels | None = None
     mask: Pixels | None = None
     sky_mask: Pixels | None = None
+    valid: Pixels | None = None
     depth: Pixels | None = None
 
     def __post_init__(self) -> None:
@@ -92,6 +101,12 @@ class View:
     def has(self, field: str) -> bool:
         """Whether the view has this map."""
         return getattr(self, field) is not None
+
+    def believed(self) -> np.ndarray:
+        """(H, W) bool: pixels whose image counts; all of them where the view has no ``valid``."""
+        if self.valid is None:
+            return np.ones((self.camera.height, self.camera.width), bool)
+        return self.read("valid") > _WHOLE
 
     def read(self, field: str = "image") -> np.ndarray:
         """The image or a map, float32, read now if it was not yet: (H, W, 3), or (H, W) for scalar maps.

@@ -19,15 +19,10 @@ def refuse_foreign(path: Path) -> None:
     """Raise TronError if the name is that of a file that needs a step before it is a scene."""
     suffix = path.suffix.lower()
     if suffix in VIDEOS:
-        mend = f"{photos_of_video(path)}; tron-reconstruct capture=photos matching=sequential output_dir=OUT"
-        raise TronError("a video is no scene, its frames can become one", path, mend)
+        mend = f"tron-reconstruct capture={path.name} output_dir=OUT makes a scene of its frames"
+        raise TronError("a video is no scene", path, mend)
     if suffix in PACKED_SPLATS:
         raise packed_splats(path, PACKED_SPLATS[suffix])
-
-
-def photos_of_video(path: Path) -> str:
-    """Shell line that takes two photos a second out of a video, into the folder ``photos``."""
-    return f"mkdir photos; ffmpeg -i {path.name} -vf fps=2 -q:v 2 photos/%04d.jpg"
 
 
 def packed_splats(path: Path, kind: str) -> TronError:

@@ -151,6 +151,7 @@ class Classical:
             counts = (geometry["opacity"] > _OPAQUE) & normal.any(axis=-1)
             if view.has("mask"):
                 counts &= view.read("mask") > _OPAQUE
+            counts &= view.believed()
             chosen = np.flatnonzero(counts)
             if len(chosen) > per_view:
                 draw = generator(self.seed, "prior", "classical", "points", view.name)

@@ -30,7 +30,7 @@ class GroundTruth:
         if not held:
             raise TronError(
                 "the capture has no true maps",
-                mend="use the prior classical, precomputed or rgbx; path-traced views and TensoIR have truth",
+                mend="use the prior joint, precomputed or rgbx; path-traced views and TensoIR have truth",
             )
         return dict.fromkeys(held, "the capture's own, true")
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Literal
 
 import numpy as np
 
 from tron.captures import View
+from tron.captures.view import ToneCurve
 from tron.color import agx, srgb_to_linear
-
-ToneCurve = Literal["srgb", "agx"]
 
 _TABLE = 4096
 _AGX_STOPS = (-12.4, 4.0)  # within the range that AgX does not clip

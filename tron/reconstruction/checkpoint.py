@@ -22,10 +22,16 @@ from tron.reconstruction.surfels import LearntSurfels
 from tron.reconstruction.training import Stage
 from tron.storage import write_atomic
 
-_FORMAT = "tron-reconstruction 1"
+_FORMAT = "tron-reconstruction 2"
 
 
-def save_checkpoint(path: Path, stage: Stage, made_with: Mapping[str, Any], seconds: float) -> None:
+def save_checkpoint(
+    path: Path,
+    stage: Stage,
+    made_with: Mapping[str, Any],
+    seconds: float,
+    begun: Mapping[str, Any] | None = None,
+) -> None:
     """Write where a stage stands.
 
     Args:
@@ -33,11 +39,19 @@ def save_checkpoint(path: Path, stage: Stage, made_with: Mapping[str, Any], seco
         stage: under way, between two steps.
         made_with: plain values that a run must share to go on from here.
         seconds: spent on the run so far.
+        begun: plain values that tell how the first surfels were found.
     """
     tensors = stage.surfels.state()
     if stage.plan.density is not None:
         tensors |= stage.plan.density.state()
-    about = {"stage": stage.plan.name, "step": stage.step, "psnr": stage.psnr, "seconds": seconds}
+    for part in (stage.exposures, stage.bystanders):
+        tensors |= part.state() if part is not None else {}
+    if stage.fused is not None:
+        tensors |= stage.fused.state()
+    about = {
+        **{"stage": stage.plan.name, "step": stage.step, "psnr": stage.psnr, "seconds": seconds},
+        "begun": dict(begun or {}),
+    }
     metadata = {
         "format": _FORMAT,
         "about": json.dumps(about),
@@ -72,6 +86,7 @@ class Checkpoint:
         self.step: int = about["step"]
         self.psnr: float = about["psnr"]
         self.seconds: float = about["seconds"]
+        self.begun: dict[str, Any] = about["begun"]
 
     def require(self, values: Mapping[str, Any]) -> None:
         """Raise TronError, naming the first key that differs, unless the checkpoint was made with these."""
@@ -90,3 +105,8 @@ class Checkpoint:
         stage.step, stage.psnr = self.step, self.psnr
         if stage.plan.density is not None:
             stage.plan.density.restore(self.tensors, stage.surfels.device)
+        for part in (stage.exposures, stage.bystanders):
+            if part is not None:
+                part.restore(self.tensors)
+        if stage.fused is not None:
+            stage.fused.restore(self.tensors, stage.surfels.device)

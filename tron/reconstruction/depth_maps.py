@@ -46,6 +46,7 @@ def _gbuffer(view: View, most: int, seed: int) -> GBufferView:
     valid = (depth > 0) & ((normal * normal).sum(-1) > 0.25)
     if view.has("mask"):
         valid &= view.read("mask") > _SUBJECT
+    valid &= view.believed()
     if valid.sum() > most:
         draw = generator(seed, "reconstruction", "depth", view.name)
         valid &= draw.random(valid.shape) < most / valid.sum()

@@ -1,8 +1,9 @@
 """Scores of a reconstruction: its pictures against photos, its maps against the truth where there is any.
 
-Pictures are compared over the whole frame, behind the subject the background that was trained with, and on
-the subject where views have masks. Base color is known up to a factor: it is scaled for each view and channel
-by least squares on the subject, as the TRON paper does (docs/conventions.md, 11).
+Pictures are compared over the whole frame, less what a view's ``valid`` leaves out (SSIM and LPIPS, which
+look at neighbourhoods, take the picture to be right there), behind the subject the background that was
+trained with, and on the subject where views have masks. Base color is known up to a factor: it is scaled for
+each view and channel by least squares on the subject, as the TRON paper does (docs/conventions.md, 11).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tron.captures import View
-from tron.metrics import LPIPS, angular_error_deg, capped_psnr, scale_albedo, ssim
+from tron.metrics import LPIPS, angular_errors_deg, capped_psnr, scale_albedo, ssim
 from tron.priors import Track, untracked
 from tron.shading.guidance import ViewTracer
 
@@ -46,8 +47,9 @@ def score_views(
     """Score what the surfels show from each view.
 
     Figures: ``psnr``, ``ssim``, ``lpips`` of the whole frame; ``psnr_subject`` where the view has a mask;
-    ``normal_mae_deg``, ``base_color_psnr`` (linear, scaled), ``roughness_mae``, ``metallic_mae`` where the
-    view has the truth, over its subject. All are finite: a PSNR is at most PSNR_CAP of :mod:`tron.metrics`.
+    ``normal_mae_deg``, ``normal_median_deg``, ``base_color_psnr`` (linear, scaled), ``roughness_mae``,
+    ``metallic_mae`` where the view has the truth, over its subject. All are finite: a PSNR is at most
+    PSNR_CAP of :mod:`tron.metrics`.
 
     Args:
         tracer: the surfels.
@@ -90,13 +92,17 @@ def wanted_picture(view: View, behind: float = 0.0) -> np.ndarray:
 def _figures(
     buffers: Mapping[str, np.ndarray], view: View, behind: float, lpips: LPIPS | None
 ) -> Iterator[tuple[str, float]]:
-    rendered, wanted = picture(buffers, behind), wanted_picture(view, behind)
-    yield "psnr", capped_psnr(rendered, wanted)
+    rendered, wanted, believed = picture(buffers, behind), wanted_picture(view, behind), view.believed()
+    if not believed.any():
+        return
+    yield "psnr", capped_psnr(rendered, wanted, believed)
+    rendered = np.where(believed[..., None], rendered, wanted)
     if min(rendered.shape[:2]) >= 6:
         yield "ssim", ssim(rendered, wanted)
     if lpips is not None and min(rendered.shape[:2]) >= _LPIPS_LEAST_SIDE:
         yield "lpips", _distance(lpips, rendered, wanted)
     subject = view.read("mask") > _SUBJECT if view.has("mask") else np.ones(rendered.shape[:2], bool)
+    subject &= believed
     if not subject.any():
         return
     if view.has("mask"):
@@ -105,7 +111,9 @@ def _figures(
         normal = view.read("normal")
         known = subject & normal.any(axis=-1)
         if known.any():
-            yield "normal_mae_deg", angular_error_deg(buffers["normal"], normal, known)
+            angles = angular_errors_deg(buffers["normal"], normal, known)
+            yield "normal_mae_deg", float(angles.mean())
+            yield "normal_median_deg", float(np.median(angles))
     if view.has("base_color"):
         truth = view.read("base_color")
         scaled = scale_albedo(buffers["base_color"], truth, subject)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -18,19 +20,46 @@ from tron.gaussians.scene import (
     neighbour_distances,
     quats_from_normals,
 )
-from tron.reconstruction.settings import InitialSettings
+from tron.priors import Track, untracked
+from tron.reconstruction.seen_space import pixels_of, random_points
+from tron.reconstruction.settings import InitialSettings, Place
 from tron.seeds import generator
 
-Source = Literal["points", "depth", "random"]
+log = logging.getLogger(__name__)
+
+Source = Literal["points", "depth", "stereo", "random"]
 
 _EXTENT_MARGIN = 1.1
 _SAME_PLACE = 1e-9  # rounding moves cameras that turn on the spot by about 1e-16
-_DRAWS = 64
-_DRAWS_OF_BOX = 16
-_LEAST_SHARE = 0.25
-_INSIDE = 0.95
-_OUTWARD = 4.0
 _ABOUT = 0.99  # surfels from depth maps are as many as asked for within half a percent
+_SOME = 10_000  # points that tell how far away they all are
+_DENSE = 2.0  # pixels between points that cover surfaces; structure from motion's lie farther apart
+
+
+@dataclass(frozen=True, eq=False)
+class Beginning:
+    """First surfels, and how they were found.
+
+    Attributes:
+        scene: the surfels.
+        source: of them.
+        confident: share of the subject's pixels whose depth stereo found and other photos confirm; None where
+            stereo was not asked.
+    """
+
+    scene: GaussianScene
+    source: Source
+    confident: float | None = None
+
+    @property
+    def place(self) -> Place:
+        """Distance that the surfels may have to go."""
+        return place_of(self.source)
+
+
+def place_of(source: Source) -> Place:
+    """Distance that surfels of a source may have to go."""
+    return {"depth": "in place", "stereo": "near"}.get(source, "anywhere")
 
 
 def extent_of(views: Sequence[View]) -> float:
@@ -51,7 +80,7 @@ def source_of(capture: Capture, settings: InitialSettings) -> Source:
     """
     has_depth = any(view.has("depth") for view in capture.train_views)
     if settings.source == "auto":
-        return "points" if capture.points is not None else "depth" if has_depth else "random"
+        return "points" if _dense(capture) else "depth" if has_depth else "stereo"
     if settings.source == "points" and capture.points is None:
         raise TronError("the capture has no points", mend="start from depth maps or random points")
     if settings.source == "depth" and not has_depth:
@@ -59,36 +88,78 @@ def source_of(capture: Capture, settings: InitialSettings) -> Source:
     return settings.source
 
 
-def initial_surfels(
-    capture: Capture, settings: InitialSettings, seed: int, most: int | None = None
-) -> GaussianScene:
+def beginning(
+    capture: Capture,
+    settings: InitialSettings,
+    seed: int,
+    most: int | None = None,
+    device: str = "cpu",
+    track: Track = untracked,
+) -> Beginning:
     """Surfels to begin with.
+
+    Where stereo finds nothing, as on walls without texture, a line says so and the capture's points are
+    taken, or random ones.
 
     Args:
         capture: its training views and points.
         settings: source, number and kernel.
         seed: root of all random numbers.
         most: maximum number of surfels; of more points as many are drawn.
+        device: torch's, for stereo.
+        track: shows progress.
 
     Raises:
         TronError: the source asked for is not there.
     """
-    source = source_of(capture, settings)
+    source, confident = source_of(capture, settings), None
+    of_maps = settings
+    if most is not None and settings.count > _ABOUT * most:
+        of_maps = settings.model_copy(update={"count": int(_ABOUT * most)})
+    if source == "stereo":
+        from tron.reconstruction.stereo import stereo_maps
+
+        maps = stereo_maps(capture, settings.stereo, seed, device, track)
+        confident = maps.confident
+        if maps.views and confident >= settings.stereo.fewest:
+            scene = _surfels_from_depth(replace(capture, views=maps.views, test=frozenset()), of_maps, seed)
+            return Beginning(scene, source, confident)
+        source = "random" if capture.points is None else "points"
+        log.warning(
+            "stereo found a depth in %.1f %% of the pixels only: surfaces without texture, or poses that are "
+            "wrong; beginning from %s",
+            100 * confident,
+            "random points" if source == "random" else "the capture's points",
+        )
+    if source == "depth":
+        return Beginning(_surfels_from_depth(capture, of_maps, seed), source)
     if source == "points" and capture.points is not None:
         points, colors = capture.points, capture.point_colors
         if most is not None and len(points) > most:
             draw = generator(seed, "reconstruction", "points")
             chosen = np.sort(draw.choice(len(points), most, replace=False))
             points, colors = points[chosen], None if colors is None else colors[chosen]
-        return surfels_at(points, colors, capture, settings, seed)
-    if source == "depth":
-        from tron.reconstruction.depth_maps import surfels_from_depth
-
-        if most is not None and settings.count > _ABOUT * most:
-            settings = settings.model_copy(update={"count": int(_ABOUT * most)})
-        return surfels_from_depth(capture, settings, seed)
+        return Beginning(surfels_at(points, colors, capture, settings, seed), source, confident)
     points = random_points(capture, min(settings.count, most or settings.count), seed)
-    return surfels_at(points, None, capture, settings, seed)
+    return Beginning(surfels_at(points, None, capture, settings, seed), source, confident)
+
+
+def _surfels_from_depth(capture: Capture, settings: InitialSettings, seed: int) -> GaussianScene:
+    from tron.reconstruction.depth_maps import surfels_from_depth
+
+    return surfels_from_depth(capture, settings, seed)
+
+
+def _dense(capture: Capture) -> bool:
+    """Whether a capture's points lie as near to one another as surfels must: on surfaces, not on corners."""
+    points = capture.points
+    if points is None or len(points) < 4:
+        return False
+    spacing, some = measure_spacing(points), points[:: max(len(points) // _SOME, 1)]
+    widths = [
+        np.median(view.camera.project(some)[1].clip(0)) / view.camera.fx for view in capture.train_views
+    ]
+    return spacing <= _DENSE * float(np.median(widths))
 
 
 def surfels_at(
@@ -130,91 +201,13 @@ def surfels_at(
     )
 
 
-def random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
-    """(count, 3) float32 points, uniform over the part of the cameras' box that the pictures show.
-
-    The box is that of the camera positions, made symmetric about the point that the cameras look at, and a
-    few times as large where they look outwards. Points that few cameras see are left out, and so are those
-    that the masks show to be empty (the visual hull of Laurentini 1994, with some tolerance). What is left
-    may be so small that fewer points are found.
-    """
-    views = capture.train_views
-    focus, outward = _focus([view.camera.camera_to_world for view in views])
-    reach = np.abs(np.stack([view.camera.position for view in views]) - focus).max(axis=0)
-    reach = np.maximum(reach, 0.1 * reach.max()) * (_OUTWARD if outward else 1)
-    masks = [view.read("mask") > 0.5 if view.has("mask") else None for view in views]
-    rng = generator(seed, "reconstruction", "random points")
-    centre = focus
-    seen, inside, points = [], [], []
-    chosen = np.zeros((0, 3))
-    for draw in range(_DRAWS):
-        if draw >= _DRAWS_OF_BOX and len(chosen) > 1:
-            # A small subject in a large box: go on in the box around what was found of it, and some more.
-            low, high = chosen.min(axis=0), chosen.max(axis=0)
-            centre, reach = (low + high) / 2, np.minimum(0.6 * (high - low), reach)
-        batch = centre + rng.uniform(-1, 1, (count, 3)) * reach
-        shown, filled = _coverage(batch, views, masks)
-        points.append(batch)
-        seen.append(shown)
-        inside.append(filled)
-        most = max(np.max(s) for s in seen)
-        kept = [(s >= max(_LEAST_SHARE * most, 1)) & (f >= _INSIDE * s) for s, f in zip(seen, inside)]
-        chosen = np.concatenate([p[k] for p, k in zip(points, kept)])[:count]
-        if len(chosen) == count:
-            break
-    if len(chosen) < min(count, 4):
-        raise TronError("no part of space is seen by several cameras", mend="check the poses and the masks")
-    return chosen.astype(np.float32)
-
-
-def _coverage(
-    points: np.ndarray, views: Sequence[View], masks: Sequence[np.ndarray | None]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of views, (N,) each, that have a point in their picture, and that have it on the subject."""
-    seen, inside = np.zeros(len(points), int), np.zeros(len(points), int)
-    for view, mask in zip(views, masks):
-        column, row, within = _pixels(view, points)
-        seen += within
-        inside += within if mask is None else within & mask[row, column]
-    return seen, inside
-
-
-def _pixels(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Columns and rows, (N,) int each, of world points, and whether the picture shows them."""
-    camera = view.camera
-    pixels, depth = camera.project(points)
-    with np.errstate(invalid="ignore"):
-        within = (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
-        column, row = np.where(within[:, None], pixels, 0).astype(int).T
-    return column, row, within
-
-
-def _focus(camera_to_world: Sequence[np.ndarray]) -> tuple[np.ndarray, bool]:
-    """(3,) the point nearest to all optical axes, and whether these diverge.
-
-    Nearest by least squares; in front of the cameras if the axes diverge.
-    """
-    matrices = np.stack(camera_to_world)
-    origins, axes = matrices[:, :3, 3], matrices[:, :3, 2]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    normal = across.sum(0)
-    centre = origins.mean(0)
-    spread = np.linalg.norm(origins - centre, axis=1).mean()
-    # Parallel axes meet nowhere: a little pull towards a point before the cameras decides.
-    ahead = centre + axes.mean(0) * spread
-    pull = 1e-3 * len(origins)
-    point = np.linalg.solve(normal + pull * np.eye(3), np.einsum("nij,nj->i", across, origins) + pull * ahead)
-    in_front = np.einsum("ni,ni->n", point - origins, axes) > 0
-    return (point, False) if in_front.mean() > 0.5 else (ahead, True)
-
-
 def _towards_cameras(points: np.ndarray, views: Sequence[View], seed: int) -> np.ndarray:
     """(N, 3) unit directions to a camera that has the point in its picture, drawn at random."""
     rng = generator(seed, "reconstruction", "facing")
     best = np.full(len(points), -1.0)
     chosen = np.zeros(len(points), int)
     for index, view in enumerate(views):
-        within = _pixels(view, points)[2]
+        within = pixels_of(view, points)[2]
         lot = np.where(within, 1.0, 0.0) + 0.5 * rng.random(len(points))
         chosen = np.where(lot > best, index, chosen)
         best = np.maximum(lot, best)

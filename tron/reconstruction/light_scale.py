@@ -72,7 +72,7 @@ def choose_photos(views: Sequence[View], settings: FitSettings, exposure: float)
         shown = view.read()
         if view.space == "linear":
             shown = agx(exposure * shown)
-        photos.append(Photo(view, _reduced_camera(view.camera, factor), reduced(shown, factor), factor))
+        photos.append(Photo(view, reduced_camera(view.camera, factor), reduced(shown, factor), factor))
     return photos
 
 
@@ -142,7 +142,8 @@ def reduced(image: np.ndarray, factor: int) -> np.ndarray:
     return np.ascontiguousarray(blocks.mean((1, 3)).reshape(height, width, *image.shape[2:]))
 
 
-def _reduced_camera(camera: Camera, factor: int) -> Camera:
+def reduced_camera(camera: Camera, factor: int) -> Camera:
+    """The camera of :func:`reduced` images."""
     return replace(
         camera,
         fx=camera.fx / factor,

@@ -6,7 +6,6 @@ settings and checkpoint goes on where the last call was cut off.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +23,9 @@ from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
 from tron.priors import Prior, Track, apply_prior, untracked
 from tron.reconstruction.checkpoint import Checkpoint, save_checkpoint
-from tron.reconstruction.initial import extent_of, initial_surfels, source_of
+from tron.reconstruction.explanation import Explanation, explain
+from tron.reconstruction.initial import Beginning, beginning, extent_of, place_of, source_of
+from tron.reconstruction.joint import Joint
 from tron.reconstruction.settings import ReconstructionSettings
 from tron.reconstruction.surfels import LearntSurfels
 from tron.reconstruction.training import Plan, Stage, StepSummary, Watch, materials_plan, radiance_plan
@@ -39,20 +40,27 @@ class Reconstruction:
 
     Attributes:
         scene: surfels with radiance and materials.
-        capture: the capture whose training views carry the prior's maps.
+        capture: the capture; its training views carry the prior's maps, if it gives any.
         seconds: of the stages, those before an interruption included.
-        learnt: the materials that a prior taught; the others are what surfels begin with.
+        learnt: the materials that were learnt; the others are what surfels begin with.
+        source: of the first surfels.
+        confident: share of the subject's pixels whose depth stereo found and other photos confirm; None where
+            stereo was not asked.
+        explanation: light and materials together, where the prior is :class:`Joint`.
     """
 
     scene: GaussianScene
     capture: Capture
     seconds: float
     learnt: tuple[str, ...]
+    source: str
+    confident: float | None
+    explanation: Explanation | None = None
 
 
 def reconstruct(
     capture: Capture,
-    prior: Prior,
+    prior: Prior | Joint,
     settings: ReconstructionSettings,
     *,
     checkpoint: Path | None = None,
@@ -64,7 +72,8 @@ def reconstruct(
 
     Args:
         capture: training views are learnt from, the others never looked at.
-        prior: gives normals to stage 1 and materials to stage 2, as far as it can.
+        prior: gives normals to stage 1 and materials to stage 2, as far as it can; ``Joint`` finds materials
+            and light together after stage 1.
         settings: schedules, rates, seed.
         checkpoint: file to keep the state in and to go on from; None keeps none.
         device: torch's, that of the active Mitsuba variant.
@@ -89,16 +98,22 @@ def reconstruct(
         )
     run = _Run(settings, made_with(capture, prior, settings), checkpoint, device, watch)
     extent = extent_of(views)
-    source = source_of(capture, settings.initial)  # a lacking one is told before a prior works for hours
-    radiance = settings.radiance.scaled(settings.steps_scaler, placed=source == "depth")
-    wanted = [] if radiance.normal == 0 else ["normal"]
-    taught = apply_prior(capture, prior, fields=wanted, track=track) if wanted else capture
-    plan = radiance_plan(radiance, extent, settings.seed)
-    most = radiance.density.most
-    surfels = run.stage(
-        plan, taught.train_views, lambda: initial_surfels(taught, settings.initial, settings.seed, most)
-    )
+    source_of(capture, settings.initial)  # a lacking one is told before a prior works for hours
+    taught, given = capture, False
+    if settings.radiance.normal > 0 and not isinstance(prior, Joint):
+        taught = apply_prior(capture, prior, fields=["normal"], track=track)
+        given = any(view.has("normal") for view in taught.train_views)
+    most = settings.radiance.density.most
+    first = run.begin(lambda: beginning(taught, settings.initial, settings.seed, most, device, track))
+    radiance = settings.radiance.scaled(settings.steps_scaler, place_of(run.begun["source"]))
+    plan = radiance_plan(radiance, extent, settings.seed, normals_given=given, tone_curve=capture.tone_curve)
+    surfels = run.stage(plan, taught.train_views, first)
     scene = surfels.scene(settings.initial.kernel_degree, capture.up)
+    if isinstance(prior, Joint):
+        found = explain(capture, scene, prior, settings.seed, device, track)
+        return Reconstruction(
+            found.scene.validate(), capture, run.seconds(), MATERIALS, explanation=found, **run.begun
+        )
 
     tracer = SurfelTracer(scene)
     taught = apply_prior(
@@ -113,16 +128,13 @@ def reconstruct(
         scene = run.stage(plan, learners, lambda: scene).scene(settings.initial.kernel_degree, capture.up)
     for name in (name for name in MATERIALS if name not in fields):
         log.warning("no prior for %s: it stays what surfels begin with", name)
-    return Reconstruction(scene.validate(), taught, run.seconds(), fields)
+    return Reconstruction(scene.validate(), taught, run.seconds(), fields, **run.begun)
 
 
-def made_with(capture: Capture, prior: Prior, settings: ReconstructionSettings) -> dict[str, Any]:
+def made_with(capture: Capture, prior: Prior | Joint, settings: ReconstructionSettings) -> dict[str, Any]:
     """All that a reconstruction is a function of, as plain values: a checkpoint of others is refused."""
-    digest = hashlib.sha256()
-    for view in capture.train_views:
-        digest.update(repr((view.name, view.camera.to_dict())).encode())
     values = settings.model_dump(mode="json", exclude={"checkpoint_every"})
-    return {"capture": digest.hexdigest(), "prior": repr(prior), **values}
+    return {"capture": capture.content, "prior": repr(prior), **values}
 
 
 class _Run:
@@ -139,10 +151,19 @@ class _Run:
         self.settings, self.values, self.path, self.device, self.watch = settings, values, path, device, watch
         self.found = Checkpoint(path) if path is not None and path.exists() else None
         self.before = self.found.seconds if self.found else 0.0
+        self.begun: dict[str, Any] = self.found.begun if self.found else {}
         self.started = time.perf_counter()
         if self.found is not None:
             self.found.require(self.values)
             log.info("resuming from step %d of stage %s", self.found.step, self.found.stage)
+
+    def begin(self, find: Callable[[], Beginning]) -> Callable[[], GaussianScene]:
+        """Maker of the first surfels: they are found now, unless a checkpoint has gone on from them."""
+        if self.found is not None:
+            return lambda: find().scene
+        first = find()
+        self.begun = {"source": first.source, "confident": first.confident}
+        return lambda: first.scene
 
     def seconds(self) -> float:
         """Spent on the run, interrupted parts included."""
@@ -173,7 +194,7 @@ class _Run:
 
     def _save(self, stage: Stage) -> None:
         if self.path is not None:
-            save_checkpoint(self.path, stage, self.values, self.seconds())
+            save_checkpoint(self.path, stage, self.values, self.seconds(), self.begun)
 
 
 _ORDER = ("radiance", "materials")

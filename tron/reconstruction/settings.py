@@ -7,7 +7,6 @@ A machine without a GPU takes fewer of them: ``scaled`` shortens every schedule 
 
 from __future__ import annotations
 
-import math
 from typing import Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -16,7 +15,11 @@ from tron.estimation import FINAL, Diffuse, Estimation, Estimator
 
 Model = TypeVar("Model", bound="Settings")
 
-_RATES_OF_PLACE = ("position_rate", "position_rate_final", "rotation_rate")
+Place = Literal["in place", "near", "anywhere"]
+"""Place that surfels begin at: on the surface (depth maps), near it (stereo), or anywhere."""
+
+_FASTER: dict[Place, tuple[float, float]] = {"in place": (0, 0), "near": (0.25, 0.5), "anywhere": (0.5, 0.5)}
+"""Powers of the number of steps by which positions and rotations learn faster in fewer."""
 
 
 class Settings(BaseModel):
@@ -25,13 +28,58 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+class StereoSettings(Settings):
+    """Depth from photographs: plane sweep, then fusion."""
+
+    planes: int = Field(default=64, ge=4, le=1024, description="Planes, even in inverse distance.")
+    neighbours: int = Field(default=5, ge=1, description="Photos that each one is compared with.")
+    angle: float = Field(
+        default=12.0, gt=0, lt=180, description="Wanted angle between the views of two photos, degrees."
+    )
+    least_angle: float = Field(default=4.0, ge=0, lt=180, description="Smallest such angle, degrees.")
+    most_angle: float = Field(default=40.0, gt=0, le=180, description="Largest such angle, degrees.")
+    best: int = Field(
+        default=3, ge=1, description="Neighbours that count, those that agree best: others are hidden."
+    )
+    radius: int = Field(default=2, ge=1, description="Radius of the compared windows, pixels.")
+    smooth_small: float = Field(
+        default=0.02,
+        ge=0,
+        description="Semi-global matching: price of one plane's difference to a pixel beside.",
+    )
+    smooth_large: float = Field(
+        default=0.2, ge=0, description="The same of a larger difference; 0 decides each pixel by itself."
+    )
+    confident: float = Field(
+        default=0.55, ge=0, le=1, description="Least likeness, 1 - cost, of a depth that is fused."
+    )
+    most_side: int = Field(
+        default=512, ge=16, description="Larger photos are reduced to so many pixels, which bounds memory."
+    )
+    truncation: float = Field(default=6.0, gt=0, description="Voxels at which fused distances are cut off.")
+    sigma: float = Field(default=1.5, ge=0, description="Gaussian that smooths the fused field, voxels.")
+    most_voxels: int = Field(
+        default=160, ge=8, le=1024, description="Maximum number of voxels along the scene's longest side."
+    )
+    fewest: float = Field(
+        default=0.05,
+        ge=0,
+        le=1,
+        description="Share of pixels with a confirmed depth, below which stereo has found nothing.",
+    )
+
+
 class InitialSettings(Settings):
     """First surfels of a capture."""
 
-    source: Literal["auto", "points", "depth", "random"] = Field(
+    source: Literal["auto", "points", "depth", "stereo", "random"] = Field(
         default="auto",
-        description="points of the capture (COLMAP's), depth maps of its views, or random points in the "
-        "cameras' box; auto: points where there are any, else depth, else random.",
+        description="points of the capture (COLMAP's), depth maps of its views, stereo, depth found by "
+        "comparing the photos, or random points in the cameras' box; auto: depth where there is any, else "
+        "points that are dense, else stereo, and where it finds nothing points or random ones.",
+    )
+    stereo: StereoSettings = Field(
+        default_factory=lambda: StereoSettings(), description="Depth by comparing photos."
     )
     count: int = Field(
         default=5000, ge=4, description="Approximate number of surfels made from depth maps or random points."
@@ -74,6 +122,30 @@ class DensitySettings(Settings):
     )
 
 
+class ConsistencySettings(Settings):
+    """Normals pulled to those that the surfels' own depths agree on, where no prior gives normals."""
+
+    weight: float = Field(
+        default=0.1, ge=0, description="Weight of opacity - (sum of w n) . N in the loss; 0 leaves it out."
+    )
+    every: int = Field(default=7500, ge=1, description="Steps between two fusions of all views' depths.")
+    truncation: float = Field(default=4.0, gt=0, description="Voxels at which fused distances are cut off.")
+    sigma: float = Field(default=1.0, ge=0, description="Gaussian that smooths the fused field, voxels.")
+    most_voxels: int = Field(
+        default=160, ge=8, le=1024, description="Maximum number of voxels along the scene's longest side."
+    )
+    refine: float = Field(
+        default=0.0,
+        ge=0,
+        description="Widths of a pixel by which depths may move to where photos agree best before they are "
+        "fused; 0 leaves them.",
+    )
+    refine_steps: int = Field(default=4, ge=1, description="Depths that are tried to either side.")
+    photos: StereoSettings = Field(
+        default_factory=lambda: StereoSettings(), description="How photos are compared for that."
+    )
+
+
 class RadianceSettings(Settings):
     """Stage 1: geometry and radiance, with learning rates of Adam."""
 
@@ -101,24 +173,45 @@ class RadianceSettings(Settings):
     background: Literal["black", "white", "random"] = Field(
         default="black", description="Background behind surfels and masked subjects."
     )
+    exposures: bool = Field(
+        default=True,
+        description="Find the exposure and white balance of each photo; false takes all as exposed alike.",
+    )
+    bystanders: float = Field(
+        default=0.0,
+        ge=0,
+        description="Leave out patches of a photo whose error is so many times the usual one (3 is a good "
+        "number), as passers-by have; 0 leaves out none.",
+    )
     density: DensitySettings = Field(
         default_factory=lambda: DensitySettings(), description="Surfels added and removed."
     )
+    consistency: ConsistencySettings = Field(
+        default_factory=lambda: ConsistencySettings(),
+        description="Normals pulled to those that all views' depths agree on, where no prior gives any.",
+    )
 
-    def scaled(self, factor: float, *, placed: bool = False) -> RadianceSettings:
+    def scaled(self, factor: float, place: Place = "anywhere") -> RadianceSettings:
         """The same schedule in ``factor`` times as many steps; a step number of 0 stays 0.
 
-        Positions and rotations are learnt at 1 / sqrt(factor) of their rates, unless surfels begin in place
-        (``placed``). A step of Adam is about as long as its rate, whatever the gradient, and views pull to
-        and fro: n steps reach rate x sqrt(n), and this reach is kept. (The same law as for batches: k views a
-        step in 1/k of the steps want sqrt(k) times Adam's rate; Malladi et al. 2022, "On the SDEs and Scaling
-        Rules for Adaptive Gradient Algorithms"; Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting
-        Training".) The other parameters begin near where they end, and keep their rates.
+        Positions and rotations are learnt at 1 / sqrt(factor) of their rates, unless surfels begin in place;
+        positions at the square root of that where they begin near their place. A step of Adam is about as
+        long as its rate, whatever the gradient, and views pull to and fro: n steps reach rate x sqrt(n), and
+        this reach is kept. (The same law as for batches: k views a step in 1/k of the steps want sqrt(k)
+        times Adam's rate; Malladi et al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient
+        Algorithms"; Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting Training".) The other parameters
+        begin near where they end, and keep their rates.
         """
         density = _scaled(self.density, ("start", "end", "every", "prune_every", "reset_every"), factor)
-        faster = 1.0 if placed else 1 / math.sqrt(factor)
-        rates = {name: faster * getattr(self, name) for name in _RATES_OF_PLACE}
-        return _scaled(self, ("steps", "sh_every"), factor).model_copy(update={"density": density, **rates})
+        consistency = _scaled(self.consistency, ("every",), factor)
+        moving, turning = _FASTER[place]
+        rates = {
+            "position_rate": self.position_rate / factor**moving,
+            "position_rate_final": self.position_rate_final / factor**moving,
+            "rotation_rate": self.rotation_rate / factor**turning,
+        }
+        schedule = _scaled(self, ("steps", "sh_every"), factor)
+        return schedule.model_copy(update={"density": density, "consistency": consistency, **rates})
 
 
 class MaterialSettings(Settings):

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from tron.captures import View
 from tron.gaussians.fields import MATERIALS
+from tron.reconstruction.consistency import normal_consistency
 from tron.reconstruction.losses import SSIM_WEIGHT, photometric_loss
 
 _COMPARED = ("image", "normal", *MATERIALS)
@@ -34,16 +35,23 @@ class Weights:
     roughness: float = 0.0
     metallic: float = 0.0
     ssim: float = SSIM_WEIGHT
+    consistency: float = 0.0
 
     def wanted(self) -> tuple[str, ...]:
-        """The maps of a view that count, the mask always among them."""
+        """The maps of a view that count, the mask and what is to be believed always among them."""
         names = [name for name in _COMPARED if getattr(self, "rgb" if name == "image" else name) > 0]
-        return (*names, "mask")
+        return (*names, "mask", "valid")
 
 
 def targets(view: View, wanted: tuple[str, ...], device: str | torch.device) -> dict[str, Tensor]:
-    """Those of the wanted maps that the view has, (H, W[, 3]) float32; images are display values."""
-    return {name: torch.from_numpy(view.read(name)).to(device) for name in wanted if view.has(name)}
+    """Those of the wanted maps that the view has, (H, W[, 3]) float32; ``valid`` is bool.
+
+    Images are display values.
+    """
+    found = {name: view.read(name) for name in wanted if view.has(name)}
+    if "valid" in found:
+        found["valid"] = view.believed()
+    return {name: torch.from_numpy(values).to(device) for name, values in found.items()}
 
 
 def loss_of(
@@ -53,20 +61,24 @@ def loss_of(
 
     Args:
         rendered: images of :func:`tron.tracing.torch_bridge.render`.
-        target: the view's maps (see :func:`targets`).
+        target: the view's maps (see :func:`targets`), and ``fused_normal`` (see :mod:`.consistency`).
         weights: what counts.
         background: (3,) display colour behind the surfels.
     """
-    opacity, mask = rendered["opacity"], target.get("mask")
+    opacity, mask, valid = rendered["opacity"], target.get("mask"), target.get("valid")
     total = opacity.new_zeros(())
     if weights.rgb and "image" in target:
         rgb, wanted = pictures(rendered, target, background)
-        total = total + weights.rgb * photometric_loss(rgb, wanted, ssim_weight=weights.ssim)
+        total = total + weights.rgb * photometric_loss(rgb, wanted, valid, weights.ssim)
     if weights.normal and "normal" in target:
         total = total + weights.normal * _normal_loss(rendered, target, weights.ssim)
     if weights.mask and mask is not None:
         total = total + weights.mask * (opacity - mask).abs().mean()
+    if weights.consistency and "fused_normal" in target:
+        total = total + weights.consistency * normal_consistency(rendered, target["fused_normal"])
     surface = opacity.detach() > _SURFACE
+    if valid is not None:
+        surface = surface & valid
     if mask is not None:
         surface = surface & (mask > _SURFACE)
     for name in MATERIALS:
@@ -96,5 +108,7 @@ def _normal_loss(rendered: Mapping[str, Tensor], target: Mapping[str, Tensor], s
     if "mask" in target:  # beside the subject is no surface, whatever a prior sees there
         outside = target["mask"] < _SURFACE
         wanted, known = torch.where(outside[..., None], 0, wanted), known | outside
+    if "valid" in target:
+        known = known & target["valid"]
     normal = rendered["normal"] * rendered["opacity"][..., None]
     return photometric_loss(0.5 * normal + 0.5, 0.5 * wanted + 0.5, known, ssim)

@@ -30,6 +30,7 @@ def surface_mask(view: View, opacity: np.ndarray) -> np.ndarray:
         counts &= view.read("sky_mask") < SKY
     if view.has("mask"):
         counts &= view.read("mask") > OPAQUE
+    counts &= view.believed()
     return counts
 
 

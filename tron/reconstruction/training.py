@@ -17,9 +17,13 @@ import torch
 from torch import Tensor
 
 from tron.captures import View
+from tron.captures.view import ToneCurve
 from tron.errors import TronError
+from tron.reconstruction.bystanders import Bystanders
+from tron.reconstruction.consistency import FusedNormals
 from tron.reconstruction.density import DensityControl
-from tron.reconstruction.settings import MaterialSettings, RadianceSettings
+from tron.reconstruction.photo_exposure import PhotoExposures
+from tron.reconstruction.settings import ConsistencySettings, MaterialSettings, RadianceSettings
 from tron.reconstruction.supervision import MATERIALS, Weights, loss_of, pictures, targets
 from tron.reconstruction.surfels import LearntSurfels
 from tron.seeds import generator
@@ -27,6 +31,9 @@ from tron.tracing.torch_bridge import render
 
 Background = Literal["black", "white", "random"]
 _PSNR_MEMORY = 0.98
+_EXPOSURES_FROM = 0.1
+_BYSTANDERS_FROM = 0.3
+"""Parts of the steps after which photos are compared with what the others say: before, that is little."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +77,9 @@ class Plan:
         sh_every: steps after which one more degree is learnt.
         background: behind the surfels.
         density: makes and removes surfels; None leaves their number.
+        exposures: curve of the photos whose exposures are found; None takes them as exposed alike.
+        bystanders: ratio of :class:`Bystanders`; 0 leaves out nobody.
+        consistency: pulls normals to those that the views' depths agree on; None does not.
     """
 
     name: str
@@ -81,6 +91,9 @@ class Plan:
     sh_every: int = 1
     background: Background = "black"
     density: DensityControl | None = None
+    exposures: ToneCurve | None = None
+    bystanders: float = 0.0
+    consistency: ConsistencySettings | None = None
 
     def learning(self, names: Collection[str]) -> Plan:
         """The same plan, learning these parameters alone."""
@@ -89,8 +102,20 @@ class Plan:
         return replace(self, rates=kept, final_rates=final)
 
 
-def radiance_plan(settings: RadianceSettings, extent: float, seed: int) -> Plan:
-    """Stage 1: geometry and radiance; ``extent`` in world units scales the rate of the positions."""
+def radiance_plan(
+    settings: RadianceSettings,
+    extent: float,
+    seed: int,
+    *,
+    normals_given: bool = False,
+    tone_curve: ToneCurve = "srgb",
+) -> Plan:
+    """Stage 1: geometry and radiance; ``extent`` in world units scales the rate of the positions.
+
+    Normals are pulled to those that the views' depths agree on unless a prior gives some (``normals_given``);
+    ``tone_curve`` is that of the photos.
+    """
+    own = settings.consistency.weight if not normals_given else 0.0
     rates = {
         "means": settings.position_rate * extent,
         "quats": settings.rotation_rate,
@@ -103,13 +128,18 @@ def radiance_plan(settings: RadianceSettings, extent: float, seed: int) -> Plan:
     return Plan(
         name="radiance",
         steps=settings.steps,
-        weights=Weights(rgb=1.0, normal=settings.normal, mask=settings.mask, ssim=settings.ssim),
+        weights=Weights(
+            rgb=1.0, normal=settings.normal, mask=settings.mask, ssim=settings.ssim, consistency=own
+        ),
         rates=rates,
         final_rates={"means": settings.position_rate_final * extent},
         sh_degree=settings.sh_degree,
         sh_every=settings.sh_every,
         background=settings.background,
         density=DensityControl(settings.density, extent, seed),
+        exposures=tone_curve if settings.exposures else None,
+        bystanders=settings.bystanders,
+        consistency=settings.consistency if own else None,
     )
 
 
@@ -147,6 +177,15 @@ class Stage:
         self.kernel_degree, self.seed = kernel_degree, seed
         self.step = 0
         self.psnr = float("nan")
+        self.exposures: PhotoExposures | None = None
+        self.bystanders: Bystanders | None = None
+        if plan.exposures is not None:
+            self.exposures = PhotoExposures(views, plan.exposures, round(_EXPOSURES_FROM * plan.steps))
+        if plan.bystanders > 0:
+            self.bystanders = Bystanders(plan.bystanders, round(_BYSTANDERS_FROM * plan.steps))
+        self.fused: FusedNormals | None = None
+        if plan.consistency is not None:
+            self.fused = FusedNormals(plan.consistency, views, kernel_degree)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
     def run(self, watch: Watch | None = None) -> None:
@@ -166,11 +205,19 @@ class Stage:
         plan, surfels, number = self.plan, self.surfels, self.step + 1
         view = self._view(self.step)
         target = targets(view, plan.weights.wanted(), surfels.device)
+        if self.fused is not None:
+            self.fused.before(surfels, self.step)
+            target |= self.fused.of(view)
         self._set_rates()
         rendered = render(
             surfels.rendered(), view.camera, kernel_degree=self.kernel_degree, sh_degree=self.sh_degree
         )
         background = self._background()
+        if self.exposures is not None:
+            stored, target = target, self.exposures.balanced(view, target)
+            self.exposures.observe(view, self.step, rendered, stored)
+        if self.bystanders is not None and "image" in target:
+            target = self.bystanders.without(self.step, *pictures(rendered, target, background), target)
         loss = loss_of(rendered, target, plan.weights, background)
         if not loss.requires_grad:
             raise TronError(

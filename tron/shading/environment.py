@@ -147,6 +147,15 @@ class EnvironmentMap:
         """(H,) float64: integral over the sphere of one texel's bilinear weight; W times the sum is 4 pi."""
         return _row_integrals(self.image.shape[0], np.sin) * (2 * np.pi / self.image.shape[1])
 
+    def directions(self) -> np.ndarray:
+        """(H, W, 3) float64 unit directions that the samples of the image come from, before the rotation."""
+        height, width = self.image.shape[:2]
+        polar = np.arange(height)[:, None] * np.pi / (height - 1)
+        around = (np.arange(width) + 0.5)[None] * 2 * np.pi / width
+        across = np.sin(polar)
+        axes = np.broadcast_arrays(across * np.sin(around), across * np.cos(around), np.cos(polar))
+        return np.stack(axes, axis=-1)
+
     def mean(self) -> np.ndarray:
         """(3,) float64: mean radiance over the sphere."""
         weights = self.solid_angles() / (4 * np.pi)

@@ -25,6 +25,7 @@ def centres(records: SurfelRecords, surfel: mi.UInt32, active: mi.Bool | bool = 
         position=mi.Point3f(centre.x, centre.y, centre.z),
         depth=mi.Float(0),
         normal=mi.Normal3f(normal.x, normal.y, normal.z),
+        normal_sum=mi.Normal3f(normal.x, normal.y, normal.z),
         base_color=mi.Color3f(base.x, base.y, base.z),
         roughness=normal.w,
         metallic=base.w,

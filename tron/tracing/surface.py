@@ -25,6 +25,8 @@ class Surface:
         depth: mi.Float, distance along the unit ray to the median hit, world units; 0 where there is none.
             Not differentiated.
         normal: mi.Normal3f, unit, world, geometric; zero where opacity is 0.
+        normal_sum: mi.Normal3f, sum of ``w n`` before it is brought to unit length: shorter than the opacity
+            where the surfels of a ray face several ways.
         base_color: mi.Color3f, linear.
         roughness, metallic: mi.Float.
         rgb: mi.Color3f, composited SH radiance in display space, premultiplied by opacity.
@@ -36,6 +38,7 @@ class Surface:
     position: mi.Point3f
     depth: mi.Float
     normal: mi.Normal3f
+    normal_sum: mi.Normal3f
     base_color: mi.Color3f
     roughness: mi.Float
     metallic: mi.Float
@@ -61,6 +64,7 @@ def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surf
         position=origin + distance * direction,
         depth=depth,
         normal=dr.select(oriented, normal / dr.sqrt(dr.select(oriented, squared, 1)), 0),
+        normal_sum=normal,
         base_color=mi.Color3f(*channels[4:7]) * inverse,
         roughness=channels[3] * inverse,
         metallic=channels[7] * inverse,

@@ -36,7 +36,9 @@ if TYPE_CHECKING:
     from tron.cameras import Camera
     from tron.gaussians.scene import GaussianScene
 
-IMAGES = ("rgb", "opacity", "normal", "base_color", "roughness", "metallic", "depth", "position")
+IMAGES = (
+    *("rgb", "opacity", "normal", "normal_sum", "base_color", "roughness", "metallic", "depth", "position"),
+)
 
 
 def tensors_of(scene: GaussianScene, device: str | torch.device = "cpu") -> dict[str, torch.Tensor]:
@@ -60,9 +62,9 @@ def render(
         sh_degree: harmonics beyond it are not evaluated and get no gradient.
 
     Returns:
-        The fields of :class:`tron.tracing.surface.Surface`: rgb, normal, base_color and position (H, W, 3);
-        opacity, roughness, metallic and depth (H, W). rgb is premultiplied by opacity, over black. depth has
-        no gradient; position has one where it is at the mean depth.
+        The fields of :class:`tron.tracing.surface.Surface`: rgb, normal, normal_sum, base_color and position
+        (H, W, 3); opacity, roughness, metallic and depth (H, W). rgb is premultiplied by opacity, over black.
+        depth has no gradient; position has one where it is at the mean depth.
 
     Raises:
         TronError: a tensor is missing, or has another shape, dtype, layout or device than the ones above.

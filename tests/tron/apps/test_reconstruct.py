@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from tron.apps import reconstruct_run as app
+from tron.apps.camera_files import cameras_of
 from tron.apps.reconstruct import cli
 from tron.apps.reconstruct_pictures import sheet_estimation
 from tron.apps.relight import cli as relight_cli
@@ -18,7 +19,7 @@ from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import write_capture
 from tron.gaussians import GaussianScene
-from tron.images import read_image
+from tron.images import read_image, write_image
 from tron.shading.environment import EnvironmentMap
 from tron.tracing import SurfelTracer
 
@@ -29,6 +30,7 @@ TINY = (
     "radiance.density.threshold=1e-5", "radiance.density.most=340", "materials.steps=6",
     "light.steps=6", "light.resolution=8", "light.rays=4", "light.pixels=64", "light.scale_steps=3",
     "light.scale_pixels=256", "light.scale_rays=4", "light.split_sum_resolution=64",
+    "report.frames=4", "report.side=32", "report.views=2",
 )  # fmt: skip
 
 
@@ -116,11 +118,13 @@ def copied(finished: Path, tmp_path: Path) -> Path:
 def test_it_writes_everything_that_it_says(finished: Path):
     assert {path.name for path in finished.iterdir() if not path.name.startswith(".")} == {
         "scene.ply",
+        "cameras.json",
         "environment.exr",
         "metrics.json",
         "curve.json",
         "contact_sheet.png",
         "light.png",
+        "report.html",
         "config.yaml",
         "checkpoint.safetensors",
     }
@@ -160,9 +164,10 @@ def test_the_report_is_whole_and_strict_json(finished: Path):
     )
     assert {"albedo_scaling", "seconds", "settings", "machine", "curve"} < set(report)
     assert report["capture"]["held_out"] == ["00", "03", "06"]
+    assert report["first_surfels"] == {"source": "depth", "stereo_confident": None}
     assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
-    figures = {"psnr", "psnr_subject", "ssim", "normal_mae_deg", "base_color_psnr"}
-    figures |= {"roughness_mae", "metallic_mae"}
+    figures = {"psnr", "psnr_subject", "ssim", "normal_mae_deg", "normal_median_deg"}
+    figures |= {"base_color_psnr", "roughness_mae", "metallic_mae"}
     assert set(report["test"]) == set(report["train"]) == figures | {"views"}
     assert (report["test"]["views"], report["train"]["views"]) == (3, 6)
     assert report["test"]["psnr"] > 18  # from depth maps: good before it begins
@@ -180,6 +185,10 @@ def test_what_it_writes_can_be_relit(variant, finished: Path, tmp_path: Path):
     assert not exit_info.value.code
     report = json.loads((out / "relight.json").read_text())
     assert report["scene"]["materials_guessed"] is False
+    filmed = np.stack([camera.position for camera in cameras_of(finished / "cameras.json")])
+    place = Camera.from_dict(report["cameras"][0]).position
+    assert filmed.min(axis=0)[2] < place[2] < filmed.max(axis=0)[2]
+    assert np.linalg.norm(place[:2]) == pytest.approx(3, abs=0.1)  # as far as the photos were taken from
     assert read_image(out / "frames" / "0000.mask.exr").max() > 0.9
 
 
@@ -274,6 +283,27 @@ def test_other_settings_are_refused_and_change_nothing_unless_told_to(
     assert json.loads((out / "metrics.json").read_text())["light"] is None
 
 
+def test_photos_replaced_under_their_names_are_another_capture(
+    reconstruct, steps, capture_path, copied: Path, tmp_path: Path, capsys
+):
+    other = Path(shutil.copytree(capture_path, tmp_path / "capture"))
+    photo = other / "images" / "01.png"
+    write_image(photo, read_image(photo, 4)[:, ::-1].copy())
+    capsys.readouterr()
+    assert reconstruct(copied, f"capture={other}") == 2
+    assert "a checkpoint made with capture=" in capsys.readouterr().err
+    assert reconstruct(copied) == 0  # the same photos are still the same capture
+    assert not steps
+    report = json.loads((copied / "metrics.json").read_text())
+    report["capture"]["content"][1] = "another held-out photo"
+    (copied / "metrics.json").write_text(json.dumps(report))
+    assert reconstruct(copied) == 0
+    assert not steps  # what was learnt stays, what was scored does not
+    assert (
+        json.loads((copied / "metrics.json").read_text())["capture"]["content"][1] != "another held-out photo"
+    )
+
+
 def test_without_priors_for_light_there_is_no_light_and_it_is_said(
     reconstruct, capture_path, tmp_path: Path, caplog
 ):
@@ -289,8 +319,23 @@ def test_without_priors_for_light_there_is_no_light_and_it_is_said(
 
 def test_the_default_prior_needs_nothing_but_photos(reconstruct, tmp_path: Path):
     out = tmp_path / "out"
+    assert cli.compose("capture=x", "output_dir=y").prior["_target_"] == "tron.reconstruction.Joint"
+    few = ("prior.refinement.steps=3", "prior.rounds=1", "prior.light.steps=10")
+    assert reconstruct(out, *few, prior="joint") == 0
+    report = json.loads((out / "metrics.json").read_text())
+    assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
+    assert report["light"]["surfels_seen"] > 0.5
+    found = GaussianScene.load(out / "scene.ply")
+    assert np.ptp(found.base_color) > 0.05
+    light = EnvironmentMap.load(out / "environment.exr")
+    assert light.image.min() >= 0 < light.image.max()
+
+
+def test_the_classical_prior_gives_maps_to_learn_from(reconstruct, tmp_path: Path):
+    out = tmp_path / "out"
     assert reconstruct(out, prior="classical") == 0
     report = json.loads((out / "metrics.json").read_text())
+    assert report["first_surfels"] == {"source": "depth", "stereo_confident": None}
     assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
     assert report["light"]["sigma"] > 0
     assert (out / "environment.exr").exists()

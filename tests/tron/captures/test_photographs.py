@@ -11,7 +11,8 @@ from PIL import Image, ImageOps
 
 from tron.captures import LoadSettings, load_capture
 from tron.captures.distortion import Lens
-from tron.captures.photographs import PhotoCache, PhotoReader, inspect_photo
+from tron.captures.photo_files import inspect_photo
+from tron.captures.photographs import PhotoCache, PhotoReader
 from tron.errors import TronError
 from tron.seeds import generator
 
@@ -125,6 +126,35 @@ def test_photos_are_turned_as_their_tag_says_only_if_asked(tmp_path: Path, orien
     assert np.array_equal(np.round(upright.color() * 255), turned)
 
 
+def damaged(data: bytes, kind: str) -> bytes:
+    """A file of a right beginning and a right end whose middle is lost."""
+    middle = len(data) // 2
+    return {
+        "zeros": data[:middle] + bytes(500) + data[middle + 500 :],
+        "lost": data[:middle] + data[middle + 500 :],
+        "ended": data[:middle] + data[-2:],
+    }[kind]
+
+
+@pytest.mark.parametrize("kind", ["zeros", "lost", "ended"])
+@pytest.mark.parametrize("progressive", [False, True])
+def test_a_jpeg_damaged_in_its_middle_is_found(tmp_path: Path, kind: str, progressive: bool) -> None:
+    """Decoders fill what is lost with grey and say nothing; that grey must not be learnt."""
+    data = jpeg(progressive=progressive)
+    (tmp_path / "a.jpg").write_bytes(damaged(data, kind))
+    with Image.open(tmp_path / "a.jpg") as picture:
+        picture.verify()  # Pillow's own check sees nothing
+    with pytest.raises(TronError, match="damaged or cut short"):
+        inspect_photo(tmp_path / "a.jpg")
+
+
+def test_a_png_damaged_in_its_middle_is_found(tmp_path: Path) -> None:
+    Image.fromarray(noise(64, 80, 3)).save(tmp_path / "a.png")
+    (tmp_path / "a.png").write_bytes(damaged((tmp_path / "a.png").read_bytes(), "zeros"))
+    with pytest.raises(TronError, match="damaged"):
+        inspect_photo(tmp_path / "a.png")
+
+
 def jpeg(**options) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(noise(64, 80, 3)).save(stream, "JPEG", **options)
@@ -173,9 +203,9 @@ def test_nothing_is_decoded_before_it_is_looked_at_and_memory_is_bounded(
 ) -> None:
     import tron.captures.photographs as module
 
-    decoded, decode = [], module._decode
+    decoded, decode = [], module.decode_photo
     monkeypatch.setattr(
-        module, "_decode", lambda path, header: decoded.append(path.name) or decode(path, header)
+        module, "decode_photo", lambda path, *rest: decoded.append(path.name) or decode(path, *rest)
     )
     write.json(tmp_path / "transforms.json", write.transforms(photos))
     write.photos(tmp_path / "images", photos)

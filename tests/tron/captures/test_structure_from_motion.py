@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from tron.captures import LoadSettings, load_capture
+from tron.captures.photo_files import inspect_photo
 
 COUNT = 12
 
@@ -84,7 +85,7 @@ def test_cameras_that_differ_do_not_share_intrinsics(tmp_path: Path) -> None:
         exif[0x0110] = model
         paths.append(tmp_path / f"{index}.jpg")
         Image.new("RGB", size).save(paths[-1], exif=exif)
-    copies = _copy(paths, tmp_path / "copies", 32)
+    copies = _copy({path: inspect_photo(path) for path in paths}, tmp_path / "copies", 32)
     groups = [name.split("/")[0] for name in copies]
     assert groups[0] == groups[1]
     assert len(set(groups)) == 3
@@ -97,6 +98,6 @@ def test_sixteen_bit_grey_is_scaled_to_eight(tmp_path: Path, write) -> None:
     from tron.captures.structure_from_motion import _copy
 
     write.save(tmp_path / "a.png", np.full((40, 40), 32768, np.uint16))
-    (name,) = _copy([tmp_path / "a.png"], tmp_path / "copies", 64)
+    (name,) = _copy({tmp_path / "a.png": inspect_photo(tmp_path / "a.png")}, tmp_path / "copies", 64)
     with Image.open(tmp_path / "copies" / name) as copy:
         assert np.abs(np.asarray(copy, float) - 128).max() <= 1

@@ -107,6 +107,12 @@ def cameras_around(count: int, distance: float = 4.0, size: int = SIZE) -> list[
     return cameras
 
 
+@pytest.fixture(scope="session")
+def around() -> Callable[..., list[Camera]]:
+    """Makes cameras on three rings that look at the origin."""
+    return cameras_around
+
+
 def seen_by(tracer: SurfelTracer, camera: Camera, name: str) -> View:
     """What a camera sees of a scene, its true maps included; the opacity is the mask."""
     seen = tracer.gbuffer(camera).numpy()

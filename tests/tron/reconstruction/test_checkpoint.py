@@ -83,7 +83,7 @@ def test_a_foreign_file_is_one_line(tmp_path: Path) -> None:
         refused(tmp_path / name)
     save_file({"weight": torch.zeros(3)}, tmp_path / "weights")
     assert "not a checkpoint of a reconstruction" in refused(tmp_path / "weights")
-    save_file({"weight": torch.zeros(3)}, tmp_path / "half", {"format": "tron-reconstruction 1"})
+    save_file({"weight": torch.zeros(3)}, tmp_path / "half", {"format": "tron-reconstruction 2"})
     refused(tmp_path / "half")
     (tmp_path / "folder").mkdir()
     refused(tmp_path / "folder")

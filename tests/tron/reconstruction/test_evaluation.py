@@ -95,6 +95,20 @@ def test_what_lies_outside_the_mask_counts_for_no_map(tracer, painted_capture) -
     assert figures(tracer, replace(view, **spoiled)) == figures(tracer, view)
 
 
+def test_what_is_not_believed_counts_for_no_figure(tracer, painted_capture) -> None:
+    view = painted_capture.test_views[0]
+    valid = np.ones((view.camera.height, view.camera.width), np.float32)
+    valid[4:14, 6:20] = 0
+    spoiled = {"valid": valid}
+    for name in ("image", "normal", "base_color", "roughness", "metallic"):
+        spoiled[name] = view.read(name).copy()
+        spoiled[name][valid == 0] = 1 / np.sqrt(3)
+    judged = figures(tracer, replace(view, **spoiled))
+    assert judged == figures(tracer, replace(view, valid=valid))
+    assert judged["psnr"] == pytest.approx(figures(tracer, view)["psnr"], abs=3)
+    assert figures(tracer, replace(view, valid=np.zeros_like(valid))) == {}
+
+
 def test_a_map_that_is_exactly_right_has_a_finite_figure(tracer, painted_capture) -> None:
     """JSON has no infinity: metrics.json could not be read again."""
     view = painted_capture.test_views[0]

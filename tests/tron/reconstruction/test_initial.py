@@ -12,7 +12,8 @@ from tron.captures import Capture, View
 from tron.color import srgb_to_linear
 from tron.errors import TronError
 from tron.gaussians.harmonics import SH_C0
-from tron.reconstruction.initial import extent_of, initial_surfels, random_points, surfels_at
+from tron.reconstruction.initial import beginning, extent_of, surfels_at
+from tron.reconstruction.seen_space import random_points
 from tron.reconstruction.settings import InitialSettings
 from tron.seeds import generator
 
@@ -173,12 +174,12 @@ def test_auto_takes_points_before_depth_and_depth_before_chance() -> None:
     points = generator(0, "points").normal(size=(30, 3)).astype(np.float32) * 0.2
     with_depth = tuple(replace(v, depth=ball_mask(v.camera, np.zeros(3), 0.5) * 2.5) for v in views)
     settings = InitialSettings(count=100)
-    from_points = initial_surfels(Capture(with_depth, points=points), settings, 0)
+    from_points = beginning(Capture(with_depth, points=points), settings, 0).scene
     np.testing.assert_array_equal(from_points.means, points)
-    from_depth = initial_surfels(Capture(with_depth), settings, 0)
+    from_depth = beginning(Capture(with_depth), settings, 0).scene
     assert np.linalg.norm(from_depth.means, axis=1).max() < 1
     assert from_depth.opacities().min() > 0.9
-    by_chance = initial_surfels(Capture(tuple(views)), settings, 0)
+    by_chance = beginning(Capture(tuple(views)), settings, 0).scene
     np.testing.assert_array_equal(by_chance.means, random_points(Capture(tuple(views)), 100, 0))
 
 
@@ -186,14 +187,14 @@ def test_no_more_surfels_than_the_cap_to_begin_with() -> None:
     points = generator(0, "many").normal(size=(300, 3)).astype(np.float32) * 0.2
     colors = generator(1, "many").random((300, 3)).astype(np.float32)
     capture = Capture(tuple(ring()), points=points, point_colors=colors)
-    scene = initial_surfels(capture, InitialSettings(), 0, most=100)
+    scene = beginning(capture, InitialSettings(), 0, most=100).scene
     assert len(scene) == 100
     place = [int(np.flatnonzero((points == mean).all(1))[0]) for mean in scene.means]
     np.testing.assert_allclose(scene.sh[:, 0] * SH_C0 + 0.5, colors[place], atol=1e-6)
     np.testing.assert_allclose(scene.scales()[:, 0], brute_force_scale(scene.means), rtol=1e-4)
-    again = initial_surfels(capture, InitialSettings(), 0, most=100)
+    again = beginning(capture, InitialSettings(), 0, most=100).scene
     np.testing.assert_array_equal(again.means, scene.means)
-    assert len(initial_surfels(Capture(tuple(ring())), InitialSettings(count=200), 0, most=70)) == 70
+    assert len(beginning(Capture(tuple(ring())), InitialSettings(count=200), 0, most=70).scene) == 70
 
 
 @pytest.mark.parametrize(
@@ -201,10 +202,10 @@ def test_no_more_surfels_than_the_cap_to_begin_with() -> None:
 )
 def test_a_source_that_is_not_there_is_said(source, words: str) -> None:
     with pytest.raises(TronError, match=words):
-        initial_surfels(Capture(tuple(ring())), InitialSettings(source=source), 0)
+        beginning(Capture(tuple(ring())), InitialSettings(source=source), 0)
 
 
 def test_three_points_are_too_few() -> None:
     capture = Capture(tuple(ring()), points=np.eye(3, dtype=np.float32))
     with pytest.raises(TronError, match="3 points are too few"):
-        initial_surfels(capture, InitialSettings(), 0)
+        beginning(capture, InitialSettings(), 0)

@@ -19,6 +19,7 @@ from tron.priors import Classical, GroundTruth
 from tron.reconstruction import Reconstruction, reconstruct
 from tron.reconstruction.evaluation import mean_figures, score_views
 from tron.reconstruction.settings import (
+    ConsistencySettings,
     DensitySettings,
     InitialSettings,
     MaterialSettings,
@@ -34,8 +35,9 @@ DENSITY = DensitySettings(start=0, end=16, every=6, threshold=1e-5, prune_every=
 def settings(**changes: Any) -> ReconstructionSettings:
     """A dozen and some steps, with density changes; rates for so few."""
     radiance = RadianceSettings(
-        steps=14, position_rate=1e-3, sh_rate=0.05, scale_rate=0.02, sh_every=4, normal=0.1, density=DENSITY
-    )
+        steps=14, position_rate=1e-3, sh_rate=0.05, scale_rate=0.02, sh_every=4, normal=0.1, density=DENSITY,
+        consistency=ConsistencySettings(every=6),
+    )  # fmt: skip
     values = {
         "initial": InitialSettings(source="depth", count=300, kernel_degree=2),
         "radiance": radiance,

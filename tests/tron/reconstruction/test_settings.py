@@ -22,6 +22,7 @@ STEP_NUMBERS = {
     "steps",
     "sh_every",
     *("density.start", "density.end", "density.every", "density.prune_every", "density.reset_every"),
+    "consistency.every",
 }
 RATES_OF_PLACES = {"position_rate", "position_rate_final", "rotation_rate"}
 
@@ -112,11 +113,12 @@ def test_a_surfel_wanders_as_far_in_a_scaled_schedule(factor: float) -> None:
     assert RadianceSettings().scaled(1.0) == RadianceSettings()
 
 
-def test_surfels_that_begin_in_place_keep_their_rates() -> None:
-    before, after = RadianceSettings(), RadianceSettings().scaled(0.1, placed=True)
-    assert {name: getattr(after, name) for name in RATES_OF_PLACES} == {
-        name: getattr(before, name) for name in RATES_OF_PLACES
-    }
+@pytest.mark.parametrize(("place", "moving", "turning"), [("in place", 1, 1), ("near", 10**0.25, 10**0.5)])
+def test_surfels_move_faster_the_farther_they_may_have_to_go(place, moving: float, turning: float) -> None:
+    before, after = RadianceSettings(), RadianceSettings().scaled(0.1, place)
+    for name in RATES_OF_PLACES:
+        faster = turning if name == "rotation_rate" else moving
+        assert getattr(after, name) == pytest.approx(faster * getattr(before, name)), name
     assert after.steps == RadianceSettings().scaled(0.1).steps
 
 

@@ -16,7 +16,7 @@ from tron.gaussians import GaussianScene
 from tron.gaussians.scene import quats_from_normals
 from tron.metrics import angular_error_deg, psnr
 from tron.reconstruction.settings import DensitySettings, MaterialSettings, RadianceSettings
-from tron.reconstruction.supervision import Weights
+from tron.reconstruction.supervision import Weights, loss_of, targets
 from tron.reconstruction.surfels import ROWS, LearntSurfels
 from tron.reconstruction.training import Plan, Stage, materials_plan, radiance_plan
 from tron.seeds import generator
@@ -195,6 +195,42 @@ def test_normals_beside_the_subject_ask_for_nothing(painted, painted_capture) ->
         stage = stage_of(painted, [replace(view, normal=normal)], plan)
         losses.append(stage.advance().loss)
     assert losses[0] == losses[1]
+
+
+@pytest.mark.parametrize("ssim", [0.0, 0.2])
+def test_nothing_is_learnt_where_the_photo_is_not_believed(painted_capture, ssim: float) -> None:
+    """Of masked-out pixels nothing is asked, whatever stands there; others are asked what they were.
+
+    (SSIM's windows reach over the mask's edge and see the same there on both sides: less is asked beside it.)
+    """
+    view = painted_capture.views[1]
+    valid = np.ones((view.camera.height, view.camera.width), np.float32)
+    valid[8:20, 5:25] = 0
+    names = ("image", "normal", "base_color", "roughness", "metallic")
+    weights = Weights(rgb=1.0, normal=0.5, base_color=1.0, roughness=1.0, metallic=1.0, ssim=ssim)
+    draw = generator(0, "rendered")
+    shapes = {"rgb": (3,), "opacity": (), "normal": (3,), "base_color": (3,), "roughness": (), "metallic": ()}
+    found = []
+    rendered = {
+        name: torch.tensor(draw.uniform(0.6, 1, (*valid.shape, *shape)), dtype=torch.float32)
+        for name, shape in shapes.items()
+    }
+    for seen in (0.0, 1.0):
+        maps = {name: view.read(name).copy() for name in names}
+        for values_of in maps.values():
+            values_of[valid == 0] = seen / np.sqrt(3)
+        leaves = {name: values_of.clone().requires_grad_(True) for name, values_of in rendered.items()}
+        target = targets(replace(view, valid=valid, **maps), weights.wanted(), "cpu")
+        loss = loss_of(leaves, target, weights, np.full(3, 0.3))
+        loss.backward()
+        found.append((float(loss.detach()), {name: leaf.grad for name, leaf in leaves.items()}))
+    assert found[0][0] == found[1][0] or ssim
+    for name, gradient in found[0][1].items():
+        assert gradient is not None
+        if not ssim:
+            torch.testing.assert_close(gradient, found[1][1][name], atol=0, rtol=0)
+        assert not gradient[torch.from_numpy(valid == 0)].any()
+        assert gradient.any()
 
 
 def test_the_loss_of_masks_clears_what_lies_beside_the_subject(painted, painted_capture) -> None:

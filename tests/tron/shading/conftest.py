@@ -60,6 +60,7 @@ class SphereOverPlane:
             position=position,
             depth=dr.select(seen, t, 0),
             normal=mi.Normal3f(dr.select(seen, normal, 0)),
+            normal_sum=mi.Normal3f(dr.select(seen, normal, 0)),
             base_color=mi.Color3f(self.base_color) * one,
             roughness=0.5 * one,
             metallic=self.metallic * one,

@@ -31,6 +31,7 @@ def compare(scene, camera, tolerance=1e-4):
         "opacity": opacity,
         "depth": truth.median_depth,
         "rgb": truth.rgb,
+        "normal_sum": truth.normal,
         "base_color": truth.base_color,
         "roughness": truth.roughness,
         "metallic": truth.metallic,

@@ -12,8 +12,8 @@ import numpy as np
 from markupsafe import Markup
 from PIL import Image
 
-from eval.report.page import Page
 from tron.images import encode_png
+from tron.report.page import Page
 from tron.storage import write_atomic
 
 LOSSLESS_PIXELS = 256 * 256
@@ -30,13 +30,18 @@ def data_uri(image: np.ndarray) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
+def film_uri(video: bytes) -> str:
+    """An MP4 as a ``data:`` URI."""
+    return "data:video/mp4;base64," + base64.b64encode(video).decode()
+
+
 def render(page: Page) -> str:
     """The page as HTML; every text in it is escaped."""
-    folder = resources.files("eval.report")
+    folder = resources.files("tron.report")
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters["data_uri"] = data_uri
+    environment.filters |= {"data_uri": data_uri, "film_uri": film_uri}
     template = environment.from_string(folder.joinpath("page.html.j2").read_text("utf-8"))
     style = Markup(folder.joinpath("style.css").read_text("utf-8"))
     return template.render(page=page, style=style)

@@ -1,4 +1,4 @@
-"""Blocks that a report is made of; a benchmark fills them in without a word of HTML."""
+"""Blocks that a report is made of: whoever reports fills them in without a word of HTML."""
 
 from __future__ import annotations
 
@@ -91,8 +91,36 @@ class Pictures:
 
 
 @dataclass(frozen=True)
+class Film:
+    """A short silent film that plays on and on.
+
+    Attributes:
+        video: bytes of an MP4 (:mod:`tron.video`).
+        size: width and height, pixels.
+        title: words under it.
+        alt: words in its place.
+    """
+
+    video: bytes
+    size: tuple[int, int]
+    title: str
+    alt: str
+
+
+@dataclass(frozen=True)
+class Films:
+    """Films that belong together, side by side, under a title of their own."""
+
+    kind: ClassVar[str] = "films"
+    title: str
+    films: Sequence[Film]
+    note: str = ""
+    columns: int = 3
+
+
+@dataclass(frozen=True)
 class Chart:
-    """Inline SVG (made by :mod:`eval.report.charts`) with a caption and a text in its place."""
+    """Inline SVG (such as :mod:`eval.report.charts` makes) with a caption and a text in its place."""
 
     kind: ClassVar[str] = "chart"
     svg: str
@@ -100,7 +128,7 @@ class Chart:
     alt: str
 
 
-Block = Text | Code | Table | Pictures | Chart
+Block = Text | Code | Table | Pictures | Films | Chart
 
 
 @dataclass(frozen=True)
@@ -125,7 +153,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Page:
-    """A whole report."""
+    """A whole report; ``brand`` says behind the project's name what kind it is."""
 
     title: str
     verdict: str
@@ -133,3 +161,4 @@ class Page:
     tiles: Sequence[Tile]
     sections: Sequence[Section] = field(default_factory=list)
     footer: str = ""
+    brand: str = "benchmark report"

@@ -1,0 +1,135 @@
+"""A reconstruction under lights that its photos never saw, against Mitsuba's path tracer.
+
+What the surfels are for. Held-out views are lit as tron-relight's final quality lights them (``lit``), and
+held against path-traced ones where these show nothing but surfaces. Photos alone do not tell bright paint in
+dim light from dim paint in bright light: one factor on all light of a scene is found that brings both
+nearest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import fminbound
+
+from tron.apps.lit_scene import LitScene
+from tron.apps.relight_settings import QUALITY
+from tron.captures import Capture
+from tron.captures.folder import read_capture_folder
+from tron.color import to_display
+from tron.estimation import Estimation
+from tron.gaussians.scene import GaussianScene
+from tron.metrics import capped_psnr
+from tron.seeds import integer
+from tron.shading.environment import EnvironmentMap
+from tron.shading.guidance import Lighting, render_guidance
+
+COVERED = 0.999
+"""Coverage from which a pixel shows nothing but surfaces."""
+STOPS = 6.0
+"""The factor is looked for within so many powers of two either way."""
+
+
+@dataclass(frozen=True)
+class RelitLight:
+    """Held-out views under one light.
+
+    Attributes:
+        psnr: mean over the views, dB, on surfaces, display values.
+        truth: the middle view path-traced, (H, W, 3) display values.
+        shown: the same of the surfels, after the factor.
+    """
+
+    psnr: float
+    truth: np.ndarray
+    shown: np.ndarray
+
+
+@dataclass(frozen=True)
+class Relit:
+    """A reconstruction under all its other lights.
+
+    Attributes:
+        lights: name of a light, such as "sun" -> what was found.
+        factor: on the surfels' radiance, one for all lights and views.
+    """
+
+    lights: dict[str, RelitLight]
+    factor: float
+
+    @property
+    def psnr(self) -> float:
+        """Mean over the lights, dB."""
+        return float(np.mean([light.psnr for light in self.lights.values()]))
+
+
+def relight(scene: Path, truths: Sequence[Path], estimation: Estimation = QUALITY["final"]) -> Relit:
+    """Light surfels as the path-traced views were lit, and score them.
+
+    Args:
+        scene: scene.ply, in the world of the views.
+        truths: capture folders of the views (tron-datagen's relit/NAME_1_sun), each with its environment.exr.
+        estimation: of the light.
+    """
+    surfels = GaussianScene.load(scene)
+    captures = {path.name.rpartition("_")[2]: (path, read_capture_folder(path)) for path in truths}
+    first = next(iter(captures.values()))[1].views[0].camera
+    lit = LitScene(surfels, first, estimation, integer(0, "reconstruction", "relit bounces"))
+    pictures = {
+        name: _lit_views(lit, capture, EnvironmentMap.load(path / "environment.exr"), estimation)
+        for name, (path, capture) in captures.items()
+    }
+    views = {name: _display(capture) for name, (_, capture) in captures.items()}
+    exposures = {name: capture.exposure for name, (_, capture) in captures.items()}
+    factor = fitted_factor(
+        [(pictures[name], exposures[name], truth, covered) for name, (truth, covered) in views.items()]
+    )
+    found = {}
+    for name, (truth, covered) in views.items():
+        shown = to_display(pictures[name], factor * exposures[name])
+        psnrs = [capped_psnr(*each) for each in zip(shown, truth, covered) if each[2].any()]
+        middle = len(truth) // 2
+        found[name] = RelitLight(float(np.mean(psnrs)), truth[middle], shown[middle])
+    return Relit(found, factor)
+
+
+def fitted_factor(lights: Sequence[tuple[np.ndarray, float, np.ndarray, np.ndarray]]) -> float:
+    """The one factor on radiance that brings display values nearest to the truth, in the mean square.
+
+    Args:
+        lights: of each its radiance (K, H, W, 3), exposure, true display values (K, H, W, 3) and the pixels
+            that count (K, H, W) bool.
+    """
+
+    def error(stops: float) -> float:
+        squares = [
+            np.square(to_display(radiance[where], 2.0**stops * exposure) - truth[where]).ravel()
+            for radiance, exposure, truth, where in lights
+        ]
+        return float(np.concatenate(squares).mean())
+
+    # The error has one valley, but for plateaus where all is black or white: a coarse look finds its floor.
+    coarse = np.linspace(-STOPS, STOPS, 25)
+    floor, step = coarse[np.argmin([error(stops) for stops in coarse])], coarse[1] - coarse[0]
+    return float(np.exp2(fminbound(error, floor - step, floor + step)))
+
+
+def _lit_views(lit: LitScene, capture: Capture, light: EnvironmentMap, estimation: Estimation) -> np.ndarray:
+    """(K, H, W, 3) linear radiance of the surfels from the capture's views."""
+    lighting = Lighting(light)
+    bounced = lit.bake(lighting)
+    frames = []
+    for number, view in enumerate(capture.views):
+        tracer, seed = lit.tracer(view.camera), integer(0, "reconstruction", "relit", number)
+        bounce = bounced(view.camera)
+        frames.append(render_guidance(tracer, view.camera, lighting, estimation, seed, bounce=bounce).lit)
+    return np.stack(frames)
+
+
+def _display(capture: Capture) -> tuple[np.ndarray, np.ndarray]:
+    """True display values (K, H, W, 3), and where nothing but surfaces is seen (K, H, W) bool."""
+    truth = np.stack([to_display(view.read(), capture.exposure) for view in capture.views])
+    return truth, np.stack([view.read("mask") > COVERED for view in capture.views])

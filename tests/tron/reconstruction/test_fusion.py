@@ -1,0 +1,122 @@
+"""Laws of the fusion: a ball comes back from its depth maps, noise averages out, masks carve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tron.cameras import Camera
+from tron.metrics import angular_error_deg
+from tron.reconstruction.consensus import consensus
+from tron.reconstruction.fusion import DepthMap, DistanceField, empty_rays, fuse, pixel_footprint
+from tron.seeds import generator
+
+RADIUS = 0.7
+
+
+def ball_map(camera: Camera, noise: float = 0.0, index: int = 0) -> DepthMap:
+    """The true depth of a ball about the origin, with noise."""
+    rays = camera.rays().astype(np.float64)
+    along = -(rays @ camera.position)
+    inside = RADIUS**2 - (camera.position @ camera.position - along**2)
+    depth = np.where(inside > 0, along - np.sqrt(np.maximum(inside, 0)), 0)
+    depth += (depth > 0) * noise * generator(0, "ball", index).normal(size=depth.shape)
+    known = torch.from_numpy(depth > 0)
+    return DepthMap(
+        camera,
+        torch.from_numpy(depth).float(),
+        known.float(),
+        empty_rays(known),
+    )
+
+
+BallMaps = Callable[..., list[DepthMap]]
+
+
+@pytest.fixture
+def ball_maps(around: Callable[..., list[Camera]]) -> BallMaps:
+    """Makes the depth maps of twelve views of the ball, with noise of a size."""
+
+    def make(noise: float = 0.0) -> list[DepthMap]:
+        return [ball_map(camera, noise, k) for k, camera in enumerate(around(12, size=64))]
+
+    return make
+
+
+def on_the_ball(count: int = 400, radius: float = RADIUS) -> torch.Tensor:
+    points = generator(0, "on the ball").normal(size=(count, 3))
+    return torch.from_numpy(radius * points / np.linalg.norm(points, axis=1, keepdims=True)).float()
+
+
+def field_of(maps: list[DepthMap]) -> DistanceField:
+    field = fuse(maps, pixel_footprint(maps), 4, 160)
+    assert field is not None
+    return field
+
+
+def test_the_field_of_a_ball_is_the_distance_to_it(ball_maps: BallMaps) -> None:
+    field = field_of(ball_maps())
+
+    def median(off: float) -> float:
+        found = field.sample(field.value[None], on_the_ball(radius=RADIUS + off))
+        return field.reach * float(found.median())
+
+    assert abs(median(0)) < 0.006
+    # Distances are measured along rays, which meet the ball at a slant: they are too long, never too short.
+    assert 1 < median(0.04) / 0.04 < 2
+    assert 1 < median(-0.04) / -0.04 < 2
+    assert float(field.value.reshape(-1)[0]) == 1  # where nobody saw anything
+
+
+def test_views_agree_on_depth_and_normals_of_a_ball(ball_maps: BallMaps) -> None:
+    maps = ball_maps()
+    for each, (depth, normal) in zip(maps, consensus(field_of(maps), maps, sigma=1.0), strict=True):
+        known = depth > 0
+        assert known.sum() > 0.8 * (each.depth > 0).sum()
+        assert float((depth - each.depth)[known].abs().median()) < 0.01
+        points = np.asarray(each.camera.position + depth[..., None].numpy() * each.rays.numpy())
+        radial = points / np.linalg.norm(points, axis=-1, keepdims=True).clip(1e-9)
+        assert angular_error_deg(normal.numpy(), radial, known.numpy()) < 4
+
+
+def test_noise_averages_out_over_the_views(ball_maps: BallMaps) -> None:
+    truth, noisy = ball_maps(), ball_maps(noise=0.03)
+    errors = []
+    for each, exact, (depth, _) in zip(noisy, truth, consensus(field_of(noisy), noisy, 1.0), strict=True):
+        known = (depth > 0) & (exact.depth > 0)
+        errors.append([(d - exact.depth)[known].square().mean().sqrt() for d in (depth, each.depth)])
+    after, before = np.mean(errors, 0)
+    assert after < 0.5 * before
+
+
+def test_masks_carve_what_depth_invents(ball_maps: BallMaps) -> None:
+    maps = ball_maps()
+    camera = maps[0].camera
+    # One view sees a wall in front of everything; all the others see nothing there.
+    wall = replace(maps[0], depth=torch.full_like(maps[0].depth, 2.9), weight=torch.ones_like(maps[0].depth))
+    wall = replace(wall, empty=None)
+    probe = torch.from_numpy(camera.position + 2.9 * camera.rays()[8, 8])[None].float()
+    carved, kept = (
+        fuse([wall, *others], 0.03, 4, 160)
+        for others in (maps[1:], [replace(each, empty=None) for each in maps[1:]])
+    )
+    assert carved is not None
+    assert kept is not None
+    assert float(carved.sample(carved.value[None], probe)) > 0.5
+    assert abs(float(kept.sample(kept.value[None], probe))) < 0.3
+
+
+def test_nothing_seen_is_no_field(ball_maps: BallMaps) -> None:
+    maps = [replace(each, weight=torch.zeros_like(each.weight)) for each in ball_maps()]
+    assert fuse(maps, 0.03, 4, 160) is None
+    assert pixel_footprint(maps) == 0
+
+
+def test_a_wide_scene_has_larger_voxels_and_no_more_of_them(ball_maps: BallMaps) -> None:
+    field = fuse(ball_maps(), 1e-4, 4, 40)
+    assert field is not None
+    assert max(field.value.shape) <= 42

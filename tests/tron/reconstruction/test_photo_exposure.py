@@ -1,0 +1,142 @@
+"""Exposures of photos are found from what surfels show, and held at a mean of one; passers-by stand out."""
+
+import numpy as np
+import pytest
+import torch
+
+from tron.cameras import Camera
+from tron.captures import View
+from tron.captures.view import ToneCurve
+from tron.color import agx, linear_to_srgb
+from tron.reconstruction.bystanders import Bystanders
+from tron.reconstruction.photo_exposure import PhotoExposures
+from tron.reconstruction.supervision import targets
+from tron.seeds import generator
+
+SIZE, COUNT = 32, 6
+
+
+def shown(linear: np.ndarray, curve: ToneCurve) -> np.ndarray:
+    return (linear_to_srgb(linear) if curve == "srgb" else agx(linear)).clip(0, 1).astype(np.float32)
+
+
+def scene(curve: ToneCurve) -> tuple[list[View], np.ndarray, dict[str, torch.Tensor], np.ndarray]:
+    """Photos of one picture with gains, the gains, what surfels show of it, and the picture."""
+    draw = generator(0, "photo exposures")
+    linear = draw.uniform(0.05, 0.6, (SIZE, SIZE, 3))
+    gains = np.exp(draw.normal(0, 0.2, (COUNT, 3)))
+    gains /= np.exp(np.log(gains).mean(0))
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), up=(0, 1, 0), fov_deg=40, width=SIZE, height=SIZE)
+    views = [
+        View(f"{index}", camera, np.round(255 * shown(linear * gain, curve)) / 255, "display")
+        for index, gain in enumerate(gains)
+    ]
+    rendered = {
+        "rgb": torch.from_numpy(shown(linear, curve)),
+        "opacity": torch.ones(SIZE, SIZE),
+    }
+    return views, gains, rendered, shown(linear, curve)
+
+
+def observed(views: list[View], rendered, curve: ToneCurve, rounds: int = 6) -> PhotoExposures:
+    exposures = PhotoExposures(views, curve, begin=0)
+    for turn in range(rounds):
+        for view in views:
+            exposures.observe(
+                view, len(views) * (1 + turn), rendered, targets(view, ("image", "mask"), "cpu")
+            )
+    return exposures
+
+
+@pytest.mark.parametrize("curve", ["srgb", "agx"])
+def test_gains_are_found_and_taken_out(curve: ToneCurve) -> None:
+    views, gains, rendered, picture = scene(curve)
+    exposures = observed(views, rendered, curve)
+    found = np.stack([exposures.gains[view.name] for view in views])
+    # AgX mixes channels before its curve, so that it blurs what belongs to each.
+    assert np.abs(np.log(found / gains)).max() < (0.01 if curve == "srgb" else 0.06)
+    np.testing.assert_allclose(np.log(found).mean(0), 0, atol=1e-12)
+    for view in views:
+        before = targets(view, ("image",), "cpu")
+        after = exposures.balanced(view, before)["image"].numpy()
+        assert (
+            np.abs(after - picture).mean() < 0.15 * np.abs(before["image"].numpy() - picture).mean() + 0.003
+        )
+
+
+def test_a_common_factor_belongs_to_the_light() -> None:
+    views, _, rendered, _ = scene("srgb")
+    darker = {**rendered, "rgb": 0.8 * rendered["rgb"]}
+    for one, other in zip(
+        observed(views, rendered, "srgb").gains.values(), observed(views, darker, "srgb").gains.values()
+    ):
+        np.testing.assert_allclose(one, other, rtol=0.02)
+
+
+def test_what_is_masked_uncovered_or_clipped_says_nothing() -> None:
+    views, gains, rendered, _ = scene("srgb")
+    spoiled = []
+    for view in views:
+        image, valid = view.read().copy(), np.ones((SIZE, SIZE), np.float32)
+        image[:12], valid[:12] = 0.9, 0
+        image[12:20] = 1.0  # clipped
+        spoiled.append(View(view.name, view.camera, image, "display", valid=valid))
+    thin = {**rendered, "opacity": torch.ones(SIZE, SIZE)}
+    thin["opacity"][:, :6] = 0.2
+    exposures = PhotoExposures(spoiled, "srgb", begin=0)
+    for turn in range(6):
+        for view in spoiled:
+            exposures.observe(
+                view, COUNT * (1 + turn), thin, targets(view, ("image", "mask", "valid"), "cpu")
+            )
+    found = np.stack([exposures.gains[view.name] for view in spoiled])
+    assert np.abs(np.log(found / gains)).max() < 0.015
+
+
+def test_before_they_are_looked_for_photos_are_what_they_are() -> None:
+    views, _, rendered, _ = scene("srgb")
+    exposures = PhotoExposures(views, "srgb", begin=50)
+    target = targets(views[0], ("image",), "cpu")
+    exposures.observe(views[0], 49, rendered, target)
+    assert exposures.gains == {}
+    assert exposures.balanced(views[0], target)["image"] is target["image"]
+
+
+def test_they_outlive_a_checkpoint() -> None:
+    views, _, rendered, _ = scene("srgb")
+    exposures = observed(views, rendered, "srgb")
+    again = PhotoExposures(views, "srgb", begin=0)
+    again.restore(exposures.state())
+    for name, gain in exposures.gains.items():
+        np.testing.assert_array_equal(gain, again.gains[name])
+
+
+def test_a_passer_by_stands_out_and_nobody_else_does() -> None:
+    draw = generator(0, "bystanders")
+    people = Bystanders(3.0, begin=10)
+    for step in range(12):
+        wanted = torch.tensor(draw.random((64, 64, 3)), dtype=torch.float32)
+        picture = wanted + torch.tensor(draw.normal(0, 0.05, (64, 64, 3)), dtype=torch.float32)
+        assert "valid" not in people.without(step, picture, wanted, {})
+    seen = wanted.clone()
+    seen[20:44, 30:40] = 1 - seen[20:44, 30:40].round()
+    seen[20:44, 30:40] += 0.4
+    left = people.without(12, picture, seen, {})["valid"]
+    assert not left[24:40, 32:38].any()
+    away = torch.ones(64, 64, dtype=torch.bool)
+    away[14:50, 24:46] = False
+    assert left[away].all()
+    other = torch.ones(64, 64, dtype=torch.bool)
+    other[0] = False
+    both = people.without(12, picture, seen, {"valid": other})["valid"]
+    assert torch.equal(both, left & other)
+
+
+def test_a_view_that_is_not_learnt_yet_is_no_crowd() -> None:
+    people = Bystanders(3.0, begin=0)
+    flat = torch.full((64, 64, 3), 0.5)
+    people.without(0, flat, flat + 0.02, {})
+    assert "valid" not in people.without(1, flat, flat + 0.4, {})
+    again = Bystanders(3.0, begin=0)
+    again.restore(people.state())
+    assert again.state() == people.state()

@@ -1,0 +1,1 @@
+"""Pages of pictures, tables and films as one HTML file: what benchmarks and reconstructions report with."""
