@@ -41,7 +41,7 @@ HEADLINE = {
     "irradiance.seconds_ratio_to_mitsuba_direct": "64-ray irradiance: times as long as Mitsuba's direct",
     "primary.max_error": "Camera rays: largest error against float64",
     "bounce.seconds_ratio_to_frame": "Bake of a light: times as long as a frame of guidance",
-    "guidance.ratio_to_path_tracing": "A lit frame (tron-relight's default): time over path tracing's at the same error",
+    "guidance.ratio_to_path_tracing": "A lit frame of tron-relight: time over path tracing's at equal error",
 }
 
 

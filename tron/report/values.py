@@ -16,7 +16,7 @@ _STYLES = {
 
 
 def format_value(value: float, unit: str, signed: bool = False) -> str:
-    """A figure with its unit: fractions as percent, seconds beyond a minute as minutes too, below ten with decimals.
+    """A figure with its unit: fractions as percent, seconds as minutes too or with decimals.
 
     >>> format_value(0.0123, "fraction"), format_value(31.456, "dB"), format_value(754, "s")
     ('1.23%', '31.46 dB', '12 min 34 s')
