@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-_COARSEST = 500
+_COARSEST = 250
 _RATIO = 0.8  # of the distances to the nearest and the second nearest descriptor (Lowe 2004)
 
 
 def coarse_descriptors(database: Path) -> dict[str, np.ndarray]:
-    """Descriptors (at most 500, 128) float32 of unit length of each image's largest features, by its name.
+    """Descriptors (at most 250, 128) float32 of unit length of each image's largest features, by its name.
 
     Args:
         database: COLMAP's, with SIFT features.

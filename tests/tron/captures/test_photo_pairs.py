@@ -72,5 +72,5 @@ def test_the_largest_features_are_taken(tmp_path: Path) -> None:
 
     ((name, found),) = coarse_descriptors(tmp_path / "database.db").items()
     assert name == "camera_000/00000.jpg"
-    largest = values[np.sort(np.argsort(-scale)[:500])]
+    largest = values[np.sort(np.argsort(-scale)[:250])]
     np.testing.assert_allclose(found, unit(largest.astype(float)), atol=1e-6)
