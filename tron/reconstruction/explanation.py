@@ -37,7 +37,10 @@ log = logging.getLogger(__name__)
 
 MAP_HEIGHT = 256
 """Rows of the environment map; a sun narrower than a row is a row wide."""
-_PHOTOS = 2  # that show a surfel whose colour tells of the light
+_PHOTOS = 2
+_USUAL = 0.6
+"""Photos, and share of the usual number of them, that show a surfel whose colour tells of the light: where few
+looked, as at a table's edge, surfels face anywhere."""
 _METAL = 0.5  # metallic from here on: no diffuse part to speak of
 _RAYS = 64  # shadow rays of a surfel
 
@@ -154,7 +157,8 @@ class LightFinder:
         self.tracer, self.prior, self.seed, self.device = tracer, prior, seed, device
         self.sky = sky
         scene = tracer.scene
-        usable = np.flatnonzero(evidence.count >= _PHOTOS)
+        usual = np.median(evidence.count[evidence.seen])
+        usable = np.flatnonzero(evidence.count >= max(_PHOTOS, _USUAL * usual))
         draw = generator(seed, "joint light", "points")
         self.chosen = np.sort(draw.permutation(usable)[: prior.light.points])
         self.position, self.normal = scene.means[self.chosen], scene.normals()[self.chosen]
@@ -170,17 +174,19 @@ class LightFinder:
         """
         settings, seed, device = self.prior.light, self.seed, self.device
         kept = metallic[self.chosen] < _METAL
-        points = Points(
+        surfels = Points(
             self.position[kept],
             self.normal[kept],
             diffuse[self.chosen][kept],
             self.bounced[kept],
             self.transport[kept],
         )
+        radius = settings.patch * self.tracer.scene.spacing
+        points = surfels.averaged(surfels.patches(radius, settings.alike))
         soft = fit_light(points, settings, seed, device, self.sky)
         if self.prior.sun >= 1:
             return soft, None
-        search = SunSearch(self.tracer, points, soft, settings.robust, settings.alike, seed)
+        search = SunSearch(self.tracer, surfels, soft, radius, settings.robust, settings.alike, seed)
         direction, strength = search.find()
         width = search.width(direction, strength)
         lit = replace(points, lobe=search.received(direction, width))

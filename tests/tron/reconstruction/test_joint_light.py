@@ -152,7 +152,7 @@ def test_shadows_tell_where_the_sun_is(scene, transport) -> None:
     environment, towards = sunny()
     points = points_of(scene, transport, environment)
     soft = fit_light(points, QUICK, 0)
-    search = SunSearch(transport.tracer, points, soft, QUICK.robust, QUICK.alike, 0)
+    search = SunSearch(transport.tracer, points, soft, 0.0, QUICK.robust, QUICK.alike, 0)
     direction, strength = search.find()
     assert np.degrees(np.arccos(direction @ towards)) < 4
     received = search.received(direction, search.width(direction, strength))
@@ -176,6 +176,26 @@ def test_light_without_a_sun_is_found(scene, transport) -> None:
     chosen = np.sort(generator(0, "tests", "points").permutation(len(scene))[:1500])
     truth = scene.base_color[chosen[scene.normals()[chosen][:, 2] > -0.5]]
     assert _psnr(base, truth) > _psnr(even, truth) + 4
+
+
+def test_patches_bear_bumps_that_no_photo_shows(scene, transport) -> None:
+    """Surfels turned by some 15 degrees at random: patches show better that there is a sun, and where."""
+    environment, towards = sunny()
+    true = points_of(scene, transport, environment)
+    turned = true.normal + np.radians(10) * generator(0, "tests", "bumps").normal(size=true.normal.shape)
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    rays = sky_transport(transport.tracer, true.position, turned, 8, 0)
+    bumpy = replace(true, normal=turned, transport=rays)
+
+    def explained(radius: float) -> float:
+        points = bumpy.averaged(bumpy.patches(radius, QUICK.alike))
+        soft = fit_light(points, QUICK, 0)
+        search = SunSearch(transport.tracer, bumpy, soft, radius, QUICK.robust, QUICK.alike, 0)
+        lit = replace(points, lobe=search.received(towards, 0.03))
+        return 1 - search.loss(fit_light(lit, QUICK, 0), lit) / search.loss(soft, points)
+
+    alone, together = explained(0.0), explained(0.2)
+    assert together > 2 * max(alone, 0.02)
 
 
 def test_too_few_points_are_refused(scene, transport) -> None:
