@@ -39,8 +39,10 @@ MAP_HEIGHT = 256
 """Rows of the environment map; a sun narrower than a row is a row wide."""
 _PHOTOS = 2
 _USUAL = 0.6
-"""Photos, and share of the usual number of them, that show a surfel whose colour tells of the light: where few
-looked, as at a table's edge, surfels face anywhere."""
+"""Photos, and share of the usual number of them, that show a surfel whose colour tells of the light.
+
+Where few look, as at a table's edge, surfels face anywhere.
+"""
 _METAL = 0.5  # metallic from here on: no diffuse part to speak of
 _RAYS = 64  # shadow rays of a surfel
 

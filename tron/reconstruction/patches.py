@@ -1,10 +1,10 @@
 """Patches: points that lie together, face alike and have like colour, taken as one.
 
-Reconstructed surfaces are bumpy: normals are ten degrees wrong from one surfel to the next, and a light fitted
-to them point by point is flattened until bumps that nobody photographed cost little (regression towards the
-mean, as with any noise in what explains). Light that arrives is linear in the normal and in visibility, so
-its mean over a patch keeps what the surfels have in common and loses their noise; so does the mean of the
-logarithms of their colours.
+Reconstructed surfaces are bumpy: normals are ten degrees wrong from one surfel to the next, and a light
+fitted to them point by point is flattened until bumps that nobody photographed cost little (noise in what
+explains weakens what is explained). Light that arrives is linear in the normal and in visibility, so its mean
+over a patch keeps what the surfels have in common and loses their noise; so does the mean of the logarithms
+of their colours.
 """
 
 from __future__ import annotations

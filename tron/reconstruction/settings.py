@@ -60,8 +60,8 @@ class StereoSettings(Settings):
         default=0.03,
         ge=0,
         le=1,
-        description="Weight in the fusion of depths that no other photo confirms, where a mask says that there "
-        "is a surface.",
+        description="Weight in the fusion of depths that no other photo confirms, where a mask tells of a "
+        "surface.",
     )
     truncation: float = Field(default=6.0, gt=0, description="Voxels at which fused distances are cut off.")
     sigma: float = Field(default=1.5, ge=0, description="Gaussian that smooths the fused field, voxels.")
