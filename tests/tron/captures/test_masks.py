@@ -8,7 +8,9 @@ import pytest
 
 from tron.captures import LoadSettings, load_capture
 from tron.captures.folder import write_capture
-from tron.captures.masks import find_mask
+from tron.captures.masks import find_mask, mask_values
+from tron.captures.photo_files import PhotoHeader
+from tron.captures.photo_views import mask_of
 from tron.errors import TronError
 
 PLACES = {
@@ -52,6 +54,26 @@ def test_a_mask_says_which_pixels_are_believed(folder: Path, photos, write, plac
     assert believed[:, write.size[0] // 2 :].all()
     assert views[2].believed().all()
     assert not views[3].has("mask")
+
+
+def test_masks_have_any_depth_and_their_alpha_says_nothing() -> None:
+    deep = np.array([[0, 255, 0x7FFF, 0x8000, 0xFFFF]], np.uint16)[..., None]
+    assert mask_values(deep, "ignore")[0, :, 0].tolist() == [0, 0, 0, 255, 255]
+    assert mask_values(deep, "subject")[0, :, 0].tolist() == [0, 0, 127, 128, 255]
+    black_and_white = np.array([[[0, 0, 0, 255], [255, 255, 255, 255], [0, 200, 0, 0]]], np.uint8)
+    assert mask_values(black_and_white, "ignore")[0, :, 0].tolist() == [0, 255, 255]
+
+
+def test_the_mask_of_a_turned_photo_is_one_of_what_it_shows(tmp_path: Path, write) -> None:
+    """A phone stores a portrait on its side, 96 x 72 pixels with EXIF's 6; its mask stands: 72 x 96."""
+    width, height = 96, 72
+    header = PhotoHeader(width, height, orientation=6)
+    write.save(tmp_path / "a_mask.png", np.full((width, height), 255, np.uint8))
+    found = mask_of(tmp_path / "a.png", header, "ignore", upright=True)
+    assert found is not None
+    assert found[1].size(upright=True) == (height, width)
+    with pytest.raises(TronError, match="mask has 72 x 96 pixels, the photo 96 x 72"):
+        mask_of(tmp_path / "a.png", header, "ignore", upright=False)
 
 
 def test_a_mask_may_be_the_subject_instead(folder: Path, write, caplog) -> None:
