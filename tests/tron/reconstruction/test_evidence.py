@@ -72,6 +72,18 @@ def test_clipped_colours_say_nothing_of_exposure() -> None:
     assert np.abs(np.log(found.color[:200] / truth[:200])).max() < 0.03
 
 
+def test_a_photo_of_few_surfels_is_half_believed() -> None:
+    """Of 41 photos one shows twenty surfels alone, the number at which its exposure counts half."""
+    draw = generator(6, "tests", "few")
+    truth = draw.uniform(0.05, 0.3, (400, 3))
+    surfel, view = (index.ravel() for index in np.meshgrid(np.arange(400), np.arange(41), indexing="ij"))
+    shown = (view > 0) | (surfel < 20)
+    surfel, view = surfel[shown], view[shown]
+    color = truth[surfel] * np.where(view == 0, 2.0, 1.0)[:, None]
+    gain = np.log(gather_evidence(observations(surfel, view, color)).gain)
+    np.testing.assert_allclose(gain[0] - gain[1:].mean(0), 0.5 * np.log(2), atol=0.02)
+
+
 def test_the_spread_is_what_is_left_when_exposures_are_taken_out() -> None:
     draw = generator(5, "tests", "spread")
     noise, gain = 0.05, np.exp(draw.normal(0, 0.15, (40, 3)))
