@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tron.captures import Capture, View
+from tron.color import linear_to_srgb
 from tron.estimation import Estimation
 from tron.gaussians import GaussianScene
 from tron.reconstruction.evidence import Evidence, gather_evidence
@@ -20,7 +21,7 @@ from tron.reconstruction.joint import Joint
 from tron.reconstruction.joint_light import LightSettings
 from tron.reconstruction.lobes import ROUGHNESSES, Materials, Received, choose, materials_of
 from tron.reconstruction.observations import Observations, observe
-from tron.reconstruction.photographed_sky import photographed_sky
+from tron.reconstruction.photographed_sky import _texel, photographed_sky
 from tron.reconstruction.sky_visibility import cube_texels
 from tron.seeds import generator
 from tron.shading.bounce import BounceTransport
@@ -176,6 +177,28 @@ def test_the_exposure_of_a_photo_is_in_the_picture_that_is_compared(
     assert losses[2] > losses[0] + 0.1
 
 
+def test_white_pixels_are_not_compared_and_materials_stay_materials(
+    scene: GaussianScene, capture: Capture, lighting: Lighting
+) -> None:
+    view = capture.views[0]
+    image, believed = linear_to_srgb(np.clip(view.read(), 0, 0.9)), np.ones((40, 40), np.float32)
+    image[16:24, 16:24], believed[16:24, 16:24] = 1.0, 0.0
+    white = View("white", view.camera, image, "display")
+    settings = RefinementSettings(rays=8, steps=4, rate=0.3, tie=0.0, even=0.0)
+    losses = []
+    for photo in (white, replace(white, valid=believed)):
+        renderer = InverseRenderer(scene, [photo], np.ones((1, 3)), lighting, 1.0, "srgb", settings, 0)
+        losses.append(float(renderer.loss(renderer.photos[0])[0]))
+    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+    # Far brighter photos than any material explains.
+    bright = replace(view, image=5 * view.read())
+    found = InverseRenderer(scene, [bright], np.ones((1, 3)), lighting, 1.0, "srgb", settings, 0).refine()
+    for values in (found.base_color, found.roughness, found.metallic):
+        assert values.min() >= 0
+        assert values.max() <= 1
+    assert found.base_color.mean() > scene.base_color.mean()
+
+
 def test_the_regulariser_is_its_formula_and_the_loss_has_the_slope_of_differences(
     scene: GaussianScene, capture: Capture, lighting: Lighting
 ) -> None:
@@ -297,4 +320,5 @@ def _texel_centres(resolution: int) -> np.ndarray:
     centres = cube_texels(resolution)[0]
     face = np.array(direction_face(mi.Vector3f(*[mi.Float(c.astype(np.float32)) for c in centres.T]))[0])
     assert (np.bincount(face) == resolution**2).all()
+    np.testing.assert_array_equal(_texel(centres, resolution), np.arange(6 * resolution**2))
     return centres
