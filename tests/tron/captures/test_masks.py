@@ -8,7 +8,7 @@ import pytest
 
 from tron.captures import LoadSettings, load_capture
 from tron.captures.folder import write_capture
-from tron.captures.masks import find_mask, mask_values
+from tron.captures.masks import beside_reduced, find_mask, mask_values
 from tron.captures.photo_files import PhotoHeader
 from tron.captures.photo_views import mask_of
 from tron.errors import TronError
@@ -104,7 +104,12 @@ def test_a_pixel_of_which_a_part_is_masked_is_not_believed(folder: Path, write) 
 def test_reduced_photos_take_reduced_masks(tmp_path: Path, write) -> None:
     for name in ("images_4/a.png", "masks_4/a.png", "masks/a.png"):
         write.save(tmp_path / name, half(write))
-    assert find_mask(tmp_path / "images_4" / "a.png") == tmp_path / "masks_4" / "a.png"
+    photo, whole = tmp_path / "images_4" / "a.png", tmp_path / "masks" / "a.png"
+    assert find_mask(photo) == tmp_path / "masks_4" / "a.png"
+    # A mask that a file of poses names is that of the whole photo.
+    assert beside_reduced(photo, whole) == tmp_path / "masks_4" / "a.png"
+    assert beside_reduced(tmp_path / "images" / "a.png", whole) == whole
+    assert beside_reduced(photo, tmp_path / "masks" / "b.png") == tmp_path / "masks" / "b.png"
 
 
 def test_a_mask_of_another_size_costs_its_photo_and_is_named(folder: Path, write) -> None:

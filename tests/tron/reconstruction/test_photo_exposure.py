@@ -96,6 +96,23 @@ def test_what_is_masked_uncovered_or_clipped_says_nothing() -> None:
     assert np.abs(np.log(found / gains)).max() < 0.015
 
 
+def test_a_blur_changes_no_gain() -> None:
+    """One of four pixels is bright in the first photo, and surfels show the mean of the four."""
+    views, _, _, _ = scene("srgb")
+    speckled = np.full((SIZE, SIZE, 3), 0.1)
+    speckled[::2, ::2] = 0.7
+    blurred = np.full((SIZE, SIZE, 3), 0.25)
+    exposures = PhotoExposures(views, "srgb", begin=0)
+    rendered = {"rgb": torch.from_numpy(shown(blurred, "srgb")), "opacity": torch.ones(SIZE, SIZE)}
+    for turn in range(3):
+        for view in views:
+            photo = View(
+                view.name, view.camera, shown(speckled if view is views[0] else blurred, "srgb"), "display"
+            )
+            exposures.observe(photo, COUNT * (1 + turn), rendered, targets(photo, ("image", "mask"), "cpu"))
+    np.testing.assert_allclose(np.stack(list(exposures.gains.values())), 1, atol=0.01)
+
+
 def test_what_a_poor_picture_said_of_a_photo_is_mended() -> None:
     """Surfels show half of the light when a photo is first compared, and all of it from then on."""
     views, gains, rendered, picture = scene("srgb")
@@ -159,3 +176,16 @@ def test_a_view_that_is_not_learnt_yet_is_no_crowd() -> None:
     again = Bystanders(3.0, begin=0)
     again.restore(people.state())
     assert again.state() == people.state()
+
+
+def test_what_is_usual_is_that_of_all_photos_and_single_pixels_are_nobody() -> None:
+    people, flat = Bystanders(3.0, begin=20), torch.full((64, 64, 3), 0.5)
+    crowd, speck = flat.clone(), flat.clone()
+    crowd[:, :10] += 0.2  # of a sixth of the photo: more than the tenth beyond its own percentile
+    speck[30, 30] += 0.4
+    for step in range(20):
+        assert "valid" not in people.without(step, flat, crowd if step == 10 else flat + 0.02, {})
+    assert "valid" not in people.without(20, flat, speck + 0.02, {})
+    left = people.without(21, flat, crowd, {})["valid"]
+    assert not left[:, :8].any()
+    assert left[:, 16:].all()
