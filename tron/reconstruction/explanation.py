@@ -12,14 +12,13 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from tron.captures import Capture
-from tron.errors import TronError
 from tron.estimation import Estimation
 from tron.gaussians import GaussianScene
 from tron.priors import Track, untracked
 from tron.reconstruction.evidence import Evidence, gather_evidence
 from tron.reconstruction.inverse_rendering import InverseRenderer
 from tron.reconstruction.joint import Joint
-from tron.reconstruction.joint_light import Light, Points, fit_light
+from tron.reconstruction.joint_light import Light, Points, TooFewSeen, fit_light
 from tron.reconstruction.lobes import Materials, Received, materials_of
 from tron.reconstruction.observations import observe
 from tron.reconstruction.photographed_sky import PhotographedSky, photographed_sky
@@ -97,13 +96,14 @@ def explain(
         track: wraps long loops.
 
     Raises:
-        TronError: the photos show too few of the surfels.
+        TooFewSeen: the photos show too few of the surfels.
+        TronError: a loss is not finite.
     """
     tracer = SurfelTracer(scene)
     found = observe(tracer, capture.train_views, capture.exposure, prior.tone_curve, track)
     evidence = gather_evidence(found, prior.same_exposure)
     if not evidence.seen.any():
-        raise TronError(
+        raise TooFewSeen(
             "no photo shows a surfel",
             mend="check that cameras and scene share one world, and that masks do not hide everything",
         )

@@ -45,6 +45,10 @@ _PERCENTILE = 95
 _TURN = 0.01  # share of the scene's size that opposite normals count in the distance between points
 
 
+class TooFewSeen(TronError):
+    """The photos show too few of the surfels to say anything of light and materials."""
+
+
 class LightSettings(Settings):
     """Fit of the light to pairs of points."""
 
@@ -149,12 +153,13 @@ def fit_light(
         begin: light whose sun to begin with.
 
     Raises:
-        TronError: too few points, or the loss is not finite.
+        TooFewSeen: too few points.
+        TronError: the loss is not finite.
     """
     if len(points.position) < 10:
-        raise TronError(
-            "too few surfels are seen by the photos to find the light",
-            mend="check cameras and masks, or leave the light out: light=null",
+        raise TooFewSeen(
+            f"{len(points.position)} surfels are seen by two photos or more, too few to find the light",
+            mend="check cameras and masks",
         )
     fit = _Fit(points, settings, seed, device, sky, begin)
     for number in range(settings.rounds):

@@ -82,8 +82,8 @@ class InitialSettings(Settings):
     source: Literal["auto", "points", "depth", "stereo", "random"] = Field(
         default="auto",
         description="points of the capture (COLMAP's), depth maps of its views, stereo, depth found by "
-        "comparing the photos, or random points in the cameras' box; auto: depth where there is any, else "
-        "points that are dense, else stereo, and where it finds nothing points or random ones.",
+        "comparing the photos, or random points in the cameras' box; auto: points that are dense, else depth "
+        "where there is any, else stereo, and where it finds nothing points or random ones.",
     )
     stereo: StereoSettings = Field(
         default_factory=lambda: StereoSettings(), description="Depth by comparing photos."

@@ -83,6 +83,21 @@ def test_views_agree_on_depth_and_normals_of_a_ball(ball_maps: BallMaps) -> None
         assert angular_error_deg(normal.numpy(), radial, known.numpy()) < 4
 
 
+def test_a_surface_is_not_found_from_behind(ball_maps: BallMaps) -> None:
+    """A view whose depth is that of the ball's far side, which the others see from outside."""
+    maps = ball_maps()
+    camera, rays = maps[0].camera, maps[0].camera.rays().astype(np.float64)
+    along = -(rays @ camera.position)
+    inside = RADIUS**2 - (camera.position @ camera.position - along**2)
+    far = torch.from_numpy(np.where(inside > 0, along + np.sqrt(np.maximum(inside, 0)), 0)).float()
+    field = field_of(maps)
+    for depth, most in ((maps[0].depth, 1.0), (far, 0.02)):
+        found, normal = consensus(field, [replace(maps[0], depth=depth)], sigma=1.0)[0]
+        share = float((found > 0).sum() / (depth > 0).sum())
+        assert most - 0.2 < share <= most
+        assert not normal[found == 0].any()
+
+
 def test_noise_averages_out_over_the_views(ball_maps: BallMaps) -> None:
     truth, noisy = ball_maps(), ball_maps(noise=0.03)
     errors = []
