@@ -12,6 +12,7 @@ import numpy as np
 from tron.captures.depth_files import DepthReader, require_depth
 from tron.captures.distortion import Lens
 from tron.captures.masks import MaskMeaning, beside_reduced, find_mask
+from tron.captures.open_sky import open_sky
 from tron.captures.photo_files import PhotoHeader, inspect_photo
 from tron.captures.photographs import PhotoCache, PhotoReader
 from tron.captures.posed_photos import PosedPhoto, rigid_pose
@@ -90,9 +91,18 @@ class PhotoViews:
             meaning = self.settings.masks
             maps["mask" if meaning == "subject" else "valid"] = reader(*mask, mask=meaning).grey
             self.masked += 1
+        if self.settings.sky and "mask" not in maps:
+            maps |= {"sky_mask": partial(self._sky, read), "mask": partial(self._below_sky, read)}
         if reduced != size:
             self.reduced.append((size, reduced))
         return View(name, camera, read.color, "display", **maps)
+
+    def _sky(self, read: PhotoReader) -> np.ndarray:
+        """(H, W) float32, 1 where a photo shows the sky."""
+        return self.cache.get((read, "sky"), lambda: open_sky(read.color())).astype(np.float32)
+
+    def _below_sky(self, read: PhotoReader) -> np.ndarray:
+        return 1 - self._sky(read)
 
 
 def mask_of(

@@ -37,6 +37,11 @@ class PhotoSettings(BaseModel):
         description="black in a photo's mask (mask_path, masks/NAME.png, NAME_mask.png): ignore, it is not "
         "learnt from; subject, it is empty background; null: masks are not read",
     )
+    sky: bool = Field(
+        default=False,
+        description="photos taken outdoors, upright: their open sky is found by colour and smoothness and is "
+        "light, not a surface; photos with alpha or a mask of their subject are left as they are",
+    )
     depth_unit: float = Field(
         default=0.001,
         gt=0,

@@ -1,5 +1,7 @@
 """Photos without poses, posed by pycolmap: SIFT, matching and incremental mapping on the CPU.
 
+Each photo is matched with those that share most coarse features with it (:mod:`tron.captures.photo_pairs`).
+
 Features are sought in upright, reduced copies, so that nothing in the files (EXIF orientation, 16 bits,
 alpha) can be read in two ways. The copies of photos that one camera and lens took at one size lie in a folder
 of their own and share a camera, COLMAP's OPENCV model refined with the poses.
@@ -29,6 +31,7 @@ from tron.captures.photo_files import (
     open_photo,
     require_decoders,
 )
+from tron.captures.photo_pairs import coarse_descriptors, overlapping_pairs
 from tron.captures.photo_views import mask_of
 from tron.captures.posed_photos import PosedPhoto, PosedPhotos
 from tron.captures.settings import PhotoSettings
@@ -43,12 +46,12 @@ log = logging.getLogger(__name__)
 Progress = Callable[[str], None]
 
 WORKSPACE = "structure_from_motion"
-_VERSION = 2
+_VERSION = 3
 _EXIF_FOLDER = 0x8769
 _CAMERA_TAGS = (0x010F, 0x0110)  # make, model
 _LENS_TAGS = (0x920A, 0xA405, 0xA404)  # focal length, the same for 35 mm film, digital zoom
 _FOCAL_35MM = 0xA405
-_EXHAUSTIVE_UP_TO = 200
+_NEAREST = 16
 _FEWEST = 3
 _QUALITY = 95
 
@@ -56,10 +59,11 @@ _QUALITY = 95
 class MatchingSettings(BaseModel):
     """Order of the photos, as the user knows it."""
 
-    matching: Literal["auto", "exhaustive", "sequential"] = Field(
+    matching: Literal["auto", "overlapping", "exhaustive", "sequential"] = Field(
         default="auto",
-        description="how photos without poses are matched: exhaustive compares every pair, sequential each "
-        "with the ten after it by name, as suits videos; auto: exhaustive up to 200 photos",
+        description="how photos without poses are matched: overlapping compares each with the sixteen that "
+        "share most coarse features with it, exhaustive every pair, sequential each with the ten after it by "
+        "name; auto: sequential for videos, else overlapping",
     )
 
 
@@ -70,7 +74,10 @@ class PosingSettings(MatchingSettings, PhotoSettings):
         default=None, description="folder that keeps the poses; null: structure_from_motion beside the photos"
     )
     feature_side: int = Field(
-        default=1600, ge=64, description="features are sought in copies of at most so many pixels a side"
+        default=1000, ge=64, description="features are sought in copies of at most so many pixels a side"
+    )
+    features: int = Field(
+        default=4096, ge=100, description="largest features that are kept of a photo, places in it"
     )
     threads: int = Field(
         default=0,
@@ -149,6 +156,7 @@ def _posed_copies(
         "masks": {path.name: sha256(mask) for path, mask in masks.items()},
         "matching": settings.matching,
         "max_side": settings.feature_side,
+        "features": settings.features,
         "seed": settings.seed,
     }
     kept = _kept(record)
@@ -170,7 +178,7 @@ def _posed_copies(
 def _clear(workspace: Path, *folders: str) -> None:
     for name in folders:
         shutil.rmtree(workspace / name, ignore_errors=True)
-    for stale in workspace.glob("database.db*"):
+    for stale in (*workspace.glob("database.db*"), *workspace.glob("pairs.txt")):
         stale.unlink()
 
 
@@ -247,13 +255,11 @@ def _map(workspace: Path, count: int, settings: PosingSettings, progress: Progre
         reader.mask_path = workspace / "masks"
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads, extraction.use_gpu = threads, False
+    extraction.sift.max_num_features = settings.features
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads, matching.use_gpu = threads, False
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = settings.seed
-    exhaustive = settings.matching == "exhaustive" or (
-        settings.matching == "auto" and count <= _EXHAUSTIVE_UP_TO
-    )
     try:
         progress(f"extracting features of {count} photos")
         pycolmap.extract_features(
@@ -264,14 +270,23 @@ def _map(workspace: Path, count: int, settings: PosingSettings, progress: Progre
             extraction_options=extraction,
             device=pycolmap.Device.cpu,
         )
-        progress(f"matching features, {'every pair' if exhaustive else 'neighbours in time'}")
-        match = pycolmap.match_exhaustive if exhaustive else pycolmap.match_sequential
-        match(
-            database,
-            matching_options=matching,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-        )
+        options = {
+            "matching_options": matching,
+            "verification_options": verification,
+            "device": pycolmap.Device.cpu,
+        }
+        if settings.matching == "sequential":
+            progress("matching features of neighbours in time")
+            pycolmap.match_sequential(database, **options)
+        elif settings.matching == "exhaustive":
+            progress("matching features of every pair")
+            pycolmap.match_exhaustive(database, **options)
+        else:
+            pairs = _write_pairs(database, workspace / "pairs.txt")
+            progress(f"matching features of {pairs} pairs out of {count * (count - 1) // 2}")
+            pairing = pycolmap.ImportedPairingOptions()
+            pairing.match_list_path = workspace / "pairs.txt"
+            pycolmap.match_image_pairs(database, pairing_options=pairing, **options)
         progress("finding cameras and points")
         models = pycolmap.incremental_mapping(
             database, images, workspace / "models", options=_mapping_options(count, threads, settings.seed)
@@ -288,6 +303,15 @@ def _map(workspace: Path, count: int, settings: PosingSettings, progress: Progre
     progress(f"{largest.num_reg_images()} of {count} photos posed, {largest.num_points3D()} points")
     (workspace / "sparse").mkdir()
     largest.write_binary(workspace / "sparse")
+
+
+def _write_pairs(database: Path, file: Path) -> int:
+    """Write COLMAP's list of the pairs that are likely to overlap; their number."""
+    descriptors = coarse_descriptors(database)
+    names = list(descriptors)
+    pairs = overlapping_pairs(list(descriptors.values()), _NEAREST)
+    file.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs), "utf-8")
+    return len(pairs)
 
 
 def _mapping_options(count: int, threads: int, seed: int) -> pycolmap.IncrementalPipelineOptions:

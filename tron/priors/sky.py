@@ -7,11 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from tron.captures import Capture, View
-from tron.color import luminance
+from tron.captures.open_sky import sky_coloured
 
 _OPAQUE = 0.5
-_BLUE = 1.1  # blue over red
-_DARK = 0.02  # linear; darker pixels have no colour to speak of
 
 
 def sky_mask(
@@ -32,11 +30,7 @@ def sky_mask(
     """
     nothing = (geometry["opacity"] < _OPAQUE) | (geometry["depth"] > reach)
     rises = view.camera.rays() @ up > 0
-    brightness = luminance(light)
-    bright = brightness > np.median(brightness)
-    blue = (light[..., 2] > _BLUE * light[..., 0]) & (light[..., 2] >= light[..., 1])
-    coloured = (bright | blue) & (brightness > _DARK)
-    return (nothing & rises & coloured).astype(np.float32)
+    return (nothing & rises & sky_coloured(light)).astype(np.float32)
 
 
 def capture_radius(capture: Capture) -> float:

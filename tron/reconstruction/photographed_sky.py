@@ -1,7 +1,8 @@
 """Sky from the photos themselves: where nothing stands in the way, a pixel shows the environment's radiance.
 
-Pixels without surfels of views without masks (behind a masked subject nobody knows what there is) are brought
-to one exposure and gathered on a cubemap's texels, each the median of its pixels.
+Pixels of the views' sky masks, and those without surfels of views without masks (behind a masked subject
+nobody knows what there is), are brought to one exposure and gathered on a cubemap's texels, each the median
+of its pixels.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from tron.captures import View
 from tron.priors import Track, untracked
 from tron.priors.linear_light import ToneCurve, linear_light
 from tron.reconstruction.evidence import grouped_median
+from tron.reconstruction.surface_points import SKY
 from tron.seeds import generator
 from tron.shading.cubemap import direction_face
 from tron.shading.guidance import ViewTracer
@@ -61,9 +63,12 @@ def photographed_sky(
     """
     texels, colors = [np.zeros(0, int)], [np.zeros((0, 3))]
     for view, gain in zip(track(views, "sky"), gains, strict=True):
-        if view.has("mask"):
+        if view.has("sky_mask"):
+            open_sky = view.read("sky_mask") >= SKY
+        elif view.has("mask"):
             continue
-        open_sky = tracer.gbuffer(view.camera).numpy()["opacity"] < _EMPTY
+        else:
+            open_sky = tracer.gbuffer(view.camera).numpy()["opacity"] < _EMPTY
         empty = np.flatnonzero(open_sky & view.believed())
         draw = generator(seed, "photographed sky", view.name)
         empty = draw.permutation(empty)[:_PER_VIEW]

@@ -283,6 +283,10 @@ def test_the_sky_behind_the_scene_is_the_environment(
     masked = [replace(view, mask=np.ones((40, 40))) for view in capture.views]
     none = photographed_sky(SurfelTracer(scene), masked, gains, 1.0, "srgb", 8, 0)
     assert not none.trust.any()
+    seen = [SurfelTracer(scene).gbuffer(view.camera).numpy()["opacity"] < 0.05 for view in capture.views]
+    told = [replace(view, sky_mask=each) for view, each in zip(masked, seen)]
+    of_masks = photographed_sky(SurfelTracer(scene), told, gains, 1.0, "srgb", 8, 0)
+    np.testing.assert_array_equal(of_masks.radiance, sky.radiance)
 
 
 def test_photos_alone_tell_light_and_materials(
