@@ -82,7 +82,10 @@ def test_what_is_masked_uncovered_or_clipped_says_nothing() -> None:
         image[12:24] = 1.0  # clipped: more than half of what is left
         spoiled.append(View(view.name, view.camera, image, "display", valid=valid))
     thin = {**rendered, "opacity": torch.ones(SIZE, SIZE)}
-    thin["opacity"][:, :20] = 0.75  # in the first view alone: what is common to all belongs to the light
+    # In the first view alone: what is common to all belongs to the light.
+    thin["opacity"][:, :20] = 0.75
+    thin["rgb"] = rendered["rgb"].clone()
+    thin["rgb"][:, :20] *= 0.5
     exposures = PhotoExposures(spoiled, "srgb", begin=0)
     for turn in range(6):
         for view in spoiled:
