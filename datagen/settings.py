@@ -18,7 +18,7 @@ from pydantic import (
 
 from datagen.lights import PROCEDURAL, Family, LightChoice
 from datagen.materials import Style
-from tron.estimation import FINAL, Diffuse, Estimation, Estimator
+from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounces
 
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
@@ -353,6 +353,7 @@ class Settings(_Model):
                 raise ValueError(f"{name}.lights or families ask for hdri: give environments=FOLDER")
         if self.objects is not None and not 1 <= self.objects[0] <= self.objects[1]:
             raise ValueError("objects must be [least, greatest] with 1 <= least <= greatest")
+        require_bounces(self.bounces, self.reflections)
         return self
 
     def _ask_hdri(self, lights: list[LightChoice]) -> bool:

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Estimator = Literal["ratio", "plain"]
 Diffuse = Literal["principled", "lambert"]
+
+
+def require_bounces(bounces: int, reflections: int) -> None:
+    """Raise ValueError where reflections are asked for that have nothing to show."""
+    if reflections and not bounces:
+        raise ValueError(
+            f"reflections={reflections} would show light that bounces, and there is none with bounces=0 "
+            "(which fidelity=paper sets): give bounces too, such as bounces=4, or leave reflections out"
+        )
 
 
 class Estimation(BaseModel):
@@ -56,6 +65,11 @@ class Estimation(BaseModel):
     supersample: Literal[1, 2] = Field(
         default=1, description="2: 2 x 2 sub-pixels with a quarter of the rays each, averaged"
     )
+
+    @model_validator(mode="after")
+    def _reflects_something(self) -> Estimation:
+        require_bounces(self.bounces, self.reflections)
+        return self
 
     def of_sub_pixel(self) -> Estimation:
         """The same for each of a pixel's sub-pixels, which share its rays out."""

@@ -128,6 +128,20 @@ def test_a_value_of_the_wrong_type_is_named_with_what_is_wanted(run, name):
     assert "integer" in line
 
 
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("tron-relight", ["bounces=0", "reflections=4"]),
+        ("tron-relight", ["fidelity=paper", "reflections=4"]),
+        ("tron-datagen", ["bounces=0", "reflections=4"]),
+    ],
+)
+def test_reflections_of_light_that_does_not_bounce_are_refused(run, name, arguments):
+    line = run(name, *COMPLETE[name], *arguments)
+    assert "reflections=4" in line
+    assert "bounces=0" in line
+
+
 @pytest.mark.parametrize("name", sorted(SCRIPTS))
 def test_a_word_that_is_no_setting_is_explained(run, name):
     assert "write key=value" in run(name, *COMPLETE[name], "please")

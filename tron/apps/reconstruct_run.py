@@ -71,6 +71,8 @@ def run(settings: Settings, capture: Capture, prior: Prior | Joint, lpips: LPIPS
         log.info("no light is fitted: light=null")
     elif found.explanation is not None:
         environment, said = found.explanation.environment, found.explanation.said()
+    elif isinstance(prior, Joint):
+        pass  # too few surfels are seen, as was told
     elif not any(view.has("irradiance") for view in found.capture.train_views):
         log.warning("the prior gives no irradiance, so no light can be fitted: there is no environment.exr")
     else:

@@ -176,8 +176,8 @@ def _load_renderer(settings: Settings) -> Renderer | None:
         set_torch_threads(settings.threads)
     renderer = load_renderer(settings.checkpoint, settings.vae)
     if settings.bounces == 0 and "lit" in renderer.config.guidance:
-        what = "the network is given lit, which has no bounced light with bounces=0"
-        mend = "leave bounces as it is, or take a checkpoint of pbr and irradiance"
+        what = "the network is given lit, which has no bounced light with bounces=0 (fidelity=paper sets it)"
+        mend = "give bounces=4, or take a checkpoint of pbr and irradiance"
         raise TronError(what, settings.checkpoint, mend)
     return renderer.to(torch_device(settings.variant))
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from tron.apps.framing import TrajectoryName
 from tron.apps.relit import Background
 from tron.errors import TronError
-from tron.estimation import FINAL, FINEST, PREVIEW, Estimation, Estimator
+from tron.estimation import FINAL, FINEST, PREVIEW, Estimation, Estimator, require_bounces
 from tron.shards.schema import light_members
 
 DEFAULT_BUFFERS = (*light_members(), "indirect", "foreground", "mask", "share")
@@ -144,11 +144,16 @@ class Settings(BaseModel):
             )
         return self
 
+    @model_validator(mode="after")
+    def _reflects_something(self) -> Settings:
+        require_bounces(self.bounces, self.reflections or 0)
+        return self
+
     def estimation(self) -> Estimation:
         """Estimation of the light: what quality says, unless the settings do."""
         said = {
             "filtered": self.denoise,
-            "reflections": self.reflections,
+            "reflections": self.reflections if self.bounces else 0,
             "supersample": self.supersample,
             **self.model_dump(include={"estimator", "two_sided", "bounces", "diffuse"}),
         }

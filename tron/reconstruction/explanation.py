@@ -12,14 +12,13 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from tron.captures import Capture
-from tron.errors import TronError
 from tron.estimation import Estimation
 from tron.gaussians import GaussianScene
 from tron.priors import Track, untracked
 from tron.reconstruction.evidence import Evidence, gather_evidence
 from tron.reconstruction.inverse_rendering import InverseRenderer
 from tron.reconstruction.joint import Joint
-from tron.reconstruction.joint_light import Light, Points, fit_light
+from tron.reconstruction.joint_light import Light, Points, TooFewSeen, fit_light
 from tron.reconstruction.lobes import Materials, Received, materials_of
 from tron.reconstruction.observations import observe
 from tron.reconstruction.photographed_sky import PhotographedSky, photographed_sky
@@ -37,7 +36,12 @@ log = logging.getLogger(__name__)
 
 MAP_HEIGHT = 256
 """Rows of the environment map; a sun narrower than a row is a row wide."""
-_PHOTOS = 2  # that show a surfel whose colour tells of the light
+_PHOTOS = 2
+_USUAL = 0.6
+"""Photos, and share of the usual number of them, that show a surfel whose colour tells of the light.
+
+Where few look, as at a table's edge, surfels face anywhere.
+"""
 _METAL = 0.5  # metallic from here on: no diffuse part to speak of
 _RAYS = 64  # shadow rays of a surfel
 
@@ -92,13 +96,14 @@ def explain(
         track: wraps long loops.
 
     Raises:
-        TronError: the photos show too few of the surfels.
+        TooFewSeen: the photos show too few of the surfels.
+        TronError: a loss is not finite.
     """
     tracer = SurfelTracer(scene)
     found = observe(tracer, capture.train_views, capture.exposure, prior.tone_curve, track)
     evidence = gather_evidence(found, prior.same_exposure)
     if not evidence.seen.any():
-        raise TronError(
+        raise TooFewSeen(
             "no photo shows a surfel",
             mend="check that cameras and scene share one world, and that masks do not hide everything",
         )
@@ -154,7 +159,8 @@ class LightFinder:
         self.tracer, self.prior, self.seed, self.device = tracer, prior, seed, device
         self.sky = sky
         scene = tracer.scene
-        usable = np.flatnonzero(evidence.count >= _PHOTOS)
+        usual = np.median(evidence.count[evidence.seen])
+        usable = np.flatnonzero(evidence.count >= max(_PHOTOS, _USUAL * usual))
         draw = generator(seed, "joint light", "points")
         self.chosen = np.sort(draw.permutation(usable)[: prior.light.points])
         self.position, self.normal = scene.means[self.chosen], scene.normals()[self.chosen]
@@ -170,17 +176,19 @@ class LightFinder:
         """
         settings, seed, device = self.prior.light, self.seed, self.device
         kept = metallic[self.chosen] < _METAL
-        points = Points(
+        surfels = Points(
             self.position[kept],
             self.normal[kept],
             diffuse[self.chosen][kept],
             self.bounced[kept],
             self.transport[kept],
         )
+        radius = settings.patch * self.tracer.scene.spacing
+        points = surfels.averaged(surfels.patches(radius, settings.alike))
         soft = fit_light(points, settings, seed, device, self.sky)
         if self.prior.sun >= 1:
             return soft, None
-        search = SunSearch(self.tracer, points, soft, settings.robust, settings.alike, seed)
+        search = SunSearch(self.tracer, surfels, soft, radius, settings.robust, settings.alike, seed)
         direction, strength = search.find()
         width = search.width(direction, strength)
         lit = replace(points, lobe=search.received(direction, width))

@@ -33,6 +33,7 @@ from torch import Tensor
 
 from tron.errors import TronError
 from tron.reconstruction.evidence import FLOOR
+from tron.reconstruction.patches import Patches
 from tron.reconstruction.photographed_sky import PhotographedSky
 from tron.reconstruction.settings import Settings
 from tron.reconstruction.sky_visibility import cube_texels
@@ -44,6 +45,10 @@ _PERCENTILE = 95
 _TURN = 0.01  # share of the scene's size that opposite normals count in the distance between points
 
 
+class TooFewSeen(TronError):
+    """The photos show too few of the surfels to say anything of light and materials."""
+
+
 class LightSettings(Settings):
     """Fit of the light to pairs of points."""
 
@@ -53,14 +58,18 @@ class LightSettings(Settings):
     rounds: int = Field(default=2, ge=1, description="Times that the pairs are drawn.")
     steps: int = Field(default=150, ge=1, description="Steps of Adam a round.")
     rate: float = Field(default=0.05, gt=0, description="Learning rate, in log radiance.")
-    robust: float = Field(default=0.08, gt=0, description="Log difference beyond which a pair is doubted.")
+    patch: float = Field(
+        default=3.5, ge=0,
+        description="Radius of the patches that are compared, in spacings of surfels; 0 compares surfels.",
+    )  # fmt: skip
+    robust: float = Field(default=0.2, gt=0, description="Log difference beyond which a pair is doubted.")
     alike: float = Field(default=0.12, gt=0, description="Log chromaticity that like materials differ by.")
     brightest: float = Field(
         default=0.8, gt=0, le=1, description="Base color of the 95th percentile, largest channel."
     )
     scale: float = Field(default=0.05, ge=0, description="Weight of base color being as bright as that.")
-    smooth: float = Field(default=1e-2, ge=0, description="Weight of fine levels being small.")
-    grey: float = Field(default=0.02, ge=0, description="Weight of the light being grey.")
+    smooth: float = Field(default=3e-3, ge=0, description="Weight of fine levels being small.")
+    grey: float = Field(default=0.05, ge=0, description="Weight of the light being grey.")
     dark: float = Field(default=0.02, ge=0, description="Weight of unseen directions being dark.")
     darkness: float = Field(
         default=0.3, gt=0, le=1, description="Radiance of unseen directions, as a share of the mean."
@@ -91,6 +100,18 @@ class Points:
         """Some of them."""
         arrays = {name: value if value is None else value[which] for name, value in vars(self).items()}
         return Points(**arrays)
+
+    def patches(self, radius: float, alike: float) -> Patches:
+        """Patches of the points; ``radius`` in world units, ``alike`` in log chromaticity."""
+        return Patches.of(self.position, self.normal, np.maximum(self.color, FLOOR), radius, alike)
+
+    def averaged(self, patches: Patches) -> Points:
+        """What patches show and see; of colours it is the geometric mean."""
+        color = np.exp(patches.mean(np.log(np.maximum(self.color, FLOOR))))
+        lobe = None if self.lobe is None else patches.mean(self.lobe)
+        return Points(
+            self.position, self.normal, color, patches.mean(self.bounced), patches.mean(self.transport), lobe
+        )
 
 
 @dataclass(frozen=True)
@@ -132,12 +153,13 @@ def fit_light(
         begin: light whose sun to begin with.
 
     Raises:
-        TronError: too few points, or the loss is not finite.
+        TooFewSeen: too few points.
+        TronError: the loss is not finite.
     """
     if len(points.position) < 10:
-        raise TronError(
-            "too few surfels are seen by the photos to find the light",
-            mend="check cameras and masks, or leave the light out: light=null",
+        raise TooFewSeen(
+            f"{len(points.position)} surfels are seen by two photos or more, too few to find the light",
+            mend="check cameras and masks",
         )
     fit = _Fit(points, settings, seed, device, sky, begin)
     for number in range(settings.rounds):

@@ -26,6 +26,7 @@ from tron.reconstruction.checkpoint import Checkpoint, save_checkpoint
 from tron.reconstruction.explanation import Explanation, explain
 from tron.reconstruction.initial import Beginning, beginning, extent_of, place_of, source_of
 from tron.reconstruction.joint import Joint
+from tron.reconstruction.joint_light import TooFewSeen
 from tron.reconstruction.settings import ReconstructionSettings
 from tron.reconstruction.surfels import LearntSurfels
 from tron.reconstruction.training import Plan, Stage, StepSummary, Watch, materials_plan, radiance_plan
@@ -110,7 +111,13 @@ def reconstruct(
     surfels = run.stage(plan, taught.train_views, first)
     scene = surfels.scene(settings.initial.kernel_degree, capture.up)
     if isinstance(prior, Joint):
-        found = explain(capture, scene, prior, settings.seed, device, track)
+        try:
+            found = explain(capture, scene, prior, settings.seed, device, track)
+        except TooFewSeen as error:  # surfaces were not found: that is no reason to lose what was
+            log.warning("%s: base color is what the photos show, and there is no environment.exr", error)
+            return Reconstruction(
+                _with_baked_color(scene).validate(), capture, run.seconds(), (), **run.begun
+            )
         return Reconstruction(
             found.scene.validate(), capture, run.seconds(), MATERIALS, explanation=found, **run.begun
         )

@@ -32,14 +32,14 @@ class StereoSettings(Settings):
     """Depth from photographs: plane sweep, then fusion."""
 
     planes: int = Field(default=64, ge=4, le=1024, description="Planes, even in inverse distance.")
-    neighbours: int = Field(default=5, ge=1, description="Photos that each one is compared with.")
+    neighbours: int = Field(default=8, ge=1, description="Photos that each one is compared with.")
     angle: float = Field(
         default=12.0, gt=0, lt=180, description="Wanted angle between the views of two photos, degrees."
     )
     least_angle: float = Field(default=4.0, ge=0, lt=180, description="Smallest such angle, degrees.")
     most_angle: float = Field(default=40.0, gt=0, le=180, description="Largest such angle, degrees.")
     best: int = Field(
-        default=3, ge=1, description="Neighbours that count, those that agree best: others are hidden."
+        default=4, ge=1, description="Neighbours that count, those that agree best: others are hidden."
     )
     radius: int = Field(default=2, ge=1, description="Radius of the compared windows, pixels.")
     smooth_small: float = Field(
@@ -55,6 +55,13 @@ class StereoSettings(Settings):
     )
     most_side: int = Field(
         default=512, ge=16, description="Larger photos are reduced to so many pixels, which bounds memory."
+    )
+    unsure: float = Field(
+        default=0.03,
+        ge=0,
+        le=1,
+        description="Weight in the fusion of depths that no other photo confirms, where a mask tells of a "
+        "surface.",
     )
     truncation: float = Field(default=6.0, gt=0, description="Voxels at which fused distances are cut off.")
     sigma: float = Field(default=1.5, ge=0, description="Gaussian that smooths the fused field, voxels.")
@@ -75,8 +82,8 @@ class InitialSettings(Settings):
     source: Literal["auto", "points", "depth", "stereo", "random"] = Field(
         default="auto",
         description="points of the capture (COLMAP's), depth maps of its views, stereo, depth found by "
-        "comparing the photos, or random points in the cameras' box; auto: depth where there is any, else "
-        "points that are dense, else stereo, and where it finds nothing points or random ones.",
+        "comparing the photos, or random points in the cameras' box; auto: points that are dense, else depth "
+        "where there is any, else stereo, and where it finds nothing points or random ones.",
     )
     stereo: StereoSettings = Field(
         default_factory=lambda: StereoSettings(), description="Depth by comparing photos."
@@ -130,7 +137,7 @@ class ConsistencySettings(Settings):
     )
     every: int = Field(default=7500, ge=1, description="Steps between two fusions of all views' depths.")
     truncation: float = Field(default=4.0, gt=0, description="Voxels at which fused distances are cut off.")
-    sigma: float = Field(default=1.0, ge=0, description="Gaussian that smooths the fused field, voxels.")
+    sigma: float = Field(default=3.0, ge=0, description="Gaussian that smooths the fused field, voxels.")
     most_voxels: int = Field(
         default=160, ge=8, le=1024, description="Maximum number of voxels along the scene's longest side."
     )

@@ -91,7 +91,7 @@ def stereo_maps(
     confident = sum(int(each.sum()) for each in known) / max(subject, 1)
     maps = [
         DepthMap(
-            photograph.camera, each.depth, ok.float(),
+            photograph.camera, each.depth, torch.where(ok, 1.0, settings.unsure if view.has("mask") else 0.0),
             empty_rays(photograph.subject) if view.has("mask") else None,
         )
         for view, photograph, each, ok in zip(views, photographs, found, known)

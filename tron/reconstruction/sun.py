@@ -64,21 +64,31 @@ class SunSearch:
         tracer: what casts shadows.
         points: the surface.
         soft: light without a sun.
+        radius: of the patches that are compared, world units.
         robust, alike: as of :class:`tron.reconstruction.joint_light.LightSettings`.
         seed: root of the pairs.
     """
 
     def __init__(
-        self, tracer: Occluder, points: Points, soft: Light, robust: float, alike: float, seed: int
+        self,
+        tracer: Occluder,
+        points: Points,
+        soft: Light,
+        radius: float,
+        robust: float,
+        alike: float,
+        seed: int,
     ) -> None:
         self.tracer, self.points, self.soft = tracer, points, soft
-        self.settings = (robust, alike, seed)
+        self.settings = (radius, robust, alike, seed)
         self.robust = robust
+        self.patches = points.patches(radius, alike)
+        averaged = points.averaged(self.patches)
         # The soft light has put what it could of the sun into its brightest texels: that is not the rest.
         grey = soft.texels.mean(1)
         rest = np.minimum(grey, _BRIGHTEST * np.median(grey))
-        self.rest = np.maximum(points.transport @ rest + points.bounced.mean(1), 1e-5)
-        shown = np.log(np.maximum(points.color, 1e-4))
+        self.rest = np.maximum(averaged.transport @ rest + averaged.bounced.mean(1), 1e-5)
+        shown = np.log(np.maximum(averaged.color, 1e-4))
         chroma = shown[:, [0, 2]] - shown[:, 1:2]
         size = np.ptp(points.position, axis=0).max()
         place = points.position / size
@@ -96,13 +106,14 @@ class SunSearch:
 
     def find(self) -> tuple[np.ndarray, float]:
         """Direction (3,) of the best sun, and its strength over the mean rest."""
-        best = self._of_few()._best(_sphere(_DIRECTIONS))
+        up = self.tracer.scene.up
+        best = self._of_few()._best(_above(_sphere(_DIRECTIONS), up))
         for ring in _RINGS:
-            best = self._best(_around(best[0], ring))
+            best = self._best(_above(_around(best[0], ring), up))
         return best[0], best[1]
 
     def loss(self, light: Light, points: Points) -> float:
-        """Misfit of a light to the neighbours: mean robust log difference, over that of like points."""
+        """Misfit of a light to the neighbours among averaged points: mean robust log difference."""
         received = (light.irradiance(points) + points.bounced).mean(1)
         return self._loss(np.log(np.maximum(received, 1e-5)))
 
@@ -119,15 +130,18 @@ class SunSearch:
         return float(WIDTHS[int(np.argmin(losses))])
 
     def received(self, direction: np.ndarray, width: float) -> np.ndarray:
-        """(P,) share of a sun's irradiance that arrives at the points, cosine included."""
-        return lobe_transport(self.tracer, self.points.position, self.points.normal, direction, width)
+        """(P,) share of a sun's irradiance that arrives at the patches, cosine included."""
+        points = self.points
+        return self.patches.mean(
+            lobe_transport(self.tracer, points.position, points.normal, direction, width)
+        )
 
     def _best(self, directions: np.ndarray) -> tuple[np.ndarray, float, float]:
         points, found = self.points, []
         for first in range(0, len(directions), 64):
             some = directions[first : first + 64]
             seen = visibility_towards(self.tracer, points.position, points.normal, some)
-            seen *= np.maximum(points.normal @ some.T, 0)
+            seen = self.patches.mean(seen * np.maximum(points.normal @ some.T, 0))
             for column, direction in zip(seen.T, some, strict=True):
                 for strength in _STRENGTHS:
                     received = self.rest + strength * self.rest.mean() * column
@@ -155,6 +169,11 @@ def _sphere(count: int) -> np.ndarray:
     z, angle = 1 - 2 * i / count, i * np.pi * (3 - np.sqrt(5))
     r = np.sqrt(1 - z * z)
     return np.stack([r * np.cos(angle), r * np.sin(angle), z], -1)
+
+
+def _above(directions: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Those of some directions (N, 3) that are above the horizon."""
+    return directions[directions @ up > 0]
 
 
 def _around(direction: np.ndarray, angle: float) -> np.ndarray:

@@ -10,6 +10,7 @@ from tron.shading.background import background_share
 from tron.shading.bounce import BouncedLight, BounceTransport
 from tron.shading.cubemap import CubemapLight
 from tron.shading.environment import EnvironmentLight, EnvironmentMap
+from tron.shading.fixed_rays import FixedRays
 from tron.shading.guidance import Guidance, render_guidance
 from tron.shading.irradiance import irradiance
 from tron.shading.lighting import Lighting
@@ -22,6 +23,7 @@ __all__ = [
     "EnvironmentLight",
     "EnvironmentMap",
     "Estimation",
+    "FixedRays",
     "Guidance",
     "Lighting",
     "SplitSum",

@@ -14,6 +14,7 @@ from tron.apps.relight_settings import BUFFERS, DEFAULT_BUFFERS, Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
 from tron.color import to_display
+from tron.estimation import Estimation
 from tron.gaussians.ply import MATERIAL_PROPERTIES
 from tron.images import read_image
 from tron.seeds import generator
@@ -215,11 +216,21 @@ def test_without_bounces_a_renderer_that_is_given_lit_is_refused(
     assert relight(*base, f"checkpoint={checkpoint}") == 2
     error = capsys.readouterr().err.strip()
     assert "no bounced light with bounces=0" in error
-    assert error.endswith("leave bounces as it is, or take a checkpoint of pbr and irradiance")
+    assert "fidelity=paper" in error
+    assert error.endswith("give bounces=4, or take a checkpoint of pbr and irradiance")
     assert "\n" not in error
     assert not out.exists()
     save_renderer(checkpoint, PixelMLP(PixelMLPConfig(width=4, guidance=("pbr", "irradiance"))))
     assert relight(*base, f"checkpoint={checkpoint}") == 0
+
+
+def test_final_frames_without_bounces_have_no_reflections(tmp_path):
+    """What a quality brings with it is no wish; asked for by name it would be refused."""
+    given = {"scene": tmp_path, "environment": tmp_path, "output_dir": tmp_path, "quality": "final"}
+    assert Settings(**given).estimation().reflections == 4
+    assert Settings(**given, bounces=0).estimation().reflections == 0
+    with pytest.raises(ValueError, match="reflections=2 would show light that bounces"):
+        Estimation(bounces=0, reflections=2)
 
 
 def test_a_clip_in_parts_is_the_clip_in_one(tmp_path, monkeypatch):

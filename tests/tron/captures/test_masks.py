@@ -8,7 +8,9 @@ import pytest
 
 from tron.captures import LoadSettings, load_capture
 from tron.captures.folder import write_capture
-from tron.captures.masks import find_mask
+from tron.captures.masks import beside_reduced, find_mask, mask_values
+from tron.captures.photo_files import PhotoHeader
+from tron.captures.photo_views import mask_of
 from tron.errors import TronError
 
 PLACES = {
@@ -54,6 +56,26 @@ def test_a_mask_says_which_pixels_are_believed(folder: Path, photos, write, plac
     assert not views[3].has("mask")
 
 
+def test_masks_have_any_depth_and_their_alpha_says_nothing() -> None:
+    deep = np.array([[0, 255, 0x7FFF, 0x8000, 0xFFFF]], np.uint16)[..., None]
+    assert mask_values(deep, "ignore")[0, :, 0].tolist() == [0, 0, 0, 255, 255]
+    assert mask_values(deep, "subject")[0, :, 0].tolist() == [0, 0, 127, 128, 255]
+    black_and_white = np.array([[[0, 0, 0, 255], [255, 255, 255, 255], [0, 200, 0, 0]]], np.uint8)
+    assert mask_values(black_and_white, "ignore")[0, :, 0].tolist() == [0, 255, 255]
+
+
+def test_the_mask_of_a_turned_photo_is_one_of_what_it_shows(tmp_path: Path, write) -> None:
+    """A phone stores a portrait on its side, 96 x 72 pixels with EXIF's 6; its mask stands: 72 x 96."""
+    width, height = 96, 72
+    header = PhotoHeader(width, height, orientation=6)
+    write.save(tmp_path / "a_mask.png", np.full((width, height), 255, np.uint8))
+    found = mask_of(tmp_path / "a.png", header, "ignore", upright=True)
+    assert found is not None
+    assert found[1].size(upright=True) == (height, width)
+    with pytest.raises(TronError, match="mask has 72 x 96 pixels, the photo 96 x 72"):
+        mask_of(tmp_path / "a.png", header, "ignore", upright=False)
+
+
 def test_a_mask_may_be_the_subject_instead(folder: Path, write, caplog) -> None:
     write.save(folder / "images" / "photo_03_mask.png", half(write))
     caplog.set_level(logging.INFO)
@@ -82,7 +104,12 @@ def test_a_pixel_of_which_a_part_is_masked_is_not_believed(folder: Path, write) 
 def test_reduced_photos_take_reduced_masks(tmp_path: Path, write) -> None:
     for name in ("images_4/a.png", "masks_4/a.png", "masks/a.png"):
         write.save(tmp_path / name, half(write))
-    assert find_mask(tmp_path / "images_4" / "a.png") == tmp_path / "masks_4" / "a.png"
+    photo, whole = tmp_path / "images_4" / "a.png", tmp_path / "masks" / "a.png"
+    assert find_mask(photo) == tmp_path / "masks_4" / "a.png"
+    # A mask that a file of poses names is that of the whole photo.
+    assert beside_reduced(photo, whole) == tmp_path / "masks_4" / "a.png"
+    assert beside_reduced(tmp_path / "images" / "a.png", whole) == whole
+    assert beside_reduced(photo, tmp_path / "masks" / "b.png") == tmp_path / "masks" / "b.png"
 
 
 def test_a_mask_of_another_size_costs_its_photo_and_is_named(folder: Path, write) -> None:

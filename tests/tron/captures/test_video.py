@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 
 from tron.captures import LoadSettings, load_capture
-from tron.captures.video import choose_frames, motion, sharpness
+from tron.captures import video as module
+from tron.captures.video import VideoSettings, _kept_frames, choose_frames, motion, read_video, sharpness
 from tron.errors import TronError
 from tron.seeds import generator
 from tron.video import VideoWriter
@@ -71,6 +72,36 @@ def test_a_video_without_motion_is_one_line(tmp_path: Path) -> None:
         load_capture(path, LoadSettings(frames=6, workspace=tmp_path / "work"))
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "work" / "frames").exists()
+
+
+def test_frames_are_those_of_the_video_that_is_there(tmp_path: Path) -> None:
+    """Kept while the video stays, made anew when another one has its name or other frames are wanted."""
+    path, work = film(tmp_path / "a.mp4", walk()), tmp_path / "work"
+
+    def frames(count: int) -> dict[str, bytes]:
+        return {file.name: file.read_bytes() for file in _kept_frames(path, count, work).iterdir()}
+
+    first = frames(6)
+    marked = work / "frames" / "00000.jpg"
+    marked.write_bytes(b"kept")
+    assert frames(6)["00000.jpg"] == b"kept"
+    assert len(frames(4)) == 4 + 1
+    assert frames(6) == first
+    film(path, walk()[::-1])
+    assert frames(6)["00000.jpg"] not in (b"kept", first["00000.jpg"])
+
+
+@pytest.mark.parametrize(("asked", "taken"), [("auto", "sequential"), ("exhaustive", "exhaustive")])
+def test_neighbours_in_time_are_matched_unless_another_way_is_asked_for(
+    tmp_path: Path, monkeypatch, asked, taken
+) -> None:
+    posed = []
+    monkeypatch.setattr(module, "pose_photos", lambda folder, settings: posed.append((folder, settings)))
+    path = film(tmp_path / "a.mp4", walk())
+    read_video(path, VideoSettings(frames=6, matching=asked, workspace=tmp_path / "work"))
+    [(folder, settings)] = posed
+    assert settings.matching == taken
+    assert len(list(folder.glob("*.jpg"))) == 6
 
 
 def test_a_phones_video_is_turned_upright(tmp_path: Path) -> None:

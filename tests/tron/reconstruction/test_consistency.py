@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,7 @@ from tron.captures import Capture
 from tron.gaussians import GaussianScene
 from tron.metrics import angular_error_deg
 from tron.reconstruction.consistency import FusedNormals, normal_consistency
-from tron.reconstruction.settings import ConsistencySettings, RadianceSettings
+from tron.reconstruction.settings import ConsistencySettings, RadianceSettings, StereoSettings
 from tron.reconstruction.surfels import LearntSurfels
 from tron.reconstruction.training import Stage, radiance_plan
 from tron.seeds import generator
@@ -45,6 +47,36 @@ def test_fused_normals_are_the_surfaces(painted: GaussianScene, painted_capture:
         known = normal.any(-1) & (view.read("depth") > 0)
         assert known.sum() > 0.6 * (view.read("depth") > 0).sum()
         assert angular_error_deg(normal, view.read("normal"), known) < 12
+
+
+def test_masks_carve_surfels_that_no_photo_shows(painted: GaussianScene, painted_capture: Capture) -> None:
+    """Photos with empty masks: whatever the surfels say, there is no surface to take normals from."""
+    views, surfels = painted_capture.train_views, LearntSurfels.of_scene(painted, RATES)
+    known = []
+    for masks in (True, False):
+        shown = [view if masks else replace(view, mask=np.zeros((32, 32))) for view in views]
+        fused = FusedNormals(SETTINGS, shown, painted.kernel_degree)
+        fused.before(surfels, 0)
+        known.append(np.mean([fused.of(view)["fused_normal"].any(-1).float().mean() for view in shown]))
+    assert known[1] < 0.2 * known[0]
+
+
+def test_depths_may_move_to_where_photos_agree_before_they_are_fused(
+    painted: GaussianScene, painted_capture: Capture
+) -> None:
+    views, surfels = painted_capture.train_views, LearntSurfels.of_scene(painted, RATES)
+    normals = []
+    for refine in (0.0, 2.0):
+        settings = SETTINGS.model_copy(
+            update={"refine": refine, "photos": StereoSettings(most_angle=120, confident=0.3)}
+        )
+        fused = FusedNormals(settings, views, painted.kernel_degree)
+        fused.before(surfels, 0)
+        normals.append([fused.of(view)["fused_normal"].numpy() for view in views])
+    assert not np.array_equal(normals[0], normals[1])
+    for view, normal in zip(views, normals[1]):
+        known = normal.any(-1) & (view.read("depth") > 0)
+        assert angular_error_deg(normal, view.read("normal"), known) < 25
 
 
 def test_surfels_that_are_turned_turn_back(painted: GaussianScene, painted_capture: Capture) -> None:

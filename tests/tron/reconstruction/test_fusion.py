@@ -83,6 +83,61 @@ def test_views_agree_on_depth_and_normals_of_a_ball(ball_maps: BallMaps) -> None
         assert angular_error_deg(normal.numpy(), radial, known.numpy()) < 4
 
 
+def test_a_surface_is_not_found_from_behind(ball_maps: BallMaps) -> None:
+    """A view whose depth is that of the ball's far side, which the others see from outside."""
+    maps = ball_maps()
+    camera, rays = maps[0].camera, maps[0].camera.rays().astype(np.float64)
+    along = -(rays @ camera.position)
+    inside = RADIUS**2 - (camera.position @ camera.position - along**2)
+    far = torch.from_numpy(np.where(inside > 0, along + np.sqrt(np.maximum(inside, 0)), 0)).float()
+    field = field_of(maps)
+    for depth, most in ((maps[0].depth, 1.0), (far, 0.02)):
+        found, normal = consensus(field, [replace(maps[0], depth=depth)], sigma=1.0)[0]
+        share = float((found > 0).sum() / (depth > 0).sum())
+        assert most - 0.2 < share <= most
+        assert not normal[found == 0].any()
+
+
+@pytest.mark.parametrize(
+    ("slope", "weight", "known"), [(0.2, 0.6, True), (0.1, 0.6, False), (0.2, 0.4, False)]
+)
+def test_flat_fields_and_those_that_hardly_anyone_saw_have_no_surface(
+    slope: float, weight: float, known: bool
+) -> None:
+    """A wall at x = 4, seen along x; ``slope`` is the field's, of a full one's."""
+    x = torch.arange(9.0)[:, None, None].expand(9, 9, 9)
+    field = DistanceField(torch.zeros(3), 1.0, 4.0, slope * (4 - x) / 4, torch.full((9, 9, 9), weight))
+    camera = Camera.look_at((-5, 4, 4), (4, 4, 4), fov_deg=5, width=4, height=4)
+    view = DepthMap(camera, torch.full((4, 4), 8.6), torch.ones(4, 4))
+    depth, normal = consensus(field, [view], sigma=0)[0]
+    assert ((depth > 0) == known).all()
+    expected = torch.tensor([-1.0, 0, 0] if known else [0.0, 0, 0])
+    torch.testing.assert_close(normal, expected.expand(4, 4, 3), atol=1e-5, rtol=0)
+
+
+def test_what_has_no_weight_does_not_count_and_smoothing_is_a_weighted_mean(ball_maps: BallMaps) -> None:
+    maps = ball_maps()
+    wrong = replace(maps[0], depth=0.9 * maps[0].depth, weight=torch.zeros_like(maps[0].weight), empty=None)
+    fields = [fuse(some, 0.03, 4, 160) for some in ([wrong, *maps[1:]], maps[1:])]
+    assert fields[0] is not None
+    assert fields[1] is not None
+    torch.testing.assert_close(fields[0].value, fields[1].value)
+    draw = generator(0, "weights")
+    weight, value = (torch.from_numpy(draw.uniform(0.5, 3, (9, 9, 9))).float() for _ in range(2))
+    even = DistanceField(torch.zeros(3), 1.0, 4.0, torch.full_like(value, 0.5), weight).smoothed(1.0)
+    torch.testing.assert_close(even.value, torch.full_like(value, 0.5))
+    # In the middle, by hand: a Gaussian of one voxel, cut off at four.
+    offsets = np.arange(9) - 4
+    kernel = np.exp(-0.5 * offsets**2)
+    kernel = np.einsum("i,j,k->ijk", *[kernel / kernel.sum()] * 3)
+    smooth = DistanceField(torch.zeros(3), 1.0, 4.0, value, weight).smoothed(1.0)
+    w = kernel * weight.double().numpy()
+    assert float(smooth.weight[4, 4, 4]) == pytest.approx(w.sum(), rel=1e-5)
+    assert float(smooth.value[4, 4, 4]) == pytest.approx(
+        (w * value.double().numpy()).sum() / w.sum(), rel=1e-5
+    )
+
+
 def test_noise_averages_out_over_the_views(ball_maps: BallMaps) -> None:
     truth, noisy = ball_maps(), ball_maps(noise=0.03)
     errors = []

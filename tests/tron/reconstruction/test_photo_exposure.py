@@ -7,7 +7,7 @@ import torch
 from tron.cameras import Camera
 from tron.captures import View
 from tron.captures.view import ToneCurve
-from tron.color import agx, linear_to_srgb
+from tron.color import agx, linear_to_srgb, srgb_to_linear
 from tron.reconstruction.bystanders import Bystanders
 from tron.reconstruction.photo_exposure import PhotoExposures
 from tron.reconstruction.supervision import targets
@@ -79,17 +79,56 @@ def test_what_is_masked_uncovered_or_clipped_says_nothing() -> None:
     for view in views:
         image, valid = view.read().copy(), np.ones((SIZE, SIZE), np.float32)
         image[:12], valid[:12] = 0.9, 0
-        image[12:20] = 1.0  # clipped
+        image[12:24] = 1.0  # clipped: more than half of what is left
         spoiled.append(View(view.name, view.camera, image, "display", valid=valid))
     thin = {**rendered, "opacity": torch.ones(SIZE, SIZE)}
-    thin["opacity"][:, :6] = 0.2
+    # In the first view alone: what is common to all belongs to the light.
+    thin["opacity"][:, :20] = 0.75
+    thin["rgb"] = rendered["rgb"].clone()
+    thin["rgb"][:, :20] *= 0.5
     exposures = PhotoExposures(spoiled, "srgb", begin=0)
     for turn in range(6):
         for view in spoiled:
             exposures.observe(
-                view, COUNT * (1 + turn), thin, targets(view, ("image", "mask", "valid"), "cpu")
+                view,
+                COUNT * (1 + turn),
+                thin if view is spoiled[0] else rendered,
+                targets(view, ("image", "mask", "valid"), "cpu"),
             )
     found = np.stack([exposures.gains[view.name] for view in spoiled])
+    assert np.abs(np.log(found / gains)).max() < 0.015
+
+
+def test_a_blur_changes_no_gain() -> None:
+    """One of four pixels is bright in the first photo, and surfels show the mean of the four."""
+    views, _, _, _ = scene("srgb")
+    speckled = np.full((SIZE, SIZE, 3), 0.1)
+    speckled[::2, ::2] = 0.7
+    blurred = np.full((SIZE, SIZE, 3), 0.25)
+    exposures = PhotoExposures(views, "srgb", begin=0)
+    rendered = {"rgb": torch.from_numpy(shown(blurred, "srgb")), "opacity": torch.ones(SIZE, SIZE)}
+    for turn in range(3):
+        for view in views:
+            photo = View(
+                view.name, view.camera, shown(speckled if view is views[0] else blurred, "srgb"), "display"
+            )
+            exposures.observe(photo, COUNT * (1 + turn), rendered, targets(photo, ("image", "mask"), "cpu"))
+    np.testing.assert_allclose(np.stack(list(exposures.gains.values())), 1, atol=0.01)
+
+
+def test_what_a_poor_picture_said_of_a_photo_is_mended() -> None:
+    """Surfels show half of the light when a photo is first compared, and all of it from then on."""
+    views, gains, rendered, picture = scene("srgb")
+    poor = {**rendered, "rgb": torch.from_numpy(shown(0.5 * srgb_to_linear(picture), "srgb"))}
+    exposures = PhotoExposures(views, "srgb", begin=0)
+    for turn in range(9):
+        for view in views:
+            seen = poor if turn == 0 and view is views[0] else rendered
+            target = targets(view, ("image", "mask"), "cpu")
+            exposures.observe(view, COUNT * (1 + turn), seen, target)
+        if turn == 0:
+            assert np.log(exposures.gains["0"] / gains[0]).min() > 0.4
+    found = np.stack([exposures.gains[view.name] for view in views])
     assert np.abs(np.log(found / gains)).max() < 0.015
 
 
@@ -140,3 +179,16 @@ def test_a_view_that_is_not_learnt_yet_is_no_crowd() -> None:
     again = Bystanders(3.0, begin=0)
     again.restore(people.state())
     assert again.state() == people.state()
+
+
+def test_what_is_usual_is_that_of_all_photos_and_single_pixels_are_nobody() -> None:
+    people, flat = Bystanders(3.0, begin=20), torch.full((64, 64, 3), 0.5)
+    crowd, speck = flat.clone(), flat.clone()
+    crowd[:, :10] += 0.2  # of a sixth of the photo: more than the tenth beyond its own percentile
+    speck[30, 30] += 0.4
+    for step in range(20):
+        assert "valid" not in people.without(step, flat, crowd if step == 10 else flat + 0.02, {})
+    assert "valid" not in people.without(20, flat, speck + 0.02, {})
+    left = people.without(21, flat, crowd, {})["valid"]
+    assert not left[:, :8].any()
+    assert left[:, 16:].all()

@@ -85,6 +85,7 @@ def test_the_defaults_are_the_papers_but_for_what_so_short_a_schedule_needs(pape
     )
     assert {name for name in its if own[name] != its[name]} == {
         "radiance.normal",
+        "radiance.consistency.weight",
         *(f"radiance.density.{name}" for name in ("end", "every", "threshold", "reset_every", "most")),
         "materials.rate",
         "materials.decay",

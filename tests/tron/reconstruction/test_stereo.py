@@ -75,7 +75,7 @@ def test_a_painted_ball_comes_back_from_its_photos(truth: Capture, found: Stereo
     assert depth < 0.015  # a pixel covers 1.2 % of the distance
     assert angle < 12
     assert share > 0.75
-    assert found.confident > 0.35
+    assert found.confident > 0.3
 
 
 def test_nothing_is_found_beside_the_subject(truth: Capture, found: StereoMaps) -> None:
@@ -94,6 +94,29 @@ def test_surfels_begin_on_the_surface_and_face_outwards(truth: Capture) -> None:
     outward = first.scene.means / radius[:, None]
     normals = first.scene.normals()
     assert np.median((normals * outward).sum(1)) > 0.95
+
+
+def test_a_plain_part_of_a_photo_has_no_depth(truth: Capture) -> None:
+    """The ball is grey above its equator: a match there is one of noise."""
+
+    def half_grey(view: View) -> View:
+        position = view.camera.position + view.read("depth")[..., None] * view.camera.rays()
+        grey = (position[..., 2] > 0) & (view.read("depth") > 0)
+        return replace(view, image=np.where(grey[..., None], 0.5, view.read()), depth=None, normal=None)
+
+    views = tuple(half_grey(view) for view in truth.views)
+    photographs = [Photograph.of(view, 512, "cpu") for view in views]
+    textured = np.stack([p.textured(SETTINGS.radius).numpy() for p in photographs])
+    depth = np.stack([view.read("depth") for view in truth.views])
+    position = np.stack(
+        [v.camera.position + v.read("depth")[..., None] * v.camera.rays() for v in truth.views]
+    )
+    top, bottom = (depth > 0) & (position[..., 2] > 0.2), (depth > 0) & (position[..., 2] < -0.2)
+    assert textured[top].mean() < 0.4  # what borders on something else, 5 pixels of 34
+    assert textured[bottom].mean() > 0.95
+    whole = stereo_maps(photos(truth), SETTINGS, seed=0).confident
+    plain = stereo_maps(replace(truth, views=views), SETTINGS, seed=0).confident
+    assert plain < 0.68 * whole  # 0.24 of 0.42; were plain windows believed, 0.33
 
 
 def test_photos_without_texture_are_said_to_show_nothing(
@@ -153,6 +176,30 @@ def test_neighbours_are_those_near_the_wanted_angle(truth: Capture) -> None:
         fit = [k for k in range(24) if k != index and SETTINGS.least_angle < angles[k] < SETTINGS.most_angle]
         best = np.sort(np.abs(angles[fit] - SETTINGS.angle))[: SETTINGS.neighbours]
         assert np.abs(angles[others] - SETTINGS.angle).max() <= best.max() + 3
+
+
+def test_a_photo_that_shows_another_place_is_no_neighbour() -> None:
+    """Seen from the wanted angle, it looks away from what the first one shows."""
+    places = [(0, -4, 0), (4 * np.sin(np.radians(20)), -4 * np.cos(np.radians(20)), 0), (1.0, -3.8, 0.6)]
+    image = np.full((SIZE, SIZE, 3), 0.5)
+    photographs = [
+        Photograph.of(
+            View(str(k), Camera.look_at(at, towards, fov_deg=30, width=SIZE, height=SIZE), image, "display"),
+            512,
+            "cpu",
+        )
+        for k, (at, towards) in enumerate(zip(places, [(0, 0, 0), (9, -9, 0), (0, 0, 0)]))
+    ]
+    points = generator(0, "two places").normal(size=(400, 3)) * 0.2
+    assert neighbours(photographs, points, SETTINGS)[0] == [2]
+
+
+def test_a_mask_hides_from_stereo_what_is_not_to_be_believed(truth: Capture) -> None:
+    view, half = truth.views[0], np.ones((SIZE, SIZE), np.float32)
+    half[:, :20] = 0
+    whole = Photograph.of(view, 512, "cpu").subject.numpy()
+    hidden = Photograph.of(replace(view, valid=half), 512, "cpu").subject.numpy()
+    np.testing.assert_array_equal(hidden, whole & (half > 0))
 
 
 def test_a_depth_that_other_photos_contradict_is_not_confirmed(truth: Capture) -> None:

@@ -1,0 +1,53 @@
+"""Recipes for photos: what each adds to the one beneath it, and that their schedules hold together."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import pytest
+from omegaconf import OmegaConf
+
+from tron.apps.reconstruct_settings import Settings
+from tron.cli.recipes import check, compose_recipe
+from tron.nested import leaves
+
+FOX = (1080, 1920)
+
+
+def composed(*overrides: str) -> Settings:
+    given = ["capture=photos", "output_dir=out", *overrides]
+    return check(compose_recipe("conf.reconstruct", Settings, given), Settings)
+
+
+def test_a_fine_reconstruction_has_200000_surfels_of_photos_at_a_quarter_of_their_size() -> None:
+    fine = composed("experiment=photos_fine")
+    assert fine.radiance.density.most == 200_000
+    assert fine.of_loading().size_of(*FOX) == (270, 480)
+    assert fine.initial.stereo.most_side >= 480  # stereo loses nothing of them
+    radiance = fine.radiance.scaled(fine.steps_scaler, "near")
+    assert radiance.steps == 6000
+    # Room for the surfels: half as many again each time would do from 40,000.
+    times = (radiance.density.end - radiance.density.start) / radiance.density.every
+    assert fine.initial.count * 1.1**times > fine.radiance.density.most
+    assert fine.variant == "llvm_ad_rgb"
+
+
+def test_the_gpu_has_more_steps_and_larger_photos() -> None:
+    fine, gpu = composed("experiment=photos_fine"), composed("experiment=photos_gpu")
+    assert gpu.variant == "cuda_ad_rgb"
+    assert gpu.steps_scaler > fine.steps_scaler
+    assert gpu.radiance.density.most > fine.radiance.density.most
+    assert gpu.of_loading().size_of(*FOX) == (540, 960)
+    assert gpu.initial.stereo.most_side >= 960
+
+
+@pytest.mark.parametrize("name", ["photos_fine", "photos_gpu"])
+def test_they_are_recipes_for_photos_and_nothing_of_that_is_undone(name: str) -> None:
+    def plain(settings: Settings) -> dict[str, Any]:
+        return leaves(cast(dict, OmegaConf.to_container(OmegaConf.create(settings.model_dump(mode="json")))))
+
+    base, photos, this = (plain(composed(*o)) for o in ([], ["experiment=photos"], [f"experiment={name}"]))
+    chosen = {key for key in photos if photos[key] != base[key]}
+    assert {"radiance.sh_degree", "radiance.background"} <= chosen
+    assert {key: this[key] for key in chosen} == {key: photos[key] for key in chosen}
+    assert this["prior._target_"] == "tron.reconstruction.Joint"
