@@ -21,7 +21,7 @@ class Joint(Settings):
     )
     roughness: float = Field(default=0.6, ge=0, le=1, description="Roughness where no lobe is seen.")
     sun: float = Field(
-        default=0.02, ge=0, le=1,
+        default=0.005, ge=0, le=1,
         description="Share of the differences between neighbours that a sun must explain to be one; 1: none.",
     )  # fmt: skip
     rounds: int = Field(default=1, ge=1, description="Times that light and materials are found in turns.")
