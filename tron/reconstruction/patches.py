@@ -44,7 +44,7 @@ class Patches:
         count = len(position)
         if radius <= 0 or count < 2:
             return cls(csr_array((np.ones(count, np.float32), (np.arange(count), np.arange(count)))))
-        distance, near = KDTree(position).query(position, k=min(_MOST, count))
+        distance, near = map(np.asarray, KDTree(position).query(position, k=min(_MOST, count)))
         log = np.log(color)
         chroma = log[:, [0, 2]] - log[:, 1:2]
         facing = np.einsum("pkc,pc->pk", normal[near], normal)
