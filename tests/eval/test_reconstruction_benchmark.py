@@ -343,7 +343,7 @@ def test_every_scene_in_every_way_and_the_fox_are_run_once(stand_ins: Path, tmp_
     for name, value in (("test_psnr", 33.0), ("ssim", 0.9), ("surfels", 300.0), ("views", 9.0)):
         assert results.value(f"fox.{name}") == value
     assert not [row.metric for row in results.rows if row.metric.startswith("step.")]
-    assert results.find("fox.test_psnr").reference == "target: at least 22 dB"  # type: ignore[union-attr]
+    assert results.find("fox.test_psnr").reference == "target: at least 25 dB"  # type: ignore[union-attr]
 
     page = (out / "report.html").read_text()
     for anchor in ("targets", "scenes", "views", "light", "fox", "limits", "stages"):

@@ -44,6 +44,8 @@ TRIMMED = 0.05
 """Share of the splats beyond each side of the box that places inside are drawn from."""
 SOLID = 0.5
 """Opacity from which a pixel shows a surface."""
+SIGMA = 1.0
+"""Voxels of the Gaussian that smooths fused depths: rendered ones are less noisy than those of stereo."""
 THIN = 0.02
 """Opacity below which a pixel's colour is not known."""
 
@@ -182,7 +184,7 @@ def _agreeing(views: Sequence[View], settings: ConsistencySettings, device: str)
     field = fuse(maps, pixel_footprint(maps), settings.truncation, settings.most_voxels)
     if field is None:
         return [replace(view, depth=None) for view in views]
-    agreed = consensus(field, maps, settings.sigma)
+    agreed = consensus(field, maps, SIGMA)
     return [replace(view, depth=depth.cpu().numpy()) for view, (depth, _) in zip(views, agreed)]
 
 

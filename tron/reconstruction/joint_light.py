@@ -106,7 +106,7 @@ class Points:
         return Patches.of(self.position, self.normal, np.maximum(self.color, FLOOR), radius, alike)
 
     def averaged(self, patches: Patches) -> Points:
-        """What patches show and see; of colours it is the geometric mean."""
+        """Points of what patches show and see, means over each; of colours the geometric one."""
         color = np.exp(patches.mean(np.log(np.maximum(self.color, FLOOR))))
         lobe = None if self.lobe is None else patches.mean(self.lobe)
         return Points(

@@ -9,6 +9,7 @@ of their colours.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +44,8 @@ class Patches:
         """
         count = len(position)
         if radius <= 0 or count < 2:
-            return cls(csr_array((np.ones(count, np.float32), (np.arange(count), np.arange(count)))))
+            alone = (np.ones(count, np.float32), (np.arange(count), np.arange(count)))
+            return cls(csr_array(alone, shape=(count, count)))
         distance, near = map(np.asarray, KDTree(position).query(position, k=min(_MOST, count)))
         log = np.log(color)
         chroma = log[:, [0, 2]] - log[:, 1:2]
@@ -57,4 +59,5 @@ class Patches:
 
     def mean(self, values: np.ndarray) -> np.ndarray:
         """(P, ...) mean of values (P, ...) over the patches."""
-        return (self.weights @ values.reshape(len(values), -1)).reshape(values.shape)
+        columns = values.reshape(len(values), math.prod(values.shape[1:]))
+        return (self.weights @ columns).reshape(values.shape)

@@ -19,7 +19,7 @@ from tron.seeds import generator
 from tron.tracing.torch_bridge import render
 
 RATES = {"quats": 1e-2}
-SETTINGS = ConsistencySettings(every=10)
+SETTINGS = ConsistencySettings(sigma=1.0, every=10)
 
 
 def test_the_loss_is_the_weighted_turn_of_the_surfels_from_the_fused_normal() -> None:
