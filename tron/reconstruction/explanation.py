@@ -105,7 +105,7 @@ def explain(
     if not evidence.seen.any():
         raise TooFewSeen(
             "no photo shows a surfel",
-            mend="check that cameras and scene share one world, and that masks do not hide everything",
+            mend="take larger pictures (max_side=) and more steps; cameras and masks must be the scene's",
         )
     shown = _everywhere(evidence, scene)
     transport = BounceTransport.trace(tracer, seed=seed)
