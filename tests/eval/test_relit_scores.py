@@ -82,6 +82,15 @@ def test_one_factor_does_not_mend_two_lights(scene: Path, views: list[View], tmp
     assert max(light.psnr for light in found.lights.values()) < 30
 
 
+def test_what_is_not_all_surface_does_not_count(scene: Path, views: list[View], tmp_path: Path):
+    spoilt = [replace(v, image=np.where(v.read("mask")[..., None] > 0.999, v.read(), 9.0)) for v in views]
+    clean, dirty = (
+        relight(scene, [truth(tmp_path / name / "s_1_side", shown, sided_light())], QUICK)
+        for name, shown in (("clean", views), ("dirty", spoilt))
+    )
+    assert dirty.psnr == pytest.approx(clean.psnr, abs=1e-3)
+
+
 def test_light_from_the_other_side_is_an_error(scene: Path, views: list[View], tmp_path: Path):
     right = relight(scene, [truth(tmp_path / "s_1_side", views, sided_light())], QUICK).psnr
     turned = sided_light().rotated(180)

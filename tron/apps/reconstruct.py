@@ -17,6 +17,7 @@ from tron.cli.command_line import command
 from tron.cli.instantiation import make
 from tron.cli.progress import track
 from tron.reconstruction.joint import Joint
+from tron.reconstruction.settings import FusionSettings
 from tron.runtime import activate, set_torch_threads, torch_device
 from tron.storage import locked, require_free_space, write_atomic
 
@@ -72,9 +73,10 @@ def main(settings: Settings) -> None:
 def _load_capture(settings: Settings) -> Capture:
     if not is_splats(settings.capture):
         return load_capture(settings.capture, settings.of_loading())
+    fusion = FusionSettings(most_voxels=settings.radiance.consistency.most_voxels)
     return film_splats(
-        settings.capture, settings.splats, settings.up, settings.test_every, settings.radiance.consistency,
-        settings.seed, torch_device(settings.variant), track,
+        settings.capture, settings.splats, settings.up, settings.test_every, fusion, settings.seed,
+        torch_device(settings.variant), track,
     )  # fmt: skip
 
 

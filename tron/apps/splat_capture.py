@@ -28,7 +28,7 @@ from tron.seeds import generator
 
 if TYPE_CHECKING:
     from tron.priors import Track
-    from tron.reconstruction.settings import ConsistencySettings
+    from tron.reconstruction.settings import FusionSettings
 
 log = logging.getLogger(__name__)
 
@@ -44,8 +44,6 @@ TRIMMED = 0.05
 """Share of the splats beyond each side of the box that places inside are drawn from."""
 SOLID = 0.5
 """Opacity from which a pixel shows a surface."""
-SIGMA = 1.0
-"""Voxels of the Gaussian that smooths fused depths: rendered ones are less noisy than those of stereo."""
 THIN = 0.02
 """Opacity below which a pixel's colour is not known."""
 
@@ -74,7 +72,7 @@ def film_splats(
     settings: SplatSettings,
     up: Sequence[float] | None,
     test_every: int,
-    fusion: ConsistencySettings,
+    fusion: FusionSettings,
     seed: int,
     device: str,
     track: Track,
@@ -166,12 +164,12 @@ def _level(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return east, np.cross(up, east)
 
 
-def _agreeing(views: Sequence[View], settings: ConsistencySettings, device: str) -> list[View]:
+def _agreeing(views: Sequence[View], settings: FusionSettings, device: str) -> list[View]:
     """The views with the depths that they agree on, 0 elsewhere; without any where there is no surface."""
     import torch
 
-    from tron.reconstruction.consensus import consensus
-    from tron.reconstruction.fusion import DepthMap, empty_rays, fuse, pixel_footprint
+    from tron.reconstruction.consensus import fused_views
+    from tron.reconstruction.fusion import DepthMap, empty_rays
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(device)
@@ -181,10 +179,9 @@ def _agreeing(views: Sequence[View], settings: ConsistencySettings, device: str)
         subject, depth = view.read("mask") > SOLID, view.read("depth")
         empty = empty_rays(torch.from_numpy(subject).to(device))
         maps.append(DepthMap(view.camera, tensor(depth), tensor(subject & (depth > 0)), empty))
-    field = fuse(maps, pixel_footprint(maps), settings.truncation, settings.most_voxels)
-    if field is None:
+    agreed = fused_views(maps, settings)
+    if not agreed:
         return [replace(view, depth=None) for view in views]
-    agreed = consensus(field, maps, SIGMA)
     return [replace(view, depth=depth.cpu().numpy()) for view, (depth, _) in zip(views, agreed)]
 
 

@@ -7,13 +7,20 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from tron.reconstruction.fusion import DepthMap, DistanceField
+from tron.reconstruction.fusion import DepthMap, DistanceField, fuse, pixel_footprint
+from tron.reconstruction.settings import FusionSettings
 
 _STEPS = 4
 _STRIDE = 0.8
 _CLOSE = 0.25  # of the reach: farther from zero no surface was met
 _STEEP = 0.15  # of a full slope: flatter fields have no direction
 _SEEN = 0.5
+
+
+def fused_views(maps: Sequence[DepthMap], settings: FusionSettings) -> list[tuple[Tensor, Tensor]]:
+    """The views' consensus on their own fused depths, as of :func:`consensus`; empty if there is no surface."""
+    field = fuse(maps, pixel_footprint(maps), settings.truncation, settings.most_voxels)
+    return [] if field is None else consensus(field, maps, settings.sigma)
 
 
 def consensus(field: DistanceField, maps: Sequence[DepthMap], sigma: float) -> list[tuple[Tensor, Tensor]]:

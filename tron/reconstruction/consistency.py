@@ -19,8 +19,8 @@ from torch import Tensor
 
 from tron.captures import View
 from tron.gaussians.fields import FIELDS, PARAMETERS
-from tron.reconstruction.consensus import consensus
-from tron.reconstruction.fusion import DepthMap, empty_rays, fuse, pixel_footprint
+from tron.reconstruction.consensus import fused_views
+from tron.reconstruction.fusion import DepthMap, empty_rays
 from tron.reconstruction.matching import Photograph
 from tron.reconstruction.refinement import refined_depth
 from tron.reconstruction.settings import ConsistencySettings
@@ -90,12 +90,10 @@ class FusedNormals:
         maps = [self._depth_map(view) for view in self.views]
         if s.refine > 0:
             maps = self._refined(maps)
-        field = fuse(maps, pixel_footprint(maps), s.truncation, s.most_voxels)
-        self._normals = {}
-        if field is not None:
-            for view, (_, normal) in zip(self.views, consensus(field, maps, s.sigma), strict=True):
-                # Half precision is a hundredth of a degree, and half the memory of many large views.
-                self._normals[view.name] = normal.half()
+        # Half precision is a hundredth of a degree, and half the memory of many large views.
+        self._normals = {
+            view.name: normal.half() for view, (_, normal) in zip(self.views, fused_views(maps, s))
+        }
 
     def _refined(self, maps: list[DepthMap]) -> list[DepthMap]:
         s = self.settings

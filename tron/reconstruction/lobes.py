@@ -37,8 +37,8 @@ _LIKE = 24  # neighbours that decide together
 _CHROMA = 0.3  # log colour that counts as one spacing between neighbours
 _CERTAIN = 0.02  # mean loss by which a material must be better to be e times as likely
 _PRIOR = 0.02  # loss of a roughness at 1 from the prior's
-_METAL = 0.06  # loss of a polished metal: few things are one
-_ROUGH_METAL = 5.0
+_METAL_LOSS = 0.06  # loss of a polished metal: few things are one
+_ROUGH_METAL_LOSS = 5.0
 """Loss of a metal of roughness 1, over a polished one's: it looks like paint, and in a light that is somewhat
 wrong fur looks like it."""
 
@@ -152,7 +152,7 @@ def choose(
     roughness = np.tile(ROUGHNESSES, 2)
     metallic = np.repeat([0.0, 1.0], len(ROUGHNESSES))
     prior = _PRIOR * (roughness - prior_roughness) ** 2
-    prior = prior + _METAL * (1 + _ROUGH_METAL * roughness**2) * metallic
+    prior = prior + _METAL_LOSS * (1 + _ROUGH_METAL_LOSS * roughness**2) * metallic
     score = mean + prior[:, None]
     weight = np.exp(-(score - score.min(0)) / _CERTAIN)
     weight /= weight.sum(0)

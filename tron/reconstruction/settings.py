@@ -7,7 +7,7 @@ A machine without a GPU takes fewer of them: ``scaled`` shortens every schedule 
 
 from __future__ import annotations
 
-from typing import Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -28,7 +28,22 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class StereoSettings(Settings):
+Truncation = Annotated[float, Field(gt=0, description="Voxels at which fused distances are cut off.")]
+Smoothing = Annotated[float, Field(ge=0, description="Gaussian that smooths the fused field, voxels.")]
+MostVoxels = Annotated[
+    int, Field(ge=8, le=1024, description="Maximum number of voxels along the scene's longest side.")
+]
+
+
+class FusionSettings(Settings):
+    """Fusion of the views' depths, and what they agree on; smooth by little, for depths that were rendered."""
+
+    truncation: Truncation = 4.0
+    sigma: Smoothing = 1.0
+    most_voxels: MostVoxels = 160
+
+
+class StereoSettings(FusionSettings):
     """Depth from photographs: plane sweep, then fusion."""
 
     planes: int = Field(default=64, ge=4, le=1024, description="Planes, even in inverse distance.")
@@ -63,11 +78,8 @@ class StereoSettings(Settings):
         description="Weight in the fusion of depths that no other photo confirms, where a mask tells of a "
         "surface.",
     )
-    truncation: float = Field(default=6.0, gt=0, description="Voxels at which fused distances are cut off.")
-    sigma: float = Field(default=1.5, ge=0, description="Gaussian that smooths the fused field, voxels.")
-    most_voxels: int = Field(
-        default=160, ge=8, le=1024, description="Maximum number of voxels along the scene's longest side."
-    )
+    truncation: Truncation = 6.0
+    sigma: Smoothing = 1.5
     fewest: float = Field(
         default=0.05,
         ge=0,
@@ -129,18 +141,14 @@ class DensitySettings(Settings):
     )
 
 
-class ConsistencySettings(Settings):
+class ConsistencySettings(FusionSettings):
     """Normals pulled to those that the surfels' own depths agree on, where no prior gives normals."""
 
     weight: float = Field(
         default=0.1, ge=0, description="Weight of opacity - (sum of w n) . N in the loss; 0 leaves it out."
     )
     every: int = Field(default=7500, ge=1, description="Steps between two fusions of all views' depths.")
-    truncation: float = Field(default=4.0, gt=0, description="Voxels at which fused distances are cut off.")
-    sigma: float = Field(default=3.0, ge=0, description="Gaussian that smooths the fused field, voxels.")
-    most_voxels: int = Field(
-        default=160, ge=8, le=1024, description="Maximum number of voxels along the scene's longest side."
-    )
+    sigma: Smoothing = 3.0
     refine: float = Field(
         default=0.0,
         ge=0,

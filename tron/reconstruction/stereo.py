@@ -20,8 +20,8 @@ from torch import Tensor
 
 from tron.captures import Capture, View
 from tron.priors import Track, untracked
-from tron.reconstruction.consensus import consensus
-from tron.reconstruction.fusion import DepthMap, empty_rays, fuse, pixel_footprint
+from tron.reconstruction.consensus import fused_views
+from tron.reconstruction.fusion import DepthMap, empty_rays
 from tron.reconstruction.matching import Photograph
 from tron.reconstruction.seen_space import random_points
 from tron.reconstruction.settings import StereoSettings
@@ -96,13 +96,11 @@ def stereo_maps(
         )
         for view, photograph, each, ok in zip(views, photographs, found, known)
     ]  # fmt: skip
-    field = fuse(maps, pixel_footprint(maps), settings.truncation, settings.most_voxels)
-    agreed = [] if field is None else consensus(field, maps, settings.sigma)
     log.info("stereo: %.0f %% of the pixels have a depth that other photos confirm", 100 * confident)
     return StereoMaps(
         tuple(
             _with_maps(view, photograph, depth, normal)
-            for view, photograph, (depth, normal) in zip(views, photographs, agreed)
+            for view, photograph, (depth, normal) in zip(views, photographs, fused_views(maps, settings))
         ),
         confident,
     )

@@ -13,7 +13,7 @@ from tron.errors import TronError
 from tron.gaussians.ply import MATERIAL_PROPERTIES
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.priors import untracked
-from tron.reconstruction.settings import ConsistencySettings
+from tron.reconstruction.settings import FusionSettings
 from tron.seeds import generator
 from tron.tracing import SurfelTracer
 
@@ -44,7 +44,7 @@ def plain(ball_on_floor, tmp_path_factory) -> Path:
 
 def test_pictures_and_depths_are_those_of_the_oriented_surfaces(variant, ball_on_floor, plain):
     settings = SplatSettings(views=17, side=48)
-    capture = film_splats(plain, settings, (0, 0, 2), 8, ConsistencySettings(), 0, "cpu", untracked)
+    capture = film_splats(plain, settings, (0, 0, 2), 8, FusionSettings(), 0, "cpu", untracked)
     tracer = SurfelTracer(dense(ball_on_floor()))
     assert capture.up.tolist() == [0, 0, 1]
     assert capture.test == {"film_00000", "film_00008", "film_00016"}
@@ -129,11 +129,11 @@ def test_what_is_no_plain_file_of_splats_is_one_line(tmp_path, plain):
     packed.write_bytes(b"\x1f\x8b")
     assert is_splats(packed)
     with pytest.raises(TronError, match=r"Niantic's \.spz.*splat-transform"):
-        film_splats(packed, SMALL, None, 8, ConsistencySettings(), 0, "cpu", untracked)
+        film_splats(packed, SMALL, None, 8, FusionSettings(), 0, "cpu", untracked)
     points = tmp_path / "points.ply"
     points.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
     with pytest.raises(TronError, match="lacks y"):
-        film_splats(points, SMALL, None, 8, ConsistencySettings(), 0, "cpu", untracked)
+        film_splats(points, SMALL, None, 8, FusionSettings(), 0, "cpu", untracked)
     assert not is_splats(tmp_path)
 
 
@@ -148,7 +148,7 @@ QUICK = [
 
 
 def test_a_file_that_does_not_say_its_up_is_told(variant, plain, caplog):
-    capture = film_splats(plain, SMALL, None, 0, ConsistencySettings(), 0, "cpu", untracked)
+    capture = film_splats(plain, SMALL, None, 0, FusionSettings(), 0, "cpu", untracked)
     assert capture.up.tolist() == [0, -1, 0]
     assert not capture.test
     assert "does not say which way is up" in caplog.text

@@ -204,6 +204,27 @@ def test_surfels_that_no_photo_shows_look_like_the_nearest_four(scene) -> None:
     np.testing.assert_allclose(found[~seen], color[seen][nearest].mean(1), rtol=1e-5)
 
 
+def test_a_sun_is_sought_above_the_horizon(scene, transport) -> None:
+    """Points as bright as a light from below would make them, had it no floor in its way."""
+    points = points_of(scene, transport, sunny(False)[0])
+    below = np.array([0.48, 0.36, -0.8])
+    lit = points.color * (0.2 + 3 * np.maximum(points.normal @ below, 0))[:, None]
+    points = replace(points, color=lit.astype(np.float32))
+    soft = fit_light(points, QUICK, 0)
+    search = SunSearch(transport.tracer, points, soft, 0.0, QUICK.robust, QUICK.alike, 0)
+    assert search.find()[0] @ scene.up > 0
+
+
+def test_surfels_that_few_photos_show_do_not_tell_of_the_light(scene, transport) -> None:
+    count = np.full(len(scene), 10)
+    count[::3], count[1::7] = 5, 0
+    evidence = Evidence(np.full((len(scene), 3), 0.5), np.zeros(len(scene)), count, np.ones((20, 3)))
+    sky = PhotographedSky(np.zeros((6 * 64, 3)), np.zeros(6 * 64))
+    finder = LightFinder(transport.tracer, evidence, evidence.color, sky, Joint(light=QUICK), 0)
+    assert len(finder.chosen)
+    assert count[finder.chosen].min() == 10
+
+
 def test_light_without_a_sun_is_found(scene, transport) -> None:
     environment, _ = sunny(False)
     image = environment.image.copy()

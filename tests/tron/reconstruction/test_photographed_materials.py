@@ -122,6 +122,19 @@ def test_where_all_materials_explain_alike_the_prior_decides(scene: GaussianScen
     assert sharp.confidence[seen].min() > 0.5
 
 
+@pytest.mark.parametrize(("roughness", "metal"), [(0.15, True), (0.95, False)])
+def test_a_rough_metal_must_prove_itself_more(
+    scene: GaussianScene, chosen: Chosen, roughness: float, metal: bool
+) -> None:
+    """A metal that explains all photos better by 0.2 of log loss each: believed if it is polished."""
+    kinds = 2 * len(ROUGHNESSES)
+    losses = np.full((kinds, len(scene)), 0.2) * chosen.evidence.count
+    losses[len(ROUGHNESSES) + list(ROUGHNESSES).index(roughness)] = 0
+    found = choose(scene, chosen.evidence, np.full((kinds, len(scene), 3), 0.5), losses, 0.6)
+    seen = chosen.evidence.seen
+    assert ((found.metallic[seen] > 0.5) == metal).all()
+
+
 def test_base_color_is_free_of_shadows_and_highlights(scene: GaussianScene, chosen: Chosen) -> None:
     materials, evidence = chosen.materials, chosen.evidence
     seen = evidence.count >= 3

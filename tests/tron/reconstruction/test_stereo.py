@@ -78,6 +78,21 @@ def test_a_painted_ball_comes_back_from_its_photos(truth: Capture, found: Stereo
     assert found.confident > 0.3
 
 
+def test_depths_that_nobody_confirms_count_a_little_where_a_mask_tells_of_a_surface(truth: Capture) -> None:
+    """Of twelve planes, some depths are confirmed by no photo: they are left out, or fill the surface."""
+    few = SETTINGS.model_copy(update={"planes": 12, "smooth_large": 0.0, "confident": 0.8})
+    shares = []
+    for unsure in (0.0, 0.1):
+        settings = few.model_copy(update={"unsure": unsure})
+        shares.append(errors(truth, stereo_maps(photos(truth), settings, seed=0))[2])
+    assert shares[1] > shares[0] + 0.05
+    bare = [
+        stereo_maps(photos(truth, masks=False), few.model_copy(update={"unsure": u}), 0) for u in (0, 0.1)
+    ]
+    for one, other in zip(bare[0].views, bare[1].views, strict=True):
+        np.testing.assert_array_equal(one.read("depth"), other.read("depth"))
+
+
 def test_nothing_is_found_beside_the_subject(truth: Capture, found: StereoMaps) -> None:
     for view, other in zip(truth.views, found.views, strict=True):
         assert not other.read("depth")[view.read("mask") < 0.5].any()
