@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Literal, Union
 
 from pydantic import Field
 
+from datagen.lights.clouds import CloudsSpec
 from datagen.lights.hdri import HdriSpec
+from datagen.lights.landscape import LandscapeSpec
 from datagen.lights.light import Light
 from datagen.lights.overcast import OvercastSpec
 from datagen.lights.studio import StudioSpec
@@ -14,7 +16,7 @@ from datagen.lights.sun import SunSpec
 
 FAMILIES: dict[str, type[Light]] = {
     str(light.model_fields["family"].default): light
-    for light in (SunSpec, StudioSpec, OvercastSpec, HdriSpec)
+    for light in (SunSpec, StudioSpec, OvercastSpec, HdriSpec, CloudsSpec, LandscapeSpec)
 }
 """Name -> family, in the order in which ``any`` numbers them: new ones come last."""
 
