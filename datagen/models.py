@@ -8,7 +8,6 @@ become opaque. Path tracer, G-buffers and reference then agree on what is there.
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from PIL import Image
 from trimesh import Trimesh
 from trimesh.visual.color import ColorVisuals
 
+from datagen.gltf.document import confined
 from datagen.gltf.images import pixels, require_size
 from datagen.gltf.meshes import read_parts
 from datagen.parts import Part, split_mirrored, without_clear, without_slivers
@@ -28,6 +28,10 @@ from tron.errors import TronError
 SUFFIXES = (".gltf", ".glb", ".obj")
 MOST_TRIANGLES = 5_000_000
 LARGEST_OBJ = 2**30
+LARGEST_MTL = 2**20
+TEXTURES = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "TGA", "TIFF", "GIF")
+"""Formats of an OBJ's textures."""
+
 NEEDLE = 1e-3
 """Least width over length of a model: below it no pixel and no surfel would find it."""
 
@@ -87,12 +91,13 @@ def _fitted(parts: list[Part], up: str) -> list[Part]:
 def _read_obj(path: Path) -> list[Part]:
     _require_small_obj(path)
     scene = trimesh.load_scene(path, process=False)
+    _require_textures(scene, path)
     parts = []
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         mesh = scene.geometry[name]
         if isinstance(mesh, Trimesh) and len(mesh.faces):
-            parts.append(_obj_part(mesh, path).transformed(np.asarray(transform)))
+            parts.append(_obj_part(mesh).transformed(np.asarray(transform)))
     return parts
 
 
@@ -109,11 +114,34 @@ def _require_small_obj(path: Path) -> None:
         raise TronError(f"model has more than {MOST_TRIANGLES:,} triangles", mend="simplify it")
 
 
-def _obj_part(mesh: Trimesh, path: Path) -> Part:
+def _require_textures(scene: trimesh.Scene, path: Path) -> None:
+    """Refuse an OBJ whose materials name textures that trimesh, silently, did not read."""
+    named: dict[str, str] = {}
+    with path.open("rb") as file:
+        library = next((line.split(None, 1)[1].strip() for line in file if line.startswith(b"mtllib ")), None)
+    if library is not None:
+        source = confined(path, library.decode("utf-8", "replace"))
+        if source.stat().st_size > LARGEST_MTL:
+            raise TronError(f"material library of {source.stat().st_size >> 20} MiB is too large")
+        material = ""
+        for line in source.read_text("utf-8", "replace").splitlines():
+            key, _, value = line.strip().partition(" ")
+            if key.lower() == "newmtl":
+                material = value.strip()
+            elif key.lower() == "map_kd":
+                named[material] = value.strip()
+    for mesh in scene.geometry.values():
+        material = getattr(mesh.visual, "material", None)
+        name = named.get(str(getattr(material, "name", "")))
+        if name is not None and getattr(material, "image", None) is None:
+            raise TronError(f"texture '{name[:80]}' cannot be read, or lies outside the model's folder")
+
+
+def _obj_part(mesh: Trimesh) -> Part:
     uv = getattr(mesh.visual, "uv", None)
     # trimesh follows OpenGL (v = 0 at the bottom); Mitsuba's bitmaps begin at the top.
     uv = None if uv is None else np.column_stack([uv[:, 0], 1.0 - np.asarray(uv)[:, 1]]).astype(np.float32)
-    base_color, alpha, roughness = _obj_textures(mesh, uv is not None, path)
+    base_color, alpha, roughness = _obj_textures(mesh, uv is not None)
     part = Part(
         vertices=np.array(mesh.vertices, np.float64),
         normals=_unit_normals(mesh),
@@ -140,7 +168,7 @@ def _unit_normals(mesh: Trimesh) -> np.ndarray:
     return normals / length[:, None]
 
 
-def _obj_textures(mesh: Trimesh, has_uv: bool, path: Path) -> tuple[np.ndarray, np.ndarray | None, float]:
+def _obj_textures(mesh: Trimesh, has_uv: bool) -> tuple[np.ndarray, np.ndarray | None, float]:
     """base color, alpha image or None, and roughness of a mesh's material."""
     if isinstance(mesh.visual, ColorVisuals) and mesh.visual.kind == "vertex":
         colors = np.asarray(mesh.visual.vertex_colors)[:, :3] / 255.0
@@ -149,6 +177,8 @@ def _obj_textures(mesh: Trimesh, has_uv: bool, path: Path) -> tuple[np.ndarray, 
     # An OBJ's Kd usually stands beside the texture rather than on it, so the texture wins.
     image: Image.Image | None = getattr(material, "image", None)
     if image is not None and has_uv:
+        if image.format not in TEXTURES:  # Pillow's PostScript reader starts a program
+            raise TronError(f"texture is {image.format}, which is not read", mend="store it as PNG")
         require_size(image.width, image.height)
         stored = pixels(image) / np.float32(255.0)
         alpha = stored[..., 3] if stored.shape[2] == 4 else None

@@ -75,17 +75,7 @@ class Document:
                 return memoryview(base64.b64decode(text, validate=True))
             except (binascii.Error, ValueError) as error:
                 raise TronError("model has a damaged data URI", self.path) from error
-        name = unquote(uri)
-        folder = self.path.parent.resolve()
-        shown = name[:80].replace("\n", " ")
-        if ":" in name or "\\" in name or "\0" in name or name.startswith("/"):
-            raise TronError(f"model refers to '{shown}', not to a file in its folder", self.path)
-        target = (folder / name).resolve()
-        if not target.is_relative_to(folder):
-            raise TronError(f"model refers to '{shown}', outside its folder", self.path)
-        if not target.is_file():
-            raise TronError(f"model refers to '{shown}', which is missing", self.path)
-        return _mapped(target)
+        return _mapped(confined(self.path, unquote(uri)))
 
     def _buffer(self, index: Any) -> memoryview:
         if index not in self._buffers:
@@ -97,6 +87,20 @@ class Document:
             else:
                 raise TronError(f"model's buffer {index} has no data", self.path)
         return self._buffers[index]
+
+
+def confined(model: Path, name: str) -> Path:
+    """The file that a model refers to; TronError unless it is there, in the model's folder or below."""
+    shown = " ".join(name[:80].split())
+    if ":" in name or "\\" in name or "\0" in name or name.startswith("/"):
+        raise TronError(f"model refers to '{shown}', not to a file in its folder", model)
+    folder = model.parent.resolve()
+    target = (folder / name).resolve()
+    if not target.is_relative_to(folder):
+        raise TronError(f"model refers to '{shown}', outside its folder", model)
+    if not target.is_file():
+        raise TronError(f"model refers to '{shown}', which is missing", model)
+    return target
 
 
 def read_document(path: Path) -> Document:
