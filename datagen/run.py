@@ -24,7 +24,7 @@ from datagen.clip_rows import ClipRow, clip_row
 from datagen.clusters import logs_folder, require_cluster
 from datagen.failures import Failure, summary
 from datagen.lights import LightChoice
-from datagen.models import outline
+from datagen.parts import outline
 from datagen.pathtrace import gbuffers
 from datagen.plan import (
     RECORD_NAME,
