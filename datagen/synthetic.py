@@ -130,7 +130,8 @@ def make_clip(
         extra={
             "style": spec.style,
             "contrast": classify(environment),
-            "light_spec": light.model_dump(mode="json"),
+            "contrast_share": round(environment.contrast(), 4),
+            "light_spec": light.model_dump_json(),  # text: families differ in their keys, and tables cannot
         },
     )
     return meta, frames
