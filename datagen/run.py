@@ -20,6 +20,7 @@ import numpy as np
 from datagen.assets import for_split, load_models
 from datagen.build import Geometry, build
 from datagen.card import card_text
+from datagen.clock import stage
 from datagen.clusters import logs_folder, require_cluster
 from datagen.failures import Failure, record_failures, summary
 from datagen.lights import LightChoice
@@ -107,8 +108,9 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
                 quarantined.append(Quarantined(key=meta.key, reason=problem))
                 _set_aside(output / "quarantine" / f"{meta.key}.npz", frames)
                 continue
-            writer.write(meta, frames)
-            rows[meta.key] = contact_row(meta, frames[0])
+            with stage("write"):
+                writer.write(meta, frames)
+                rows[meta.key] = contact_row(meta, frames[0])
     for entry in writer.entries:
         write_sheet(output / sheet_name(entry.name), [rows[key] for key in entry.keys])
     record = Record(name=item.name, shards=writer.entries, quarantined=quarantined, refinement=refinement)
@@ -119,6 +121,7 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
     return record
 
 
+@stage("build")
 def draw_and_build(
     item: Work, settings: Settings, sources: Sources, lights: Sequence[LightChoice]
 ) -> tuple[SceneSpec, Geometry]:
