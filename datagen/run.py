@@ -24,7 +24,7 @@ from datagen.clock import stage
 from datagen.clusters import logs_folder, require_cluster
 from datagen.failures import Failure, record_failures, summary
 from datagen.lights import LightChoice
-from datagen.models import outline
+from datagen.parts import outline
 from datagen.plan import (
     RECORD_NAME,
     Quarantined,
