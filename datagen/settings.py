@@ -37,6 +37,7 @@ CAPTURED = {
     "objects": True,
     "families": True,
     "mesh_edge": True,
+    "texels_per_unit": True,
     "environment_height": True,
     "assets": True,
     "asset_names": True,
@@ -271,7 +272,15 @@ class Settings(_Model):
         0.04,
         gt=0,
         le=1,
-        description="Longest edge of procedural meshes in world units; patterns are that sharp.",
+        description="Longest edge of procedural meshes in world units.",
+    )
+    texels_per_unit: float | None = Field(
+        None,
+        gt=0,
+        le=4096,
+        description="Texels a world unit of the textures on procedural pieces; null: two a pixel of frames "
+        "and views at the median distance of their cameras from the nearest thing. A scene has 4 million at "
+        "most; where that is too few, the log says how many a unit they are.",
     )
     environment_height: int = Field(
         256, ge=8, le=8192, description="Rows of the lat-long maps that lights are baked to."
