@@ -7,17 +7,29 @@ from typing import TYPE_CHECKING, Annotated, Literal, Union
 from pydantic import Field
 
 from datagen.lights.clouds import CloudsSpec
+from datagen.lights.coloured import ColouredSpec
 from datagen.lights.hdri import HdriSpec
 from datagen.lights.interior import InteriorSpec
 from datagen.lights.landscape import LandscapeSpec
 from datagen.lights.light import Light
+from datagen.lights.night import NightSpec
 from datagen.lights.overcast import OvercastSpec
 from datagen.lights.studio import StudioSpec
 from datagen.lights.sun import SunSpec
 
 FAMILIES: dict[str, type[Light]] = {
     str(light.model_fields["family"].default): light
-    for light in (SunSpec, StudioSpec, OvercastSpec, HdriSpec, CloudsSpec, LandscapeSpec, InteriorSpec)
+    for light in (
+        SunSpec,
+        StudioSpec,
+        OvercastSpec,
+        HdriSpec,
+        CloudsSpec,
+        LandscapeSpec,
+        InteriorSpec,
+        NightSpec,
+        ColouredSpec,
+    )
 }
 """Name -> family, in the order in which ``any`` numbers them: new ones come last."""
 
