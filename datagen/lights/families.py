@@ -20,15 +20,8 @@ from datagen.lights.sun import SunSpec
 FAMILIES: dict[str, type[Light]] = {
     str(light.model_fields["family"].default): light
     for light in (
-        SunSpec,
-        StudioSpec,
-        OvercastSpec,
-        HdriSpec,
-        CloudsSpec,
-        LandscapeSpec,
-        InteriorSpec,
-        NightSpec,
-        ColouredSpec,
+        *(SunSpec, StudioSpec, OvercastSpec, HdriSpec),
+        *(CloudsSpec, LandscapeSpec, InteriorSpec, NightSpec, ColouredSpec),
     )
 }
 """Name -> family, in the order in which ``any`` numbers them: new ones come last."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
+from pydantic import Field
 
 from datagen.lights.directions import direction, smoothstep
 from datagen.lights.discs import Disc
@@ -37,14 +38,15 @@ class FurnishedRoom(Light):
         size: of the room in x, y, z.
         eye: where the map is seen from.
         albedo: of the six faces, numbered as in :class:`Rectangle`.
-        windows, panels, screens, pictures: in the faces; pictures carry an albedo, screens a coloured pattern.
+        windows, panels, screens, pictures: in the faces; a picture carries an albedo, a screen a coloured
+            pattern.
         sun: its irradiance on a plane facing it, which falls in by windows; azimuth and elevation in degrees.
     """
 
     supersamples = 2
     size: Triple
     eye: Triple
-    albedo: tuple[Triple, Triple, Triple, Triple, Triple, Triple]
+    albedo: tuple[Triple, ...] = Field(min_length=6, max_length=6)
     windows: tuple[Rectangle, ...]
     panels: tuple[Rectangle, ...]
     screens: tuple[Rectangle, ...] = ()
@@ -162,4 +164,4 @@ class FurnishedRoom(Light):
 
 def _inside(rectangle: Rectangle, points: np.ndarray) -> np.ndarray:
     place = rectangle.place(points)
-    return ((place > 0.0) & (place < 1.0)).all(axis=1)
+    return np.all((place > 0.0) & (place < 1.0), axis=1)

@@ -168,8 +168,9 @@ class NightSpec(Light):
         # Shops: one bright strip of a colour of its own along the street.
         shop = ((floor == 0) & (tone > 0.45) & (across > 0.1) & (across < 0.9)).astype(float)
         sign = shining(np.stack([house * 3.0, house * 0.0 + 11.0], axis=1), 1)[:, None]
-        tints = np.clip(np.abs((sign + np.array([0.0, 1 / 3, 2 / 3])) % 1.0 * 6.0 - 3.0) - 1.0, 0.1, 1.0)
-        inside += (shop * street.lit * 2.0 * street.window * curtains)[:, None] * tints
+        tints = np.clip(np.abs((sign + np.array([0.0, 1 / 3, 2 / 3])) % 1.0 * 6.0 - 3.0) - 1.0, 0.4, 1.0)
+        goods = np.exp(4.0 * (shining(np.stack([azimuth, elevation], axis=1) * 2.5, 5, 0.7) - 0.5))
+        inside += (0.7 * shop * street.lit * street.window * goods)[:, None] * tints
         return walls * light / np.pi + inside
 
 
