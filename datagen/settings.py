@@ -17,13 +17,13 @@ from pydantic import (
 )
 
 from datagen.lights import PROCEDURAL, Family, LightChoice
-from datagen.materials import Style
+from datagen.styles import StyleChoice
 from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounces
 
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
-    *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "cluster"),
-    *("captures", "equal_error"),
+    *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
+    *("captures", "equal_error", "variety_against"),
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
@@ -64,8 +64,8 @@ class SplitSettings(_Model):
     """One split: how many scenes of which kind, and how they are rendered."""
 
     scenes: int = Field(ge=0, le=1_000_000, description="Number of scenes.")
-    style: Style = Field(
-        default="A", description="Distribution of shapes, patterns, object counts and floor."
+    style: StyleChoice = Field(
+        default="A", description="What stands in a scene, on what, and how it is filmed."
     )
     lights: list[LightChoice] = Field(
         default=["any"] * 4,
@@ -119,7 +119,7 @@ class SensorSettings(_Model):
 
 
 class CaptureSettings(_Model):
-    """Scenes of the test split as captures: spiral views under one light, path-traced, with true maps."""
+    """Scenes of the test split as captures: views from all sides, path-traced under one light, true maps."""
 
     scenes: int = Field(
         default=4,
@@ -138,7 +138,7 @@ class CaptureSettings(_Model):
         default=64,
         ge=2,
         le=100_000,
-        description="Spiral views of a capture; each 8th is held out, from the first.",
+        description="Views of a capture from all sides; each 8th is held out, from the first.",
     )
     width: int = Field(default=128, ge=8, le=8192, description="View width in pixels.")
     height: int = Field(default=128, ge=8, le=8192, description="View height in pixels.")
@@ -183,11 +183,13 @@ class Settings(_Model):
     """Settings of ``tron-datagen``."""
 
     output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
-    mode: Literal["make", "validate", "captures", "equal_error"] = Field(
+    mode: Literal["make", "plan", "validate", "captures", "equal_error"] = Field(
         "make",
-        description="make the dataset, validate the one in output_dir and list every problem, path-trace "
-        "captures for tron-reconstruct into output_dir/captures, or measure on the test scenes in output_dir "
-        "how long the path tracer takes to be as near the truth as guidance is.",
+        description="make the dataset; plan it: print what is missing, the bytes and hours it takes and the "
+        "memory of a worker, measured by a small probe here, and render nothing else; validate the one in "
+        "output_dir and list every problem; path-trace captures for tron-reconstruct into "
+        "output_dir/captures; or measure on the test scenes in output_dir how long the path tracer takes to "
+        "be as near the truth as guidance is.",
     )
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."
@@ -225,7 +227,7 @@ class Settings(_Model):
         f"is given, else [{', '.join(PROCEDURAL)}].",
         examples=["[sun,overcast]"],
     )
-    views: int = Field(64, ge=1, description="Spiral views whose G-buffers the surfels are made from.")
+    views: int = Field(64, ge=1, description="Views whose G-buffers the surfels are made from.")
     view_width: int = Field(256, ge=8, le=8192, description="Width of those views in pixels.")
     view_height: int = Field(256, ge=8, le=8192, description="Height of those views in pixels.")
     surfels: int = Field(60_000, ge=100, description="Approximate number of surfels of a scene.")
@@ -296,6 +298,10 @@ class Settings(_Model):
         description="Names of assets and maps to use although the catalogue has no licence.",
     )
     only: list[str] = Field(default_factory=list, description="Make these scenes only, such as train-000012.")
+    variety_against: Path | None = Field(
+        None,
+        description="Folder of another dataset whose histograms are drawn beside this one's in README.md.",
+    )
     clips_per_shard: int = Field(
         64, ge=1, description="Maximum number of clips of a shard; no shard spans two scenes."
     )
@@ -311,7 +317,17 @@ class Settings(_Model):
         600.0, gt=0, description="Seconds to wait for the cluster's first worker: jobs may queue for long."
     )
     recycle_after: int = Field(
-        50, ge=1, description="Scenes a worker makes before it is replaced; not with cluster=address."
+        50,
+        ge=1,
+        description="Scenes a worker makes before it is replaced, while the others go on; not with "
+        "cluster=address.",
+    )
+    scene_timeout: float | None = Field(
+        None,
+        gt=0,
+        description="Seconds after which a scene fails and its worker is killed and replaced; null: 20 times "
+        "the median of its split so far, 600 at the least, and a day until three are made. With cluster=none "
+        "it is only told.",
     )
     cluster: dict[str, Any] | None = Field(
         None,

@@ -10,9 +10,11 @@ from trimesh.visual.texture import TextureVisuals
 
 from datagen.build import build
 from datagen.layout import Placement
-from datagen.models import Part, load_model, outline
+from datagen.models import load_model
+from datagen.objects import ObjectSpec
+from datagen.parts import Part, outline
 from datagen.pathtrace import gbuffers
-from datagen.scene import ObjectSpec, draw_scene
+from datagen.scene import draw_scene
 from tron.cameras import Camera
 from tron.color import srgb_to_linear
 from tron.errors import TronError
