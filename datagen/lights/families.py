@@ -29,10 +29,13 @@ FAMILIES: dict[str, type[Light]] = {
 PROCEDURAL = tuple(name for name, light in FAMILIES.items() if light.in_any)
 """Families that ``any`` chooses from in styles A and B, unless a recipe names others."""
 
+EVERY = tuple(name for name in FAMILIES if name != "hdri")
+"""Families that it chooses from in every other style: all that need no files."""
+
 if TYPE_CHECKING:
     LightSpec = Light
     Family = LightChoice = str
 else:
     LightSpec = Annotated[Union[tuple(FAMILIES.values())], Field(discriminator="family")]  # noqa: UP007
     Family = Literal[tuple(FAMILIES)]
-    LightChoice = Literal["any", *FAMILIES]
+    LightChoice = Literal["any", "high", "medium", "low", *FAMILIES]
