@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from pydantic import Field
 
-from datagen.lights import FAMILIES, PROCEDURAL, Family, HdriSpec, LightChoice, LightSpec
+from datagen.lights import EVERY, PROCEDURAL, Family, HdriSpec, LightChoice, LightSpec, draw_light
 from datagen.objects import ObjectSpec
 from datagen.paths import PathSpec
 from datagen.spec import Spec
@@ -91,7 +91,7 @@ def draw_scene(
     *,
     style: StyleChoice,
     lights: Sequence[LightChoice],
-    families: Sequence[Family] = PROCEDURAL,
+    families: Sequence[Family] | None = None,
     environments: Sequence[HdriSpec] = (),
     choice: Choice | None = None,
     frames: int = 5,
@@ -103,8 +103,8 @@ def draw_scene(
         seed: the run's root seed.
         split, index: which scene; they name its random streams.
         style: what stands there and how it is filmed; ``mixed`` draws one of MIXED.
-        lights: a family for each light of the scene; ``any`` draws one of ``families``.
-        families: what ``any`` chooses from.
+        lights: for each light of the scene a family, ``any`` of ``families``, or a class of contrast.
+        families: what ``any`` and classes choose from; None: the style's own, and every one.
         environments: files for the family ``hdri``.
         choice: what the recipe says of objects; None leaves it to the style.
         frames, path_frames: length of a clip and of the path it is cut from.
@@ -123,6 +123,11 @@ def draw_scene(
         made = STYLES[style](streams, choice or Choice())
     except TronError as error:
         raise TronError(error.what, error.where or scene_name(split, index), error.mend) from error
+    own = PROCEDURAL if style not in MIXED else EVERY
+    drawn = [
+        draw_light(streams("light", k), wanted, families or (own if wanted == "any" else EVERY), environments)
+        for k, wanted in enumerate(lights)
+    ]
     rng = streams("clips")
     return SceneSpec(
         name=scene_name(split, index),
@@ -134,7 +139,7 @@ def draw_scene(
         objects=made.objects,
         left_out=made.left_out,
         metered=made.metered,
-        lights=tuple(_draw_lights(seed, split, index, lights, families, environments)),
+        lights=tuple(drawn),
         cameras=CameraSpec(
             capture=made.capture,
             film=made.film,
@@ -142,19 +147,3 @@ def draw_scene(
             first_frame=tuple(int(rng.integers(path_frames - frames + 1)) for _ in lights),
         ),
     )
-
-
-def _draw_lights(
-    seed: int,
-    split: str,
-    index: int,
-    lights: Sequence[LightChoice],
-    families: Sequence[Family],
-    environments: Sequence[HdriSpec],
-) -> list[LightSpec]:
-    drawn = []
-    for k, wanted in enumerate(lights):
-        rng = generator(seed, split, index, "light", k)
-        family = families[int(rng.integers(len(families)))] if wanted == "any" else wanted
-        drawn.append(FAMILIES[family].draw(rng, environments))
-    return drawn

@@ -72,8 +72,9 @@ class SplitSettings(_Model):
         default=["any"] * 4,
         min_length=1,
         max_length=64,
-        description="Light family of each clip of a scene, one clip for each in the list. any draws one of "
-        "families; hdri takes one of the maps in environments.",
+        description="Light of each clip of a scene, one clip for each in the list. any draws one of "
+        "families; high, medium and low draw one of such contrast; hdri takes one of the maps in "
+        "environments.",
     )
     frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
     width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
@@ -132,8 +133,7 @@ class CaptureSettings(_Model):
         default=["overcast", "studio", "sun"],
         min_length=1,
         max_length=64,
-        description="Light family of each capture, in rotation. any draws one of families; hdri takes one of "
-        "the maps in environments.",
+        description="Light of each capture, in rotation, as in a split's lights.",
     )
     views: int = Field(
         default=64,
@@ -164,8 +164,8 @@ class CaptureSettings(_Model):
     relights: list[LightChoice] = Field(
         default=[],
         max_length=16,
-        description="Other lights, by family, under which the held-out views are path-traced as well, into "
-        "output_dir/relit: the truth of relighting.",
+        description="Other lights, as in a split's lights, under which the held-out views are path-traced as "
+        "well, into output_dir/relit: the truth of relighting.",
     )
     relight_spp: int = Field(default=144, ge=1, description="Paths per pixel of those.")
 
@@ -224,8 +224,9 @@ class Settings(_Model):
     )
     families: list[Family] | None = Field(
         None,
-        description="Light families that 'any' draws from, a list as above; null: [hdri] where environments "
-        f"is given, else [{', '.join(PROCEDURAL)}].",
+        description="Light families that any, high, medium and low draw from, a list as above; null: [hdri] "
+        f"where environments is given; else any draws from [{', '.join(PROCEDURAL)}] in styles A and B, and "
+        "all else from every family but hdri.",
         examples=["[sun,overcast]"],
     )
     views: int = Field(64, ge=1, description="Views whose G-buffers the surfels are made from.")
@@ -382,7 +383,7 @@ class Settings(_Model):
         return self
 
     def _ask_hdri(self, lights: list[LightChoice]) -> bool:
-        return "hdri" in {*lights, *self.light_families()}
+        return "hdri" in {*lights, *(self.light_families() or ())}
 
     def split(self, name: str) -> SplitSettings:
         """The settings of one split."""
@@ -397,11 +398,11 @@ class Settings(_Model):
         """The splits that have scenes."""
         return [name for name in SPLITS if self.split(name).scenes]
 
-    def light_families(self) -> list[Family]:
-        """The families that ``any`` chooses from."""
+    def light_families(self) -> list[Family] | None:
+        """The families that ``any`` chooses from; None: the style's own."""
         if self.families is not None:
             return list(self.families)
-        return ["hdri"] if self.environments is not None else list(PROCEDURAL)
+        return ["hdri"] if self.environments is not None else None
 
     def recipe(self) -> dict[str, Any]:
         """Keys that decide a scene's content, plain values: not where it goes, who makes it or how many."""

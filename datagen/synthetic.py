@@ -9,7 +9,7 @@ import numpy as np
 
 from datagen.build import Geometry
 from datagen.clock import stage
-from datagen.lights import classify
+from datagen.lights import classify, contrast_share
 from datagen.pathtrace import DirectIrradiance, direct_irradiance, gbuffers, render_frames
 from datagen.plan import Refinement
 from datagen.refinement import refine_surfels
@@ -133,7 +133,7 @@ def make_clip(
         extra={
             "style": spec.style,
             "contrast": classify(environment),
-            "contrast_share": round(environment.contrast(), 4),
+            "contrast_share": contrast_share(environment),
             "light_spec": light.model_dump_json(),  # text: families differ in their keys, and tables cannot
         },
     )
