@@ -204,19 +204,20 @@ def _from_specular(read: _Reader, glossy: dict[str, Any]) -> Material:
         elif own.texcoord != use.texcoord or not np.allclose(own.matrix, use.matrix):
             raise TronError("diffuse and specular textures of a material do not lie on each other")
     diffuse = result.base_color.astype(np.float64)
-    size = max((x.shape[:2] for x in (diffuse, specular) if x.ndim == 3), default=())
-    if size:
+    sizes = [(x.shape[0], x.shape[1]) for x in (diffuse, specular) if x.ndim == 3]
+    if sizes:
+        size = max(sizes)
         diffuse, specular = (_resized(x, size) for x in (diffuse, specular))
         shine = _resized(shine[..., None], size)[..., 0]
         result.uses.setdefault("roughness", result.uses["base_color"])
     base, roughness, metallic = metallic_of(diffuse, specular, shine)
     result.base_color = base.astype(np.float32)
-    result.roughness = roughness.astype(np.float32) if size else float(roughness)
-    result.metallic = metallic.astype(np.float32) if size else float(metallic)
+    result.roughness = roughness.astype(np.float32) if sizes else float(roughness)
+    result.metallic = metallic.astype(np.float32) if sizes else float(metallic)
     return result
 
 
-def _resized(values: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+def _resized(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """(h, w, C) of an image or of a constant (C,)."""
     if values.ndim == 1:
         return np.broadcast_to(values, (*size, len(values)))

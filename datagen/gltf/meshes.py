@@ -216,9 +216,8 @@ def _normals(geometry: _Geometry) -> np.ndarray:
         a, b, c = (positions[faces[:, i]] for i in range(3))
         cross = np.cross(b - a, c - a)
         size = np.linalg.norm(cross, axis=1, keepdims=True)
-        own = trimesh.geometry.mean_vertex_normals(
-            len(positions), faces, np.divide(cross, size, out=np.zeros_like(cross), where=size > 0)
-        )
+        flat = np.divide(cross, size, out=np.zeros_like(cross), where=size > 0)
+        own = np.asarray(trimesh.geometry.mean_vertex_normals(len(positions), faces, flat))
         found = np.linalg.norm(own, axis=1) > 0.5
         own[~found] = (0.0, 0.0, 1.0)
         normals[bad], length[bad] = own[bad], np.linalg.norm(own[bad], axis=1)
