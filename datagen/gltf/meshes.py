@@ -17,7 +17,7 @@ from datagen.gltf.materials import Material, Materials, TextureUse
 from datagen.parts import Part, Sampling, Wrap, joined, without_clear
 from tron.errors import TronError
 
-MOST_INSTANCES = 100_000
+MOST_NODES = 20_000
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 
@@ -61,6 +61,8 @@ def _instances(document: Document) -> list[tuple[int, np.ndarray]]:
     """(mesh, (4, 4) to the scene's frame) of every node with a mesh, parents before children."""
     scenes = document.tree.get("scenes", [])
     nodes = document.tree.get("nodes", [])
+    if len(nodes) > MOST_NODES:
+        raise TronError(f"model has more than {MOST_NODES:,} nodes", mend="join its meshes")
     if scenes:
         roots = document.item("scenes", document.tree.get("scene", 0)).get("nodes", [])
     else:
@@ -107,8 +109,6 @@ def _require_few(document: Document, instances: list[tuple[int, np.ndarray]], mo
         announced[mesh] = sum(_triangles(document, primitive) for primitive in primitives)
     if sum(announced[mesh] for mesh, _ in instances) > most:
         raise TronError(f"model has more than {most:,} triangles", mend="simplify it")
-    if len(instances) > MOST_INSTANCES:
-        raise TronError(f"model has more than {MOST_INSTANCES:,} nodes with a mesh", mend="join them")
 
 
 def _triangles(document: Document, primitive: dict[str, Any]) -> int:
