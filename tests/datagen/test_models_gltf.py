@@ -221,7 +221,7 @@ def test_images_of_every_kind_are_read(tmp_path, write_glb, quarters, kind):
 
 @pytest.mark.parametrize("codec", sorted(KTX2))
 def test_ktx2_is_decoded_where_its_decoder_is_installed(tmp_path, write_glb, quarters, codec):
-    pytest.importorskip("opengl_basisu", reason="no decoder of KTX2: pip install tron[ktx2]")
+    pytest.importorskip("opengl_basisu", reason="no decoder of KTX2: pip install 'tron-relight[ktx2]'")
     data = base64.b64decode(KTX2[codec])
     tree = card({"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}, **textured(data))
     tree["textures"] = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
@@ -238,7 +238,7 @@ def test_ktx2_without_a_decoder_is_refused_or_its_substitute_is_read(
     tree = card(material, **textured(data, data), textures_=None)
     tree.pop("textures_")
     tree["textures"] = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
-    with pytest.raises(TronError, match=r"KTX2.*k\.glb.*tron\[ktx2\]"):
+    with pytest.raises(TronError, match=r"KTX2.*k\.glb.*tron-relight\[ktx2\]"):
         load_model(write_glb(tmp_path / "k.glb", tree, [*CARD, data, encoded(quarters)]))
     tree["textures"][0]["source"] = 1
     part = one(write_glb(tmp_path / "k.glb", tree, [*CARD, data, encoded(quarters)]))
