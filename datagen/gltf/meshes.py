@@ -10,11 +10,12 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from datagen.alpha import without_clear
 from datagen.gltf.accessors import element_count, meant, read_raw, read_values
 from datagen.gltf.document import Document, read_document
 from datagen.gltf.draco import decode_primitive
 from datagen.gltf.materials import Material, Materials, TextureUse
-from datagen.parts import Part, Sampling, Wrap, joined, without_clear
+from datagen.parts import Part, Sampling, Wrap, joined
 from tron.errors import TronError
 
 MOST_NODES = 20_000
