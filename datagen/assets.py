@@ -22,7 +22,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from datagen.lights import HdriSpec, classify
+from datagen.lights import Contrast, HdriSpec, classify
 from datagen.models import SUFFIXES, load_model
 from datagen.parts import Part
 from tron.errors import TronError
@@ -177,7 +177,7 @@ def find_environments(
 
 
 @lru_cache(maxsize=4096)
-def _contrast(path: str, _sha256: str) -> Literal["high", "low"]:
+def _contrast(path: str, _sha256: str) -> Contrast:
     environment = EnvironmentMap.load(path)
     return classify(environment.resized(min(128, environment.image.shape[0])))
 

@@ -47,6 +47,7 @@ class SceneSpec(Spec):
         surroundings: floor, walls, terrain; their object ids count from 1.
         objects: their ids go on from there.
         left_out: objects that found no place.
+        metered: clips are exposed for what they show, not for the light.
     """
 
     version: int = SPEC_VERSION
@@ -58,6 +59,7 @@ class SceneSpec(Spec):
     surroundings: tuple[ObjectSpec, ...]
     objects: tuple[ObjectSpec, ...]
     left_out: int
+    metered: bool = False
     lights: tuple[LightSpec, ...] = Field(min_length=1)
     cameras: CameraSpec
 
@@ -131,6 +133,7 @@ def draw_scene(
         surroundings=made.surroundings,
         objects=made.objects,
         left_out=made.left_out,
+        metered=made.metered,
         lights=tuple(_draw_lights(seed, split, index, lights, families, environments)),
         cameras=CameraSpec(
             capture=made.capture,

@@ -22,8 +22,8 @@ from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounc
 
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
-    *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "cluster"),
-    *("captures", "equal_error"),
+    *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
+    *("captures", "equal_error", "variety_against"),
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
@@ -37,6 +37,7 @@ CAPTURED = {
     "objects": True,
     "families": True,
     "mesh_edge": True,
+    "texels_per_unit": True,
     "environment_height": True,
     "assets": True,
     "asset_names": True,
@@ -183,11 +184,13 @@ class Settings(_Model):
     """Settings of ``tron-datagen``."""
 
     output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
-    mode: Literal["make", "validate", "captures", "equal_error"] = Field(
+    mode: Literal["make", "plan", "validate", "captures", "equal_error"] = Field(
         "make",
-        description="make the dataset, validate the one in output_dir and list every problem, path-trace "
-        "captures for tron-reconstruct into output_dir/captures, or measure on the test scenes in output_dir "
-        "how long the path tracer takes to be as near the truth as guidance is.",
+        description="make the dataset; plan it: print what is missing, the bytes and hours it takes and the "
+        "memory of a worker, measured by a small probe here, and render nothing else; validate the one in "
+        "output_dir and list every problem; path-trace captures for tron-reconstruct into "
+        "output_dir/captures; or measure on the test scenes in output_dir how long the path tracer takes to "
+        "be as near the truth as guidance is.",
     )
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."
@@ -269,7 +272,15 @@ class Settings(_Model):
         0.04,
         gt=0,
         le=1,
-        description="Longest edge of procedural meshes in world units; patterns are that sharp.",
+        description="Longest edge of procedural meshes in world units.",
+    )
+    texels_per_unit: float | None = Field(
+        None,
+        gt=0,
+        le=4096,
+        description="Texels a world unit of the textures on procedural pieces; null: two a pixel of frames "
+        "and views at the median distance of their cameras from the nearest thing. A scene has 4 million at "
+        "most; where that is too few, the log says how many a unit they are.",
     )
     environment_height: int = Field(
         256, ge=8, le=8192, description="Rows of the lat-long maps that lights are baked to."
@@ -296,6 +307,10 @@ class Settings(_Model):
         description="Names of assets and maps to use although the catalogue has no licence.",
     )
     only: list[str] = Field(default_factory=list, description="Make these scenes only, such as train-000012.")
+    variety_against: Path | None = Field(
+        None,
+        description="Folder of another dataset whose histograms are drawn beside this one's in README.md.",
+    )
     clips_per_shard: int = Field(
         64, ge=1, description="Maximum number of clips of a shard; no shard spans two scenes."
     )
@@ -311,7 +326,17 @@ class Settings(_Model):
         600.0, gt=0, description="Seconds to wait for the cluster's first worker: jobs may queue for long."
     )
     recycle_after: int = Field(
-        50, ge=1, description="Scenes a worker makes before it is replaced; not with cluster=address."
+        50,
+        ge=1,
+        description="Scenes a worker makes before it is replaced, while the others go on; not with "
+        "cluster=address.",
+    )
+    scene_timeout: float | None = Field(
+        None,
+        gt=0,
+        description="Seconds after which a scene fails and its worker is killed and replaced; null: 20 times "
+        "the median of its split so far, 600 at the least, and a day until three are made. With cluster=none "
+        "it is only told.",
     )
     cluster: dict[str, Any] | None = Field(
         None,
