@@ -25,8 +25,8 @@ FLAGS = [
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
     *("--enable-logging=stderr", "--host-resolver-rules=MAP * ~NOTFOUND", "--virtual-time-budget=2000000"),
 ]
-# Time in the page runs ahead whenever nothing is to be done, and the page is read when its budget is spent: what
-# the probe waits for it asks for again and again.
+# Time in the page runs ahead whenever nothing is to be done, and the page is read when its budget is spent:
+# what the probe waits for, it asks for again and again.
 PROBE = """<script>
 (async () => {
   const until = async test => { while (!test()) await new Promise(done => setTimeout(done, 20)); };
