@@ -21,6 +21,7 @@ from datagen.assets import for_split, load_models
 from datagen.build import Geometry, build
 from datagen.clip_preview import thumbnail_name, write_preview
 from datagen.clip_rows import ClipRow, clip_row
+from datagen.clock import stage
 from datagen.clusters import logs_folder, require_cluster
 from datagen.failures import Failure, summary
 from datagen.lights import LightChoice
@@ -113,9 +114,10 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
                 quarantined.append(Quarantined(key=meta.key, reason=problem))
                 _set_aside(output / "quarantine" / f"{meta.key}.npz", frames)
                 continue
-            writer.write(meta, frames)
-            write_preview(output, meta, frames)
-            rows[meta.key] = contact_row(meta, frames[0])
+            with stage("write"):
+                writer.write(meta, frames)
+                write_preview(output, meta, frames)
+                rows[meta.key] = contact_row(meta, frames[0])
             made.append((meta, {name: frames[0][name] for name in COUNTED_MEMBERS if name in frames[0]}))
     for entry in writer.entries:
         write_sheet(output / sheet_name(entry.name), [rows[key] for key in entry.keys])
@@ -148,6 +150,7 @@ def _variety(geometry: Geometry, made: Sequence[tuple[ClipMeta, Frame]]) -> Hist
     )
 
 
+@stage("build")
 def draw_and_build(
     item: Work, settings: Settings, sources: Sources, lights: Sequence[LightChoice]
 ) -> tuple[SceneSpec, Geometry]:
