@@ -43,6 +43,7 @@ def register() -> None:
     from tron.errors import TronError
     from tron.integrators.gbuffer import GBufferAppearance
     from tron.integrators.guidance import GuidanceAppearance
+    from tron.integrators.many_lights import NAME, many_lights_class
     from tron.integrators.plugin import plugin_class
 
     if mi.variant() not in VARIANTS:
@@ -52,3 +53,4 @@ def register() -> None:
         )
     for name, appearance in {"tron_gbuffer": GBufferAppearance, "tron_guidance": GuidanceAppearance}.items():
         mi.register_integrator(name, plugin_class(name, appearance))
+    mi.register_integrator(NAME, lambda properties: many_lights_class()(properties))
