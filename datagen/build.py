@@ -13,18 +13,18 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-import trimesh
+from trimesh import Trimesh
 
-from datagen.materials import MaterialSpec, evaluate
+from datagen.materials import Material
 from datagen.models import Part
 from datagen.scene import SceneSpec
-from datagen.shapes import make_mesh, split_creases
+from datagen.shapes import make_pieces, split_creases
 from tron.aligned import aligned
 from tron.errors import TronError
 from tron.shading.environment import EnvironmentMap
 
-FLOOR_ID = 1
-"""Object id of the floor; objects count on from it, 0 is nothing."""
+FIRST_ID = 1
+"""Object id of the first of the surroundings; 0 is nothing."""
 
 Arrays = dict[str, np.ndarray]
 
@@ -72,12 +72,15 @@ def build(spec: SceneSpec, models: Mapping[str, list[Part]] | None = None, edge:
     Raises:
         TronError: the scene names an asset that is not among the models.
     """
-    solids = [_floor(spec, edge / 2)]
-    surfaces = []
-    for number, item in enumerate(spec.objects, start=FLOOR_ID + 1):
+    solids, surfaces = [], []
+    for number, item in enumerate((*spec.surroundings, *spec.objects), start=FIRST_ID):
         matrix = item.placement.matrix()
-        if item.shape is not None and item.material is not None:
-            solids.append(_solid(make_mesh(item.shape, edge), item.material, matrix, number))
+        if item.shape is not None and item.materials:
+            fine = edge / 2 if number <= len(spec.surroundings) else edge
+            solids += [
+                _solid(mesh, item.materials[slot % len(item.materials)], matrix, number)
+                for mesh, slot in make_pieces(item.shape, fine)
+            ]
             continue
         parts = (models or {}).get(str(item.asset))
         if parts is None:
@@ -88,40 +91,18 @@ def build(spec: SceneSpec, models: Mapping[str, list[Part]] | None = None, edge:
     return Geometry([_merge(solids), *surfaces])
 
 
-def _solid(mesh: trimesh.Trimesh, material: MaterialSpec, matrix: np.ndarray, object_id: int) -> Arrays:
-    """Arrays of one solid in the world; the pattern is the object's own and moves with it."""
+def _solid(mesh: Trimesh, material: Material, matrix: np.ndarray, object_id: int) -> Arrays:
+    """Arrays of one piece in the world; its look is the object's own and moves with it."""
     vertices, normals, faces = split_creases(mesh)
-    base_color, roughness, metallic = evaluate(material, vertices)
+    seen = material.evaluate(vertices, normals)
     return {
         "vertices": vertices @ matrix[:3, :3].T + matrix[:3, 3],
         "normals": normals @ matrix[:3, :3].T,
         "faces": faces,
-        "base_color": base_color,
-        "roughness": roughness,
-        "metallic": metallic,
+        "base_color": seen.base_color,
+        "roughness": seen.roughness,
+        "metallic": seen.metallic,
         "object_id": np.full(len(faces), object_id, np.uint32),
-    }
-
-
-def _floor(spec: SceneSpec, edge: float) -> Arrays:
-    half = spec.floor.half_size
-    n = int(np.ceil(2 * half / edge)) + 1
-    line = np.linspace(-half, half, n)
-    x, y = np.meshgrid(line, line, indexing="ij")
-    vertices = np.stack([x.ravel(), y.ravel(), np.zeros(n * n)], axis=1)
-    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
-    faces = np.concatenate(
-        [np.stack([corner, corner + n, corner + n + 1], 1), np.stack([corner, corner + n + 1, corner + 1], 1)]
-    )
-    base_color, roughness, metallic = evaluate(spec.floor.material, vertices)
-    return {
-        "vertices": vertices,
-        "normals": np.broadcast_to((0.0, 0.0, 1.0), vertices.shape),
-        "faces": faces,
-        "base_color": base_color,
-        "roughness": roughness,
-        "metallic": metallic,
-        "object_id": np.full(len(faces), FLOOR_ID, np.uint32),
     }
 
 

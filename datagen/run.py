@@ -44,6 +44,7 @@ from datagen.preview import contact_row, index_html, sheet_name, write_sheet
 from datagen.scene import SceneSpec, draw_scene
 from datagen.scheduling import make_each
 from datagen.settings import SPLITS, Settings
+from datagen.styles import Choice
 from datagen.synthetic import first_bad_value, make_clips, make_surfels
 from tron.runtime import activate
 from tron.shards.manifest import Manifest
@@ -134,9 +135,11 @@ def draw_and_build(
         environments=sources.environments
         if settings.share_maps
         else for_split(sources.environments, item.split),
-        assets={name: outline(parts) for name, parts in models.items()},
-        asset_share=settings.asset_share,
-        objects=settings.objects,
+        choice=Choice(
+            assets={name: outline(parts) for name, parts in models.items()},
+            asset_share=settings.asset_share,
+            objects=settings.objects,
+        ),
         frames=recipe.frames,
         path_frames=settings.path_frames,
     )

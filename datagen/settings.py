@@ -17,7 +17,7 @@ from pydantic import (
 )
 
 from datagen.lights import PROCEDURAL, Family, LightChoice
-from datagen.materials import Style
+from datagen.styles import StyleChoice
 from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounces
 
 Split = Literal["train", "train_b", "validation", "test"]
@@ -64,8 +64,8 @@ class SplitSettings(_Model):
     """One split: how many scenes of which kind, and how they are rendered."""
 
     scenes: int = Field(ge=0, le=1_000_000, description="Number of scenes.")
-    style: Style = Field(
-        default="A", description="Distribution of shapes, patterns, object counts and floor."
+    style: StyleChoice = Field(
+        default="A", description="What stands in a scene, on what, and how it is filmed."
     )
     lights: list[LightChoice] = Field(
         default=["any"] * 4,
@@ -119,7 +119,7 @@ class SensorSettings(_Model):
 
 
 class CaptureSettings(_Model):
-    """Scenes of the test split as captures: spiral views under one light, path-traced, with true maps."""
+    """Scenes of the test split as captures: views from all sides, path-traced under one light, true maps."""
 
     scenes: int = Field(
         default=4,
@@ -138,7 +138,7 @@ class CaptureSettings(_Model):
         default=64,
         ge=2,
         le=100_000,
-        description="Spiral views of a capture; each 8th is held out, from the first.",
+        description="Views of a capture from all sides; each 8th is held out, from the first.",
     )
     width: int = Field(default=128, ge=8, le=8192, description="View width in pixels.")
     height: int = Field(default=128, ge=8, le=8192, description="View height in pixels.")
@@ -225,7 +225,7 @@ class Settings(_Model):
         f"is given, else [{', '.join(PROCEDURAL)}].",
         examples=["[sun,overcast]"],
     )
-    views: int = Field(64, ge=1, description="Spiral views whose G-buffers the surfels are made from.")
+    views: int = Field(64, ge=1, description="Views whose G-buffers the surfels are made from.")
     view_width: int = Field(256, ge=8, le=8192, description="Width of those views in pixels.")
     view_height: int = Field(256, ge=8, le=8192, description="Height of those views in pixels.")
     surfels: int = Field(60_000, ge=100, description="Approximate number of surfels of a scene.")

@@ -33,11 +33,11 @@ REFERENCE_REFLECTIONS = 16
 def make_surfels(
     spec: SceneSpec, geometry: Geometry, settings: Settings
 ) -> tuple[GaussianScene, Refinement | None]:
-    """Surfels through what the spiral views see of a scene, then fitted to it, and what that gained.
+    """Surfels through what the its capture's views see of a scene, then fitted to it, and what that gained.
 
-    They are judged by the cameras of the first clip, which are not among the spiral's.
+    They are judged by the cameras of the first clip, which are not among those.
     """
-    cameras = spec.spiral(settings.views, settings.view_width, settings.view_height)
+    cameras = spec.views(settings.views, settings.view_width, settings.view_height)
     seen = gbuffers(geometry, cameras)
     surfels = surfels_from_gbuffers(seen, count=settings.surfels)
     if not settings.refine_steps:

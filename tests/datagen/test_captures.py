@@ -91,7 +91,7 @@ def test_a_capture_is_a_spiral_around_a_test_scene_under_its_own_light(capture, 
     assert capture.test == {"view_00000", "view_00008"}
     assert capture.up.tolist() == [0, 0, 1]
     assert capture.exposure == light.exposure()
-    for view, camera in zip(capture.views, spec.spiral(9, 28, 20)):
+    for view, camera in zip(capture.views, spec.views(9, 28, 20)):
         np.testing.assert_allclose(view.camera.world_to_camera, camera.world_to_camera, rtol=0, atol=1e-12)
         assert view.camera.fx == camera.fx
 

@@ -18,6 +18,7 @@ from datagen.plan import Sources, Work
 from datagen.run import make_scene
 from datagen.scene import draw_scene
 from datagen.settings import CaptureSettings, Settings
+from datagen.styles import Choice
 from tron.aligned import ALIGNMENT, aligned
 from tron.cameras import Camera
 from tron.cli.recipes import check, compose_recipe
@@ -41,7 +42,9 @@ def kernels_of(action: Callable[[], object]) -> set[str]:
 
 def geometry(index: int) -> Geometry:
     lights: list[Family] = ["overcast"]
-    spec = draw_scene(0, "test", index, style="A", lights=lights, frames=1, path_frames=4, objects=(2, 2))
+    spec = draw_scene(
+        0, "test", index, style="A", lights=lights, frames=1, path_frames=4, choice=Choice(objects=(2, 2))
+    )
     return build(spec, edge=0.2)
 
 
@@ -143,7 +146,14 @@ def test_a_second_capture_brings_no_kernel(variant):
     def shot(index: int) -> set[str]:
         families: list[Family] = ["studio"]
         spec = draw_scene(
-            0, "test", index, style="A", lights=families, frames=1, path_frames=4, objects=(2, 2)
+            0,
+            "test",
+            index,
+            style="A",
+            lights=families,
+            frames=1,
+            path_frames=4,
+            choice=Choice(objects=(2, 2)),
         )
         capture = captured(spec, build(spec, edge=0.2), spec.lights[0].bake(16).baked(), settings)
         return kernels_of(lambda: [view.read() for view in capture.views])

@@ -11,8 +11,9 @@ from trimesh.visual.texture import TextureVisuals
 from datagen.build import build
 from datagen.layout import Placement
 from datagen.models import Part, load_model, outline
+from datagen.objects import ObjectSpec
 from datagen.pathtrace import gbuffers
-from datagen.scene import ObjectSpec, draw_scene
+from datagen.scene import draw_scene
 from tron.cameras import Camera
 from tron.color import srgb_to_linear
 from tron.errors import TronError

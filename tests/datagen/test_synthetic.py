@@ -32,7 +32,7 @@ def test_20k_surfels_and_their_irradiance_on_held_out_views_of_textured_scenes(i
     families = tuple(LEAST_DB)
     spec = draw_scene(0, "test", index, style="A", lights=families, frames=5, path_frames=24)
     geometry = build(spec)
-    surfels = surfels_from_gbuffers(gbuffers(geometry, spec.spiral(32, 128, 128)), count=20_000)
+    surfels = surfels_from_gbuffers(gbuffers(geometry, spec.views(32, 128, 128)), count=20_000)
     assert len(surfels) == pytest.approx(20_000, rel=0.02)
     tracer = SurfelTracer(surfels)
     leaking = shadowed = darkened = lit = 0

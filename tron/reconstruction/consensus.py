@@ -18,7 +18,7 @@ _SEEN = 0.5
 
 
 def fused_views(maps: Sequence[DepthMap], settings: FusionSettings) -> list[tuple[Tensor, Tensor]]:
-    """The views' consensus on their own fused depths, as of :func:`consensus`; empty if there is no surface."""
+    """The views' consensus on their own fused depths, as of :func:`consensus`; empty without a surface."""
     field = fuse(maps, pixel_footprint(maps), settings.truncation, settings.most_voxels)
     return [] if field is None else consensus(field, maps, settings.sigma)
 

@@ -36,7 +36,7 @@ MostVoxels = Annotated[
 
 
 class FusionSettings(Settings):
-    """Fusion of the views' depths, and what they agree on; smooth by little, for depths that were rendered."""
+    """Fusion of the views' depths, and what they agree on; smoothed little, as rendered depths need."""
 
     truncation: Truncation = 4.0
     sigma: Smoothing = 1.0

@@ -1,0 +1,49 @@
+"""What a style makes of a scene: things, and the paths that cameras take among them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from trimesh import Trimesh
+
+from datagen.objects import ObjectSpec
+from datagen.paths import PathSpec
+
+Streams = Callable[[str], np.random.Generator]
+"""The scene's random stream of a name."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a recipe says of a scene's objects.
+
+    Attributes:
+        assets: id -> mesh in a unit ball, z up, standing; empty means procedural shapes only.
+        asset_share: probability that an object is an asset, where there are any.
+        objects: least and greatest number of objects; None takes the style's own.
+    """
+
+    assets: Mapping[str, Trimesh] = field(default_factory=dict)
+    asset_share: float = 1.0
+    objects: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """A scene without its light.
+
+    Attributes:
+        surroundings: what stands still around the objects, such as the floor.
+        objects: what stands there.
+        left_out: how many more were drawn and found no place.
+        capture: paths of the views that surfels are made from, each taking an equal share of them.
+        film: path that clips are cut from.
+    """
+
+    surroundings: tuple[ObjectSpec, ...]
+    objects: tuple[ObjectSpec, ...]
+    left_out: int
+    capture: tuple[PathSpec, ...]
+    film: PathSpec
