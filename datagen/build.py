@@ -16,9 +16,10 @@ import numpy as np
 from trimesh import Trimesh
 
 from datagen.materials import Material
-from datagen.models import Part
+from datagen.parts import Part, Sampling
 from datagen.scene import SceneSpec
 from datagen.shapes import make_pieces, split_creases
+from datagen.tint import ATTRIBUTE, tinted
 from tron.aligned import aligned
 from tron.errors import TronError
 from tron.shading.environment import EnvironmentMap
@@ -129,32 +130,39 @@ def _merge(solids: list[Arrays]) -> Surface:
 
 def _textured(part: Part, object_id: int, index: int) -> Surface:
     per_vertex = part.base_color.ndim == 2
+    look = part.sampling.get
     base_color = (
-        {"type": "mesh_attribute", "name": "vertex_base_color"} if per_vertex else _texture(part.base_color)
+        {"type": "mesh_attribute", "name": "vertex_base_color"}
+        if per_vertex
+        else _texture(part.base_color, look("base_color"))
     )
+    if part.tint is not None:
+        base_color = tinted(base_color)
     principled = mi.load_dict(
         {
             "type": "principled",
             "base_color": base_color,
-            "roughness": _texture(part.roughness),
-            "metallic": _texture(part.metallic),
+            "roughness": _texture(part.roughness, look("roughness")),
+            "metallic": _texture(part.metallic, look("metallic")),
             "specular": 0.5,
         }
     )
     bsdf: Any = principled
     normal_map = None
     if part.normal_map is not None:
-        normal_map = mi.load_dict(_texture(part.normal_map))
+        normal_map = mi.load_dict(_texture(part.normal_map, look("normal_map")))
         bsdf = mi.load_dict({"type": "normalmap", "normalmap": normal_map, "bsdf": principled})
     # Models are often open shells; a back face that renders black would not match its surfels.
     bsdf = mi.load_dict({"type": "twosided", "bsdf": bsdf})
     mesh = _mesh(f"object{object_id}-{index}", bsdf, part.vertices, part.normals, part.faces, part.uv)
     if per_vertex:
         mesh.add_attribute("vertex_base_color", 3, _flat(part.base_color))
+    if part.tint is not None:
+        mesh.add_attribute(ATTRIBUTE, 3, _flat(part.tint))
     return Surface(mesh, principled, normal_map, np.full(len(part.faces), object_id, np.uint32))
 
 
-def _texture(value: np.ndarray | float) -> Any:
+def _texture(value: np.ndarray | float, sampling: Sampling | None = None) -> Any:
     """A constant or an image as Mitsuba texture; values are linear already."""
     image = np.asarray(value, np.float32)
     if image.ndim == 0:
@@ -162,7 +170,11 @@ def _texture(value: np.ndarray | float) -> Any:
     if image.ndim == 1:
         return {"type": "rgb", "value": image.tolist()}
     pixels = np.ascontiguousarray(image if image.ndim == 3 else image[..., None])
-    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
+    if sampling is None:
+        return texture
+    to_uv = mi.ScalarTransform3f(sampling.matrix)
+    return texture | {"to_uv": to_uv, "wrap_mode": sampling.wrap}
 
 
 def _flat(values: np.ndarray) -> Any:

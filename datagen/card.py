@@ -119,6 +119,11 @@ def card_text(
         lines += ["| asset | licence | author | source | sha256 |", "|---|---|---|---|---|"]
         lines += [_asset_row(asset) for asset in (*sources.assets, *sources.maps)]
         lines += [""]
+    if sources.refused:
+        lines += [f"Models left out because they cannot be used: {len(sources.refused)}.", ""]
+        lines += ["| model | reason |", "|---|---|"]
+        lines += [f"| {_cell(model.path)} | {_cell(model.reason)} |" for model in sources.refused]
+        lines += [""]
     if not sources.assets:
         lines.append("Shapes and materials are procedural: no asset of anybody's is in it.")
     if not sources.maps:
@@ -154,4 +159,8 @@ def _asset_row(asset: Asset) -> str:
         asset.source or "",
         asset.sha256[:16],
     )
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+    return "| " + " | ".join(map(_cell, cells)) + " |"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")

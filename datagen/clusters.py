@@ -80,6 +80,7 @@ def workers(settings: Settings, most: int) -> Iterator[Any]:
     from datagen.worker_log import WorkerLog
 
     logging.getLogger("distributed").setLevel(logging.WARNING)  # it reports every connection otherwise
+    logging.getLogger("distributed.nanny").setLevel(logging.ERROR)  # that a worker is replaced is no news
     assert settings.cluster is not None
     options = dict(settings.cluster)
     target = options["_target_"]
@@ -128,25 +129,6 @@ def _close(cluster: Any) -> None:
         cluster.close(timeout=CLOSE_SECONDS)
     except TimeoutError:
         log.warning("a worker does not end; it ends with this process")
-
-
-def recycle(client: Any, seconds: float) -> None:
-    """Replace the workers' processes: Mitsuba's memory grows with every scene it loads.
-
-    Those that do not come back within ``seconds`` are left behind, and the others go on.
-    """
-    found = client.scheduler_info(n_workers=-1)["workers"]
-    before = [address for address, worker in found.items() if worker["nanny"]]  # others cannot be replaced
-    client.restart_workers(before, timeout=seconds, raise_for_error=False)
-    client.wait_for_workers(1, timeout=seconds)
-    back = worker_count(client)
-    if back < len(found):
-        log.warning("%d of %d workers have come back after their scenes", back, len(found))
-
-
-def worker_count(client: Any) -> int:
-    """Workers that a client's scheduler has, one at the least: more may be on their way."""
-    return max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
 
 
 def logs_folder(settings: Settings) -> Path:

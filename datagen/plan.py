@@ -15,7 +15,7 @@ from pathlib import Path
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from datagen.assets import Asset, find_assets, find_environments
+from datagen.assets import Asset, Refused, find_environments, find_models
 from datagen.lights import HdriSpec
 from datagen.scene import scene_name
 from datagen.settings import SPLITS, Settings
@@ -43,11 +43,19 @@ class Work:
 
 @dataclass(frozen=True)
 class Sources:
-    """The user's files that scenes draw from; empty where everything is procedural."""
+    """The user's files that scenes draw from; empty where everything is procedural.
+
+    Attributes:
+        assets: models.
+        maps: files of the environments.
+        environments: the same maps as lights.
+        refused: models that were left out because they cannot be used.
+    """
 
     assets: tuple[Asset, ...] = ()
     maps: tuple[Asset, ...] = ()
     environments: tuple[HdriSpec, ...] = ()
+    refused: tuple[Refused, ...] = ()
 
 
 class Quarantined(BaseModel):
@@ -123,22 +131,17 @@ def chosen(items: list[Work], only: Iterable[str]) -> list[Work]:
 def find_sources(settings: Settings) -> Sources:
     """Catalogue the user's assets and environments; raises as ``datagen.assets`` does, before any render."""
     allowed = settings.allow_unlicensed
-    assets = (
-        find_assets(
-            settings.assets,
-            catalogue=settings.catalogue,
-            allow_unlicensed=allowed,
-            names=settings.asset_names,
-        )
+    assets, refused = (
+        find_models(settings.assets, settings.catalogue, allowed, settings.asset_names)
         if settings.assets
-        else []
+        else ([], [])
     )
     maps, environments = (
         find_environments(settings.environments, settings.catalogue, allowed)
         if settings.environments
         else ([], [])
     )
-    return Sources(tuple(assets), tuple(maps), tuple(environments))
+    return Sources(tuple(assets), tuple(maps), tuple(environments), tuple(refused))
 
 
 def scene_folder(output: Path, name: str) -> Path:

@@ -23,7 +23,7 @@ from datagen.card import card_text
 from datagen.clusters import logs_folder, require_cluster
 from datagen.failures import Failure, record_failures, summary
 from datagen.lights import LightChoice
-from datagen.models import outline
+from datagen.parts import outline
 from datagen.plan import (
     RECORD_NAME,
     Quarantined,

@@ -22,7 +22,7 @@ from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounc
 
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
-    *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "cluster"),
+    *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
     *("captures", "equal_error"),
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
@@ -311,7 +311,17 @@ class Settings(_Model):
         600.0, gt=0, description="Seconds to wait for the cluster's first worker: jobs may queue for long."
     )
     recycle_after: int = Field(
-        50, ge=1, description="Scenes a worker makes before it is replaced; not with cluster=address."
+        50,
+        ge=1,
+        description="Scenes a worker makes before it is replaced, while the others go on; not with "
+        "cluster=address.",
+    )
+    scene_timeout: float | None = Field(
+        None,
+        gt=0,
+        description="Seconds after which a scene fails and its worker is killed and replaced; null: 20 times "
+        "the median of its split so far, 600 at the least, and a day until three are made. With cluster=none "
+        "it is only told.",
     )
     cluster: dict[str, Any] | None = Field(
         None,

@@ -10,8 +10,9 @@ from trimesh.visual.texture import TextureVisuals
 
 from datagen.build import build
 from datagen.layout import Placement
-from datagen.models import Part, load_model, outline
+from datagen.models import load_model
 from datagen.objects import ObjectSpec
+from datagen.parts import Part, outline
 from datagen.pathtrace import gbuffers
 from datagen.scene import draw_scene
 from tron.cameras import Camera
