@@ -21,6 +21,8 @@ render are traced at once, so memory grows with pixels x samples. Plugins:
 
 ``tron_gbuffer`` (:mod:`tron.integrators.gbuffer`): what the surfels are, their harmonics' radiance included.
 ``tron_guidance`` (:mod:`tron.integrators.guidance`): what they look like under an environment.
+``tron_many_lights`` (:mod:`tron.integrators.many_lights`): no surfels, but the Mitsuba scene's own shapes,
+path-traced under many environments at once.
 
 Mitsuba wraps what a plugin raises in a RuntimeError of its own; the last line of its message is TRON's.
 """
@@ -53,4 +55,4 @@ def register() -> None:
         )
     for name, appearance in {"tron_gbuffer": GBufferAppearance, "tron_guidance": GuidanceAppearance}.items():
         mi.register_integrator(name, plugin_class(name, appearance))
-    mi.register_integrator(NAME, lambda properties: many_lights_class()(properties))
+    mi.register_integrator(NAME, many_lights_class())

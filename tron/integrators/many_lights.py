@@ -4,8 +4,8 @@
     lights         object    environment maps: tron.integrators.embed([map, ...])
     max_depth      integer   longest path in segments, as of Mitsuba's ``path`` (default: 6)
     hide_emitters  boolean   leave out the light that is seen directly (default: false)
-    first_rays     integer   shadow rays at the surface that is seen (default: 8)
-    later_rays     integer   shadow rays at each surface that light came by (default: 2)
+    first_rays     integer   shadow rays at the surface that is seen (default: as many as lights)
+    later_rays     integer   shadow rays at each surface that light came by (default: two fifths of those)
 
 Channels ``light0.R``, ``light0.G`` and so on are linear radiance under each light, in expectation what
 ``path`` renders of the scene under that light alone; main channels are their mean. Emitters of the Mitsuba
@@ -22,6 +22,7 @@ sample, which brings their radiance where it leaves the scene, they are weighted
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import drjit as dr
@@ -34,8 +35,8 @@ from tron.shading.environment import EnvironmentMap
 
 NAME = "tron_many_lights"
 MAX_DEPTH = 6
-FIRST_RAYS = 8
-LATER_RAYS = 2
+LATER_SHARE = 0.4
+"""Shadow rays at later hits over those at the first: with 20 lights 0.2 to 0.6 are as good."""
 
 
 def many_lights_class() -> type:
@@ -53,7 +54,8 @@ def many_lights_class() -> type:
             self.lights = StackedLights(carried)
             self.max_depth = properties.get("max_depth", MAX_DEPTH)
             self.hides = properties.get("hide_emitters", False)
-            rays = [properties.get("first_rays", FIRST_RAYS), properties.get("later_rays", LATER_RAYS)]
+            first = properties.get("first_rays", self.lights.count)
+            rays = [first, properties.get("later_rays", math.ceil(LATER_SHARE * first))]
             if self.max_depth < 1 or min(rays) < 1:
                 raise TronError(f"{NAME} has no path or no shadow ray", mend="give numbers of 1 or more")
             # Opaque: other numbers of rays and bounces are traced by the same kernel.

@@ -7,11 +7,10 @@ within its hat, and a direction that was found otherwise picks one of the four h
 side by side in it, and because hat_j is a factor of the density and of the radiance it leaves every weight.
 
 Texels are drawn from one distribution for all lights: proportional to the root of the sum of squares of the
-lights' luminances, each over its own mean. Of all densities q it makes the sum over lights of the integral of
-L^2 / q least, so that lights whose suns stand apart each keep a share, and smooth lights, which are alike,
-need not pay for one another. It is inverted along a Hilbert curve through blocks of texels: stratified numbers
-stay near one another on the sphere (Steigleder & McCool 2003), so each sun gets its number of samples almost
-exactly.
+lights' luminances, each over its own mean. Of all densities q it makes the sum over lights of the integral
+of L^2 / q least: lights whose suns stand apart each keep a share, and smooth lights, which are alike, share
+theirs. It is inverted along a Hilbert curve through blocks of texels: stratified numbers stay near one another
+on the sphere (Steigleder & McCool 2003), so each sun gets its number of samples almost exactly.
 """
 
 # pyright: reportArgumentType=false, reportCallIssue=false
@@ -78,8 +77,9 @@ class StackedLights:
         _, height, width, _ = images.shape
         # Opaque numbers: lights of other sizes must share one compiled kernel.
         self._width, self._height = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, height)
-        self._column, self._row = dr.opaque(mi.Float, 2 * math.pi / width), dr.opaque(
-            mi.Float, math.pi / (height - 1)
+        self._column, self._row = (
+            dr.opaque(mi.Float, 2 * math.pi / width),
+            dr.opaque(mi.Float, math.pi / (height - 1)),
         )
         # Half of a hat on a pole lies beyond it.
         area = np.full((height, 1), 2 * math.pi / width * math.pi / (height - 1))
@@ -174,9 +174,7 @@ class StackedLights:
         for k in range(self._packets):
             packet = dr.gather(mi.Vector4f, self._texels, index * self._packets + k, active)
             numbers += list(packet)
-        return [
-            color + weight * mi.Color3f(*numbers[1 + 3 * k : 4 + 3 * k]) for k, color in enumerate(total)
-        ]
+        return [color + weight * mi.Color3f(*numbers[1 + 3 * k : 4 + 3 * k]) for k, color in enumerate(total)]
 
     def _texel(self, direction: mi.Vector3f, row: mi.UInt32, column: mi.UInt32, active: mi.Bool) -> Texel:
         index = row * self._width + column
