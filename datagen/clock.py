@@ -58,7 +58,7 @@ def clocked() -> Iterator[dict[str, float]]:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """A stage of the work that is clocked; nothing where none is."""
+    """A stage of the work that is clocked, as a block or around a function; nothing where none is."""
     clock = _running.get()
     if clock is None:
         yield

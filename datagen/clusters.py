@@ -131,6 +131,21 @@ def _close(cluster: Any) -> None:
         log.warning("a worker does not end; it ends with this process")
 
 
+def describe_workers(client: Any) -> dict[str, dict[str, Any]]:
+    """Workers that a client's scheduler has now: address -> what Dask says of each.
+
+    Asked of the scheduler itself: what ``Client.scheduler_info`` gives is replaced every two seconds, in
+    another thread, by an answer without workers.
+
+    Raises:
+        TronError: the scheduler is gone.
+    """
+    try:
+        return client.sync(client.scheduler.identity, n_workers=-1)["workers"]
+    except OSError as error:
+        raise TronError(f"the scheduler is gone: {error}", mend="start this again: it goes on") from error
+
+
 def logs_folder(settings: Settings) -> Path:
     """Folder of the workers' logs."""
     return settings.output_dir / "logs"

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from datagen.clusters import CLOSE_SECONDS, logs_folder, ours
+from datagen.clusters import CLOSE_SECONDS, describe_workers, logs_folder, ours
 from datagen.failures import Failure
 from datagen.patience import Patience
 from datagen.plan import Work
@@ -73,22 +73,18 @@ class Crew:
             key: name of a task on the scheduler, of a scene and the number of the attempt.
         """
         self._waiting.extend(items)
-        alone_since = None
+        busy_at = time.monotonic()
         while self._waiting or self._turns:
             free = self._free_threads()
             yield from self._lost()
             for worker, threads in free.items():
                 for _ in range(min(threads, len(self._waiting))):
                     self._give(worker, task, self._waiting.popleft(), key)
-            if not self._waiting:
-                pass
-            elif self._turns or self._replacing:
-                alone_since = None
-            else:
-                alone_since = alone_since or time.monotonic()
-                if time.monotonic() - alone_since > self._settings.worker_timeout:
-                    yield from self._without_workers()
-                    return
+            if self._turns or self._replacing:
+                busy_at = time.monotonic()
+            elif time.monotonic() - busy_at > self._settings.worker_timeout:
+                yield from self._without_workers()
+                return
             yield from self._done()
             yield from self._hung()
         for thread in self._replacing.values():  # a worker that is just starting ends badly
@@ -99,7 +95,7 @@ class Crew:
         for worker, thread in list(self._replacing.items()):
             if not thread.is_alive():
                 del self._replacing[worker], self._made[worker]
-        found = self._client.scheduler_info(n_workers=-1)["workers"]
+        found = describe_workers(self._client)
         self._nannies = {worker: each["nanny"] is not None for worker, each in found.items()}
         busy = Counter(turn.worker for turn in self._turns.values())
         free = {}
@@ -185,7 +181,7 @@ class Crew:
             yield turn.item, Failure(reason, f"{reason}\n{where}\n")
 
     def _again(self, worker: str) -> None:
-        """Withdraw what else a worker of several threads makes: it ends with it, through no fault of its own."""
+        """Withdraw what else a worker of several threads makes: it ends too, through no fault of its own."""
         for key, turn in list(self._turns.items()):
             if turn.worker == worker:
                 self._withdraw(key)
@@ -225,5 +221,5 @@ class Crew:
     def _without_workers(self) -> Iterator[tuple[Work, Failure]]:
         seconds = self._settings.worker_timeout
         reason = f"no worker was left, and none came within worker_timeout={seconds:g} s"
-        for item in self._waiting:
-            yield item, Failure(reason, reason + "\n")
+        while self._waiting:
+            yield self._waiting.popleft(), Failure(reason, reason + "\n")

@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from datagen.build import Geometry
+from datagen.clock import stage
 from tron.aligned import aligned
 from tron.cameras import Camera, mitsuba_sensor
 from tron.gaussians.initialize import GBufferView
@@ -30,6 +31,7 @@ LANES = 2**22
 """Most paths or rays in flight at once: bounds memory, not quality."""
 
 
+@stage("path_trace")
 def render_frames(
     scene: mi.Scene,
     cameras: Sequence[Camera],
@@ -186,6 +188,7 @@ class DirectIrradiance(NamedTuple):
     unshadowed: np.ndarray
 
 
+@stage("reference")
 def direct_irradiance(
     geometry: Geometry, scene: mi.Scene, camera: Camera, spp: int, seed: int
 ) -> DirectIrradiance:

@@ -34,7 +34,7 @@ Task = Callable[[Work, Settings, Sources], Made]
 
 @dataclass(frozen=True)
 class Attempt(Generic[Made]):
-    """What a task gave, or why it gave nothing; its seconds by stage; and the name of the log of who did it."""
+    """What a task gave, or why it gave nothing; its seconds by stage; the worker's name, as in its log."""
 
     outcome: Made | Failure
     seconds: dict[str, float] = field(default_factory=dict)
@@ -115,7 +115,7 @@ def try_in_worker(task: Task[Made], settings: Settings, sources: Sources, item: 
 
 @contextmanager
 def _told(item: Work, limit: float) -> Iterator[None]:
-    """A block that makes one scene in this process, which cannot kill itself: it is told if that takes long."""
+    """A block that makes one scene in this process, which cannot kill itself: it says that it takes long."""
     text = "%s takes longer than scene_timeout=%.0f s; with cluster=local its worker would be replaced"
     timer = threading.Timer(limit, log.error, (text, item.name, limit))
     timer.daemon = True

@@ -23,7 +23,7 @@ from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounc
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
     *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
-    *("captures", "equal_error"),
+    *("captures", "equal_error", "variety_against"),
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
@@ -183,11 +183,13 @@ class Settings(_Model):
     """Settings of ``tron-datagen``."""
 
     output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
-    mode: Literal["make", "validate", "captures", "equal_error"] = Field(
+    mode: Literal["make", "plan", "validate", "captures", "equal_error"] = Field(
         "make",
-        description="make the dataset, validate the one in output_dir and list every problem, path-trace "
-        "captures for tron-reconstruct into output_dir/captures, or measure on the test scenes in output_dir "
-        "how long the path tracer takes to be as near the truth as guidance is.",
+        description="make the dataset; plan it: print what is missing, the bytes and hours it takes and the "
+        "memory of a worker, measured by a small probe here, and render nothing else; validate the one in "
+        "output_dir and list every problem; path-trace captures for tron-reconstruct into "
+        "output_dir/captures; or measure on the test scenes in output_dir how long the path tracer takes to "
+        "be as near the truth as guidance is.",
     )
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."
@@ -296,6 +298,10 @@ class Settings(_Model):
         description="Names of assets and maps to use although the catalogue has no licence.",
     )
     only: list[str] = Field(default_factory=list, description="Make these scenes only, such as train-000012.")
+    variety_against: Path | None = Field(
+        None,
+        description="Folder of another dataset whose histograms are drawn beside this one's in README.md.",
+    )
     clips_per_shard: int = Field(
         64, ge=1, description="Maximum number of clips of a shard; no shard spans two scenes."
     )

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 
 from datagen.build import Geometry
+from datagen.clock import stage
 from datagen.lights import classify
 from datagen.pathtrace import DirectIrradiance, direct_irradiance, gbuffers, render_frames
 from datagen.plan import Refinement
@@ -30,6 +31,7 @@ REFERENCE_REFLECTIONS = 16
 """Rays a pixel of the member lit_reflections."""
 
 
+@stage("surfels")
 def make_surfels(
     spec: SceneSpec, geometry: Geometry, settings: Settings
 ) -> tuple[GaussianScene, Refinement | None]:
@@ -57,16 +59,17 @@ def make_clips(
     Each frame holds the schema's members, linear: guidance from the surfels, rgb path-traced from the meshes,
     both under the same baked map; with reference buffers also what Mitsuba says of the pixel centres.
     """
-    tracer = SurfelTracer(surfels)
     estimation = settings.estimation(spec.split)
-    transport = None
-    if estimation.bounces:
-        seed = integer(spec.seed, spec.split, spec.index, "bounce")
-        transport = BounceTransport.trace(tracer.sided(estimation.two_sided), seed=seed)
+    with stage("guidance"):
+        tracer, transport = SurfelTracer(surfels), None
+        if estimation.bounces:
+            seed = integer(spec.seed, spec.split, spec.index, "bounce")
+            transport = BounceTransport.trace(tracer.sided(estimation.two_sided), seed=seed)
     for number in range(len(spec.lights)):
         yield make_clip(spec, geometry, tracer, transport, number, settings)
 
 
+@stage("guidance")
 def make_clip(
     spec: SceneSpec,
     geometry: Geometry,
@@ -130,7 +133,8 @@ def make_clip(
         extra={
             "style": spec.style,
             "contrast": classify(environment),
-            "light_spec": light.model_dump(mode="json"),
+            "contrast_share": round(environment.contrast(), 4),
+            "light_spec": light.model_dump_json(),  # text: families differ in their keys, and tables cannot
         },
     )
     return meta, frames

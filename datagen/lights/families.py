@@ -8,6 +8,7 @@ from pydantic import Field
 
 from datagen.lights.clouds import CloudsSpec
 from datagen.lights.hdri import HdriSpec
+from datagen.lights.interior import InteriorSpec
 from datagen.lights.landscape import LandscapeSpec
 from datagen.lights.light import Light
 from datagen.lights.overcast import OvercastSpec
@@ -16,7 +17,7 @@ from datagen.lights.sun import SunSpec
 
 FAMILIES: dict[str, type[Light]] = {
     str(light.model_fields["family"].default): light
-    for light in (SunSpec, StudioSpec, OvercastSpec, HdriSpec, CloudsSpec, LandscapeSpec)
+    for light in (SunSpec, StudioSpec, OvercastSpec, HdriSpec, CloudsSpec, LandscapeSpec, InteriorSpec)
 }
 """Name -> family, in the order in which ``any`` numbers them: new ones come last."""
 

@@ -200,4 +200,3 @@ def _panes(ridge: Ridge, house: np.ndarray, across: np.ndarray, elevation: np.nd
     columns = 3 + house * 7 % 4
     x, y = across * columns % 1.0, elevation / ridge.height_deg * (6 + house * 5 % 5) % 1.0
     return ((x > 0.25) & (x < 0.75) & (y > 0.3) & (y < 0.8) & (elevation > 0.0)).astype(float)
-

@@ -1,4 +1,4 @@
-"""Scheduling: no scene waits for another's worker; what hangs or kills its worker is named, the rest is made."""
+"""Scheduling: no scene waits for another's; what hangs or kills its worker is named, and the rest is made."""
 
 import json
 import os
@@ -6,9 +6,11 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from dask.distributed import LocalCluster
 
 from datagen.clock import clocked, stage
 from datagen.failures import Failure
@@ -71,6 +73,27 @@ def test_workers_are_replaced_one_by_one_and_a_scene_that_hangs_or_kills_is_name
         assert not Path(f"/proc/{pid}").exists(), "no worker outlives the run"
 
 
+@pytest.mark.long
+def test_a_worker_of_another_that_hangs_is_left_alone_and_what_nobody_can_make_is_named(tmp_path):
+    def task(item: Work, *_: object) -> str:
+        time.sleep(60.0 if item.name == "hangs" else 0.0)
+        return item.name
+
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster:
+        address = ["cluster=address", f"cluster.address={cluster.scheduler_address}"]
+        settings = settings_of(tmp_path, *address, "scene_timeout=10", "worker_timeout=3", "recycle_after=1")
+        before = next(iter(cluster.workers.values())).pid
+        items = works("first", "hangs", "second")
+        found = {item.name: each.outcome for item, each in attempts(task, items, settings, Sources())}
+        assert next(iter(cluster.workers.values())).pid == before
+    hangs, second = (found[name] for name in ("hangs", "second"))
+    assert found["first"] == "first"
+    assert isinstance(hangs, Failure)
+    assert hangs.reason.endswith("is given no other scene")
+    assert isinstance(second, Failure)
+    assert second.reason == "no worker was left, and none came within worker_timeout=3 s"
+
+
 def test_this_process_tells_of_a_scene_that_takes_long_and_goes_on(tmp_path, caplog):
     settings = settings_of(tmp_path, "cluster=none", "scene_timeout=0.05")
 
@@ -117,16 +140,19 @@ def test_a_clock_counts_the_innermost_stage(monkeypatch):
     def passes(seconds: float) -> None:
         now[0] += seconds
 
-    with pytest.raises(KeyError), clocked() as seconds:
+    @stage("refine")
+    def fails() -> None:
+        passes(16.0)
+        raise KeyError
+
+    with suppress(KeyError), clocked() as seconds:
         passes(1.0)
         with stage("surfels"):
             passes(2.0)
             with stage("refine"):
                 passes(4.0)
             passes(8.0)
-        with stage("refine"):
-            passes(16.0)
-            raise KeyError
+        fails()
     assert seconds == {"rest": 1.0, "surfels": 10.0, "refine": 20.0}
     with stage("unclocked"):
         passes(1.0)
