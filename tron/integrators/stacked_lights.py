@@ -9,8 +9,8 @@ side by side in it, and because hat_j is a factor of the density and of the radi
 Texels are drawn from one distribution for all lights: proportional to the root of the sum of squares of the
 lights' luminances, each over its own mean. Of all densities q it makes the sum over lights of the integral
 of L^2 / q least: lights whose suns stand apart each keep a share, and smooth lights, which are alike, share
-theirs. It is inverted along a Hilbert curve through blocks of texels: stratified numbers stay near one another
-on the sphere (Steigleder & McCool 2003), so each sun gets its number of samples almost exactly.
+theirs. It is inverted along a Hilbert curve through blocks of texels: stratified numbers stay near one
+another on the sphere (Steigleder & McCool 2003), so each sun gets its number of samples almost exactly.
 """
 
 # pyright: reportArgumentType=false, reportCallIssue=false
