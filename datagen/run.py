@@ -175,6 +175,7 @@ def draw_and_build(
         ),
         frames=recipe.frames,
         path_frames=settings.path_frames,
+        lights_share_path=recipe.lights_share_path,
     )
     return spec, build(spec, models, settings.mesh_edge, texels_per_unit(spec, settings))
 
