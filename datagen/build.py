@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from datagen import texels
+from datagen.motion import Pose
 from datagen.parts import Part, Sampling
 from datagen.scene import SceneSpec
 from datagen.shapes import make_pieces, split_creases
@@ -45,12 +46,14 @@ class Surface:
         principled: the innermost material, which knows base color, roughness and metallic.
         normal_map: texture of tangent-space normals as (n + 1) / 2, or None.
         object_id: (F,) uint32 object of each triangle.
+        rest: (V, 3) positions and normals before anything moved.
     """
 
     shape: mi.Mesh
     principled: mi.BSDF
     normal_map: mi.Texture | None
     object_id: np.ndarray
+    rest: tuple[np.ndarray, ...] | None = None
 
 
 @dataclass
@@ -58,6 +61,24 @@ class Geometry:
     """A scene without its light."""
 
     surfaces: list[Surface]
+
+    def move(self, object_id: int, pose: Pose) -> None:
+        """Put an object where it is at a time, away from where it rests; scenes made before do not follow."""
+        for surface in self.surfaces:
+            if not (surface.object_id == object_id).any():
+                continue
+            parameters = mi.traverse(surface.shape)
+            if surface.rest is None:
+                surface.rest = tuple(
+                    np.array(parameters[f"vertex_{name}"]).reshape(-1, 3) for name in ("positions", "normals")
+                )
+            faces = np.array(parameters["faces"]).reshape(-1, 3)
+            which = np.unique(faces[surface.object_id == object_id])
+            positions, normals = (array.copy() for array in surface.rest)
+            positions[which] = (positions[which] - pose.pivot) @ pose.rotation.T + pose.pivot + pose.shift
+            normals[which] = normals[which] @ pose.rotation.T
+            parameters["vertex_positions"], parameters["vertex_normals"] = _flat(positions), _flat(normals)
+            parameters.update()
 
     def lit(self, environment: EnvironmentMap | None = None) -> mi.Scene:
         """The Mitsuba scene under a light; without one it still answers rays."""

@@ -26,6 +26,7 @@ from datagen.clusters import logs_folder, require_cluster
 from datagen.density import texels_per_unit
 from datagen.failures import Failure, summary
 from datagen.lights import LightChoice
+from datagen.motion import Share
 from datagen.parts import outline
 from datagen.pathtrace import gbuffers
 from datagen.plan import (
@@ -176,6 +177,7 @@ def draw_and_build(
         frames=recipe.frames,
         path_frames=settings.path_frames,
         lights_share_path=recipe.lights_share_path,
+        moving=Share(recipe.moving_objects, recipe.moving_lights),
     )
     return spec, build(spec, models, settings.mesh_edge, texels_per_unit(spec, settings))
 

@@ -13,9 +13,10 @@ import numpy as np
 from pydantic import Field
 
 from datagen.lights import EVERY, PROCEDURAL, Family, HdriSpec, LightChoice, LightSpec, draw_light
+from datagen.motion import STILL, MotionSpec, Share, draw_motion
 from datagen.objects import ObjectSpec
 from datagen.paths import PathSpec
-from datagen.spec import Spec
+from datagen.spec import Number, Spec
 from datagen.styles import MIXED, OLD, STYLES, Choice, Style, StyleChoice
 from tron.cameras import Camera
 from tron.errors import TronError
@@ -53,6 +54,8 @@ class SceneSpec(Spec):
         objects: their ids go on from there.
         left_out: objects that found no place.
         metered: clips are exposed for what they show, not for the light.
+        motion: the object that moves within a clip, if one does.
+        turns_deg: by how much each light turns about the zenith within its clip; empty: none does.
     """
 
     version: int = SPEC_VERSION
@@ -65,6 +68,8 @@ class SceneSpec(Spec):
     objects: tuple[ObjectSpec, ...]
     left_out: int
     metered: bool = False
+    motion: MotionSpec | None = None
+    turns_deg: tuple[Number, ...] = ()
     lights: tuple[LightSpec, ...] = Field(min_length=1)
     cameras: CameraSpec
 
@@ -108,6 +113,7 @@ def draw_scene(
     frames: int = 5,
     path_frames: int = 93,
     lights_share_path: bool | None = None,
+    moving: Share = STILL,
 ) -> SceneSpec:
     """Draw scene ``index`` of a split.
 
@@ -121,6 +127,7 @@ def draw_scene(
         choice: what the recipe says of objects; None leaves it to the style.
         frames, path_frames: length of a clip and of the path it is cut from.
         lights_share_path: whether the clips of all lights begin at one place; None: in all styles but OLD.
+        moving: probabilities that something moves within a clip.
 
     Raises:
         TronError: too few objects found a place, or a clip is longer than its path.
@@ -142,6 +149,7 @@ def draw_scene(
         for k, wanted in enumerate(lights)
     ]
     shared = style not in OLD if lights_share_path is None else lights_share_path
+    motion, turns = draw_motion(streams("motion"), made.objects, len(lights), moving)
     rng = streams("clips")
     first = [int(rng.integers(path_frames - frames + 1)) for _ in (lights[:1] if shared else lights)]
     return SceneSpec(
@@ -154,6 +162,8 @@ def draw_scene(
         objects=made.objects,
         left_out=made.left_out,
         metered=made.metered,
+        motion=motion,
+        turns_deg=turns,
         lights=tuple(drawn),
         cameras=CameraSpec(
             capture=made.capture,

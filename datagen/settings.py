@@ -82,6 +82,18 @@ class SplitSettings(_Model):
         "lights at once, which share its paths, rays and G-buffers. null: in every style but A and B, "
         "whose clips begin at places of their own.",
     )
+    moving_objects: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Share of scenes in whose clips an object is lifted and turned; their frames cost more.",
+    )
+    moving_lights: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Share of lights that turn about the zenith within their clip; their frames cost more.",
+    )
     frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
     width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
     height: int = Field(default=256, ge=8, le=8192, description="Frame height in pixels.")
