@@ -200,7 +200,8 @@ def _terrain_heights(p: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     flat = np.column_stack([x.ravel(), y.ravel(), np.zeros(TERRAIN * TERRAIN)])
     frequency = between(p[0], 0.7, 1.6)
     heights = hills(flat * frequency).reshape(x.shape) * between(p[1], 0.015, 0.05)
-    slope = np.hypot(*np.gradient(heights, line, line)).max()
+    along, across = np.gradient(heights, line, line)
+    slope = float(np.hypot(along, across).max())
     heights *= min(1.0, 0.25 / slope)
     heights += clods(flat * between(p[2], 5.0, 9.0)).reshape(x.shape) * between(p[3], 0.0005, 0.0025)
     # A rim that rises a little hides the horizon of the slab.
