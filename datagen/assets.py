@@ -13,6 +13,7 @@ explicitly.
 from __future__ import annotations
 
 import json
+import logging
 from collections import Counter
 from collections.abc import Collection, Sequence
 from functools import lru_cache
@@ -21,11 +22,14 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from datagen.lights import HdriSpec, classify
-from datagen.models import SUFFIXES, Part, load_model
+from datagen.lights import Contrast, HdriSpec, classify
+from datagen.models import SUFFIXES, load_model
+from datagen.parts import Part
 from tron.errors import TronError
 from tron.shading.environment import EnvironmentMap
 from tron.storage import sha256
+
+log = logging.getLogger(__name__)
 
 CATALOGUE_NAME = "catalogue.json"
 LARGEST_CATALOGUE = 64 * 2**20
@@ -51,6 +55,16 @@ class Asset(BaseModel):
     author: str | None = None
     source: str | None = None
     up: Literal["y", "z"] = "y"
+
+
+class Refused(BaseModel):
+    """A model of the folder that cannot be used, and why, on one line."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    id: str
+    path: str
+    reason: str
 
 
 class _Entry(BaseModel):
@@ -115,6 +129,39 @@ def find_assets(
     return assets
 
 
+def find_models(
+    folder: Path,
+    catalogue: Path | None = None,
+    allow_unlicensed: Collection[str] = (),
+    names: Collection[str] = (),
+) -> tuple[list[Asset], list[Refused]]:
+    """List the models of a folder that can be used, and those that cannot, each of them read once.
+
+    A model that cannot be used is left out with a warning; asked for by name, it is an error.
+
+    Raises:
+        TronError: as :func:`find_assets`, a model of ``names`` that cannot be used, or none that can.
+    """
+    usable, refused = [], []
+    for asset in find_assets(folder, SUFFIXES, catalogue, allow_unlicensed, names):
+        try:
+            load_model(folder / asset.path, asset.up)
+        except TronError as error:
+            if names:
+                raise
+            reason = f"{error.what}: {error.mend}" if error.mend else error.what
+            refused.append(Refused(id=asset.id, path=asset.path, reason=" ".join(reason.split())))
+        else:
+            usable.append(asset)
+    for model in refused if usable else ():
+        log.warning("model left out: %s: %s", folder / model.path, model.reason)
+    if not usable:
+        raise TronError(
+            f"none of the {len(refused)} models can be used; '{refused[0].id}': {refused[0].reason}", folder
+        )
+    return usable, refused
+
+
 def find_environments(
     folder: Path, catalogue: Path | None = None, allow_unlicensed: Collection[str] = ()
 ) -> tuple[list[Asset], list[HdriSpec]]:
@@ -130,9 +177,8 @@ def find_environments(
 
 
 @lru_cache(maxsize=4096)
-def _contrast(path: str, _sha256: str) -> Literal["high", "low"]:
-    environment = EnvironmentMap.load(path)
-    return classify(environment.resized(min(128, environment.image.shape[0])))
+def _contrast(path: str, _sha256: str) -> Contrast:
+    return classify(EnvironmentMap.load(path))
 
 
 def for_split(maps: Sequence[HdriSpec], split: str) -> list[HdriSpec]:

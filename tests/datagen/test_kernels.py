@@ -28,9 +28,6 @@ from tron.shading.guidance import Lighting
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-SUN_KERNELS = 2
-"""What each sun costs: Mitsuba's sunsky writes its sun's size and place into the code."""
-
 
 def kernels_of(action: Callable[[], object]) -> set[str]:
     """Hashes of the kernels that an action launches."""
@@ -112,13 +109,14 @@ def test_another_light_is_prepared_by_the_same_kernels(variant):
         assert {array.ctypes.data % ALIGNMENT for array in texels} == {0}
 
 
-def test_a_sun_brings_no_more_than_its_own_kernels(variant):
+@pytest.mark.parametrize("family", [name for name in FAMILIES if name != "hdri"])
+def test_another_light_of_a_family_is_baked_by_the_same_kernels(variant, family):
     def baked(number: int) -> set[str]:
-        return kernels_of(lambda: FAMILIES["sun"].draw(generator(1, "kernels", number), []).bake(16))
+        return kernels_of(lambda: FAMILIES[family].draw(generator(1, "kernels", number), []).bake(16))
 
     first = baked(0)
-    assert len(baked(1) - first) <= SUN_KERNELS
-    assert len(baked(2) - first) <= SUN_KERNELS
+    for number in range(1, 8):
+        assert baked(number) <= first
 
 
 def test_a_second_scene_of_a_split_brings_no_kernel(variant, tmp_path: Path):

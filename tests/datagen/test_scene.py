@@ -145,9 +145,9 @@ def test_a_body_settles_where_its_centre_of_mass_cannot_fall_further():
 
 def test_camera_paths_stay_above_the_floor_and_see_the_middle():
     spec = draw()
-    for camera in [*spec.spiral(16, 32, 32), *spec.clip(2, 5, 32, 32)]:
+    for camera in [*spec.views(16, 32, 32), *spec.clip(2, 5, 32, 32)]:
         assert camera.position[2] > 0.5
-        pixels, depth = camera.project(np.array([spec.cameras.target]))
+        pixels, depth = camera.project(np.array([spec.cameras.film.target]))
         np.testing.assert_allclose(pixels, [[16, 16]], atol=1e-6)
         assert depth[0] > 4
 
