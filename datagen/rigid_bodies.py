@@ -34,6 +34,9 @@ HULL_GRID = 2.0**-12
 MARGIN = 0.003
 """Distance in typical bodies that a hull keeps from others: no surfel of one lies within another."""
 
+FRICTION = (1.0, 0.05, 0.05)
+"""Sliding (a ratio), torsional and rolling (lengths in typical bodies): of rough things that heap up."""
+
 CELL = 0.7
 """Greatest side of a cell of terrain, in typical bodies."""
 
@@ -113,7 +116,7 @@ class RigidBodies:
         spec.option.disableflags = (
             mujoco.mjtDisableBit.mjDSBL_WARMSTART | mujoco.mjtDisableBit.mjDSBL_AUTORESET
         )
-        spec.default.geom.friction = (0.8, 0.02, 0.01)
+        spec.default.geom.friction = FRICTION
         spec.default.geom.condim = 6
         spec.default.geom.solref = (2.5 * STEP, 1.0)
         spec.default.geom.margin = MARGIN

@@ -85,7 +85,10 @@ def settle(
         # A heap is poured into a bin without friction that is then lifted; dropped freely, things scatter.
         widest = max(float(np.linalg.norm(body.points, axis=1).max()) for body in bodies)
         radius = max(radius, ROOMY * widest)
-        bin = (*centre, radius)
+        # The whole bin stands over the ground, away from its rim or walls.
+        low, high = ground.low[:2] + radius, ground.high[:2] - radius
+        x, y = np.clip(centre, np.minimum(low, high), np.maximum(low, high)).tolist()
+        centre, bin = (x, y), (x, y, radius)
     world = RigidBodies(bodies, ground, fixed, bin)
     drop = _Drop(rng, ground, centre, radius, arrangement, 2.0 * MARGIN * world.unit)
     waiting = list(range(len(bodies)))
