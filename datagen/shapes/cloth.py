@@ -114,7 +114,7 @@ def draped(p: np.ndarray, rng: np.random.Generator) -> Parts:
     """Cloth over a ball, a block or a drum that shows below it."""
     high, wide = between(p[0], 0.6, 1.1), between(p[1], 0.5, 0.8)
     middle = np.array([0.0, 0.0, 0.5 * high])
-    margin = 0.03
+    margin = 0.05
     choice = count(p[2], 0, 2)
     solid: Solid
     if choice == 0:
