@@ -9,6 +9,9 @@ within it of the middle between two grid points: about once in 10^7 numbers. Wha
 the ground, is rounded likewise. The grid also lets things come to rest: what would move by less stands still.
 """
 
+# MuJoCo's compiled module has no stubs.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from collections.abc import Sequence

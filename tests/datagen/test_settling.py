@@ -159,7 +159,7 @@ def test_a_last_bit_that_differs_within_a_step_dies_at_once(crowd, monkeypatch):
         return [world.placement(i) for i in range(5)]
 
     exact = run()
-    step, rng = mujoco.mj_step, generator(0, "libm")
+    step, rng = mujoco.mj_step, generator(0, "libm")  # pyright: ignore
 
     def sloppy(model, data):
         step(model, data)
