@@ -8,7 +8,7 @@ material each.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,6 +16,8 @@ import mitsuba as mi
 import numpy as np
 
 from datagen import texels
+from datagen.materials import PhotographedSpec
+from datagen.materials.photographed import Photographed
 from datagen.parts import Part, Sampling
 from datagen.scene import SceneSpec
 from datagen.shapes import make_pieces, split_creases
@@ -73,6 +75,7 @@ def build(
     models: Mapping[str, list[Part]] | None = None,
     edge: float = 0.05,
     texels_per_unit: float = 64.0,
+    photographed: Callable[[PhotographedSpec], Photographed] | None = None,
 ) -> Geometry:
     """Build a scene's meshes and materials.
 
@@ -81,9 +84,10 @@ def build(
         models: asset id -> its parts (unit ball, z up), for the assets that the scene names.
         edge: longest edge of the procedural meshes, world units.
         texels_per_unit: density of the textures on them.
+        photographed: opens the user's texture sets, where the scene names some.
 
     Raises:
-        TronError: the scene names an asset that is not among the models.
+        TronError: the scene names an asset or a texture set that was not given.
     """
     solids, surfaces = [], []
     for number, item in enumerate((*spec.surroundings, *spec.objects), start=FIRST_ID):
@@ -93,6 +97,14 @@ def build(
             fine = np.inf if number < FIRST_ID + len(spec.surroundings) else edge
             for mesh, slot in make_pieces(item.shape, fine):
                 material = item.materials[slot % len(item.materials)]
+                if isinstance(material, PhotographedSpec):
+                    if photographed is None:
+                        raise TronError(
+                            f"the scene needs the texture set '{material.texture_set}'",
+                            spec.name,
+                            "give its folder as textures=...",
+                        )
+                    material = photographed(material)
                 solids.append(_Solid(texels.Surface(*split_creases(mesh), material), matrix, number))
             continue
         parts = (models or {}).get(str(item.asset))

@@ -15,8 +15,10 @@ from pydantic import Field
 from datagen.lights import EVERY, PROCEDURAL, Family, HdriSpec, LightChoice, LightSpec, draw_light
 from datagen.objects import ObjectSpec
 from datagen.paths import PathSpec
+from datagen.shapes import SHAPES
 from datagen.spec import Spec
 from datagen.styles import MIXED, STYLES, Choice, Style, StyleChoice
+from datagen.texture_sets import dressed
 from tron.cameras import Camera
 from tron.errors import TronError
 from tron.seeds import generator
@@ -128,6 +130,7 @@ def draw_scene(
         draw_light(streams("light", k), wanted, families or (own if wanted == "any" else EVERY), environments)
         for k, wanted in enumerate(lights)
     ]
+    dressing = partial(_dressed, choice=choice or Choice(), rng=streams("textures"))
     rng = streams("clips")
     return SceneSpec(
         name=scene_name(split, index),
@@ -135,8 +138,8 @@ def draw_scene(
         index=index,
         seed=seed,
         style=style,
-        surroundings=made.surroundings,
-        objects=made.objects,
+        surroundings=tuple(dressing(item) for item in made.surroundings),
+        objects=tuple(dressing(item) for item in made.objects),
         left_out=made.left_out,
         metered=made.metered,
         lights=tuple(drawn),
@@ -147,3 +150,15 @@ def draw_scene(
             first_frame=tuple(int(rng.integers(path_frames - frames + 1)) for _ in lights),
         ),
     )
+
+
+def _dressed(item: ObjectSpec, choice: Choice, rng: np.random.Generator) -> ObjectSpec:
+    """The object with the user's texture sets on some of its pieces."""
+    if item.shape is None or not choice.textures:
+        return item
+    roles = SHAPES[item.shape.kind].roles
+    materials = tuple(
+        dressed(material, roles[slot % len(roles)], choice.textures, choice.texture_share, rng)
+        for slot, material in enumerate(item.materials)
+    )
+    return item.model_copy(update={"materials": materials})

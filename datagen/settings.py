@@ -42,6 +42,8 @@ CAPTURED = {
     "assets": True,
     "asset_names": True,
     "asset_share": True,
+    "textures": True,
+    "texture_share": True,
     "environments": True,
     "share_maps": True,
     "catalogue": True,
@@ -292,6 +294,12 @@ class Settings(_Model):
     )
     asset_share: float = Field(
         1.0, ge=0, le=1, description="Share of objects drawn from assets, where given."
+    )
+    textures: Path | None = Field(
+        None, description="Folder of PBR texture sets to lay on procedural pieces whose role they suit."
+    )
+    texture_share: float = Field(
+        0.5, ge=0, le=1, description="Share of pieces with a texture set, among those that one suits."
     )
     environments: Path | None = Field(None, description="Folder of .hdr and .exr maps to use as lights.")
     share_maps: bool = Field(
