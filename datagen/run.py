@@ -177,6 +177,7 @@ def draw_and_build(
         ),
         frames=recipe.frames,
         path_frames=settings.path_frames,
+        lights_share_path=recipe.lights_share_path,
     )
     return spec, scene_geometry(spec, settings, sources)
 

@@ -17,7 +17,7 @@ from datagen.objects import ObjectSpec
 from datagen.paths import PathSpec
 from datagen.shapes import SHAPES
 from datagen.spec import Spec
-from datagen.styles import MIXED, STYLES, Choice, Style, StyleChoice
+from datagen.styles import MIXED, OLD, STYLES, Choice, Style, StyleChoice
 from datagen.texture_sets import dressed
 from tron.cameras import Camera
 from tron.errors import TronError
@@ -33,13 +33,18 @@ class CameraSpec(Spec):
         capture: what the views lie on that surfels are made from, an equal share on each.
         film: what is path-traced lies on it.
         path_frames: frames of the whole of ``film``.
-        first_frame: for each light where on it its clip begins.
+        first_frame: where on it the clips begin: all lights' at one place, or each light's at its own.
     """
 
     capture: tuple[PathSpec, ...] = Field(min_length=1)
     film: PathSpec
     path_frames: int
-    first_frame: tuple[int, ...]
+    first_frame: int | tuple[int, ...]
+
+    @property
+    def shared(self) -> bool:
+        """Whether all lights are filmed from the same places, frame by frame."""
+        return isinstance(self.first_frame, int)
 
 
 class SceneSpec(Spec):
@@ -75,9 +80,15 @@ class SceneSpec(Spec):
             for camera in path.cameras(share, width, height)
         ]
 
+    def groups(self) -> list[list[int]]:
+        """Numbers of the lights whose clips are filmed together."""
+        numbers = list(range(len(self.lights)))
+        return [numbers] if self.cameras.shared else [[number] for number in numbers]
+
     def clip(self, light: int, frames: int, width: int, height: int) -> list[Camera]:
         """The consecutive cameras of the clip under light number ``light``."""
-        first = self.cameras.first_frame[light]
+        first = self.cameras.first_frame
+        first = first if isinstance(first, int) else first[light]
         return self.cameras.film.cameras(self.cameras.path_frames, width, height)[first : first + frames]
 
 
@@ -98,6 +109,7 @@ def draw_scene(
     choice: Choice | None = None,
     frames: int = 5,
     path_frames: int = 93,
+    lights_share_path: bool | None = None,
 ) -> SceneSpec:
     """Draw scene ``index`` of a split.
 
@@ -110,6 +122,7 @@ def draw_scene(
         environments: files for the family ``hdri``.
         choice: what the recipe says of objects; None leaves it to the style.
         frames, path_frames: length of a clip and of the path it is cut from.
+        lights_share_path: whether the clips of all lights begin at one place; None: in all styles but OLD.
 
     Raises:
         TronError: too few objects found a place, or a clip is longer than its path.
@@ -131,7 +144,9 @@ def draw_scene(
         for k, wanted in enumerate(lights)
     ]
     dressing = partial(_dressed, choice=choice or Choice(), rng=streams("textures"))
+    shared = style not in OLD if lights_share_path is None else lights_share_path
     rng = streams("clips")
+    first = [int(rng.integers(path_frames - frames + 1)) for _ in (lights[:1] if shared else lights)]
     return SceneSpec(
         name=scene_name(split, index),
         split=split,
@@ -147,7 +162,7 @@ def draw_scene(
             capture=made.capture,
             film=made.film,
             path_frames=path_frames,
-            first_frame=tuple(int(rng.integers(path_frames - frames + 1)) for _ in lights),
+            first_frame=first[0] if shared else tuple(first),
         ),
     )
 

@@ -78,6 +78,12 @@ class SplitSettings(_Model):
         "families; high, medium and low draw one of such contrast; hdri takes one of the maps in "
         "environments.",
     )
+    lights_share_path: bool | None = Field(
+        default=None,
+        description="All clips of a scene show it from the same cameras: each frame is path-traced under all "
+        "lights at once, which share its paths, rays and G-buffers. null: in every style but A and B, "
+        "whose clips begin at places of their own.",
+    )
     frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
     width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
     height: int = Field(default=256, ge=8, le=8192, description="Frame height in pixels.")
