@@ -75,6 +75,7 @@ def build(
     models: Mapping[str, list[Part]] | None = None,
     edge: float = 0.05,
     texels_per_unit: float = 64.0,
+    most_texels: int = texels.MOST_TEXELS,
     photographed: Callable[[PhotographedSpec], Photographed] | None = None,
 ) -> Geometry:
     """Build a scene's meshes and materials.
@@ -84,6 +85,7 @@ def build(
         models: asset id -> its parts (unit ball, z up), for the assets that the scene names.
         edge: longest edge of the procedural meshes, world units.
         texels_per_unit: density of the textures on them.
+        most_texels: of all of them; where that is too few, the density falls.
         photographed: opens the user's texture sets, where the scene names some.
 
     Raises:
@@ -113,12 +115,12 @@ def build(
                 f"the scene needs the asset {item.asset!r}", spec.name, "give its folder as assets=..."
             )
         surfaces += [_textured(part.moved(matrix, item.size), number, i) for i, part in enumerate(parts)]
-    return Geometry([_solids(solids, texels_per_unit), *surfaces])
+    return Geometry([_solids(solids, texels_per_unit, most_texels), *surfaces])
 
 
-def _solids(solids: Sequence[_Solid], texels_per_unit: float) -> Surface:
+def _solids(solids: Sequence[_Solid], texels_per_unit: float, most: int = texels.MOST_TEXELS) -> Surface:
     """All procedural pieces as one mesh under one material, whose textures are one atlas."""
-    atlas = texels.bake([solid.surface for solid in solids], texels_per_unit)
+    atlas = texels.bake([solid.surface for solid in solids], texels_per_unit, most)
     vertices, normals, uvs, faces, ids, count = [], [], [], [], [], 0
     for (surface, matrix, object_id), (index, uv, corners) in zip(solids, atlas.laid):
         rotation = matrix[:3, :3]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datagen.assets import load_models
 from datagen.build import Geometry, build
-from datagen.density import texels_per_unit
+from datagen.density import most_texels, texels_per_unit
 from datagen.materials import PhotographedSpec
 from datagen.materials.photographed import Photographed
 from datagen.plan import Sources
@@ -25,4 +25,5 @@ def scene_geometry(spec: SceneSpec, settings: Settings, sources: Sources) -> Geo
     def photographed(material: PhotographedSpec) -> Photographed:
         return opened(material, settings.textures, sources.textures, density)
 
-    return build(spec, models, settings.mesh_edge, density, photographed)
+    most = most_texels(spec, settings)
+    return build(spec, models, settings.mesh_edge, density, most_texels=most, photographed=photographed)

@@ -287,9 +287,10 @@ class Settings(_Model):
         None,
         gt=0,
         le=4096,
-        description="Texels a world unit of the textures on procedural pieces; null: two a pixel of frames "
-        "and views at the median distance of their cameras from the nearest thing. A scene has 4 million at "
-        "most; where that is too few, the log says how many a unit they are.",
+        description="Texels a world unit of the textures on procedural pieces; null: two along a pixel of "
+        "frames and views at the median distance of cameras and things. A scene has 64 for each pixel of a "
+        "frame at most, between one and eight million; where those are too few, the log says how many a unit "
+        "they are.",
     )
     environment_height: int = Field(
         256, ge=8, le=8192, description="Rows of the lat-long maps that lights are baked to."
