@@ -16,8 +16,10 @@ from datagen.lights import EVERY, PROCEDURAL, Family, HdriSpec, LightChoice, Lig
 from datagen.motion import STILL, MotionSpec, Share, draw_motion
 from datagen.objects import ObjectSpec
 from datagen.paths import PathSpec
+from datagen.shapes import SHAPES
 from datagen.spec import Number, Spec
 from datagen.styles import MIXED, OLD, STYLES, Choice, Style, StyleChoice
+from datagen.texture_sets import dressed
 from tron.cameras import Camera
 from tron.errors import TronError
 from tron.seeds import generator
@@ -148,6 +150,7 @@ def draw_scene(
         draw_light(streams("light", k), wanted, families or (own if wanted == "any" else EVERY), environments)
         for k, wanted in enumerate(lights)
     ]
+    dressing = partial(_dressed, choice=choice or Choice(), rng=streams("textures"))
     shared = style not in OLD if lights_share_path is None else lights_share_path
     motion, turns = draw_motion(streams("motion"), made.objects, len(lights), moving)
     rng = streams("clips")
@@ -158,8 +161,8 @@ def draw_scene(
         index=index,
         seed=seed,
         style=style,
-        surroundings=made.surroundings,
-        objects=made.objects,
+        surroundings=tuple(dressing(item) for item in made.surroundings),
+        objects=tuple(dressing(item) for item in made.objects),
         left_out=made.left_out,
         metered=made.metered,
         motion=motion,
@@ -172,3 +175,15 @@ def draw_scene(
             first_frame=first[0] if shared else tuple(first),
         ),
     )
+
+
+def _dressed(item: ObjectSpec, choice: Choice, rng: np.random.Generator) -> ObjectSpec:
+    """The object with the user's texture sets on some of its pieces."""
+    if item.shape is None or not choice.textures:
+        return item
+    roles = SHAPES[item.shape.kind].roles
+    materials = tuple(
+        dressed(material, roles[slot % len(roles)], choice.textures, choice.texture_share, rng)
+        for slot, material in enumerate(item.materials)
+    )
+    return item.model_copy(update={"materials": materials})

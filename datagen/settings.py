@@ -42,6 +42,8 @@ CAPTURED = {
     "assets": True,
     "asset_names": True,
     "asset_share": True,
+    "textures": True,
+    "texture_share": True,
     "environments": True,
     "share_maps": True,
     "catalogue": True,
@@ -297,9 +299,10 @@ class Settings(_Model):
         None,
         gt=0,
         le=4096,
-        description="Texels a world unit of the textures on procedural pieces; null: two a pixel of frames "
-        "and views at the median distance of their cameras from the nearest thing. A scene has 4 million at "
-        "most; where that is too few, the log says how many a unit they are.",
+        description="Texels a world unit of the textures on procedural pieces; null: two along a pixel of "
+        "frames and views at the median distance of cameras and things. A scene has 64 for each pixel of a "
+        "frame at most, between one and eight million; where those are too few, the log says how many a unit "
+        "they are.",
     )
     environment_height: int = Field(
         256, ge=8, le=8192, description="Rows of the lat-long maps that lights are baked to."
@@ -310,6 +313,12 @@ class Settings(_Model):
     )
     asset_share: float = Field(
         1.0, ge=0, le=1, description="Share of objects drawn from assets, where given."
+    )
+    textures: Path | None = Field(
+        None, description="Folder of PBR texture sets to lay on procedural pieces whose role they suit."
+    )
+    texture_share: float = Field(
+        0.5, ge=0, le=1, description="Share of pieces with a texture set, among those that one suits."
     )
     environments: Path | None = Field(None, description="Folder of .hdr and .exr maps to use as lights.")
     share_maps: bool = Field(
