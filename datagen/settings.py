@@ -37,6 +37,7 @@ CAPTURED = {
     "objects": True,
     "families": True,
     "mesh_edge": True,
+    "texels_per_unit": True,
     "environment_height": True,
     "assets": True,
     "asset_names": True,
@@ -74,6 +75,12 @@ class SplitSettings(_Model):
         description="Light of each clip of a scene, one clip for each in the list. any draws one of "
         "families; high, medium and low draw one of such contrast; hdri takes one of the maps in "
         "environments.",
+    )
+    lights_share_path: bool | None = Field(
+        default=None,
+        description="All clips of a scene show it from the same cameras: each frame is path-traced under all "
+        "lights at once, which share its paths, rays and G-buffers. null: in every style but A and B, "
+        "whose clips begin at places of their own.",
     )
     frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
     width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
@@ -272,7 +279,15 @@ class Settings(_Model):
         0.04,
         gt=0,
         le=1,
-        description="Longest edge of procedural meshes in world units; patterns are that sharp.",
+        description="Longest edge of procedural meshes in world units.",
+    )
+    texels_per_unit: float | None = Field(
+        None,
+        gt=0,
+        le=4096,
+        description="Texels a world unit of the textures on procedural pieces; null: two a pixel of frames "
+        "and views at the median distance of their cameras from the nearest thing. A scene has 4 million at "
+        "most; where that is too few, the log says how many a unit they are.",
     )
     environment_height: int = Field(
         256, ge=8, le=8192, description="Rows of the lat-long maps that lights are baked to."
