@@ -130,7 +130,9 @@ class InteriorSpec(Light):
 
     def _flux(self, sun: np.ndarray) -> np.ndarray:
         """Light (3,) that enters the room: radiance x pi x area, intensity x 4 pi, and the sun's."""
-        flux = sum((np.pi * r.area() * np.asarray(r.radiance) for r in self.windows + self.panels), np.zeros(3))
+        flux = sum(
+            (np.pi * r.area() * np.asarray(r.radiance) for r in self.windows + self.panels), np.zeros(3)
+        )
         flux = flux + sum((4 * np.pi * np.asarray(b.intensity) for b in self.bulbs), np.zeros(3))
         for window in self.windows:
             axis, end = divmod(window.face, 2)
@@ -168,7 +170,9 @@ class InteriorSpec(Light):
 
     def _outdoors(self, directions: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Sky above a ragged horizon, and what stands before it, of the ``mean`` radiance given."""
-        angles = np.degrees(np.stack([np.arctan2(directions[:, 1], directions[:, 0]), directions[:, 2]], axis=1))
+        angles = np.degrees(
+            np.stack([np.arctan2(directions[:, 1], directions[:, 0]), directions[:, 2]], axis=1)
+        )
         leaves = Fractal(self.seed, "outdoors")
         skyline = 14.0 * (leaves(angles * (0.06, 0.0), 6) - 0.4)
         texture = np.exp(2.5 * (leaves(angles * 0.4, 6, 0.7) - 0.5))[:, None]
@@ -278,7 +282,6 @@ def _furniture(rng: np.random.Generator, size: np.ndarray, eye: np.ndarray) -> t
         if table:
             corners = [(x, y) for x in (low[0], high[0] - 0.05) for y in (low[1], high[1] - 0.05)]
             boxes += [
-                Box(low=(x, y, 0.0), high=(x + 0.05, y + 0.05, top - 0.05), albedo=albedo)
-                for x, y in corners
+                Box(low=(x, y, 0.0), high=(x + 0.05, y + 0.05, top - 0.05), albedo=albedo) for x, y in corners
             ]
     return tuple(boxes)

@@ -164,7 +164,8 @@ def nearness(hits: Hits, size: np.ndarray, boxes: tuple[Box, ...]) -> np.ndarray
         if box.low[2] > 1.0:
             continue
         outside = np.maximum(
-            np.asarray(box.low[:2]) - hits.points[floor, :2], hits.points[floor, :2] - np.asarray(box.high[:2])
+            np.asarray(box.low[:2]) - hits.points[floor, :2],
+            hits.points[floor, :2] - np.asarray(box.high[:2]),
         )
         away = np.linalg.norm(np.maximum(outside, 0.0), axis=1) + box.low[2]
         share[floor] *= 1.0 - 0.6 * np.exp(-away / CORNER)
