@@ -1,7 +1,7 @@
 """What a scene costs, measured on a small one: seconds by part of the work, bytes on disk, memory.
 
 The probe runs the functions that make scenes, on a scene of the split, at two small sizes of frames and for
-one frame and two. Seconds and bytes are taken as linear: what grows with pixels, frames, views and
+one frame and three. Seconds and bytes are taken as linear: what grows with pixels, frames, views and
 optimisation steps is carried on to the recipe's numbers.
 """
 
@@ -20,7 +20,7 @@ from typing import TypeVar
 
 from datagen import refinement
 from datagen.build import Geometry
-from datagen.clip_preview import write_preview
+from datagen.clip_preview import preview_bytes, write_preview
 from datagen.pathtrace import LANES
 from datagen.plan import Sources, Work
 from datagen.run import draw_and_build
@@ -28,11 +28,14 @@ from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from datagen.synthetic import make_clips, make_surfels
 from tron.gaussians.scene import GaussianScene
+from tron.shards.schema import clip_members
 from tron.shards.writer import ShardWriter
 
-SIDES = (24, 56)
-"""Longer sides of the probe's frames, pixels."""
-MOST_LIGHTS, VIEWS, STEPS = 8, 4, 4
+SIDES = (24, 96)
+"""Longer sides of the probe's frames, pixels: in smaller ones fixed costs hide what grows with pixels."""
+FRAMES = (1, 3)
+"""Frames of its clips."""
+MOST_LIGHTS, VIEWS, STEPS = 4, 4, 10
 """Lights, views and optimisation steps of a probe, where the recipe has more."""
 
 Result = TypeVar("Result")
@@ -103,10 +106,11 @@ def probe(item: Work, settings: Settings, sources: Sources) -> SceneCost:
     def clips(size: tuple[int, int], frames: int) -> _Clips:
         return _clips(spec, geometry, plain, _small(settings, item.split, size, frames))
 
-    clips(sizes[0], 2)  # compiles
-    few, more = clips(sizes[0], 1), clips(sizes[0], 2)
+    frames = [min(count, recipe.frames) for count in FRAMES]
+    clips(sizes[0], frames[0])  # compiles
+    few, more = (clips(sizes[0], count) for count in frames)
     peak = _peak()
-    larger, most = clips(sizes[1], 1), clips(sizes[1], 2)
+    larger, most = (clips(sizes[1], count) for count in frames)
     lanes = [min(LANES, count * recipe.path_spp) for count in pixels]
     growth = max(_peak() - peak, 0) / max(lanes[1] - lanes[0], 1)
     whole = recipe.width * recipe.height
@@ -116,17 +120,25 @@ def probe(item: Work, settings: Settings, sources: Sources) -> SceneCost:
         slope = max(high - low, 0.0) / (pixels[1] - pixels[0]) if pixels[1] > pixels[0] else 0.0
         return max(low, 0.0) + slope * (whole - pixels[0])
 
-    frame_seconds = carried(more.seconds - few.seconds, most.seconds - larger.seconds)
-    first_seconds = max(few.seconds - (more.seconds - few.seconds), 0.0)
+    if frames[1] > frames[0]:
+        further = frames[1] - frames[0]
+        one_frame = [(more.seconds - few.seconds) / further, (most.seconds - larger.seconds) / further]
+        fixed = max(few.seconds - one_frame[0], 0.0)
+    else:  # clips of one frame
+        one_frame, fixed = [few.seconds, larger.seconds], 0.0
+    frame_seconds = carried(*one_frame)
     share = len(recipe.lights) / len(lights)
-    frame_bytes = carried(more.shards / 2, most.shards / 2)
+    frame_bytes = carried(more.shards / frames[1], most.shards / frames[1])
+    members = len(clip_members(recipe.reference_buffers))
+    tiles = [preview_bytes(*sizes[1], count, members) for count in (frames[1], recipe.frames)]
+    preview = carried(more.previews, most.previews) * tiles[1] / tiles[0]
     with TemporaryDirectory() as folder:
         plain.save(Path(folder) / "surfels.ply")
         kept = (Path(folder) / "surfels.ply").stat().st_size
     held = recipe.frames * whole * 4 * 64  # some sixty float channels a pixel until the clip is written
     return SceneCost(
-        seconds=building + viewing + refining + share * (first_seconds + recipe.frames * frame_seconds),
-        bytes=kept + share * (recipe.frames * frame_bytes + carried(more.previews, most.previews)),
+        seconds=building + viewing + refining + share * (fixed + recipe.frames * frame_seconds),
+        bytes=kept + share * (recipe.frames * frame_bytes + preview),
         memory=_peak() + growth * max(min(LANES, whole * recipe.path_spp) - lanes[1], 0) + held,
         source=f"probe: {item.name}, {len(lights)} lights, {sizes[1][0]} x {sizes[1][1]}",
     )
