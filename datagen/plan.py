@@ -208,7 +208,13 @@ def config_sha256(settings: Settings) -> str:
 
 
 def adopt(settings: Settings) -> None:
-    """Make output_dir this recipe's, or make sure that it is already.
+    """Make output_dir this recipe's, or make sure that it is already; raises as :func:`require_adoptable`."""
+    require_adoptable(settings)
+    write_if_changed(settings.output_dir / CONFIG_NAME, config_text(settings))
+
+
+def require_adoptable(settings: Settings) -> None:
+    """Make sure that output_dir is this recipe's or nobody's.
 
     More scenes may be added to a dataset; any other change would mix two datasets in one folder.
 
@@ -216,7 +222,7 @@ def adopt(settings: Settings) -> None:
         TronError: the folder holds a dataset of another schema or recipe (names the key), or more scenes
             than are asked for.
     """
-    path, text = settings.output_dir / CONFIG_NAME, config_text(settings)
+    path = settings.output_dir / CONFIG_NAME
     old = read_recipe(path)
     if old is not None:
         try:
@@ -243,7 +249,6 @@ def adopt(settings: Settings) -> None:
         raise TronError(
             "output_dir holds shards of something else", settings.output_dir, "choose an empty folder"
         )
-    write_if_changed(path, text)
 
 
 def clear_temporaries(output: Path) -> None:
