@@ -1,21 +1,21 @@
 """SceneSpec -> Mitsuba scene.
 
-All procedural objects and the floor are one mesh under one ``principled`` material whose parameters are mesh
-attributes. Every synthetic scene then has the same kernel: Dr.Jit compiles it once and finds it in its cache
-for all others. Parts of the user's models bring a mesh and a material each.
+All procedural objects and what surrounds them are one mesh under one ``principled`` material whose parameters
+and normals come from one atlas. Every synthetic scene then has the same kernel, whatever it holds: Dr.Jit
+compiles it once and finds it in its cache for all others. Parts of the user's models bring a mesh and a
+material each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
-from trimesh import Trimesh
 
-from datagen.materials import Material
+from datagen import texels
 from datagen.parts import Part, Sampling
 from datagen.scene import SceneSpec
 from datagen.shapes import make_pieces, split_creases
@@ -27,7 +27,13 @@ from tron.shading.environment import EnvironmentMap
 FIRST_ID = 1
 """Object id of the first of the surroundings; 0 is nothing."""
 
-Arrays = dict[str, np.ndarray]
+
+class _Solid(NamedTuple):
+    """A piece in its object's frame, where it stands, and its object's id."""
+
+    surface: texels.Surface
+    matrix: np.ndarray
+    object_id: int
 
 
 @dataclass
@@ -62,13 +68,19 @@ class Geometry:
         return mi.load_dict(scene)
 
 
-def build(spec: SceneSpec, models: Mapping[str, list[Part]] | None = None, edge: float = 0.05) -> Geometry:
+def build(
+    spec: SceneSpec,
+    models: Mapping[str, list[Part]] | None = None,
+    edge: float = 0.05,
+    texels_per_unit: float = 64.0,
+) -> Geometry:
     """Build a scene's meshes and materials.
 
     Args:
         spec: the scene.
         models: asset id -> its parts (unit ball, z up), for the assets that the scene names.
-        edge: longest edge of the procedural meshes, world units; patterns are as sharp as the mesh is fine.
+        edge: longest edge of the procedural meshes, world units.
+        texels_per_unit: density of the textures on them.
 
     Raises:
         TronError: the scene names an asset that is not among the models.
@@ -77,11 +89,11 @@ def build(spec: SceneSpec, models: Mapping[str, list[Part]] | None = None, edge:
     for number, item in enumerate((*spec.surroundings, *spec.objects), start=FIRST_ID):
         matrix = item.placement.matrix()
         if item.shape is not None and item.materials:
-            fine = edge / 2 if number <= len(spec.surroundings) else edge
-            solids += [
-                _solid(mesh, item.materials[slot % len(item.materials)], matrix, number)
-                for mesh, slot in make_pieces(item.shape, fine)
-            ]
+            # Subdivision rounds what is curved; walls, floors and terrain come as fine as they are.
+            fine = np.inf if number < FIRST_ID + len(spec.surroundings) else edge
+            for mesh, slot in make_pieces(item.shape, fine):
+                material = item.materials[slot % len(item.materials)]
+                solids.append(_Solid(texels.Surface(*split_creases(mesh), material), matrix, number))
             continue
         parts = (models or {}).get(str(item.asset))
         if parts is None:
@@ -89,43 +101,36 @@ def build(spec: SceneSpec, models: Mapping[str, list[Part]] | None = None, edge:
                 f"the scene needs the asset {item.asset!r}", spec.name, "give its folder as assets=..."
             )
         surfaces += [_textured(part.moved(matrix, item.size), number, i) for i, part in enumerate(parts)]
-    return Geometry([_merge(solids), *surfaces])
+    return Geometry([_solids(solids, texels_per_unit), *surfaces])
 
 
-def _solid(mesh: Trimesh, material: Material, matrix: np.ndarray, object_id: int) -> Arrays:
-    """Arrays of one piece in the world; its look is the object's own and moves with it."""
-    vertices, normals, faces = split_creases(mesh)
-    seen = material.evaluate(vertices, normals)
-    return {
-        "vertices": vertices @ matrix[:3, :3].T + matrix[:3, 3],
-        "normals": normals @ matrix[:3, :3].T,
-        "faces": faces,
-        "base_color": seen.base_color,
-        "roughness": seen.roughness,
-        "metallic": seen.metallic,
-        "object_id": np.full(len(faces), object_id, np.uint32),
-    }
-
-
-def _merge(solids: list[Arrays]) -> Surface:
-    offsets = np.cumsum([0, *(len(solid["vertices"]) for solid in solids)])
-    faces = np.concatenate([solid["faces"] + offset for solid, offset in zip(solids, offsets)])
-    joined = {
-        name: np.concatenate([solid[name] for solid in solids]) for name in solids[0] if name != "faces"
-    }
+def _solids(solids: Sequence[_Solid], texels_per_unit: float) -> Surface:
+    """All procedural pieces as one mesh under one material, whose textures are one atlas."""
+    atlas = texels.bake([solid.surface for solid in solids], texels_per_unit)
+    vertices, normals, uvs, faces, ids, count = [], [], [], [], [], 0
+    for (surface, matrix, object_id), (index, uv, corners) in zip(solids, atlas.laid):
+        rotation = matrix[:3, :3]
+        vertices.append(surface.vertices[index] @ rotation.T + matrix[:3, 3])
+        normals.append(surface.normals[index] @ rotation.T)
+        uvs.append(uv)
+        faces.append(corners + count)
+        ids.append(np.full(len(corners), object_id, np.uint32))
+        count += len(index)
     principled = mi.load_dict(
         {
             "type": "principled",
-            "base_color": {"type": "mesh_attribute", "name": "vertex_base_color"},
-            "roughness": {"type": "mesh_attribute", "name": "vertex_roughness"},
-            "metallic": {"type": "mesh_attribute", "name": "vertex_metallic"},
+            "base_color": _texture(atlas.base_color, half=True),
+            "roughness": _texture(atlas.roughness, half=True),
+            "metallic": _texture(atlas.metallic, half=True),
             "specular": 0.5,
         }
     )
-    mesh = _mesh("solids", principled, joined["vertices"], joined["normals"], faces, None)
-    for name, width in (("base_color", 3), ("roughness", 1), ("metallic", 1)):
-        mesh.add_attribute(f"vertex_{name}", width, _flat(joined[name]))
-    return Surface(mesh, principled, None, joined["object_id"])
+    normal_map = mi.load_dict(_texture(atlas.normal_map, half=True))
+    bsdf: Any = mi.load_dict({"type": "normalmap", "normalmap": normal_map, "bsdf": principled})
+    # Cloth, leaves and walls are open; a back face that renders black would not match its surfels.
+    bsdf = mi.load_dict({"type": "twosided", "bsdf": bsdf})
+    mesh = _mesh("solids", bsdf, *(np.concatenate(part) for part in (vertices, normals, faces, uvs)))
+    return Surface(mesh, principled, normal_map, np.concatenate(ids))
 
 
 def _textured(part: Part, object_id: int, index: int) -> Surface:
@@ -162,8 +167,8 @@ def _textured(part: Part, object_id: int, index: int) -> Surface:
     return Surface(mesh, principled, normal_map, np.full(len(part.faces), object_id, np.uint32))
 
 
-def _texture(value: np.ndarray | float, sampling: Sampling | None = None) -> Any:
-    """A constant or an image as Mitsuba texture; values are linear already."""
+def _texture(value: np.ndarray | float, sampling: Sampling | None = None, half: bool = False) -> Any:
+    """A constant or an image as Mitsuba texture; values are linear already, ``half`` halves their memory."""
     image = np.asarray(value, np.float32)
     if image.ndim == 0:
         return float(image)
@@ -171,10 +176,11 @@ def _texture(value: np.ndarray | float, sampling: Sampling | None = None) -> Any
         return {"type": "rgb", "value": image.tolist()}
     pixels = np.ascontiguousarray(image if image.ndim == 3 else image[..., None])
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
-    if sampling is None:
-        return texture
-    to_uv = mi.ScalarTransform3f(sampling.matrix)
-    return texture | {"to_uv": to_uv, "wrap_mode": sampling.wrap}
+    if half:
+        texture |= {"format": "fp16", "wrap_mode": "clamp"}
+    if sampling is not None:
+        texture |= {"to_uv": mi.ScalarTransform3f(sampling.matrix), "wrap_mode": sampling.wrap}
+    return texture
 
 
 def _flat(values: np.ndarray) -> Any:

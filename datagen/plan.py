@@ -13,12 +13,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from datagen.assets import Asset, Refused, find_environments, find_models
+from datagen.clip_preview import preview_bytes
+from datagen.clip_rows import ClipRow
 from datagen.lights import HdriSpec
 from datagen.scene import scene_name
 from datagen.settings import SPLITS, Settings
+from datagen.variety import Histograms
 from tron.claim import CHOOSE_ANOTHER, read_recipe, require_same
 from tron.cli.recipes import model_defaults
 from tron.errors import TronError
@@ -94,7 +97,12 @@ class Refinement(BaseModel):
 
 
 class Record(BaseModel):
-    """scenes/NAME/record.json: the scene is finished, and this is what it gave."""
+    """scenes/NAME/record.json: the scene is finished, and this is what it gave.
+
+    Attributes:
+        clips: a row each; empty in records of older versions.
+        variety: histograms of the scene (``datagen.variety``); likewise.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -102,6 +110,8 @@ class Record(BaseModel):
     shards: list[ShardEntry]
     quarantined: list[Quarantined]
     refinement: Refinement | None = None
+    clips: list[ClipRow] = Field(default_factory=list)
+    variety: Histograms = Field(default_factory=dict)
 
 
 def plan(settings: Settings) -> list[Work]:
@@ -149,10 +159,10 @@ def scene_folder(output: Path, name: str) -> Path:
     return output / "scenes" / name
 
 
-def read_record(output: Path, item: Work) -> Record | None:
+def read_record(output: Path, name: str) -> Record | None:
     """The record of a finished scene; None if it has to be made (again)."""
     try:
-        record = Record.model_validate_json((scene_folder(output, item.name) / RECORD_NAME).read_bytes())
+        record = Record.model_validate_json((scene_folder(output, name) / RECORD_NAME).read_bytes())
     except (OSError, ValidationError):
         return None
     whole = all(_size(output / entry.name) == entry.bytes for entry in record.shards)
@@ -171,7 +181,8 @@ def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
         members = [MEMBERS[name] for name in clip_members(recipe.reference_buffers)]
         pixel = sum(member.bytes * member.channels for member in members)
         frame = recipe.width * recipe.height * pixel + 16_384
-        total += len(recipe.lights) * recipe.frames * frame + settings.surfels * SURFEL_BYTES
+        previews = preview_bytes(recipe.width, recipe.height, recipe.frames, len(members))
+        total += len(recipe.lights) * (recipe.frames * frame + previews) + settings.surfels * SURFEL_BYTES
     return total
 
 

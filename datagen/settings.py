@@ -23,7 +23,7 @@ from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounc
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
     *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
-    *("captures", "equal_error"),
+    *("captures", "equal_error", "variety_against"),
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
@@ -37,6 +37,7 @@ CAPTURED = {
     "objects": True,
     "families": True,
     "mesh_edge": True,
+    "texels_per_unit": True,
     "environment_height": True,
     "assets": True,
     "asset_names": True,
@@ -71,8 +72,15 @@ class SplitSettings(_Model):
         default=["any"] * 4,
         min_length=1,
         max_length=64,
-        description="Light family of each clip of a scene, one clip for each in the list. any draws one of "
-        "families; hdri takes one of the maps in environments.",
+        description="Light of each clip of a scene, one clip for each in the list. any draws one of "
+        "families; high, medium and low draw one of such contrast; hdri takes one of the maps in "
+        "environments.",
+    )
+    lights_share_path: bool | None = Field(
+        default=None,
+        description="All clips of a scene show it from the same cameras: each frame is path-traced under all "
+        "lights at once, which share its paths, rays and G-buffers. null: in every style but A and B, "
+        "whose clips begin at places of their own.",
     )
     frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
     width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
@@ -131,8 +139,7 @@ class CaptureSettings(_Model):
         default=["overcast", "studio", "sun"],
         min_length=1,
         max_length=64,
-        description="Light family of each capture, in rotation. any draws one of families; hdri takes one of "
-        "the maps in environments.",
+        description="Light of each capture, in rotation, as in a split's lights.",
     )
     views: int = Field(
         default=64,
@@ -163,8 +170,8 @@ class CaptureSettings(_Model):
     relights: list[LightChoice] = Field(
         default=[],
         max_length=16,
-        description="Other lights, by family, under which the held-out views are path-traced as well, into "
-        "output_dir/relit: the truth of relighting.",
+        description="Other lights, as in a split's lights, under which the held-out views are path-traced as "
+        "well, into output_dir/relit: the truth of relighting.",
     )
     relight_spp: int = Field(default=144, ge=1, description="Paths per pixel of those.")
 
@@ -183,11 +190,13 @@ class Settings(_Model):
     """Settings of ``tron-datagen``."""
 
     output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
-    mode: Literal["make", "validate", "captures", "equal_error"] = Field(
+    mode: Literal["make", "plan", "validate", "captures", "equal_error"] = Field(
         "make",
-        description="make the dataset, validate the one in output_dir and list every problem, path-trace "
-        "captures for tron-reconstruct into output_dir/captures, or measure on the test scenes in output_dir "
-        "how long the path tracer takes to be as near the truth as guidance is.",
+        description="make the dataset; plan it: print what is missing, the bytes and hours it takes and the "
+        "memory of a worker, measured by a small probe here, and render nothing else; validate the one in "
+        "output_dir and list every problem; path-trace captures for tron-reconstruct into "
+        "output_dir/captures; or measure on the test scenes in output_dir how long the path tracer takes to "
+        "be as near the truth as guidance is.",
     )
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."
@@ -221,8 +230,9 @@ class Settings(_Model):
     )
     families: list[Family] | None = Field(
         None,
-        description="Light families that 'any' draws from, a list as above; null: [hdri] where environments "
-        f"is given, else [{', '.join(PROCEDURAL)}].",
+        description="Light families that any, high, medium and low draw from, a list as above; null: [hdri] "
+        f"where environments is given; else any draws from [{', '.join(PROCEDURAL)}] in styles A and B, and "
+        "all else from every family but hdri.",
         examples=["[sun,overcast]"],
     )
     views: int = Field(64, ge=1, description="Views whose G-buffers the surfels are made from.")
@@ -269,7 +279,15 @@ class Settings(_Model):
         0.04,
         gt=0,
         le=1,
-        description="Longest edge of procedural meshes in world units; patterns are that sharp.",
+        description="Longest edge of procedural meshes in world units.",
+    )
+    texels_per_unit: float | None = Field(
+        None,
+        gt=0,
+        le=4096,
+        description="Texels a world unit of the textures on procedural pieces; null: two a pixel of frames "
+        "and views at the median distance of their cameras from the nearest thing. A scene has 4 million at "
+        "most; where that is too few, the log says how many a unit they are.",
     )
     environment_height: int = Field(
         256, ge=8, le=8192, description="Rows of the lat-long maps that lights are baked to."
@@ -296,6 +314,10 @@ class Settings(_Model):
         description="Names of assets and maps to use although the catalogue has no licence.",
     )
     only: list[str] = Field(default_factory=list, description="Make these scenes only, such as train-000012.")
+    variety_against: Path | None = Field(
+        None,
+        description="Folder of another dataset whose histograms are drawn beside this one's in README.md.",
+    )
     clips_per_shard: int = Field(
         64, ge=1, description="Maximum number of clips of a shard; no shard spans two scenes."
     )
@@ -367,7 +389,7 @@ class Settings(_Model):
         return self
 
     def _ask_hdri(self, lights: list[LightChoice]) -> bool:
-        return "hdri" in {*lights, *self.light_families()}
+        return "hdri" in {*lights, *(self.light_families() or ())}
 
     def split(self, name: str) -> SplitSettings:
         """The settings of one split."""
@@ -382,11 +404,11 @@ class Settings(_Model):
         """The splits that have scenes."""
         return [name for name in SPLITS if self.split(name).scenes]
 
-    def light_families(self) -> list[Family]:
-        """The families that ``any`` chooses from."""
+    def light_families(self) -> list[Family] | None:
+        """The families that ``any`` chooses from; None: the style's own."""
         if self.families is not None:
             return list(self.families)
-        return ["hdri"] if self.environments is not None else list(PROCEDURAL)
+        return ["hdri"] if self.environments is not None else None
 
     def recipe(self) -> dict[str, Any]:
         """Keys that decide a scene's content, plain values: not where it goes, who makes it or how many."""

@@ -11,6 +11,8 @@ import numpy as np
 import trimesh
 from trimesh import Trimesh
 
+from datagen.shapes.shape import Kind
+
 
 def _between(fraction: float, low: float, high: float) -> float:
     return float(low + fraction * (high - low))
@@ -131,7 +133,7 @@ def _superquadric(p: np.ndarray) -> Trimesh:
     return mesh
 
 
-PRIMITIVES: dict[str, Callable[[np.ndarray], Trimesh]] = {
+_BUILDERS: dict[str, Callable[[np.ndarray], Trimesh]] = {
     "sphere": _sphere,
     "box": _box,
     "cylinder": _cylinder,
@@ -145,3 +147,10 @@ PRIMITIVES: dict[str, Callable[[np.ndarray], Trimesh]] = {
     "knot": _knot,
     "superquadric": _superquadric,
 }
+
+
+def _kind(build: Callable[[np.ndarray], Trimesh]) -> Kind:
+    return Kind(lambda parameters, _rng: [(build(parameters), 0)], seeded=False)
+
+
+PRIMITIVES: dict[str, Kind] = {name: _kind(build) for name, build in _BUILDERS.items()}

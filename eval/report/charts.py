@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from tron.report.colours import LINE_COLOURS
 from tron.report.page import Chart
 
 INK = "#123456"
 """Stands for the page's text colour while matplotlib draws; replaced by ``currentColor`` afterwards."""
-LINE_COLOURS = ("#3d85c6", "#d9822b", "#4a9d5f", "#a064c8", "#c0504d", "#7f7f7f")
 BAR_COLOURS = (*LINE_COLOURS, "#c9a227", "#5aa7a7")
 CLOCK = "seconds"
 

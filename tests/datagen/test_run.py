@@ -87,14 +87,14 @@ def test_a_dataset_is_whole_and_has_everything_beside_its_shards(dataset):
     for name in (
         "config.yaml",
         "index.html",
-        "card.md",
+        "README.md",
         "scenes/train-000001/spec.json",
         "previews/test-00000.png",
     ):
         assert (dataset / name).is_file()
     GaussianScene.load(dataset / "scenes/train_b-000000/surfels.ply").validate()
     assert not (dataset / "failures.jsonl").exists()
-    card = (dataset / "card.md").read_text()
+    card = (dataset / "README.md").read_text()
     assert "| train | 2 | 4 | 8 | 16 x 12 |" in card
     assert "mitsuba" in card
     page = (dataset / "index.html").read_text()
@@ -195,7 +195,7 @@ def test_the_recipe_of_models_makes_test_scenes_alone_under_every_map(variant, t
     clips = list(read_clips(tmp_path / "out", "test", ("lit", "lit_reflections")))
     assert {clip.meta.light_family for clip in clips} == {"hdri"}
     # with maps held out only the last of the four would light the test split
-    assert len({clip.meta.extra["light_spec"]["path"] for clip in clips}) > 1
+    assert len({json.loads(clip.meta.extra["light_spec"])["path"] for clip in clips}) > 1
     spec = SceneSpec.model_validate_json((tmp_path / "out/scenes/test-000000/spec.json").read_text())
     assert {item.asset for item in spec.objects} == {"box"}
 
@@ -344,6 +344,7 @@ def test_failures_are_listed_and_retried_by_their_command(dataset, unfinished, f
 def test_values_that_are_not_finite_never_reach_a_shard(tmp_path, monkeypatch):
     def spoilt(*arguments):
         for meta, frames in make_clips(*arguments):
+            frames = list(frames)
             if meta.key == "test-000000-l1":
                 frames[1]["pbr"][3, 4] = np.nan
             yield meta, frames
@@ -407,7 +408,7 @@ def test_config_says_how_it_was_made_and_not_where(dataset):
     config = yaml.safe_load((dataset / "config.yaml").read_text())
     assert config["scenes"] == {"train": 2, "train_b": 1, "validation": 1, "test": 1}
     assert str(dataset) not in (dataset / "config.yaml").read_text()
-    assert str(dataset) not in (dataset / "card.md").read_text()
+    assert str(dataset) not in (dataset / "README.md").read_text()
 
 
 @pytest.mark.long
