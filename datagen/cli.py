@@ -6,6 +6,7 @@ from datagen.capture_export import make_captures
 from datagen.equal_error import measure_equal_error
 from datagen.run import make
 from datagen.settings import Settings
+from datagen.sharing import measure_sharing
 from datagen.validate import validate
 from tron.cli.command_line import command
 
@@ -16,9 +17,10 @@ def main(settings: Settings) -> int:
     Scenes are drawn from seeds, path-traced by Mitsuba, turned into surfels and rendered again by TRON's
     tracer; the pairs land in tar shards with a manifest. With mode=captures scenes are path-traced from all
     sides instead, with true maps, as folders that tron-reconstruct and nerfstudio read. With mode=equal_error
-    guidance of a dataset's test scenes is held against the path tracer: equal_error.json. An interrupted run
-    resumes. The exit code is 1 if a scene could not be made (failures.jsonl
-    says why, that of captures lies among them) or if validation found a problem.
+    guidance of a dataset's test scenes is held against the path tracer: equal_error.json. With
+    mode=sharing frames under many lights at once are held against frames one by one: sharing.json. An
+    interrupted run resumes. The exit code is 1 if a scene could not be made (failures.jsonl says why, that of
+    captures lies among them) or if validation found a problem.
     """
     if settings.mode == "validate":
         return 1 if validate(settings.output_dir) else 0
@@ -26,6 +28,9 @@ def main(settings: Settings) -> int:
         return 1 if make_captures(settings) else 0
     if settings.mode == "equal_error":
         measure_equal_error(settings)
+        return 0
+    if settings.mode == "sharing":
+        measure_sharing(settings)
         return 0
     return 1 if make(settings) else 0
 
