@@ -178,8 +178,7 @@ def find_environments(
 
 @lru_cache(maxsize=4096)
 def _contrast(path: str, _sha256: str) -> Contrast:
-    environment = EnvironmentMap.load(path)
-    return classify(environment.resized(min(128, environment.image.shape[0])))
+    return classify(EnvironmentMap.load(path))
 
 
 def for_split(maps: Sequence[HdriSpec], split: str) -> list[HdriSpec]:

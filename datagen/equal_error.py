@@ -23,6 +23,7 @@ import numpy as np
 
 from datagen.assets import load_models
 from datagen.build import Geometry, build
+from datagen.density import texels_per_unit
 from datagen.lights import HdriSpec
 from datagen.pathtrace import gbuffers, render_frames
 from datagen.plan import Work, chosen, find_sources, plan, scene_folder
@@ -79,7 +80,8 @@ def measure_equal_error(settings: Settings) -> None:
     for item in scenes:
         spec = SceneSpec.model_validate_json(_surfels(settings, item).with_name("spec.json").read_bytes())
         scene = GaussianScene.load(_surfels(settings, item))
-        cases += _judge_scene(spec, build(spec, models, settings.mesh_edge), scene, settings)
+        geometry = build(spec, models, settings.mesh_edge, texels_per_unit(spec, settings))
+        cases += _judge_scene(spec, geometry, scene, settings)
         record = {"machine": describe_machine(), "cases": cases}
         write_atomic(settings.output_dir / RESULT_NAME, json.dumps(record, indent=1) + "\n")
 

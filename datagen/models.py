@@ -2,8 +2,8 @@
 
 Textures become linear float32 images; the glTF metallic-roughness model maps one to one onto Mitsuba's
 ``principled``. Surfels and shadow rays know opaque surfaces only, so transparency is decided once, here:
-triangles whose alpha is below the cut-off (one half where the material blends) are left out, the others
-become opaque. Path tracer, G-buffers and reference then agree on what is there.
+what is below the cut-off of alpha (one half where the material blends) is cut away, the rest becomes
+opaque. Path tracer, G-buffers and reference then agree on what is there.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from PIL import Image
 from trimesh import Trimesh
 from trimesh.visual.color import ColorVisuals
 
+from datagen.alpha import without_clear
 from datagen.gltf.document import confined
 from datagen.gltf.images import pixels, require_size
 from datagen.gltf.meshes import read_parts
-from datagen.parts import Part, split_mirrored, without_clear, without_slivers
+from datagen.parts import Part, split_mirrored, without_slivers
 from tron.color import srgb_to_linear
 from tron.errors import TronError
 

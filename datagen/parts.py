@@ -119,21 +119,6 @@ def without_slivers(part: Part) -> Part:
     )
 
 
-def without_clear(part: Part, alpha: np.ndarray, cutoff: float, vertex_alpha: np.ndarray | None) -> Part:
-    """The part without triangles whose mean alpha is below the cut-off.
-
-    Args:
-        part: its ``sampling`` of ``base_color`` is that of alpha.
-        alpha: (h, w) in [0, 1].
-        cutoff: least alpha that stays.
-        vertex_alpha: (V,) factor of it, or None.
-    """
-    mean = _face_alpha(part, alpha)
-    if vertex_alpha is not None:
-        mean = mean * vertex_alpha[part.faces].mean(axis=1)
-    return replace(part, faces=part.faces[mean >= cutoff])
-
-
 def split_mirrored(part: Part) -> list[Part]:
     """Separate triangles whose texture is mirrored: there the bitangent points down, so normals flip in y.
 
@@ -153,24 +138,3 @@ def split_mirrored(part: Part) -> list[Part]:
         replace(part, faces=part.faces[mirrored], normal_map=flipped),
     ]
     return [half for half in halves if len(half.faces)]
-
-
-def _face_alpha(part: Part, alpha: np.ndarray) -> np.ndarray:
-    """(F,) mean alpha at each triangle's centre and halfway to its corners."""
-    if part.uv is None:
-        return np.full(len(part.faces), float(alpha.mean()))
-    corners = part.uv[part.faces]
-    centre = corners.mean(axis=1, keepdims=True)
-    uv = np.concatenate([centre, 0.5 * (corners + centre)], axis=1)
-    matrix, wrap = part.sampling.get("base_color", Sampling(np.eye(3), "repeat"))
-    uv = _wrapped(uv @ matrix[:2, :2].T + matrix[:2, 2], wrap)
-    rows = np.clip((uv[..., 1] * alpha.shape[0]).astype(int), 0, alpha.shape[0] - 1)
-    columns = np.clip((uv[..., 0] * alpha.shape[1]).astype(int), 0, alpha.shape[1] - 1)
-    return alpha[rows, columns].mean(axis=1)
-
-
-def _wrapped(uv: np.ndarray, wrap: Wrap) -> np.ndarray:
-    """Coordinates within [0, 1]."""
-    if wrap == "clamp":
-        return np.clip(uv, 0.0, 1.0)
-    return uv % 1.0 if wrap == "repeat" else 1.0 - np.abs(uv % 2.0 - 1.0)

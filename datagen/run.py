@@ -23,6 +23,7 @@ from datagen.clip_preview import thumbnail_name, write_preview
 from datagen.clip_rows import ClipRow, clip_row
 from datagen.clock import stage
 from datagen.clusters import logs_folder, require_cluster
+from datagen.density import texels_per_unit
 from datagen.failures import Failure, summary
 from datagen.lights import LightChoice
 from datagen.parts import outline
@@ -176,7 +177,7 @@ def draw_and_build(
         path_frames=settings.path_frames,
         lights_share_path=recipe.lights_share_path,
     )
-    return spec, build(spec, models, settings.mesh_edge)
+    return spec, build(spec, models, settings.mesh_edge, texels_per_unit(spec, settings))
 
 
 def _set_aside(path: Path, frames: Sequence[dict[str, np.ndarray]]) -> None:

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from pydantic import Field
 
-from datagen.lights import FAMILIES, PROCEDURAL, Family, HdriSpec, LightChoice, LightSpec
+from datagen.lights import EVERY, PROCEDURAL, Family, HdriSpec, LightChoice, LightSpec, draw_light
 from datagen.objects import ObjectSpec
 from datagen.paths import PathSpec
 from datagen.spec import Spec
@@ -52,6 +52,7 @@ class SceneSpec(Spec):
         surroundings: floor, walls, terrain; their object ids count from 1.
         objects: their ids go on from there.
         left_out: objects that found no place.
+        metered: clips are exposed for what they show, not for the light.
     """
 
     version: int = SPEC_VERSION
@@ -63,6 +64,7 @@ class SceneSpec(Spec):
     surroundings: tuple[ObjectSpec, ...]
     objects: tuple[ObjectSpec, ...]
     left_out: int
+    metered: bool = False
     lights: tuple[LightSpec, ...] = Field(min_length=1)
     cameras: CameraSpec
 
@@ -100,7 +102,7 @@ def draw_scene(
     *,
     style: StyleChoice,
     lights: Sequence[LightChoice],
-    families: Sequence[Family] = PROCEDURAL,
+    families: Sequence[Family] | None = None,
     environments: Sequence[HdriSpec] = (),
     choice: Choice | None = None,
     frames: int = 5,
@@ -113,8 +115,8 @@ def draw_scene(
         seed: the run's root seed.
         split, index: which scene; they name its random streams.
         style: what stands there and how it is filmed; ``mixed`` draws one of MIXED.
-        lights: a family for each light of the scene; ``any`` draws one of ``families``.
-        families: what ``any`` chooses from.
+        lights: for each light of the scene a family, ``any`` of ``families``, or a class of contrast.
+        families: what ``any`` and classes choose from; None: the style's own, and every one.
         environments: files for the family ``hdri``.
         choice: what the recipe says of objects; None leaves it to the style.
         frames, path_frames: length of a clip and of the path it is cut from.
@@ -134,6 +136,11 @@ def draw_scene(
         made = STYLES[style](streams, choice or Choice())
     except TronError as error:
         raise TronError(error.what, error.where or scene_name(split, index), error.mend) from error
+    own = PROCEDURAL if style not in MIXED else EVERY
+    drawn = [
+        draw_light(streams("light", k), wanted, families or (own if wanted == "any" else EVERY), environments)
+        for k, wanted in enumerate(lights)
+    ]
     shared = style not in OLD if lights_share_path is None else lights_share_path
     rng = streams("clips")
     first = [int(rng.integers(path_frames - frames + 1)) for _ in (lights[:1] if shared else lights)]
@@ -146,7 +153,8 @@ def draw_scene(
         surroundings=made.surroundings,
         objects=made.objects,
         left_out=made.left_out,
-        lights=tuple(_draw_lights(seed, split, index, lights, families, environments)),
+        metered=made.metered,
+        lights=tuple(drawn),
         cameras=CameraSpec(
             capture=made.capture,
             film=made.film,
@@ -154,19 +162,3 @@ def draw_scene(
             first_frame=first[0] if shared else tuple(first),
         ),
     )
-
-
-def _draw_lights(
-    seed: int,
-    split: str,
-    index: int,
-    lights: Sequence[LightChoice],
-    families: Sequence[Family],
-    environments: Sequence[HdriSpec],
-) -> list[LightSpec]:
-    drawn = []
-    for k, wanted in enumerate(lights):
-        rng = generator(seed, split, index, "light", k)
-        family = families[int(rng.integers(len(families)))] if wanted == "any" else wanted
-        drawn.append(FAMILIES[family].draw(rng, environments))
-    return drawn

@@ -37,6 +37,7 @@ CAPTURED = {
     "objects": True,
     "families": True,
     "mesh_edge": True,
+    "texels_per_unit": True,
     "environment_height": True,
     "assets": True,
     "asset_names": True,
@@ -71,8 +72,9 @@ class SplitSettings(_Model):
         default=["any"] * 4,
         min_length=1,
         max_length=64,
-        description="Light family of each clip of a scene, one clip for each in the list. any draws one of "
-        "families; hdri takes one of the maps in environments.",
+        description="Light of each clip of a scene, one clip for each in the list. any draws one of "
+        "families; high, medium and low draw one of such contrast; hdri takes one of the maps in "
+        "environments.",
     )
     lights_share_path: bool | None = Field(
         default=None,
@@ -137,8 +139,7 @@ class CaptureSettings(_Model):
         default=["overcast", "studio", "sun"],
         min_length=1,
         max_length=64,
-        description="Light family of each capture, in rotation. any draws one of families; hdri takes one of "
-        "the maps in environments.",
+        description="Light of each capture, in rotation, as in a split's lights.",
     )
     views: int = Field(
         default=64,
@@ -169,8 +170,8 @@ class CaptureSettings(_Model):
     relights: list[LightChoice] = Field(
         default=[],
         max_length=16,
-        description="Other lights, by family, under which the held-out views are path-traced as well, into "
-        "output_dir/relit: the truth of relighting.",
+        description="Other lights, as in a split's lights, under which the held-out views are path-traced as "
+        "well, into output_dir/relit: the truth of relighting.",
     )
     relight_spp: int = Field(default=144, ge=1, description="Paths per pixel of those.")
 
@@ -245,8 +246,9 @@ class Settings(_Model):
     )
     families: list[Family] | None = Field(
         None,
-        description="Light families that 'any' draws from, a list as above; null: [hdri] where environments "
-        f"is given, else [{', '.join(PROCEDURAL)}].",
+        description="Light families that any, high, medium and low draw from, a list as above; null: [hdri] "
+        f"where environments is given; else any draws from [{', '.join(PROCEDURAL)}] in styles A and B, and "
+        "all else from every family but hdri.",
         examples=["[sun,overcast]"],
     )
     views: int = Field(64, ge=1, description="Views whose G-buffers the surfels are made from.")
@@ -293,7 +295,15 @@ class Settings(_Model):
         0.04,
         gt=0,
         le=1,
-        description="Longest edge of procedural meshes in world units; patterns are that sharp.",
+        description="Longest edge of procedural meshes in world units.",
+    )
+    texels_per_unit: float | None = Field(
+        None,
+        gt=0,
+        le=4096,
+        description="Texels a world unit of the textures on procedural pieces; null: two a pixel of frames "
+        "and views at the median distance of their cameras from the nearest thing. A scene has 4 million at "
+        "most; where that is too few, the log says how many a unit they are.",
     )
     environment_height: int = Field(
         256, ge=8, le=8192, description="Rows of the lat-long maps that lights are baked to."
@@ -395,7 +405,7 @@ class Settings(_Model):
         return self
 
     def _ask_hdri(self, lights: list[LightChoice]) -> bool:
-        return "hdri" in {*lights, *self.light_families()}
+        return "hdri" in {*lights, *(self.light_families() or ())}
 
     def split(self, name: str) -> SplitSettings:
         """The settings of one split."""
@@ -410,11 +420,11 @@ class Settings(_Model):
         """The splits that have scenes."""
         return [name for name in SPLITS if self.split(name).scenes]
 
-    def light_families(self) -> list[Family]:
-        """The families that ``any`` chooses from."""
+    def light_families(self) -> list[Family] | None:
+        """The families that ``any`` chooses from; None: the style's own."""
         if self.families is not None:
             return list(self.families)
-        return ["hdri"] if self.environments is not None else list(PROCEDURAL)
+        return ["hdri"] if self.environments is not None else None
 
     def recipe(self) -> dict[str, Any]:
         """Keys that decide a scene's content, plain values: not where it goes, who makes it or how many."""

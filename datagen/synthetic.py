@@ -10,7 +10,7 @@ import numpy as np
 
 from datagen.build import Geometry
 from datagen.clock import stage
-from datagen.lights import classify
+from datagen.lights import classify, contrast_share
 from datagen.pathtrace import (
     DirectIrradiance,
     direct_irradiance,
@@ -195,7 +195,7 @@ def _meta(spec: SceneSpec, lit: _Lit, cameras: Sequence[Camera], recipe: SplitSe
         extra={
             "style": spec.style,
             "contrast": classify(lit.environment),
-            "contrast_share": round(lit.environment.contrast(), 4),
+            "contrast_share": contrast_share(lit.environment),
             "light_spec": light.model_dump_json(),  # text: families differ in their keys, and tables cannot
         },
     )

@@ -20,7 +20,7 @@ from datagen.materials import Material
 
 log = logging.getLogger(__name__)
 
-MOST_TEXELS = 2**23
+MOST_TEXELS = 2**22
 """Texels of an atlas at most. A scene that needs more has fewer a unit."""
 
 ROUNDS = 8

@@ -1,6 +1,6 @@
 """Images tinted per vertex: glTF multiplies a texture by the colours of the vertices."""
 
-# pyright: reportArgumentType=false, reportIncompatibleMethodOverride=false, reportAttributeAccessIssue=false
+# pyright: reportArgumentType=false, reportIncompatibleMethodOverride=false, reportReturnType=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
 from functools import cache

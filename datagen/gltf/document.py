@@ -163,4 +163,4 @@ def _mapped(path: Path) -> memoryview:
     """A file's bytes, read when they are needed."""
     if path.stat().st_size == 0:
         raise TronError("file is empty", path)
-    return memoryview(np.memmap(path, np.uint8, "r"))
+    return np.memmap(path, np.uint8, "r").data

@@ -59,7 +59,9 @@ def reads_ktx2() -> bool:
 
 def _decode_ktx2(data: bytes) -> np.ndarray:
     if not reads_ktx2():
-        raise TronError("textures are KTX2, which needs opengl_basisu", mend="pip install tron[ktx2]")
+        raise TronError(
+            "textures are KTX2, which needs opengl_basisu", mend="pip install 'tron-relight[ktx2]'"
+        )
     import opengl_basisu
 
     if len(data) < 80:

@@ -60,11 +60,12 @@ class Material:
 
 
 class Materials:
-    """The materials of a file; images are decoded once."""
+    """The materials of a file; each is made once, and each image decoded once."""
 
     def __init__(self, document: Document):
         self._document = document
         self._images: dict[int, np.ndarray] = {}
+        self._read: dict[tuple[int, frozenset[int]], Material] = {}
 
     def read(self, index: int | None, texcoords: frozenset[int]) -> Material:
         """Material of a primitive.
@@ -75,6 +76,11 @@ class Materials:
         """
         if index is None:
             return Material(np.ones(3, np.float32))
+        if (index, texcoords) not in self._read:
+            self._read[index, texcoords] = self._made(index, texcoords)
+        return self._read[index, texcoords]
+
+    def _made(self, index: int, texcoords: frozenset[int]) -> Material:
         material = self._document.item("materials", index)
         extensions = material.get("extensions", {})
         glossy = extensions.get("KHR_materials_pbrSpecularGlossiness")
@@ -146,11 +152,14 @@ def transform_matrix(transform: dict[str, Any]) -> np.ndarray:
 
 
 def scaled_normals(image: np.ndarray, scale: float) -> np.ndarray:
-    """(h, w, 3) float32 unit normals as (n + 1) / 2; ``scale`` multiplies x and y of the stored ones."""
-    normals = image[..., :3].astype(np.float32) / 127.5 - 1.0
-    normals[..., :2] *= scale
-    normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-6)
-    return 0.5 * normals + 0.5
+    """(h, w, 3) float32 normals as (n + 1) / 2, x and y of the stored ones multiplied by ``scale``.
+
+    Their length is left to the look-up, which filters them first (glTF 2.0, section 3.9.3).
+    """
+    stored = image[..., :3] * np.float32(1 / 255)
+    if scale != 1.0:
+        stored[..., :2] = (stored[..., :2] - 0.5) * np.float32(scale) + 0.5
+    return stored
 
 
 def metallic_of(
@@ -204,19 +213,20 @@ def _from_specular(read: _Reader, glossy: dict[str, Any]) -> Material:
         elif own.texcoord != use.texcoord or not np.allclose(own.matrix, use.matrix):
             raise TronError("diffuse and specular textures of a material do not lie on each other")
     diffuse = result.base_color.astype(np.float64)
-    size = max((x.shape[:2] for x in (diffuse, specular) if x.ndim == 3), default=())
-    if size:
+    sizes = [(x.shape[0], x.shape[1]) for x in (diffuse, specular) if x.ndim == 3]
+    if sizes:
+        size = max(sizes)
         diffuse, specular = (_resized(x, size) for x in (diffuse, specular))
         shine = _resized(shine[..., None], size)[..., 0]
         result.uses.setdefault("roughness", result.uses["base_color"])
     base, roughness, metallic = metallic_of(diffuse, specular, shine)
     result.base_color = base.astype(np.float32)
-    result.roughness = roughness.astype(np.float32) if size else float(roughness)
-    result.metallic = metallic.astype(np.float32) if size else float(metallic)
+    result.roughness = roughness.astype(np.float32) if sizes else float(roughness)
+    result.metallic = metallic.astype(np.float32) if sizes else float(metallic)
     return result
 
 
-def _resized(values: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+def _resized(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """(h, w, C) of an image or of a constant (C,)."""
     if values.ndim == 1:
         return np.broadcast_to(values, (*size, len(values)))

@@ -10,14 +10,15 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from datagen.alpha import without_clear
 from datagen.gltf.accessors import element_count, meant, read_raw, read_values
 from datagen.gltf.document import Document, read_document
 from datagen.gltf.draco import decode_primitive
 from datagen.gltf.materials import Material, Materials, TextureUse
-from datagen.parts import Part, Sampling, Wrap, joined, without_clear
+from datagen.parts import Part, Sampling, Wrap, joined
 from tron.errors import TronError
 
-MOST_INSTANCES = 100_000
+MOST_NODES = 20_000
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 
@@ -61,6 +62,8 @@ def _instances(document: Document) -> list[tuple[int, np.ndarray]]:
     """(mesh, (4, 4) to the scene's frame) of every node with a mesh, parents before children."""
     scenes = document.tree.get("scenes", [])
     nodes = document.tree.get("nodes", [])
+    if len(nodes) > MOST_NODES:
+        raise TronError(f"model has more than {MOST_NODES:,} nodes", mend="join its meshes")
     if scenes:
         roots = document.item("scenes", document.tree.get("scene", 0)).get("nodes", [])
     else:
@@ -107,8 +110,6 @@ def _require_few(document: Document, instances: list[tuple[int, np.ndarray]], mo
         announced[mesh] = sum(_triangles(document, primitive) for primitive in primitives)
     if sum(announced[mesh] for mesh, _ in instances) > most:
         raise TronError(f"model has more than {most:,} triangles", mend="simplify it")
-    if len(instances) > MOST_INSTANCES:
-        raise TronError(f"model has more than {MOST_INSTANCES:,} nodes with a mesh", mend="join them")
 
 
 def _triangles(document: Document, primitive: dict[str, Any]) -> int:
@@ -216,9 +217,8 @@ def _normals(geometry: _Geometry) -> np.ndarray:
         a, b, c = (positions[faces[:, i]] for i in range(3))
         cross = np.cross(b - a, c - a)
         size = np.linalg.norm(cross, axis=1, keepdims=True)
-        own = trimesh.geometry.mean_vertex_normals(
-            len(positions), faces, np.divide(cross, size, out=np.zeros_like(cross), where=size > 0)
-        )
+        flat = np.divide(cross, size, out=np.zeros_like(cross), where=size > 0)
+        own = np.asarray(trimesh.geometry.mean_vertex_normals(len(positions), faces, flat))
         found = np.linalg.norm(own, axis=1) > 0.5
         own[~found] = (0.0, 0.0, 1.0)
         normals[bad], length[bad] = own[bad], np.linalg.norm(own[bad], axis=1)

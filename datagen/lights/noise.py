@@ -14,7 +14,7 @@ _TURN = 0.65  # radians between octaves, so that their lattices do not show
 
 
 class Fractal:
-    """Sum of octaves of value noise in the plane (Perlin 1985; Musgrave 1989), a function of the seed alone."""
+    """Sum of octaves of value noise in the plane (Perlin 1985; Musgrave 1989), by the seed alone."""
 
     def __init__(self, seed: int, name: str) -> None:
         lattice = generator(seed, "fractal", name).random((LATTICE, LATTICE), np.float32)

@@ -12,7 +12,12 @@ from datagen.materials.noise import fbm, worley
 from datagen.shapes.shape import Role
 from datagen.spec import Number, Triple
 
-GREENS: tuple[Triple, ...] = ((0.07, 0.17, 0.03), (0.12, 0.24, 0.05), (0.04, 0.10, 0.035), (0.17, 0.25, 0.10))
+GREENS: tuple[Triple, ...] = (
+    (0.07, 0.14, 0.03),
+    (0.11, 0.19, 0.045),
+    (0.04, 0.09, 0.035),
+    (0.16, 0.21, 0.09),
+)
 AUTUMN: tuple[Triple, ...] = ((0.48, 0.26, 0.03), (0.40, 0.09, 0.03), (0.24, 0.11, 0.04))
 
 
@@ -49,7 +54,7 @@ class LeafSpec(Solid):
         cloud = fbm(points * 2.5, 4)
         net = worley(points / self.vein + 0.3 * cloud)
         vein = 1.0 - smoothstep(0.02, 0.16, net.second - net.first)
-        old = smoothstep(0.25, -0.25, cloud + (1.1 - 2.2 * self.age))
+        old = 0.9 * smoothstep(0.55, -0.45, cloud + (1.3 - 2.6 * self.age))
         color = mix(column(self.green), column(self.turning), old) * (1.0 + 0.25 * cloud)
         pale = np.array([[1.6], [1.45], [1.5]], np.float32)
         color = mix(color, color * pale, 0.7 * vein) * (0.9 + 0.2 * net.random[0])

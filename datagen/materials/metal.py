@@ -85,7 +85,7 @@ class MetalSpec(Solid):
         elif self.finish == "scratched":
             scratch = self._scratches(points, normals)
             rough = rough + 0.3 * scratch
-            color, height = color * (1.0 - 0.15 * scratch), -0.0022 * scratch
+            color, height = color * (1.0 - 0.15 * scratch), -0.0012 * scratch
         elif self.finish == "hammered":
             dents = worley(points / self.scale, 0.8)
             height = (0.16 * self.scale) * np.minimum(dents.first, 0.75) ** 2

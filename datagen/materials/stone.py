@@ -64,9 +64,9 @@ class StoneSpec(Solid):
         return self._massive(points, base)
 
     def _granite(self, points: np.ndarray, base: np.ndarray) -> Look:
-        cells = worley(points / self.grain)
+        cells = worley(points / (0.6 * self.grain))
         kind = cells.random[0]
-        shade = np.where(kind < 0.2, 0.22, np.where(kind < 0.62, 0.85, 1.45)) + 0.25 * (cells.random[1] - 0.5)
+        shade = np.where(kind < 0.15, 0.35, np.where(kind < 0.65, 0.9, 1.3)) + 0.25 * (cells.random[1] - 0.5)
         cloud = fbm(points * 1.5, 2)
         quartz = (kind > 0.8).astype(np.float32)
         color = mix(base * shade, (0.62) * (0.8 + 0.4 * cells.random[2]), 0.7 * quartz)

@@ -57,9 +57,9 @@ class WoodSpec(Solid):
         return cls(
             offset=draw_offset(rng),
             axis=tuple(axis.tolist()),
-            ring=between(rng, 0.03, 0.09),
+            ring=between(rng, 0.05, 0.13),
             early=early,
-            late=darker(early, rng.uniform(0.4, 0.75)),
+            late=darker(early, rng.uniform(0.45, 0.75)),
             roughness=rng.uniform(0.25, 0.8),
             plank=between(rng, 0.15, 0.45) if planks else 0.0,
         )
@@ -72,10 +72,14 @@ class WoodSpec(Solid):
         along = np.stack([p[0] * 1.3, p[1] * 1.3, p[2] * 0.35])
         bend = fbm(along, 3)
         # The pith lies beside most pieces: what is cut from a trunk shows arcs, rarely whole rings.
-        radius = np.hypot(p[0] % 4.0 - 2.0, p[1] % 4.0 - 2.3) + 0.12 * bend
-        year = radius / self.ring
+        radius = np.hypot(p[0] % 4.0 - 2.0, p[1] % 4.0 - 2.3) + 0.16 * bend
+        # Good years are wide, poor ones narrow and pale.
+        year = radius / self.ring + 1.1 * gradient_noise(
+            np.stack([0.4 * radius / self.ring, 0 * bend, 0 * bend])
+        )
         phase = year - np.floor(year)
-        late = smoothstep(0.35, 0.85, phase) * (1.0 - smoothstep(0.92, 1.0, phase))
+        late = smoothstep(0.2, 0.9, phase) * (1.0 - smoothstep(0.9, 1.0, phase))
+        late = late * (0.35 + 0.65 * cell_random(np.floor(year))[0])
         # Fibres at a fixed width, as seen: finer ones are below what a picture resolves.
         fibre = gradient_noise(np.stack([p[0] * 28.0, p[1] * 28.0, p[2] * 1.6]))
         pore = smoothstep(0.25, 0.6, fibre) * (0.35 + 0.65 * late)

@@ -51,7 +51,7 @@ def leaf(
 
 
 def _placed(solid: Manifold, at: np.ndarray, azimuth: float, rise: float, roll: float = 0.0) -> Manifold:
-    turn = Rotation.from_euler("zyx", [azimuth, -rise, roll]).as_matrix()
+    turn = Rotation.from_euler("ZYX", [azimuth, -rise, roll]).as_matrix()
     return solid.transform(np.column_stack([turn, at]))
 
 

@@ -235,7 +235,7 @@ SURROUNDINGS: dict[str, Surrounding] = {
         roles=("wood", "wood"),
         standing=lambda _p, _rng: _over((0.68, 0.68), 0.0),
     ),
-    "backdrop": Surrounding(backdrop, upright=True, roles=("paper",), standing=_backdrop_space),
+    "backdrop": Surrounding(backdrop, upright=True, roles=("plaster",), standing=_backdrop_space),
     "room_shell": Surrounding(
         room_shell, upright=True, roles=("plaster", "wood", "plaster", "wood"), standing=_room_space
     ),

@@ -18,7 +18,7 @@ from datagen.materials.pattern import Palette
 from datagen.objects import ObjectSpec
 from datagen.paths import OscillatingPath, SpiralPath
 from datagen.shapes import ShapeSpec, draw_shape, make_pieces
-from datagen.styles.arrangement import Arrangement, Choice, Streams
+from datagen.styles.composition import Choice, Composition, Streams
 from tron.errors import TronError
 
 LAYOUT_EDGE = 0.5
@@ -49,7 +49,7 @@ DISTRIBUTIONS: dict[Palette, Distribution] = {
 }
 
 
-def primitives(palette: Palette, streams: Streams, choice: Choice) -> Arrangement:
+def primitives(palette: Palette, streams: Streams, choice: Choice) -> Composition:
     """Draw a scene of style A or B.
 
     Raises:
@@ -99,7 +99,7 @@ def primitives(palette: Palette, streams: Streams, choice: Choice) -> Arrangemen
         amplitude_deg=rng.uniform(8.0, 15.0),
         azimuth_deg=(start, start + 321.0),
     )
-    return Arrangement((floor,), placed, len(drawn) - len(placed), (capture,), film)
+    return Composition((floor,), placed, len(drawn) - len(placed), (capture,), film)
 
 
 STYLE_A = partial(primitives, "A")

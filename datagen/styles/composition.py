@@ -31,7 +31,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Arrangement:
+class Composition:
     """A scene without its light.
 
     Attributes:
@@ -40,6 +40,7 @@ class Arrangement:
         left_out: how many more were drawn and found no place.
         capture: paths of the views that surfels are made from, each taking an equal share of them.
         film: path that clips are cut from.
+        metered: frames are exposed for what they show, as a camera does indoors, not for the light outside.
     """
 
     surroundings: tuple[ObjectSpec, ...]
@@ -47,3 +48,4 @@ class Arrangement:
     left_out: int
     capture: tuple[PathSpec, ...]
     film: PathSpec
+    metered: bool = False
