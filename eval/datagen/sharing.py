@@ -66,7 +66,7 @@ class Sharing:
         caption = (
             f"A frame of {first['pixels']} pixels under {first['lights']} lights, half of high contrast and "
             "half of low: path-traced light by light by Mitsuba's path, and under all at once, at the same "
-            "mean over lights of the relative squared error. Paths of a pixel, and medians of interleaved rounds."
+            "mean over lights of the relative squared error. Medians of interleaved rounds."
         )
         headings = ["scene", "paths one by one", "paths together", "one by one", "together", "gain"]
         note = "A row a light: the truth, one by one, together, and eight times the errors of both."

@@ -164,6 +164,7 @@ def test_a_clip_is_consecutive_frames_of_the_path():
 
 def test_lights_that_share_a_path_are_filmed_from_the_same_places():
     own, shared = draw(), draw(lights_share_path=True)
+    assert isinstance(own.cameras.first_frame, tuple)
     assert len(set(own.cameras.first_frame)) > 1
     assert own.groups() == [[k] for k in range(len(own.lights))]
     assert shared.groups() == [list(range(len(shared.lights)))]

@@ -69,7 +69,8 @@ def test_guidance_of_shared_frames_is_that_of_each_light_alone(shared):
     seed = integer(spec.seed, "test", 0, "bounce")
     transport = BounceTransport.trace(tracer.sided(estimation.two_sided), seed=seed)
     for number, (meta, frames) in enumerate(clips):
-        lighting = Lighting(spec.lights[number].bake(16))
+        environment = spec.lights[number].bake(16)
+        lighting = Lighting(environment)
         seed = integer(spec.seed, "test", 0, "light", number, "bounce")
         bounce = transport.bake(lighting, estimation, seed=seed)
         for i, camera in enumerate(spec.clip(number, 2, 24, 16)):
@@ -77,7 +78,7 @@ def test_guidance_of_shared_frames_is_that_of_each_light_alone(shared):
             alone = render_guidance(tracer, camera, lighting, estimation, seed, bounce=bounce)
             for name in ("pbr", "irradiance", "lit"):
                 np.testing.assert_allclose(frames[i][name], alone[name], rtol=2e-3, atol=1e-5)
-        assert meta.exposure == pytest.approx(lighting.light.environment.exposure())
+        assert meta.exposure == pytest.approx(environment.exposure())
 
 
 def test_shared_frames_are_path_traced_as_each_light_alone(shared):
