@@ -1,4 +1,4 @@
-"""What it saves to path-trace a frame under many lights at once, at equal mean error.
+"""Time saved by path tracing a frame under many lights at once, at equal mean error.
 
 One by one, each light has a frame of Mitsuba's ``path``, as :func:`datagen.pathtrace.render_frames` makes it;
 together, all have one of :func:`datagen.pathtrace.render_lights`. Both are held against what ``path`` gives
@@ -179,6 +179,7 @@ class Reference:
         for light in (0, 1, len(self.image) // 2, len(self.image) // 2 + 1):
             truth = self.image[light]
             shown = [image[light] * self._exposure[light] for image in (alone, together)]
-            off = [np.abs(image - truth) * 8 for image in shown]
-            rows.append(np.concatenate([np.asarray(to_display(x, 1.0)) for x in (truth, *shown, *off)], 1))
+            images = [np.asarray(to_display(x, 1.0)) for x in (truth, *shown)]
+            off = [np.clip(np.abs(image - truth) * 8, 0.0, 1.0) for image in shown]
+            rows.append(np.concatenate([*images, *off], 1))
         return np.concatenate(rows).astype(np.float32)
