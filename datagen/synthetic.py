@@ -10,6 +10,7 @@ import numpy as np
 
 from datagen.build import Geometry
 from datagen.clock import stage
+from datagen.exposure import metered
 from datagen.lights import classify, contrast_share
 from datagen.pathtrace import (
     DirectIrradiance,
@@ -89,6 +90,7 @@ class _Lit:
     Attributes:
         number: its place in the scene's list, which names its seeds.
         seeds: what they are for -> one a frame.
+        exposure: of its clip.
     """
 
     number: int
@@ -96,6 +98,7 @@ class _Lit:
     lighting: Lighting
     bounce: BouncedLight | None
     seeds: dict[str, list[int]]
+    exposure: float
 
 
 @stage("guidance")
@@ -134,6 +137,8 @@ def _film(
         views = trace_views(tracer, camera, estimation, bounces)
         fine = trace_views(tracer, camera, finer, bounces) if recipe.reference_buffers else []
         for k, light in enumerate(lights):
+            if spec.metered and i == 0:
+                light.exposure = metered(rgb[k], truth.valid, light.exposure)
             seed = light.seeds["guidance"][i]
             view = partial(render_guidance, tracer, camera, light.lighting, seed=seed, bounce=light.bounce)
             guidance = view(estimation, gbuffer=views[k])
@@ -166,7 +171,7 @@ def _prepare(
     own = ("light", number, "frame")
     where = {"path": ("frame",) if shared else own, "guidance": own, "reference": own}
     seeds = {what: _seeds(spec, recipe.frames, what, *path) for what, path in where.items()}
-    return _Lit(number, environment, lighting, bounce, seeds)
+    return _Lit(number, environment, lighting, bounce, seeds, environment.exposure())
 
 
 def _meta(spec: SceneSpec, lit: _Lit, cameras: Sequence[Camera], recipe: SplitSettings) -> ClipMeta:
@@ -184,7 +189,7 @@ def _meta(spec: SceneSpec, lit: _Lit, cameras: Sequence[Camera], recipe: SplitSe
         width=recipe.width,
         height=recipe.height,
         cameras=[camera.to_dict() for camera in cameras],
-        exposure=lit.environment.exposure(),
+        exposure=lit.exposure,
         color_space={
             name: space
             for name in clip_members(recipe.reference_buffers)
