@@ -95,7 +95,7 @@ def _judge_scene(
     recipe, wanted = settings.split(spec.split), settings.equal_error
     tracer = SurfelTracer(scene)
     BounceTransport.trace(tracer)  # compiles it
-    transport, seconds = _timed(lambda: BounceTransport.trace(tracer))
+    transport, seconds = timed(lambda: BounceTransport.trace(tracer))
     cases = []
     for number, light in enumerate(spec.lights):
         environment = light.bake(settings.environment_height, settings.environments)
@@ -176,7 +176,7 @@ class _Frame:
         taken = {name: [] for name in contestants}
         for _ in range(self._rounds):
             for name, work in contestants.items():
-                taken[name].append(_timed(work)[1])
+                taken[name].append(timed(work)[1])
         seconds = {name: float(np.median(values)) for name, values in taken.items()}
         by_paths = {spp: (error, seconds[str(spp)]) for spp, error in paths.items()}
         ways = {}
@@ -225,7 +225,8 @@ def equal(by_paths: Mapping[int, tuple[float, float]], error: float) -> tuple[fl
     return low * (high / low) ** at, s0 * (s1 / s0) ** at
 
 
-def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
+def timed(work: Callable[[], Any]) -> tuple[Any, float]:
+    """What ``work`` makes, evaluated, and the seconds that it took."""
     import drjit as dr
 
     dr.sync_thread()

@@ -23,7 +23,7 @@ from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounc
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
     *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
-    *("captures", "equal_error", "variety_against"),
+    *("captures", "equal_error", "sharing", "variety_against"),
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
@@ -200,17 +200,28 @@ class EqualErrorSettings(_Model):
     threads: int | None = Field(default=None, ge=1, description="Threads of both renderers; null: all.")
 
 
+class SharingSettings(_Model):
+    """Comparison of frames under 20 lights one by one and together, on scenes drawn as the test split's."""
+
+    scenes: int = Field(default=2, ge=1, le=1000, description="Number of scenes.")
+    size: int = Field(default=48, ge=8, le=2048, description="Width and height of the frames in pixels.")
+    path_spp: int = Field(default=64, ge=4, description="Paths per pixel of frames one by one.")
+    rounds: int = Field(default=3, ge=1, le=100, description="Times that each way is rendered, in turns.")
+    threads: int | None = Field(default=1, ge=1, description="Threads of both ways; null: all.")
+
+
 class Settings(_Model):
     """Settings of ``tron-datagen``."""
 
     output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
-    mode: Literal["make", "plan", "validate", "captures", "equal_error"] = Field(
+    mode: Literal["make", "plan", "validate", "captures", "equal_error", "sharing"] = Field(
         "make",
         description="make the dataset; plan it: print what is missing, the bytes and hours it takes and the "
         "memory of a worker, measured by a small probe here, and render nothing else; validate the one in "
         "output_dir and list every problem; path-trace captures for tron-reconstruct into "
-        "output_dir/captures; or measure on the test scenes in output_dir how long the path tracer takes to "
-        "be as near the truth as guidance is.",
+        "output_dir/captures; measure on the test scenes in output_dir how long the path tracer takes to be "
+        "as near the truth as guidance is (equal_error); or measure what it saves to path-trace under many "
+        "lights at once (sharing).",
     )
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."
@@ -229,6 +240,11 @@ class Settings(_Model):
     )
     captures: CaptureSettings = Field(
         CaptureSettings(), description="Captures to reconstruct, of the test scenes."
+    )
+    sharing: SharingSettings = Field(
+        SharingSettings(),
+        description="What mode=sharing measures: how many times as fast a frame is path-traced under 10 "
+        "lights of high and 10 of low contrast together as one by one, at equal mean error.",
     )
     equal_error: EqualErrorSettings = Field(
         EqualErrorSettings(), description="Comparison of guidance with the path tracer."
