@@ -198,9 +198,10 @@ def test_what_falls_off_a_table_is_tried_again_and_then_left_out():
 def test_things_in_a_room_stay_within_its_walls(crowd):
     space = standing(ShapeSpec(kind="room_shell", size=2.0, parameters=(0.5, 0.5, 0.5, 0.5), seed=1))
     corner = (float(space.low[0]), float(space.low[1]))
-    placements = settle(generator(0, "room"), crowd, space, arrangement="pile", centre=corner, radius=0.3)
+    few = crowd[:6]
+    placements = settle(generator(0, "room"), few, space, arrangement="pile", centre=corner, radius=0.5)
     assert placements.count(None) <= 1
-    for thing, placement in zip(crowd, placements):
+    for thing, placement in zip(few, placements):
         if placement is None:
             continue
         points = placement.moved(thing.points)
