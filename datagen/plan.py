@@ -21,6 +21,7 @@ from datagen.clip_rows import ClipRow
 from datagen.lights import HdriSpec
 from datagen.scene import scene_name
 from datagen.settings import SPLITS, Settings
+from datagen.texture_sets import TextureSet, find_texture_sets
 from datagen.variety import Histograms
 from tron.claim import CHOOSE_ANOTHER, read_recipe, require_same
 from tron.cli.recipes import model_defaults
@@ -58,6 +59,7 @@ class Sources:
     assets: tuple[Asset, ...] = ()
     maps: tuple[Asset, ...] = ()
     environments: tuple[HdriSpec, ...] = ()
+    textures: tuple[TextureSet, ...] = ()
     refused: tuple[Refused, ...] = ()
 
 
@@ -151,7 +153,14 @@ def find_sources(settings: Settings) -> Sources:
         if settings.environments
         else ([], [])
     )
-    return Sources(tuple(assets), tuple(maps), tuple(environments), tuple(refused))
+    textures = find_texture_sets(settings.textures, settings.catalogue, allowed) if settings.textures else []
+    return Sources(
+        assets=tuple(assets),
+        maps=tuple(maps),
+        environments=tuple(environments),
+        textures=tuple(textures),
+        refused=tuple(refused),
+    )
 
 
 def scene_folder(output: Path, name: str) -> Path:
@@ -199,7 +208,13 @@ def config_sha256(settings: Settings) -> str:
 
 
 def adopt(settings: Settings) -> None:
-    """Make output_dir this recipe's, or make sure that it is already.
+    """Make output_dir this recipe's, or make sure that it is already; raises as :func:`require_adoptable`."""
+    require_adoptable(settings)
+    write_if_changed(settings.output_dir / CONFIG_NAME, config_text(settings))
+
+
+def require_adoptable(settings: Settings) -> None:
+    """Make sure that output_dir is this recipe's or nobody's.
 
     More scenes may be added to a dataset; any other change would mix two datasets in one folder.
 
@@ -207,7 +222,7 @@ def adopt(settings: Settings) -> None:
         TronError: the folder holds a dataset of another schema or recipe (names the key), or more scenes
             than are asked for.
     """
-    path, text = settings.output_dir / CONFIG_NAME, config_text(settings)
+    path = settings.output_dir / CONFIG_NAME
     old = read_recipe(path)
     if old is not None:
         try:
@@ -234,7 +249,6 @@ def adopt(settings: Settings) -> None:
         raise TronError(
             "output_dir holds shards of something else", settings.output_dir, "choose an empty folder"
         )
-    write_if_changed(path, text)
 
 
 def clear_temporaries(output: Path) -> None:

@@ -12,11 +12,14 @@ from functools import partial
 import numpy as np
 from pydantic import Field
 
-from datagen.lights import FAMILIES, PROCEDURAL, Family, HdriSpec, LightChoice, LightSpec
+from datagen.lights import EVERY, PROCEDURAL, Family, HdriSpec, LightChoice, LightSpec, draw_light
+from datagen.motion import STILL, MotionSpec, Share, draw_motion
 from datagen.objects import ObjectSpec
 from datagen.paths import PathSpec
-from datagen.spec import Spec
-from datagen.styles import MIXED, STYLES, Choice, Style, StyleChoice
+from datagen.shapes import SHAPES
+from datagen.spec import Number, Spec
+from datagen.styles import MIXED, OLD, STYLES, Choice, Style, StyleChoice
+from datagen.texture_sets import dressed
 from tron.cameras import Camera
 from tron.errors import TronError
 from tron.seeds import generator
@@ -31,13 +34,18 @@ class CameraSpec(Spec):
         capture: what the views lie on that surfels are made from, an equal share on each.
         film: what is path-traced lies on it.
         path_frames: frames of the whole of ``film``.
-        first_frame: for each light where on it its clip begins.
+        first_frame: where on it the clips begin: all lights' at one place, or each light's at its own.
     """
 
     capture: tuple[PathSpec, ...] = Field(min_length=1)
     film: PathSpec
     path_frames: int
-    first_frame: tuple[int, ...]
+    first_frame: int | tuple[int, ...]
+
+    @property
+    def shared(self) -> bool:
+        """Whether all lights are filmed from the same places, frame by frame."""
+        return isinstance(self.first_frame, int)
 
 
 class SceneSpec(Spec):
@@ -48,6 +56,8 @@ class SceneSpec(Spec):
         objects: their ids go on from there.
         left_out: objects that found no place.
         metered: clips are exposed for what they show, not for the light.
+        motion: the object that moves within a clip, if one does.
+        turns_deg: by how much each light turns about the zenith within its clip; empty: none does.
     """
 
     version: int = SPEC_VERSION
@@ -60,6 +70,8 @@ class SceneSpec(Spec):
     objects: tuple[ObjectSpec, ...]
     left_out: int
     metered: bool = False
+    motion: MotionSpec | None = None
+    turns_deg: tuple[Number, ...] = ()
     lights: tuple[LightSpec, ...] = Field(min_length=1)
     cameras: CameraSpec
 
@@ -73,9 +85,15 @@ class SceneSpec(Spec):
             for camera in path.cameras(share, width, height)
         ]
 
+    def groups(self) -> list[list[int]]:
+        """Numbers of the lights whose clips are filmed together."""
+        numbers = list(range(len(self.lights)))
+        return [numbers] if self.cameras.shared else [[number] for number in numbers]
+
     def clip(self, light: int, frames: int, width: int, height: int) -> list[Camera]:
         """The consecutive cameras of the clip under light number ``light``."""
-        first = self.cameras.first_frame[light]
+        first = self.cameras.first_frame
+        first = first if isinstance(first, int) else first[light]
         return self.cameras.film.cameras(self.cameras.path_frames, width, height)[first : first + frames]
 
 
@@ -91,11 +109,13 @@ def draw_scene(
     *,
     style: StyleChoice,
     lights: Sequence[LightChoice],
-    families: Sequence[Family] = PROCEDURAL,
+    families: Sequence[Family] | None = None,
     environments: Sequence[HdriSpec] = (),
     choice: Choice | None = None,
     frames: int = 5,
     path_frames: int = 93,
+    lights_share_path: bool | None = None,
+    moving: Share = STILL,
 ) -> SceneSpec:
     """Draw scene ``index`` of a split.
 
@@ -103,11 +123,13 @@ def draw_scene(
         seed: the run's root seed.
         split, index: which scene; they name its random streams.
         style: what stands there and how it is filmed; ``mixed`` draws one of MIXED.
-        lights: a family for each light of the scene; ``any`` draws one of ``families``.
-        families: what ``any`` chooses from.
+        lights: for each light of the scene a family, ``any`` of ``families``, or a class of contrast.
+        families: what ``any`` and classes choose from; None: the style's own, and every one.
         environments: files for the family ``hdri``.
         choice: what the recipe says of objects; None leaves it to the style.
         frames, path_frames: length of a clip and of the path it is cut from.
+        lights_share_path: whether the clips of all lights begin at one place; None: in all styles but OLD.
+        moving: probabilities that something moves within a clip.
 
     Raises:
         TronError: too few objects found a place, or a clip is longer than its path.
@@ -123,38 +145,45 @@ def draw_scene(
         made = STYLES[style](streams, choice or Choice())
     except TronError as error:
         raise TronError(error.what, error.where or scene_name(split, index), error.mend) from error
+    own = PROCEDURAL if style not in MIXED else EVERY
+    drawn = [
+        draw_light(streams("light", k), wanted, families or (own if wanted == "any" else EVERY), environments)
+        for k, wanted in enumerate(lights)
+    ]
+    dressing = partial(_dressed, choice=choice or Choice(), rng=streams("textures"))
+    shared = style not in OLD if lights_share_path is None else lights_share_path
+    motion, turns = draw_motion(streams("motion"), made.objects, len(lights), moving)
     rng = streams("clips")
+    first = [int(rng.integers(path_frames - frames + 1)) for _ in (lights[:1] if shared else lights)]
     return SceneSpec(
         name=scene_name(split, index),
         split=split,
         index=index,
         seed=seed,
         style=style,
-        surroundings=made.surroundings,
-        objects=made.objects,
+        surroundings=tuple(dressing(item) for item in made.surroundings),
+        objects=tuple(dressing(item) for item in made.objects),
         left_out=made.left_out,
         metered=made.metered,
-        lights=tuple(_draw_lights(seed, split, index, lights, families, environments)),
+        motion=motion,
+        turns_deg=turns,
+        lights=tuple(drawn),
         cameras=CameraSpec(
             capture=made.capture,
             film=made.film,
             path_frames=path_frames,
-            first_frame=tuple(int(rng.integers(path_frames - frames + 1)) for _ in lights),
+            first_frame=first[0] if shared else tuple(first),
         ),
     )
 
 
-def _draw_lights(
-    seed: int,
-    split: str,
-    index: int,
-    lights: Sequence[LightChoice],
-    families: Sequence[Family],
-    environments: Sequence[HdriSpec],
-) -> list[LightSpec]:
-    drawn = []
-    for k, wanted in enumerate(lights):
-        rng = generator(seed, split, index, "light", k)
-        family = families[int(rng.integers(len(families)))] if wanted == "any" else wanted
-        drawn.append(FAMILIES[family].draw(rng, environments))
-    return drawn
+def _dressed(item: ObjectSpec, choice: Choice, rng: np.random.Generator) -> ObjectSpec:
+    """The object with the user's texture sets on some of its pieces."""
+    if item.shape is None or not choice.textures:
+        return item
+    roles = SHAPES[item.shape.kind].roles
+    materials = tuple(
+        dressed(material, roles[slot % len(roles)], choice.textures, choice.texture_share, rng)
+        for slot, material in enumerate(item.materials)
+    )
+    return item.model_copy(update={"materials": materials})

@@ -7,8 +7,9 @@ The same image lights Mitsuba's path tracer and the surfels, so whatever the bak
 both.
 """
 
-from datagen.lights.contrast import Contrast, classify
-from datagen.lights.families import FAMILIES, PROCEDURAL, Family, LightChoice, LightSpec
+from datagen.lights.contrast import Contrast, classify, contrast_share
+from datagen.lights.drawing import draw_light
+from datagen.lights.families import EVERY, FAMILIES, PROCEDURAL, Family, LightChoice, LightSpec
 from datagen.lights.hdri import HdriSpec
 from datagen.lights.light import Light
 from datagen.lights.overcast import OvercastSpec
@@ -16,6 +17,7 @@ from datagen.lights.studio import Panel, StudioSpec
 from datagen.lights.sun import SunSpec
 
 __all__ = [
+    "EVERY",
     "FAMILIES",
     "PROCEDURAL",
     "Contrast",
@@ -29,4 +31,6 @@ __all__ = [
     "StudioSpec",
     "SunSpec",
     "classify",
+    "contrast_share",
+    "draw_light",
 ]

@@ -57,6 +57,6 @@ class Ground(Spec):
 
 
 def on_ground(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 2) of the ground in directions (N, 3) with z < 0, and their distances (N,), in eye heights."""
+    """Points (N, 2) of the ground and their distances (N,), in eye heights, in directions (N, 3), z < 0."""
     distance = 1.0 / np.maximum(-directions[:, 2], 1e-3)
     return directions[:, :2] * distance[:, None], distance

@@ -13,8 +13,8 @@ from datagen.spec import Spec
 from tron.shading.environment import EnvironmentMap
 
 SUPERSAMPLES = 4
-"""Directions a texel and axis when a map is baked, unless a family says fewer: a sun two texels wide keeps its
-energy."""
+"""Directions a texel and axis when a map is baked, unless a family says fewer: a sun two texels wide keeps
+its energy."""
 
 
 class Light(Spec):
@@ -22,8 +22,8 @@ class Light(Spec):
 
     Attributes:
         family: name in recipes, specifications and clips: a Literal with its default.
-        in_any: whether ``any`` draws the family in styles A and B where a recipe names none. True changes what
-            seeds give.
+        in_any: whether ``any`` draws the family in styles A and B where a recipe names none. True changes
+            what seeds give.
         supersamples: directions a texel and axis that :meth:`radiance` is averaged over. Small bright sources
             belong to :meth:`discs`, which need none.
     """

@@ -14,7 +14,7 @@ _TURN = 0.65  # radians between octaves, so that their lattices do not show
 
 
 class Fractal:
-    """Sum of octaves of value noise in the plane (Perlin 1985; Musgrave 1989), a function of the seed alone."""
+    """Sum of octaves of value noise in the plane (Perlin 1985; Musgrave 1989), by the seed alone."""
 
     def __init__(self, seed: int, name: str) -> None:
         lattice = generator(seed, "fractal", name).random((LATTICE, LATTICE), np.float32)
@@ -35,6 +35,8 @@ class Fractal:
 
     def threshold(self, share: float, octaves: int = 6, gain: float = 0.5) -> float:
         """Value that the noise exceeds on a ``share`` of the plane."""
+        if share <= 0.0:
+            return 1.0
         axis = np.arange(48) * 1.37
         points = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
         return float(np.quantile(self(points, octaves, gain), 1.0 - share))

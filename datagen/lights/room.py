@@ -1,7 +1,7 @@
 """Box room seen from inside: what a direction meets, and the light that falls there.
 
 Metres; the corner of the room is the origin, z up. Direct light comes from rectangles and small lamps without
-shadows but the sun's; light that bounces is that of an integrating sphere with the room's area and mean albedo.
+shadows but the sun's; light that bounces is that of an integrating sphere of the room's area and mean albedo.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Box(Spec):
 
 
 class Bulb(Spec):
-    """Small lamp: its place, its radius in metres, and its linear intensity (radiance times square metres)."""
+    """Small lamp: its place, its radius, metres, and its linear intensity (radiance times square metres)."""
 
     place: Triple
     radius: Number
@@ -164,7 +164,8 @@ def nearness(hits: Hits, size: np.ndarray, boxes: tuple[Box, ...]) -> np.ndarray
         if box.low[2] > 1.0:
             continue
         outside = np.maximum(
-            np.asarray(box.low[:2]) - hits.points[floor, :2], hits.points[floor, :2] - np.asarray(box.high[:2])
+            np.asarray(box.low[:2]) - hits.points[floor, :2],
+            hits.points[floor, :2] - np.asarray(box.high[:2]),
         )
         away = np.linalg.norm(np.maximum(outside, 0.0), axis=1) + box.low[2]
         share[floor] *= 1.0 - 0.6 * np.exp(-away / CORNER)

@@ -1,8 +1,8 @@
 """Weather: sun, air and two layers of cloud, as seen from the ground.
 
-Clouds are shells of varying optical depth. What passes through them, and what they scatter towards us, follows
-the two-stream picture (Bohren 1987): light goes straight through as exp(-depth), comes out diffuse as
-1 / (1 + (1 - g) depth), and the rest goes back, which we see on the side that faces the sun.
+Clouds are shells of varying optical depth. What passes through them, and what they scatter towards us,
+follows the two-stream picture (Bohren 1987): light goes straight through as exp(-depth), comes out diffuse
+as 1 / (1 + (1 - g) depth), and the rest goes back, which we see on the side that faces the sun.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from datagen.lights.sky import Sky
 from datagen.spec import Number, Spec
 
 EARTH = 60.0
-"""Radius of the earth in heights of the clouds: less than the true one, so that clouds meet the horizon sooner."""
+"""Radius of the earth in heights of the clouds; less than the true one: clouds meet the horizon sooner."""
 
 HAZE = 9.0
 """Distance, in heights of the clouds, over which the air hides a share of 1 - 1/e of them."""
@@ -119,6 +119,8 @@ class Above:
     def _horizon(self) -> np.ndarray:
         around = [direction(azimuth, 2.0) for azimuth in np.arange(0.0, 360.0, 4.0)]
         ring = self.radiance(np.stack(around))
+        # The glow around a low sun lies beyond the haze, not in it.
+        ring = np.minimum(ring, 3.0 * self.skylight / np.pi)
         return np.concatenate([ring, ring[:1]])
 
     def horizon(self, directions: np.ndarray) -> np.ndarray:
@@ -132,7 +134,7 @@ class Above:
         return self.skylight + self.sunlight_below * self.weather.toward[2]
 
     def radiance(self, directions: np.ndarray) -> np.ndarray:
-        """Linear radiance (N, 3) of air and clouds without the sun's disc along directions (N, 3) with z > 0."""
+        """Linear radiance (N, 3) of air and clouds, without the sun's disc, in directions (N, 3), z > 0."""
         w = self.weather
         # The model is black at the horizon itself.
         raised = directions * (1.0, 1.0, 0.0) + np.maximum(directions[:, 2:], 0.01) * (0.0, 0.0, 1.0)
@@ -167,7 +169,7 @@ class Above:
         return np.maximum(behind + (there - behind) * seen, 0.0)
 
     def _sunlight(self) -> np.ndarray:
-        """Irradiance that the disc gives on a plane that faces it: the mean radiance times the solid angle."""
+        """Irradiance of the disc on a plane that faces it: the mean radiance times the solid angle."""
         width = 2.0
         inside = _around(self.weather.toward, width)
         cap = 2.0 * np.pi * (1.0 - np.cos(np.radians(0.5 * width)))

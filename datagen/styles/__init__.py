@@ -12,7 +12,8 @@ from datagen.styles.primitives import STYLE_A, STYLE_B
 from datagen.styles.room import room
 from datagen.styles.table import table
 
-__all__ = ["MIXED", "STYLES", "Choice", "Composition", "Streams", "Style", "StyleChoice"]
+__all__ = ["MIXED", "OLD", "STYLES", "Choice", "Composition", "Streams", "Style", "StyleChoice"]
+
 
 STYLES: dict[str, Callable[[Streams, Choice], Composition]] = {
     "A": STYLE_A,
@@ -23,6 +24,9 @@ STYLES: dict[str, Callable[[Streams, Choice], Composition]] = {
     "ground": ground,
 }
 """Name -> style."""
+
+OLD = ("A", "B")
+"""Styles that draw what they always drew: among other things a place of its own for each light's clip."""
 
 MIXED = ("object", "table", "table", "room", "ground")
 """Styles that ``mixed`` draws from, one as likely as another."""

@@ -344,6 +344,7 @@ def test_failures_are_listed_and_retried_by_their_command(dataset, unfinished, f
 def test_values_that_are_not_finite_never_reach_a_shard(tmp_path, monkeypatch):
     def spoilt(*arguments):
         for meta, frames in make_clips(*arguments):
+            frames = list(frames)
             if meta.key == "test-000000-l1":
                 frames[1]["pbr"][3, 4] = np.nan
             yield meta, frames
