@@ -233,7 +233,9 @@ def _resized(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     if values.shape[:2] == size:
         return values
     bands = [
-        Image.fromarray(values[..., i].astype(np.float32)).resize(size[::-1], Image.Resampling.BILINEAR)
+        Image.fromarray(values[..., i].astype(np.float32)).resize(
+            (size[1], size[0]), Image.Resampling.BILINEAR
+        )
         for i in range(values.shape[2])
     ]
     return np.stack([np.asarray(band, np.float64) for band in bands], axis=2)

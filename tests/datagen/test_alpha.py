@@ -1,5 +1,7 @@
 """Alpha becomes geometry: what is left has the mask's area, place, texture and colours."""
 
+# pyright: reportArgumentType=false, reportOptionalSubscript=false
+
 import numpy as np
 import pytest
 

@@ -1,5 +1,9 @@
 """glTF files: what accessors, extensions and materials mean by the specification arrives in the parts."""
 
+# pyright: reportCallIssue=false, reportOptionalSubscript=false, reportIndexIssue=false
+# pyright: reportArgumentType=false, reportOptionalMemberAccess=false
+# pyright: reportAttributeAccessIssue=false
+
 import base64
 import io
 

@@ -1,5 +1,8 @@
 """Normal maps against tangents that this file computes itself, and textures, as G-buffers show them."""
 
+# pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false
+# pyright: reportArgumentType=false
+
 import io
 from dataclasses import replace
 

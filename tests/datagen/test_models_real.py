@@ -1,5 +1,7 @@
 """The real models: read as another library reads them, and visible as what they are."""
 
+# pyright: reportAttributeAccessIssue=false
+
 import json
 import struct
 from functools import cache
