@@ -77,7 +77,7 @@ def frame() -> dict[str, np.ndarray]:
         "irradiance": np.where(seen > 0, 0.75 * light, 5 * light),  # what is not foreground does not count
         "lit": light,
         "shadowed": 0.875 * light,
-        "base_color_ref": np.broadcast_to(np.float32([0.5, 0.5, 0.5]), (SIZE, SIZE, 3)),
+        "base_color_ref": np.broadcast_to(np.full(3, 0.5, np.float32), (SIZE, SIZE, 3)),
         "roughness_ref": np.full((SIZE, SIZE, 1), 0.31, np.float32),
         "metallic_ref": np.full((SIZE, SIZE), 1.0, np.float32),
         "depth_ref": np.full((SIZE, SIZE, 1), 1000.0, np.float32),
