@@ -67,7 +67,9 @@ class Refused(BaseModel):
     reason: str
 
 
-class _Entry(BaseModel):
+class Entry(BaseModel):
+    """What a catalogue says of a file; fields as in :class:`Asset`."""
+
     model_config = ConfigDict(extra="forbid")
 
     path: str
@@ -104,7 +106,7 @@ def find_assets(
     )
     if not paths:
         raise TronError(f"no {', '.join(suffixes)} in the folder", folder)
-    entries = _read_catalogue(
+    entries = read_catalogue(
         catalogue if catalogue is not None else folder / CATALOGUE_NAME, catalogue is not None
     )
     stems = Counter(Path(path).stem for path in paths)
@@ -118,7 +120,7 @@ def find_assets(
     for name, path in found.items():
         if names and name not in names:
             continue
-        entry = entries.get(path, _Entry(path=path))
+        entry = entries.get(path, Entry(path=path))
         if not entry.licence and name not in allow_unlicensed:
             raise TronError(
                 f"asset '{name}' has no licence",
@@ -201,7 +203,12 @@ def _load(path: str, up: str, _sha256: str) -> list[Part]:
     return load_model(path, up)
 
 
-def _read_catalogue(path: Path, required: bool) -> dict[str, _Entry]:
+def read_catalogue(path: Path, required: bool) -> dict[str, Entry]:
+    """Path -> entry of a catalogue; none where it is not there.
+
+    Raises:
+        TronError: it cannot be read, or is ``required`` and not there.
+    """
     if not path.is_file():
         if required:
             raise TronError("catalogue not found", path)
@@ -209,7 +216,7 @@ def _read_catalogue(path: Path, required: bool) -> dict[str, _Entry]:
     try:
         if path.stat().st_size > LARGEST_CATALOGUE:
             raise ValueError("file is too large to be a catalogue")
-        entries = TypeAdapter(list[_Entry]).validate_python(json.loads(path.read_text("utf-8")))
+        entries = TypeAdapter(list[Entry]).validate_python(json.loads(path.read_text("utf-8")))
     except (OSError, ValueError, RecursionError, ValidationError) as error:
         raise TronError(
             f"catalogue cannot be read: {_reason(error)}", path, 'write [{"path": ..., "licence": ...}, ...]'

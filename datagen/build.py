@@ -8,7 +8,7 @@ material each.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,6 +16,9 @@ import mitsuba as mi
 import numpy as np
 
 from datagen import texels
+from datagen.materials import PhotographedSpec
+from datagen.materials.photographed import Photographed
+from datagen.motion import Pose
 from datagen.parts import Part, Sampling
 from datagen.scene import SceneSpec
 from datagen.shapes import make_pieces, split_creases
@@ -45,12 +48,14 @@ class Surface:
         principled: the innermost material, which knows base color, roughness and metallic.
         normal_map: texture of tangent-space normals as (n + 1) / 2, or None.
         object_id: (F,) uint32 object of each triangle.
+        rest: (V, 3) positions and normals before anything moved.
     """
 
     shape: mi.Mesh
     principled: mi.BSDF
     normal_map: mi.Texture | None
     object_id: np.ndarray
+    rest: tuple[np.ndarray, ...] | None = None
 
 
 @dataclass
@@ -58,6 +63,24 @@ class Geometry:
     """A scene without its light."""
 
     surfaces: list[Surface]
+
+    def move(self, object_id: int, pose: Pose) -> None:
+        """Put an object where it is at a time, away from where it rests; scenes made before do not follow."""
+        for surface in self.surfaces:
+            if not (surface.object_id == object_id).any():
+                continue
+            parameters = mi.traverse(surface.shape)
+            if surface.rest is None:
+                surface.rest = tuple(
+                    np.array(parameters[f"vertex_{name}"]).reshape(-1, 3) for name in ("positions", "normals")
+                )
+            faces = np.array(parameters["faces"]).reshape(-1, 3)
+            which = np.unique(faces[surface.object_id == object_id])
+            positions, normals = (array.copy() for array in surface.rest)
+            positions[which] = (positions[which] - pose.pivot) @ pose.rotation.T + pose.pivot + pose.shift
+            normals[which] = normals[which] @ pose.rotation.T
+            parameters["vertex_positions"], parameters["vertex_normals"] = _flat(positions), _flat(normals)
+            parameters.update()
 
     def lit(self, environment: EnvironmentMap | None = None) -> mi.Scene:
         """The Mitsuba scene under a light; without one it still answers rays."""
@@ -73,6 +96,8 @@ def build(
     models: Mapping[str, list[Part]] | None = None,
     edge: float = 0.05,
     texels_per_unit: float = 64.0,
+    most_texels: int = texels.MOST_TEXELS,
+    photographed: Callable[[PhotographedSpec], Photographed] | None = None,
 ) -> Geometry:
     """Build a scene's meshes and materials.
 
@@ -81,9 +106,11 @@ def build(
         models: asset id -> its parts (unit ball, z up), for the assets that the scene names.
         edge: longest edge of the procedural meshes, world units.
         texels_per_unit: density of the textures on them.
+        most_texels: of all of them; where that is too few, the density falls.
+        photographed: opens the user's texture sets, where the scene names some.
 
     Raises:
-        TronError: the scene names an asset that is not among the models.
+        TronError: the scene names an asset or a texture set that was not given.
     """
     solids, surfaces = [], []
     for number, item in enumerate((*spec.surroundings, *spec.objects), start=FIRST_ID):
@@ -93,6 +120,14 @@ def build(
             fine = np.inf if number < FIRST_ID + len(spec.surroundings) else edge
             for mesh, slot in make_pieces(item.shape, fine):
                 material = item.materials[slot % len(item.materials)]
+                if isinstance(material, PhotographedSpec):
+                    if photographed is None:
+                        raise TronError(
+                            f"the scene needs the texture set '{material.texture_set}'",
+                            spec.name,
+                            "give its folder as textures=...",
+                        )
+                    material = photographed(material)
                 solids.append(_Solid(texels.Surface(*split_creases(mesh), material), matrix, number))
             continue
         parts = (models or {}).get(str(item.asset))
@@ -101,12 +136,12 @@ def build(
                 f"the scene needs the asset {item.asset!r}", spec.name, "give its folder as assets=..."
             )
         surfaces += [_textured(part.moved(matrix, item.size), number, i) for i, part in enumerate(parts)]
-    return Geometry([_solids(solids, texels_per_unit), *surfaces])
+    return Geometry([_solids(solids, texels_per_unit, most_texels), *surfaces])
 
 
-def _solids(solids: Sequence[_Solid], texels_per_unit: float) -> Surface:
+def _solids(solids: Sequence[_Solid], texels_per_unit: float, most: int = texels.MOST_TEXELS) -> Surface:
     """All procedural pieces as one mesh under one material, whose textures are one atlas."""
-    atlas = texels.bake([solid.surface for solid in solids], texels_per_unit)
+    atlas = texels.bake([solid.surface for solid in solids], texels_per_unit, most)
     vertices, normals, uvs, faces, ids, count = [], [], [], [], [], 0
     for (surface, matrix, object_id), (index, uv, corners) in zip(solids, atlas.laid):
         rotation = matrix[:3, :3]

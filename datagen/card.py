@@ -86,7 +86,7 @@ def card_text(
     """
     by_split = {split: [row for row in rows if row.split == split] for split in SPLITS}
     clips = {split: len(found) for split, found in by_split.items() if found}
-    files = (*sources.assets, *sources.maps)
+    files = _files(sources)
     lines = [
         front_matter(settings, clips, [file.licence for file in files]),
         "# Dataset card",
@@ -132,9 +132,9 @@ def card_text(
     lines += _variety(variety or {}, other, pictures)
     lines += _reading(settings, clips)
     lines += ["", "## What it was made from", ""]
-    if sources.assets or sources.maps:
+    if files := _files(sources):
         lines += ["| asset | licence | author | source | sha256 |", "|---|---|---|---|---|"]
-        lines += [_asset_row(asset) for asset in (*sources.assets, *sources.maps)]
+        lines += [_asset_row(asset) for asset in files]
         lines += [""]
     if sources.refused:
         lines += [f"Models left out because they cannot be used: {len(sources.refused)}.", ""]
@@ -218,6 +218,11 @@ def _reading(settings: Settings, clips: Mapping[str, int]) -> list[str]:
         "A frame's file is a column, such as `f00.rgb.exr`: OpenEXR bytes of linear values. `meta.json` "
         "holds cameras, exposure and light.",
     ]
+
+
+def _files(sources: Sources) -> tuple[Asset, ...]:
+    """All of the user's files that scenes draw from."""
+    return (*sources.assets, *sources.maps, *(each.asset for each in sources.textures))
 
 
 def _asset_row(asset: Asset) -> str:

@@ -7,6 +7,7 @@ from datagen.equal_error import measure_equal_error
 from datagen.projection import project
 from datagen.run import make
 from datagen.settings import Settings
+from datagen.sharing import measure_sharing
 from datagen.validate import validate
 from tron.cli.command_line import command
 
@@ -19,7 +20,8 @@ def main(settings: Settings) -> int:
     timed, and what is missing is printed with its bytes, memory and hours. With mode=captures scenes are
     path-traced from all sides instead, with true maps, as folders that tron-reconstruct and nerfstudio read.
     With mode=equal_error guidance of a dataset's test scenes is held against the path tracer:
-    equal_error.json. An interrupted run resumes. The exit code is 1 if a scene could not be made
+    equal_error.json; with mode=sharing frames under many lights at once against frames one by one:
+    sharing.json. An interrupted run resumes. The exit code is 1 if a scene could not be made
     (failures.jsonl says why, that of captures lies among them) or if validation found a problem.
     """
     if settings.mode == "validate":
@@ -31,6 +33,9 @@ def main(settings: Settings) -> int:
         return 1 if make_captures(settings) else 0
     if settings.mode == "equal_error":
         measure_equal_error(settings)
+        return 0
+    if settings.mode == "sharing":
+        measure_sharing(settings)
         return 0
     return 1 if make(settings) else 0
 

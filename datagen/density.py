@@ -17,22 +17,42 @@ NEAREST = 1.0
 PATH_SAMPLES = 8
 """Cameras of a path that its distance is taken from."""
 
+TEXELS_A_FRAME = 64
+"""Texels of a scene for each pixel of a frame: what is not in it, or behind, wants some as well."""
+
+FEWEST, MOST = 2**20, 2**23
+"""Bounds of that number, whatever the frames' size."""
+
 
 def texels_per_unit(spec: SceneSpec, settings: Settings) -> float:
     """Texels a world unit of a scene: the setting, or what suits the frames and views that are made of it."""
     if settings.texels_per_unit is not None:
         return settings.texels_per_unit
+    return max(_suited(spec, cameras) for cameras in _cameras(spec, settings))
+
+
+def most_texels(spec: SceneSpec, settings: Settings) -> int:
+    """Texels of a scene at most."""
+    if settings.texels_per_unit is not None:
+        return MOST
+    pixels = max(cameras[0].width * cameras[0].height for cameras in _cameras(spec, settings))
+    return int(np.clip(TEXELS_A_FRAME * pixels, FEWEST, MOST))
+
+
+def _cameras(spec: SceneSpec, settings: Settings) -> list[list[Camera]]:
+    """Some cameras of each path that pictures are taken from."""
     recipe, captures = settings.split(spec.split), settings.captures
     if settings.mode == "captures":
-        return _suited(spec, spec.views(PATH_SAMPLES, captures.width, captures.height))
-    views = spec.views(PATH_SAMPLES, settings.view_width, settings.view_height)
-    film = spec.cameras.film.cameras(PATH_SAMPLES, recipe.width, recipe.height)
-    return max(_suited(spec, views), _suited(spec, film))
+        return [spec.views(PATH_SAMPLES, captures.width, captures.height)]
+    return [
+        spec.views(PATH_SAMPLES, settings.view_width, settings.view_height),
+        spec.cameras.film.cameras(PATH_SAMPLES, recipe.width, recipe.height),
+    ]
 
 
 def _suited(spec: SceneSpec, cameras: list[Camera]) -> float:
-    """TEXELS_A_PIXEL at the median distance of cameras to the nearest thing."""
+    """TEXELS_A_PIXEL at the median distance of cameras and things."""
     things = np.array([item.placement.position for item in spec.objects or spec.surroundings])
     places = np.array([camera.position for camera in cameras])
-    nearest = np.linalg.norm(places[:, None] - things, axis=-1).min(axis=1)
-    return TEXELS_A_PIXEL * cameras[0].fx / max(float(np.median(nearest)), NEAREST)
+    distance = float(np.median(np.linalg.norm(places[:, None] - things, axis=-1)))
+    return TEXELS_A_PIXEL * cameras[0].fx / max(distance, NEAREST)

@@ -82,6 +82,7 @@ def stacked_lights(
     )
 
 
+@stage("path_trace")
 def render_lights(
     scene: mi.Scene, lights: mi.Integrator, camera: Camera, spp: int, seed: int, transparent: bool = False
 ) -> np.ndarray:

@@ -21,6 +21,7 @@ from datagen.clip_rows import ClipRow
 from datagen.lights import HdriSpec
 from datagen.scene import scene_name
 from datagen.settings import SPLITS, Settings
+from datagen.texture_sets import TextureSet, find_texture_sets
 from datagen.variety import Histograms
 from tron.claim import CHOOSE_ANOTHER, read_recipe, require_same
 from tron.cli.recipes import model_defaults
@@ -58,6 +59,7 @@ class Sources:
     assets: tuple[Asset, ...] = ()
     maps: tuple[Asset, ...] = ()
     environments: tuple[HdriSpec, ...] = ()
+    textures: tuple[TextureSet, ...] = ()
     refused: tuple[Refused, ...] = ()
 
 
@@ -151,7 +153,14 @@ def find_sources(settings: Settings) -> Sources:
         if settings.environments
         else ([], [])
     )
-    return Sources(tuple(assets), tuple(maps), tuple(environments), tuple(refused))
+    textures = find_texture_sets(settings.textures, settings.catalogue, allowed) if settings.textures else []
+    return Sources(
+        assets=tuple(assets),
+        maps=tuple(maps),
+        environments=tuple(environments),
+        textures=tuple(textures),
+        refused=tuple(refused),
+    )
 
 
 def scene_folder(output: Path, name: str) -> Path:

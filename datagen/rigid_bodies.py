@@ -9,6 +9,9 @@ within it of the middle between two grid points: about once in 10^7 numbers. Wha
 the ground, is rounded likewise. The grid also lets things come to rest: what would move by less stands still.
 """
 
+# MuJoCo's compiled module has no stubs.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -31,11 +34,16 @@ GRAVITY = 9.81
 POSITION_GRID = 2.0**-16
 VELOCITY_GRID = 2.0**-12
 HULL_GRID = 2.0**-12
-MARGIN = 0.006
-"""Distance in typical bodies that hulls keep, so that no surfel of one lies within another."""
+MARGIN = 0.003
+"""Distance in typical bodies that a hull keeps from others: no surfel of one lies within another."""
 
-CELL = 0.3
+FRICTION = (1.0, 0.05, 0.05)
+"""Sliding (a ratio), torsional and rolling (lengths in typical bodies): of rough things that heap up."""
+
+CELL = 0.7
 """Greatest side of a cell of terrain, in typical bodies."""
+
+BIN_SIDES = 8
 
 FASTEST = 30.0
 """Typical bodies a second: nothing that only fell is faster; what is was thrown by a solver gone wrong."""
@@ -64,8 +72,15 @@ class Body:
 
     @cached_property
     def hulls(self) -> list[np.ndarray]:
-        """(V, 3) vertices of the convex hull of each piece, at most a few hundred of them."""
-        return [np.asarray(support_hull(piece.convex_hull).vertices) for piece in self.pieces]
+        """(V, 3) vertices of the convex hull of each piece, at most a few hundred of them, on a grid."""
+        radius = max(float(np.linalg.norm(piece.vertices, axis=1).max()) for piece in self.pieces)
+        grid = HULL_GRID * 2.0 ** float(np.round(np.log2(radius)))
+        hulls = []
+        for piece in self.pieces:
+            # Rounded first: which of two equally far points a hull keeps must not hang on a last bit.
+            points = np.unique(np.round(np.asarray(piece.convex_hull.vertices) / grid), axis=0) * grid
+            hulls.append(np.asarray(support_hull(Trimesh(points).convex_hull).vertices))
+        return hulls
 
     @cached_property
     def points(self) -> np.ndarray:
@@ -83,10 +98,15 @@ class RigidBodies:
         bodies: what moves.
         ground: what it falls on: a flat rectangle whose rim things fall off, a room with walls, or terrain.
         fixed: bodies that stand still, with their places.
+        bin: x, y and radius of walls of a bin that keeps a heap together until :meth:`lift_bin`.
     """
 
     def __init__(
-        self, bodies: Sequence[Body], ground: Standing, fixed: Sequence[tuple[Body, Placement]] = ()
+        self,
+        bodies: Sequence[Body],
+        ground: Standing,
+        fixed: Sequence[tuple[Body, Placement]] = (),
+        bin: tuple[float, float, float] | None = None,
     ):
         self.unit = 2.0 ** float(
             np.round(np.log2(np.median([np.linalg.norm(body.points, axis=1).max() for body in bodies])))
@@ -99,11 +119,14 @@ class RigidBodies:
         spec.option.disableflags = (
             mujoco.mjtDisableBit.mjDSBL_WARMSTART | mujoco.mjtDisableBit.mjDSBL_AUTORESET
         )
-        spec.default.geom.friction = (0.8, 0.02, 0.01)
+        spec.default.geom.friction = FRICTION
         spec.default.geom.condim = 6
         spec.default.geom.solref = (2.5 * STEP, 1.0)
         spec.default.geom.margin = MARGIN
         self._add_ground(spec, ground)
+        self._has_bin = bin is not None
+        if bin is not None:
+            self._add_bin(spec, *(round(number / self.unit / HULL_GRID) * HULL_GRID for number in bin))
         for i, (body, placement) in enumerate(fixed):
             for j, hull in enumerate(body.hulls):
                 self._add_hull(spec, spec.worldbody, f"fixed{i}-{j}", placement.moved(hull))
@@ -143,6 +166,12 @@ class RigidBodies:
         """Body ``i`` is no longer there."""
         self.put(i, np.eye(3), np.array(_PARKED) * self.unit * (1.0 + i))
         self.gone[i] = True
+
+    def lift_bin(self) -> None:
+        """Take the walls of the bin away, if there is one."""
+        for i in range(BIN_SIDES if self._has_bin else 0):
+            geom = self._model.geom(f"bin{i}")
+            geom.contype = geom.conaffinity = 0
 
     def step(self, drag: float = 0.0) -> None:
         """Advance by STEP seconds. What has fallen far below the ground is gone.
@@ -210,6 +239,20 @@ class RigidBodies:
         mesh = spec.add_mesh(name=name, uservert=points.ravel())
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
         parent.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+
+    def _add_bin(self, spec: mujoco.MjSpec, x: float, y: float, radius: float) -> None:
+        half = (1.0, 2.0 * radius, 100.0)
+        for i in range(BIN_SIDES):
+            angle = 2 * np.pi * i / BIN_SIDES
+            reach = radius + half[0]
+            spec.worldbody.add_geom(
+                name=f"bin{i}",
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                size=half,
+                pos=(x + reach * np.cos(angle), y + reach * np.sin(angle), self._floor),
+                quat=(np.cos(0.5 * angle), 0.0, 0.0, np.sin(0.5 * angle)),
+                friction=(0.0, 0.0, 0.0),
+            )
 
     def _add_ground(self, spec: mujoco.MjSpec, ground: Standing) -> None:
         low, high = np.round(np.stack([ground.low, ground.high]) / self.unit / HULL_GRID) * HULL_GRID

@@ -18,14 +18,14 @@ import numpy as np
 
 from datagen.account import read_other, write_account
 from datagen.assets import for_split, load_models
-from datagen.build import Geometry, build
+from datagen.build import Geometry
 from datagen.clip_preview import thumbnail_name, write_preview
 from datagen.clip_rows import ClipRow, clip_row
 from datagen.clock import stage
 from datagen.clusters import logs_folder, require_cluster
-from datagen.density import texels_per_unit
 from datagen.failures import Failure, summary
 from datagen.lights import LightChoice
+from datagen.motion import Share
 from datagen.parts import outline
 from datagen.pathtrace import gbuffers
 from datagen.plan import (
@@ -45,6 +45,7 @@ from datagen.plan import (
 )
 from datagen.preview import contact_row, sheet_name, write_sheet
 from datagen.scene import SceneSpec, draw_scene
+from datagen.scene_geometry import scene_geometry
 from datagen.scheduling import make_each
 from datagen.settings import Settings
 from datagen.styles import Choice
@@ -172,12 +173,15 @@ def draw_and_build(
             assets={name: outline(parts) for name, parts in models.items()},
             asset_share=settings.asset_share,
             objects=settings.objects,
+            textures=sources.textures,
+            texture_share=settings.texture_share,
         ),
         frames=recipe.frames,
         path_frames=settings.path_frames,
         lights_share_path=recipe.lights_share_path,
+        moving=Share(recipe.moving_objects, recipe.moving_lights),
     )
-    return spec, build(spec, models, settings.mesh_edge, texels_per_unit(spec, settings))
+    return spec, scene_geometry(spec, settings, sources)
 
 
 def _set_aside(path: Path, frames: Sequence[dict[str, np.ndarray]]) -> None:

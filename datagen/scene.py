@@ -13,10 +13,13 @@ import numpy as np
 from pydantic import Field
 
 from datagen.lights import EVERY, PROCEDURAL, Family, HdriSpec, LightChoice, LightSpec, draw_light
+from datagen.motion import STILL, MotionSpec, Share, draw_motion
 from datagen.objects import ObjectSpec
 from datagen.paths import PathSpec
-from datagen.spec import Spec
+from datagen.shapes import SHAPES
+from datagen.spec import Number, Spec
 from datagen.styles import MIXED, OLD, STYLES, Choice, Style, StyleChoice
+from datagen.texture_sets import dressed
 from tron.cameras import Camera
 from tron.errors import TronError
 from tron.seeds import generator
@@ -53,6 +56,8 @@ class SceneSpec(Spec):
         objects: their ids go on from there.
         left_out: objects that found no place.
         metered: clips are exposed for what they show, not for the light.
+        motion: the object that moves within a clip, if one does.
+        turns_deg: by how much each light turns about the zenith within its clip; empty: none does.
     """
 
     version: int = SPEC_VERSION
@@ -65,6 +70,8 @@ class SceneSpec(Spec):
     objects: tuple[ObjectSpec, ...]
     left_out: int
     metered: bool = False
+    motion: MotionSpec | None = None
+    turns_deg: tuple[Number, ...] = ()
     lights: tuple[LightSpec, ...] = Field(min_length=1)
     cameras: CameraSpec
 
@@ -108,6 +115,7 @@ def draw_scene(
     frames: int = 5,
     path_frames: int = 93,
     lights_share_path: bool | None = None,
+    moving: Share = STILL,
 ) -> SceneSpec:
     """Draw scene ``index`` of a split.
 
@@ -121,6 +129,7 @@ def draw_scene(
         choice: what the recipe says of objects; None leaves it to the style.
         frames, path_frames: length of a clip and of the path it is cut from.
         lights_share_path: whether the clips of all lights begin at one place; None: in all styles but OLD.
+        moving: probabilities that something moves within a clip.
 
     Raises:
         TronError: too few objects found a place, or a clip is longer than its path.
@@ -141,7 +150,9 @@ def draw_scene(
         draw_light(streams("light", k), wanted, families or (own if wanted == "any" else EVERY), environments)
         for k, wanted in enumerate(lights)
     ]
+    dressing = partial(_dressed, choice=choice or Choice(), rng=streams("textures"))
     shared = style not in OLD if lights_share_path is None else lights_share_path
+    motion, turns = draw_motion(streams("motion"), made.objects, len(lights), moving)
     rng = streams("clips")
     first = [int(rng.integers(path_frames - frames + 1)) for _ in (lights[:1] if shared else lights)]
     return SceneSpec(
@@ -150,10 +161,12 @@ def draw_scene(
         index=index,
         seed=seed,
         style=style,
-        surroundings=made.surroundings,
-        objects=made.objects,
+        surroundings=tuple(dressing(item) for item in made.surroundings),
+        objects=tuple(dressing(item) for item in made.objects),
         left_out=made.left_out,
         metered=made.metered,
+        motion=motion,
+        turns_deg=turns,
         lights=tuple(drawn),
         cameras=CameraSpec(
             capture=made.capture,
@@ -162,3 +175,15 @@ def draw_scene(
             first_frame=first[0] if shared else tuple(first),
         ),
     )
+
+
+def _dressed(item: ObjectSpec, choice: Choice, rng: np.random.Generator) -> ObjectSpec:
+    """The object with the user's texture sets on some of its pieces."""
+    if item.shape is None or not choice.textures:
+        return item
+    roles = SHAPES[item.shape.kind].roles
+    materials = tuple(
+        dressed(material, roles[slot % len(roles)], choice.textures, choice.texture_share, rng)
+        for slot, material in enumerate(item.materials)
+    )
+    return item.model_copy(update={"materials": materials})

@@ -23,7 +23,7 @@ from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounc
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
     *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
-    *("captures", "equal_error", "variety_against"),
+    *("captures", "equal_error", "sharing", "variety_against"),
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
@@ -42,6 +42,8 @@ CAPTURED = {
     "assets": True,
     "asset_names": True,
     "asset_share": True,
+    "textures": True,
+    "texture_share": True,
     "environments": True,
     "share_maps": True,
     "catalogue": True,
@@ -81,6 +83,18 @@ class SplitSettings(_Model):
         description="All clips of a scene show it from the same cameras: each frame is path-traced under all "
         "lights at once, which share its paths, rays and G-buffers. null: in every style but A and B, "
         "whose clips begin at places of their own.",
+    )
+    moving_objects: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Share of scenes in whose clips an object is lifted and turned; their frames cost more.",
+    )
+    moving_lights: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Share of lights that turn about the zenith within their clip; their frames cost more.",
     )
     frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
     width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
@@ -186,17 +200,28 @@ class EqualErrorSettings(_Model):
     threads: int | None = Field(default=None, ge=1, description="Threads of both renderers; null: all.")
 
 
+class SharingSettings(_Model):
+    """Comparison of frames under 20 lights one by one and together, on scenes drawn as the test split's."""
+
+    scenes: int = Field(default=2, ge=1, le=1000, description="Number of scenes.")
+    size: int = Field(default=48, ge=8, le=2048, description="Width and height of the frames in pixels.")
+    path_spp: int = Field(default=64, ge=4, description="Paths per pixel of frames one by one.")
+    rounds: int = Field(default=3, ge=1, le=100, description="Times that each way is rendered, in turns.")
+    threads: int | None = Field(default=1, ge=1, description="Threads of both ways; null: all.")
+
+
 class Settings(_Model):
     """Settings of ``tron-datagen``."""
 
     output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
-    mode: Literal["make", "plan", "validate", "captures", "equal_error"] = Field(
+    mode: Literal["make", "plan", "validate", "captures", "equal_error", "sharing"] = Field(
         "make",
         description="make the dataset; plan it: print what is missing, the bytes and hours it takes and the "
         "memory of a worker, measured by a small probe here, and render nothing else; validate the one in "
         "output_dir and list every problem; path-trace captures for tron-reconstruct into "
-        "output_dir/captures; or measure on the test scenes in output_dir how long the path tracer takes to "
-        "be as near the truth as guidance is.",
+        "output_dir/captures; measure on the test scenes in output_dir how long the path tracer takes to be "
+        "as near the truth as guidance is (equal_error); or measure what it saves to path-trace under many "
+        "lights at once (sharing).",
     )
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."
@@ -215,6 +240,11 @@ class Settings(_Model):
     )
     captures: CaptureSettings = Field(
         CaptureSettings(), description="Captures to reconstruct, of the test scenes."
+    )
+    sharing: SharingSettings = Field(
+        SharingSettings(),
+        description="What mode=sharing measures: how many times as fast a frame is path-traced under 10 "
+        "lights of high and 10 of low contrast together as one by one, at equal mean error.",
     )
     equal_error: EqualErrorSettings = Field(
         EqualErrorSettings(), description="Comparison of guidance with the path tracer."
@@ -285,9 +315,10 @@ class Settings(_Model):
         None,
         gt=0,
         le=4096,
-        description="Texels a world unit of the textures on procedural pieces; null: two a pixel of frames "
-        "and views at the median distance of their cameras from the nearest thing. A scene has 4 million at "
-        "most; where that is too few, the log says how many a unit they are.",
+        description="Texels a world unit of the textures on procedural pieces; null: two along a pixel of "
+        "frames and views at the median distance of cameras and things. A scene has 64 for each pixel of a "
+        "frame at most, between one and eight million; where those are too few, the log says how many a unit "
+        "they are.",
     )
     environment_height: int = Field(
         256, ge=8, le=8192, description="Rows of the lat-long maps that lights are baked to."
@@ -298,6 +329,12 @@ class Settings(_Model):
     )
     asset_share: float = Field(
         1.0, ge=0, le=1, description="Share of objects drawn from assets, where given."
+    )
+    textures: Path | None = Field(
+        None, description="Folder of PBR texture sets to lay on procedural pieces whose role they suit."
+    )
+    texture_share: float = Field(
+        0.5, ge=0, le=1, description="Share of pieces with a texture set, among those that one suits."
     )
     environments: Path | None = Field(None, description="Folder of .hdr and .exr maps to use as lights.")
     share_maps: bool = Field(

@@ -26,7 +26,7 @@ Arrangement = Literal["strewn", "pile", "stack"]
 """Strewn over a disk, each on free ground; dropped onto one heap; one upon the other."""
 
 ATTEMPTS = 3
-FREE_STEPS, STEPS = 400, 1200
+FREE_STEPS, STEPS = 400, 1400
 """Steps of one attempt that are free of drag, and most steps of it in all."""
 
 DRAG = 0.02
@@ -39,6 +39,9 @@ STILL_STEPS = 15
 RESTLESS = 0.1
 """Above it a body still moves when its time is up."""
 
+ROOMY = 1.15
+"""Least radius of a heap's bin over that of its largest body."""
+
 FACES = 6
 """Resting poses of which the flattest is stacked."""
 
@@ -48,7 +51,7 @@ STAGGER = 0.03
 DEEPEST = 0.02
 """Typical bodies that one may lie deep in another: more and it has sunk in."""
 
-TRIES = 40
+TRIES = 30
 
 
 def settle(
@@ -77,7 +80,16 @@ def settle(
     """
     if not bodies:
         return []
-    world = RigidBodies(bodies, ground, fixed)
+    bin = None
+    if arrangement == "pile":
+        # A heap is poured into a bin without friction that is then lifted; dropped freely, things scatter.
+        widest = max(float(np.linalg.norm(body.points, axis=1).max()) for body in bodies)
+        radius = max(radius, ROOMY * widest)
+        # The whole bin stands over the ground, away from its rim or walls.
+        low, high = ground.low[:2] + radius, ground.high[:2] - radius
+        x, y = np.clip(centre, np.minimum(low, high), np.maximum(low, high)).tolist()
+        centre, bin = (x, y), (x, y, radius)
+    world = RigidBodies(bodies, ground, fixed, bin)
     drop = _Drop(rng, ground, centre, radius, arrangement, 2.0 * MARGIN * world.unit)
     waiting = list(range(len(bodies)))
     rest: list[Placement | None] = [None] * len(bodies)
@@ -107,15 +119,21 @@ def settle(
 
 def _run(world: RigidBodies) -> None:
     """Step until everything has been still for STILL_STEPS; what still moves after STEPS is taken away."""
-    still = 0
-    for k in range(STEPS):
-        world.step(drag=DRAG if k >= FREE_STEPS else 0.0)
-        still = still + 1 if world.speeds().max() < STILL else 0
-        if still >= STILL_STEPS:
-            return
+    _until_still(world, FREE_STEPS, drag=0.0)
+    world.lift_bin()
+    _until_still(world, STEPS - FREE_STEPS, drag=DRAG)
     for i, speed in enumerate(world.speeds()):
         if speed > RESTLESS:
             world.take_away(i)
+
+
+def _until_still(world: RigidBodies, steps: int, drag: float) -> None:
+    still = 0
+    for _ in range(steps):
+        world.step(drag)
+        still = still + 1 if world.speeds().max() < STILL else 0
+        if still >= STILL_STEPS:
+            return
 
 
 class _Drop:
@@ -159,7 +177,9 @@ class _Drop:
         if self._arrangement == "strewn":
             return layout.settle(hull, drawn[0])
         resting = [layout.settle(hull, turn) for turn in drawn]
-        return spin @ min(resting, key=lambda turn: np.ptp((hull.vertices @ turn.T)[:, 2]))
+        # Faces of a cube are equally high but for the last bit, which must not choose.
+        heights = [round(float(np.ptp((hull.vertices @ turn.T)[:, 2])), 4) for turn in resting]
+        return spin @ resting[int(np.argmin(heights))]
 
     def _stacked(self, points: np.ndarray, taken: Sequence[_Prism]) -> np.ndarray:
         """On top of all that stands where the stack does."""
@@ -173,24 +193,28 @@ class _Drop:
         return position
 
     def _free(self, points: np.ndarray, taken: Sequence[_Prism]) -> np.ndarray:
-        """The first free place of TRIES on the ground (a heap has one try); over it, if none is free."""
+        """The lowest place that is free among TRIES: on the ground, or above what stands there."""
         low, high = (
             self._ground.low[:2] - points.min(axis=0)[:2],
             self._ground.high[:2] - points.max(axis=0)[:2],
         )
-        position = np.zeros(3)
-        for _ in range(TRIES if self._arrangement == "strewn" else 1):
-            distance, angle = self._radius * np.sqrt(self._rng.random()), self._rng.uniform(0.0, 2 * np.pi)
+        inside = self._radius - float(np.linalg.norm(points[:, :2], axis=1).max())
+        radius = max(inside, 0.0) if self._arrangement == "pile" else self._radius
+        best = np.full(3, np.inf)
+        for _ in range(TRIES):
+            distance, angle = radius * np.sqrt(self._rng.random()), self._rng.uniform(0.0, 2 * np.pi)
             at = self._centre + distance * np.array([np.cos(angle), np.sin(angle)])
             position = self._on_ground(points, np.clip(at, np.minimum(low, high), np.maximum(low, high)))
-            if _Prism(points + position).is_apart_from(taken, self._gap):
-                return position
-        # It clears everything after at most one rise for each of them.
-        for other in sorted(taken, key=lambda prism: prism.high):
-            if _Prism(points + position).is_apart_from(taken, self._gap):
+            grounded = position[2]
+            # Lowest first: one rise over each clears them all.
+            for other in sorted(taken, key=lambda prism: prism.high):
+                if not _Prism(points + position).is_apart_from([other], self._gap):
+                    position[2] = other.high + 2.0 * self._gap - points[:, 2].min()
+            if position[2] < best[2]:
+                best = position
+            if position[2] == grounded:
                 break
-            position[2] = max(position[2], other.high + 2.0 * self._gap - points[:, 2].min())
-        return position
+        return best
 
     def _on_ground(self, points: np.ndarray, at: np.ndarray) -> np.ndarray:
         """Position over ``at`` (2,) such that no point is below the ground, and ``gap`` above it."""

@@ -11,12 +11,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from datagen.charts import Charts, divided, flatten, make_charts
-from datagen.materials import Material
+from datagen.materials import Appearance
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +28,12 @@ ROUNDS = 8
 
 FOLD = 0.1
 """Depth in texels to which the centre of a texel lies inside two triangles where a chart is folded."""
+
+
+class Evaluated(Protocol):
+    """What can say how it looks at points (N, 3) of unit normals (N, 3)."""
+
+    def evaluate(self, points: np.ndarray, normals: np.ndarray) -> Appearance: ...
 
 
 class Surface(NamedTuple):
@@ -42,7 +48,7 @@ class Surface(NamedTuple):
     vertices: np.ndarray
     normals: np.ndarray
     faces: np.ndarray
-    material: Material
+    material: Evaluated
 
 
 @dataclass

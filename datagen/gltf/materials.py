@@ -42,7 +42,7 @@ class TextureUse:
 
 @dataclass
 class Material:
-    """What a primitive is made of; fields as in ``Part``.
+    """Surface of a primitive; fields as in ``Part``.
 
     Attributes:
         alpha: (h, w) image or (1, 1); None where the material is opaque.

@@ -1,4 +1,4 @@
-"""Night: street lamps, lit windows and signs under a nearly black sky."""
+"""Night: street lamps, lit windows and shops under a nearly black sky, or at dusk."""
 
 from __future__ import annotations
 
@@ -62,9 +62,12 @@ class NightSpec(Light):
     def draw(cls, rng: np.random.Generator, files: Sequence[Light]) -> Self:  # noqa: ARG003
         far = np.linspace(1.0, 0.0, int(rng.integers(1, 4)))
         moon = rng.uniform(1e-4, 1e-2) if rng.random() < 0.3 else 0.0
+        dusk = rng.random() < 0.35  # the last light of the day, and lamps that have just been lit
+        zenith = _between(rng, 1e-3, 2e-2) if dusk else _between(rng, 2e-6, 1e-4)
+        glow = _between(rng, 1e-3, 3e-2) if dusk else _between(rng, 3e-5, 2e-3)
         return cls(
-            zenith=tuple(_between(rng, 2e-6, 1e-4) * np.array([0.8, 0.95, 1.4])),
-            glow=tuple(_between(rng, 3e-5, 2e-3) * np.array([1.3, 0.95, 0.65])),
+            zenith=tuple(zenith * np.array([0.8, 0.95, 1.4])),
+            glow=tuple(glow * np.array([1.3, 0.95, 0.65])),
             glow_azimuth_deg=rng.uniform(0.0, 360.0),
             ground=Ground.draw(rng, ("asphalt", "stone", "grass", "soil")),
             wet=rng.uniform(0.0, 0.5) if rng.random() < 0.5 else 0.0,

@@ -35,6 +35,8 @@ class Fractal:
 
     def threshold(self, share: float, octaves: int = 6, gain: float = 0.5) -> float:
         """Value that the noise exceeds on a ``share`` of the plane."""
+        if share <= 0.0:
+            return 1.0
         axis = np.arange(48) * 1.37
         points = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
         return float(np.quantile(self(points, octaves, gain), 1.0 - share))

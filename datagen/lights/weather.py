@@ -119,6 +119,8 @@ class Above:
     def _horizon(self) -> np.ndarray:
         around = [direction(azimuth, 2.0) for azimuth in np.arange(0.0, 360.0, 4.0)]
         ring = self.radiance(np.stack(around))
+        # The glow around a low sun lies beyond the haze, not in it.
+        ring = np.minimum(ring, 3.0 * self.skylight / np.pi)
         return np.concatenate([ring, ring[:1]])
 
     def horizon(self, directions: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from datagen.materials.material import Appearance, Material, Solid
 from datagen.materials.metal import MetalSpec
 from datagen.materials.paint import PaintSpec
 from datagen.materials.pattern import PatternSpec, draw_pattern
+from datagen.materials.photographed import PhotographedSpec
 from datagen.materials.plastic import PlasticSpec
 from datagen.materials.printed import PrintSpec
 from datagen.materials.rust import RustSpec
@@ -34,6 +35,7 @@ __all__ = [
     "Material",
     "MaterialSpec",
     "PatternSpec",
+    "PhotographedSpec",
     "draw_material",
     "draw_pattern",
 ]
@@ -59,7 +61,8 @@ SOLIDS: tuple[type[Solid], ...] = (
 """Families that roles choose from, each as likely as another; a new one changes what seeds give."""
 
 FAMILIES: dict[str, type[Material]] = {
-    str(material.model_fields["family"].default): material for material in (PatternSpec, *SOLIDS)
+    str(material.model_fields["family"].default): material
+    for material in (PatternSpec, *SOLIDS, PhotographedSpec)
 }
 """Name -> family."""
 

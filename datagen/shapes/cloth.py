@@ -114,7 +114,7 @@ def draped(p: np.ndarray, rng: np.random.Generator) -> Parts:
     """Cloth over a ball, a block or a drum that shows below it."""
     high, wide = between(p[0], 0.6, 1.1), between(p[1], 0.5, 0.8)
     middle = np.array([0.0, 0.0, 0.5 * high])
-    margin = 0.03
+    margin = 0.05
     choice = count(p[2], 0, 2)
     solid: Solid
     if choice == 0:
@@ -130,8 +130,9 @@ def draped(p: np.ndarray, rng: np.random.Generator) -> Parts:
     half_side = between(p[3], 0.9, 1.5)
     cloth = _square(half_side, rng.uniform(0.0, np.pi), top + 0.06)
     cloth[..., 2] += 0.01 * Noise(rng, octaves=2)(cloth.reshape(-1, 3) * 2.0).reshape(GRID, GRID)
-    cloth = _fallen(cloth, push, 0.02)
-    return [(solid, 0), (sheet(_smoothed(cloth), 0.02).refine(2), 1)]
+    # Pushed once more: evening out draws threads through the edges of a block.
+    cloth = push(_smoothed(_fallen(cloth, push, 0.02)))
+    return [(solid, 0), (sheet(cloth, 0.02).refine(2), 1)]
 
 
 def _smoothed(points: np.ndarray) -> np.ndarray:

@@ -40,8 +40,8 @@ def closed(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
         TronError: it is not, or it encloses nothing.
     """
     mesh = Mesh64(
-        vert_properties=np.ascontiguousarray(vertices, np.float64),
-        tri_verts=np.ascontiguousarray(faces, np.uint64),
+        vert_properties=np.array(vertices, np.float64, order="C"),
+        tri_verts=np.array(faces, np.uint64, order="C"),
     )
     solid = Manifold(mesh)
     if solid.status() != Error.NoError or not solid.volume() > 0.0:
@@ -151,7 +151,7 @@ def _transport(first: np.ndarray, a: np.ndarray, b: np.ndarray, at_a: np.ndarray
     return first / np.linalg.norm(first)
 
 
-def smooth_profile(heights: Sequence[float], radii: Sequence[float], n: int = 48) -> np.ndarray:
+def smooth_profile(heights: Vector, radii: Vector, n: int = 48) -> np.ndarray:
     """(n, 2) points (radius, height) of a monotone cubic through the given ones: it never overshoots."""
     z = np.linspace(heights[0], heights[-1], n)
     return np.column_stack([PchipInterpolator(heights, radii)(z), z])

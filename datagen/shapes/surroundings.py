@@ -89,6 +89,11 @@ def table_top(p: np.ndarray, _rng: np.random.Generator) -> Parts:
     return [(rounded_box((x, y, thick), 0.3 * thick, (0.0, 0.0, -0.5 * thick)), 0)]
 
 
+def _table_space(p: np.ndarray, _rng: np.random.Generator) -> Standing:
+    x, y, thick = _top_sides(p)
+    return _over((0.5 * x - 0.3 * thick, 0.5 * y - 0.3 * thick), 0.0)
+
+
 def round_table(p: np.ndarray, _rng: np.random.Generator) -> Parts:
     """Round top on a turned pillar with a wide foot."""
     thick, high = between(p[0], 0.04, 0.1), between(p[1], 0.8, 1.4)
@@ -200,7 +205,8 @@ def _terrain_heights(p: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     flat = np.column_stack([x.ravel(), y.ravel(), np.zeros(TERRAIN * TERRAIN)])
     frequency = between(p[0], 0.7, 1.6)
     heights = hills(flat * frequency).reshape(x.shape) * between(p[1], 0.015, 0.05)
-    slope = np.hypot(*np.gradient(heights, line, line)).max()
+    along, across = np.gradient(heights, line, line)
+    slope = float(np.hypot(along, across).max())
     heights *= min(1.0, 0.25 / slope)
     heights += clods(flat * between(p[2], 5.0, 9.0)).reshape(x.shape) * between(p[3], 0.0005, 0.0025)
     # A rim that rises a little hides the horizon of the slab.
@@ -227,7 +233,7 @@ SURROUNDINGS: dict[str, Surrounding] = {
         table_top,
         upright=True,
         roles=("wood",),
-        standing=lambda p, _rng: _over((0.97, 0.97 * 0.5 * _top_sides(p)[1]), 0.0),
+        standing=_table_space,
     ),
     "round_table": Surrounding(
         round_table,

@@ -10,6 +10,7 @@ from trimesh import Trimesh
 
 from datagen.objects import ObjectSpec
 from datagen.paths import PathSpec
+from datagen.texture_sets import TextureSet
 
 Streams = Callable[[str], np.random.Generator]
 """The scene's random stream of a name."""
@@ -23,11 +24,15 @@ class Choice:
         assets: id -> mesh in a unit ball, z up, standing; empty means procedural shapes only.
         asset_share: probability that an object is an asset, where there are any.
         objects: least and greatest number of objects; None takes the style's own.
+        textures: texture sets; empty means procedural materials only.
+        texture_share: probability that a piece has one of them, where one suits its role.
     """
 
     assets: Mapping[str, Trimesh] = field(default_factory=dict)
     asset_share: float = 1.0
     objects: tuple[int, int] | None = None
+    textures: tuple[TextureSet, ...] = ()
+    texture_share: float = 0.5
 
 
 @dataclass(frozen=True)

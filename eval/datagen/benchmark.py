@@ -10,6 +10,7 @@ from pathlib import Path
 from eval.datagen.kills import measure_kills
 from eval.datagen.parts import Found
 from eval.datagen.settings import DatagenSettings, Part
+from eval.datagen.sharing import measure_sharing
 from eval.datagen.soak import measure_soak
 from eval.datagen.specifications import measure_specifications
 from eval.datagen.throughput import measure_throughput
@@ -33,6 +34,7 @@ LEAD = (
 HEADLINE = {
     "variety.ood_gain_db": "Gain of the new world on real models",
     "variety.loss_db": "Loss on the old world's test scenes",
+    "lights.sharing_gain": "20 lights together: times as fast as one by one",
     "workers.speedup_2": "Two workers: times as fast as one",
     "frames_per_hour.256": "Frames an hour, 256²",
     "soak.rss_growth_mb": "Growth of memory over the soak",
@@ -82,6 +84,7 @@ class Datagen(DatagenSettings):
             return measure_variety(self.variety, self.seed, folder / part)
         tiny = self.tiny
         measures: dict[str, Callable[[Path], Found]] = {
+            "sharing": lambda at: measure_sharing(self.sharing, at),
             "workers": lambda at: measure_workers(self.workers, self.rounds, at),
             "soak": lambda at: measure_soak(tiny, self.soak_scenes, at),
             "kills": lambda at: measure_kills(_of(tiny, self.kill_scenes), self.kills, self.seed, at),

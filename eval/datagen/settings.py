@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat
 
 from eval.benchmark import Benchmark
 
-Part = Literal["variety", "workers", "soak", "kills", "specifications", "throughput"]
+Part = Literal["variety", "sharing", "workers", "soak", "kills", "specifications", "throughput"]
 
 
 class VarietySettings(BaseModel):
@@ -41,6 +41,7 @@ class DatagenSettings(Benchmark):
     parts: list[Part] = Field(description="what is measured", min_length=1)
     seed: int = Field(default=0, description="seed of the judging scenes, the kills and the intervals")
     variety: VarietySettings
+    sharing: list[str] = Field(description="scenes whose frames are path-traced under many lights")
     workers: list[str] = Field(description="scenes that one worker and two make")
     rounds: PositiveInt = Field(default=2, description="rounds of that")
     tiny: list[str] = Field(description="recipe of tiny scenes, of the train split alone")

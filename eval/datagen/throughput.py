@@ -74,10 +74,10 @@ class Throughput:
         """Time by stage as a chart and a table."""
         stages = [stage for stage in STAGES if any(stage in size.seconds for size in self.sizes.values())]
         bars = {
-            f"{width}²": {STAGES[stage]: size.seconds.get(stage, 0.0) / size.frames for stage in stages}
+            f"{width}²": {STAGES[stage]: 100 * size.seconds.get(stage, 0.0) / size.total for stage in stages}
             for width, size in self.sizes.items()
         }
-        chart = bar_chart(bars, "seconds of one worker a frame", "Where the time of a frame goes.")
+        chart = bar_chart(bars, "share of the time, %", "Where the time of a frame goes, by its size.")
         rows = [
             [
                 f"{width}²",

@@ -119,7 +119,11 @@ class Variety:
         """The two renderers in a table, and side by side."""
         rows = {row.metric: row for row in self.rows(0)}
         table = [
-            [words, *(row_cell(rows.get(f"variety.psnr.{m}.{judge}")) for m in (LIT, OLD, NEW))]
+            [
+                words,
+                *(row_cell(rows.get(f"variety.psnr.{method}.{judge}")) for method in (LIT, OLD, NEW)),
+                row_cell(self.gain([judge], 0, "variety.gain"), "strong"),
+            ]
             for judge, words in JUDGES.items()
         ]
         caption = (
@@ -127,7 +131,7 @@ class Variety:
             f"scenes of the old distribution and of that trained on {self.scenes.get(NEW, 0)} of the new, "
             "for as long; lit is the picture that both start from."
         )
-        headings = ["Judged on", "lit", "trained on the old", "trained on the new"]
+        headings = ["Judged on", "lit", "trained on the old", "trained on the new", "gain"]
         judged = {score.scene for score in self.scores}
         blocks: list[Block] = [Table(caption, headings, table), Text(interval_note(len(judged)))]
         if self.left_out:

@@ -13,7 +13,7 @@ import pytest
 from datagen.build import Geometry, build
 from datagen.capture_export import captured
 from datagen.lights import FAMILIES, Family
-from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
+from datagen.pathtrace import direct_irradiance, gbuffers, render_frames, render_lights, stacked_lights
 from datagen.plan import Sources, Work
 from datagen.run import make_scene
 from datagen.scene import draw_scene
@@ -61,8 +61,11 @@ def light(number: int, rotation: float) -> EnvironmentMap:
         lambda meshes, scene, view, seed: gbuffers(meshes, [view]),
         lambda meshes, scene, view, seed: render_frames(scene, [view], 4, [seed]),
         lambda meshes, scene, view, seed: render_frames(scene, [view], 4, [seed], transparent=True),
+        lambda meshes, scene, view, seed: render_lights(
+            scene, stacked_lights([light(seed % 100 + k, 0.0) for k in range(3)]), view, 4, seed
+        ),
     ],
-    ids=["irradiance", "gbuffers", "frames", "transparent"],
+    ids=["irradiance", "gbuffers", "frames", "transparent", "many lights"],
 )
 def test_another_view_seed_light_or_scene_is_traced_by_the_same_kernels(variant, shoot):
     meshes = geometry(0)
@@ -119,10 +122,17 @@ def test_another_light_of_a_family_is_baked_by_the_same_kernels(variant, family)
         assert baked(number) <= first
 
 
-def test_a_second_scene_of_a_split_brings_no_kernel(variant, tmp_path: Path):
+@pytest.mark.parametrize("shared", [False, True], ids=["own paths", "shared path"])
+def test_a_second_scene_of_a_split_brings_no_kernel(variant, shared, tmp_path: Path):
     """Surfels, their refinement, guidance, frames, references: all of a scene."""
     tiny = [f"test.{key}" for key in ("frames=2", "width=16", "height=16", "path_spp=4", "reference_spp=4")]
-    tiny += ["test.lights=[studio,overcast]", "test.guidance_spp=2", "cluster=null", "path_frames=8"]
+    tiny += [
+        f"test.lights_share_path={shared}",
+        "test.lights=[studio,overcast]",
+        "test.guidance_spp=2",
+        "cluster=null",
+        "path_frames=8",
+    ]
     tiny += ["views=6", "view_width=32", "view_height=32", "surfels=1500", "refine_steps=6", "mesh_edge=0.2"]
     tiny += ["environment_height=16", "objects=[2,2]", f"output_dir={tmp_path}"]
     settings = check(compose_recipe("conf.datagen", Settings, tiny), Settings)

@@ -75,9 +75,9 @@ def test_gbuffers_see_the_ball_and_the_floor_where_they_are(view, camera):
 
 def test_the_base_color_of_metal_is_its_own(view):
     ball = view.object_id == FIRST_ID + 1
-    np.testing.assert_allclose(view.base_color[ball] / (0.9, 0.5, 0.1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(view.base_color[ball] / (0.9, 0.5, 0.1), 1.0, atol=1e-3)  # half precision
     np.testing.assert_allclose(view.metallic[ball], 1.0, atol=1e-6)
-    np.testing.assert_allclose(view.roughness[ball], 0.3, atol=1e-6)
+    np.testing.assert_allclose(view.roughness[ball], 0.3, atol=2e-4)
 
 
 def test_views_do_not_depend_on_their_neighbours(geometry, camera, view):

@@ -338,7 +338,7 @@ def test_a_bad_model_is_left_out_and_counted(folder, tmp_path, caplog, tiny_scen
     with caplog.at_level("WARNING", "datagen"):
         assert datagen(*arguments) == 0
     assert ["broken.glb" in record.message for record in caplog.records] == [True]
-    card = (out / "card.md").read_text()
+    card = (out / "README.md").read_text()
     assert "Models left out because they cannot be used: 1." in card
     assert "| broken.glb | model requires the glTF extension ACME_hologram" in card
     assert "| one | CC0-1.0" in card

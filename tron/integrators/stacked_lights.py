@@ -36,7 +36,7 @@ PACKET = 4
 
 
 class Texel(NamedTuple):
-    """What is known of a direction that a texel sends light from, one lane each.
+    """Direction that a texel sends light from, one lane each.
 
     Attributes:
         direction: unit, world.
