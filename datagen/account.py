@@ -1,4 +1,4 @@
-"""What a dataset says of itself, written anew from its records after every run, and only where it changed."""
+"""Account of a dataset, written anew from its records after every run, and only where it changed."""
 
 from __future__ import annotations
 

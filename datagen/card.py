@@ -194,7 +194,7 @@ def _variety(variety: Histograms, other: Other | None, pictures: Sequence[str]) 
 
 
 def _reading(settings: Settings, clips: Mapping[str, int]) -> list[str]:
-    """How other programs read it."""
+    """Section for other programs: the calls that read it."""
     if not clips:
         return []
     named = [each["config_name"] for each in configurations(settings, clips)]

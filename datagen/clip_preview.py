@@ -1,4 +1,4 @@
-"""What index.html shows of a clip: a thumbnail, and a script with the linear values of its frames.
+"""Preview of a clip in index.html: a thumbnail, and a script with the linear values of its frames.
 
 No browser reads EXR, and a page opened from a folder may neither fetch files beside it nor read the pixels of
 pictures beside it. It may run scripts beside it, so a clip's frames lie in one: PNGs whose pixels hold the

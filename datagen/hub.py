@@ -1,4 +1,4 @@
-"""What the Hugging Face Hub, `datasets` and pandas read of a dataset: front matter and metadata.parquet.
+"""Front matter and metadata.parquet: the Hugging Face Hub, `datasets` and pandas read a dataset by them.
 
 Shards are webdataset tars already. `datasets` takes the columns of a whole configuration from the first clips
 of one split, so splits whose clips hold other members or another number of frames are configurations of

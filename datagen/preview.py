@@ -44,7 +44,7 @@ def is_light(member: str) -> bool:
 
 
 def displayable(member: str, image: np.ndarray) -> np.ndarray:
-    """What a member that is no light looks like, (H, W, C) in [0, 1]: no exposure applies to it.
+    """Display values of a member that is no light, (H, W, C) in [0, 1]: no exposure applies to it.
 
     Base color goes through the square root (near enough to sRGB to look at), normals through (n + 1) / 2.
     """

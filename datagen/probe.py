@@ -1,4 +1,4 @@
-"""What a scene costs, measured on a small one: seconds by part of the work, bytes on disk, memory.
+"""Cost of a scene, measured on a small one: seconds by part of the work, bytes on disk, memory.
 
 The probe runs the functions that make scenes, on a scene of the split, at two small sizes of frames and for
 one frame and three. Seconds and bytes are taken as linear: what grows with pixels, frames, views and
@@ -60,7 +60,7 @@ class SceneCost:
 
 @dataclass(frozen=True)
 class _Clips:
-    """What the clips of a probe cost: seconds, and bytes of shards and previews."""
+    """Cost of the clips of a probe: seconds, and bytes of shards and previews."""
 
     seconds: float
     shards: float
@@ -172,7 +172,7 @@ def _clips(spec: SceneSpec, geometry: Geometry, surfels: GaussianScene, settings
 
 
 def _timed(work: Callable[[], Result]) -> tuple[Result, float]:
-    """What work gives, and its seconds of processor: what else runs on the machine does not count."""
+    """Result of work, and its seconds of processor: what else runs on the machine does not count."""
     start = time.process_time()
     result = work()
     return result, time.process_time() - start

@@ -1,4 +1,4 @@
-"""How much a dataset varies: histograms of its materials, lights and pictures, one frame a clip.
+"""Variety of a dataset: histograms of its materials, lights and pictures, one frame a clip.
 
 A scene's histograms are counted where it is made, from the true G-buffer and the frame beside it, and lie in
 its record; those of a dataset are their sums. A dataset that was made before is counted from its shards, as

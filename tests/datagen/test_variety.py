@@ -1,6 +1,7 @@
 """Histograms against closed forms: lengths of silhouettes, shares of light, sums over clips."""
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ CAMERA = Camera.look_at((0, 0, 0), (0, 1, 0), fov_deg=50, width=SIZE, height=SIZ
 CAMERA_AXIS_Z = CAMERA.world_to_camera[2, :3]
 
 
-def plane_distance(normal: np.ndarray, offset: float) -> np.ndarray:
+def plane_distance(normal: Sequence[float], offset: float) -> np.ndarray:
     """(H, W) distance along each ray to the plane normal . x = offset; infinite where it is not met."""
     cosine = CAMERA.rays() @ np.asarray(normal, float)
     with np.errstate(divide="ignore"):
@@ -76,7 +77,7 @@ def frame() -> dict[str, np.ndarray]:
         "irradiance": np.where(seen > 0, 0.75 * light, 5 * light),  # what is not foreground does not count
         "lit": light,
         "shadowed": 0.875 * light,
-        "base_color_ref": np.broadcast_to(np.float32([0.5, 0.5, 0.5]), (SIZE, SIZE, 3)),
+        "base_color_ref": np.broadcast_to(np.full(3, 0.5, np.float32), (SIZE, SIZE, 3)),
         "roughness_ref": np.full((SIZE, SIZE, 1), 0.31, np.float32),
         "metallic_ref": np.full((SIZE, SIZE), 1.0, np.float32),
         "depth_ref": np.full((SIZE, SIZE, 1), 1000.0, np.float32),
@@ -89,7 +90,13 @@ def test_each_measure_counts_what_it_says():
     pixels = SIZE * SIZE // 4
     for name, measure in MEASURES.items():
         assert sum(found[name]) == (pixels if measure.counted == "pixels" else 1)
-    expected = {"coverage": 0.25, "albedo": 0.5, "roughness": 0.31, "metallic": 1.0, "contrast": 0.52}
+    expected: dict[str, float] = {
+        "coverage": 0.25,
+        "albedo": 0.5,
+        "roughness": 0.31,
+        "metallic": 1.0,
+        "contrast": 0.52,
+    }
     expected |= {"shadow": 0.25, "bounce": 0.125, "depth": 100.0}  # beyond the last bin counts in it
     for name, value in expected.items():
         edges = MEASURES[name].edges
