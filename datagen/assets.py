@@ -68,7 +68,7 @@ class Refused(BaseModel):
 
 
 class Entry(BaseModel):
-    """What a catalogue says of a file; fields as in :class:`Asset`."""
+    """Entry of a catalogue; fields as in :class:`Asset`."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -193,7 +193,7 @@ class Crew:
         self._client.cancel([turn.future], force=True)
 
     def _stack(self, turn: _Turn) -> str:
-        """Where a worker hangs, as Python prints it."""
+        """Stack of a worker that hangs, as Python prints it."""
         found: list[str] = []
 
         def ask() -> None:

@@ -226,7 +226,7 @@ def equal(by_paths: Mapping[int, tuple[float, float]], error: float) -> tuple[fl
 
 
 def timed(work: Callable[[], Any]) -> tuple[Any, float]:
-    """What ``work`` makes, evaluated, and the seconds that it took."""
+    """Result of ``work``, evaluated, and the seconds that it took."""
     import drjit as dr
 
     dr.sync_thread()

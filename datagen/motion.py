@@ -51,7 +51,7 @@ class MotionSpec(Spec):
     turn_deg: Number
 
     def pose(self, item: ObjectSpec, time: float) -> Pose:
-        """Where the object is at a time; at 0 where it rests."""
+        """Pose of the object at a time; at 0 it rests."""
         turn = Rotation.from_euler("z", self.turn_deg * time**3, degrees=True).as_matrix()
         shift = np.array([0.0, 0.0, self.lift * np.sin(0.5 * np.pi * time)])
         return Pose(turn, shift, np.asarray(item.placement.position, np.float64))

@@ -15,7 +15,7 @@ THINNEST = 1e-12
 
 
 class Sampling(NamedTuple):
-    """How a texture is looked up: at ``matrix`` (3, 3) times a part's (u, v, 1), continued by ``wrap``."""
+    """Lookup of a texture: at ``matrix`` (3, 3) times a part's (u, v, 1), continued by ``wrap``."""
 
     matrix: np.ndarray
     wrap: Wrap

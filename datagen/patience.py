@@ -1,4 +1,4 @@
-"""How long a scene may take before whoever makes it counts as hung."""
+"""Time that a scene may take before its maker counts as hung."""
 
 from __future__ import annotations
 

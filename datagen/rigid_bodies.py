@@ -215,7 +215,7 @@ class RigidBodies:
         return depth * self.unit
 
     def placement(self, i: int) -> Placement | None:
-        """Where body ``i`` is; None if it is gone."""
+        """Placement of body ``i``; None if it is gone."""
         if self.gone[i]:
             return None
         state = self._data.qpos[self._at[i]]

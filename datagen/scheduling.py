@@ -34,7 +34,7 @@ Task = Callable[[Work, Settings, Sources], Made]
 
 @dataclass(frozen=True)
 class Attempt(Generic[Made]):
-    """What a task gave, or why it gave nothing; its seconds by stage; the worker's name, as in its log."""
+    """Result of a task, or why there is none; its seconds by stage; the worker's name, as in its log."""
 
     outcome: Made | Failure
     seconds: dict[str, float] = field(default_factory=dict)

@@ -137,7 +137,7 @@ def _until_still(world: RigidBodies, steps: int, drag: float) -> None:
 
 
 class _Drop:
-    """Where bodies start: apart from each other and from what stands there."""
+    """Starts of bodies: apart from each other and from what stands there."""
 
     def __init__(
         self,

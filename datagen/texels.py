@@ -31,7 +31,7 @@ FOLD = 0.1
 
 
 class Evaluated(Protocol):
-    """What can say how it looks at points (N, 3) of unit normals (N, 3)."""
+    """Source of the look at points (N, 3) of unit normals (N, 3)."""
 
     def evaluate(self, points: np.ndarray, normals: np.ndarray) -> Appearance: ...
 
@@ -193,7 +193,7 @@ def _pairs(charts: Charts, density: float) -> _Pairs:
 
 
 def _depths(charts: Charts, density: float, pairs: _Pairs) -> tuple[np.ndarray, np.ndarray]:
-    """How far inside its triangle each texel's centre is, in texels (P,), and its weights (P, 3)."""
+    """Depth of each texel's centre inside its triangle, in texels (P,), and its weights (P, 3)."""
     corners = charts.corners * density + 1.0
     a, b, c = (corners[:, k] for k in range(3))
     twice = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]

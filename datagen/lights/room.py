@@ -63,7 +63,7 @@ class Bulb(Spec):
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays end.
+    """Ends of rays.
 
     Attributes:
         points: (N, 3) metres.

@@ -1,4 +1,4 @@
-"""What a surface looks like at its points: the base of every family of materials."""
+"""Look of a surface at its points: the base of every family of materials."""
 
 from __future__ import annotations
 

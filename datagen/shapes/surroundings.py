@@ -1,4 +1,4 @@
-"""What stands still around the objects: floors, table tops, a room, terrain, and the space free over each."""
+"""Surroundings of the objects: floors, table tops, a room, terrain, and the space free over each."""
 
 from __future__ import annotations
 

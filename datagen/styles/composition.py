@@ -1,4 +1,4 @@
-"""What a style makes of a scene: things, and the paths that cameras take among them."""
+"""Composition of a scene by its style: things, and the paths that cameras take among them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Streams = Callable[[str], np.random.Generator]
 
 @dataclass(frozen=True)
 class Choice:
-    """What a recipe says of a scene's objects.
+    """Wishes of a recipe for a scene's objects.
 
     Attributes:
         assets: id -> mesh in a unit ball, z up, standing; empty means procedural shapes only.

@@ -1,4 +1,4 @@
-"""What every part of the datagen benchmark gives: figures, and its own sections of the page."""
+"""Result of a part of the datagen benchmark: figures, and its own sections of the page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a wider world teaches: a renderer trained on the old distribution and one on the new, both judged.
+"""Gain of a wider world: a renderer trained on the old distribution and one on the new, both judged.
 
 Both datasets have as many scenes, lights and frames of the same size, and both renderers train for as long,
 side by side on a thread each. They are judged by real models under photographed light, which neither has

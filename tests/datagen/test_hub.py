@@ -17,25 +17,7 @@ from tron.shards.manifest import Manifest
 from tron.shards.reader import read_clips
 from tron.shards.schema import MEMBERS, clip_members
 
-READ = """
-import json, sys
-import datasets
-folder, shards, cache = sys.argv[1], sys.argv[2].split(","), sys.argv[3]
-found = {}
-plain = datasets.load_dataset("webdataset", data_files={"train": shards}, cache_dir=cache, split="train")
-found["plain"] = [row["__key__"] for row in plain]
-whole = datasets.load_dataset(folder, cache_dir=cache)
-found["default"] = {split: [row["__key__"] for row in rows] for split, rows in whole.items()}
-held_out = datasets.load_dataset(folder, "test", cache_dir=cache, split="test")
-found["columns"] = [plain.column_names, held_out.column_names]
-row = plain[0]
-found["exr"] = row["f01.rgb.exr"].hex()
-found["meta"] = row["meta.json"]
-found["lights"] = [each["meta.json"]["extra"]["light_spec"] for each in plain]
-streamed = datasets.load_dataset(folder, split="train", streaming=True, cache_dir=cache)
-found["streamed"] = [row["__key__"] for row in streamed]
-print(json.dumps(found))
-"""
+READ = Path(__file__).with_name("read_by_datasets.py")
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +25,7 @@ def read(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
     """What `datasets` says of the folder, in a process of its own that may not reach the network."""
     home = tmp_path_factory.mktemp("hub")
     shards = [str(small_dataset / entry.name) for entry in Manifest.load(small_dataset).of_split("train")]
-    command = [sys.executable, "-c", READ, str(small_dataset), ",".join(shards), str(home / "cache")]
+    command = [sys.executable, str(READ), str(small_dataset), ",".join(shards), str(home / "cache")]
     done = subprocess.run(
         command,
         env={"HF_HUB_OFFLINE": "1", "HF_HOME": str(home), "PATH": "/usr/bin:/bin"},
