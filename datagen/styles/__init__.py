@@ -28,7 +28,7 @@ STYLES: dict[str, Callable[[Streams, Choice], Composition]] = {
 OLD = ("A", "B")
 """Styles that draw what they always drew: among other things a place of its own for each light's clip."""
 
-MIXED = ("object", "table", "table", "room", "ground")
+MIXED = ("object", "object", "table", "table", "table", "room", "ground")
 """Styles that ``mixed`` draws from, one as likely as another."""
 
 if TYPE_CHECKING:
