@@ -13,7 +13,7 @@ from datagen.settling import Body
 from datagen.shapes import Standing
 from tron.errors import TronError
 
-SAMPLES = 160
+SAMPLES = 48
 """Places of a path that are looked at."""
 
 TRIES = 40
