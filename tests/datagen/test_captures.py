@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import datagen.capture_export
-from datagen.build import build
 from datagen.capture_export import make_capture, make_captures
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
-from datagen.plan import Work
+from datagen.plan import Sources, Work
 from datagen.relit import straightened
 from datagen.scene import SceneSpec
+from datagen.scene_geometry import scene_geometry
 from datagen.settings import Settings
 from datagen.validate import validate
 from tron.captures import Capture
@@ -73,8 +73,8 @@ def spec(folder) -> SceneSpec:
 
 
 @pytest.fixture(scope="module")
-def geometry(spec, variant):
-    return build(spec, edge=EDGE)
+def geometry(spec, output):
+    return scene_geometry(spec, tiny(output), Sources())
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ def settings(folder, **split):
         "height": SIZE,
         "path_spp": 36,
         "guidance_spp": 16,
-        "lights": ["studio", "overcast"],
+        "lights": ["interior", "overcast"],
     }
     return Settings.model_validate(
         {
@@ -50,7 +50,7 @@ def drawn(share, shared):
         "train",
         1,
         style="A",
-        lights=["studio", "overcast"],
+        lights=["interior", "overcast"],
         choice=Choice(objects=(3, 3)),
         frames=3,
         path_frames=8,
@@ -130,8 +130,7 @@ def test_lights_turn_about_the_zenith(filmed):
             np.abs(light.bake(32).rotated(degrees).lookup(camera.rays())[behind] - seen).mean()
             for degrees in (turn, 0.0)
         )
-        assert turned < 0.1 * seen.mean()
-        told.append(turned < 0.8 * unturned)  # a surround that fades with height looks the same when it turns
+        told.append(turned < 0.7 * unturned)  # a surround that fades with height looks the same when it turns
     assert any(told)
 
 

@@ -16,7 +16,7 @@ import pytest
 import trimesh
 import yaml
 
-import datagen.run
+import datagen.scene_geometry
 from datagen.card import command_line
 from datagen.plan import Sources, Work, adopt, plan
 from datagen.run import make, make_scene
@@ -310,10 +310,10 @@ def test_a_key_that_an_older_dataset_did_not_know_has_its_default(tmp_path):
 
 
 def test_failures_are_listed_and_retried_by_their_command(dataset, unfinished, files_of, monkeypatch, caplog):
-    def fails(spec, *_):
+    def fails(*_, **__):
         raise RuntimeError("no memory\nfor this")
 
-    monkeypatch.setattr(datagen.run, "build", fails)
+    monkeypatch.setattr(datagen.scene_geometry, "build", fails)
     settings = tiny(unfinished)
     assert make(settings) == 1
     failure = json.loads((unfinished / "failures.jsonl").read_text())
@@ -321,7 +321,7 @@ def test_failures_are_listed_and_retried_by_their_command(dataset, unfinished, f
     assert failure["reason"] == "RuntimeError: no memory for this"
     trace = (unfinished / failure["traceback"]).read_text()
     assert failure["traceback"] == "failures/train-000001.txt"
-    assert "in draw_and_build" in trace
+    assert "in scene_geometry" in trace
     assert trace.endswith("RuntimeError: no memory\nfor this\n")
     assert (
         f"listed in {unfinished / 'failures.jsonl'}, tracebacks in {unfinished / 'failures'}" in caplog.text
