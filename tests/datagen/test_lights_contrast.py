@@ -87,6 +87,7 @@ def test_a_scene_asks_for_classes_and_reads_them_back():
     assert twice.to_json() == spec.to_json()
 
 
+@pytest.mark.long
 def test_the_shares_of_the_classes_are_those_that_the_module_tells():
     """A third or so of all drawn lights is of low contrast, about half of high, and some are in between."""
     found = Counter(

@@ -253,6 +253,7 @@ def test_a_scene_depends_on_nothing_else_that_is_made(dataset, tmp_path, files_o
     assert [entry.name for entry in Manifest.load(tmp_path).shards] == ["train-00001.tar"]
 
 
+@pytest.mark.long
 def test_a_dataset_grows_without_making_the_old_scenes_again(tmp_path, monkeypatch, files_of):
     small = ["train.scenes=1", "train_b.scenes=0", "validation.scenes=0", "test.scenes=0"]
     assert make(tiny(tmp_path, *small)) == 0

@@ -157,6 +157,7 @@ def test_frames_an_hour_leave_out_the_scene_that_compiles():
     assert "frames" in section.title.lower()
 
 
+@pytest.mark.long
 def test_a_kill_reaches_what_the_command_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A stand-in starts a process that lives on by itself: killed with it, or found to outlive it."""
     script = tmp_path / "tron-datagen"
@@ -216,6 +217,7 @@ def variety(real_data: Path | None) -> VarietySettings:
     )
 
 
+@pytest.mark.long
 def test_variety_trains_on_both_and_judges_by_every_model_that_can_be_read(
     stand_ins: Path, tmp_path: Path, shared: Callable[[], Path]
 ):

@@ -278,6 +278,7 @@ def write_bad_files(folder, write_glb):
     return files
 
 
+@pytest.mark.long
 def test_a_bad_model_costs_one_line_a_second_and_little_memory(tmp_path, write_glb):
     files = write_bad_files(tmp_path, write_glb)
     paths = [path for _, path in files.values()]
