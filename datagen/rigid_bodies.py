@@ -14,6 +14,7 @@ the ground, is rounded likewise. The grid also lets things come to rest: what wo
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,6 +27,9 @@ from trimesh import Trimesh
 
 from datagen.layout import Placement, support_hull
 from datagen.shapes import Standing
+
+# Else MuJoCo writes MUJOCO_LOG.TXT into the user's folder; what it warns of, step() finds by itself.
+mujoco.set_mju_user_warning(logging.getLogger(__name__).debug)
 
 STEP = 0.005
 """Seconds a step."""

@@ -219,12 +219,14 @@ def test_things_keep_off_what_stands_fixed():
         assert max(abs(x), abs(y)) > 0.4 or z > 2.0
 
 
-def test_an_explosion_is_caught_tried_again_and_counted(crowd, monkeypatch):
+def test_an_explosion_is_caught_tried_again_and_counted(crowd, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
     world = RigidBodies(crowd[:2], FLAT)
     world.put(0, np.eye(3), np.array([0.0, 0.0, 1.0]))
     world._data.qvel[0] = np.nan
     with pytest.raises(Exploded):
         world.step()
+    assert list(tmp_path.iterdir()) == [], "MuJoCo's log"
     runs = []
     run = settling._run
 
