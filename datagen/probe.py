@@ -159,8 +159,9 @@ def _clips(spec: SceneSpec, geometry: Geometry, surfels: GaussianScene, settings
     """Make a scene's clips in a folder that goes away."""
 
     def make(folder: Path) -> int:
+        there = settings.model_copy(update={"output_dir": folder})
         with ShardWriter(folder, spec.split, settings.clips_per_shard) as writer:
-            for meta, frames in make_clips(spec, geometry, surfels, settings):
+            for meta, frames in make_clips(spec, geometry, surfels, there):
                 writer.write(meta, frames)
                 write_preview(folder, meta, frames)
         return sum(entry.bytes for entry in writer.entries)
