@@ -109,7 +109,7 @@ def workers(settings: Settings, most: int) -> Iterator[Any]:
                 _where(options),
                 "look at the queue and the workers' logs, or wait longer",
             ) from error
-        log_to = WorkerLog(logs_folder(settings).absolute(), log_level())
+        log_to = WorkerLog(logs_folder(settings).absolute(), log_level(), ours(settings))
         try:
             made.register_plugin(log_to)
         except OSError as error:
