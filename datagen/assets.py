@@ -13,6 +13,7 @@ explicitly.
 from __future__ import annotations
 
 import json
+import logging
 from collections import Counter
 from collections.abc import Collection, Sequence
 from functools import lru_cache
@@ -21,11 +22,14 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from datagen.lights import HdriSpec, classify
-from datagen.models import SUFFIXES, Part, load_model
+from datagen.lights import Contrast, HdriSpec, classify
+from datagen.models import SUFFIXES, load_model
+from datagen.parts import Part
 from tron.errors import TronError
 from tron.shading.environment import EnvironmentMap
 from tron.storage import sha256
+
+log = logging.getLogger(__name__)
 
 CATALOGUE_NAME = "catalogue.json"
 LARGEST_CATALOGUE = 64 * 2**20
@@ -53,7 +57,19 @@ class Asset(BaseModel):
     up: Literal["y", "z"] = "y"
 
 
-class _Entry(BaseModel):
+class Refused(BaseModel):
+    """A model of the folder that cannot be used, and why, on one line."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    id: str
+    path: str
+    reason: str
+
+
+class Entry(BaseModel):
+    """Entry of a catalogue; fields as in :class:`Asset`."""
+
     model_config = ConfigDict(extra="forbid")
 
     path: str
@@ -90,7 +106,7 @@ def find_assets(
     )
     if not paths:
         raise TronError(f"no {', '.join(suffixes)} in the folder", folder)
-    entries = _read_catalogue(
+    entries = read_catalogue(
         catalogue if catalogue is not None else folder / CATALOGUE_NAME, catalogue is not None
     )
     stems = Counter(Path(path).stem for path in paths)
@@ -104,7 +120,7 @@ def find_assets(
     for name, path in found.items():
         if names and name not in names:
             continue
-        entry = entries.get(path, _Entry(path=path))
+        entry = entries.get(path, Entry(path=path))
         if not entry.licence and name not in allow_unlicensed:
             raise TronError(
                 f"asset '{name}' has no licence",
@@ -113,6 +129,39 @@ def find_assets(
             )
         assets.append(Asset(id=name, sha256=sha256(folder / path), **entry.model_dump()))
     return assets
+
+
+def find_models(
+    folder: Path,
+    catalogue: Path | None = None,
+    allow_unlicensed: Collection[str] = (),
+    names: Collection[str] = (),
+) -> tuple[list[Asset], list[Refused]]:
+    """List the models of a folder that can be used, and those that cannot, each of them read once.
+
+    A model that cannot be used is left out with a warning; asked for by name, it is an error.
+
+    Raises:
+        TronError: as :func:`find_assets`, a model of ``names`` that cannot be used, or none that can.
+    """
+    usable, refused = [], []
+    for asset in find_assets(folder, SUFFIXES, catalogue, allow_unlicensed, names):
+        try:
+            load_model(folder / asset.path, asset.up)
+        except TronError as error:
+            if names:
+                raise
+            reason = f"{error.what}: {error.mend}" if error.mend else error.what
+            refused.append(Refused(id=asset.id, path=asset.path, reason=" ".join(reason.split())))
+        else:
+            usable.append(asset)
+    for model in refused if usable else ():
+        log.warning("model left out: %s: %s", folder / model.path, model.reason)
+    if not usable:
+        raise TronError(
+            f"none of the {len(refused)} models can be used; '{refused[0].id}': {refused[0].reason}", folder
+        )
+    return usable, refused
 
 
 def find_environments(
@@ -130,9 +179,8 @@ def find_environments(
 
 
 @lru_cache(maxsize=4096)
-def _contrast(path: str, _sha256: str) -> Literal["high", "low"]:
-    environment = EnvironmentMap.load(path)
-    return classify(environment.resized(min(128, environment.image.shape[0])))
+def _contrast(path: str, _sha256: str) -> Contrast:
+    return classify(EnvironmentMap.load(path))
 
 
 def for_split(maps: Sequence[HdriSpec], split: str) -> list[HdriSpec]:
@@ -155,7 +203,12 @@ def _load(path: str, up: str, _sha256: str) -> list[Part]:
     return load_model(path, up)
 
 
-def _read_catalogue(path: Path, required: bool) -> dict[str, _Entry]:
+def read_catalogue(path: Path, required: bool) -> dict[str, Entry]:
+    """Path -> entry of a catalogue; none where it is not there.
+
+    Raises:
+        TronError: it cannot be read, or is ``required`` and not there.
+    """
     if not path.is_file():
         if required:
             raise TronError("catalogue not found", path)
@@ -163,7 +216,7 @@ def _read_catalogue(path: Path, required: bool) -> dict[str, _Entry]:
     try:
         if path.stat().st_size > LARGEST_CATALOGUE:
             raise ValueError("file is too large to be a catalogue")
-        entries = TypeAdapter(list[_Entry]).validate_python(json.loads(path.read_text("utf-8")))
+        entries = TypeAdapter(list[Entry]).validate_python(json.loads(path.read_text("utf-8")))
     except (OSError, ValueError, RecursionError, ValidationError) as error:
         raise TronError(
             f"catalogue cannot be read: {_reason(error)}", path, 'write [{"path": ..., "licence": ...}, ...]'

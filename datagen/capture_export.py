@@ -144,7 +144,7 @@ def view_names(settings: CaptureSettings) -> list[str]:
 
 def held_out_cameras(spec: SceneSpec, settings: CaptureSettings) -> dict[str, Camera]:
     """The held-out views by their names."""
-    cameras = spec.spiral(settings.views, settings.width, settings.height)
+    cameras = spec.views(settings.views, settings.width, settings.height)
     return dict(list(zip(view_names(settings), cameras))[::HELD_OUT])
 
 
@@ -170,7 +170,7 @@ def captured(
     coverage as their mask; those that ``photographs`` names are what a camera made of that radiance, and no
     map tells more of them. Maps are of the pixel centres, zero where there is no surface.
     """
-    cameras = spec.spiral(settings.views, settings.width, settings.height)
+    cameras = spec.views(settings.views, settings.width, settings.height)
     shots = _Shots(spec, geometry, environment, cameras, settings, photographs or {})
     views = []
     for number, (name, camera) in enumerate(zip(view_names(settings), cameras)):

@@ -12,8 +12,12 @@ from omegaconf import OmegaConf
 
 import tron
 from datagen.assets import Asset
+from datagen.clip_rows import ClipRow
+from datagen.contact_sheet import SHEET_NAME
+from datagen.hub import configurations, front_matter
 from datagen.plan import Figures, Refinement, Sources, config_sha256
 from datagen.settings import OUTSIDE, SPLITS, Settings
+from datagen.variety import MEASURES, VARIETY_NAME, Histograms, Other, median
 from tron.cli.recipes import compose_recipe
 from tron.nested import leaves
 from tron.runtime import describe_machine
@@ -62,38 +66,49 @@ def card_text(
     settings: Settings,
     manifest: Manifest,
     sources: Sources,
-    lights: Mapping[str, Counter[str]],
+    rows: Sequence[ClipRow],
     refinements: Sequence[Refinement] = (),
+    variety: Histograms | None = None,
+    other: Other | None = None,
+    pictures: Sequence[str] = (),
 ) -> str:
-    """card.md, the same bytes for the same dataset.
+    """README.md, the same bytes for the same dataset.
 
     Args:
         settings: what it was made with.
         manifest: what it holds.
         sources: the user's files it drew from.
-        lights: split -> light family -> clips.
+        rows: its clips.
         refinements: of the scenes' surfels, where they were refined.
+        variety: its histograms.
+        other: those of another dataset, drawn beside its own.
+        pictures: files beside the card that it shows.
     """
+    by_split = {split: [row for row in rows if row.split == split] for split in SPLITS}
+    clips = {split: len(found) for split, found in by_split.items() if found}
+    files = _files(sources)
     lines = [
+        front_matter(settings, clips, [file.licence for file in files]),
         "# Dataset card",
         "",
         f"Clips of synthetic scenes for TRON's neural renderer, made by `tron-datagen` {tron.__version__} "
         f"(shard schema {SCHEMA_VERSION}, configuration {config_sha256(settings)[:12]}).",
+        "Open `index.html` to look at every clip.",
         "",
+        *([f"![one frame each of its scenes]({SHEET_NAME})", ""] if SHEET_NAME in pictures else []),
         "| split | scenes | clips | frames | size | lights | style |",
         "|---|---|---|---|---|---|---|",
     ]
-    for split in SPLITS:
-        entries = [entry for entry in manifest.shards if entry.split == split]
-        clips = sum(entry.samples for entry in entries)
-        if not clips:
-            continue
-        recipe = settings.split(split)
-        scenes = len({key.rsplit("-l", 1)[0] for entry in entries for key in entry.keys})
-        families = ", ".join(f"{count} {family}" for family, count in sorted(lights[split].items()))
+    for split in clips:
+        found, recipe = by_split[split], settings.split(split)
+        families = Counter(row.light_family for row in found)
+        styles = Counter({row.scene: row.style for row in found}.values())
+        kinds = ", ".join(f"{count} {style}" for style, count in sorted(styles.items()))
         lines.append(
-            f"| {split} | {scenes} | {clips} | {clips * recipe.frames} | {recipe.width} x {recipe.height} "
-            f"| {families} | {recipe.style} |"
+            f"| {split} | {styles.total()} | {len(found)} | {sum(row.frames for row in found)} "
+            f"| {recipe.width} x {recipe.height} "
+            f"| {', '.join(f'{count} {family}' for family, count in sorted(families.items()))} "
+            f"| {kinds if len(styles) > 1 else next(iter(styles))} |"
         )
     lines += [
         "",
@@ -114,10 +129,17 @@ def card_text(
     ]
     packages = describe_machine()["packages"]
     lines += [f"| {name} | {packages[name]} |" for name in PACKAGES if name in packages]
+    lines += _variety(variety or {}, other, pictures)
+    lines += _reading(settings, clips)
     lines += ["", "## What it was made from", ""]
-    if sources.assets or sources.maps:
+    if files := _files(sources):
         lines += ["| asset | licence | author | source | sha256 |", "|---|---|---|---|---|"]
-        lines += [_asset_row(asset) for asset in (*sources.assets, *sources.maps)]
+        lines += [_asset_row(asset) for asset in files]
+        lines += [""]
+    if sources.refused:
+        lines += [f"Models left out because they cannot be used: {len(sources.refused)}.", ""]
+        lines += ["| model | reason |", "|---|---|"]
+        lines += [f"| {_cell(model.path)} | {_cell(model.reason)} |" for model in sources.refused]
         lines += [""]
     if not sources.assets:
         lines.append("Shapes and materials are procedural: no asset of anybody's is in it.")
@@ -146,6 +168,63 @@ def _refinement(found: Sequence[Refinement]) -> list[str]:
     ]
 
 
+def _variety(variety: Histograms, other: Other | None, pictures: Sequence[str]) -> list[str]:
+    """The figure of the histograms, and their medians as a table."""
+    if not variety:
+        return []
+    found = {"this dataset": variety} | ({other.name: other.histograms} if other else {})
+    lines = [
+        "",
+        "## Variety",
+        "",
+        "Of the first frame of every clip: materials and depth of the pixels that show a surface, as they "
+        "truly are; the rest once a clip. Shadows: share of the irradiance on the surfels that they take. "
+        "Bounced: share of `lit` that `shadowed` lacks. Silhouettes: lines where a surface ends before "
+        "another or before nothing.",
+        "",
+        *([f"![histograms]({VARIETY_NAME})", ""] if VARIETY_NAME in pictures else []),
+        f"| measure | {' | '.join(f'median, {_cell(name)}' for name in found)} | counted |",
+        f"|---|{'---|' * len(found)}---|",
+    ]
+    for name, measure in MEASURES.items():
+        medians = [f"{median(name, each[name]):.3g}" if name in each else "" for each in found.values()]
+        if any(medians):
+            lines.append(f"| {measure.title} | {' | '.join(medians)} | {measure.counted} |")
+    return lines
+
+
+def _reading(settings: Settings, clips: Mapping[str, int]) -> list[str]:
+    """Section for other programs: the calls that read it."""
+    if not clips:
+        return []
+    named = [each["config_name"] for each in configurations(settings, clips)]
+    split = next(iter(clips))
+    lines = [
+        "",
+        "## Reading it",
+        "",
+        "```python",
+        "import datasets, pandas",
+        f'clips = datasets.load_dataset("DIR", split="{split}")',
+        'table = pandas.read_parquet("DIR/metadata.parquet")  # a row a clip',
+        "```",
+        "",
+    ]
+    if len(named) > 1:
+        others = ", ".join(f"`{name}`" for name in named[1:])
+        lines += [f"Splits whose clips hold other files are configurations of their own: {others}.", ""]
+    return [
+        *lines,
+        "A frame's file is a column, such as `f00.rgb.exr`: OpenEXR bytes of linear values. `meta.json` "
+        "holds cameras, exposure and light.",
+    ]
+
+
+def _files(sources: Sources) -> tuple[Asset, ...]:
+    """All of the user's files that scenes draw from."""
+    return (*sources.assets, *sources.maps, *(each.asset for each in sources.textures))
+
+
 def _asset_row(asset: Asset) -> str:
     cells = (
         asset.id,
@@ -154,4 +233,8 @@ def _asset_row(asset: Asset) -> str:
         asset.source or "",
         asset.sha256[:16],
     )
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+    return "| " + " | ".join(map(_cell, cells)) + " |"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")

@@ -4,28 +4,38 @@ from __future__ import annotations
 
 from datagen.capture_export import make_captures
 from datagen.equal_error import measure_equal_error
+from datagen.projection import project
 from datagen.run import make
 from datagen.settings import Settings
+from datagen.sharing import measure_sharing
 from datagen.validate import validate
 from tron.cli.command_line import command
 
 
 def main(settings: Settings) -> int:
-    """Make a dataset for the neural renderer, validate one, or make captures to reconstruct.
+    """Make a dataset for the neural renderer, plan or validate one, or make captures to reconstruct.
 
     Scenes are drawn from seeds, path-traced by Mitsuba, turned into surfels and rendered again by TRON's
-    tracer; the pairs land in tar shards with a manifest. With mode=captures scenes are path-traced from all
-    sides instead, with true maps, as folders that tron-reconstruct and nerfstudio read. With mode=equal_error
-    guidance of a dataset's test scenes is held against the path tracer: equal_error.json. An interrupted run
-    resumes. The exit code is 1 if a scene could not be made (failures.jsonl
-    says why, that of captures lies among them) or if validation found a problem.
+    tracer; the pairs land in tar shards with a manifest. With mode=plan nothing is made: a small scene is
+    timed, and what is missing is printed with its bytes, memory and hours. With mode=captures scenes are
+    path-traced from all sides instead, with true maps, as folders that tron-reconstruct and nerfstudio read.
+    With mode=equal_error guidance of a dataset's test scenes is held against the path tracer:
+    equal_error.json; with mode=sharing frames under many lights at once against frames one by one:
+    sharing.json. An interrupted run resumes. The exit code is 1 if a scene could not be made
+    (failures.jsonl says why, that of captures lies among them) or if validation found a problem.
     """
     if settings.mode == "validate":
         return 1 if validate(settings.output_dir) else 0
+    if settings.mode == "plan":
+        print(project(settings))
+        return 0
     if settings.mode == "captures":
         return 1 if make_captures(settings) else 0
     if settings.mode == "equal_error":
         measure_equal_error(settings)
+        return 0
+    if settings.mode == "sharing":
+        measure_sharing(settings)
         return 0
     return 1 if make(settings) else 0
 
@@ -38,6 +48,7 @@ cli = command(
     examples=(
         "tron-datagen experiment=demo output_dir=outputs/dataset",
         "tron-datagen experiment=demo output_dir=outputs/mine assets=models environments=hdris workers=8",
+        "tron-datagen experiment=paper output_dir=outputs/paper workers=64 mode=plan",
         "tron-datagen output_dir=outputs/dataset mode=validate",
         "tron-datagen experiment=captures output_dir=outputs/synthetic",
     ),

@@ -80,6 +80,7 @@ def workers(settings: Settings, most: int) -> Iterator[Any]:
     from datagen.worker_log import WorkerLog
 
     logging.getLogger("distributed").setLevel(logging.WARNING)  # it reports every connection otherwise
+    logging.getLogger("distributed.nanny").setLevel(logging.ERROR)  # that a worker is replaced is no news
     assert settings.cluster is not None
     options = dict(settings.cluster)
     target = options["_target_"]
@@ -108,7 +109,7 @@ def workers(settings: Settings, most: int) -> Iterator[Any]:
                 _where(options),
                 "look at the queue and the workers' logs, or wait longer",
             ) from error
-        log_to = WorkerLog(logs_folder(settings).absolute(), log_level())
+        log_to = WorkerLog(logs_folder(settings).absolute(), log_level(), ours(settings))
         try:
             made.register_plugin(log_to)
         except OSError as error:
@@ -130,23 +131,19 @@ def _close(cluster: Any) -> None:
         log.warning("a worker does not end; it ends with this process")
 
 
-def recycle(client: Any, seconds: float) -> None:
-    """Replace the workers' processes: Mitsuba's memory grows with every scene it loads.
+def describe_workers(client: Any) -> dict[str, dict[str, Any]]:
+    """Workers that a client's scheduler has now: address -> what Dask says of each.
 
-    Those that do not come back within ``seconds`` are left behind, and the others go on.
+    Asked of the scheduler itself: what ``Client.scheduler_info`` gives is replaced every two seconds, in
+    another thread, by an answer without workers.
+
+    Raises:
+        TronError: the scheduler is gone.
     """
-    found = client.scheduler_info(n_workers=-1)["workers"]
-    before = [address for address, worker in found.items() if worker["nanny"]]  # others cannot be replaced
-    client.restart_workers(before, timeout=seconds, raise_for_error=False)
-    client.wait_for_workers(1, timeout=seconds)
-    back = worker_count(client)
-    if back < len(found):
-        log.warning("%d of %d workers have come back after their scenes", back, len(found))
-
-
-def worker_count(client: Any) -> int:
-    """Workers that a client's scheduler has, one at the least: more may be on their way."""
-    return max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
+    try:
+        return client.sync(client.scheduler.identity, n_workers=-1)["workers"]
+    except OSError as error:
+        raise TronError(f"the scheduler is gone: {error}", mend="start this again: it goes on") from error
 
 
 def logs_folder(settings: Settings) -> Path:

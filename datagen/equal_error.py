@@ -21,12 +21,12 @@ from typing import Any
 
 import numpy as np
 
-from datagen.assets import load_models
-from datagen.build import Geometry, build
+from datagen.build import Geometry
 from datagen.lights import HdriSpec
 from datagen.pathtrace import gbuffers, render_frames
 from datagen.plan import Work, chosen, find_sources, plan, scene_folder
 from datagen.scene import SceneSpec
+from datagen.scene_geometry import scene_geometry
 from datagen.settings import EqualErrorSettings, Settings
 from tron.cameras import Camera
 from tron.color import to_display
@@ -74,12 +74,12 @@ def measure_equal_error(settings: Settings) -> None:
         name = missing[0] if missing else "test"
         raise TronError(f"scene {name} is not there", settings.output_dir, "make it by mode=make first")
     activate(settings.variant, settings.equal_error.threads)
-    models = load_models(settings.assets, find_sources(settings).assets) if settings.assets else {}
+    sources = find_sources(settings)
     cases: list[dict[str, Any]] = []
     for item in scenes:
         spec = SceneSpec.model_validate_json(_surfels(settings, item).with_name("spec.json").read_bytes())
         scene = GaussianScene.load(_surfels(settings, item))
-        cases += _judge_scene(spec, build(spec, models, settings.mesh_edge), scene, settings)
+        cases += _judge_scene(spec, scene_geometry(spec, settings, sources), scene, settings)
         record = {"machine": describe_machine(), "cases": cases}
         write_atomic(settings.output_dir / RESULT_NAME, json.dumps(record, indent=1) + "\n")
 
@@ -95,7 +95,7 @@ def _judge_scene(
     recipe, wanted = settings.split(spec.split), settings.equal_error
     tracer = SurfelTracer(scene)
     BounceTransport.trace(tracer)  # compiles it
-    transport, seconds = _timed(lambda: BounceTransport.trace(tracer))
+    transport, seconds = timed(lambda: BounceTransport.trace(tracer))
     cases = []
     for number, light in enumerate(spec.lights):
         environment = light.bake(settings.environment_height, settings.environments)
@@ -176,7 +176,7 @@ class _Frame:
         taken = {name: [] for name in contestants}
         for _ in range(self._rounds):
             for name, work in contestants.items():
-                taken[name].append(_timed(work)[1])
+                taken[name].append(timed(work)[1])
         seconds = {name: float(np.median(values)) for name, values in taken.items()}
         by_paths = {spp: (error, seconds[str(spp)]) for spp, error in paths.items()}
         ways = {}
@@ -225,7 +225,8 @@ def equal(by_paths: Mapping[int, tuple[float, float]], error: float) -> tuple[fl
     return low * (high / low) ** at, s0 * (s1 / s0) ** at
 
 
-def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
+def timed(work: Callable[[], Any]) -> tuple[Any, float]:
+    """Result of ``work``, evaluated, and the seconds that it took."""
     import drjit as dr
 
     dr.sync_thread()

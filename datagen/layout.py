@@ -41,6 +41,11 @@ class Placement(Spec):
         matrix[:3, 3] = self.position
         return matrix
 
+    def moved(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) world points from the object's (N, 3)."""
+        matrix = self.matrix()
+        return points @ matrix[:3, :3].T + matrix[:3, 3]
+
 
 def place(
     rng: np.random.Generator,
@@ -65,7 +70,7 @@ def place(
     placements: list[Placement | None] = []
     for i, mesh in enumerate(meshes):
         hull = mesh.convex_hull
-        coarse = _support_hull(hull)
+        coarse = support_hull(hull)
         stays = upright is not None and upright[i]
         turn = np.eye(3) if stays else settle(hull, Rotation.random(rng=rng).as_matrix())
         turn = Rotation.from_euler("z", rng.uniform(0.0, 2 * np.pi)).as_matrix() @ turn
@@ -104,7 +109,7 @@ class _Body:
         return float(manager.min_distance_single(self.hull, self.matrix)) > GAP  # type: ignore[arg-type]
 
 
-def _support_hull(hull: Trimesh) -> Trimesh:
+def support_hull(hull: Trimesh) -> Trimesh:
     """Hull of the outermost points in SUPPORTS directions.
 
     It is exact for boxes and within GAP / 4 for balls of size 1. FCL's distance takes time in proportion to

@@ -19,15 +19,19 @@ import mitsuba as mi
 import numpy as np
 
 from datagen.build import Geometry
+from datagen.clock import stage
 from tron.aligned import aligned
 from tron.cameras import Camera, mitsuba_sensor
 from tron.gaussians.initialize import GBufferView
+from tron.integrators import embed, register
+from tron.shading.environment import EnvironmentMap
 
 MAX_DEPTH = 6
 LANES = 2**22
 """Most paths or rays in flight at once: bounds memory, not quality."""
 
 
+@stage("path_trace")
 def render_frames(
     scene: mi.Scene,
     cameras: Sequence[Camera],
@@ -50,30 +54,75 @@ def render_frames(
         (K, H, W, 3) float32 linear radiance; or (K, H, W, 4), radiance times coverage, and coverage, the
         share of the pixel that surfaces cover.
     """
-    channels = 4 if transparent else 3
     integrator = mi.load_dict(
         {"type": "path", "max_depth": max_depth, "rr_depth": max_depth, "hide_emitters": transparent}
     )
-    frames = []
-    for camera, seed in zip(cameras, seeds):
-        description = mitsuba_sensor(camera, spp, pixel_format="rgba" if transparent else "rgb")
-        # Samples that cover pixel, light and lobe evenly: at 64 spp 3 to 6 dB less noise than independent
-        # ones, free.
-        description["sampler"]["type"] = "multijitter"
-        sensor = mi.load_dict(description)
-        total = np.zeros((camera.height, camera.width, channels))
-        done = 0
-        while done < spp:
-            part = min(spp - done, max(LANES // (camera.width * camera.height), 1))
-            # Passes of one frame need streams of their own; the odd constant keeps them apart from other
-            # frames.
-            image = mi.render(
-                scene, sensor=sensor, integrator=integrator, spp=part, seed=_pass_seed(seed, done)
-            )
-            total += part * np.array(image, np.float64)[..., :channels]
-            done += part
-        frames.append((total / spp).astype(np.float32))
+    frames = [
+        _render(scene, integrator, camera, spp, seed, transparent) for camera, seed in zip(cameras, seeds)
+    ]
     return np.stack(frames)
+
+
+def stacked_lights(
+    environments: Sequence[EnvironmentMap], max_depth: int = MAX_DEPTH, transparent: bool = False
+) -> mi.Integrator:
+    """Lights made ready for :func:`render_lights`; other arguments as of :func:`render_frames`.
+
+    Raises:
+        TronError: the maps differ in size, or one is turned.
+    """
+    register()
+    return mi.load_dict(
+        {
+            "type": "tron_many_lights",
+            "lights": embed(list(environments)),
+            "max_depth": max_depth,
+            "hide_emitters": transparent,
+        }
+    )
+
+
+@stage("path_trace")
+def render_lights(
+    scene: mi.Scene, lights: mi.Integrator, camera: Camera, spp: int, seed: int, transparent: bool = False
+) -> np.ndarray:
+    """Path-trace one frame under each of many lights at once: all of them share its paths.
+
+    Args:
+        scene: the scene; its own light, if any, is not seen.
+        lights: of :func:`stacked_lights`.
+        camera, spp, seed, transparent: as of :func:`render_frames`, for one frame.
+
+    Returns:
+        (N, H, W, 3) float32 linear radiance, light by light; or (N, H, W, 4) with coverage.
+    """
+    image = _render(scene, lights, camera, spp, seed, transparent)
+    first = 4 if transparent else 3
+    colors = image[..., first:].reshape(camera.height, camera.width, -1, 3).transpose(2, 0, 1, 3)
+    if transparent:
+        coverage = np.broadcast_to(image[..., 3:4], (*colors.shape[:3], 1))
+        colors = np.concatenate([colors, coverage], axis=-1)
+    return np.ascontiguousarray(colors)
+
+
+def _render(
+    scene: mi.Scene, integrator: mi.Integrator, camera: Camera, spp: int, seed: int, transparent: bool
+) -> np.ndarray:
+    """(H, W, C) float32: all channels of a frame."""
+    description = mitsuba_sensor(camera, spp, pixel_format="rgba" if transparent else "rgb")
+    # Samples that cover pixel, light and lobe evenly: at 64 spp 3 to 6 dB less noise than independent
+    # ones, free.
+    description["sampler"]["type"] = "multijitter"
+    sensor = mi.load_dict(description)
+    total = np.zeros(())
+    done = 0
+    while done < spp:
+        part = min(spp - done, max(LANES // (camera.width * camera.height), 1))
+        # Passes of one frame need streams of their own; the odd constant keeps them apart from other frames.
+        image = mi.render(scene, sensor=sensor, integrator=integrator, spp=part, seed=_pass_seed(seed, done))
+        total = total + part * np.array(image, np.float64)
+        done += part
+    return (total / spp).astype(np.float32)
 
 
 def _pass_seed(seed: int, done: int) -> int:
@@ -140,6 +189,7 @@ class DirectIrradiance(NamedTuple):
     unshadowed: np.ndarray
 
 
+@stage("reference")
 def direct_irradiance(
     geometry: Geometry, scene: mi.Scene, camera: Camera, spp: int, seed: int
 ) -> DirectIrradiance:

@@ -13,12 +13,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from datagen.assets import Asset, find_assets, find_environments
+from datagen.assets import Asset, Refused, find_environments, find_models
+from datagen.clip_preview import preview_bytes
+from datagen.clip_rows import ClipRow
 from datagen.lights import HdriSpec
 from datagen.scene import scene_name
 from datagen.settings import SPLITS, Settings
+from datagen.texture_sets import TextureSet, find_texture_sets
+from datagen.variety import Histograms
 from tron.claim import CHOOSE_ANOTHER, read_recipe, require_same
 from tron.cli.recipes import model_defaults
 from tron.errors import TronError
@@ -43,11 +47,20 @@ class Work:
 
 @dataclass(frozen=True)
 class Sources:
-    """The user's files that scenes draw from; empty where everything is procedural."""
+    """The user's files that scenes draw from; empty where everything is procedural.
+
+    Attributes:
+        assets: models.
+        maps: files of the environments.
+        environments: the same maps as lights.
+        refused: models that were left out because they cannot be used.
+    """
 
     assets: tuple[Asset, ...] = ()
     maps: tuple[Asset, ...] = ()
     environments: tuple[HdriSpec, ...] = ()
+    textures: tuple[TextureSet, ...] = ()
+    refused: tuple[Refused, ...] = ()
 
 
 class Quarantined(BaseModel):
@@ -86,7 +99,12 @@ class Refinement(BaseModel):
 
 
 class Record(BaseModel):
-    """scenes/NAME/record.json: the scene is finished, and this is what it gave."""
+    """scenes/NAME/record.json: the scene is finished, and this is what it gave.
+
+    Attributes:
+        clips: a row each; empty in records of older versions.
+        variety: histograms of the scene (``datagen.variety``); likewise.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -94,6 +112,8 @@ class Record(BaseModel):
     shards: list[ShardEntry]
     quarantined: list[Quarantined]
     refinement: Refinement | None = None
+    clips: list[ClipRow] = Field(default_factory=list)
+    variety: Histograms = Field(default_factory=dict)
 
 
 def plan(settings: Settings) -> list[Work]:
@@ -123,22 +143,24 @@ def chosen(items: list[Work], only: Iterable[str]) -> list[Work]:
 def find_sources(settings: Settings) -> Sources:
     """Catalogue the user's assets and environments; raises as ``datagen.assets`` does, before any render."""
     allowed = settings.allow_unlicensed
-    assets = (
-        find_assets(
-            settings.assets,
-            catalogue=settings.catalogue,
-            allow_unlicensed=allowed,
-            names=settings.asset_names,
-        )
+    assets, refused = (
+        find_models(settings.assets, settings.catalogue, allowed, settings.asset_names)
         if settings.assets
-        else []
+        else ([], [])
     )
     maps, environments = (
         find_environments(settings.environments, settings.catalogue, allowed)
         if settings.environments
         else ([], [])
     )
-    return Sources(tuple(assets), tuple(maps), tuple(environments))
+    textures = find_texture_sets(settings.textures, settings.catalogue, allowed) if settings.textures else []
+    return Sources(
+        assets=tuple(assets),
+        maps=tuple(maps),
+        environments=tuple(environments),
+        textures=tuple(textures),
+        refused=tuple(refused),
+    )
 
 
 def scene_folder(output: Path, name: str) -> Path:
@@ -146,10 +168,10 @@ def scene_folder(output: Path, name: str) -> Path:
     return output / "scenes" / name
 
 
-def read_record(output: Path, item: Work) -> Record | None:
+def read_record(output: Path, name: str) -> Record | None:
     """The record of a finished scene; None if it has to be made (again)."""
     try:
-        record = Record.model_validate_json((scene_folder(output, item.name) / RECORD_NAME).read_bytes())
+        record = Record.model_validate_json((scene_folder(output, name) / RECORD_NAME).read_bytes())
     except (OSError, ValidationError):
         return None
     whole = all(_size(output / entry.name) == entry.bytes for entry in record.shards)
@@ -168,7 +190,8 @@ def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
         members = [MEMBERS[name] for name in clip_members(recipe.reference_buffers)]
         pixel = sum(member.bytes * member.channels for member in members)
         frame = recipe.width * recipe.height * pixel + 16_384
-        total += len(recipe.lights) * recipe.frames * frame + settings.surfels * SURFEL_BYTES
+        previews = preview_bytes(recipe.width, recipe.height, recipe.frames, len(members))
+        total += len(recipe.lights) * (recipe.frames * frame + previews) + settings.surfels * SURFEL_BYTES
     return total
 
 
@@ -185,7 +208,13 @@ def config_sha256(settings: Settings) -> str:
 
 
 def adopt(settings: Settings) -> None:
-    """Make output_dir this recipe's, or make sure that it is already.
+    """Make output_dir this recipe's, or make sure that it is already; raises as :func:`require_adoptable`."""
+    require_adoptable(settings)
+    write_if_changed(settings.output_dir / CONFIG_NAME, config_text(settings))
+
+
+def require_adoptable(settings: Settings) -> None:
+    """Make sure that output_dir is this recipe's or nobody's.
 
     More scenes may be added to a dataset; any other change would mix two datasets in one folder.
 
@@ -193,7 +222,7 @@ def adopt(settings: Settings) -> None:
         TronError: the folder holds a dataset of another schema or recipe (names the key), or more scenes
             than are asked for.
     """
-    path, text = settings.output_dir / CONFIG_NAME, config_text(settings)
+    path = settings.output_dir / CONFIG_NAME
     old = read_recipe(path)
     if old is not None:
         try:
@@ -220,7 +249,6 @@ def adopt(settings: Settings) -> None:
         raise TronError(
             "output_dir holds shards of something else", settings.output_dir, "choose an empty folder"
         )
-    write_if_changed(path, text)
 
 
 def clear_temporaries(output: Path) -> None:

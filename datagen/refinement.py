@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from datagen.clock import stage
 from datagen.plan import Figures, Refinement
 from tron.captures import View
 from tron.color import linear_to_srgb
@@ -21,6 +22,7 @@ from tron.tracing import SurfelTracer
 log = logging.getLogger(__name__)
 
 
+@stage("refine")
 def refine_surfels(
     surfels: GaussianScene,
     seen: Sequence[GBufferView],

@@ -10,20 +10,24 @@ from __future__ import annotations
 import gc
 import io
 import logging
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import drjit as dr
 import numpy as np
 
+from datagen.account import read_other, write_account
 from datagen.assets import for_split, load_models
-from datagen.build import Geometry, build
-from datagen.card import card_text
+from datagen.build import Geometry
+from datagen.clip_preview import thumbnail_name, write_preview
+from datagen.clip_rows import ClipRow, clip_row
+from datagen.clock import stage
 from datagen.clusters import logs_folder, require_cluster
-from datagen.failures import Failure, record_failures, summary
+from datagen.failures import Failure, summary
 from datagen.lights import LightChoice
-from datagen.models import outline
+from datagen.motion import Share
+from datagen.parts import outline
+from datagen.pathtrace import gbuffers
 from datagen.plan import (
     RECORD_NAME,
     Quarantined,
@@ -33,22 +37,26 @@ from datagen.plan import (
     adopt,
     chosen,
     clear_temporaries,
-    config_sha256,
     estimate_bytes,
     find_sources,
     plan,
     read_record,
     scene_folder,
 )
-from datagen.preview import contact_row, index_html, sheet_name, write_sheet
+from datagen.preview import contact_row, sheet_name, write_sheet
 from datagen.scene import SceneSpec, draw_scene
+from datagen.scene_geometry import scene_geometry
 from datagen.scheduling import make_each
-from datagen.settings import SPLITS, Settings
-from datagen.synthetic import first_bad_value, make_clips, make_surfels
+from datagen.settings import Settings
+from datagen.styles import Choice
+from datagen.synthetic import Frame, first_bad_value, make_clips, make_surfels
+from datagen.variety import COUNTED_MEMBERS, Histograms, frame_histograms, surface_members, total
+from tron.cameras import Camera
 from tron.runtime import activate
-from tron.shards.manifest import Manifest
+from tron.shards.manifest import ShardEntry
+from tron.shards.schema import ClipMeta
 from tron.shards.writer import ShardWriter
-from tron.storage import locked, require_free_space, write_atomic, write_if_changed
+from tron.storage import locked, require_free_space, write_atomic
 
 log = logging.getLogger(__name__)
 
@@ -65,18 +73,19 @@ def make(settings: Settings) -> int:
     require_cluster(settings)
     activate(settings.variant, threads=1)
     sources = find_sources(settings)
+    other = read_other(settings.variety_against) if settings.variety_against is not None else None
     output = settings.output_dir
     with locked(output):
         clear_temporaries(output)
         adopt(settings)
-        missing = [item for item in wanted if read_record(output, item) is None]
+        missing = [item for item in wanted if read_record(output, item.name) is None]
         failed: dict[str, Failure] = {}
         if missing:
             require_free_space(output, estimate_bytes(settings, missing))
             log.info("%d of %d scenes to make in %s", len(missing), len(items), output)
             clips = {item: len(settings.split(item.split).lights) for item in missing}
             failed = make_each(make_scene, missing, settings, sources, clips.__getitem__, "clips")
-        failures = _account(settings, items, sources, failed)
+        failures = write_account(settings, items, sources, failed, other)
     if failures:
         log.error("%s", summary(failures, output, logs_folder(settings)))
     else:
@@ -99,6 +108,7 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
 
     quarantined: list[Quarantined] = []
     rows: dict[str, np.ndarray] = {}
+    made: list[tuple[ClipMeta, Frame]] = []
     with ShardWriter(output, item.split, settings.clips_per_shard, item.first_shard) as writer:
         for meta, frames in make_clips(spec, geometry, surfels, settings):
             problem = first_bad_value(frames)
@@ -106,11 +116,21 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
                 quarantined.append(Quarantined(key=meta.key, reason=problem))
                 _set_aside(output / "quarantine" / f"{meta.key}.npz", frames)
                 continue
-            writer.write(meta, frames)
-            rows[meta.key] = contact_row(meta, frames[0])
+            with stage("write"):
+                writer.write(meta, frames)
+                write_preview(output, meta, frames)
+                rows[meta.key] = contact_row(meta, frames[0])
+            made.append((meta, {name: frames[0][name] for name in COUNTED_MEMBERS if name in frames[0]}))
     for entry in writer.entries:
         write_sheet(output / sheet_name(entry.name), [rows[key] for key in entry.keys])
-    record = Record(name=item.name, shards=writer.entries, quarantined=quarantined, refinement=refinement)
+    record = Record(
+        name=item.name,
+        shards=writer.entries,
+        quarantined=quarantined,
+        refinement=refinement,
+        clips=_clip_rows([meta for meta, _ in made], writer.entries),
+        variety=_variety(geometry, made),
+    )
     write_atomic(folder / RECORD_NAME, record.model_dump_json(indent=1) + "\n")
     del geometry, surfels
     gc.collect()
@@ -118,6 +138,21 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
     return record
 
 
+def _clip_rows(metas: Sequence[ClipMeta], entries: Sequence[ShardEntry]) -> list[ClipRow]:
+    shards = {key: entry.name for entry in entries for key in entry.keys}
+    return [clip_row(meta, shards[meta.key], thumbnail_name(meta.key)) for meta in metas]
+
+
+def _variety(geometry: Geometry, made: Sequence[tuple[ClipMeta, Frame]]) -> Histograms:
+    """Histograms of the clips' first frames: those beside them show the same."""
+    cameras = [Camera.from_dict(meta.cameras[0]) for meta, _ in made]
+    return total(
+        frame_histograms(frame | surface_members(truth), camera, meta.extra.get("contrast_share"))
+        for (meta, frame), camera, truth in zip(made, cameras, gbuffers(geometry, cameras))
+    )
+
+
+@stage("build")
 def draw_and_build(
     item: Work, settings: Settings, sources: Sources, lights: Sequence[LightChoice]
 ) -> tuple[SceneSpec, Geometry]:
@@ -134,13 +169,19 @@ def draw_and_build(
         environments=sources.environments
         if settings.share_maps
         else for_split(sources.environments, item.split),
-        assets={name: outline(parts) for name, parts in models.items()},
-        asset_share=settings.asset_share,
-        objects=settings.objects,
+        choice=Choice(
+            assets={name: outline(parts) for name, parts in models.items()},
+            asset_share=settings.asset_share,
+            objects=settings.objects,
+            textures=sources.textures,
+            texture_share=settings.texture_share,
+        ),
         frames=recipe.frames,
         path_frames=settings.path_frames,
+        lights_share_path=recipe.lights_share_path,
+        moving=Share(recipe.moving_objects, recipe.moving_lights),
     )
-    return spec, build(spec, models, settings.mesh_edge)
+    return spec, scene_geometry(spec, settings, sources)
 
 
 def _set_aside(path: Path, frames: Sequence[dict[str, np.ndarray]]) -> None:
@@ -148,27 +189,3 @@ def _set_aside(path: Path, frames: Sequence[dict[str, np.ndarray]]) -> None:
     arrays = {member: np.stack([frame[member] for frame in frames]) for member in frames[0]}
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     write_atomic(path, buffer.getvalue())
-
-
-def _account(
-    settings: Settings, items: Sequence[Work], sources: Sources, failed: Mapping[str, Failure]
-) -> int:
-    """Write failures, manifest, card and index from the records; return the number of failures."""
-    output = settings.output_dir
-    made = [record for item in items if (record := read_record(output, item)) is not None]
-    finished = {record.name: record.quarantined for record in made}
-    failures = record_failures(output, settings, items, failed, finished)
-    shards = sorted((entry for record in made for entry in record.shards), key=lambda entry: entry.name)
-    manifest = Manifest(config_sha256=config_sha256(settings), shards=shards, failures=failures)
-    lights = {split: Counter[str]() for split in SPLITS}
-    for record in made:
-        spec = SceneSpec.model_validate_json((scene_folder(output, record.name) / "spec.json").read_bytes())
-        kept = {key for entry in record.shards for key in entry.keys}
-        lights[spec.split].update(
-            light.family for i, light in enumerate(spec.lights) if f"{spec.name}-l{i}" in kept
-        )
-    refinements = [record.refinement for record in made if record.refinement is not None]
-    write_if_changed(output / "card.md", card_text(settings, manifest, sources, lights, refinements))
-    write_if_changed(output / "index.html", index_html("TRON dataset", shards))
-    manifest.save(output)
-    return failures

@@ -6,68 +6,59 @@ of the split alone. What it is rendered with (resolution, samples) is the run's 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
 
+import numpy as np
 from pydantic import Field
-from trimesh import Trimesh
 
-from datagen.layout import Placement, place
-from datagen.lights import FAMILIES, PROCEDURAL, Family, HdriSpec, LightChoice, LightSpec
-from datagen.materials import MaterialSpec, Style, draw_material
-from datagen.shapes import ShapeSpec, draw_shape, make_mesh
-from datagen.spec import Number, Spec, Triple
+from datagen.lights import EVERY, PROCEDURAL, Family, HdriSpec, LightChoice, LightSpec, draw_light
+from datagen.motion import STILL, MotionSpec, Share, draw_motion
+from datagen.objects import ObjectSpec
+from datagen.paths import PathSpec
+from datagen.shapes import SHAPES
+from datagen.spec import Number, Spec
+from datagen.styles import MIXED, OLD, STYLES, Choice, Style, StyleChoice
+from datagen.texture_sets import dressed
 from tron.cameras import Camera
 from tron.errors import TronError
 from tron.seeds import generator
-from tron.trajectories import oscillating, spiral
 
-SPEC_VERSION = 1
-LAYOUT_EDGE = 0.5
-"""Edge length of the meshes that objects are placed with: only their convex hulls matter there."""
-
-FEWEST_OBJECTS = 2
-SCENE_RADIUS = 1.45
-"""World units from the origin within which objects stand: all of them in view from every camera."""
-
-
-class ObjectSpec(Spec):
-    """One object: a procedural shape with its material, or a user's asset scaled to a ball of ``size``."""
-
-    shape: ShapeSpec | None = None
-    material: MaterialSpec | None = None
-    asset: str | None = None
-    size: Number
-    placement: Placement
-
-
-class FloorSpec(Spec):
-    """A square in the plane z = 0 around the origin; a side is twice ``half_size`` world units."""
-
-    half_size: Number
-    material: MaterialSpec
+SPEC_VERSION = 2
 
 
 class CameraSpec(Spec):
-    """Paths of the cameras; angles in degrees, lengths in world units.
+    """Paths of the cameras.
 
-    The spiral is what surfels are made from; the oscillating path is what is path-traced. ``first_frame``
-    says, for each light, where on the path its clip begins.
+    Attributes:
+        capture: what the views lie on that surfels are made from, an equal share on each.
+        film: what is path-traced lies on it.
+        path_frames: frames of the whole of ``film``.
+        first_frame: where on it the clips begin: all lights' at one place, or each light's at its own.
     """
 
-    target: Triple
-    fov_deg: Number
-    spiral_radius: Number
-    spiral_phase: Number
-    path_radius: Number
-    path_elevation_deg: Number
-    path_amplitude_deg: Number
-    path_azimuth_deg: tuple[Number, Number]
+    capture: tuple[PathSpec, ...] = Field(min_length=1)
+    film: PathSpec
     path_frames: int
-    first_frame: tuple[int, ...]
+    first_frame: int | tuple[int, ...]
+
+    @property
+    def shared(self) -> bool:
+        """Whether all lights are filmed from the same places, frame by frame."""
+        return isinstance(self.first_frame, int)
 
 
 class SceneSpec(Spec):
-    """One scene: objects on a floor, lights, cameras. ``left_out`` counts objects that found no place."""
+    """One scene: objects in surroundings, lights, cameras.
+
+    Attributes:
+        surroundings: floor, walls, terrain; their object ids count from 1.
+        objects: their ids go on from there.
+        left_out: objects that found no place.
+        metered: clips are exposed for what they show, not for the light.
+        motion: the object that moves within a clip, if one does.
+        turns_deg: by how much each light turns about the zenith within its clip; empty: none does.
+    """
 
     version: int = SPEC_VERSION
     name: str
@@ -75,41 +66,35 @@ class SceneSpec(Spec):
     index: int
     seed: int
     style: Style
+    surroundings: tuple[ObjectSpec, ...]
     objects: tuple[ObjectSpec, ...]
     left_out: int
-    floor: FloorSpec
+    metered: bool = False
+    motion: MotionSpec | None = None
+    turns_deg: tuple[Number, ...] = ()
     lights: tuple[LightSpec, ...] = Field(min_length=1)
     cameras: CameraSpec
 
-    def spiral(self, count: int, width: int, height: int) -> list[Camera]:
+    def views(self, count: int, width: int, height: int) -> list[Camera]:
         """The ``count`` cameras that surfels are made from."""
-        c = self.cameras
-        return spiral(
-            count,
-            target=c.target,
-            radius=c.spiral_radius,
-            width=width,
-            height=height,
-            fov_deg=c.fov_deg,
-            phase=c.spiral_phase,
-        )
+        shares = np.diff(np.arange(len(self.cameras.capture) + 1) * count // len(self.cameras.capture))
+        return [
+            camera
+            for path, share in zip(self.cameras.capture, shares.tolist())
+            if share
+            for camera in path.cameras(share, width, height)
+        ]
+
+    def groups(self) -> list[list[int]]:
+        """Numbers of the lights whose clips are filmed together."""
+        numbers = list(range(len(self.lights)))
+        return [numbers] if self.cameras.shared else [[number] for number in numbers]
 
     def clip(self, light: int, frames: int, width: int, height: int) -> list[Camera]:
         """The consecutive cameras of the clip under light number ``light``."""
-        c = self.cameras
-        path = oscillating(
-            c.path_frames,
-            target=c.target,
-            radius=c.path_radius,
-            width=width,
-            height=height,
-            fov_deg=c.fov_deg,
-            elevation_deg=c.path_elevation_deg,
-            amplitude_deg=c.path_amplitude_deg,
-            azimuth_deg=c.path_azimuth_deg,
-        )
-        first = c.first_frame[light]
-        return path[first : first + frames]
+        first = self.cameras.first_frame
+        first = first if isinstance(first, int) else first[light]
+        return self.cameras.film.cameras(self.cameras.path_frames, width, height)[first : first + frames]
 
 
 def scene_name(split: str, index: int) -> str:
@@ -122,110 +107,83 @@ def draw_scene(
     split: str,
     index: int,
     *,
-    style: Style,
+    style: StyleChoice,
     lights: Sequence[LightChoice],
-    families: Sequence[Family] = PROCEDURAL,
+    families: Sequence[Family] | None = None,
     environments: Sequence[HdriSpec] = (),
-    assets: Mapping[str, Trimesh] | None = None,
-    asset_share: float = 1.0,
-    objects: tuple[int, int] | None = None,
+    choice: Choice | None = None,
     frames: int = 5,
     path_frames: int = 93,
+    lights_share_path: bool | None = None,
+    moving: Share = STILL,
 ) -> SceneSpec:
     """Draw scene ``index`` of a split.
 
     Args:
         seed: the run's root seed.
-        split, index: which scene; they name its random stream.
-        style: distribution of shapes, materials, counts and floor.
-        lights: a family for each light of the scene; ``any`` draws one of ``families``.
-        families: what ``any`` chooses from.
+        split, index: which scene; they name its random streams.
+        style: what stands there and how it is filmed; ``mixed`` draws one of MIXED.
+        lights: for each light of the scene a family, ``any`` of ``families``, or a class of contrast.
+        families: what ``any`` and classes choose from; None: the style's own, and every one.
         environments: files for the family ``hdri``.
-        assets: id -> mesh in a unit ball, z up, standing; None or empty means procedural shapes only.
-        asset_share: probability that an object is an asset, where there are any.
-        objects: least and greatest number of objects; None takes the style's own.
+        choice: what the recipe says of objects; None leaves it to the style.
         frames, path_frames: length of a clip and of the path it is cut from.
+        lights_share_path: whether the clips of all lights begin at one place; None: in all styles but OLD.
+        moving: probabilities that something moves within a clip.
 
     Raises:
-        TronError: fewer objects found a place than make a scene, or a clip is longer than its path.
+        TronError: too few objects found a place, or a clip is longer than its path.
     """
     if frames > path_frames:
         raise TronError(
             f"a clip of {frames} frames does not fit a path of {path_frames}", mend="raise path_frames"
         )
-    counts, sizes = {"A": ((3, 7), (0.4, 0.85)), "B": ((2, 4), (0.55, 1.0))}[style]
-    low, high = objects or counts
-    rng = generator(seed, split, index, "objects")
-    drawn: list[tuple[ShapeSpec | None, str | None, float]] = []
-    meshes: list[Trimesh] = []
-    names = sorted(assets or {})
-    for _ in range(int(rng.integers(low, high + 1))):
-        if assets and rng.random() < asset_share:
-            name, size = names[int(rng.integers(len(names)))], round(float(rng.uniform(*sizes)), 6)
-            drawn.append((None, name, size))
-            meshes.append(assets[name].copy().apply_scale(size))
-        else:
-            shape = draw_shape(rng, style, sizes)
-            drawn.append((shape, None, shape.size))
-            meshes.append(make_mesh(shape, LAYOUT_EDGE))
-    upright = [shape is None for shape, _, _ in drawn]
-    places = place(generator(seed, split, index, "layout"), meshes, SCENE_RADIUS, upright=upright)
-    rng = generator(seed, split, index, "materials")
-    materials = [draw_material(rng, style) if shape else None for shape, _, _ in drawn]
-    placed = tuple(
-        ObjectSpec(shape=shape, asset=asset, size=size, material=material, placement=spot)
-        for (shape, asset, size), material, spot in zip(drawn, materials, places)
-        if spot is not None
-    )
-    if len(placed) < min(FEWEST_OBJECTS, len(drawn)):
-        raise TronError(f"only {len(placed)} of {len(drawn)} objects found a place on the floor", split)
-    floor = generator(seed, split, index, "floor")
+    streams = partial(generator, seed, split, index)
+    if style == "mixed":
+        style = MIXED[int(streams("style").integers(len(MIXED)))]
+    try:
+        made = STYLES[style](streams, choice or Choice())
+    except TronError as error:
+        raise TronError(error.what, error.where or scene_name(split, index), error.mend) from error
+    own = PROCEDURAL if style not in MIXED else EVERY
+    drawn = [
+        draw_light(streams("light", k), wanted, families or (own if wanted == "any" else EVERY), environments)
+        for k, wanted in enumerate(lights)
+    ]
+    dressing = partial(_dressed, choice=choice or Choice(), rng=streams("textures"))
+    shared = style not in OLD if lights_share_path is None else lights_share_path
+    motion, turns = draw_motion(streams("motion"), made.objects, len(lights), moving)
+    rng = streams("clips")
+    first = [int(rng.integers(path_frames - frames + 1)) for _ in (lights[:1] if shared else lights)]
     return SceneSpec(
         name=scene_name(split, index),
         split=split,
         index=index,
         seed=seed,
         style=style,
-        objects=placed,
-        left_out=len(drawn) - len(placed),
-        floor=FloorSpec(
-            half_size=3.0 if style == "A" else 2.6, material=draw_material(floor, style, floor=True)
+        surroundings=tuple(dressing(item) for item in made.surroundings),
+        objects=tuple(dressing(item) for item in made.objects),
+        left_out=made.left_out,
+        metered=made.metered,
+        motion=motion,
+        turns_deg=turns,
+        lights=tuple(drawn),
+        cameras=CameraSpec(
+            capture=made.capture,
+            film=made.film,
+            path_frames=path_frames,
+            first_frame=first[0] if shared else tuple(first),
         ),
-        lights=tuple(_draw_lights(seed, split, index, lights, families, environments)),
-        cameras=_draw_cameras(seed, split, index, len(lights), frames, path_frames),
     )
 
 
-def _draw_lights(
-    seed: int,
-    split: str,
-    index: int,
-    lights: Sequence[LightChoice],
-    families: Sequence[Family],
-    environments: Sequence[HdriSpec],
-) -> list[LightSpec]:
-    drawn = []
-    for k, wanted in enumerate(lights):
-        rng = generator(seed, split, index, "light", k)
-        family = families[int(rng.integers(len(families)))] if wanted == "any" else wanted
-        drawn.append(FAMILIES[family].draw(rng, environments))
-    return drawn
-
-
-def _draw_cameras(
-    seed: int, split: str, index: int, lights: int, frames: int, path_frames: int
-) -> CameraSpec:
-    rng = generator(seed, split, index, "cameras")
-    start = rng.uniform(0.0, 360.0)
-    return CameraSpec(
-        target=(0.0, 0.0, 0.3),
-        fov_deg=34.0,
-        spiral_radius=6.4,
-        spiral_phase=rng.uniform(0.0, 360.0),
-        path_radius=rng.uniform(5.8, 6.6),
-        path_elevation_deg=rng.uniform(24.0, 34.0),
-        path_amplitude_deg=rng.uniform(8.0, 15.0),
-        path_azimuth_deg=(start, start + 321.0),
-        path_frames=path_frames,
-        first_frame=tuple(int(rng.integers(path_frames - frames + 1)) for _ in range(lights)),
+def _dressed(item: ObjectSpec, choice: Choice, rng: np.random.Generator) -> ObjectSpec:
+    """The object with the user's texture sets on some of its pieces."""
+    if item.shape is None or not choice.textures:
+        return item
+    roles = SHAPES[item.shape.kind].roles
+    materials = tuple(
+        dressed(material, roles[slot % len(roles)], choice.textures, choice.texture_share, rng)
+        for slot, material in enumerate(item.materials)
     )
+    return item.model_copy(update={"materials": materials})

@@ -1,24 +1,44 @@
-"""A task for every scene, in this process or on the cluster, with progress and what failed."""
+"""A task for every scene, in this process or on the cluster, with progress, times and what failed."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
-from typing import Any, TypeVar
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Generic, TypeVar
 
-from datagen.clusters import ours, recycle, worker_count, workers
+from datagen.clock import clocked
+from datagen.clusters import logs_folder, workers
+from datagen.crew import Crew
 from datagen.failures import Failure
+from datagen.patience import Patience
 from datagen.plan import Sources, Work
 from datagen.settings import Settings
 from tron.cli.progress import Progress
+from tron.cli.termination import termination_unwinds
 
 log = logging.getLogger(__name__)
+
+TIMES_NAME = "times.jsonl"
+"""File among the logs: a line a scene, as they are finished, with its seconds by stage and its worker."""
 
 Made = TypeVar("Made")
 Task = Callable[[Work, Settings, Sources], Made]
 """Function that makes something of one scene, in a worker; it can be pickled."""
+
+
+@dataclass(frozen=True)
+class Attempt(Generic[Made]):
+    """Result of a task, or why there is none; its seconds by stage; the worker's name, as in its log."""
+
+    outcome: Made | Failure
+    seconds: dict[str, float] = field(default_factory=dict)
+    worker: str = ""
 
 
 def make_each(
@@ -37,68 +57,87 @@ def make_each(
         unit: what weights count.
     """
     failed: dict[str, Failure] = {}
-    with Progress("scenes", sum(map(size, items)), unit=unit) as progress:
-        for item, outcome in outcomes(task, items, settings, sources):
-            if isinstance(outcome, Failure):
-                failed[item.name] = outcome
-                log.error("%s failed: %s", item.name, outcome.reason)
+    with termination_unwinds(), Progress("scenes", sum(map(size, items)), unit=unit) as progress:
+        for item, attempt in attempts(task, items, settings, sources):
+            if isinstance(attempt.outcome, Failure):
+                failed[item.name] = attempt.outcome
+                log.error("%s failed: %s", item.name, attempt.outcome.reason)
+            _note(settings, item, attempt)
             progress.advance(size(item), item.name)
     return failed
 
 
-def outcomes(
+def attempts(
     task: Task[Made], items: Sequence[Work], settings: Settings, sources: Sources
-) -> Iterator[tuple[Work, Made | Failure]]:
-    """Scenes as they are finished, in any order, each with what its task gave or why it gave nothing."""
-    if settings.cluster is None or not items:
-        for item in items:
-            yield item, attempt(task, item, settings, sources)
+) -> Iterator[tuple[Work, Attempt[Made]]]:
+    """Scenes as they are finished, in any order."""
+    if not items:
         return
-    from dask.distributed import as_completed
-
+    if settings.cluster is None:
+        patience = Patience(settings.scene_timeout)
+        for item in items:
+            with _told(item, patience.limit(item.split)):
+                made = try_it(task, settings, sources, item)
+            patience.saw(item.split, sum(made.seconds.values()))
+            yield item, made
+        return
     with workers(settings, len(items)) as client:
-        queue, left = iter(items), len(items)
-        mine = ours(settings)
-        while left:
-            wave = list(islice(queue, worker_count(client) * settings.recycle_after if mine else None))
-            futures = {
-                client.submit(
-                    attempt_logged, task, item, settings, sources, key=_key(settings, item), pure=False
-                ): item
-                for item in wave
-            }
-            for future in as_completed(futures):
-                # A worker that died (killed for memory, crashed in native code) surfaces here, after Dask's
-                # retries.
-                error = future.exception()
-                outcome = Failure.of(error, "worker lost: ") if error else future.result()
-                future.release()  # a result that is still held is computed again when its worker is replaced
-                yield futures[future], outcome
-            left -= len(wave)
-            if mine and left:
-                recycle(client, settings.worker_timeout)
+        crew = Crew(client, settings)
+        work = partial(try_in_worker, task, settings, sources)
+        for item, outcome in crew.outcomes(work, items, partial(_key, settings)):
+            yield item, outcome if isinstance(outcome, Attempt) else Attempt(outcome)
 
 
-def attempt(task: Task[Made], item: Work, settings: Settings, sources: Sources) -> Made | Failure:
+def try_it(task: Task[Made], settings: Settings, sources: Sources, item: Work) -> Attempt[Made]:
     """Do a task; whatever goes wrong is an outcome: one scene's failure is not the run's."""
-    try:
-        return task(item, settings, sources)
-    except Exception as error:
-        log.debug("scene %s", item.name, exc_info=True)
-        return Failure.of(error)
+    with clocked() as seconds:
+        try:
+            outcome = task(item, settings, sources)
+        except Exception as error:
+            log.debug("scene %s", item.name, exc_info=True)
+            outcome = Failure.of(error)
+    return Attempt(outcome, seconds)
 
 
-def attempt_logged(task: Task[Made], item: Work, settings: Settings, sources: Sources) -> Made | Failure:
+def try_in_worker(task: Task[Made], settings: Settings, sources: Sources, item: Work) -> Attempt[Made]:
     """The same in a worker, whose log tells of it."""
+    from dask.distributed import get_worker
+
     log.info("%s begins", item.name)
-    outcome = attempt(task, item, settings, sources)
+    made = try_it(task, settings, sources, item)
+    outcome = made.outcome
     if isinstance(outcome, Failure):
         log.error("%s failed: %s\n%s", item.name, outcome.reason, outcome.traceback)
     else:
         log.info("%s is made", item.name)
-    return outcome
+    return Attempt(outcome, made.seconds, str(get_worker().name))
 
 
-def _key(settings: Settings, item: Work) -> str:
+@contextmanager
+def _told(item: Work, limit: float) -> Iterator[None]:
+    """A block that makes one scene in this process, which cannot kill itself: it says that it takes long."""
+    text = "%s takes longer than scene_timeout=%.0f s; with cluster=local its worker would be replaced"
+    timer = threading.Timer(limit, log.error, (text, item.name, limit))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _note(settings: Settings, item: Work, attempt: Attempt[Any]) -> None:
+    """Add a scene's line to the file of times."""
+    path = logs_folder(settings) / TIMES_NAME
+    path.parent.mkdir(parents=True, exist_ok=True)
+    seconds = {stage: round(value, 4) for stage, value in attempt.seconds.items()}
+    made = not isinstance(attempt.outcome, Failure)
+    line = {"scene": item.name, "made": made, "worker": attempt.worker, "seconds": seconds}
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(line) + "\n")
+
+
+def _key(settings: Settings, item: Work, attempt: int) -> str:
     """A task's name on a scheduler that may serve several runs."""
-    return f"{item.name}-{hashlib.sha256(str(settings.output_dir.absolute()).encode()).hexdigest()[:16]}"
+    folder = hashlib.sha256(str(settings.output_dir.absolute()).encode()).hexdigest()[:16]
+    return f"{item.name}-{attempt}-{folder}"

@@ -17,13 +17,13 @@ from pydantic import (
 )
 
 from datagen.lights import PROCEDURAL, Family, LightChoice
-from datagen.materials import Style
+from datagen.styles import StyleChoice
 from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounces
 
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
-    *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "cluster"),
-    *("captures", "equal_error"),
+    *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
+    *("captures", "equal_error", "sharing", "variety_against"),
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
@@ -37,10 +37,13 @@ CAPTURED = {
     "objects": True,
     "families": True,
     "mesh_edge": True,
+    "texels_per_unit": True,
     "environment_height": True,
     "assets": True,
     "asset_names": True,
     "asset_share": True,
+    "textures": True,
+    "texture_share": True,
     "environments": True,
     "share_maps": True,
     "catalogue": True,
@@ -64,15 +67,34 @@ class SplitSettings(_Model):
     """One split: how many scenes of which kind, and how they are rendered."""
 
     scenes: int = Field(ge=0, le=1_000_000, description="Number of scenes.")
-    style: Style = Field(
-        default="A", description="Distribution of shapes, patterns, object counts and floor."
+    style: StyleChoice = Field(
+        default="A", description="What stands in a scene, on what, and how it is filmed."
     )
     lights: list[LightChoice] = Field(
         default=["any"] * 4,
         min_length=1,
         max_length=64,
-        description="Light family of each clip of a scene, one clip for each in the list. any draws one of "
-        "families; hdri takes one of the maps in environments.",
+        description="Light of each clip of a scene, one clip for each in the list. any draws one of "
+        "families; high, medium and low draw one of such contrast; hdri takes one of the maps in "
+        "environments.",
+    )
+    lights_share_path: bool | None = Field(
+        default=None,
+        description="All clips of a scene show it from the same cameras: each frame is path-traced under all "
+        "lights at once, which share its paths, rays and G-buffers. null: in every style but A and B, "
+        "whose clips begin at places of their own.",
+    )
+    moving_objects: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Share of scenes in whose clips an object is lifted and turned; their frames cost more.",
+    )
+    moving_lights: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Share of lights that turn about the zenith within their clip; their frames cost more.",
     )
     frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
     width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
@@ -119,7 +141,7 @@ class SensorSettings(_Model):
 
 
 class CaptureSettings(_Model):
-    """Scenes of the test split as captures: spiral views under one light, path-traced, with true maps."""
+    """Scenes of the test split as captures: views from all sides, path-traced under one light, true maps."""
 
     scenes: int = Field(
         default=4,
@@ -131,14 +153,13 @@ class CaptureSettings(_Model):
         default=["overcast", "studio", "sun"],
         min_length=1,
         max_length=64,
-        description="Light family of each capture, in rotation. any draws one of families; hdri takes one of "
-        "the maps in environments.",
+        description="Light of each capture, in rotation, as in a split's lights.",
     )
     views: int = Field(
         default=64,
         ge=2,
         le=100_000,
-        description="Spiral views of a capture; each 8th is held out, from the first.",
+        description="Views of a capture from all sides; each 8th is held out, from the first.",
     )
     width: int = Field(default=128, ge=8, le=8192, description="View width in pixels.")
     height: int = Field(default=128, ge=8, le=8192, description="View height in pixels.")
@@ -163,8 +184,8 @@ class CaptureSettings(_Model):
     relights: list[LightChoice] = Field(
         default=[],
         max_length=16,
-        description="Other lights, by family, under which the held-out views are path-traced as well, into "
-        "output_dir/relit: the truth of relighting.",
+        description="Other lights, as in a split's lights, under which the held-out views are path-traced as "
+        "well, into output_dir/relit: the truth of relighting.",
     )
     relight_spp: int = Field(default=144, ge=1, description="Paths per pixel of those.")
 
@@ -179,15 +200,28 @@ class EqualErrorSettings(_Model):
     threads: int | None = Field(default=None, ge=1, description="Threads of both renderers; null: all.")
 
 
+class SharingSettings(_Model):
+    """Comparison of frames under 20 lights one by one and together, on scenes drawn as the test split's."""
+
+    scenes: int = Field(default=2, ge=1, le=1000, description="Number of scenes.")
+    size: int = Field(default=48, ge=8, le=2048, description="Width and height of the frames in pixels.")
+    path_spp: int = Field(default=64, ge=4, description="Paths per pixel of frames one by one.")
+    rounds: int = Field(default=3, ge=1, le=100, description="Times that each way is rendered, in turns.")
+    threads: int | None = Field(default=1, ge=1, description="Threads of both ways; null: all.")
+
+
 class Settings(_Model):
     """Settings of ``tron-datagen``."""
 
     output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
-    mode: Literal["make", "validate", "captures", "equal_error"] = Field(
+    mode: Literal["make", "plan", "validate", "captures", "equal_error", "sharing"] = Field(
         "make",
-        description="make the dataset, validate the one in output_dir and list every problem, path-trace "
-        "captures for tron-reconstruct into output_dir/captures, or measure on the test scenes in output_dir "
-        "how long the path tracer takes to be as near the truth as guidance is.",
+        description="make the dataset; plan it: print what is missing, the bytes and hours it takes and the "
+        "memory of a worker, measured by a small probe here, and render nothing else; validate the one in "
+        "output_dir and list every problem; path-trace captures for tron-reconstruct into "
+        "output_dir/captures; measure on the test scenes in output_dir how long the path tracer takes to be "
+        "as near the truth as guidance is (equal_error); or measure what it saves to path-trace under many "
+        "lights at once (sharing).",
     )
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."
@@ -207,6 +241,11 @@ class Settings(_Model):
     captures: CaptureSettings = Field(
         CaptureSettings(), description="Captures to reconstruct, of the test scenes."
     )
+    sharing: SharingSettings = Field(
+        SharingSettings(),
+        description="What mode=sharing measures: how many times as fast a frame is path-traced under 10 "
+        "lights of high and 10 of low contrast together as one by one, at equal mean error.",
+    )
     equal_error: EqualErrorSettings = Field(
         EqualErrorSettings(), description="Comparison of guidance with the path tracer."
     )
@@ -221,11 +260,12 @@ class Settings(_Model):
     )
     families: list[Family] | None = Field(
         None,
-        description="Light families that 'any' draws from, a list as above; null: [hdri] where environments "
-        f"is given, else [{', '.join(PROCEDURAL)}].",
+        description="Light families that any, high, medium and low draw from, a list as above; null: [hdri] "
+        f"where environments is given; else any draws from [{', '.join(PROCEDURAL)}] in styles A and B, and "
+        "all else from every family but hdri.",
         examples=["[sun,overcast]"],
     )
-    views: int = Field(64, ge=1, description="Spiral views whose G-buffers the surfels are made from.")
+    views: int = Field(64, ge=1, description="Views whose G-buffers the surfels are made from.")
     view_width: int = Field(256, ge=8, le=8192, description="Width of those views in pixels.")
     view_height: int = Field(256, ge=8, le=8192, description="Height of those views in pixels.")
     surfels: int = Field(60_000, ge=100, description="Approximate number of surfels of a scene.")
@@ -269,7 +309,16 @@ class Settings(_Model):
         0.04,
         gt=0,
         le=1,
-        description="Longest edge of procedural meshes in world units; patterns are that sharp.",
+        description="Longest edge of procedural meshes in world units.",
+    )
+    texels_per_unit: float | None = Field(
+        None,
+        gt=0,
+        le=4096,
+        description="Texels a world unit of the textures on procedural pieces; null: two along a pixel of "
+        "frames and views at the median distance of cameras and things. A scene has 64 for each pixel of a "
+        "frame at most, between one and eight million; where those are too few, the log says how many a unit "
+        "they are.",
     )
     environment_height: int = Field(
         256, ge=8, le=8192, description="Rows of the lat-long maps that lights are baked to."
@@ -280,6 +329,12 @@ class Settings(_Model):
     )
     asset_share: float = Field(
         1.0, ge=0, le=1, description="Share of objects drawn from assets, where given."
+    )
+    textures: Path | None = Field(
+        None, description="Folder of PBR texture sets to lay on procedural pieces whose role they suit."
+    )
+    texture_share: float = Field(
+        0.5, ge=0, le=1, description="Share of pieces with a texture set, among those that one suits."
     )
     environments: Path | None = Field(None, description="Folder of .hdr and .exr maps to use as lights.")
     share_maps: bool = Field(
@@ -296,6 +351,10 @@ class Settings(_Model):
         description="Names of assets and maps to use although the catalogue has no licence.",
     )
     only: list[str] = Field(default_factory=list, description="Make these scenes only, such as train-000012.")
+    variety_against: Path | None = Field(
+        None,
+        description="Folder of another dataset whose histograms are drawn beside this one's in README.md.",
+    )
     clips_per_shard: int = Field(
         64, ge=1, description="Maximum number of clips of a shard; no shard spans two scenes."
     )
@@ -311,7 +370,17 @@ class Settings(_Model):
         600.0, gt=0, description="Seconds to wait for the cluster's first worker: jobs may queue for long."
     )
     recycle_after: int = Field(
-        50, ge=1, description="Scenes a worker makes before it is replaced; not with cluster=address."
+        50,
+        ge=1,
+        description="Scenes a worker makes before it is replaced, while the others go on; not with "
+        "cluster=address.",
+    )
+    scene_timeout: float | None = Field(
+        None,
+        gt=0,
+        description="Seconds after which a scene fails and its worker is killed and replaced; null: 20 times "
+        "the median of its split so far, 600 at the least, and a day until three are made. With cluster=none "
+        "it is only told.",
     )
     cluster: dict[str, Any] | None = Field(
         None,
@@ -357,7 +426,7 @@ class Settings(_Model):
         return self
 
     def _ask_hdri(self, lights: list[LightChoice]) -> bool:
-        return "hdri" in {*lights, *self.light_families()}
+        return "hdri" in {*lights, *(self.light_families() or ())}
 
     def split(self, name: str) -> SplitSettings:
         """The settings of one split."""
@@ -372,11 +441,11 @@ class Settings(_Model):
         """The splits that have scenes."""
         return [name for name in SPLITS if self.split(name).scenes]
 
-    def light_families(self) -> list[Family]:
-        """The families that ``any`` chooses from."""
+    def light_families(self) -> list[Family] | None:
+        """The families that ``any`` chooses from; None: the style's own."""
         if self.families is not None:
             return list(self.families)
-        return ["hdri"] if self.environments is not None else list(PROCEDURAL)
+        return ["hdri"] if self.environments is not None else None
 
     def recipe(self) -> dict[str, Any]:
         """Keys that decide a scene's content, plain values: not where it goes, who makes it or how many."""

@@ -3,42 +3,58 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
+import mitsuba as mi
 import numpy as np
 
-from datagen.build import Geometry
-from datagen.lights import classify
-from datagen.pathtrace import DirectIrradiance, direct_irradiance, gbuffers, render_frames
-from datagen.plan import Refinement
+from datagen.build import FIRST_ID, Geometry
+from datagen.clock import stage
+from datagen.exposure import metered
+from datagen.lights import classify, contrast_share
+from datagen.pathtrace import (
+    DirectIrradiance,
+    direct_irradiance,
+    gbuffers,
+    render_frames,
+    render_lights,
+    stacked_lights,
+)
+from datagen.plan import Refinement, scene_folder
 from datagen.refinement import refine_surfels
 from datagen.scene import SceneSpec
-from datagen.settings import Settings
+from datagen.settings import Settings, SplitSettings
+from datagen.spool import Frame, Spool
 from tron.cameras import Camera
+from tron.estimation import Estimation
+from tron.gaussians.edit import moved
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.gaussians.scene import GaussianScene
 from tron.runtime import torch_device
 from tron.seeds import integer
-from tron.shading.bounce import BounceTransport
+from tron.shading.bounce import BouncedLight, BounceTransport
 from tron.shading.environment import EnvironmentMap
-from tron.shading.guidance import Guidance, Lighting, render_guidance
+from tron.shading.guidance import Guidance, Lighting, render_guidance, trace_views
 from tron.shards.schema import MEMBERS, ClipMeta, clip_members
 from tron.tracing import SurfelTracer
 
-Frame = dict[str, np.ndarray]
 REFERENCE_REFLECTIONS = 16
 """Rays a pixel of the member lit_reflections."""
 
 
+@stage("surfels")
 def make_surfels(
     spec: SceneSpec, geometry: Geometry, settings: Settings
 ) -> tuple[GaussianScene, Refinement | None]:
-    """Surfels through what the spiral views see of a scene, then fitted to it, and what that gained.
+    """Surfels through what its capture's views see of a scene, then fitted to it, and what that gained.
 
-    They are judged by the cameras of the first clip, which are not among the spiral's.
+    They are judged by the cameras of the first clip, which are not among those.
     """
-    cameras = spec.spiral(settings.views, settings.view_width, settings.view_height)
+    cameras = spec.views(settings.views, settings.view_width, settings.view_height)
     seen = gbuffers(geometry, cameras)
+    if spec.motion is not None:
+        seen += _uncovered(spec, geometry, cameras)
     surfels = surfels_from_gbuffers(seen, count=settings.surfels)
     if not settings.refine_steps:
         return surfels, None
@@ -49,91 +65,221 @@ def make_surfels(
     return refine_surfels(surfels, seen, held_out, settings.refine_steps, seed, device)
 
 
+def _uncovered(spec: SceneSpec, geometry: Geometry, cameras: Sequence[Camera]) -> list[GBufferView]:
+    """Every other view once more with the moving object away and left out: what it rests on has no hole."""
+    number = _move(spec, geometry, 1.0)
+    views = gbuffers(geometry, cameras[::2])
+    _move(spec, geometry, 0.0)
+    return [replace(view, valid=view.valid & (view.object_id != number)) for view in views]
+
+
+def _move(spec: SceneSpec, geometry: Geometry, time: float) -> int:
+    """Put the object that moves where it is at a time; its id."""
+    assert spec.motion is not None
+    number = FIRST_ID + len(spec.surroundings) + spec.motion.object
+    geometry.move(number, spec.motion.pose(spec.objects[spec.motion.object], time))
+    return number
+
+
 def make_clips(
     spec: SceneSpec, geometry: Geometry, surfels: GaussianScene, settings: Settings
-) -> Iterator[tuple[ClipMeta, list[Frame]]]:
+) -> Iterator[tuple[ClipMeta, Sequence[Frame]]]:
     """Render one clip a light, in the order of the specification.
 
     Each frame holds the schema's members, linear: guidance from the surfels, rgb path-traced from the meshes,
-    both under the same baked map; with reference buffers also what Mitsuba says of the pixel centres.
+    both under the same baked map; with reference buffers also what Mitsuba says of the pixel centres. Lights
+    that share a path share each frame's G-buffers and its paths. A clip's frames are read while it is the
+    last that was given.
     """
-    tracer = SurfelTracer(surfels)
     estimation = settings.estimation(spec.split)
-    transport = None
-    if estimation.bounces:
-        seed = integer(spec.seed, spec.split, spec.index, "bounce")
-        transport = BounceTransport.trace(tracer.sided(estimation.two_sided), seed=seed)
-    for number in range(len(spec.lights)):
-        yield make_clip(spec, geometry, tracer, transport, number, settings)
+    with stage("guidance"):
+        tracer = SurfelTracer(surfels)
+        transport = _transport(spec, tracer, estimation)
+    folder = scene_folder(settings.output_dir, spec.name)
+    for group in spec.groups():
+        with Spool(folder, len(group)) as spool:
+            for k, meta in enumerate(_film(spec, geometry, tracer, transport, group, settings, spool)):
+                yield meta, spool.clip(k)
 
 
-def make_clip(
+@dataclass
+class _Lit:
+    """One light of a group, made ready.
+
+    Attributes:
+        number: its place in the scene's list, which names its seeds.
+        seeds: what they are for -> one a frame.
+        exposure: of its clip.
+    """
+
+    number: int
+    environment: EnvironmentMap
+    lighting: Lighting
+    bounce: BouncedLight | None
+    seeds: dict[str, list[int]]
+    exposure: float
+
+
+def _transport(spec: SceneSpec, tracer: SurfelTracer, estimation: Estimation) -> BounceTransport | None:
+    if not estimation.bounces:
+        return None
+    seed = integer(spec.seed, spec.split, spec.index, "bounce")
+    return BounceTransport.trace(tracer.sided(estimation.two_sided), seed=seed)
+
+
+@dataclass
+class _Moment:
+    """A scene at one time of its clips: where things are and how they are lit.
+
+    Attributes:
+        scenes: under no light, for frames that all lights share; or one a light.
+        stacked: the lights of frames that are path-traced under all of them at once.
+    """
+
+    tracer: SurfelTracer
+    lights: list[_Lit]
+    scenes: list[mi.Scene]
+    stacked: mi.Integrator | None
+
+
+def _moment(
     spec: SceneSpec,
     geometry: Geometry,
     tracer: SurfelTracer,
     transport: BounceTransport | None,
-    number: int,
+    group: Sequence[int],
     settings: Settings,
-) -> tuple[ClipMeta, list[Frame]]:
-    """Render the clip of one light; ``number`` is its place in the scene's list and names its seeds.
+    time: float,
+) -> _Moment:
+    """The scene at a time from 0 to 1; moves the geometry."""
+    recipe = settings.split(spec.split)
+    if spec.motion is not None:
+        which = tracer.scene.object_id == _move(spec, geometry, time)
+        if time and which.any():
+            pose = spec.motion.pose(spec.objects[spec.motion.object], time)
+            tracer = tracer.moved(moved(tracer.scene, which, *pose))
+            transport = _transport(spec, tracer, settings.estimation(spec.split))
+    lights = [_prepare(spec, transport, number, settings, time) for number in group]
+    together = spec.cameras.shared
+    if together and not recipe.reference_buffers:
+        scenes = [geometry.lit()]
+    else:
+        scenes = [geometry.lit(light.environment) for light in lights]
+    stacked = stacked_lights([light.environment for light in lights]) if together else None
+    return _Moment(tracer, lights, scenes, stacked)
+
+
+@stage("guidance")
+def _film(
+    spec: SceneSpec,
+    geometry: Geometry,
+    tracer: SurfelTracer,
+    transport: BounceTransport | None,
+    group: Sequence[int],
+    settings: Settings,
+    spool: Spool,
+) -> list[ClipMeta]:
+    """Render the clips of lights that are filmed from the same places, frame by frame.
 
     ``transport`` carries the light that bounces; None: none does.
     """
-    recipe, light = settings.split(spec.split), spec.lights[number]
-    estimation = settings.estimation(spec.split)
-    environment = light.bake(settings.environment_height, settings.environments)
-    cameras = spec.clip(number, recipe.frames, recipe.width, recipe.height)
-    scene = geometry.lit(environment)
-    path = ("light", number, "frame")
-    seeds = {what: _seeds(spec, len(cameras), what, *path) for what in ("path", "guidance", "reference")}
+    recipe, estimation = settings.split(spec.split), settings.estimation(spec.split)
+    cameras = spec.clip(group[0], recipe.frames, recipe.width, recipe.height)
+    still = spec.motion is None and not any(spec.turns_deg)
+    now = _moment(spec, geometry, tracer, transport, group, settings, 0.0)
+    first = now.lights
+    finer = estimation.model_copy(update={"supersample": 2})
+    mirrored = finer.model_copy(update={"reflections": REFERENCE_REFLECTIONS})
+    for i, camera in enumerate(cameras):
+        if i and not still:
+            time = i / (len(cameras) - 1)
+            now = _moment(spec, geometry, tracer, transport, group, settings, time)
+        bounces = [light.bounce for light in now.lights]
+        (truth,) = gbuffers(geometry, [camera])
+        spp, seed = recipe.path_spp, first[0].seeds["path"][i]
+        if now.stacked is None:
+            rgb = render_frames(now.scenes[0], [camera], spp, [seed])
+        else:
+            rgb = render_lights(now.scenes[0], now.stacked, camera, spp, seed)
+        views = trace_views(now.tracer, camera, estimation, bounces)
+        fine = trace_views(now.tracer, camera, finer, bounces) if recipe.reference_buffers else []
+        for k, light in enumerate(now.lights):
+            if spec.metered and i == 0:
+                first[k].exposure = metered(rgb[k], truth.valid, light.exposure)
+            seed = light.seeds["guidance"][i]
+            view = partial(
+                render_guidance, now.tracer, camera, light.lighting, seed=seed, bounce=light.bounce
+            )
+            guidance = view(estimation, gbuffer=views[k])
+            frame = {name: guidance[name] for name in guidance.BUFFERS if name in MEMBERS}
+            frame |= {"rgb": rgb[k], "foreground": truth.valid.astype(np.float32)}
+            if recipe.reference_buffers:
+                seed = light.seeds["reference"][i]
+                direct = direct_irradiance(geometry, now.scenes[k], camera, recipe.reference_spp, seed)
+                frame |= _reference(camera, truth, guidance, direct, light.environment)
+                frame["lit_supersampled"] = view(finer, gbuffer=fine[k]).lit
+                frame["lit_reflections"] = view(mirrored, gbuffer=fine[k]).lit
+            spool.add(k, frame)
+    if spec.motion is not None:
+        _move(spec, geometry, 0.0)
+    return [_meta(spec, light, cameras, recipe) for light in first]
 
-    rgb = render_frames(scene, cameras, recipe.path_spp, seeds["path"])
-    lighting = Lighting(environment)
-    bounce = None
+
+def _prepare(
+    spec: SceneSpec,
+    transport: BounceTransport | None,
+    number: int,
+    settings: Settings,
+    time: float,
+) -> _Lit:
+    recipe, shared = settings.split(spec.split), spec.cameras.shared
+    environment = spec.lights[number].bake(settings.environment_height, settings.environments)
+    if spec.turns_deg:
+        environment = environment.rotated(spec.turns_deg[number] * time)
+    if shared:  # lights that are traced together have texels at the same places
+        environment = environment.baked().resized(settings.environment_height)
+    lighting, bounce = Lighting(environment), None
     if transport is not None:
         seed = integer(spec.seed, spec.split, spec.index, "light", number, "bounce")
-        bounce = transport.bake(lighting, estimation, seed=seed)
-    frames: list[Frame] = []
-    for i, (camera, truth) in enumerate(zip(cameras, gbuffers(geometry, cameras))):
-        view = partial(render_guidance, tracer, camera, lighting, seed=seeds["guidance"][i], bounce=bounce)
-        guidance = view(estimation)
-        frame = {name: guidance[name] for name in guidance.BUFFERS if name in MEMBERS}
-        frame |= {"rgb": rgb[i], "foreground": truth.valid.astype(np.float32)}
-        if recipe.reference_buffers:
-            direct = direct_irradiance(geometry, scene, camera, recipe.reference_spp, seeds["reference"][i])
-            frame |= _reference(camera, truth, guidance, direct, environment)
-            finer = estimation.model_copy(update={"supersample": 2})
-            mirrored = finer.model_copy(update={"reflections": REFERENCE_REFLECTIONS})
-            frame |= {"lit_supersampled": view(finer).lit, "lit_reflections": view(mirrored).lit}
-        frames.append(frame)
+        bounce = transport.bake(lighting, settings.estimation(spec.split), seed=seed)
+    own = ("light", number, "frame")
+    where = {"path": ("frame",) if shared else own, "guidance": own, "reference": own}
+    seeds = {what: _seeds(spec, recipe.frames, what, *path) for what, path in where.items()}
+    return _Lit(number, environment, lighting, bounce, seeds, environment.exposure())
+
+
+def _meta(spec: SceneSpec, lit: _Lit, cameras: Sequence[Camera], recipe: SplitSettings) -> ClipMeta:
+    light = spec.lights[lit.number]
     spp = {"path": recipe.path_spp, "guidance": recipe.guidance_spp}
     if recipe.reference_buffers:
         spp["reference"] = recipe.reference_spp
-    meta = ClipMeta(
-        key=f"{spec.name}-l{number}",
+    return ClipMeta(
+        key=f"{spec.name}-l{lit.number}",
         scene=spec.name,
-        light=f"{spec.name}-{light.family}{number}",
+        light=f"{spec.name}-{light.family}{lit.number}",
         light_family=light.family,
         split=spec.split,
-        frames=len(frames),
+        frames=len(cameras),
         width=recipe.width,
         height=recipe.height,
         cameras=[camera.to_dict() for camera in cameras],
-        exposure=environment.exposure(),
+        exposure=lit.exposure,
         color_space={
             name: space
             for name in clip_members(recipe.reference_buffers)
             if (space := MEMBERS[name].color_space) is not None
         },
-        seeds={"root": spec.seed, **{f"{what}0": values[0] for what, values in seeds.items()}},
+        seeds={"root": spec.seed, **{f"{what}0": values[0] for what, values in lit.seeds.items()}},
         spp=spp,
         extra={
             "style": spec.style,
-            "contrast": classify(environment),
-            "light_spec": light.model_dump(mode="json"),
+            "contrast": classify(lit.environment),
+            "contrast_share": contrast_share(lit.environment),
+            "turn_deg": spec.turns_deg[lit.number] if spec.turns_deg else 0.0,
+            "moving_object": spec.motion is not None,
+            "light_spec": light.model_dump_json(),  # text: families differ in their keys, and tables cannot
         },
     )
-    return meta, frames
 
 
 def first_bad_value(frames: Sequence[Frame]) -> str | None:

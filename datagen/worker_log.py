@@ -21,12 +21,15 @@ class WorkerLog(WorkerPlugin):
     Args:
         folder: made where it is missing.
         level: that of the command.
+        ours: the worker ends with the command, so what Dask says in it, also while it ends, is for the log
+            and not for the command's terminal.
     """
 
-    def __init__(self, folder: Path, level: Level) -> None:
+    def __init__(self, folder: Path, level: Level, ours: bool = True) -> None:
         self.name = f"log in {folder}"
         self._folder = folder
         self._level: Level = level
+        self._ours = ours
 
     def setup(self, worker: Any) -> None:
         """Begin to write; Dask calls this in every worker that is there or comes."""
@@ -36,6 +39,9 @@ class WorkerLog(WorkerPlugin):
         self._handler = logging.StreamHandler(self._stream)
         self._handler.setFormatter(logging.Formatter(FORMAT))
         logging.getLogger().addHandler(self._handler)
+        if self._ours:
+            dask = logging.getLogger("distributed")
+            dask.handlers = [logging.NullHandler(), self._handler]
         configure_logging(self._level)  # the root has a handler now, so stderr gets none
         self._crashes = not faulthandler.is_enabled()
         if self._crashes:
@@ -46,4 +52,5 @@ class WorkerLog(WorkerPlugin):
         if self._crashes:
             faulthandler.disable()
         logging.getLogger().removeHandler(self._handler)
+        logging.getLogger("distributed").removeHandler(self._handler)
         self._stream.close()

@@ -75,6 +75,7 @@ cli = command(
         "output_dir=outputs/relighting",
         "tron-eval benchmark=tracing output_dir=outputs/tracing",
         "tron-eval benchmark=reconstruction output_dir=outputs/reconstruction",
+        "tron-eval benchmark=datagen output_dir=outputs/datagen",
     ),
 )
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import threading
@@ -22,6 +21,7 @@ from pathlib import Path
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat
 
+from tron.cli.termination import termination_unwinds
 from tron.errors import TronError
 from tron.runtime import describe_machine
 from tron.storage import write_atomic
@@ -168,7 +168,7 @@ def run_together(children: Sequence[Child]) -> None:
         StageFailed: the first child, in the order given, that failed by itself.
     """
     paths = [script_path(child.script) for child in children]
-    with _termination_unwinds(), ExitStack() as running:
+    with termination_unwinds(), ExitStack() as running:
         started = [running.enter_context(_running(child, path)) for child, path in zip(children, paths)]
         while True:
             codes = [process.poll() for process, _ in started]
@@ -181,23 +181,6 @@ def run_together(children: Sequence[Child]) -> None:
             if None not in codes:
                 return
             time.sleep(0.05)
-
-
-@contextmanager
-def _termination_unwinds() -> Iterator[None]:
-    """Let SIGTERM end this process by an exception, so that it does not leave its children running."""
-
-    def end(signum: int, _frame: object) -> None:
-        raise SystemExit(128 + signum)
-
-    if threading.current_thread() is not threading.main_thread():  # only there may handlers be set
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

@@ -1,10 +1,13 @@
 """Fixtures for every test: one torch thread, this machine's Mitsuba variants, the real data."""
 
 import ctypes
+import json
 import os
+import struct
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -107,3 +110,34 @@ def read_video() -> Callable[[Path], np.ndarray]:
             return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
     return read
+
+
+@pytest.fixture(scope="session")
+def write_glb() -> Callable[[Path, dict[str, Any], Sequence[Any]], Path]:
+    """Writes a GLB of a tree and what its buffer views hold; arrays get accessors of the same numbers.
+
+    Arrays come first, then bytes. Node 0 holds mesh 0 where the tree has no nodes.
+    """
+    widths = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+    kinds = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
+
+    def write(path: Path, tree: dict[str, Any], blobs: Sequence[Any]) -> Path:
+        data, views, accessors = b"", [], []
+        for blob in blobs:
+            content = blob if isinstance(blob, bytes) else np.ascontiguousarray(blob).tobytes()
+            views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(content)})
+            data += content + bytes(-len(content) % 4)
+            if not isinstance(blob, bytes):
+                shape = (*np.shape(blob), 1)
+                kind = {"componentType": kinds[blob.dtype.str[1:]], "type": widths[shape[1]]}
+                accessors.append({"bufferView": len(views) - 1, "count": shape[0]} | kind)
+        whole = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+        whole |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": len(data)}]} | tree
+        text = json.dumps(whole).encode()
+        text += b" " * (-len(text) % 4)
+        chunks = struct.pack("<2I", len(text), 0x4E4F534A) + text
+        chunks += struct.pack("<2I", len(data), 0x004E4942) + data
+        path.write_bytes(struct.pack("<3I", 0x46546C67, 2, 12 + len(chunks)) + chunks)
+        return path
+
+    return write

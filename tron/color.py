@@ -14,13 +14,14 @@ import array_api_compat
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """BT.709 weights of linear R, G, B in relative luminance."""
 
-# Rows give each inset channel as a blend of linear BT.709 R, G, B.
-_AGX_INSET = (
+AGX_INSET = (
     (0.842479062253094, 0.0784335999999992, 0.0792237451477643),
     (0.0423282422610123, 0.878468636469772, 0.0791661274605434),
     (0.0423756549057051, 0.0784336, 0.879142973793104),
 )
-_AGX_LOG2_RANGE = (-12.47393, 4.026069)  # 10 stops below and 6.5 above middle grey, 0.18
+"""Rows give each channel that AgX's curve is applied to as a blend of linear BT.709 R, G, B."""
+AGX_LOG2_RANGE = (-12.47393, 4.026069)
+"""Base-2 logarithms that AgX's curve spans: 10 stops below and 6.5 above middle grey, 0.18."""
 _AGX_PIVOT = (10 / 16.5, 0.5)  # middle grey
 _AGX_SLOPE = 2.0
 _AGX_TOE_POWER, _AGX_SHOULDER_POWER = 3.0, 3.25
@@ -71,8 +72,8 @@ def agx(linear: Any, axis: int = -1) -> Any:
     """
     xp = array_api_compat.array_namespace(linear)
     rgb = _channels(xp.where(linear > 0, linear, xp.zeros_like(linear)), axis)
-    low, high = _AGX_LOG2_RANGE
-    inset = xp.stack([r * rgb[0] + g * rgb[1] + b * rgb[2] for r, g, b in _AGX_INSET], axis=axis)
+    low, high = AGX_LOG2_RANGE
+    inset = xp.stack([r * rgb[0] + g * rgb[1] + b * rgb[2] for r, g, b in AGX_INSET], axis=axis)
     # Clamping before the logarithm rather than after it gives the same values and no infinite gradients.
     stops = xp.log2(xp.clip(inset, 2.0**low, 2.0**high))
     return _agx_sigmoid(xp, (stops - low) / (high - low))

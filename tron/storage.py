@@ -75,11 +75,11 @@ def write_atomic(path: str | os.PathLike[str], data: bytes | str) -> None:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
-def write_if_changed(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file atomically unless it says that already: a finished dataset is not touched."""
-    path = Path(path)
-    if not path.is_file() or path.read_bytes() != text.encode():
-        write_atomic(path, text)
+def write_if_changed(path: str | os.PathLike[str], data: bytes | str) -> None:
+    """Write a file (text as UTF-8) unless it holds that already: a finished dataset is not touched."""
+    path, data = Path(path), data.encode() if isinstance(data, str) else data
+    if not path.is_file() or path.read_bytes() != data:
+        write_atomic(path, data)
 
 
 @contextmanager

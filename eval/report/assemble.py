@@ -63,7 +63,7 @@ def _targets(results: Results, targets: Sequence[Target]) -> Section:
         name = target.what or target.metric
         rows.append([name, Cell(measured, "strong"), bound(target, unit), Cell(words, tone)])
     caption = "Bounds set before the measurement; verdicts are on the unrounded figures."
-    table = Table(caption, ["Figure", "Measured", "Target", "Verdict"], rows, words=[3])
+    table = Table(caption, ["Figure", "Measured", "Target", "Verdict"], rows, words=[0, 3])
     return Section("targets", "Targets", [table])
 
 

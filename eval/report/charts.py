@@ -1,4 +1,4 @@
-"""Line charts as inline SVG that follows the page's colours: training curves, growth of time with size."""
+"""Charts as inline SVG that follows the page's colours: training curves, growth with size, parts of a sum."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from tron.report.colours import LINE_COLOURS
 from tron.report.page import Chart
 
 INK = "#123456"
 """Stands for the page's text colour while matplotlib draws; replaced by ``currentColor`` afterwards."""
-LINE_COLOURS = ("#3d85c6", "#d9822b", "#4a9d5f", "#a064c8", "#c0504d", "#7f7f7f")
+BAR_COLOURS = (*LINE_COLOURS, "#c9a227", "#5aa7a7")
 CLOCK = "seconds"
 
 Points = Sequence[tuple[float, float]]
@@ -142,6 +143,29 @@ def line_chart(
         f"{label} from {points[0][1]:.3g} to {points[-1][1]:.3g}" for label, points in lines.items()
     )
     return Chart(svg(), caption, f"Line chart, {y_label} over {x_label}: {ends}.")
+
+
+def bar_chart(bars: Mapping[str, Mapping[str, float]], x_label: str, caption: str) -> Chart:
+    """Horizontal bars, each a sum of parts.
+
+    Args:
+        bars: label -> part -> its length; all have the same parts, in the same order.
+        x_label, caption: the words around it.
+    """
+    parts = list(next(iter(bars.values())))
+    with _canvas(caption) as (axes, svg):
+        left = np.zeros(len(bars))
+        for part, colour in zip(parts, BAR_COLOURS * len(parts)):
+            lengths = np.array([bar[part] for bar in bars.values()])
+            axes.barh(list(bars), lengths, left=left, color=colour, label=part)
+            left += lengths
+        axes.invert_yaxis()  # the first on top
+        axes.set(xlabel=x_label, xlim=(0, 1.25 * left.max()))  # room for the legend
+    said = "; ".join(
+        f"{label}: " + ", ".join(f"{part} {length:.3g}" for part, length in bar.items())
+        for label, bar in bars.items()
+    )
+    return Chart(svg(), caption, f"Bar chart of {x_label}: {said}.")
 
 
 @contextmanager

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import datagen.capture_export
-from datagen.build import build
 from datagen.capture_export import make_capture, make_captures
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
-from datagen.plan import Work
+from datagen.plan import Sources, Work
 from datagen.relit import straightened
 from datagen.scene import SceneSpec
+from datagen.scene_geometry import scene_geometry
 from datagen.settings import Settings
 from datagen.validate import validate
 from tron.captures import Capture
@@ -73,8 +73,8 @@ def spec(folder) -> SceneSpec:
 
 
 @pytest.fixture(scope="module")
-def geometry(spec, variant):
-    return build(spec, edge=EDGE)
+def geometry(spec, output):
+    return scene_geometry(spec, tiny(output), Sources())
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_a_capture_is_a_spiral_around_a_test_scene_under_its_own_light(capture, 
     assert capture.test == {"view_00000", "view_00008"}
     assert capture.up.tolist() == [0, 0, 1]
     assert capture.exposure == light.exposure()
-    for view, camera in zip(capture.views, spec.spiral(9, 28, 20)):
+    for view, camera in zip(capture.views, spec.views(9, 28, 20)):
         np.testing.assert_allclose(view.camera.world_to_camera, camera.world_to_camera, rtol=0, atol=1e-12)
         assert view.camera.fx == camera.fx
 

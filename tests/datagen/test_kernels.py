@@ -13,11 +13,12 @@ import pytest
 from datagen.build import Geometry, build
 from datagen.capture_export import captured
 from datagen.lights import FAMILIES, Family
-from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
+from datagen.pathtrace import direct_irradiance, gbuffers, render_frames, render_lights, stacked_lights
 from datagen.plan import Sources, Work
 from datagen.run import make_scene
 from datagen.scene import draw_scene
 from datagen.settings import CaptureSettings, Settings
+from datagen.styles import Choice
 from tron.aligned import ALIGNMENT, aligned
 from tron.cameras import Camera
 from tron.cli.recipes import check, compose_recipe
@@ -26,9 +27,6 @@ from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Lighting
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-SUN_KERNELS = 2
-"""What each sun costs: Mitsuba's sunsky writes its sun's size and place into the code."""
 
 
 def kernels_of(action: Callable[[], object]) -> set[str]:
@@ -41,7 +39,9 @@ def kernels_of(action: Callable[[], object]) -> set[str]:
 
 def geometry(index: int) -> Geometry:
     lights: list[Family] = ["overcast"]
-    spec = draw_scene(0, "test", index, style="A", lights=lights, frames=1, path_frames=4, objects=(2, 2))
+    spec = draw_scene(
+        0, "test", index, style="A", lights=lights, frames=1, path_frames=4, choice=Choice(objects=(2, 2))
+    )
     return build(spec, edge=0.2)
 
 
@@ -61,8 +61,11 @@ def light(number: int, rotation: float) -> EnvironmentMap:
         lambda meshes, scene, view, seed: gbuffers(meshes, [view]),
         lambda meshes, scene, view, seed: render_frames(scene, [view], 4, [seed]),
         lambda meshes, scene, view, seed: render_frames(scene, [view], 4, [seed], transparent=True),
+        lambda meshes, scene, view, seed: render_lights(
+            scene, stacked_lights([light(seed % 100 + k, 0.0) for k in range(3)]), view, 4, seed
+        ),
     ],
-    ids=["irradiance", "gbuffers", "frames", "transparent"],
+    ids=["irradiance", "gbuffers", "frames", "transparent", "many lights"],
 )
 def test_another_view_seed_light_or_scene_is_traced_by_the_same_kernels(variant, shoot):
     meshes = geometry(0)
@@ -109,19 +112,27 @@ def test_another_light_is_prepared_by_the_same_kernels(variant):
         assert {array.ctypes.data % ALIGNMENT for array in texels} == {0}
 
 
-def test_a_sun_brings_no_more_than_its_own_kernels(variant):
+@pytest.mark.parametrize("family", [name for name in FAMILIES if name != "hdri"])
+def test_another_light_of_a_family_is_baked_by_the_same_kernels(variant, family):
     def baked(number: int) -> set[str]:
-        return kernels_of(lambda: FAMILIES["sun"].draw(generator(1, "kernels", number), []).bake(16))
+        return kernels_of(lambda: FAMILIES[family].draw(generator(1, "kernels", number), []).bake(16))
 
     first = baked(0)
-    assert len(baked(1) - first) <= SUN_KERNELS
-    assert len(baked(2) - first) <= SUN_KERNELS
+    for number in range(1, 8):
+        assert baked(number) <= first
 
 
-def test_a_second_scene_of_a_split_brings_no_kernel(variant, tmp_path: Path):
+@pytest.mark.parametrize("shared", [False, True], ids=["own paths", "shared path"])
+def test_a_second_scene_of_a_split_brings_no_kernel(variant, shared, tmp_path: Path):
     """Surfels, their refinement, guidance, frames, references: all of a scene."""
     tiny = [f"test.{key}" for key in ("frames=2", "width=16", "height=16", "path_spp=4", "reference_spp=4")]
-    tiny += ["test.lights=[studio,overcast]", "test.guidance_spp=2", "cluster=null", "path_frames=8"]
+    tiny += [
+        f"test.lights_share_path={shared}",
+        "test.lights=[studio,overcast]",
+        "test.guidance_spp=2",
+        "cluster=null",
+        "path_frames=8",
+    ]
     tiny += ["views=6", "view_width=32", "view_height=32", "surfels=1500", "refine_steps=6", "mesh_edge=0.2"]
     tiny += ["environment_height=16", "objects=[2,2]", f"output_dir={tmp_path}"]
     settings = check(compose_recipe("conf.datagen", Settings, tiny), Settings)
@@ -143,7 +154,14 @@ def test_a_second_capture_brings_no_kernel(variant):
     def shot(index: int) -> set[str]:
         families: list[Family] = ["studio"]
         spec = draw_scene(
-            0, "test", index, style="A", lights=families, frames=1, path_frames=4, objects=(2, 2)
+            0,
+            "test",
+            index,
+            style="A",
+            lights=families,
+            frames=1,
+            path_frames=4,
+            choice=Choice(objects=(2, 2)),
         )
         capture = captured(spec, build(spec, edge=0.2), spec.lights[0].bake(16).baked(), settings)
         return kernels_of(lambda: [view.read() for view in capture.views])

@@ -1,5 +1,7 @@
 """Lights: what is drawn is what shines, whatever the resolution it is baked at."""
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -76,6 +78,40 @@ def test_suns_cast_shadows_and_clouds_do_not():
     for k in range(3):
         assert classify(FAMILIES["sun"].draw(generator(k, "s"), []).bake(64)) == "high"
         assert classify(FAMILIES["overcast"].draw(generator(k, "o"), []).bake(64)) == "low"
+
+
+@pytest.mark.parametrize("family", DRAWN)
+def test_a_light_read_back_is_baked_to_the_same_map(family):
+    light = FAMILIES[family].draw(generator(7, family), [])
+    again = FAMILIES[family].model_validate_json(light.to_json())
+    assert again == light
+    np.testing.assert_array_equal(again.bake(32).image, light.bake(32).image)
+
+
+@pytest.mark.parametrize("family", DRAWN)
+def test_mitsubas_plugin_shows_the_same_light(family):
+    environment = FAMILIES[family].draw(generator(3, family), []).bake(48)
+    d = generator(0, "seen").normal(size=(2000, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    emitter = mi.load_dict(environment.to_mitsuba())
+    si = dr.zeros(mi.SurfaceInteraction3f, len(d))
+    si.wi = -mi.Vector3f(np.ascontiguousarray(d.T, np.float32))
+    top = float(environment.image.max())
+    np.testing.assert_allclose(
+        np.array(emitter.eval(si)).T, environment.lookup(d), rtol=1e-3, atol=1e-5 * top
+    )
+
+
+@pytest.mark.parametrize("family", ["clouds", "landscape", "interior", "night", "coloured"])
+def test_places_have_detail_down_to_the_texel(family):
+    """Neighbouring texels differ everywhere, unlike in a smooth gradient, yet far less than distant ones."""
+    for k in range(3):
+        image = FAMILIES[family].draw(generator(k, "detail", family), []).bake(128).image
+        brightness = np.log(np.asarray(luminance(image), np.float64)[8:-8] + 1e-9)
+        near = np.abs(np.diff(brightness, axis=1))
+        far = np.abs(brightness - np.roll(brightness, 64, axis=1))
+        assert np.median(near) > 2e-4
+        assert np.mean(near) < 0.7 * np.mean(far)
 
 
 def test_a_panel_shines_with_its_solid_angle():

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from datagen.materials import PATTERNS_OF_STYLE, draw_material, evaluate, pattern
+from datagen.materials.pattern import PATTERNS_OF_STYLE, draw_pattern, pattern
 from tron.seeds import generator
 
 PATTERNS = sorted({name for names in PATTERNS_OF_STYLE.values() for name in names})
 
 
 def material(name, **changes):
-    drawn = draw_material(generator(3, "material"), "A")
+    drawn = draw_pattern(generator(3, "material"), "A")
     values = {
         "pattern": name,
         "frequency": 1.3,
@@ -42,7 +42,7 @@ def test_a_point_has_one_colour_whatever_else_is_evaluated(name, points):
 
 @pytest.mark.parametrize("name", [name for name in PATTERNS if name != "plain"])
 def test_floors_are_patterned_in_the_plane(name):
-    drawn = [draw_material(generator(i, "floor"), "A", floor=True) for i in range(4)]
+    drawn = [draw_pattern(generator(i, "floor"), "A", floor=True) for i in range(4)]
     assert all(each.pattern != "plain" and each.metallic == (0.0, 0.0) for each in drawn)
     x, y = np.meshgrid(np.linspace(-3, 3, 120), np.linspace(-3, 3, 120))
     weight = pattern(
@@ -54,8 +54,9 @@ def test_floors_are_patterned_in_the_plane(name):
 def test_parameters_blend_by_the_pattern(points):
     spec = material("stripes", roughness=(0.2, 0.8), metallic=(1.0, 0.0))
     weight = pattern(spec, points)
-    base_color, roughness, metallic = evaluate(spec, points)
+    base_color, roughness, metallic, height = spec.evaluate(points, np.zeros_like(points))
     np.testing.assert_allclose(metallic, weight, atol=1e-6)
+    assert not height.any()
     np.testing.assert_allclose(roughness, 0.8 - 0.6 * weight, atol=1e-6)
     np.testing.assert_allclose(base_color[:, 0], 0.1 + 0.8 * weight, atol=1e-6)
 
@@ -63,7 +64,7 @@ def test_parameters_blend_by_the_pattern(points):
 def test_drawn_materials_are_physical():
     for style in PATTERNS_OF_STYLE:
         for i in range(50):
-            drawn = draw_material(generator(i, "m"), style)
+            drawn = draw_pattern(generator(i, "m"), style)
             assert drawn.pattern in PATTERNS_OF_STYLE[style]
             assert all(0 <= c <= 1 for c in (*drawn.color_a, *drawn.color_b, *drawn.metallic))
             assert all(0.2 <= r <= 0.95 for r in drawn.roughness), "mirrors make fireflies at few samples"

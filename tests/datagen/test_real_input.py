@@ -71,7 +71,7 @@ def test_the_models_stand_in_the_scenes_and_in_the_card(dataset: Path):
     specs = [SceneSpec.model_validate_json(path.read_bytes()) for path in dataset.glob("scenes/*/spec.json")]
     used = {item.asset for spec in specs for item in spec.objects}
     assert used == {"FlightHelmet", "GolfBall", "spot"}
-    card = (dataset / "card.md").read_text()
+    card = (dataset / "README.md").read_text()
     for licence in LICENCES:
         assert licence in card
 
@@ -79,7 +79,8 @@ def test_the_models_stand_in_the_scenes_and_in_the_card(dataset: Path):
 def test_lights_of_the_test_split_are_held_out(dataset: Path):
     lights = {
         split: {
-            clip.meta.extra["light_spec"]["path"] for clip in read_clips(dataset, split, members=["mask"])
+            json.loads(clip.meta.extra["light_spec"])["path"]
+            for clip in read_clips(dataset, split, members=["mask"])
         }
         for split in ("train", "test")
     }

@@ -9,12 +9,19 @@ import pytest
 
 from datagen.layout import GAP, place, settle
 from datagen.scene import SceneSpec, draw_scene
-from datagen.shapes import KINDS_OF_STYLE, ShapeSpec, make_mesh, split_creases
+from datagen.shapes import ShapeSpec, make_pieces, split_creases
+from datagen.styles import Choice
+from datagen.styles.primitives import DISTRIBUTIONS
 from tron.errors import TronError
 from tron.seeds import generator
 
 LIGHTS = ("any", "sun", "studio", "overcast")
-KINDS = [kind for kinds in KINDS_OF_STYLE.values() for kind in kinds]
+KINDS = [kind for each in DISTRIBUTIONS.values() for kind in each.kinds]
+
+
+def solid(shape, edge):
+    (piece,) = make_pieces(shape, edge)
+    return piece.mesh
 
 
 @cache
@@ -26,7 +33,7 @@ def draw(seed=0, split="train", index=0, **changes):
 
 def test_a_specification_is_the_same_bytes_on_every_machine():
     text = draw().to_json()
-    assert hashlib.sha256(text.encode()).hexdigest()[:16] == "67cb21b3da5ad439", (
+    assert hashlib.sha256(text.encode()).hexdigest()[:16] == "ca4bda84dab4fa6e", (
         "the distribution changed: is that meant?"
     )
 
@@ -47,7 +54,7 @@ def test_seed_split_and_index_each_change_the_scene_and_nothing_else_does():
 def test_more_lights_leave_objects_floor_and_earlier_lights_alone():
     few, many = draw(lights=LIGHTS[:2]), draw(lights=LIGHTS)
     assert many.objects == few.objects
-    assert many.floor == few.floor
+    assert many.surroundings == few.surroundings
     assert many.lights[:2] == few.lights
 
 
@@ -71,7 +78,7 @@ def test_lights_are_the_families_asked_for():
 def test_objects_rest_on_the_floor_and_keep_their_distance():
     for index in range(4):
         meshes = [
-            make_mesh(o.shape, 0.1).apply_transform(o.placement.matrix())
+            solid(o.shape, 0.1).apply_transform(o.placement.matrix())
             for o in draw(index=index).objects
             if o.shape is not None
         ]
@@ -87,7 +94,7 @@ def test_objects_rest_on_the_floor_and_keep_their_distance():
 
 def test_what_finds_no_place_is_left_out_and_the_rest_stays():
     balls = [
-        make_mesh(ShapeSpec(kind="sphere", size=0.5, parameters=(0.5, 0.5, 0.5, 0.5)), 0.5) for _ in range(8)
+        solid(ShapeSpec(kind="sphere", size=0.5, parameters=(0.5, 0.5, 0.5, 0.5)), 0.5) for _ in range(8)
     ]
     placements = place(generator(0, "layout"), balls, radius=0.4)
     assert placements[0] is not None
@@ -95,15 +102,15 @@ def test_what_finds_no_place_is_left_out_and_the_rest_stays():
 
 
 def test_a_scene_without_room_is_an_error(monkeypatch):
-    monkeypatch.setattr("datagen.scene.SCENE_RADIUS", 0.01)
+    monkeypatch.setattr("datagen.styles.primitives.SCENE_RADIUS", 0.01)
     with pytest.raises(TronError, match="found a place"):
-        draw(objects=(3, 3))
+        draw.__wrapped__(choice=Choice(objects=(3, 3)))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_shapes_are_closed_oriented_fitted_and_fine(kind):
     shape = ShapeSpec(kind=kind, size=0.6, parameters=(0.2, 0.9, 0.4, 0.7))
-    mesh = make_mesh(shape, 0.08)
+    mesh = solid(shape, 0.08)
     assert mesh.is_watertight
     assert mesh.volume > 0
     assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(0.6, abs=1e-6)
@@ -112,7 +119,7 @@ def test_shapes_are_closed_oriented_fitted_and_fine(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_shading_normals_are_unit_and_near_the_geometry(kind):
-    mesh = make_mesh(ShapeSpec(kind=kind, size=0.6, parameters=(0.2, 0.9, 0.4, 0.7)), 0.08)
+    mesh = solid(ShapeSpec(kind=kind, size=0.6, parameters=(0.2, 0.9, 0.4, 0.7)), 0.08)
     vertices, normals, faces = split_creases(mesh)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-9)
     corners = vertices[faces]
@@ -124,7 +131,7 @@ def test_shading_normals_are_unit_and_near_the_geometry(kind):
 
 
 def test_a_body_settles_where_its_centre_of_mass_cannot_fall_further():
-    box = make_mesh(ShapeSpec(kind="box", size=0.6, parameters=(0.1, 0.0, 0.0, 0.0)), 1.0)
+    box = solid(ShapeSpec(kind="box", size=0.6, parameters=(0.1, 0.0, 0.0, 0.0)), 1.0)
     rng = generator(0, "settle")
     for _ in range(20):
         start = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -138,9 +145,9 @@ def test_a_body_settles_where_its_centre_of_mass_cannot_fall_further():
 
 def test_camera_paths_stay_above_the_floor_and_see_the_middle():
     spec = draw()
-    for camera in [*spec.spiral(16, 32, 32), *spec.clip(2, 5, 32, 32)]:
+    for camera in [*spec.views(16, 32, 32), *spec.clip(2, 5, 32, 32)]:
         assert camera.position[2] > 0.5
-        pixels, depth = camera.project(np.array([spec.cameras.target]))
+        pixels, depth = camera.project(np.array([spec.cameras.film.target]))
         np.testing.assert_allclose(pixels, [[16, 16]], atol=1e-6)
         assert depth[0] > 4
 
@@ -148,9 +155,25 @@ def test_camera_paths_stay_above_the_floor_and_see_the_middle():
 def test_a_clip_is_consecutive_frames_of_the_path():
     spec = draw()
     whole = [camera.position for camera in draw(frames=24).clip(1, 24, 8, 8)]
-    first = spec.cameras.first_frame[1]
+    first = spec.cameras.first_frame
+    assert isinstance(first, tuple)
+    first = first[1]
     for camera, expected in zip(spec.clip(1, 5, 8, 8), whole[first : first + 5]):
         np.testing.assert_allclose(camera.position, expected)
+
+
+def test_lights_that_share_a_path_are_filmed_from_the_same_places():
+    own, shared = draw(), draw(lights_share_path=True)
+    assert isinstance(own.cameras.first_frame, tuple)
+    assert len(set(own.cameras.first_frame)) > 1
+    assert own.groups() == [[k] for k in range(len(own.lights))]
+    assert shared.groups() == [list(range(len(shared.lights)))]
+    assert shared.cameras.first_frame == own.cameras.first_frame[0]
+    first, last = (shared.clip(k, 5, 8, 8) for k in (0, len(shared.lights) - 1))
+    assert [camera.to_dict() for camera in first] == [camera.to_dict() for camera in last]
+    assert type(shared).model_validate_json(shared.to_json()) == shared
+    changed = shared.model_copy(update={"cameras": own.cameras})
+    assert changed == own, "nothing else of the scene changes"
 
 
 def test_a_clip_longer_than_its_path_is_an_error():

@@ -172,4 +172,7 @@ def test_the_assembled_page_names_targets_missed_and_unmeasured():
     assert "not measured" in text
     assert "abc123 with uncommitted changes" in text
     assert "make demo" in text
+    assert '<th scope="row" class="plain words">neural.psnr' in html, (
+        "long names break; the verdict stays in sight"
+    )
     assert_self_contained(html)

@@ -190,6 +190,6 @@ def test_a_dataset_of_an_older_schema_is_refused_by_its_name(variant, version, n
     assert (stop.value.code, out) == (2, "")
     assert err == (
         f"{command}: dataset of schema {version}, this program reads schema {SCHEMA_VERSION} ({old}): "
-        "make it again in a new folder with the tron-datagen command of its card.md\n"
+        "make it again in a new folder with the tron-datagen command of its README.md or card.md\n"
     )
     assert sorted(path.name for path in old.iterdir() if path.name != ".tron.lock") == kept

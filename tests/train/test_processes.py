@@ -126,7 +126,7 @@ def test_two_processes_killed_and_resumed_equal_one_with_twice_the_batch(alone, 
     output = tmp_path / "two"
     # In float64, but for the samples; the tiny renderer has layers in float32 whatever it is told.
     command = typed(output, "renderer=pixel_mlp", precision="64-true", stages=LONGER)
-    for _ in range(3):  # on a crowded machine a run may end before this process gets to kill it
+    for _ in range(8):  # on a crowded machine a run may end before this process gets to kill it
         said = kill_at_a_checkpoint(command, output)
         position = find_position(output / "checkpoints", [Stage.model_validate(stage) for stage in STAGES])
         if position.stage == 0:

@@ -56,7 +56,7 @@ def test_agx_inset_is_the_primaries_compressed_by_a_fifth():
     inset.primaries = (srgb.primaries - srgb.whitepoint) / (1 - 0.2) + srgb.whitepoint
     inset.use_derived_transformation_matrices(True)
     derived = colour.matrix_RGB_to_RGB(srgb, inset)
-    assert np.abs(np.array(color._AGX_INSET) - derived).max() < 2e-4  # 4-digit sRGB matrices in the original
+    assert np.abs(np.array(color.AGX_INSET) - derived).max() < 2e-4  # 4-digit sRGB matrices in the original
 
 
 def test_agx_before_its_curve_agrees_with_opencolorio():
@@ -64,8 +64,8 @@ def test_agx_before_its_curve_agrees_with_opencolorio():
     group = ocio.GroupTransform(
         [
             ocio.RangeTransform(minInValue=0, minOutValue=0),
-            ocio.MatrixTransform(np.pad(color._AGX_INSET, (0, 1)).ravel() + np.diag([0, 0, 0, 1]).ravel()),
-            ocio.AllocationTransform(allocation=ocio.ALLOCATION_LG2, vars=list(color._AGX_LOG2_RANGE)),
+            ocio.MatrixTransform(np.pad(color.AGX_INSET, (0, 1)).ravel() + np.diag([0, 0, 0, 1]).ravel()),
+            ocio.AllocationTransform(allocation=ocio.ALLOCATION_LG2, vars=list(color.AGX_LOG2_RANGE)),
         ]
     )
     processor = ocio.Config.CreateRaw().getProcessor(group).getDefaultCPUProcessor()

@@ -21,6 +21,8 @@ render are traced at once, so memory grows with pixels x samples. Plugins:
 
 ``tron_gbuffer`` (:mod:`tron.integrators.gbuffer`): what the surfels are, their harmonics' radiance included.
 ``tron_guidance`` (:mod:`tron.integrators.guidance`): what they look like under an environment.
+``tron_many_lights`` (:mod:`tron.integrators.many_lights`): no surfels, but the Mitsuba scene's own shapes,
+path-traced under many environments at once.
 
 Mitsuba wraps what a plugin raises in a RuntimeError of its own; the last line of its message is TRON's.
 """
@@ -43,6 +45,7 @@ def register() -> None:
     from tron.errors import TronError
     from tron.integrators.gbuffer import GBufferAppearance
     from tron.integrators.guidance import GuidanceAppearance
+    from tron.integrators.many_lights import NAME, many_lights_class
     from tron.integrators.plugin import plugin_class
 
     if mi.variant() not in VARIANTS:
@@ -52,3 +55,4 @@ def register() -> None:
         )
     for name, appearance in {"tron_gbuffer": GBufferAppearance, "tron_guidance": GuidanceAppearance}.items():
         mi.register_integrator(name, plugin_class(name, appearance))
+    mi.register_integrator(NAME, many_lights_class())

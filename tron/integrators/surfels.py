@@ -25,7 +25,7 @@ MAX_SH_DEGREE = 3
 
 
 def embed(value: Any) -> mi.Object:
-    """A GaussianScene or an EnvironmentMap, made fit for ``mi.load_dict``; the variant must be set."""
+    """A GaussianScene, an EnvironmentMap or a list of them for ``mi.load_dict``; the variant must be set."""
     return _carrier(mi.variant())(value)
 
 

@@ -11,6 +11,8 @@ _STYLES = {
     "x": (1, 2, "×"),
     "surfels": (1, 0, " surfels"),
     "views": (1, 0, " views"),
+    "kills": (1, 0, " kills"),
+    "frames/h": (1, 0, " frames/h"),
 }
 """Unit -> factor, decimals, what is written behind the number."""
 

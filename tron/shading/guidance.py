@@ -21,7 +21,7 @@ exposure and AgX are applied when a buffer is looked at or loaded.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import drjit as dr
@@ -113,6 +113,7 @@ def render_guidance(
     seed: int = 0,
     background: Sequence[float] | None = None,
     bounce: BouncedLight | None = None,
+    gbuffer: GBuffer | None = None,
 ) -> Guidance:
     """Trace ``camera``'s view of the surfels and shade it under ``lighting``.
 
@@ -125,8 +126,10 @@ def render_guidance(
         background: linear RGB radiance behind the surfels; None: the environment.
         bounce: what ``lighting`` is at each surfel (``BounceTransport.bake``); None, or with no bounces in
             ``estimation``: no light bounces.
+        gbuffer: the view where it is traced already, of :func:`trace_views`.
     """
-    gbuffer = trace_view(tracer, camera, estimation, bounce)
+    if gbuffer is None:
+        gbuffer = trace_view(tracer, camera, estimation, bounce)
     arriving = arriving_light(tracer, gbuffer, lighting, estimation, seed, bounce)
     return shade(gbuffer, arriving, lighting, background, estimation)
 
@@ -135,10 +138,20 @@ def trace_view(
     tracer: ViewTracer, camera: Camera, estimation: Estimation = FINAL, bounce: BouncedLight | None = None
 ) -> GBuffer:
     """The G-buffer that :func:`shade` takes: of sub-pixels, if so, and with the values of ``bounce``."""
+    return trace_views(tracer, camera, estimation, [bounce])[0]
+
+
+def trace_views(
+    tracer: ViewTracer, camera: Camera, estimation: Estimation, bounces: Sequence[BouncedLight | None]
+) -> list[GBuffer]:
+    """:func:`trace_view` under many lights, traced once: they differ in the values of their ``bounces``."""
     times = estimation.supersample
-    bounce = bounce if estimation.bounces else None
+    values = [bounce.values() if bounce and estimation.bounces else [] for bounce in bounces]
     view = camera if times == 1 else camera.resized(times * camera.width, times * camera.height)
-    return tracer.gbuffer(view) if bounce is None else tracer.gbuffer(view, bounce.values())
+    every = [value for own in values for value in own]
+    gbuffer = tracer.gbuffer(view, every) if every else tracer.gbuffer(view)
+    shares = iter(gbuffer.values)
+    return [replace(gbuffer, values=[next(shares) for _ in own]) for own in values]
 
 
 def arriving_light(

@@ -212,7 +212,7 @@ def require_schema(version: int, where: str | Path) -> None:
         raise TronError(
             f"dataset of schema {version}, this program reads schema {SCHEMA_VERSION}",
             str(where),
-            "make it again in a new folder with the tron-datagen command of its card.md",
+            "make it again in a new folder with the tron-datagen command of its README.md or card.md",
         )
 
 

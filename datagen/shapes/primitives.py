@@ -1,85 +1,17 @@
-"""Procedural shapes: a kind, a size and a few numbers become a closed triangle mesh.
+"""Primitive solids: a closed mesh from a few proportions.
 
-Every mesh fits a ball of radius ``size`` around the origin and is dense enough to carry a material in its
-vertices. Styles A and B draw from disjoint kinds.
+Styles A and B draw from disjoint kinds of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
 
 import numpy as np
 import trimesh
 from trimesh import Trimesh
 
-from datagen.materials import Style
-from datagen.spec import Number, Spec
-
-ShapeKind = Literal[
-    "sphere",
-    "box",
-    "cylinder",
-    "cone",
-    "torus",
-    "blob",
-    "capsule",
-    "gem",
-    "star",
-    "vase",
-    "knot",
-    "superquadric",
-]
-KINDS_OF_STYLE: dict[Style, tuple[ShapeKind, ...]] = {
-    "A": ("sphere", "box", "cylinder", "cone", "torus", "blob"),
-    "B": ("capsule", "gem", "star", "vase", "knot", "superquadric"),
-}
-CREASE_DEG = 35.0
-
-
-class ShapeSpec(Spec):
-    """A procedural shape.
-
-    Attributes:
-        kind: which family.
-        size: radius in world units of the ball around the origin that the shape just fits.
-        parameters: proportions in (0, 1), whose meaning is the kind's own.
-    """
-
-    kind: ShapeKind
-    size: Number
-    parameters: tuple[Number, Number, Number, Number]
-
-
-def draw_shape(rng: np.random.Generator, style: Style, size: tuple[float, float]) -> ShapeSpec:
-    """Draw a shape of a style with a radius between the two numbers of ``size``."""
-    kinds = KINDS_OF_STYLE[style]
-    kind = kinds[int(rng.integers(len(kinds)))]
-    return ShapeSpec(kind=kind, size=rng.uniform(*size), parameters=tuple(rng.random(4)))
-
-
-def make_mesh(shape: ShapeSpec, edge: float = 0.05) -> Trimesh:
-    """Build the mesh of a shape, its edges at most ``edge`` world units long.
-
-    It is closed and centred at the origin, its normals point outwards. Vertices are shared;
-    :func:`split_creases` gives the mesh its shading normals.
-    """
-    mesh = _BUILDERS[shape.kind](np.asarray(shape.parameters))
-    vertices = np.asarray(mesh.vertices, dtype=np.float64)
-    vertices = vertices - 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-    mesh.vertices = vertices * (shape.size / np.linalg.norm(vertices, axis=1).max())
-    fine = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge, max_iter=16)
-    return Trimesh(fine[0], fine[1], process=True)
-
-
-def split_creases(mesh: Trimesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shading normals that are smooth over curved parts and break at creases sharper than CREASE_DEG.
-
-    Returns:
-        vertices (V, 3), unit normals (V, 3) float64 and faces (F, 3) int; vertices on creases are repeated.
-    """
-    shaded = trimesh.graph.smooth_shade(mesh, angle=np.radians(CREASE_DEG))
-    return np.asarray(shaded.vertices), np.asarray(shaded.vertex_normals), np.asarray(shaded.faces)
+from datagen.shapes.shape import Kind
 
 
 def _between(fraction: float, low: float, high: float) -> float:
@@ -201,7 +133,7 @@ def _superquadric(p: np.ndarray) -> Trimesh:
     return mesh
 
 
-_BUILDERS: dict[ShapeKind, Callable[[np.ndarray], Trimesh]] = {
+_BUILDERS: dict[str, Callable[[np.ndarray], Trimesh]] = {
     "sphere": _sphere,
     "box": _box,
     "cylinder": _cylinder,
@@ -215,3 +147,10 @@ _BUILDERS: dict[ShapeKind, Callable[[np.ndarray], Trimesh]] = {
     "knot": _knot,
     "superquadric": _superquadric,
 }
+
+
+def _kind(build: Callable[[np.ndarray], Trimesh]) -> Kind:
+    return Kind(lambda parameters, _rng: [(build(parameters), 0)], seeded=False)
+
+
+PRIMITIVES: dict[str, Kind] = {name: _kind(build) for name, build in _BUILDERS.items()}

@@ -12,17 +12,18 @@ from typing import Literal
 
 import numpy as np
 
-from datagen.spec import Number, Pair, Spec, Triple
+from datagen.materials.material import Appearance, Material
+from datagen.spec import Number, Pair, Triple
 
-Style = Literal["A", "B"]
+Palette = Literal["A", "B"]
 PatternName = Literal["plain", "checker", "stripes", "waves", "marble", "dots", "bricks", "noise", "bands"]
-PATTERNS_OF_STYLE: dict[Style, tuple[PatternName, ...]] = {
+PATTERNS_OF_STYLE: dict[Palette, tuple[PatternName, ...]] = {
     "A": ("plain", "checker", "stripes", "waves", "marble"),
     "B": ("plain", "dots", "bricks", "noise", "bands"),
 }
 
 
-class MaterialSpec(Spec):
+class PatternSpec(Material):
     """Two parameter sets and the pattern that blends them.
 
     Attributes:
@@ -34,6 +35,7 @@ class MaterialSpec(Spec):
         roughness, metallic: their values in a and in b.
     """
 
+    family: Literal["pattern"] = "pattern"
     pattern: PatternName
     frequency: Number
     axis: Triple
@@ -43,8 +45,23 @@ class MaterialSpec(Spec):
     roughness: Pair
     metallic: Pair
 
+    def evaluate(self, points: np.ndarray, normals: np.ndarray) -> Appearance:  # noqa: ARG002
+        weight = pattern(self, points)
 
-def draw_material(rng: np.random.Generator, style: Style, *, floor: bool = False) -> MaterialSpec:
+        def blend(a: float | Triple, b: float | Triple) -> np.ndarray:
+            first, second = np.asarray(a), np.asarray(b)
+            mix = weight[:, None] if first.ndim else weight
+            return (first * mix + second * (1.0 - mix)).astype(np.float32)
+
+        return Appearance(
+            blend(self.color_a, self.color_b),
+            blend(*self.roughness),
+            blend(*self.metallic),
+            np.zeros(len(points), np.float32),
+        )
+
+
+def draw_pattern(rng: np.random.Generator, style: Palette, *, floor: bool = False) -> PatternSpec:
     """Draw a material of a style; floors are dielectric and coarser: they are seen at grazing angles."""
     names = PATTERNS_OF_STYLE[style]
     # A plain floor hides what the guidance does wrong with texture; objects may well be plain.
@@ -62,7 +79,7 @@ def draw_material(rng: np.random.Generator, style: Style, *, floor: bool = False
         if pattern != "plain" and rng.random() < 0.3:
             metal_b = 0.0
     frequency = float(rng.uniform(0.6, 2.0) * (0.7 if floor else 1.0))
-    return MaterialSpec(
+    return PatternSpec(
         pattern=pattern,
         frequency=frequency,
         axis=tuple(axis),
@@ -74,59 +91,43 @@ def draw_material(rng: np.random.Generator, style: Style, *, floor: bool = False
     )
 
 
-def evaluate(material: MaterialSpec, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Evaluate a material at points (N, 3) of the object's frame.
-
-    Returns:
-        base color (N, 3) linear in [0, 1], roughness (N,), metallic (N,), all float32.
-    """
-    weight = pattern(material, points)
-
-    def blend(a: float | Triple, b: float | Triple) -> np.ndarray:
-        first, second = np.asarray(a), np.asarray(b)
-        mix = weight[:, None] if first.ndim else weight
-        return (first * mix + second * (1.0 - mix)).astype(np.float32)
-
-    return blend(material.color_a, material.color_b), blend(*material.roughness), blend(*material.metallic)
-
-
-def pattern(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def pattern(material: PatternSpec, points: np.ndarray) -> np.ndarray:
     """Weight (N,) float64 in [0, 1] of parameter set a at points (N, 3)."""
     return _PATTERNS[material.pattern](material, np.asarray(points, dtype=np.float64))
 
 
-def _plain(_material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def _plain(_material: PatternSpec, points: np.ndarray) -> np.ndarray:
     return np.ones(len(points))
 
 
-def _cells(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def _cells(material: PatternSpec, points: np.ndarray) -> np.ndarray:
     # The phase also keeps cell walls away from z = 0, where a floor lies exactly.
     return points * (2.0 * material.frequency) + np.asarray(material.phase) / (2 * np.pi) + (0.0, 0.0, 0.013)
 
 
-def _checker(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def _checker(material: PatternSpec, points: np.ndarray) -> np.ndarray:
     return np.floor(_cells(material, points)).sum(axis=1) % 2.0
 
 
-def _along_axis(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def _along_axis(material: PatternSpec, points: np.ndarray) -> np.ndarray:
     return 2 * np.pi * material.frequency * (points @ np.asarray(material.axis)) + material.phase[0]
 
 
-def _stripes(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def _stripes(material: PatternSpec, points: np.ndarray) -> np.ndarray:
     return 0.5 + 0.5 * np.sin(_along_axis(material, points))
 
 
-def _bands(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def _bands(material: PatternSpec, points: np.ndarray) -> np.ndarray:
     return (np.sin(_along_axis(material, points)) > 0.0).astype(np.float64)
 
 
-def _waves(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def _waves(material: PatternSpec, points: np.ndarray) -> np.ndarray:
     x, y, z = (2 * np.pi * material.frequency * points).T
     a, b, c = material.phase
     return 0.5 + 0.5 * np.sin(x + 2.0 * np.sin(0.65 * y + a) + b) * np.sin(z + 0.35 * y - 0.2 * x + c)
 
 
-def _turbulence(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def _turbulence(material: PatternSpec, points: np.ndarray) -> np.ndarray:
     """Three octaves of crossed sines, in [-1, 1]: smooth, aperiodic to the eye, and exactly repeatable."""
     total, norm = np.zeros(len(points)), 0.0
     turned = np.asarray(points) @ _TURN
@@ -140,21 +141,21 @@ def _turbulence(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
     return total / norm
 
 
-def _marble(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def _marble(material: PatternSpec, points: np.ndarray) -> np.ndarray:
     return 0.5 + 0.5 * np.sin(_along_axis(material, points) + 3.0 * _turbulence(material, points))
 
 
-def _noise(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def _noise(material: PatternSpec, points: np.ndarray) -> np.ndarray:
     return np.clip(0.5 + 1.6 * _turbulence(material, points), 0.0, 1.0)
 
 
-def _dots(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def _dots(material: PatternSpec, points: np.ndarray) -> np.ndarray:
     cell = _cells(material, points)
     distance = np.linalg.norm((cell - np.floor(cell) - 0.5) * (1.0, 1.0, 0.6), axis=1)
     return np.clip((0.36 - distance) / 0.06 + 0.5, 0.0, 1.0)
 
 
-def _bricks(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
+def _bricks(material: PatternSpec, points: np.ndarray) -> np.ndarray:
     cell = _cells(material, points)
     row = np.floor(cell[:, 1])
     x = 0.5 * cell[:, 0] + 0.5 * (row % 2.0)
@@ -165,7 +166,7 @@ def _bricks(material: MaterialSpec, points: np.ndarray) -> np.ndarray:
 # A rotation with no axis in common with the lattice of sines, so that octaves do not line up.
 _TURN = np.linalg.qr(np.array([[0.61, -0.42, 0.35], [0.28, 0.79, -0.31], [-0.52, 0.18, 0.83]]))[0]
 
-_PATTERNS: dict[PatternName, Callable[[MaterialSpec, np.ndarray], np.ndarray]] = {
+_PATTERNS: dict[PatternName, Callable[[PatternSpec, np.ndarray], np.ndarray]] = {
     "plain": _plain,
     "checker": _checker,
     "stripes": _stripes,

@@ -1,0 +1,178 @@
+"""mode=plan: what the missing scenes of a dataset will take, before anything of them is rendered."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+
+from datagen.clusters import LOCAL, cores, logs_folder, require_cluster
+from datagen.plan import Work, chosen, find_sources, plan, read_record, require_adoptable, scene_folder
+from datagen.probe import SceneCost, probe
+from datagen.scheduling import TIMES_NAME
+from datagen.settings import Settings
+from tron.runtime import activate
+
+log = logging.getLogger(__name__)
+
+NAMED = 4
+"""Missing scenes that are named."""
+
+
+@dataclass(frozen=True)
+class SplitPlan:
+    """One split: its scenes, those to make, and what one of them costs (None where none is missing)."""
+
+    name: str
+    scenes: int
+    missing: Sequence[Work]
+    cost: SceneCost | None
+
+
+def project(settings: Settings) -> str:
+    """The plan as text: tables of scenes, bytes, hours and memory, and what is missing.
+
+    Scenes that are there already stand for those that are not, with their bytes and the seconds in
+    logs/times.jsonl; where there is none, a probe is rendered and thrown away. Nothing is written to
+    output_dir.
+
+    Raises:
+        TronError: wherever making the dataset would, before its first scene.
+    """
+    items = plan(settings)
+    wanted = chosen(items, settings.only)
+    require_cluster(settings)
+    require_adoptable(settings)
+    activate(settings.variant, threads=1)
+    sources = find_sources(settings)
+    there = {item.name for item in items if read_record(settings.output_dir, item.name) is not None}
+    times = read_times(logs_folder(settings) / TIMES_NAME)
+    splits = []
+    for split in settings.used_splits():
+        missing = [item for item in wanted if item.split == split and item.name not in there]
+        cost = None
+        if missing:
+            made = [item for item in items if item.split == split and item.name in there]
+            cost = _of_made(settings, made, times)
+            if cost is None:
+                log.info("a small scene of %s is rendered to see what it costs", split)
+                cost = probe(missing[0], settings, sources)
+        splits.append(SplitPlan(split, sum(item.split == split for item in items), missing, cost))
+    return report(settings, splits)
+
+
+def read_times(path: Path) -> dict[str, float]:
+    """Seconds of each scene in times.jsonl that was made, its last; lines that cannot be read are none."""
+    found: dict[str, float] = {}
+    for line in path.read_text("utf-8").splitlines() if path.is_file() else ():
+        try:
+            noted = json.loads(line)
+            if noted["made"]:
+                found[noted["scene"]] = sum(noted["seconds"].values())
+        except (ValueError, KeyError, TypeError, AttributeError):
+            continue
+    return found
+
+
+def _of_made(settings: Settings, made: Sequence[Work], times: Mapping[str, float]) -> SceneCost | None:
+    """Mean cost of the scenes that are there and whose seconds are known."""
+    timed = [item.name for item in made if item.name in times]
+    if not timed:
+        return None
+    sizes = [scene_bytes(settings.output_dir, name) for name in timed]
+    source = f"{len(timed)} scene{'s' * (len(timed) > 1)} made here"
+    return SceneCost(fmean(times[name] for name in timed), fmean(sizes), float("nan"), source)
+
+
+def scene_bytes(output: Path, name: str) -> int:
+    """Bytes of a finished scene: its shards, surfels and previews."""
+    record = read_record(output, name)
+    if record is None:
+        return 0
+    folders = (scene_folder(output, name).iterdir(), (output / "previews").glob(f"{name}-l*"))
+    return sum(entry.bytes for entry in record.shards) + sum(
+        path.stat().st_size for folder in folders for path in folder
+    )
+
+
+def report(settings: Settings, splits: Sequence[SplitPlan]) -> str:
+    """The text of a plan."""
+    rows = [
+        ("split", "scenes", "to make", "clips", "frames", "size", "GB", "core hours", "measured by"),
+        *(_row(settings, split) for split in splits),
+    ]
+    missing = [item for split in splits for item in split.missing]
+    total_bytes = sum(len(split.missing) * split.cost.bytes for split in splits if split.cost)
+    seconds = sum(len(split.missing) * split.cost.seconds for split in splits if split.cost)
+    memory = [split.cost.memory for split in splits if split.cost and split.cost.memory > 0]
+    count, known = worker_count(settings, len(missing))
+    free = shutil.disk_usage(_existing(settings.output_dir)).free
+    facts = [
+        ("scenes to make", f"{len(missing)} of {sum(split.scenes for split in splits)}{_names(missing)}"),
+        ("bytes on disk", f"{total_bytes / 1e9:.3g} GB"),
+        (
+            "free",
+            f"{free / 1e9:.3g} GB on the disk of {settings.output_dir}: "
+            + ("enough" if free > total_bytes else "NOT ENOUGH"),
+        ),
+        ("memory", f"about {max(memory) / 1e9:.2g} GB a worker" if memory else "not measured"),
+        ("core hours", f"{seconds / 3600:.3g}, by cores as fast as this one"),
+        (
+            "wall hours",
+            f"{seconds / 3600 / count:.3g} with {count} worker{'s' * (count > 1)}{known}"
+            if missing
+            else "none: nothing is missing",
+        ),
+    ]
+    return "\n".join([*_aligned(rows), "", *_aligned(facts)])
+
+
+def _row(settings: Settings, split: SplitPlan) -> tuple[str, ...]:
+    recipe, number = settings.split(split.name), len(split.missing)
+    cost = split.cost or SceneCost(0.0, 0.0, 0.0, "")
+    clips = number * len(recipe.lights)
+    return (
+        split.name,
+        str(split.scenes),
+        str(number),
+        str(clips),
+        str(clips * recipe.frames),
+        f"{recipe.width} x {recipe.height}",
+        f"{number * cost.bytes / 1e9:.3g}",
+        f"{number * cost.seconds / 3600:.3g}",
+        cost.source,
+    )
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
+
+
+def _names(missing: Sequence[Work]) -> str:
+    if not missing:
+        return ""
+    shown = ", ".join(item.name for item in missing[:NAMED])
+    return f": {shown}{f', ... {missing[-1].name}' if len(missing) > NAMED else ''}"
+
+
+def worker_count(settings: Settings, most: int) -> tuple[int, str]:
+    """Workers that the cluster will have, one at the least, and a remark where only it knows."""
+    if settings.cluster is None:
+        return 1, ", this process"
+    if settings.workers is not None:
+        return max(min(settings.workers, most), 1), ""
+    if settings.cluster["_target_"] == LOCAL:
+        return max(min(int(settings.cluster.get("n_workers") or cores()), most), 1), ""
+    return 1, "; the cluster has its own number: give workers=N"
+
+
+def _existing(folder: Path) -> Path:
+    folder = folder.absolute()
+    while not folder.exists():
+        folder = folder.parent
+    return folder

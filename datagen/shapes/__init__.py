@@ -1,0 +1,101 @@
+"""Procedural shapes: a specification becomes triangle meshes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from datagen.shapes.bent import BENT
+from datagen.shapes.books import BOOKS
+from datagen.shapes.booleans import BOOLEANS
+from datagen.shapes.carved import CARVED
+from datagen.shapes.cloth import CLOTH
+from datagen.shapes.displaced import DISPLACED
+from datagen.shapes.extrusions import EXTRUSIONS
+from datagen.shapes.furniture import FURNITURE
+from datagen.shapes.lathes import LATHES
+from datagen.shapes.plants import PLANTS
+from datagen.shapes.primitives import PRIMITIVES
+from datagen.shapes.shape import Kind, Piece, Role, ShapeSpec, fit, frame, split_creases
+from datagen.shapes.solids import Parts
+from datagen.shapes.surroundings import SURROUNDINGS, Standing
+from datagen.shapes.wires import WIRES
+from tron.errors import TronError
+from tron.seeds import generator
+
+__all__ = [
+    "SHAPES",
+    "SURROUNDINGS",
+    "Kind",
+    "Piece",
+    "Role",
+    "ShapeSpec",
+    "Standing",
+    "draw_shape",
+    "make_pieces",
+    "split_creases",
+    "standing",
+]
+
+SHAPES: dict[str, Kind] = {
+    **PRIMITIVES,
+    **DISPLACED,
+    **CARVED,
+    **LATHES,
+    **EXTRUSIONS,
+    **BOOLEANS,
+    **BENT,
+    **WIRES,
+    **PLANTS,
+    **CLOTH,
+    **BOOKS,
+    **FURNITURE,
+    **SURROUNDINGS,
+}
+"""Every kind of shape by its name."""
+
+
+def draw_shape(rng: np.random.Generator, kinds: Sequence[str], size: tuple[float, float]) -> ShapeSpec:
+    """Draw one of ``kinds`` with a radius between the two numbers of ``size``."""
+    kind = kinds[int(rng.integers(len(kinds)))]
+    radius, parameters = rng.uniform(*size), tuple(rng.random(4))
+    # Kinds without detail of their own take no seed, so that styles A and B draw what they always drew.
+    seed = int(rng.integers(2**31)) if SHAPES[kind].seeded else 0
+    return ShapeSpec(kind=kind, size=radius, parameters=parameters, seed=seed)
+
+
+def make_pieces(shape: ShapeSpec, edge: float = 0.05) -> list[Piece]:
+    """Build a shape's pieces, their edges at most ``edge`` world units long.
+
+    Together they just fit the ball of radius ``shape.size`` around the origin of the object's frame; normals
+    point outwards. Vertices are shared; :func:`split_creases` gives a mesh its shading normals. A piece has
+    at most 60,000 triangles: the edges of a large one are longer.
+
+    Raises:
+        TronError: no such kind, or its parameters make nothing solid.
+    """
+    return fit(_parts(shape), shape.size, edge)
+
+
+def standing(shape: ShapeSpec) -> Standing:
+    """The free space over what things stand on, in the object's frame.
+
+    Raises:
+        TronError: no such kind, or nothing stands on it.
+    """
+    if shape.kind in SHAPES and shape.kind not in SURROUNDINGS:
+        raise TronError(f"nothing stands on a shape '{shape.kind}'")
+    centre, scale = frame(_parts(shape), shape.size)
+    space = SURROUNDINGS[shape.kind].standing(np.asarray(shape.parameters), _stream(shape))
+    return space.moved(centre, scale)
+
+
+def _parts(shape: ShapeSpec) -> Parts:
+    if shape.kind not in SHAPES:
+        raise TronError(f"no shape '{shape.kind}'", mend=f"shapes are {', '.join(SHAPES)}")
+    return SHAPES[shape.kind].build(np.asarray(shape.parameters), _stream(shape))
+
+
+def _stream(shape: ShapeSpec) -> np.random.Generator:
+    return generator(shape.seed, "shape", shape.kind)

@@ -1,0 +1,53 @@
+"""Settings of the benchmark `datagen`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt
+
+from eval.benchmark import Benchmark
+
+Part = Literal["variety", "sharing", "workers", "soak", "kills", "specifications", "throughput"]
+
+
+class VarietySettings(BaseModel):
+    """The two worlds, the training, and what both are judged by."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    old: list[str] = Field(description="arguments of tron-datagen: the old distribution, with test scenes")
+    new: list[str] = Field(description="the same: the new one, as many scenes, lights and frames")
+    train: list[str] = Field(
+        default=["experiment=demo", "renderer=tiny"], description="arguments of tron-train"
+    )
+    max_seconds: PositiveFloat = Field(default=250, description="wall time of each training")
+    seeds: list[int] = Field(default=[0], description="seeds of the training, one of each world for each")
+    real_data: Path | None = Field(description="folder with assets and hdri; null: no judging by real models")
+    judge: list[str] = Field(
+        default=["experiment=models"], description="arguments of tron-datagen for scenes of real models"
+    )
+    alone: list[str] = Field(description="further ones of those of one model")
+    mixed: list[str] = Field(description="further ones of those of models among procedural things")
+    pictures: NonNegativeInt = Field(default=3, description="scenes of each judge that are shown")
+
+
+class DatagenSettings(Benchmark):
+    """Sizes and recipes of the parts; recipes are arguments of tron-datagen."""
+
+    name: ClassVar[str] = "datagen"
+
+    parts: list[Part] = Field(description="what is measured", min_length=1)
+    seed: int = Field(default=0, description="seed of the judging scenes, the kills and the intervals")
+    variety: VarietySettings
+    sharing: list[str] = Field(description="scenes whose frames are path-traced under many lights")
+    workers: list[str] = Field(description="scenes that one worker and two make")
+    rounds: PositiveInt = Field(default=2, description="rounds of that")
+    tiny: list[str] = Field(description="recipe of tiny scenes, of the train split alone")
+    soak_scenes: PositiveInt = Field(default=500, description="tiny scenes over which memory is watched")
+    kills: PositiveInt = Field(default=20, description="times that runs are killed")
+    kill_scenes: PositiveInt = Field(default=8, description="tiny scenes of such a run")
+    specified_scenes: PositiveInt = Field(default=16, description="tiny scenes whose specifications are held")
+    throughput: list[str] = Field(description="recipe of the frames that are counted")
+    sizes: dict[PositiveInt, list[str]] = Field(description="width of a frame -> further arguments")

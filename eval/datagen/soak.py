@@ -1,0 +1,91 @@
+"""Memory of the data engine over hundreds of scenes: the command, its scheduler and its workers together."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from eval.datagen.runs import TIMES, make, resident_mb
+from eval.report.charts import line_chart
+from eval.results import Row
+from tron.errors import TronError
+from tron.report.page import Section, Text
+
+PARTS = 5
+"""The scenes are cut in so many parts: the first warms up, the second is what the last is held against."""
+
+
+@dataclass(frozen=True)
+class Soak:
+    """Resident memory while scenes are made.
+
+    Attributes:
+        samples: (scenes finished by then, MB) about once a second.
+        scenes: of the run.
+        seconds: wall time of the command.
+    """
+
+    samples: list[tuple[int, float]]
+    scenes: int
+    seconds: float
+
+    def peak(self, part: int) -> float:
+        """Largest resident memory while one of PARTS of the scenes was made, MB.
+
+        A part holds whole lives of workers, so a saw-tooth has its teeth in each.
+
+        Raises:
+            TronError: too few scenes for a sample in each part.
+        """
+        low, high = (self.scenes * k / PARTS for k in (part, part + 1))
+        inside = [mb for done, mb in self.samples if low <= done < high]
+        if not inside:
+            raise TronError(f"{self.scenes} scenes are over before memory is sampled", "benchmark.soak")
+        return max(inside)
+
+    def rows(self, seed: int) -> Iterator[Row]:  # noqa: ARG002
+        """Growth and peak of the memory, and seconds a scene."""
+        growth = self.peak(PARTS - 1) - self.peak(1)
+        yield Row(metric="soak.rss_growth_mb", value=growth, unit="MB", n=self.scenes)
+        peak = max(mb for _, mb in self.samples)
+        yield Row(metric="soak.rss_peak_mb", value=peak, unit="MB", n=self.scenes)
+        each = self.seconds / self.scenes
+        yield Row(metric="soak.seconds_per_scene", value=each, unit="s", n=self.scenes)
+
+    def sections(self, pictures: Path) -> list[Section]:  # noqa: ARG002
+        """Memory over the scenes."""
+        caption = (
+            f"Resident memory of the command, its scheduler and two workers over {self.scenes} tiny scenes; "
+            "workers are replaced as shipped."
+        )
+        points = [(float(done), mb) for done, mb in self.samples]
+        chart = line_chart({"all processes": points}, "scenes made", "MB", caption)
+        text = (
+            f"The figure is the largest memory in the last fifth of the scenes less that in the second: "
+            f"{self.peak(PARTS - 1):.0f} MB less {self.peak(1):.0f} MB. The first fifth warms up. Pages that "
+            "processes share are counted in each."
+        )
+        return [Section("soak", "Memory over many scenes", [Text(text), chart])]
+
+
+def measure_soak(recipe: Sequence[str], scenes: int, folder: Path) -> Soak:
+    """Make so many scenes of a recipe with two workers, and watch the memory.
+
+    Raises:
+        StageFailed: the run failed.
+    """
+    output = folder / "soak"
+    shutil.rmtree(output, ignore_errors=True)
+    samples: list[tuple[int, float]] = []
+
+    def watch(process: psutil.Process) -> None:
+        done = (output / TIMES).read_bytes().count(b"\n") if (output / TIMES).is_file() else 0
+        samples.append((done, resident_mb(process)))
+
+    seconds = make([*recipe, f"train.scenes={scenes}", "workers=2"], output, watch=watch)
+    shutil.rmtree(output)
+    return Soak(samples, scenes, seconds)

@@ -1,0 +1,101 @@
+"""Contrast: three classes by one measure, and lights drawn by it."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from datagen.lights import EVERY, FAMILIES, PROCEDURAL, HdriSpec, classify, contrast_share, draw_light
+from datagen.lights.contrast import HIGH_CONTRAST, INTERVALS, LOW_CONTRAST
+from datagen.lights.discs import Disc, lay
+from datagen.scene import SceneSpec, draw_scene
+from tron.seeds import generator
+from tron.shading.environment import EnvironmentMap
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+CLASSES = list(INTERVALS)
+
+
+def sun_of_share(share: float) -> EnvironmentMap:
+    """A small sun before a constant sky of radiance 1: share = (s + 0.01) / (1 + s) of the light."""
+    power = 4 * np.pi * (share - 0.01) / (1 - share)
+    sun = Disc(np.array([0.0, 0.6, 0.8]), 2.0, np.full(3, power))
+    return EnvironmentMap(lay(np.ones((128, 256, 3), np.float32), [sun]))
+
+
+@pytest.mark.parametrize(
+    ("share", "expected"),
+    [(0.05, "low"), (LOW_CONTRAST - 0.01, "low"), (LOW_CONTRAST + 0.01, "medium"),
+     (HIGH_CONTRAST - 0.01, "medium"), (HIGH_CONTRAST + 0.01, "high"), (0.9, "high")],
+)  # fmt: skip
+def test_the_class_follows_from_the_share_of_the_brightest_hundredth(share, expected):
+    environment = sun_of_share(share)
+    assert contrast_share(environment) == pytest.approx(share, abs=2e-3)
+    assert classify(environment) == expected
+
+
+@pytest.mark.parametrize("wanted", CLASSES)
+def test_a_light_of_a_class_is_of_it_at_other_resolutions_too(wanted):
+    for k in range(2):
+        light = draw_light(generator(k, "class", wanted), wanted, EVERY)
+        assert classify(light.bake(64)) == wanted
+        assert classify(light.bake(160)) == wanted
+
+
+@pytest.mark.parametrize("wanted", CLASSES)
+def test_a_class_draws_several_families(wanted):
+    drawn = [draw_light(generator(k, "several", wanted), wanted, EVERY) for k in range(4)]
+    assert len({light.family for light in drawn}) >= 2
+
+
+def test_the_nearest_is_taken_where_no_light_is_of_the_class():
+    """Suns above a clear plain are all of high contrast."""
+    light = draw_light(generator(0, "nearest"), "low", ["sun"])
+    shares = [contrast_share(FAMILIES["sun"].draw(generator(k, "suns"), []).bake(64)) for k in range(8)]
+    assert light.family == "sun"
+    assert contrast_share(light.bake(64)) < np.median(shares)
+
+
+def hdri(name: str, contrast) -> HdriSpec:
+    return HdriSpec(path=name, sha256="", rotation_deg=0.0, contrast=contrast)
+
+
+def test_the_users_maps_are_drawn_by_their_measured_class():
+    files = [hdri("a.exr", "low"), hdri("b.exr", "high"), hdri("c.exr", "low")]
+    for k in range(8):
+        low = draw_light(generator(k, "files"), "low", ["hdri"], files)
+        assert isinstance(low, HdriSpec)
+        assert low.path in ("a.exr", "c.exr")
+    assert draw_light(generator(0, "files"), "medium", ["hdri"], files).family in EVERY
+
+
+def test_any_draws_what_it_drew_before_in_styles_a_and_b():
+    assert PROCEDURAL == ("sun", "studio", "overcast")
+    for style in ("A", "B"):
+        spec = draw_scene(0, "train", 3, style=style, lights=["any"] * 4, frames=1, path_frames=4)
+        drawn = [light.family for light in spec.lights]
+        again = [PROCEDURAL[int(generator(0, "train", 3, "light", k).integers(3))] for k in range(4)]
+        assert drawn == again
+
+
+def test_a_scene_asks_for_classes_and_reads_them_back():
+    spec = draw_scene(0, "train", 0, style="A", lights=["high", "low", "medium"], frames=1, path_frames=4)
+    assert [classify(light.bake(64)) for light in spec.lights] == ["high", "low", "medium"]
+    assert SceneSpec.model_validate_json(spec.to_json()) == spec
+    twice = draw_scene(0, "train", 0, style="A", lights=["high", "low", "medium"], frames=1, path_frames=4)
+    assert twice.to_json() == spec.to_json()
+
+
+@pytest.mark.long
+def test_the_shares_of_the_classes_are_those_that_the_module_tells():
+    """A third or so of all drawn lights is of low contrast, about half of high, and some are in between."""
+    found = Counter(
+        classify(FAMILIES[family].draw(generator(k, "dist", family), []).bake(32))
+        for family in EVERY
+        for k in range(6)
+    )
+    total = sum(found.values())
+    assert 0.15 < found["low"] / total < 0.45
+    assert 0.4 < found["high"] / total < 0.75
+    assert found["medium"] / total > 0.04

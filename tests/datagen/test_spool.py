@@ -1,0 +1,67 @@
+"""Frames that wait on disk come back as a shard would have stored them."""
+
+import numpy as np
+import pytest
+
+from datagen.spool import Spool, stored
+from datagen.synthetic import first_bad_value
+from tron.errors import TronError
+from tron.images import decode_exr, encode_exr
+from tron.seeds import generator
+
+
+def frame(number: int) -> dict[str, np.ndarray]:
+    rng = generator(1, "spool", number)
+    return {
+        "rgb": rng.lognormal(0, 3, (5, 7, 3)).astype(np.float32),
+        "mask": rng.random((5, 7)).astype(np.float32),
+    }
+
+
+def test_frames_come_by_time_and_leave_by_clip(tmp_path):
+    with Spool(tmp_path / "new", clips=3) as spool:
+        for i in range(2):
+            for clip in range(3):
+                spool.add(clip, frame(10 * clip + i))
+        assert not list((tmp_path / "new").iterdir()), "the file has no name to be left under"
+        for number in (2, 0, 1):
+            clip = spool.clip(number)
+            assert len(clip) == 2
+            for i, found in enumerate(clip):
+                given = frame(10 * number + i)
+                assert set(found) == set(given)
+                for name, image in given.items():
+                    assert found[name].dtype == np.float32
+                    assert found[name].shape == image.shape
+                    np.testing.assert_array_equal(found[name], stored(name, image).astype(np.float32))
+                    np.testing.assert_array_equal(clip[i][name], found[name])
+            assert [set(part) for part in clip[1:]] == [{"rgb", "mask"}]
+
+
+def test_a_shard_stores_what_comes_back_bit_by_bit(tmp_path):
+    image = frame(0)["rgb"]
+    image[0, 0] = 1e6, 65504.0, 1e-9
+    with Spool(tmp_path, clips=1) as spool:
+        spool.add(0, {"rgb": image})
+        back = spool.clip(0)[0]["rgb"]
+    assert encode_exr(back, half=True) == encode_exr(image, half=True)
+    np.testing.assert_array_equal(decode_exr(encode_exr(image, half=True)), back)
+
+
+def test_values_that_are_not_finite_are_still_found(tmp_path):
+    image = np.ones((2, 2, 3), np.float32)
+    image[0, 0], image[1, 1, 0] = (np.inf, 1e30, -np.inf), np.nan
+    with Spool(tmp_path, clips=1) as spool:
+        spool.add(0, {"rgb": image})
+        assert first_bad_value(spool.clip(0)) == "frame 0: rgb has 3 values that are not finite"
+
+
+def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
+    with Spool(tmp_path, clips=1) as spool:
+
+        def full(_data: object) -> int:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(spool._file, "write", full)
+        with pytest.raises(TronError, match="No space left on device"):
+            spool.add(0, frame(0))
