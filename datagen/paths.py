@@ -88,7 +88,6 @@ class WalkPath(Spec):
         if len(places) > 1:
             keys = np.arange(len(places), dtype=np.float64)
             times = np.linspace(0.0, keys[-1], count)
-            # a spline through a place that is left again at once would round it to nothing: ends are kept
             places = np.asarray(PchipInterpolator(keys, places)(times))
         else:
             places = np.repeat(places, count, axis=0)

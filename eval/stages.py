@@ -210,14 +210,19 @@ def _running(child: Child, path: str) -> Iterator[tuple[subprocess.Popen[str], d
     try:
         yield process, last
     finally:
-        if process.poll() is None:
-            process.terminate()
-            try:
-                process.wait(PATIENCE)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        end(process)
         thread.join(PATIENCE)
+
+
+def end(process: subprocess.Popen) -> None:
+    """Terminate a process that still runs, and kill it if it has not ended within PATIENCE seconds."""
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
 
 
 def _say(label: str, text: str) -> None:

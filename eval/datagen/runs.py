@@ -14,7 +14,7 @@ from typing import Any
 
 import psutil
 
-from eval.stages import PATIENCE, StageFailed, script_path
+from eval.stages import StageFailed, end, script_path
 from tron.cli.termination import termination_unwinds
 from tron.errors import TronError
 
@@ -57,13 +57,7 @@ def running(
         try:
             yield process
         finally:
-            if process.poll() is None:
-                process.terminate()
-                try:
-                    process.wait(PATIENCE)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+            end(process)
 
 
 def make(
