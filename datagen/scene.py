@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from pydantic import Field
 
-from datagen.lights import EVERY, PROCEDURAL, Family, HdriSpec, LightChoice, LightSpec, draw_light
+from datagen.lights import EVERY, PROCEDURAL, USUAL, Family, HdriSpec, LightChoice, LightSpec, draw_light
 from datagen.motion import STILL, MotionSpec, Share, draw_motion
 from datagen.objects import ObjectSpec
 from datagen.paths import PathSpec
@@ -145,7 +145,7 @@ def draw_scene(
         made = STYLES[style](streams, choice or Choice())
     except TronError as error:
         raise TronError(error.what, error.where or scene_name(split, index), error.mend) from error
-    own = PROCEDURAL if style not in MIXED else EVERY
+    own = PROCEDURAL if style in OLD else USUAL
     drawn = [
         draw_light(streams("light", k), wanted, families or (own if wanted == "any" else EVERY), environments)
         for k, wanted in enumerate(lights)

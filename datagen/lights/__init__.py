@@ -9,7 +9,7 @@ both.
 
 from datagen.lights.contrast import Contrast, classify, contrast_share
 from datagen.lights.drawing import draw_light
-from datagen.lights.families import EVERY, FAMILIES, PROCEDURAL, Family, LightChoice, LightSpec
+from datagen.lights.families import EVERY, FAMILIES, PROCEDURAL, USUAL, Family, LightChoice, LightSpec
 from datagen.lights.hdri import HdriSpec
 from datagen.lights.light import Light
 from datagen.lights.overcast import OvercastSpec
@@ -20,6 +20,7 @@ __all__ = [
     "EVERY",
     "FAMILIES",
     "PROCEDURAL",
+    "USUAL",
     "Contrast",
     "Family",
     "HdriSpec",

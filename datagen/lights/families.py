@@ -30,7 +30,14 @@ PROCEDURAL = tuple(name for name, light in FAMILIES.items() if light.in_any)
 """Families that ``any`` chooses from in styles A and B, unless a recipe names others."""
 
 EVERY = tuple(name for name in FAMILIES if name != "hdri")
-"""Families that it chooses from in every other style: all that need no files."""
+"""All families that need no files: what classes of contrast choose from."""
+
+USUAL = (
+    *(3 * ("clouds", "landscape", "interior")),
+    *(2 * ("sun", "studio")),
+    *("overcast", "night", "coloured"),
+)
+"""Families that ``any`` chooses from in every other style, one place as likely as another."""
 
 if TYPE_CHECKING:
     LightSpec = Light

@@ -18,9 +18,10 @@ class VarietySettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     old: list[str] = Field(description="arguments of tron-datagen: the old distribution, with test scenes")
-    new: list[str] = Field(description="the same: the new one, as many scenes, lights and frames")
-    train: list[str] = Field(
-        default=["experiment=demo", "renderer=tiny"], description="arguments of tron-train"
+    new: list[str] = Field(description="the same: the new one, as many lights and frames")
+    train: dict[str, list[str]] = Field(
+        description="name of a renderer -> arguments of tron-train; figures without a name are the first's",
+        min_length=1,
     )
     max_seconds: PositiveFloat = Field(default=250, description="wall time of each training")
     seeds: list[int] = Field(default=[0], description="seeds of the training, one of each world for each")
@@ -29,7 +30,9 @@ class VarietySettings(BaseModel):
         default=["experiment=models"], description="arguments of tron-datagen for scenes of real models"
     )
     alone: list[str] = Field(description="further ones of those of one model")
-    mixed: list[str] = Field(description="further ones of those of models among procedural things")
+    mixed: dict[str, list[str]] = Field(
+        description="name -> further ones of those of models among procedural things"
+    )
     pictures: NonNegativeInt = Field(default=3, description="scenes of each judge that are shown")
 
 

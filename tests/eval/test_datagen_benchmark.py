@@ -1,6 +1,7 @@
 """The benchmark of the data engine: figures from known findings, and every part at toy sizes."""
 
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,15 +14,31 @@ from eval import stages as stages_module
 from eval.cli import cli
 from eval.datagen import kills, runs
 from eval.datagen.kills import Kill, Kills
+from eval.datagen.model_pixels import ModelPixels
 from eval.datagen.settings import VarietySettings
 from eval.datagen.soak import Soak
 from eval.datagen.specifications import Specifications
 from eval.datagen.throughput import Throughput, _size
-from eval.datagen.variety import ALONE, HOME, LIT, MIXED, NEW, OLD, Score, Variety, measure_variety
+from eval.datagen.variety import (
+    ALONE,
+    FOREGROUND,
+    HOME,
+    LIT,
+    MIXED,
+    MODELS,
+    NEW,
+    OLD,
+    Score,
+    Variety,
+    measure_variety,
+)
 from eval.datagen.workers import Workers
 from eval.results import Results, Row
+from tron.cameras import Camera
 from tron.errors import TronError
+from tron.gaussians import GaussianScene
 from tron.images import write_image
+from tron.shards.schema import Clip
 
 COMMON = [
     *(f"{split}.scenes=0" for split in ("train_b", "validation", "test")),
@@ -77,7 +94,7 @@ def test_every_part_but_variety_at_toy_sizes(tmp_path: Path):
 
 
 def test_gains_are_paired_over_scenes_and_losses_have_the_other_sign():
-    found = Variety(scenes={OLD: 24, NEW: 24})
+    found = Variety(["three", "two"], scenes={OLD: 24, NEW: 24})
     for judge, scene, old, new in (
         (ALONE, "a/0", (30.0, 32.0), (31.0, 33.0)),
         (MIXED, "m/0", (20.0,), (23.0,)),
@@ -85,7 +102,16 @@ def test_gains_are_paired_over_scenes_and_losses_have_the_other_sign():
         (HOME, "h/0", (40.0,), (39.75,)),
     ):
         for method, figures in ((OLD, old), (NEW, new), (LIT, old)):
-            found.scores += [Score(judge, scene, method, 0, psnr) for psnr in figures]
+            own = FOREGROUND if judge == HOME else MODELS
+            found.scores += [
+                Score(judge, own, scene, method, "" if method == LIT else "three", 0, psnr)
+                for psnr in figures
+            ]
+            if method != LIT:  # what belongs to another renderer or other pixels changes none of these
+                found.scores.append(Score(judge, own, scene, method, "two", 0, 10.0 + (method == NEW)))
+                if judge != HOME:
+                    psnr = 50.0 - 3 * (method == NEW)
+                    found.scores.append(Score(judge, FOREGROUND, scene, method, "three", 0, psnr))
     rows = values(found.rows(0))
     ood = rows["variety.ood_gain_db"]
     assert (ood.value, ood.n, ood.scenes) == (2.0, 3, 3)
@@ -94,8 +120,57 @@ def test_gains_are_paired_over_scenes_and_losses_have_the_other_sign():
     assert ood.low <= 2.0 <= ood.high <= 3.0
     assert rows["variety.ood_gain_db.mixed"].value == 2.5
     assert rows["variety.loss_db"].value == 0.25
-    assert rows["variety.psnr.old.alone"].value == 31.0
-    assert set(values(Variety().rows(0))) == set()
+    assert rows["variety.psnr.old.alone.models"].value == 31.0
+    assert rows["variety.ood_gain_db.foreground"].value == -3.0
+    assert rows["variety.two.ood_gain_db"].value == 1.0
+    assert rows["variety.two.loss_db"].value == -1.0
+    assert set(values(Variety(["three"]).rows(0))) == set()
+
+
+def write_scene(folder: Path, surfels: GaussianScene, models: list[int]) -> None:
+    """A scene's folder as the data engine leaves it, as far as masks read it: a floor, and two objects."""
+    folder.mkdir(parents=True)
+    surfels.save(folder / "surfels.ply")
+    objects = [{"asset": "cat" if number in models else None} for number in (2, 3)]
+    (folder / "spec.json").write_text(json.dumps({"surroundings": [{}], "objects": objects}))
+
+
+def surfels_at(places: np.ndarray, object_id: np.ndarray) -> GaussianScene:
+    count = len(places)
+    return GaussianScene(
+        means=places,
+        quats=np.tile([1.0, 0, 0, 0], (count, 1)),
+        log_scales=np.full((count, 2), -4.0),
+        opacity_logits=np.full(count, 4.0),
+        sh=np.zeros((count, 16, 3)),
+        base_color=np.full((count, 3), 0.5),
+        roughness=np.full(count, 0.5),
+        metallic=np.zeros(count),
+        object_id=object_id,
+        spacing=0.1,
+    )
+
+
+def test_pixels_of_models_are_those_whose_surface_is_a_models(
+    tmp_path: Path, drawn_clip: Callable[..., Clip]
+):
+    """A floor, a model on the left and another thing on the right, at depths that the clip is given."""
+    clip = drawn_clip(frames=1, size=16)
+    camera = Camera.from_dict(clip.meta.cameras[0])
+    depth = np.full((16, 16), 5.0, np.float32)
+    depth[4:9, 2:6], depth[4:9, 10:14], depth[0] = 3.0, 3.0, 0.0
+    clip.frames["depth_ref"] = depth[None, ..., None]
+    owner = np.ones((16, 16), int)
+    owner[4:9, 2:6], owner[4:9, 10:14] = 2, 3
+    surface = depth > 0
+    places = camera.position + camera.rays() * depth[..., None]
+    write_scene(tmp_path / "s", surfels_at(places[surface], owner[surface]), models=[2])
+    assert np.array_equal(ModelPixels(tmp_path / "s").masks(clip), (owner == 2)[None])
+    write_scene(tmp_path / "none", surfels_at(places[surface], owner[surface]), models=[])
+    assert not ModelPixels(tmp_path / "none").masks(clip).any()
+    (tmp_path / "s" / "spec.json").write_text("[]")
+    with pytest.raises(TronError, match="no specification of a scene"):
+        ModelPixels(tmp_path / "s")
 
 
 def test_the_soak_holds_the_last_fifth_against_the_second():
@@ -183,6 +258,10 @@ def test_memory_is_that_of_all_processes():
 def stand_ins(tmp_path: Path, dataset: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Stand-ins for the long commands copy what those would make; returns the list of what ran."""
     log = tmp_path / "commands.txt"
+    made = tmp_path / "made"
+    shutil.copytree(dataset, made)
+    for scene in ("s000010", "s000011"):
+        write_scene(made / "scenes" / scene, surfels_at(np.zeros((1, 3)), np.array([2])), models=[2])
     head = f"""#!{sys.executable}
 import pathlib, shutil, sys
 given = dict(word.split("=", 1) for word in sys.argv[1:])
@@ -193,7 +272,7 @@ with open({str(log)!r}, "a") as log:
     bodies = {
         "tron-datagen": "if given.get('asset_names') == '[broken]':\n"
         "    sys.exit(print('tron-datagen: no triangles (broken.obj)') or 2)\n"
-        f"shutil.copytree({str(dataset)!r}, out, dirs_exist_ok=True)\n",
+        f"shutil.copytree({str(made)!r}, out, dirs_exist_ok=True)\n",
         "tron-train": "out.mkdir(parents=True)\n"
         f"shutil.copy({str(weights / 'tiny.safetensors')!r}, out / 'renderer.safetensors')\n",
     }
@@ -208,9 +287,10 @@ def variety(real_data: Path | None) -> VarietySettings:
     return VarietySettings(
         old=["experiment=demo"],
         new=["experiment=world"],
+        train={"three": ["experiment=demo"], "two": ["experiment=demo", "renderer.config.guidance=[pbr]"]},
         real_data=real_data,
         alone=["objects=[1,1]"],
-        mixed=["asset_share=0.5"],
+        mixed={"old": ["asset_share=0.5", "test.style=A"], "new": ["asset_share=0.5", "test.style=table"]},
         seeds=[3, 4],
         max_seconds=7,
         pictures=1,
@@ -224,20 +304,26 @@ def test_variety_trains_on_both_and_judges_by_every_model_that_can_be_read(
     out = tmp_path / "out"
     found = measure_variety(variety(shared()), 0, out)
     commands = stand_ins.read_text().splitlines()
-    assert sum(line.startswith("tron-train") for line in commands) == 4
+    assert sum(line.startswith("tron-train") for line in commands) == 8
     for name in (OLD, NEW):
-        (line,) = (each for each in commands if f"dataset={out / name} " in each and "seed=4" in each)
-        assert "max_seconds=7" in line
+        lines = [each for each in commands if f"dataset={out / name} " in each and "seed=4" in each]
+        assert ["guidance=[pbr]" in line for line in lines] == [False, True]
+        assert all("max_seconds=7" in line for line in lines)
     judges = [line for line in commands if "experiment=models" in line]
     assert all("allow_unlicensed=[broken,cube,dusk]" in line for line in judges)
     assert [line for line in judges if "asset_names=[cube]" in line and "objects=[1,1]" in line]
-    assert sum("asset_share=0.5" in line for line in judges) == 2
+    assert sorted(line.partition("test.style=")[2].split()[0] for line in judges if "share=0.5" in line) == [
+        "A",
+        "table",
+    ]
     assert list(found.left_out) == ["alone_broken"]
     assert "no triangles" in found.left_out["alone_broken"]
     rows = values(found.rows(0))
     # untrained weights return lit, whatever they were trained on
     assert rows["variety.ood_gain_db"].value == rows["variety.loss_db"].value == 0.0
-    assert rows["variety.psnr.new.home"].value == pytest.approx(rows["variety.psnr.lit.home"].value, abs=1e-3)
+    assert rows["variety.psnr.new.home.foreground"].value == pytest.approx(
+        rows["variety.psnr.lit.home.foreground"].value, abs=1e-3
+    )
     assert rows["variety.ood_gain_db"].scenes == 6, "two scenes of the model, and of each of two mixtures"
     (section,) = found.sections(tmp_path / "pictures")
     assert (tmp_path / "pictures" / "variety_alone_0.png").stat().st_size > 0
