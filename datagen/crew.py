@@ -10,8 +10,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from asyncio import CancelledError
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -197,8 +199,9 @@ class Crew:
         found: list[str] = []
 
         def ask() -> None:
-            for frames in self._client.call_stack([turn.future]).get(turn.worker, {}).values():
-                found.extend(frames)
+            with suppress(Exception, CancelledError):  # its machine is gone, or this command ends
+                for frames in self._client.call_stack([turn.future]).get(turn.worker, {}).values():
+                    found.extend(frames)
 
         thread = threading.Thread(target=ask, daemon=True)
         thread.start()
@@ -210,7 +213,11 @@ class Crew:
 
         def restart() -> None:
             seconds = self._settings.worker_timeout
-            back = self._client.restart_workers([worker], timeout=seconds, raise_for_error=False)
+            try:
+                back = self._client.restart_workers([worker], timeout=seconds, raise_for_error=False)
+            except (Exception, CancelledError) as error:  # it ended by itself, or this command ends
+                log.debug("worker %s is not restarted", worker, exc_info=error)
+                return
             if back.get(worker) != "OK":
                 log.warning("worker %s has not come back within %g s; the others go on", worker, seconds)
 
