@@ -49,12 +49,12 @@ class Crew:
 
     Args:
         client: of a scheduler that has a worker.
-        settings: ``recycle_after``, ``scene_timeout``, ``worker_timeout`` are used.
+        settings: ``recycle_after`` and ``worker_timeout`` are used.
+        patience: how long a scene may take; the caller lets it learn.
     """
 
-    def __init__(self, client: Any, settings: Settings) -> None:
-        self._client, self._settings = client, settings
-        self._patience = Patience(settings.scene_timeout)
+    def __init__(self, client: Any, settings: Settings, patience: Patience) -> None:
+        self._client, self._settings, self._patience = client, settings, patience
         self._waiting: deque[Work] = deque()
         self._turns: dict[str, _Turn] = {}  # by the future's key
         self._ended: SimpleQueue[str] = SimpleQueue()
@@ -144,7 +144,6 @@ class Crew:
             outcome = Failure.of(error, "worker lost: ") if error else turn.future.result()
             turn.future.release()
             self._made[turn.worker] += 1
-            self._patience.saw(turn.item.split, time.monotonic() - turn.begun)
             yield turn.item, outcome
 
     def _lost(self) -> Iterator[tuple[Work, Failure]]:

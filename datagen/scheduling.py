@@ -73,16 +73,28 @@ def attempts(
     """Scenes as they are finished, in any order."""
     if not items:
         return
-    if settings.cluster is None:
-        patience = Patience(settings.scene_timeout)
-        for item in items:
-            with _told(item, patience.limit(item.split)):
-                made = try_it(task, settings, sources, item)
+    patience = Patience(settings.scene_timeout)
+    make = _one_by_one if settings.cluster is None else _by_workers
+    for item, made in make(task, items, settings, sources, patience):
+        if not isinstance(made.outcome, Failure):  # what fails at once says nothing of the others
             patience.saw(item.split, sum(made.seconds.values()))
-            yield item, made
-        return
+        yield item, made
+
+
+def _one_by_one(
+    task: Task[Made], items: Sequence[Work], settings: Settings, sources: Sources, patience: Patience
+) -> Iterator[tuple[Work, Attempt[Made]]]:
+    for item in items:
+        with _told(item, patience.limit(item.split)):
+            made = try_it(task, settings, sources, item)
+        yield item, made
+
+
+def _by_workers(
+    task: Task[Made], items: Sequence[Work], settings: Settings, sources: Sources, patience: Patience
+) -> Iterator[tuple[Work, Attempt[Made]]]:
     with workers(settings, len(items)) as client:
-        crew = Crew(client, settings)
+        crew = Crew(client, settings, patience)
         work = partial(try_in_worker, task, settings, sources)
         for item, outcome in crew.outcomes(work, items, partial(_key, settings)):
             yield item, outcome if isinstance(outcome, Attempt) else Attempt(outcome)
