@@ -71,12 +71,15 @@ def project(settings: Settings) -> str:
 
 
 def read_times(path: Path) -> dict[str, float]:
-    """Seconds of each scene in times.jsonl that was made, its last; lines that cannot be read are none."""
+    """Seconds of each scene in times.jsonl that was made, its last; lines that cannot be read are none.
+
+    Captures bear the names of the test split's scenes, and their lines are none of a dataset's.
+    """
     found: dict[str, float] = {}
     for line in path.read_text("utf-8").splitlines() if path.is_file() else ():
         try:
             noted = json.loads(line)
-            if noted["made"]:
+            if noted["made"] and noted.get("mode", "make") == "make":
                 found[noted["scene"]] = sum(noted["seconds"].values())
         except (ValueError, KeyError, TypeError, AttributeError):
             continue

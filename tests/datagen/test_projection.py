@@ -105,10 +105,12 @@ def test_only_scenes_that_were_made_have_seconds(tmp_path: Path):
         {"scene": "a", "made": True, "seconds": {"x": 1, "y": 2}},
         {"scene": "b", "made": False, "seconds": {"x": 1}},
         {"scene": "a", "made": True, "seconds": {"x": 5}},
+        {"scene": "a", "mode": "captures", "made": True, "seconds": {"x": 7}},
+        {"scene": "c", "mode": "make", "made": True, "seconds": {"x": 8}},
         ["no line of ours"],
     ]
     path.write_text("\n".join(map(json.dumps, lines)))
-    assert read_times(path) == {"a": 5}
+    assert read_times(path) == {"a": 5, "c": 8}
 
 
 def test_help_teaches_the_plan(capsys):

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,9 +21,10 @@ from datagen.crew import Crew
 from datagen.failures import Failure
 from datagen.patience import LEAST, UNKNOWN, Patience
 from datagen.plan import Sources, Work
-from datagen.scheduling import attempts, make_each
+from datagen.scheduling import Attempt, attempts, make_each
 from datagen.settings import Settings
 from tron.cli.recipes import check, compose_recipe
+from tron.errors import TronError
 
 
 def settings_of(output: Path, *overrides: str) -> Settings:
@@ -136,6 +138,25 @@ def test_scenes_that_fail_do_not_teach_how_long_one_takes(tmp_path, monkeypatch,
     found = list(attempts(task, works("a", "b", "c", "slow"), settings, Sources()))
     assert found[-1][1].outcome == "slow"
     assert "takes longer" not in caplog.text
+
+
+def test_times_that_cannot_be_written_end_the_run_in_one_line_and_its_workers_before(tmp_path, monkeypatch):
+    (tmp_path / "logs").write_text("a file where the folder goes")
+    ended = []
+
+    def pretend(_: object, items: Sequence[Work], *__: object) -> Iterator[tuple[Work, Attempt[str]]]:
+        try:
+            for item in items:
+                yield item, Attempt(item.name)
+        finally:
+            ended.append("workers")
+
+    monkeypatch.setattr("datagen.scheduling.attempts", pretend)
+    settings = settings_of(tmp_path, "cluster=none")
+    with pytest.raises(TronError) as told:  # which holds on to the run's frames
+        make_each(lambda *_: None, works("a", "b"), settings, Sources(), lambda _: 1, "clips")
+    assert ended == ["workers"]
+    assert told.match(r"cannot write.*times\.jsonl")
 
 
 def test_a_worker_that_is_gone_before_it_is_replaced_is_no_traceback(tmp_path, monkeypatch):
