@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -187,7 +188,8 @@ def _variety(variety: Histograms, other: Other | None, pictures: Sequence[str]) 
         f"|---|{'---|' * len(found)}---|",
     ]
     for name, measure in MEASURES.items():
-        medians = [f"{median(name, each[name]):.3g}" if name in each else "" for each in found.values()]
+        values = [median(name, each.get(name, ())) for each in found.values()]
+        medians = ["" if math.isnan(value) else f"{value:.3g}" for value in values]
         if any(medians):
             lines.append(f"| {measure.title} | {' | '.join(medians)} | {measure.counted} |")
     return lines

@@ -52,12 +52,12 @@ def contact_sheet(folder: Path, rows: Sequence[ClipRow]) -> bytes | None:
     Thumbnails are fitted into squares as large as the largest of them, and stay as small as LARGEST_SIDE.
 
     Raises:
-        TronError: a thumbnail is damaged.
+        TronError: a thumbnail is missing or damaged.
     """
     chosen = sheet_clips(rows)
     if not chosen:
         return None
-    pictures = [_thumbnail(folder / str(row.thumbnail)) for row in chosen]
+    pictures = [_thumbnail(folder, row) for row in chosen]
     tile = min(max(max(picture.size) for picture in pictures), LARGEST_SIDE)
     columns = min(SIDE, math.ceil(math.sqrt(len(pictures))))
     step, sheet_rows = tile + GUTTER, math.ceil(len(pictures) / columns)
@@ -72,8 +72,10 @@ def contact_sheet(folder: Path, rows: Sequence[ClipRow]) -> bytes | None:
     return encode_png(np.asarray(sheet))
 
 
-def _thumbnail(path: Path) -> Image.Image:
+def _thumbnail(folder: Path, row: ClipRow) -> Image.Image:
+    path = folder / str(row.thumbnail)
     try:
         return Image.open(io.BytesIO(path.read_bytes()), formats=("JPEG",)).convert("RGB")
     except OSError as error:
-        raise TronError(f"thumbnail cannot be read: {error}", path, "make its scene again") from error
+        mend = f"delete scenes/{row.scene}/record.json, and start the run again: it makes the scene anew"
+        raise TronError(f"thumbnail cannot be read: {error.strerror or error}", path, mend) from error

@@ -10,8 +10,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from asyncio import CancelledError
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -47,12 +49,12 @@ class Crew:
 
     Args:
         client: of a scheduler that has a worker.
-        settings: ``recycle_after``, ``scene_timeout``, ``worker_timeout`` are used.
+        settings: ``recycle_after`` and ``worker_timeout`` are used.
+        patience: how long a scene may take; the caller lets it learn.
     """
 
-    def __init__(self, client: Any, settings: Settings) -> None:
-        self._client, self._settings = client, settings
-        self._patience = Patience(settings.scene_timeout)
+    def __init__(self, client: Any, settings: Settings, patience: Patience) -> None:
+        self._client, self._settings, self._patience = client, settings, patience
         self._waiting: deque[Work] = deque()
         self._turns: dict[str, _Turn] = {}  # by the future's key
         self._ended: SimpleQueue[str] = SimpleQueue()
@@ -142,7 +144,6 @@ class Crew:
             outcome = Failure.of(error, "worker lost: ") if error else turn.future.result()
             turn.future.release()
             self._made[turn.worker] += 1
-            self._patience.saw(turn.item.split, time.monotonic() - turn.begun)
             yield turn.item, outcome
 
     def _lost(self) -> Iterator[tuple[Work, Failure]]:
@@ -197,8 +198,9 @@ class Crew:
         found: list[str] = []
 
         def ask() -> None:
-            for frames in self._client.call_stack([turn.future]).get(turn.worker, {}).values():
-                found.extend(frames)
+            with suppress(Exception, CancelledError):  # its machine is gone, or this command ends
+                for frames in self._client.call_stack([turn.future]).get(turn.worker, {}).values():
+                    found.extend(frames)
 
         thread = threading.Thread(target=ask, daemon=True)
         thread.start()
@@ -210,7 +212,11 @@ class Crew:
 
         def restart() -> None:
             seconds = self._settings.worker_timeout
-            back = self._client.restart_workers([worker], timeout=seconds, raise_for_error=False)
+            try:
+                back = self._client.restart_workers([worker], timeout=seconds, raise_for_error=False)
+            except (Exception, CancelledError) as error:  # it ended by itself, or this command ends
+                log.debug("worker %s is not restarted", worker, exc_info=error)
+                return
             if back.get(worker) != "OK":
                 log.warning("worker %s has not come back within %g s; the others go on", worker, seconds)
 

@@ -23,7 +23,7 @@ class Patience:
         self._seconds: defaultdict[str, list[float]] = defaultdict(list)
 
     def saw(self, split: str, seconds: float) -> None:
-        """Learn from a scene that is done."""
+        """Learn from a scene that was made; one that failed would teach too little."""
         self._seconds[split].append(seconds)
 
     def limit(self, split: str) -> float:

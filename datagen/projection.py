@@ -10,11 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
+from datagen.account import read_other
 from datagen.clusters import LOCAL, cores, logs_folder, require_cluster
 from datagen.plan import Work, chosen, find_sources, plan, read_record, require_adoptable, scene_folder
 from datagen.probe import SceneCost, probe
 from datagen.scheduling import TIMES_NAME
 from datagen.settings import Settings
+from tron.cli.termination import termination_unwinds
 from tron.runtime import activate
 
 log = logging.getLogger(__name__)
@@ -49,6 +51,8 @@ def project(settings: Settings) -> str:
     require_adoptable(settings)
     activate(settings.variant, threads=1)
     sources = find_sources(settings)
+    if settings.variety_against is not None:
+        read_other(settings.variety_against)
     there = {item.name for item in items if read_record(settings.output_dir, item.name) is not None}
     times = read_times(logs_folder(settings) / TIMES_NAME)
     splits = []
@@ -60,18 +64,22 @@ def project(settings: Settings) -> str:
             cost = _of_made(settings, made, times)
             if cost is None:
                 log.info("a small scene of %s is rendered to see what it costs", split)
-                cost = probe(missing[0], settings, sources)
+                with termination_unwinds():  # the probe's clips wait in a folder that goes away
+                    cost = probe(missing[0], settings, sources)
         splits.append(SplitPlan(split, sum(item.split == split for item in items), missing, cost))
     return report(settings, splits)
 
 
 def read_times(path: Path) -> dict[str, float]:
-    """Seconds of each scene in times.jsonl that was made, its last; lines that cannot be read are none."""
+    """Seconds of each scene in times.jsonl that was made, its last; lines that cannot be read are none.
+
+    Captures bear the names of the test split's scenes, and their lines are none of a dataset's.
+    """
     found: dict[str, float] = {}
     for line in path.read_text("utf-8").splitlines() if path.is_file() else ():
         try:
             noted = json.loads(line)
-            if noted["made"]:
+            if noted["made"] and noted.get("mode", "make") == "make":
                 found[noted["scene"]] = sum(noted["seconds"].values())
         except (ValueError, KeyError, TypeError, AttributeError):
             continue

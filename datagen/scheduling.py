@@ -6,8 +6,8 @@ import hashlib
 import json
 import logging
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Generic, TypeVar
@@ -21,6 +21,7 @@ from datagen.plan import Sources, Work
 from datagen.settings import Settings
 from tron.cli.progress import Progress
 from tron.cli.termination import termination_unwinds
+from tron.errors import TronError
 
 log = logging.getLogger(__name__)
 
@@ -55,10 +56,18 @@ def make_each(
         task, items, settings, sources: the task, the scenes and what they are made with.
         size: the weight of a scene in the estimate of the time that is left.
         unit: what weights count.
+
+    Raises:
+        TronError: the cluster does not start, its scheduler is gone, or a time cannot be written.
     """
     failed: dict[str, Failure] = {}
-    with termination_unwinds(), Progress("scenes", sum(map(size, items)), unit=unit) as progress:
-        for item, attempt in attempts(task, items, settings, sources):
+    # Closed here, whatever ends the block: workers do not outlive it.
+    with (
+        termination_unwinds(),
+        closing(attempts(task, items, settings, sources)) as made,
+        Progress("scenes", sum(map(size, items)), unit=unit) as progress,
+    ):
+        for item, attempt in made:
             if isinstance(attempt.outcome, Failure):
                 failed[item.name] = attempt.outcome
                 log.error("%s failed: %s", item.name, attempt.outcome.reason)
@@ -69,20 +78,32 @@ def make_each(
 
 def attempts(
     task: Task[Made], items: Sequence[Work], settings: Settings, sources: Sources
-) -> Iterator[tuple[Work, Attempt[Made]]]:
+) -> Generator[tuple[Work, Attempt[Made]], None, None]:
     """Scenes as they are finished, in any order."""
     if not items:
         return
-    if settings.cluster is None:
-        patience = Patience(settings.scene_timeout)
-        for item in items:
-            with _told(item, patience.limit(item.split)):
-                made = try_it(task, settings, sources, item)
+    patience = Patience(settings.scene_timeout)
+    make = _one_by_one if settings.cluster is None else _by_workers
+    for item, made in make(task, items, settings, sources, patience):
+        if not isinstance(made.outcome, Failure):  # what fails at once says nothing of the others
             patience.saw(item.split, sum(made.seconds.values()))
-            yield item, made
-        return
+        yield item, made
+
+
+def _one_by_one(
+    task: Task[Made], items: Sequence[Work], settings: Settings, sources: Sources, patience: Patience
+) -> Iterator[tuple[Work, Attempt[Made]]]:
+    for item in items:
+        with _told(item, patience.limit(item.split)):
+            made = try_it(task, settings, sources, item)
+        yield item, made
+
+
+def _by_workers(
+    task: Task[Made], items: Sequence[Work], settings: Settings, sources: Sources, patience: Patience
+) -> Iterator[tuple[Work, Attempt[Made]]]:
     with workers(settings, len(items)) as client:
-        crew = Crew(client, settings)
+        crew = Crew(client, settings, patience)
         work = partial(try_in_worker, task, settings, sources)
         for item, outcome in crew.outcomes(work, items, partial(_key, settings)):
             yield item, outcome if isinstance(outcome, Attempt) else Attempt(outcome)
@@ -129,12 +150,22 @@ def _told(item: Work, limit: float) -> Iterator[None]:
 def _note(settings: Settings, item: Work, attempt: Attempt[Any]) -> None:
     """Add a scene's line to the file of times."""
     path = logs_folder(settings) / TIMES_NAME
-    path.parent.mkdir(parents=True, exist_ok=True)
     seconds = {stage: round(value, 4) for stage, value in attempt.seconds.items()}
     made = not isinstance(attempt.outcome, Failure)
-    line = {"scene": item.name, "made": made, "worker": attempt.worker, "seconds": seconds}
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(line) + "\n")
+    line = {
+        "scene": item.name,
+        "mode": settings.mode,
+        "made": made,
+        "worker": attempt.worker,
+        "seconds": seconds,
+    }
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+    except OSError as error:
+        mend = "free some space, or choose another output_dir"
+        raise TronError(f"cannot write: {error.strerror or error}", path, mend) from error
 
 
 def _key(settings: Settings, item: Work, attempt: int) -> str:

@@ -396,7 +396,9 @@ class Settings(_Model):
         """A split without scenes may say what it likes; captures have the test split's style."""
         captures = info.data.get("mode") == "captures"
         made = info.field_name == "test" if captures else not _without_scenes(value)
-        return handler(value) if made else SplitSettings.model_construct(**dict(value))
+        if made or not isinstance(value, Mapping | SplitSettings):
+            return handler(value)
+        return SplitSettings.model_construct(**dict(value))
 
     @field_validator("cluster", mode="before")
     @classmethod

@@ -161,7 +161,9 @@ def total(parts: Iterable[Histograms]) -> Histograms:
 
 
 def median(name: str, counts: Sequence[int]) -> float:
-    """Median of a measure by its counts, taken as even within a bin."""
+    """Median of a measure by its counts, taken as even within a bin; NaN where nothing was counted."""
+    if not any(counts):
+        return float("nan")
     edges, below = np.asarray(MEASURES[name].edges), np.append(0, np.cumsum(counts))
     return float(np.interp(below[-1] / 2, below, edges))
 

@@ -4,8 +4,11 @@ from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
+import pytest
+
 from datagen.clip_rows import ClipRow
 from datagen.contact_sheet import contact_sheet, sheet_clips
+from tron.errors import TronError
 from tron.images import decode_png, read_image
 
 
@@ -57,3 +60,11 @@ def test_the_sheet_of_a_dataset_is_made_of_its_thumbnails(small_dataset: Path):
     assert sheet.shape == (2 * 36 + 4, 2 * 36 + 4, 3)  # four scenes of 32 x 24 in squares of 32
     first = decode_png((small_dataset / "previews" / "train-000000-l0.jpg").read_bytes())
     assert (sheet[4 + 4 : 4 + 28, 4:36] == first).all()
+
+
+def test_a_thumbnail_that_is_missing_or_damaged_is_named_with_what_makes_it_again(tmp_path: Path):
+    for data in (None, b"no picture"):
+        if data is not None:
+            (tmp_path / "x.jpg").write_bytes(data)
+        with pytest.raises(TronError, match=r"x\.jpg.*delete scenes/train-A0000/record\.json"):
+            contact_sheet(tmp_path, rows("train", "A", 1, lights=1))

@@ -1,7 +1,9 @@
 """mode=plan renders and writes nothing of a dataset, and foretells what it takes."""
 
 import json
+import os
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -71,6 +73,22 @@ def test_a_plan_is_refused_where_the_dataset_would_be(small_settings, small_data
         project(small_settings(tmp_path, "only=[train-000099]"))
 
 
+def test_a_dataset_that_cannot_be_drawn_beside_is_refused_by_the_plan_too(small_settings, tmp_path: Path):
+    with pytest.raises(TronError, match="manifest"):
+        project(small_settings(tmp_path / "new", f"variety_against={tmp_path}"))
+
+
+def test_sigterm_unwinds_a_probe_so_that_its_folder_goes_away(small_settings, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("datagen.projection.probe", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    before = signal.signal(signal.SIGTERM, lambda *_: None)
+    try:
+        with pytest.raises(SystemExit) as ended:
+            project(small_settings(tmp_path / "new"))
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert ended.value.code == 143
+
+
 def test_workers_are_those_of_the_cluster(small_settings, tmp_path: Path):
     assert worker_count(small_settings(tmp_path), 9) == (1, ", this process")
     assert worker_count(small_settings(tmp_path, "cluster=local", "workers=5"), 3) == (3, "")
@@ -87,10 +105,12 @@ def test_only_scenes_that_were_made_have_seconds(tmp_path: Path):
         {"scene": "a", "made": True, "seconds": {"x": 1, "y": 2}},
         {"scene": "b", "made": False, "seconds": {"x": 1}},
         {"scene": "a", "made": True, "seconds": {"x": 5}},
+        {"scene": "a", "mode": "captures", "made": True, "seconds": {"x": 7}},
+        {"scene": "c", "mode": "make", "made": True, "seconds": {"x": 8}},
         ["no line of ours"],
     ]
     path.write_text("\n".join(map(json.dumps, lines)))
-    assert read_times(path) == {"a": 5}
+    assert read_times(path) == {"a": 5, "c": 8}
 
 
 def test_help_teaches_the_plan(capsys):

@@ -289,6 +289,8 @@ def test_what_a_split_without_scenes_says_does_not_matter(tmp_path):
         tiny(tmp_path, "test.frames=9")
     with pytest.raises(TronError, match=r"path_frames"):
         tiny(tmp_path, "mode=captures", "test.scenes=0", "test.frames=9")
+    with pytest.raises(TronError, match=r"train"):
+        tiny(tmp_path, "mode=captures", "train=5")
 
 
 def test_another_recipe_is_refused_before_anything_is_written(dataset, files_of):

@@ -5,20 +5,26 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from dask.distributed import LocalCluster
 
 from datagen.clock import clocked, stage
+from datagen.crew import Crew
 from datagen.failures import Failure
 from datagen.patience import LEAST, UNKNOWN, Patience
 from datagen.plan import Sources, Work
-from datagen.scheduling import attempts, make_each
+from datagen.scheduling import Attempt, attempts, make_each
 from datagen.settings import Settings
 from tron.cli.recipes import check, compose_recipe
+from tron.errors import TronError
 
 
 def settings_of(output: Path, *overrides: str) -> Settings:
@@ -117,6 +123,58 @@ def test_this_process_tells_of_a_scene_that_takes_long_and_goes_on(tmp_path, cap
     ]
     assert lines[1]["seconds"]["rest"] == pytest.approx(0.2, abs=0.1)
     assert "write" in lines[1]["seconds"]
+
+
+def test_scenes_that_fail_do_not_teach_how_long_one_takes(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("datagen.patience.LEAST", 0.05)
+
+    def task(item: Work, *_: object) -> str:
+        if item.name != "slow":
+            raise ValueError("no")
+        time.sleep(0.2)
+        return item.name
+
+    settings = settings_of(tmp_path, "cluster=none")
+    found = list(attempts(task, works("a", "b", "c", "slow"), settings, Sources()))
+    assert found[-1][1].outcome == "slow"
+    assert "takes longer" not in caplog.text
+
+
+def test_times_that_cannot_be_written_end_the_run_in_one_line_and_its_workers_before(tmp_path, monkeypatch):
+    (tmp_path / "logs").write_text("a file where the folder goes")
+    ended = []
+
+    def pretend(_: object, items: Sequence[Work], *__: object) -> Iterator[tuple[Work, Attempt[str]]]:
+        try:
+            for item in items:
+                yield item, Attempt(item.name)
+        finally:
+            ended.append("workers")
+
+    monkeypatch.setattr("datagen.scheduling.attempts", pretend)
+    settings = settings_of(tmp_path, "cluster=none")
+    with pytest.raises(TronError) as told:  # which holds on to the run's frames
+        make_each(lambda *_: None, works("a", "b"), settings, Sources(), lambda _: 1, "clips")
+    assert ended == ["workers"]
+    assert told.match(r"cannot write.*times\.jsonl")
+
+
+def test_a_worker_that_is_gone_before_it_is_replaced_is_no_traceback(tmp_path, monkeypatch):
+    class Gone:
+        def restart_workers(self, workers: list[str], **_: object) -> dict[str, str]:
+            return {workers[0]: {}[workers[0]]}
+
+        def call_stack(self, _: object) -> dict:
+            raise OSError("no scheduler")
+
+    told: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", told.append)
+    crew = Crew(Gone(), settings_of(tmp_path), Patience(None))
+    crew._replace("tcp://gone")
+    crew._replacing["tcp://gone"].join()
+    turn = SimpleNamespace(worker="tcp://gone", future=None)
+    assert crew._stack(cast(Any, turn)) == "The worker does not say where it hangs."
+    assert told == []
 
 
 def test_patience_is_learnt_from_scenes_of_the_same_split():

@@ -105,6 +105,12 @@ def test_each_measure_counts_what_it_says():
     assert median("roughness", found["roughness"]) == pytest.approx(0.325)
 
 
+def test_what_was_never_counted_has_no_median():
+    assert np.isnan(median("albedo", [0] * 20))
+    assert np.isnan(median("albedo", []))
+    assert median("albedo", [0] * 19 + [1]) == pytest.approx(0.975)
+
+
 def test_members_that_are_not_there_are_not_counted():
     less = {name: image for name, image in frame().items() if not name.endswith("_ref")}
     assert set(frame_histograms(less, CAMERA)) == {"coverage", "shadow", "bounce"}
