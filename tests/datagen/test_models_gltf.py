@@ -316,6 +316,19 @@ def test_vertex_colours_multiply(tmp_path, write_glb, quarters):
     np.testing.assert_allclose(part.base_color, srgb_to_linear(quarters / 255) * 128 / 255, atol=1e-6)
 
 
+def test_primitives_of_one_material_keep_colours_of_their_own(tmp_path, write_glb, quarters):
+    """Each primitive is of one colour: not a factor of the material's, for the other has another."""
+    red, green = (np.tile(np.array(c, np.float32), (4, 1)) for c in ([1, 0, 0], [0, 0.5, 0]))
+    data = encoded(quarters)
+    material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    tree = card(material, {"COLOR_0": 4}, **textured(data, first=6))
+    first = tree["meshes"][0]["primitives"][0]
+    tree["meshes"][0]["primitives"].append(first | {"attributes": first["attributes"] | {"COLOR_0": 5}})
+    part = one(write_glb(tmp_path / "c.glb", tree, [*CARD, red, green, data]))
+    np.testing.assert_array_equal(part.tint, np.concatenate([red, green]))
+    np.testing.assert_allclose(part.base_color, srgb_to_linear(quarters / 255), atol=1e-6)
+
+
 def test_the_scale_of_a_normal_map_multiplies_x_and_y(tmp_path, write_glb):
     stored = np.array([0.3, -0.2, np.sqrt(1 - 0.13)])
     data = encoded(np.broadcast_to(np.round(stored * 127.5 + 127.5), (4, 4, 3)))
