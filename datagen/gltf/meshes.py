@@ -20,6 +20,7 @@ from tron.errors import TronError
 
 MOST_NODES = 20_000
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_SURFACES = (_TRIANGLES, _STRIP, _FAN)
 
 
 @dataclass
@@ -44,7 +45,7 @@ def read_parts(path: Path, most_triangles: int) -> list[Part]:
     primitives: dict[tuple[int, int], tuple[tuple[Any, ...], Part]] = {}
     for mesh, matrix in instances:
         for number, primitive in enumerate(document.item("meshes", mesh)["primitives"]):
-            if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
+            if primitive.get("mode", _TRIANGLES) not in _SURFACES:
                 continue  # points and lines have no surface
             if (mesh, number) not in primitives:
                 geometry = _read_primitive(document, primitive)
@@ -113,10 +114,13 @@ def _require_few(document: Document, instances: list[tuple[int, np.ndarray]], mo
 
 
 def _triangles(document: Document, primitive: dict[str, Any]) -> int:
+    mode = primitive.get("mode", _TRIANGLES)
+    if mode not in _SURFACES:
+        return 0
     indexed = "indices" in primitive
     index = primitive["indices"] if indexed else primitive["attributes"].get("POSITION")
     count = element_count(document, index)
-    return count // 3 if primitive.get("mode", _TRIANGLES) == _TRIANGLES else max(count - 2, 0)
+    return count // 3 if mode == _TRIANGLES else max(count - 2, 0)
 
 
 def _read_primitive(document: Document, primitive: dict[str, Any]) -> _Geometry:

@@ -146,6 +146,56 @@ def test_sparse_accessors_change_what_they_name(tmp_path, write_glb):
     np.testing.assert_array_equal(one(path).vertices, expected[FACES])
 
 
+@pytest.mark.parametrize(
+    ("kind", "where"), [(5120, np.array([-1], np.int8)), (5126, np.array([1], np.float32))]
+)
+def test_sparse_indices_are_unsigned(tmp_path, write_glb, kind, where):
+    tree = mesh()
+    accessors = [
+        {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 4},
+        {"bufferView": 1, "componentType": 5123, "type": "SCALAR", "count": 6},
+    ]
+    accessors[0]["sparse"] = {
+        "count": 1,
+        "indices": {"bufferView": 2, "componentType": kind},
+        "values": {"bufferView": 3},
+    }
+    blobs = [POSITIONS, FACES, where, np.array([[1, 5, 0]], np.float32)]
+    path = write_glb(tmp_path / "s.glb", tree | {"accessors": accessors}, blobs)
+    with pytest.raises(TronError, match="indices that are not whole numbers"):
+        read(path)
+
+
+def test_points_are_no_triangles(tmp_path, write_glb):
+    """A cloud of more points than triangles are allowed is left out, as a small one is."""
+    tree = mesh()
+    tree["meshes"][0]["primitives"].append({"attributes": {"POSITION": 2}, "mode": 0})
+    points = generator(0, "cloud").normal(size=(5000, 3)).astype(np.float32)
+    assert len(one(write_glb(tmp_path / "p.glb", tree, [POSITIONS, FACES, points])).faces) == 2
+
+
+@pytest.mark.parametrize(
+    "material",
+    [
+        {"pbrMetallicRoughness": {"roughnessFactor": float("nan")}},
+        {"pbrMetallicRoughness": {"metallicFactor": float("inf")}},
+        {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1]}},
+        {"extensions": {"KHR_materials_pbrSpecularGlossiness": {"glossinessFactor": float("nan")}}},
+        {"alphaMode": "MASK", "alphaCutoff": float("nan")},
+    ],
+)
+def test_factors_that_are_no_numbers_are_refused(tmp_path, write_glb, material):
+    with pytest.raises(TronError, match=r"finite.*n\.glb"):
+        load_model(write_glb(tmp_path / "n.glb", card(material), CARD))
+
+
+def test_factors_are_clamped(tmp_path, write_glb):
+    factors = {"roughnessFactor": 1.5, "metallicFactor": -0.1, "baseColorFactor": [2, 0.5, -1, 1]}
+    part = one(write_glb(tmp_path / "f.glb", card({"pbrMetallicRoughness": factors}), CARD))
+    assert (part.roughness, part.metallic) == (1.0, 0.0)
+    np.testing.assert_array_equal(part.base_color, (1, 0.5, 0))
+
+
 def test_quantised_and_interleaved_attributes_are_what_they_stand_for(tmp_path, write_glb):
     rows = np.zeros(4, [("position", "<i2", 4), ("uv", "<u1", 4)])
     rows["position"][:, :3] = POSITIONS * 16000
