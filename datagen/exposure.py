@@ -18,7 +18,8 @@ MOST_STOPS = 6
 def metered(frame: np.ndarray, foreground: np.ndarray, exposure: float) -> float:
     """Exposure at which a frame's median is GREY, no lower than the light's own.
 
-    Rooms are darker than what lights them: exposed for the sky, all of them would be black.
+    Rooms are darker than what lights them: exposed for the sky, all of them would be black. Pixels that are
+    not finite do not count: their clip is set aside by name, and needs an exposure until then.
 
     Args:
         frame: (H, W, 3) linear radiance.
@@ -26,6 +27,7 @@ def metered(frame: np.ndarray, foreground: np.ndarray, exposure: float) -> float
         exposure: of the light (:meth:`tron.shading.environment.EnvironmentMap.exposure`).
     """
     seen = luminance(frame[foreground]) * exposure
+    seen = seen[np.isfinite(seen)]
     middle = float(np.median(seen)) if seen.size else GREY
     stops = np.log2(GREY / max(middle, 1e-12))
     return exposure * 2.0 ** (np.floor(np.clip(stops, 0.0, MOST_STOPS) * THIRDS) / THIRDS)

@@ -6,6 +6,7 @@ The file has no name, so that nothing is left of it however the process ends.
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -44,7 +45,8 @@ class Spool:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        with contextlib.suppress(OSError):  # what did not fit is written once more, for nobody
+            self._file.close()
 
     def add(self, clip: int, frame: Frame) -> None:
         """Append a frame to clip number ``clip``; half floats are rounded as a shard rounds them.
@@ -58,6 +60,7 @@ class Spool:
             places[name] = _Place(self._file.tell(), image.dtype, image.shape)
             try:
                 self._file.write(image.data)
+                self._file.flush()  # else a full disk is found out when frames are read
             except OSError as error:
                 mend = "free some space, or choose another output_dir"
                 raise TronError(f"frames cannot be held: {error.strerror}", self._folder, mend) from error

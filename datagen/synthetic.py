@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -147,11 +147,11 @@ def _moment(
     geometry: Geometry,
     tracer: SurfelTracer,
     transport: BounceTransport | None,
-    group: Sequence[int],
+    maps: Mapping[int, EnvironmentMap],
     settings: Settings,
     time: float,
 ) -> _Moment:
-    """The scene at a time from 0 to 1; moves the geometry."""
+    """The scene at a time from 0 to 1 under the lights of these numbers; moves the geometry."""
     recipe = settings.split(spec.split)
     if spec.motion is not None:
         which = tracer.scene.object_id == _move(spec, geometry, time)
@@ -159,7 +159,7 @@ def _moment(
             pose = spec.motion.pose(spec.objects[spec.motion.object], time)
             tracer = tracer.moved(moved(tracer.scene, which, *pose))
             transport = _transport(spec, tracer, settings.estimation(spec.split))
-    lights = [_prepare(spec, transport, number, settings, time) for number in group]
+    lights = [_prepare(spec, transport, number, map_, settings, time) for number, map_ in maps.items()]
     together = spec.cameras.shared
     if together and not recipe.reference_buffers:
         scenes = [geometry.lit()]
@@ -186,14 +186,18 @@ def _film(
     recipe, estimation = settings.split(spec.split), settings.estimation(spec.split)
     cameras = spec.clip(group[0], recipe.frames, recipe.width, recipe.height)
     still = spec.motion is None and not any(spec.turns_deg)
-    now = _moment(spec, geometry, tracer, transport, group, settings, 0.0)
+    maps = {
+        number: spec.lights[number].bake(settings.environment_height, settings.environments)
+        for number in group
+    }
+    now = _moment(spec, geometry, tracer, transport, maps, settings, 0.0)
     first = now.lights
     finer = estimation.model_copy(update={"supersample": 2})
     mirrored = finer.model_copy(update={"reflections": REFERENCE_REFLECTIONS})
     for i, camera in enumerate(cameras):
         if i and not still:
             time = i / (len(cameras) - 1)
-            now = _moment(spec, geometry, tracer, transport, group, settings, time)
+            now = _moment(spec, geometry, tracer, transport, maps, settings, time)
         bounces = [light.bounce for light in now.lights]
         (truth,) = gbuffers(geometry, [camera])
         spp, seed = recipe.path_spp, first[0].seeds["path"][i]
@@ -229,11 +233,11 @@ def _prepare(
     spec: SceneSpec,
     transport: BounceTransport | None,
     number: int,
+    environment: EnvironmentMap,
     settings: Settings,
     time: float,
 ) -> _Lit:
     recipe, shared = settings.split(spec.split), spec.cameras.shared
-    environment = spec.lights[number].bake(settings.environment_height, settings.environments)
     if spec.turns_deg:
         environment = environment.rotated(spec.turns_deg[number] * time)
     if shared:  # lights that are traced together have texels at the same places

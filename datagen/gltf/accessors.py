@@ -33,15 +33,12 @@ def read_raw(document: Document, index: Any) -> np.ndarray:
     changed, where, what = sparse["count"], sparse["indices"], sparse["values"]
     if not isinstance(changed, int) or not 0 <= changed <= count:
         raise TronError(f"model's sparse accessor {index} changes more than it holds", document.path)
-    places = _array(
-        document,
-        where["bufferView"],
-        where.get("byteOffset", 0),
-        changed,
-        1,
-        _KINDS[where["componentType"]],
-        None,
-    )
+    whole = _KINDS.get(where["componentType"], "")
+    if "u" not in whole:
+        raise TronError(
+            f"model's sparse accessor {index} has indices that are not whole numbers", document.path
+        )
+    places = _array(document, where["bufferView"], where.get("byteOffset", 0), changed, 1, whole, None)
     if changed and int(places.max()) >= count:
         raise TronError(f"model's sparse accessor {index} changes what it does not hold", document.path)
     values = values.copy()

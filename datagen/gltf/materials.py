@@ -95,9 +95,9 @@ class Materials:
         if mode == "OPAQUE":
             result.alpha = None
         elif mode == "MASK":
-            result.cutoff = float(material.get("alphaCutoff", 0.5))
+            result.cutoff = _finite(material.get("alphaCutoff", 0.5))
         if (use := read.use(material.get("normalTexture"))) is not None:
-            scale = float(material["normalTexture"].get("scale", 1.0))
+            scale = _finite(material["normalTexture"].get("scale", 1.0))
             result.normal_map = scaled_normals(self.image(use.image), scale)
             result.uses["normal_map"] = use
         return result
@@ -185,8 +185,8 @@ def metallic_of(
 
 def _from_metallic(read: _Reader, pbr: dict[str, Any], unlit: bool = False) -> Material:
     result = _colored(read, pbr.get("baseColorFactor"), pbr.get("baseColorTexture"))
-    result.roughness = 1.0 if unlit else float(pbr.get("roughnessFactor", 1.0))
-    result.metallic = 0.0 if unlit else float(pbr.get("metallicFactor", 1.0))
+    result.roughness = 1.0 if unlit else float(_factor(pbr.get("roughnessFactor", 1.0), ()))
+    result.metallic = 0.0 if unlit else float(_factor(pbr.get("metallicFactor", 1.0), ()))
     use = None if unlit else read.use(pbr.get("metallicRoughnessTexture"))
     if use is not None:
         packed = read.image(use)
@@ -198,8 +198,8 @@ def _from_metallic(read: _Reader, pbr: dict[str, Any], unlit: bool = False) -> M
 
 def _from_specular(read: _Reader, glossy: dict[str, Any]) -> Material:
     result = _colored(read, glossy.get("diffuseFactor"), glossy.get("diffuseTexture"))
-    specular = np.asarray(glossy.get("specularFactor", (1.0, 1.0, 1.0)), np.float64)
-    shine = np.asarray(glossy.get("glossinessFactor", 1.0), np.float64)
+    specular = _factor(glossy.get("specularFactor", (1.0, 1.0, 1.0)), (3,))
+    shine = _factor(glossy.get("glossinessFactor", 1.0), ())
     use = read.use(glossy.get("specularGlossinessTexture"))
     if use is not None:
         packed = read.image(use)
@@ -243,9 +243,7 @@ def _resized(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 def _colored(read: _Reader, factor: Any, info: dict[str, Any] | None) -> Material:
     """Material with its base color and alpha."""
-    factor = np.asarray((1.0, 1.0, 1.0, 1.0) if factor is None else factor, np.float64)
-    if factor.shape != (4,) or not np.isfinite(factor).all():
-        raise TronError("model has a colour factor that is not four numbers")
+    factor = _factor((1.0, 1.0, 1.0, 1.0) if factor is None else factor, (4,))
     use = read.use(info)
     if use is None:
         return Material(factor[:3].astype(np.float32), np.full((1, 1), factor[3]))
@@ -256,6 +254,22 @@ def _colored(read: _Reader, factor: Any, info: dict[str, Any] | None) -> Materia
     )
     color = table[image[..., :3]] * factor[:3].astype(np.float32)
     return Material(color, alpha, uses={"base_color": use})
+
+
+def _factor(value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """A factor as float64; what lies outside of [0, 1], as some exporters write it, is clamped."""
+    factor = np.asarray(value, np.float64)
+    if factor.shape != shape or not np.isfinite(factor).all():
+        wanted = f"{shape[0]} finite numbers" if shape else "a finite number"
+        raise TronError(f"model has a factor that is not {wanted}")
+    return np.clip(factor, 0.0, 1.0)
+
+
+def _finite(value: Any) -> float:
+    number = float(value)
+    if not np.isfinite(number):
+        raise TronError("model has a material with a number that is not finite")
+    return number
 
 
 def _source(texture: dict[str, Any]) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from tron.errors import TronError
 
 MOST_NODES = 20_000
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_SURFACES = (_TRIANGLES, _STRIP, _FAN)
 
 
 @dataclass
@@ -44,7 +45,7 @@ def read_parts(path: Path, most_triangles: int) -> list[Part]:
     primitives: dict[tuple[int, int], tuple[tuple[Any, ...], Part]] = {}
     for mesh, matrix in instances:
         for number, primitive in enumerate(document.item("meshes", mesh)["primitives"]):
-            if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
+            if primitive.get("mode", _TRIANGLES) not in _SURFACES:
                 continue  # points and lines have no surface
             if (mesh, number) not in primitives:
                 geometry = _read_primitive(document, primitive)
@@ -55,7 +56,7 @@ def read_parts(path: Path, most_triangles: int) -> list[Part]:
                 primitives[mesh, number] = key, part
             key, part = primitives[mesh, number]
             groups.setdefault(key, []).append(part.transformed(matrix))
-    return [joined(parts) for parts in groups.values()]
+    return [_without_even_tint(joined(parts)) for parts in groups.values()]
 
 
 def _instances(document: Document) -> list[tuple[int, np.ndarray]]:
@@ -113,10 +114,13 @@ def _require_few(document: Document, instances: list[tuple[int, np.ndarray]], mo
 
 
 def _triangles(document: Document, primitive: dict[str, Any]) -> int:
+    mode = primitive.get("mode", _TRIANGLES)
+    if mode not in _SURFACES:
+        return 0
     indexed = "indices" in primitive
     index = primitive["indices"] if indexed else primitive["attributes"].get("POSITION")
     count = element_count(document, index)
-    return count // 3 if primitive.get("mode", _TRIANGLES) == _TRIANGLES else max(count - 2, 0)
+    return count // 3 if mode == _TRIANGLES else max(count - 2, 0)
 
 
 def _read_primitive(document: Document, primitive: dict[str, Any]) -> _Geometry:
@@ -186,8 +190,6 @@ def _part(geometry: _Geometry, material: Material) -> Part:
         tint = np.clip(color[:, :3], 0.0, 1.0).astype(np.float32)
         if base.ndim == 1:
             base, tint = (base * tint).astype(np.float32), None
-        elif (tint == tint[:1]).all():
-            base, tint = base * tint[0], None
     part = Part(
         vertices=attributes["POSITION"],
         normals=_normals(geometry),
@@ -204,6 +206,17 @@ def _part(geometry: _Geometry, material: Material) -> Part:
         vertex_alpha = color[:, 3] if color is not None and color.shape[1] == 4 else None
         part = without_clear(part, material.alpha, material.cutoff, vertex_alpha)
     return part
+
+
+def _without_even_tint(part: Part) -> Part:
+    """The part with a tint that is one colour everywhere multiplied into its image.
+
+    Only after parts are joined: primitives of one material may differ in their colours.
+    """
+    tint = part.tint
+    if tint is None or not len(tint) or np.ptp(tint, axis=0).max() > 1e-6:
+        return part
+    return replace(part, base_color=part.base_color * tint[0], tint=None)
 
 
 def _normals(geometry: _Geometry) -> np.ndarray:

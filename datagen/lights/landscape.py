@@ -84,7 +84,8 @@ class LandscapeSpec(Light):
             house, across, tone = houses(ridge, azimuth)
             turn = np.radians(140.0) * (tone - 0.5)  # fronts that do not all face us
             cos, sin = np.cos(turn), np.sin(turn)
-            facing = -level @ sun * cos + np.cross(level[:, :2], sun[:2]) * sin
+            aside = level[:, 0] * sun[1] - level[:, 1] * sun[0]
+            facing = -level @ sun * cos + aside * sin
             texture = 0.8 + 0.4 * fractal(around * 1.5, 4)
             colour = np.asarray(ridge.albedo) * (0.5 + tone[:, None])
         else:

@@ -134,6 +134,7 @@ def _factor(hits: Hits, place: np.ndarray, facing: np.ndarray, area: np.float32)
     squared = np.einsum("ij,ij->i", to, to)
     here = np.maximum(np.einsum("ij,ij->i", to, hits.normals), 0)
     there = np.maximum(-(to @ facing), 0)
+    squared = np.maximum(squared, np.float32(1e-12))  # a point of the patch itself
     return area * here * there / (squared * (squared + area / np.float32(np.pi)))
 
 

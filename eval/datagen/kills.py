@@ -11,7 +11,7 @@ from pathlib import Path
 
 import psutil
 
-from eval.datagen.runs import differences, family, make, running, tree
+from eval.datagen.runs import differences, family, make, require_success, running, tree
 from eval.results import Row
 from tron.errors import TronError
 from tron.report.page import Cell, Section, Table
@@ -110,10 +110,15 @@ def measure_kills(recipe: Sequence[str], count: int, seed: int, folder: Path) ->
 
 
 def _kill(arguments: Sequence[str], output: Path, seconds: float, victim: str) -> float | None:
-    """Run for so many seconds, then kill; how long workers outlived it, None where it was finished before."""
+    """Run for so many seconds, then kill; how long workers outlived it, None where it was finished before.
+
+    Raises:
+        StageFailed: it failed before it was killed.
+        TronError: a worker outlives its command.
+    """
     with running(arguments, output) as process:
         try:
-            process.wait(seconds)
+            require_success(process.wait(seconds), arguments, output)
             return None
         except subprocess.TimeoutExpired:
             pass

@@ -88,10 +88,15 @@ def make(
                 if watch is not None:
                     watch(seen)
     seconds = time.perf_counter() - begun
+    require_success(code, arguments, output)
+    return seconds
+
+
+def require_success(code: int, arguments: Sequence[str], output: Path) -> None:
+    """Raise StageFailed, with the last line of its log, for a run that ended with another code than 0."""
     if code:
         words = output.with_suffix(".log").read_text(errors="replace").splitlines()[-1:]
         raise StageFailed(" ".join([SCRIPT, *arguments, f"output_dir={output}"]), code, " ".join(words))
-    return seconds
 
 
 def scene_times(output: Path) -> list[SceneTime]:

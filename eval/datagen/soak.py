@@ -44,7 +44,11 @@ class Soak:
         low, high = (self.scenes * k / PARTS for k in (part, part + 1))
         inside = [mb for done, mb in self.samples if low <= done < high]
         if not inside:
-            raise TronError(f"{self.scenes} scenes are over before memory is sampled", "benchmark.soak")
+            raise TronError(
+                f"{self.scenes} scenes are over before memory is sampled",
+                "benchmark.soak_scenes",
+                "make more of them",
+            )
         return max(inside)
 
     def rows(self, seed: int) -> Iterator[Row]:  # noqa: ARG002

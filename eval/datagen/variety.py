@@ -230,8 +230,7 @@ def _make_judges(
         log.warning("no assets and hdri in %s: nothing is judged by real models", data)
         return []
     data = data.absolute()
-    models = sorted(path.stem for path in (data / "assets").rglob("*") if path.suffix in MODEL_FILES)
-    maps = sorted(path.stem for path in (data / "hdri").iterdir() if path.suffix in MAP_FILES)
+    models, maps = _stems(data / "assets", MODEL_FILES), _stems(data / "hdri", MAP_FILES)
     common = [*settings.judge, f"assets={data / 'assets'}", f"environments={data / 'hdri'}"]
     common.append(f"allow_unlicensed=[{','.join((*models, *maps))}]")
     wanted = [
@@ -250,6 +249,11 @@ def _make_judges(
     for first in range(0, len(names), SIDE_BY_SIDE):
         _make_together(stages, [children[name] for name in names[first : first + SIDE_BY_SIDE]], found)
     return [(judge, folder / name) for judge, name, _ in wanted if name not in found.left_out]
+
+
+def _stems(folder: Path, suffixes: Sequence[str]) -> list[str]:
+    """Names of a folder's files as tron-datagen finds them: with its subfolders, suffixes in any case."""
+    return sorted(path.stem for path in folder.rglob("*") if path.suffix.lower() in suffixes)
 
 
 def _make_together(stages: Stages, children: Sequence[Child], found: Variety) -> None:

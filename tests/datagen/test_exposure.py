@@ -25,3 +25,12 @@ def test_only_surfaces_count():
     frame[:, 1:], seen[:, 1:] = 5.0, False
     assert metered(frame, seen, 1.0) > 2
     assert metered(frame, np.zeros((4, 4), bool), 1.0) == 1.0
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_pixel_that_is_not_finite_does_not_count(bad):
+    frame = np.full((4, 4, 3), 0.01)
+    expected = metered(frame, SEEN, 1.0)
+    frame[1, 2] = bad
+    assert metered(frame, SEEN, 1.0) == expected
+    assert metered(np.full((4, 4, 3), bad), SEEN, 1.3) == 1.3

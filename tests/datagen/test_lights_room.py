@@ -4,7 +4,19 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from datagen.lights.room import Box, Bulb, Hits, Rectangle, bounced, bulbs_light, cast, direct, glazed, sunlit
+from datagen.lights.room import (
+    FEW,
+    Box,
+    Bulb,
+    Hits,
+    Rectangle,
+    bounced,
+    bulbs_light,
+    cast,
+    direct,
+    glazed,
+    sunlit,
+)
 from tron.seeds import generator
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -53,6 +65,12 @@ def test_a_ceiling_panel_lights_the_floor_below_its_corner_by_the_form_factor():
     found = direct(at((2.0, 1.5, 0.0), (0, 0, 1)), (panel,), SIZE)
     np.testing.assert_allclose(found[0], np.pi * 2.0 * factor, rtol=0.01)
     assert direct(at((2.0, 1.5, 0.0), (0, 0, -1)), (panel,), SIZE).max() == 0.0
+
+
+def test_a_panel_does_not_light_the_point_in_its_middle():
+    panel = Rectangle(face=5, low=(2.0, 1.0), high=(3.0, 2.0), radiance=(2.0, 2.0, 2.0))
+    found = direct(at((2.5, 1.5, 3.0), (0, 0, -1)), (panel,) * (FEW + 1), SIZE)
+    np.testing.assert_array_equal(found, 0.0)
 
 
 def test_a_bulb_lights_by_the_inverse_square_and_the_cosine():

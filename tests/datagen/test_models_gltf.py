@@ -146,6 +146,56 @@ def test_sparse_accessors_change_what_they_name(tmp_path, write_glb):
     np.testing.assert_array_equal(one(path).vertices, expected[FACES])
 
 
+@pytest.mark.parametrize(
+    ("kind", "where"), [(5120, np.array([-1], np.int8)), (5126, np.array([1], np.float32))]
+)
+def test_sparse_indices_are_unsigned(tmp_path, write_glb, kind, where):
+    tree = mesh()
+    accessors = [
+        {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 4},
+        {"bufferView": 1, "componentType": 5123, "type": "SCALAR", "count": 6},
+    ]
+    accessors[0]["sparse"] = {
+        "count": 1,
+        "indices": {"bufferView": 2, "componentType": kind},
+        "values": {"bufferView": 3},
+    }
+    blobs = [POSITIONS, FACES, where, np.array([[1, 5, 0]], np.float32)]
+    path = write_glb(tmp_path / "s.glb", tree | {"accessors": accessors}, blobs)
+    with pytest.raises(TronError, match="indices that are not whole numbers"):
+        read(path)
+
+
+def test_points_are_no_triangles(tmp_path, write_glb):
+    """A cloud of more points than triangles are allowed is left out, as a small one is."""
+    tree = mesh()
+    tree["meshes"][0]["primitives"].append({"attributes": {"POSITION": 2}, "mode": 0})
+    points = generator(0, "cloud").normal(size=(5000, 3)).astype(np.float32)
+    assert len(one(write_glb(tmp_path / "p.glb", tree, [POSITIONS, FACES, points])).faces) == 2
+
+
+@pytest.mark.parametrize(
+    "material",
+    [
+        {"pbrMetallicRoughness": {"roughnessFactor": float("nan")}},
+        {"pbrMetallicRoughness": {"metallicFactor": float("inf")}},
+        {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1]}},
+        {"extensions": {"KHR_materials_pbrSpecularGlossiness": {"glossinessFactor": float("nan")}}},
+        {"alphaMode": "MASK", "alphaCutoff": float("nan")},
+    ],
+)
+def test_factors_that_are_no_numbers_are_refused(tmp_path, write_glb, material):
+    with pytest.raises(TronError, match=r"finite.*n\.glb"):
+        load_model(write_glb(tmp_path / "n.glb", card(material), CARD))
+
+
+def test_factors_are_clamped(tmp_path, write_glb):
+    factors = {"roughnessFactor": 1.5, "metallicFactor": -0.1, "baseColorFactor": [2, 0.5, -1, 1]}
+    part = one(write_glb(tmp_path / "f.glb", card({"pbrMetallicRoughness": factors}), CARD))
+    assert (part.roughness, part.metallic) == (1.0, 0.0)
+    np.testing.assert_array_equal(part.base_color, (1, 0.5, 0))
+
+
 def test_quantised_and_interleaved_attributes_are_what_they_stand_for(tmp_path, write_glb):
     rows = np.zeros(4, [("position", "<i2", 4), ("uv", "<u1", 4)])
     rows["position"][:, :3] = POSITIONS * 16000
@@ -314,6 +364,19 @@ def test_vertex_colours_multiply(tmp_path, write_glb, quarters):
     part = one(write_glb(tmp_path / "c.glb", tree, [*CARD, even, data]))
     assert part.tint is None, "one colour for all is a factor"
     np.testing.assert_allclose(part.base_color, srgb_to_linear(quarters / 255) * 128 / 255, atol=1e-6)
+
+
+def test_primitives_of_one_material_keep_colours_of_their_own(tmp_path, write_glb, quarters):
+    """Each primitive is of one colour: not a factor of the material's, for the other has another."""
+    red, green = (np.tile(np.array(c, np.float32), (4, 1)) for c in ([1, 0, 0], [0, 0.5, 0]))
+    data = encoded(quarters)
+    material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    tree = card(material, {"COLOR_0": 4}, **textured(data, first=6))
+    first = tree["meshes"][0]["primitives"][0]
+    tree["meshes"][0]["primitives"].append(first | {"attributes": first["attributes"] | {"COLOR_0": 5}})
+    part = one(write_glb(tmp_path / "c.glb", tree, [*CARD, red, green, data]))
+    np.testing.assert_array_equal(part.tint, np.concatenate([red, green]))
+    np.testing.assert_allclose(part.base_color, srgb_to_linear(quarters / 255), atol=1e-6)
 
 
 def test_the_scale_of_a_normal_map_multiplies_x_and_y(tmp_path, write_glb):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from datagen.build import FIRST_ID, build
+from datagen.lights import Light
 from datagen.motion import STILL, Share, draw_motion
 from datagen.pathtrace import render_frames
 from datagen.scene import draw_scene
@@ -116,6 +117,23 @@ def test_the_truth_shows_the_object_rise_and_guidance_follows_it(filmed):
         assert min(errors) > 20
         assert meta.extra["moving_object"]
         assert meta.extra["turn_deg"] in spec.turns_deg
+
+
+def test_a_light_is_baked_once_a_clip_however_it_turns(variant, tmp_path, monkeypatch):
+    spec, wanted = drawn(Share(lights=1.0), True), settings(tmp_path, width=8, height=8, path_spp=4)
+    geometry = build(spec, edge=0.3)
+    surfels, _ = make_surfels(spec, geometry, wanted)
+    baked = []
+
+    def count(light, *size):
+        baked.append(light.family)
+        return bake(light, *size)
+
+    bake = Light.bake
+    monkeypatch.setattr(Light, "bake", count)
+    clips = [list(frames) for _, frames in make_clips(spec, geometry, surfels, wanted)]
+    assert [len(frames) for frames in clips] == [3, 3]
+    assert baked == ["studio", "overcast"]
 
 
 @pytest.mark.parametrize("shared", [True, False])

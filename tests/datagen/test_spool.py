@@ -1,5 +1,8 @@
 """Frames that wait on disk come back as a shard would have stored them."""
 
+import resource
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -56,12 +59,15 @@ def test_values_that_are_not_finite_are_still_found(tmp_path):
         assert first_bad_value(spool.clip(0)) == "frame 0: rgb has 3 values that are not finite"
 
 
-def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
-    with Spool(tmp_path, clips=1) as spool:
-
-        def full(_data: object) -> int:
-            raise OSError(28, "No space left on device")
-
-        monkeypatch.setattr(spool._file, "write", full)
-        with pytest.raises(TronError, match="No space left on device"):
-            spool.add(0, frame(0))
+@pytest.mark.parametrize("scale", [1, 20], ids=["in the buffer", "past it"])
+def test_a_full_disk_is_one_line(tmp_path: Path, scale: int):
+    """A file that may not grow stands for the disk, for frames that a buffer holds and for large ones."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        said = pytest.raises(TronError, match="frames cannot be held: File too large")
+        with said, Spool(tmp_path, clips=1) as spool:
+            for _ in range(200):
+                spool.add(0, {"rgb": np.ones((5 * scale, 7, 3), np.float32)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

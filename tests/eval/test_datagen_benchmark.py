@@ -34,6 +34,7 @@ from eval.datagen.variety import (
 )
 from eval.datagen.workers import Workers
 from eval.results import Results, Row
+from eval.stages import StageFailed
 from tron.cameras import Camera
 from tron.errors import TronError
 from tron.gaussians import GaussianScene
@@ -236,8 +237,7 @@ def test_frames_an_hour_leave_out_the_scene_that_compiles():
 def test_a_kill_reaches_what_the_command_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A stand-in starts a process that lives on by itself: killed with it, or found to outlive it."""
     script = tmp_path / "tron-datagen"
-    body = "import subprocess, sys, time\nsubprocess.Popen(['sleep', '20'])\ntime.sleep(20)\n"
-    script.write_text(f"#!{sys.executable}\n{body}")
+    script.write_text("#!/bin/sh\nsleep 20 &\nexec sleep 20\n")
     script.chmod(0o755)
     monkeypatch.setattr(runs, "script_path", lambda name: str(script))
     outlived = kills._kill([], tmp_path / "out", 1.0, "everything")
@@ -246,8 +246,11 @@ def test_a_kill_reaches_what_the_command_started(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(kills, "ORPHAN_SECONDS", 0.5)
     with pytest.raises(TronError, match="1 workers outlive their command"):
         kills._kill([], tmp_path / "out", 1.0, "command")
-    script.write_text(f"#!{sys.executable}\n")
+    script.write_text("#!/bin/sh\n")
     assert kills._kill([], tmp_path / "out", 10.0, "command") is None, "it was over before"
+    script.write_text("#!/bin/sh\necho the disk is full\nexit 1\n")
+    with pytest.raises(StageFailed, match="exit code 1: the disk is full"):
+        kills._kill([], tmp_path / "out", 10.0, "command")
 
 
 def test_memory_is_that_of_all_processes():
@@ -351,8 +354,11 @@ def shared(tmp_path: Path) -> Callable[[], Path]:
         for name in ("broken", "cube"):
             (tmp_path / "data" / "assets" / name).mkdir(parents=True, exist_ok=True)
             (tmp_path / "data" / "assets" / name / f"{name}.obj").touch()
-        (tmp_path / "data" / "hdri").mkdir(exist_ok=True)
-        write_image(tmp_path / "data" / "hdri" / "dusk.hdr", np.ones((4, 8, 3), np.float32))
+        (tmp_path / "data" / "assets" / "cube" / "cube.obj").rename(
+            tmp_path / "data" / "assets" / "cube" / "cube.OBJ"
+        )
+        (tmp_path / "data" / "hdri" / "evening").mkdir(parents=True, exist_ok=True)
+        write_image(tmp_path / "data" / "hdri" / "evening" / "dusk.hdr", np.ones((4, 8, 3), np.float32))
         return tmp_path / "data"
 
     return make

@@ -33,6 +33,7 @@ BLOCK = 8
 """Texels along a side of the blocks that the Hilbert curve runs through."""
 PACKET = 4
 """Numbers that one gather reads."""
+ONE_BELOW = float(np.nextafter(np.float32(1), np.float32(0)))
 
 
 class Texel(NamedTuple):
@@ -252,6 +253,3 @@ def _invert(bounds: mi.Float, group: mi.UInt32, u: mi.Float, active: mi.Bool) ->
             low = dr.select(above, bound, low)
             high = dr.select(above, high, dr.minimum(high, bound))
     return dr.minimum(member, BLOCK - 1), dr.clip((u - low) / dr.maximum(high - low, 1e-12), 0, ONE_BELOW)
-
-
-ONE_BELOW = float(np.nextafter(np.float32(1), np.float32(0)))
