@@ -1,7 +1,9 @@
 """The user's texture sets: found by their names, refused in one line, laid on as they are."""
 
+import gc
 import json
 import re
+import weakref
 
 import numpy as np
 import pytest
@@ -110,6 +112,16 @@ def test_colours_become_linear_and_data_stay(folder):
     np.testing.assert_array_equal(image[..., 4], 0.0)
     with pytest.raises(TronError, match="is not what it was"):
         opened(spec.model_copy(update={"sha256": "0"}), folder, sets, 50.0)
+
+
+def test_a_worker_does_not_gather_the_images_of_all_its_scenes(folder):
+    sets = find_texture_sets(folder)
+    chosen = next(each for each in sets if each.asset.id == "mine")
+    spec = PhotographedSpec.draw(generator(0, "t"), "mine", chosen.asset.sha256)
+    # Every scene wants a size of its own.
+    seen = [weakref.ref(opened(spec, folder, sets, density).image) for density in range(1, 30)]
+    gc.collect()
+    assert sum(image() is not None for image in seen) <= 4
 
 
 def test_a_checkerboard_lies_on_a_box_as_it_should():
