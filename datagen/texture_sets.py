@@ -45,7 +45,7 @@ RELIEF = 0.03
 """Height from black to white, in widths of the image, of a set with a height map and without normals."""
 
 SETS_KEPT = 4
-"""Images kept for the next piece: one of a thousand pixels a side takes 24 MB, and scenes want other sizes."""
+"""Images kept for the next piece: a thousand pixels a side take 24 MB, and scenes want sizes of their own."""
 
 PLAIN_ROUGHNESS = 0.7
 """Roughness of a set that has none."""
