@@ -19,6 +19,9 @@ FINEST = 4.0
 MOST_PIECES = 200_000
 """Triangles that a part is cut into at most; then those not yet cut stay or go whole."""
 
+LEVELS = 16
+"""Steps of the vertices' factor from 0 to 1 that triangles are told apart by: each has a mask of its own."""
+
 LARGEST_MASK = 1024
 """Rows and columns of the mask: a finer alpha is averaged."""
 
@@ -43,10 +46,15 @@ def without_clear(part: Part, alpha: np.ndarray, cutoff: float, vertex_alpha: np
     matrix, wrap = part.sampling.get("base_color", Sampling(np.eye(3), "repeat"))
     at = part.uv.astype(np.float64) @ matrix[:2, :2].T + matrix[:2, 2]
     mixed = part.faces[~whole & ~clear]
-    # A factor that varies over vertices is rare: those triangles are judged by its mean.
-    mask = _Mask(alpha >= cutoff / max(float(factor.max()), 1e-6), wrap)
-    weights = _cut(mask, at[mixed])
-    return _with_pieces(part, part.faces[whole], mixed, weights)
+    factor = factor[~whole & ~clear]
+    levels = np.round(factor * LEVELS)
+    pieces = []
+    for level in np.unique(levels):
+        own = np.flatnonzero(levels == level)
+        mask = _Mask(alpha >= cutoff / float(factor[own].mean()), wrap)
+        budget = MOST_PIECES * len(own) // len(mixed)
+        pieces += [(own[owner], weights) for owner, weights in _cut(mask, at[mixed[own]], budget)]
+    return _with_pieces(part, part.faces[whole], mixed, pieces)
 
 
 class _Mask:
@@ -90,8 +98,8 @@ class _Mask:
         return self.image[y, x] > 0
 
 
-def _cut(mask: _Mask, corners: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Opaque pieces of triangles (F, 3, 2).
+def _cut(mask: _Mask, corners: np.ndarray, most: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Opaque pieces of triangles (F, 3, 2), about ``most`` of them at the most.
 
     Returns:
         for each round: (N,) triangle that a piece is of, and (N, 3, 3) its corners' barycentric coordinates.
@@ -106,7 +114,7 @@ def _cut(mask: _Mask, corners: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]
         texels = np.abs(now - np.roll(now, 1, axis=1)).max(axis=(1, 2)) * mask.scale.max()
         mixed = (opaque > 0) & ~full
         last = mixed & (texels <= FINEST)
-        if pieces + full.sum() + 4 * mixed.sum() > MOST_PIECES:
+        if pieces + full.sum() + 4 * mixed.sum() > most:
             last = mixed
         centre = now.mean(axis=1, keepdims=True)
         points = np.concatenate([centre, 0.5 * (now + centre)], axis=1)

@@ -1,7 +1,7 @@
 """Charts: a mesh falls into parts that are seen whole from one side, and each is laid flat by looking at it.
 
-A chart's map is piecewise affine, continuous within the chart, and stretches nowhere by more than the root of
-three. No seam needs a search: neighbours in the plane are neighbours on the surface, and what folds over
+A chart's map is piecewise affine, continuous within the chart, and shortens nowhere to less than
+half. No seam needs a search: neighbours in the plane are neighbours on the surface, and what folds over
 itself is divided.
 """
 

@@ -67,7 +67,7 @@ class Body:
     """A thing that falls.
 
     Attributes:
-        pieces: meshes in the object's frame; the convex hull of each collides.
+        pieces: meshes in the object's frame; the convex hull of each collides. A flat one is a thin board.
         upright: it turns about z only and never tips over.
     """
 
@@ -82,7 +82,10 @@ class Body:
         hulls = []
         for piece in self.pieces:
             # Rounded first: which of two equally far points a hull keeps must not hang on a last bit.
-            points = np.unique(np.round(np.asarray(piece.convex_hull.vertices) / grid), axis=0) * grid
+            vertices = np.asarray(
+                piece.vertices if _is_flat(piece.vertices, grid) else piece.convex_hull.vertices
+            )
+            points = _thick(np.unique(np.round(vertices / grid), axis=0) * grid, grid)
             hulls.append(np.asarray(support_hull(Trimesh(points).convex_hull).vertices))
         return hulls
 
@@ -240,7 +243,7 @@ class RigidBodies:
 
     def _add_hull(self, spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, hull: np.ndarray) -> None:
         points = np.unique(np.round(hull / self.unit / HULL_GRID), axis=0) * HULL_GRID
-        mesh = spec.add_mesh(name=name, uservert=points.ravel())
+        mesh = spec.add_mesh(name=name, uservert=_thick(points, HULL_GRID).ravel())
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
         parent.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
 
@@ -291,3 +294,17 @@ class RigidBodies:
                     size[axis] = 1.0
                     place[axis] += sign * (half[axis] + 1.0)
                     spec.worldbody.add_geom(type=box, size=size, pos=place)
+
+
+def _is_flat(points: np.ndarray, grid: float) -> bool:
+    """Whether points (N, 3) lie within two grid steps of a plane."""
+    centred = points - np.mean(points, axis=0)
+    return bool(np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1][:, 0]) < 2.0 * grid)
+
+
+def _thick(points: np.ndarray, grid: float) -> np.ndarray:
+    """The points; flat ones, whose hull would enclose nothing, two grid steps to all sides of themselves."""
+    if not _is_flat(points, grid):
+        return points
+    steps = 2.0 * grid * np.concatenate([np.eye(3), -np.eye(3)])
+    return (points[:, None] + steps).reshape(-1, 3)

@@ -14,7 +14,7 @@ from datagen.texture_sets import opened
 
 
 def scene_geometry(spec: SceneSpec, settings: Settings, sources: Sources) -> Geometry:
-    """Build a scene; files are read once a process.
+    """Build a scene; models are read once a process, texture sets at the size that the scene needs.
 
     Raises:
         TronError: the scene names an asset or a texture set that is not among the sources.

@@ -44,6 +44,9 @@ _DIRECTX = {"dx", "directx", "normaldx"}
 RELIEF = 0.03
 """Height from black to white, in widths of the image, of a set with a height map and without normals."""
 
+SETS_KEPT = 4
+"""Images kept for the next piece: a thousand pixels a side take 24 MB, and scenes want sizes of their own."""
+
 PLAIN_ROUGHNESS = 0.7
 """Roughness of a set that has none."""
 
@@ -71,7 +74,7 @@ class TextureSet:
     """Images that belong together.
 
     Attributes:
-        asset: its id, place, licence, and the hash of its files' hashes.
+        asset: its id, place, licence, and the hash of its files' hashes in order of their kinds.
         maps: (kind, path relative to the folder) of each image.
         directx: whether the normal map's y points down.
         role: what it is made of by its name; ``any`` where that does not say.
@@ -154,7 +157,7 @@ def opened(
     return Photographed(spec, _image(str(folder), found, int(np.ceil(spec.repeat * texels_per_unit))))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=SETS_KEPT)
 def _image(folder: str, found: TextureSet, width: int) -> np.ndarray:
     """(h, w, 6) as :class:`Photographed` has it, at least ``width`` wide where the set is."""
     maps = {kind: Path(folder) / path for kind, path in found.maps}

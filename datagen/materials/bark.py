@@ -58,7 +58,7 @@ class BarkSpec(Solid):
         if self.sort == "birch":
             band = gradient_noise(np.stack([2.0 * x, 2.0 * y, z / (0.35 * self.scale)]))
             dark = smoothstep(0.32, 0.5, band + 0.15 * fine)
-            color = mix(column(self.color) * (1.0 + 0.12 * fine), (0.045), 0.9 * dark)
+            color = mix(column(self.color) * (1.0 + 0.12 * fine), 0.045, 0.9 * dark)
             return Look(color, 0.65 + 0.2 * dark, 0.0, 0.003 * fine - 0.004 * dark)
         p = np.stack([x, y, 0.28 * z]) / self.scale
         bend = fbm(p * 0.7, 2)

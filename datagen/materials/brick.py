@@ -73,7 +73,7 @@ class BrickSpec(Solid):
         stain = fbm(points * 2.2, 3)
         shade = np.exp(self.variation * (2.0 * r[0] - 1.0)) * (1.0 + 0.18 * rough + 0.15 * stain)
         burnt = np.array([[0.55], [0.62], [0.75]], np.float32)
-        clay = column(self.clay) * shade * np.where(r[1] > 0.85, burnt, (1.0))
+        clay = column(self.clay) * shade * np.where(r[1] > 0.85, burnt, 1.0)
         mortar = column(self.mortar) * (1.0 + 0.25 * rough + 0.15 * stain)
         # A bed of mortar, and each brick a little proud of the next.
         height = solid * (0.35 * self.joint + 0.15 * self.joint * r[2]) + 0.12 * self.joint * rough

@@ -37,7 +37,7 @@ class FabricSpec(Solid):
         pattern: of the colours.
         colors: of the ground and of the figure.
         thread: distance of threads, world units.
-        twill: threads that a row of the weave is shifted by: 1 is a plain weave, 0.25 a twill.
+        twill: threads of warp that the weave shifts by from one thread of weft to the next: 1 or 0.5.
         repeat: threads after which stripes and checks repeat.
     """
 

@@ -78,7 +78,7 @@ class MetalSpec(Solid):
         rough: np.ndarray | float = self.roughness + 0.08 * cloud
         if self.finish == "brushed":
             along = np.asarray(self.grain, np.float32)
-            across = points - along[:, None] * (along @ points) * (0.97)
+            across = points - along[:, None] * (along @ points) * 0.97
             streak = 0.6 * gradient_noise(across * 34.0) + 0.4 * gradient_noise(across * 71.0 + 3.0)
             rough = rough + 0.16 * streak
             color, height = color * (1.0 + 0.1 * streak), 0.0004 * streak

@@ -27,7 +27,7 @@ class PhotographedSpec(Material):
 
     Attributes:
         texture_set: its id.
-        sha256: of its files' hashes, in order of their paths.
+        sha256: of its files' hashes, in order of what they are (albedo, ao, height, ...).
         repeat: world units that the width of its images covers.
         offset: where the images begin, world units.
     """

@@ -62,7 +62,7 @@ class RustSpec(Solid):
         edge = smoothstep(-0.2, 0.0, level) * (1.0 - eaten)
         shade = 1.0 + 0.55 * fine + 0.3 * patch
         orange = np.array([[1.7], [1.8], [1.6]], np.float32)
-        rust = column(self.rust) * shade * mix((1.0), orange, smoothstep(0.1, 0.6, fine))
+        rust = column(self.rust) * shade * mix(1.0, orange, smoothstep(0.1, 0.6, fine))
         if self.paint is None:
             under, metal = column(IRON) * (1.0 + 0.15 * patch), 1.0 - eaten
         else:

@@ -69,7 +69,7 @@ class StoneSpec(Solid):
         shade = np.where(kind < 0.15, 0.35, np.where(kind < 0.65, 0.9, 1.3)) + 0.25 * (cells.random[1] - 0.5)
         cloud = fbm(points * 1.5, 2)
         quartz = (kind > 0.8).astype(np.float32)
-        color = mix(base * shade, (0.62) * (0.8 + 0.4 * cells.random[2]), 0.7 * quartz)
+        color = mix(base * shade, 0.62 * (0.8 + 0.4 * cells.random[2]), 0.7 * quartz)
         color = color * (1.0 + 0.12 * cloud)
         return Look(
             color, self.roughness + 0.15 * (kind < 0.2) - 0.08 * quartz, 0.0, 0.0006 * cells.random[3]

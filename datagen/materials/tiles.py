@@ -107,9 +107,9 @@ class TilesSpec(Solid):
             return edge, column_of, row_of, x, y
         row = np.floor(v * 2.0) if self.layout == "subway" else np.floor(v)
         if self.layout == "subway":
-            u, height, y = u + 0.5 * (row % 2.0), (0.5), v * 2.0 - row - 0.5
+            u, height, y = u + 0.5 * (row % 2.0), 0.5, v * 2.0 - row - 0.5
         else:
-            height, y = (1.0), v - row - 0.5
+            height, y = 1.0, v - row - 0.5
         across = np.floor(u)
         x = u - across - 0.5
         return np.minimum(0.5 - np.abs(x), (0.5 - np.abs(y)) * height), across, row, x, y

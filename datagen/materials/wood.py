@@ -65,7 +65,7 @@ class WoodSpec(Solid):
         )
 
     def look(self, points: np.ndarray, normals: np.ndarray) -> Look:
-        gap, tint = (0.0), (1.0)
+        gap, tint = 0.0, 1.0
         if self.plank:
             points, gap, tint = self._planks(points, normals)
         p = turned(points, self.axis)
@@ -93,7 +93,7 @@ class WoodSpec(Solid):
     def _planks(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points moved to each plank's own place in the wood; gaps in [0, 1]; brightness of the planks."""
         u, v, side = laid(points, normals)
-        # Along the wood's own direction on floors, along the longer coordinate elsewhere.
+        # Along the wood's own direction on floors, level elsewhere.
         length = math.hypot(self.axis[0], self.axis[1])
         c, s = self.axis[0] / length, self.axis[1] / length
         down = side == 2
@@ -110,6 +110,6 @@ class WoodSpec(Solid):
         )
         gap = 1.0 - smoothstep(0.003, 0.012, edge)
         # Boards are laid along the fibres: the frame of the wood follows them.
-        p = np.stack([c * along - s * across, s * along + c * across, points[2] * (0.2)])
+        p = np.stack([c * along - s * across, s * along + c * across, points[2] * 0.2])
         moved = p + np.stack([9.0 * r[0], 9.0 * r[1], 9.0 * r[2]])
         return moved, gap, 0.75 + 0.5 * r[3]

@@ -69,8 +69,9 @@ def make_pieces(shape: ShapeSpec, edge: float = 0.05) -> list[Piece]:
     """Build a shape's pieces, their edges at most ``edge`` world units long.
 
     Together they just fit the ball of radius ``shape.size`` around the origin of the object's frame; normals
-    point outwards. Vertices are shared; :func:`split_creases` gives a mesh its shading normals. A piece has
-    at most 60,000 triangles: the edges of a large one are longer.
+    point outwards. Vertices are shared; :func:`split_creases` gives a mesh its shading normals. A piece
+    that manifold3d made (all but the primitives and the floor) has at most 60,000 triangles: the edges of a
+    large one are longer.
 
     Raises:
         TronError: no such kind, or its parameters make nothing solid.

@@ -51,7 +51,7 @@ def drilled(p: np.ndarray, _rng: np.random.Generator) -> Parts:
 
 
 def joint(p: np.ndarray, _rng: np.random.Generator) -> Parts:
-    """Pipe fitting: two to six flanged arms that meet in a ball, all hollow."""
+    """Pipe fitting: three to six flanged arms that meet in a ball, all hollow."""
     arms = [*AXES, *-AXES][: count(p[0], 3, 6)]
     radius, length = between(p[1], 0.26, 0.42), between(p[2], 0.8, 1.2)
     flange, wall = radius + between(p[3], 0.08, 0.22), 0.07
@@ -64,7 +64,7 @@ def joint(p: np.ndarray, _rng: np.random.Generator) -> Parts:
 
 
 def nut(p: np.ndarray, _rng: np.random.Generator) -> Parts:
-    """Hexagonal nut on a bolt or alone: prism, chamfer by a cone, grooved bore."""
+    """Hexagonal nut: prism, both ends chamfered by a cone, smooth bore."""
     height, bore = between(p[0], 0.6, 1.1), between(p[1], 0.45, 0.6)
     prism = Manifold.cylinder(height, 1.0, circular_segments=6)
     cone = Manifold.cylinder(height + 1.0, 1.55, 0.55 + 0.4 * p[2], circular_segments=64)
@@ -74,7 +74,7 @@ def nut(p: np.ndarray, _rng: np.random.Generator) -> Parts:
 
 
 def lantern(p: np.ndarray, _rng: np.random.Generator) -> Parts:
-    """Shell of a ball or cylinder pierced all over, open below; light falls through it in spots."""
+    """Shell of a ball, flat or tall, pierced all over, open below; light falls through it in spots."""
     rows, around = count(p[0], 3, 5), count(p[1], 8, 14)
     squat = between(p[2], 0.9, 1.4)
     shell = (Manifold.sphere(1.0, 96) - Manifold.sphere(0.92, 96)).trim_by_plane((0, 0, 1), -0.8)

@@ -100,7 +100,7 @@ def cage(p: np.ndarray, _rng: np.random.Generator) -> Parts:
 
 
 def chain(p: np.ndarray, rng: np.random.Generator) -> Parts:
-    """Links of chain laid along a curve on the ground, every other link on edge."""
+    """Links of chain laid along a curve on the ground, tilted one way and the other in turn."""
     links, wire = count(p[0], 7, 13), between(p[1], 0.1, 0.16)
     long, wide = between(p[2], 0.75, 1.0), 0.26 + wire
     turn = np.arange(48) * 2 * np.pi / 48

@@ -37,7 +37,7 @@ class Obstacles:
         self._ground = ground
 
     def leave(self, path: PathSpec, room: float, above: float) -> bool:
-        """Whether a path keeps ``room`` from every vertex of a thing and ``above`` from the ground."""
+        """Whether a path keeps ``room`` from vertices, ``above`` from the ground, half from a ceiling."""
         places = np.array([camera.position for camera in path.cameras(SAMPLES, 8, 8)])
         if self._tree is not None and self._tree.query(places)[0].min() < room:
             return False

@@ -2,6 +2,8 @@
 
 # pyright: reportArgumentType=false, reportOptionalSubscript=false
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -65,6 +67,21 @@ def test_opaque_and_clear_triangles_are_left_as_they_are():
     assert len(without_clear(card(), np.full((4, 4), 0.4), 0.5, None).faces) == 0
     kept = without_clear(card(), np.ones((1, 1)), 0.5, np.array([1.0, 0, 0, 1]))
     assert kept.faces.tolist() == [[0, 2, 3]]
+
+
+def test_each_triangle_is_cut_at_its_own_share_of_the_alpha_of_its_vertices():
+    # Alpha rises from left to right; halved, it is opaque only where it was 1 before.
+    alpha = np.tile((np.arange(64) + 0.5) / 64, (64, 1)).astype(np.float32)
+    apart = card()
+    apart = replace(apart, faces=np.array([[0, 1, 2], [3, 4, 5]]), **{
+        name: getattr(apart, name)[[0, 1, 2, 0, 2, 3]] for name in ("vertices", "normals", "uv")
+    })  # fmt: skip
+    part = without_clear(apart, alpha, 0.45, np.array([1.0, 1, 1, 0.5, 0.5, 0.5]))
+    corners = part.vertices[part.faces]
+    centre = corners.mean(axis=1)
+    lower = centre[:, 0] > centre[:, 1]
+    assert corners[lower][..., 0].min() == pytest.approx(0.45, abs=0.05)
+    assert corners[~lower][..., 0].min() == pytest.approx(0.9, abs=0.05)
 
 
 def test_what_vertices_carry_is_interpolated():

@@ -246,3 +246,17 @@ def test_an_explosion_is_caught_tried_again_and_counted(crowd, monkeypatch, tmp_
 
 def test_nothing_to_drop_is_no_error():
     assert settle(generator(0, "none"), [], FLAT) == []
+
+
+@pytest.mark.parametrize("sides", [(1.0, 0.8, 0.0), (0.0, 0.8, 1.0), (1.0, 0.8, 1e-5), (0.0, 0.0, 1.0)])
+def test_what_is_flat_or_straight_comes_to_rest_like_anything_else(sides):
+    # A user's picture, rug or string: MuJoCo and Qhull have no hull of such points.
+    turn = trimesh.transformations.rotation_matrix(0.4, (1.0, 2.0, 0.0)) if sides[2] == 0.0 else np.eye(4)
+    board = trimesh.Trimesh(
+        trimesh.creation.box(sides).apply_transform(turn).vertices, [[0, 1, 2], [1, 3, 2]]
+    )
+    bodies = [Body([board], upright=True), box(0.3, 0.3, 0.3)]
+    for thing, placement in zip(bodies, settle(generator(0, "flat"), bodies, FLAT)):
+        assert placement is not None
+        lowest = placement.moved(np.asarray(thing.pieces[0].vertices))[:, 2].min()
+        assert lowest == pytest.approx(0.0, abs=0.01)

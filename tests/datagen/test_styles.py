@@ -111,5 +111,8 @@ def test_paths_that_touch_a_thing_are_drawn_again_and_at_last_given_up():
     assert path == walk(2.9)
     assert tries[:2] == sorted(tries[:2])
     assert not obstacles.leave(walk(0.1), 0.0, 0.2), "too near the ground"
+    indoors = Obstacles([ball], Standing(flat.low, np.array([3.0, 3.0, 3.0])))
+    assert indoors.leave(walk(2.89), 0.3, 0.2), "half as near to a ceiling"
+    assert not indoors.leave(walk(2.92), 0.3, 0.2)
     with pytest.raises(TronError, match="no camera path"):
         unhindered(generator(0, "p"), lambda _rng, _ease: walk(1.0), obstacles, 0.3, 0.2)

@@ -1,7 +1,9 @@
 """The user's texture sets: found by their names, refused in one line, laid on as they are."""
 
+import gc
 import json
 import re
+import weakref
 
 import numpy as np
 import pytest
@@ -110,6 +112,57 @@ def test_colours_become_linear_and_data_stay(folder):
     np.testing.assert_array_equal(image[..., 4], 0.0)
     with pytest.raises(TronError, match="is not what it was"):
         opened(spec.model_copy(update={"sha256": "0"}), folder, sets, 50.0)
+
+
+def image_of(folder, width):
+    """(h, w, 6) of the set ``mine``, about ``width`` wide."""
+    sets = find_texture_sets(folder)
+    sha256 = next(each.asset.sha256 for each in sets if each.asset.id == "mine")
+    spec = PhotographedSpec(texture_set="mine", sha256=sha256, repeat=1.0, offset=(0.0, 0.0, 0.0))
+    return opened(spec, folder, sets, width).image
+
+
+def test_a_packed_map_holds_roughness_in_green_and_metallic_in_blue(folder):
+    picture(folder / "mine/arm.png", (229 / 255, 51 / 255, 102 / 255))
+    np.testing.assert_allclose(image_of(folder, 16)[0, 0, 3:5], [51 / 255, 102 / 255], atol=1e-6)
+    picture(folder / "mine/rough.png", 204 / 255)
+    np.testing.assert_allclose(image_of(folder, 16)[0, 0, 3:5], [204 / 255, 102 / 255], atol=1e-6)
+
+
+def test_a_hill_is_a_hill_by_normals_of_opengl_and_of_directx(folder):
+    down, right = np.indices((32, 32)) / 32
+    normals = np.dstack([np.sin(2 * np.pi * right), np.sin(4 * np.pi * down), np.full((32, 32), 4.0)])
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    (folder / "mine/normal_dx.png").unlink()
+    heights = []
+    for name, up in (("gl", 1.0), ("dx", -1.0)):
+        write_image(
+            folder / f"mine/normal_{name}.exr", (0.5 + 0.5 * normals * (1.0, up, 1.0)).astype(np.float32)
+        )
+        heights.append(image_of(folder, 16)[..., 5])
+        (folder / f"mine/normal_{name}.exr").unlink()
+    assert np.ptp(heights[0]) > 0.01
+    np.testing.assert_allclose(heights[1], heights[0], atol=1e-4)
+
+
+def test_images_are_averaged_in_the_light_and_stay_as_wide_as_asked(folder):
+    pixels = generator(0, "p").random((40, 40, 3)).astype(np.float32)
+    write_image(folder / "mine/base_color.png", pixels)
+    linear = srgb_to_linear(np.round(pixels * 255) / 255)
+    for width, block in ((40, 1), (21, 1), (20, 2), (10, 4), (9, 4), (1, 40)):
+        seen = image_of(folder, width)[..., :3]
+        expected = linear.reshape(40 // block, block, 40 // block, block, 3).mean(axis=(1, 3))
+        np.testing.assert_allclose(seen, expected, atol=1e-5)
+
+
+def test_a_worker_does_not_gather_the_images_of_all_its_scenes(folder):
+    sets = find_texture_sets(folder)
+    chosen = next(each for each in sets if each.asset.id == "mine")
+    spec = PhotographedSpec.draw(generator(0, "t"), "mine", chosen.asset.sha256)
+    # Every scene wants a size of its own.
+    seen = [weakref.ref(opened(spec, folder, sets, density).image) for density in range(1, 30)]
+    gc.collect()
+    assert sum(image() is not None for image in seen) <= 4
 
 
 def test_a_checkerboard_lies_on_a_box_as_it_should():
