@@ -1,12 +1,13 @@
 """G-buffers, frames and reference irradiance against closed forms."""
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from datagen.build import FIRST_ID, build
 from datagen.layout import Placement
 from datagen.objects import ObjectSpec
-from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
+from datagen.pathtrace import direct_irradiance, gbuffers, near_product, render_frames
 from datagen.scene import draw_scene
 from datagen.shapes import ShapeSpec
 from tron.cameras import Camera
@@ -150,3 +151,10 @@ def test_many_passes_converge_to_the_same_frame(geometry, camera, monkeypatch):
     other_seed = render_frames(scene, [camera], 64, [2])[0]
     assert np.abs(parts - whole).mean() < 1.2 * np.abs(other_seed - whole).mean()
     assert abs(parts.mean() / whole.mean() - 1) < 0.005
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 35, 46, 55, 64, 110, 132, 1000])
+def test_counts_of_samples_are_what_multijitter_takes(count):
+    sampler = mi.load_dict({"type": "multijitter", "sample_count": count})
+    assert near_product(count) == sampler.sample_count()
+    assert near_product(near_product(count)) == near_product(count)
