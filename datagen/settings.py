@@ -261,8 +261,8 @@ class Settings(_Model):
     families: list[Family] | None = Field(
         None,
         description="Light families that any, high, medium and low draw from, a list as above; null: [hdri] "
-        f"where environments is given; else any draws from [{', '.join(PROCEDURAL)}] in styles A and B, and "
-        "all else from every family but hdri.",
+        f"where environments is given; else any draws from [{', '.join(PROCEDURAL)}] in styles A and B, in "
+        "the others from the usual ones more often, and high, medium and low from every family but hdri.",
         examples=["[sun,overcast]"],
     )
     views: int = Field(64, ge=1, description="Views whose G-buffers the surfels are made from.")
