@@ -126,8 +126,9 @@ def _render(
 
 
 def near_product(count: int) -> int:
-    """Least product of two near numbers, such as 7 x 8, that is ``count`` or more: what Mitsuba's
-    ``multijitter`` rounds a number of samples to, with a warning.
+    """Least product of two near numbers, such as 7 x 8, that is ``count`` or more.
+
+    Mitsuba's ``multijitter`` rounds a number of samples up to it, with a warning.
     """
     columns = math.isqrt(count)
     return columns * -(-count // columns)
