@@ -170,8 +170,10 @@ class Reference:
         return (off**2 / self._scale).mean(axis=(1, 2, 3)) - self._noise
 
     def bias(self, image: np.ndarray) -> float:
-        """Mean of ``image`` over that of the reference, all lights at one scale, less one."""
-        return float((image * self._exposure).mean() / self.image.mean() - 1)
+        """Mean of ``image`` over that of the reference, less one, under the light where it is largest."""
+        pixels = (1, 2, 3)
+        off = (image * self._exposure).mean(pixels) / self.image.mean(pixels) - 1
+        return float(off[np.argmax(np.abs(off))])
 
     def picture(self, alone: np.ndarray, together: np.ndarray) -> np.ndarray:
         """Display values: a row a light, of the first of each kind: truth, both ways, errors of both x 8."""

@@ -88,7 +88,9 @@ class Datagen(DatagenSettings):
             "workers": lambda at: measure_workers(self.workers, self.rounds, at),
             "soak": lambda at: measure_soak(tiny, self.soak_scenes, at),
             "kills": lambda at: measure_kills(_of(tiny, self.kill_scenes), self.kills, self.seed, at),
-            "specifications": lambda at: measure_specifications(_of(tiny, self.specified_scenes), at),
+            "specifications": lambda at: measure_specifications(
+                [*_of(tiny, self.specified_scenes), *self.specified], at
+            ),
             "throughput": lambda at: measure_throughput(self.throughput, self.sizes, at),
         }
         stages = Stages(folder)

@@ -19,7 +19,7 @@ from tron.seeds import generator
 
 VICTIMS = ("command", "everything")
 """What gets SIGKILL: the command, whose workers must notice, or all its processes, as in a power cut."""
-EARLIEST = 0.15
+EARLIEST = 0.05
 """Share of an undisturbed run's time before which nothing is killed: Python is only just starting."""
 EACH_TREE = 4
 """Kills that a dataset suffers before it is finished and compared."""

@@ -135,12 +135,12 @@ def family(process: psutil.Process) -> list[psutil.Process]:
         return []
 
 
-def resident_mb(process: psutil.Process) -> float:
-    """Resident memory of a process and all that it started, MB (10^6 bytes)."""
-    total = 0
+def resident_mb(process: psutil.Process) -> dict[int, float]:
+    """Resident memory of a process and of all that it started by their numbers, MB (10^6 bytes)."""
+    found = {}
     for each in family(process):
         try:
-            total += each.memory_info().rss
+            found[each.pid] = each.memory_info().rss / 1e6
         except psutil.NoSuchProcess:  # ended since
             continue
-    return total / 1e6
+    return found

@@ -42,7 +42,7 @@ class DatagenSettings(Benchmark):
     name: ClassVar[str] = "datagen"
 
     parts: list[Part] = Field(description="what is measured", min_length=1)
-    seed: int = Field(default=0, description="seed of the judging scenes, the kills and the intervals")
+    seed: int = Field(default=1000, description="seed of the judging scenes, the kills and the intervals")
     variety: VarietySettings
     sharing: list[str] = Field(description="scenes whose frames are path-traced under many lights")
     workers: list[str] = Field(description="scenes that one worker and two make")
@@ -52,5 +52,8 @@ class DatagenSettings(Benchmark):
     kills: PositiveInt = Field(default=20, description="times that runs are killed")
     kill_scenes: PositiveInt = Field(default=8, description="tiny scenes of such a run")
     specified_scenes: PositiveInt = Field(default=16, description="tiny scenes whose specifications are held")
+    specified: list[str] = Field(
+        default=["train.lights=[any,high,low]"], description="further arguments of tron-datagen for those"
+    )
     throughput: list[str] = Field(description="recipe of the frames that are counted")
     sizes: dict[PositiveInt, list[str]] = Field(description="width of a frame -> further arguments")

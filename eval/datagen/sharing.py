@@ -36,7 +36,10 @@ class Sharing:
     pictures: Sequence[np.ndarray]
 
     def rows(self, seed: int) -> Iterator[Row]:
-        """Gain, the seconds of both at one error, the paths that this takes, and the greatest bias."""
+        """Gain, the seconds of both at one error, the paths that this takes, and what the mean hides.
+
+        That is the error together over that alone of the light that fares worst, and the largest bias.
+        """
         for metric, unit, values in (
             (GAIN, "x", [case["gain"] for case in self.cases]),
             ("lights.seconds_alone", "s", [case["seconds"]["alone"] for case in self.cases]),
@@ -46,6 +49,8 @@ class Sharing:
             ("lights.relative_error", "abs", [case["error"]["alone"] for case in self.cases]),
         ):
             yield mean_row(metric, unit, [(c["scene"], v) for c, v in zip(self.cases, values)], seed)
+        worst = [(case["scene"], _worst_light(case)) for case in self.cases]
+        yield mean_row("lights.worst_light_error_ratio", "x", worst, seed)
         bias = max(abs(case["bias"]) for case in self.cases)
         yield Row(metric="lights.largest_bias", value=bias, unit="fraction", n=len(self.cases))
 
@@ -72,6 +77,14 @@ class Sharing:
         note = "A row a light: the truth, one by one, together, and eight times the errors of both."
         blocks = [Table(caption, headings, rows), Pictures("Under four lights", shown, note, columns=1)]
         return [Section("sharing", "Many lights at once", blocks)]
+
+
+def _worst_light(case: Mapping[str, Any]) -> float:
+    """Error together over error alone of the worst light, at about the same mean error."""
+    errors = dict(case["error_by_light"])
+    alone = np.asarray(errors.pop("alone"))
+    nearest = min(errors, key=lambda paths: abs(int(paths) - case["paths"]["together"]))
+    return float((np.asarray(errors[nearest]) / np.maximum(alone, 1e-9)).max())
 
 
 def measure_sharing(recipe: Sequence[str], folder: Path) -> Sharing:

@@ -1,7 +1,9 @@
 """Specifications of the same scenes, drawn by other numbers of workers and threads and on another processor.
 
-The other processor is stood in for by NumPy without its vector instructions beyond the baseline
-(NPY_DISABLE_CPU_FEATURES): sines and sums then differ in their last bits, as they do between machines.
+The other processor is stood in for by switches of three libraries, which change last bits as other machines
+do: NumPy without its vector instructions beyond the baseline (float32 sines, exponentials, powers),
+OpenBLAS with the kernels of a Nehalem (products of matrices, inverses), and the C library without AVX2 and
+FMA (float64 sines and arctangents, random gamma variates).
 """
 
 from __future__ import annotations
@@ -63,6 +65,10 @@ def ways() -> dict[str, Way]:
     if extensions:
         fewer = (("NPY_DISABLE_CPU_FEATURES", " ".join(extensions)),)
         found["NumPy's baseline of vector instructions"] = Way(("workers=1",), fewer)
+    found["OpenBLAS for a Nehalem"] = Way(("workers=1",), (("OPENBLAS_CORETYPE", "Nehalem"),))
+    without = ",".join(f"-{name}" for name in ("AVX2", "FMA", "AVX512F", "AVX2_Usable", "FMA_Usable"))
+    tunables = (("GLIBC_TUNABLES", f"glibc.cpu.hwcaps={without}"),)
+    found["the C library without AVX2 and FMA"] = Way(("workers=1",), tunables)
     return found
 
 

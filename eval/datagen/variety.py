@@ -238,7 +238,7 @@ def _make_judges(
         for number, model in enumerate(models)
     ]
     wanted += [
-        (MIXED, f"{MIXED}_{name}", [*own, f"seed={seed + k}"])
+        (MIXED, f"{MIXED}_{name}", [*own, f"seed={seed + len(models) + k}"])
         for k, (name, own) in enumerate(settings.mixed.items())
     ]
     children = {

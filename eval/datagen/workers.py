@@ -59,7 +59,7 @@ class Workers:
 
 
 def measure_workers(recipe: Sequence[str], rounds: int, folder: Path) -> Workers:
-    """Make the same scenes with one worker and with two, in turns.
+    """Make the same scenes with one worker and with two, in turns, after a run that warms up the caches.
 
     Args:
         recipe: arguments of tron-datagen. rounds: how often. folder: for the datasets, which are removed.
@@ -70,9 +70,13 @@ def measure_workers(recipe: Sequence[str], rounds: int, folder: Path) -> Workers
     seconds: dict[int, list[float]] = {1: [], 2: []}
     different: list[str] = []
     scenes = 0
-    for _ in range(rounds):
+    output = folder / "warm"
+    shutil.rmtree(output, ignore_errors=True)
+    make([*recipe, "train.scenes=2", "workers=1"], output)
+    shutil.rmtree(output)
+    for turn in range(rounds):
         trees = []
-        for count in seconds:
+        for count in seconds if turn % 2 == 0 else reversed(seconds):
             output = folder / f"workers_{count}"
             shutil.rmtree(output, ignore_errors=True)
             seconds[count].append(make([*recipe, f"workers={count}"], output))

@@ -22,6 +22,8 @@ def test_errors_are_relative_and_on_one_scale():
     image = truth * 1.1
     np.testing.assert_allclose(reference.errors(image), 0.05**2 / (0.25 + 0.01))
     assert reference.bias(image) == pytest.approx(0.1)
+    image[1] = truth[1] * 0.8
+    assert reference.bias(image) == pytest.approx(-0.2), "that of the worst light: signs do not cancel"
 
 
 def test_the_noise_of_the_reference_is_taken_off():

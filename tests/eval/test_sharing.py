@@ -19,6 +19,7 @@ def case(scene: str, gain: float, bias: float) -> dict:
         "paths": {"alone": 64, "together": 50.0},
         "seconds": {"alone": 4.0, "together": 4.0 / gain, "64": 1.0},
         "error": {"alone": 0.001, "64": 0.0008},
+        "error_by_light": {"alone": [0.001, 0.002], "16": [0.1, 0.1], "64": [0.0004, 0.003]},
     }  # fmt: skip
 
 
@@ -46,6 +47,7 @@ def test_the_gain_is_the_mean_over_scenes(tmp_path, engine):
     rows = {row.metric: row for row in found.rows(seed=0)}
     assert rows["lights.sharing_gain"].value == pytest.approx(4.0)
     assert rows["lights.sharing_gain"].scenes == 2
+    assert rows["lights.worst_light_error_ratio"].value == pytest.approx(1.5)
     assert rows["lights.largest_bias"].value == pytest.approx(0.001)
     (section,) = found.sections(tmp_path / "pictures")
     table = section.blocks[0]
