@@ -91,11 +91,12 @@ class Soak:
         )
         points = [(float(done), sum(each.values())) for done, each in self.samples]
         chart = line_chart({"all processes": points}, "scenes made", "MB", caption)
+        last, second = self.peak(PARTS - 1), self.peak(1)
         text = (
             f"The figure is the largest memory in the last fifth of the scenes less that in the second: "
-            f"{self.peak(PARTS - 1):.0f} MB less {self.peak(1):.0f} MB. The first fifth warms up. The "
-            f"process that grows fastest gains {self.growth_per_scene():.2f} MB a scene within its life. Pages that "
-            "processes share are counted in each."
+            f"{last:.0f} MB less {second:.0f} MB. The first fifth warms up. The process that grows fastest gains "
+            f"{self.growth_per_scene():.2f} MB a scene within its life. Pages that processes share are counted "
+            "in each."
         )
         return [Section("soak", "Memory over many scenes", [Text(text), chart])]
 
