@@ -142,8 +142,10 @@ def card_text(
         lines += ["| model | reason |", "|---|---|"]
         lines += [f"| {_cell(model.path)} | {_cell(model.reason)} |" for model in sources.refused]
         lines += [""]
-    if not sources.assets:
+    if not sources.assets and not sources.textures:
         lines.append("Shapes and materials are procedural: no asset of anybody's is in it.")
+    elif not sources.assets:
+        lines.append("Shapes are procedural, materials those of the texture sets above and procedural ones.")
     if not sources.maps:
         lines.append("Lights are procedural; skies follow Mitsuba's `sunsky`.")
     return "\n".join(lines) + "\n"

@@ -28,6 +28,9 @@ LICENCES = frozenset(
 )
 """Licences by the Hub's names, of those that models and maps come under; any other is "other" there."""
 
+SHORT = {"cc0": "cc0-1.0", "apache2": "apache-2.0"}
+"""Usual short names of some of them that leave no doubt."""
+
 COLUMNS = pa.schema(
     [
         *(pa.field(name, pa.string()) for name in ("key", "scene", "split", "style", "light_family")),
@@ -92,7 +95,7 @@ def licence_names(licences: Sequence[str | None]) -> str | list[str]:
     A dataset of procedural scenes is its maker's, who says before publishing under which licence.
     """
     words = {"-".join((licence or "").lower().split()) for licence in licences}
-    names = sorted({word if word in LICENCES else "other" for word in words})
+    names = sorted({SHORT.get(word, word if word in LICENCES else "other") for word in words})
     return "unknown" if not names else names[0] if len(names) == 1 else names
 
 

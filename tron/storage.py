@@ -139,6 +139,8 @@ def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
         TronError: another process holds the folder, or the lock cannot be made there.
     """
     folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise TronError("a folder is wanted, and this is a file", folder, "choose another output_dir")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = filelock.FileLock(folder / LOCK_NAME)

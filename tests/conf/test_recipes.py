@@ -185,6 +185,14 @@ def undescribed(model: type[BaseModel], prefix: str = "") -> list[str]:
     return names
 
 
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_line_that_help_shows_is_a_whole_sentence(path: Path):
+    """Help shows the first line of a file's comment alone."""
+    lines = [line for line in path.read_text("utf-8").splitlines() if not line.startswith("# @package")]
+    if lines and lines[0].startswith("#") and lines[1].startswith("#"):
+        assert lines[0].endswith((".", ")", ":")), lines[0]
+
+
 @pytest.mark.parametrize("folder", sorted(COMMANDS))
 def test_every_group_option_says_what_it_is_for(folder: str):
     options = group_options(load_command(folder).config_module)

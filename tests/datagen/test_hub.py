@@ -105,6 +105,7 @@ def test_splits_of_other_frames_are_another_configuration(small_settings, tmp_pa
 def test_licences_have_the_names_of_the_hub():
     assert licence_names(["CC BY 4.0", "cc-by-4.0"]) == "cc-by-4.0"
     assert licence_names(["CC0-1.0", "public domain", None]) == ["cc0-1.0", "other"]
+    assert licence_names(["CC0", "cc0-1.0"]) == "cc0-1.0"
     assert licence_names([]) == "unknown"
 
 

@@ -50,7 +50,8 @@ def folder(tmp_path):
     picture(tmp_path / "Metal032.png", 0.5)  # ambientCG's preview
     picture(tmp_path / "mine/base_color.png", 0.5)
     picture(tmp_path / "mine/normal_dx.png", 0.5)
-    licensed(tmp_path, "wood_floor", "Metal032", "mine")
+    picture(tmp_path / "linen_textile/base_color.png", 0.5)
+    licensed(tmp_path, "wood_floor", "Metal032", "mine", "linen_textile")
     return tmp_path
 
 
@@ -61,11 +62,13 @@ def test_sets_of_poly_haven_ambientcg_and_ones_own_are_found(folder):
         "wood_floor": {"albedo", "packed", "normal", "height"},
         "Metal032": {"albedo", "normal", "roughness", "metallic", "height", "ao"},
         "mine": {"albedo", "normal"},
+        "linen_textile": {"albedo"},
     }
     assert {name: each.role for name, each in found.items()} == {
         "wood_floor": "wood",
         "Metal032": "metal",
         "mine": "any",
+        "linen_textile": "fabric",
     }
     assert not found["Metal032"].directx, "OpenGL's normals are taken where both are there"
     assert "NormalGL" in dict(found["Metal032"].maps)["normal"]
@@ -84,8 +87,8 @@ def test_what_cannot_be_used_is_one_line(folder, tmp_path_factory):
     (folder / "catalogue.json").unlink()
     with pytest.raises(TronError, match=r"'Metal032' has no licence.*allow_unlicensed=\[Metal032\]"):
         find_texture_sets(folder)
-    names = ["wood_floor", "Metal032", "mine"]
-    assert len(find_texture_sets(folder, allow_unlicensed=names)) == 3
+    names = ["wood_floor", "Metal032", "mine", "linen_textile"]
+    assert len(find_texture_sets(folder, allow_unlicensed=names)) == 4
     picture(folder / "bare/bare_rough_1k.png", 0.5)
     with pytest.raises(TronError, match=r"'bare' has no albedo.*bare_albedo\.png"):
         find_texture_sets(folder, allow_unlicensed=names)

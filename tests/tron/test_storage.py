@@ -170,6 +170,16 @@ def test_folder_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path):
     pytest.fail("the lock outlived its process")
 
 
+def test_a_file_is_no_folder_to_lock(tmp_path: Path):
+    (tmp_path / "file").write_text("mine")
+    with (
+        pytest.raises(TronError, match="a folder is wanted, and this is a file"),
+        storage.locked(tmp_path / "file"),
+    ):
+        pass
+    assert (tmp_path / "file").read_text() == "mine"
+
+
 def test_lock_can_be_taken_again_after_use(tmp_path: Path):
     for _ in range(2):
         with storage.locked(tmp_path / "new"):

@@ -84,7 +84,7 @@ class Command(Generic[Settings]):
             print(f"{self.name}: {error}", file=sys.stderr)
             return USER_ERROR
         except KeyboardInterrupt:
-            print(f"{self.name}: interrupted", file=sys.stderr)
+            print(f"{self.name}: interrupted; the same command goes on from here", file=sys.stderr)
             return INTERRUPTED
 
     def _help(self, overrides: Sequence[str], config_dir: Path | None) -> str:

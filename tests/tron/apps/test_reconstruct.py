@@ -231,7 +231,9 @@ def test_an_interrupted_run_goes_on_where_it_was_saved(
 
     monkeypatch.setattr(app.StageBars, "watch", interrupting)
     assert reconstruct(out) == 130
-    assert capsys.readouterr().err.strip() == "tron-reconstruct: interrupted"
+    assert (
+        capsys.readouterr().err.strip() == "tron-reconstruct: interrupted; the same command goes on from here"
+    )
     assert not (out / "metrics.json").exists()
     monkeypatch.setattr(app.StageBars, "watch", counting)
     steps.clear()

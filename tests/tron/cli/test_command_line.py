@@ -266,7 +266,11 @@ def test_an_interruption_exits_130_without_a_traceback(run: Run):
     def interrupt(_):
         raise KeyboardInterrupt
 
-    assert run("output_dir=o", does=interrupt) == (130, "", "tron-toy: interrupted\n")
+    assert run("output_dir=o", does=interrupt) == (
+        130,
+        "",
+        "tron-toy: interrupted; the same command goes on from here\n",
+    )
 
 
 def test_a_defect_keeps_its_traceback(run: Run):
