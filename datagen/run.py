@@ -163,7 +163,7 @@ def draw_and_build(
         settings.seed,
         item.split,
         item.index,
-        style=recipe.style,
+        style=recipe.style_of(item.index),
         lights=lights,
         families=settings.light_families(),
         environments=sources.environments

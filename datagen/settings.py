@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
@@ -67,8 +67,11 @@ class SplitSettings(_Model):
     """One split: how many scenes of which kind, and how they are rendered."""
 
     scenes: int = Field(ge=0, le=1_000_000, description="Number of scenes.")
-    style: StyleChoice = Field(
-        default="A", description="What stands in a scene, on what, and how it is filmed."
+    style: StyleChoice | Annotated[list[StyleChoice], Field(min_length=1)] = Field(
+        default="A",
+        description="What stands in a scene, on what, and how it is filmed. Scenes take those of a list in "
+        "turns.",
+        examples=["[mixed,A]"],
     )
     lights: list[LightChoice] = Field(
         default=["any"] * 4,
@@ -115,6 +118,10 @@ class SplitSettings(_Model):
     reference_spp: int = Field(
         default=128, ge=2, description="Shadow rays per pixel of Mitsuba's direct irradiance."
     )
+
+    def style_of(self, index: int) -> StyleChoice:
+        """Style of the scene of that number."""
+        return self.style[index % len(self.style)] if isinstance(self.style, list) else self.style
 
 
 class SensorSettings(_Model):

@@ -32,6 +32,14 @@ def test_values_that_are_not_finite_are_found_where_they_are():
     assert first_bad_value(frames) == "frame 2: irradiance has 2 values that are not finite"
 
 
+def test_scenes_take_the_styles_of_a_list_in_turns(variant, tmp_path):
+    words = ["train.style=[A,table]", "mesh_edge=0.3", "objects=[1,2]", f"output_dir={tmp_path}"]
+    settings = check(compose_recipe("conf.datagen", Settings, words), Settings)
+    items = [Work("train", k, f"train-{k:06d}", first_shard=0) for k in range(3)]
+    specs = [draw_and_build(item, settings, Sources(), ["overcast"])[0] for item in items]
+    assert [spec.style for spec in specs] == ["A", "table", "A"]
+
+
 @pytest.fixture(scope="module")
 def shared(variant, tmp_path_factory):
     """A scene whose lights share a path, its surfels, its settings and its clips."""
