@@ -95,8 +95,8 @@ class Soak:
         text = (
             f"The figure is the largest memory in the last fifth of the scenes less that in the second: "
             f"{last:.0f} MB less {second:.0f} MB. The first fifth warms up. The process that grows most "
-            f"gains {self.growth_per_scene():.2f} MB a scene in its life. Pages that processes share are counted "
-            "in each."
+            f"gains {self.growth_per_scene():.2f} MB a scene in its life. Pages that processes share are "
+            "counted in each."
         )
         return [Section("soak", "Memory over many scenes", [Text(text), chart])]
 
