@@ -22,7 +22,7 @@ DEPTH = "depth_ref"
 
 
 class ModelPixels:
-    """Where the models of one scene are seen.
+    """Masks of the models of one scene.
 
     Args:
         scene: its folder in a dataset, with ``spec.json`` and ``surfels.ply``.
