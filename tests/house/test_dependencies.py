@@ -14,8 +14,9 @@ import yaml
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("tron", "datagen", "train", "eval", "conf")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-# Run, not imported: build by the wheel test, pre-commit by git, the linters by make; setuptools builds.
-TOOLS = {"build", "import-linter", "pre-commit", "pyright", "ruff", "setuptools"}
+# Run, not imported: build by the wheel test, pre-commit by git, the linters and the tests' processes by make;
+# setuptools builds.
+TOOLS = {"build", "import-linter", "pre-commit", "pyright", "pytest-xdist", "ruff", "setuptools"}
 
 
 def canonical(requirement: str) -> str:
