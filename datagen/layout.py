@@ -157,5 +157,17 @@ def _in_disk(rng: np.random.Generator, radius: float) -> tuple[float, float]:
 
 
 def _placement(turn: np.ndarray, position: tuple[float, float, float]) -> Placement:
-    x, y, z, w = Rotation.from_matrix(turn).as_quat(canonical=True)
-    return Placement(quaternion=(w, x, y, z), position=position)
+    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+    return Placement(quaternion=with_one_sign((w, x, y, z)), position=position)
+
+
+def with_one_sign(quaternion: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    """Of two quaternions that are one turn, that whose first component beyond a rounding is positive.
+
+    Of half a turn w is a rounding to either side of 0, another one on each processor, and decides nothing.
+    """
+    w, x, y, z = quaternion
+    rounding = 1e-3 * max(abs(part) for part in quaternion)
+    if next(part for part in quaternion if abs(part) > rounding) > 0:
+        return w, x, y, z
+    return -w, -x, -y, -z

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from trimesh import Trimesh
 
-from datagen.layout import Placement, support_hull
+from datagen.layout import Placement, support_hull, with_one_sign
 from datagen.shapes import Standing
 
 # Else MuJoCo writes MUJOCO_LOG.TXT into the user's folder; what it warns of, step() finds by itself.
@@ -229,9 +229,10 @@ class RigidBodies:
         position = state[:3] * self.unit
         if self._bodies[i].upright:
             half = 0.5 * float(state[3])
-            quaternion = (np.cos(half), 0.0, 0.0, np.sin(half))
+            quaternion = (float(np.cos(half)), 0.0, 0.0, float(np.sin(half)))
         else:
-            quaternion = tuple(state[3:] / np.linalg.norm(state[3:]))
+            w, x, y, z = (state[3:] / np.linalg.norm(state[3:])).tolist()
+            quaternion = with_one_sign((w, x, y, z))
         return Placement(quaternion=quaternion, position=tuple(position))
 
     def _height(self, i: int) -> float:

@@ -9,7 +9,7 @@ import trimesh
 from trimesh.collision import CollisionManager
 
 from datagen import rigid_bodies, settling
-from datagen.layout import Placement
+from datagen.layout import Placement, with_one_sign
 from datagen.rigid_bodies import GRAVITY, STEP, Exploded, RigidBodies
 from datagen.settling import Body, settle
 from datagen.shapes import ShapeSpec, Standing, make_pieces, standing
@@ -260,3 +260,10 @@ def test_what_is_flat_or_straight_comes_to_rest_like_anything_else(sides):
         assert placement is not None
         lowest = placement.moved(np.asarray(thing.pieces[0].vertices))[:, 2].min()
         assert lowest == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_half_turn_has_one_sign_whatever_side_of_zero_its_w_is_rounded_to():
+    for w in (-1e-9, 0.0, 1e-9):
+        assert with_one_sign((w, -0.6, 0.8, 0.0))[1:] == (0.6, -0.8, -0.0)
+        assert with_one_sign((w, 0.6, -0.8, 0.0))[1:] == (0.6, -0.8, 0.0)
+    assert with_one_sign((-0.5, 0.5, 0.5, 0.5)) == (0.5, -0.5, -0.5, -0.5)
