@@ -24,6 +24,7 @@ import yaml
 
 from datagen.build import Geometry
 from datagen.capture_manifest import CaptureManifest
+from datagen.capture_settings import CaptureSettings
 from datagen.clusters import logs_folder, require_cluster
 from datagen.failures import record_failures, summary
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
@@ -33,7 +34,7 @@ from datagen.relit import RELIT, record_relit, relit_folders, straightened, writ
 from datagen.run import draw_and_build
 from datagen.scene import SceneSpec, scene_name
 from datagen.scheduling import make_each
-from datagen.settings import CaptureSettings, Settings
+from datagen.settings import Settings
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder, write_capture
@@ -75,7 +76,7 @@ def make_captures(settings: Settings) -> int:
         TronError: wrong settings, a folder in use, made otherwise or not writable, too little space: all
             before the first scene.
     """
-    wanted = settings.captures
+    wanted = settings.capture
     items = [Work("test", i, scene_name("test", i), first_shard=0) for i in range(wanted.scenes)]
     items = chosen(items, settings.only)
     require_cluster(settings)
@@ -108,7 +109,7 @@ def make_capture(item: Work, settings: Settings, sources: Sources) -> Path:
         TronError: a buffer holds NaN or infinity, or the folder cannot be written.
     """
     activate(settings.variant, threads=1)
-    wanted = settings.captures
+    wanted = settings.capture
     folder = settings.output_dir / CAPTURES / item.name
     family = wanted.lights[item.index % len(wanted.lights)]
     spec, geometry = draw_and_build(item, settings, sources, [family, *wanted.relights])
@@ -276,6 +277,8 @@ def _adopt(settings: Settings, folder: Path) -> None:
     path, recipe = folder / CONFIG_NAME, settings.capture_recipe()
     before = read_recipe(path)
     if before is not None:
+        if "captures" in before:  # as the key was called at first
+            before["capture"] = before.pop("captures")
         require_same(before, recipe, folder, "captures", defaults=model_defaults(Settings))
     elif folder.is_dir() and any(folder.iterdir()):
         raise TronError(
@@ -295,7 +298,7 @@ def _finished(folder: Path, settings: CaptureSettings) -> bool:
 
 
 def _estimate_bytes(settings: Settings) -> int:
-    wanted = settings.captures
+    wanted = settings.capture
     pixels = wanted.views * wanted.width * wanted.height
     relit = pixels // HELD_OUT * len(wanted.relights) * RELIT_PIXEL_BYTES
     return relit + pixels * PIXEL_BYTES + wanted.views * 10_000 + settings.environment_height**2 * 2 * 12

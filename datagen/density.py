@@ -41,9 +41,9 @@ def most_texels(spec: SceneSpec, settings: Settings) -> int:
 
 def _cameras(spec: SceneSpec, settings: Settings) -> list[list[Camera]]:
     """Some cameras of each path that pictures are taken from."""
-    recipe, captures = settings.split(spec.split), settings.captures
+    recipe, capture = settings.split(spec.split), settings.capture
     if settings.mode == "captures":
-        return [spec.views(PATH_SAMPLES, captures.width, captures.height)]
+        return [spec.views(PATH_SAMPLES, capture.width, capture.height)]
     return [
         spec.views(PATH_SAMPLES, settings.view_width, settings.view_height),
         spec.cameras.film.cameras(PATH_SAMPLES, recipe.width, recipe.height),

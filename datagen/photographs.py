@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datagen.settings import SensorSettings
+from datagen.capture_settings import SensorSettings
 from tron.seeds import generator
 
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from datagen.build import Geometry
 from datagen.capture_manifest import CaptureManifest
+from datagen.capture_settings import CaptureSettings
 from datagen.pathtrace import render_frames
 from datagen.scene import SceneSpec
-from datagen.settings import CaptureSettings
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import write_capture

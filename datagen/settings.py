@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     ValidationInfo,
     ValidatorFunctionWrapHandler,
@@ -16,14 +14,16 @@ from pydantic import (
     model_validator,
 )
 
+from datagen.capture_settings import CaptureSettings
 from datagen.lights import PROCEDURAL, Family, LightChoice
-from datagen.styles import StyleChoice
+from datagen.settings_model import SettingsModel
+from datagen.split_settings import SplitSettings
 from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounces
 
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
     *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
-    *("captures", "equal_error", "sharing", "variety_against"),
+    *("capture", "equal_error", "sharing", "variety_against"),
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
@@ -49,7 +49,7 @@ CAPTURED = {
     "catalogue": True,
     "allow_unlicensed": True,
     "variant": True,
-    "captures": {
+    "capture": {
         *("lights", "views", "width", "height", "path_spp", "reference_spp", "points"),
         *("photographs", "sensor", "relights", "relight_spp"),
     },
@@ -59,145 +59,7 @@ CAPTURED = {
 SPLITS: tuple[Split, ...] = ("train", "train_b", "validation", "test")
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class SplitSettings(_Model):
-    """One split: how many scenes of which kind, and how they are rendered."""
-
-    scenes: int = Field(ge=0, le=1_000_000, description="Number of scenes.")
-    style: StyleChoice | Annotated[list[StyleChoice], Field(min_length=1)] = Field(
-        default="A",
-        description="What stands in a scene, on what, and how it is filmed. Scenes take those of a list in "
-        "turns.",
-        examples=["[mixed,A]"],
-    )
-    lights: list[LightChoice] = Field(
-        default=["any"] * 4,
-        min_length=1,
-        max_length=64,
-        description="Light of each clip of a scene, one clip for each in the list. any draws one of "
-        "families; high, medium and low draw one of such contrast; hdri takes one of the maps in "
-        "environments.",
-    )
-    lights_share_path: bool | None = Field(
-        default=None,
-        description="All clips of a scene show it from the same cameras: each frame is path-traced under all "
-        "lights at once, which share its paths, rays and G-buffers. null: in every style but A and B, "
-        "whose clips begin at places of their own.",
-    )
-    moving_objects: float = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description="Share of scenes in whose clips an object is lifted and turned; their frames cost more.",
-    )
-    moving_lights: float = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description="Share of lights that turn about the zenith within their clip; their frames cost more.",
-    )
-    frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
-    width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
-    height: int = Field(default=256, ge=8, le=8192, description="Frame height in pixels.")
-    path_spp: int = Field(
-        default=256,
-        ge=1,
-        description="Paths per pixel of path-traced frames; rounded up to a product of near numbers.",
-    )
-    guidance_spp: int = Field(
-        default=64, ge=2, multiple_of=2, description="Shadow rays per pixel of the surfels' irradiance, even."
-    )
-    reference_buffers: bool = Field(
-        default=False,
-        description="Also store Mitsuba's direct irradiance, with and without shadows, base color, normals, "
-        "depth, roughness and metallic, and the surfels' own.",
-    )
-    reference_spp: int = Field(
-        default=128, ge=2, description="Shadow rays per pixel of Mitsuba's direct irradiance."
-    )
-
-    def style_of(self, index: int) -> StyleChoice:
-        """Style of the scene of that number."""
-        return self.style[index % len(self.style)] if isinstance(self.style, list) else self.style
-
-
-class SensorSettings(_Model):
-    """Camera that photographs are taken with: its exposure and white balance, and its noise."""
-
-    exposure_stops: float = Field(
-        default=0.25,
-        ge=0,
-        le=4,
-        description="Standard deviation of photos' exposures, stops; mean 0.",
-    )
-    white_balance: float = Field(
-        default=0.05,
-        ge=0,
-        le=1,
-        description="Standard deviation of log gains on red and blue.",
-    )
-    electrons: float = Field(
-        default=5000.0,
-        gt=0,
-        description="Electrons that the sensor counts where light times exposure is 1; middle grey is 0.18.",
-    )
-    read_noise: float = Field(default=3.0, ge=0, description="Standard deviation of reading them, electrons.")
-
-
-class CaptureSettings(_Model):
-    """Scenes of the test split as captures: views from all sides, path-traced under one light, true maps."""
-
-    scenes: int = Field(
-        default=4,
-        ge=1,
-        le=1_000_000,
-        description="Captures that mode=captures makes, of as many test scenes.",
-    )
-    lights: list[LightChoice] = Field(
-        default=["overcast", "studio", "sun"],
-        min_length=1,
-        max_length=64,
-        description="Light of each capture, in rotation, as in a split's lights.",
-    )
-    views: int = Field(
-        default=64,
-        ge=2,
-        le=100_000,
-        description="Views of a capture from all sides; each 8th is held out, from the first.",
-    )
-    width: int = Field(default=128, ge=8, le=8192, description="View width in pixels.")
-    height: int = Field(default=128, ge=8, le=8192, description="View height in pixels.")
-    path_spp: int = Field(
-        default=64,
-        ge=1,
-        description="Paths per pixel; rounded up to a product of near numbers, such as 8 x 8.",
-    )
-    reference_spp: int = Field(default=32, ge=2, description="Shadow rays per pixel of the irradiance maps.")
-    points: int | None = Field(
-        default=None,
-        ge=1,
-        le=10_000_000,
-        description="Also store about so many points on surfaces, with their colours, as photos would give.",
-    )
-    photographs: bool = Field(
-        default=False,
-        description="Take training views as photographs, each with its own exposure, white balance and noise "
-        "by sensor; held-out views stay true renders, which reconstructions are judged by.",
-    )
-    sensor: SensorSettings = Field(default=SensorSettings(), description="Camera of the photographs.")
-    relights: list[LightChoice] = Field(
-        default=[],
-        max_length=16,
-        description="Other lights, as in a split's lights, under which the held-out views are path-traced as "
-        "well, into output_dir/relit: the truth of relighting.",
-    )
-    relight_spp: int = Field(default=144, ge=1, description="Paths per pixel of those.")
-
-
-class EqualErrorSettings(_Model):
+class EqualErrorSettings(SettingsModel):
     """Comparison of guidance with the path tracer, on the test scenes of a dataset."""
 
     reference_spp: int = Field(
@@ -207,7 +69,7 @@ class EqualErrorSettings(_Model):
     threads: int | None = Field(default=None, ge=1, description="Threads of both renderers; null: all.")
 
 
-class SharingSettings(_Model):
+class SharingSettings(SettingsModel):
     """Comparison of frames under 20 lights one by one and together, on scenes drawn as the test split's."""
 
     scenes: int = Field(default=2, ge=1, le=1000, description="Number of scenes.")
@@ -217,7 +79,7 @@ class SharingSettings(_Model):
     threads: int | None = Field(default=1, ge=1, description="Threads of both ways; null: all.")
 
 
-class Settings(_Model):
+class Settings(SettingsModel):
     """Settings of ``tron-datagen``."""
 
     output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
@@ -245,7 +107,7 @@ class Settings(_Model):
         SplitSettings(scenes=4, lights=["sun", "studio", "overcast"], reference_buffers=True),
         description="Held-out scenes under held-out lights, for evaluation alone: training never reads them.",
     )
-    captures: CaptureSettings = Field(
+    capture: CaptureSettings = Field(
         CaptureSettings(), description="Captures to reconstruct, of the test scenes."
     )
     sharing: SharingSettings = Field(
@@ -417,7 +279,7 @@ class Settings(_Model):
     @model_validator(mode="after")
     def _consistent(self) -> Settings:
         captures = self.mode == "captures"
-        lights = {"captures": self.captures.lights} if captures else {}
+        lights = {"capture": self.capture.lights} if captures else {}
         for name in ["test"] if captures else self.used_splits():
             split = self.split(name)
             if split.frames > self.path_frames:

@@ -24,7 +24,8 @@ from datagen.pathtrace import (
 from datagen.plan import Refinement, scene_folder
 from datagen.refinement import refine_surfels
 from datagen.scene import SceneSpec
-from datagen.settings import Settings, SplitSettings
+from datagen.settings import Settings
+from datagen.split_settings import SplitSettings
 from datagen.spool import Frame, Spool
 from tron.cameras import Camera
 from tron.estimation import Estimation

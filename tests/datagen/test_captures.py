@@ -34,13 +34,13 @@ TINY = [
     "objects=[2,3]",
     f"mesh_edge={EDGE}",
     "environment_height=16",
-    "captures.scenes=2",
-    "captures.views=9",
-    "captures.width=28",
-    "captures.height=20",
-    "captures.path_spp=64",
-    "captures.reference_spp=64",
-    "captures.lights=[overcast,studio]",
+    "capture.scenes=2",
+    "capture.views=9",
+    "capture.width=28",
+    "capture.height=20",
+    "capture.path_spp=64",
+    "capture.reference_spp=64",
+    "capture.lights=[overcast,studio]",
 ]
 
 
@@ -184,7 +184,7 @@ def test_nothing_that_is_not_finite_is_stored(tmp_path, monkeypatch):
         return frames
 
     monkeypatch.setattr(datagen.capture_export, "render_frames", spoilt)
-    assert make_captures(tiny(tmp_path, "captures.scenes=1", "captures.path_spp=1")) == 1
+    assert make_captures(tiny(tmp_path, "capture.scenes=1", "capture.path_spp=1")) == 1
     listed = tmp_path / "captures" / "failures.jsonl"
     assert {path.name for path in (tmp_path / "captures").iterdir()} == {
         "config.yaml", "manifest.json", "failures.jsonl", "failures",
@@ -256,7 +256,7 @@ def test_captures_repeat_byte_by_byte_in_any_groups_and_company(output, tmp_path
     whole = files_of(output / "captures" / "test-000001")
     assert files_of(tmp_path / "captures" / "test-000001") == whole
     assert not (tmp_path / "captures" / "test-000000").exists()
-    other = tiny(tmp_path / "other", "seed=1", "only=[test-000001]", "captures.path_spp=4")
+    other = tiny(tmp_path / "other", "seed=1", "only=[test-000001]", "capture.path_spp=4")
     assert make_captures(other) == 0
     assert files_of(tmp_path / "other/captures/test-000001")["spec.json"] != whole["spec.json"]
 
@@ -283,8 +283,8 @@ def test_a_finished_capture_is_not_made_again_and_a_damaged_one_is(output, monke
 @pytest.mark.parametrize(
     "change, message",
     [
-        ("captures.path_spp=81", r"captures\.path_spp=64, not 81"),
-        ("captures.points=10", r"captures\.points=None, not 10"),
+        ("capture.path_spp=81", r"capture\.path_spp=64, not 81"),
+        ("capture.points=10", r"capture\.points=None, not 10"),
         ("seed=3", "seed=0, not 3"),
         ("test.style=B", r"test\.style=A, not B"),
         ("mesh_edge=0.2", "mesh_edge"),
@@ -299,9 +299,9 @@ def test_another_recipe_is_refused_before_anything_is_written(output, change, me
 
 
 def test_more_captures_may_be_added_and_datasets_do_not_care(output):
-    assert tiny(output, "captures.scenes=9").capture_recipe() == tiny(output).capture_recipe()
+    assert tiny(output, "capture.scenes=9").capture_recipe() == tiny(output).capture_recipe()
     assert tiny(output, "train.scenes=0", "surfels=999").capture_recipe() == tiny(output).capture_recipe()
-    assert tiny(output, "captures.views=99").recipe() == tiny(output).recipe()
+    assert tiny(output, "capture.views=99").recipe() == tiny(output).recipe()
 
 
 def test_a_folder_of_something_else_or_in_use_is_refused(tmp_path):
@@ -315,11 +315,11 @@ def test_a_folder_of_something_else_or_in_use_is_refused(tmp_path):
 
 def test_hdri_lights_need_their_folder(tmp_path):
     with pytest.raises(TronError, match="environments=FOLDER"):
-        tiny(tmp_path, "captures.lights=[hdri]")
+        tiny(tmp_path, "capture.lights=[hdri]")
 
 
 def test_points_lie_on_surfaces_and_have_the_colours_of_the_pictures(tmp_path, capture, geometry):
-    few = ["only=[test-000001]", "captures.points=200"]
+    few = ["only=[test-000001]", "capture.points=200"]
     assert make_captures(tiny(tmp_path, *few)) == 0
     found = read_capture_folder(tmp_path / "captures/test-000001")
     assert found.points is not None

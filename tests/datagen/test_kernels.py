@@ -12,12 +12,13 @@ import pytest
 
 from datagen.build import Geometry, build
 from datagen.capture_export import captured
+from datagen.capture_settings import CaptureSettings
 from datagen.lights import FAMILIES, Family
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames, render_lights, stacked_lights
 from datagen.plan import Sources, Work
 from datagen.run import make_scene
 from datagen.scene import draw_scene
-from datagen.settings import CaptureSettings, Settings
+from datagen.settings import Settings
 from datagen.styles import Choice
 from tron.aligned import ALIGNMENT, aligned
 from tron.cameras import Camera

@@ -8,10 +8,11 @@ import pytest
 
 from datagen.build import build
 from datagen.capture_export import held_out_cameras, make_captures
+from datagen.capture_settings import SensorSettings
 from datagen.pathtrace import render_frames
 from datagen.photographs import Photograph, drift
 from datagen.scene import SceneSpec
-from datagen.settings import SensorSettings, Settings
+from datagen.settings import Settings
 from datagen.validate import validate
 from tron.captures.folder import read_capture_folder
 from tron.cli.recipes import check, compose_recipe
@@ -26,13 +27,13 @@ TINY = [
     "objects=[2,2]",
     f"mesh_edge={EDGE}",
     "environment_height=16",
-    "captures.scenes=1",
-    "captures.views=9",
-    "captures.width=24",
-    "captures.height=24",
-    "captures.path_spp=16",
-    "captures.reference_spp=4",
-    "captures.relight_spp=64",
+    "capture.scenes=1",
+    "capture.views=9",
+    "capture.width=24",
+    "capture.height=24",
+    "capture.path_spp=16",
+    "capture.reference_spp=4",
+    "capture.relight_spp=64",
 ]
 
 
@@ -51,7 +52,7 @@ def output(variant, tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def true_output(variant, tmp_path_factory) -> Path:
     output = tmp_path_factory.mktemp("renders")
-    assert make_captures(tiny(output, "captures.photographs=false", "captures.relights=[]")) == 0
+    assert make_captures(tiny(output, "capture.photographs=false", "capture.relights=[]")) == 0
     return output
 
 
@@ -111,7 +112,7 @@ def test_relit_views_are_path_traced_under_the_stored_light(output):
     assert [folder.name for folder in folders] == ["test-000000_1_sun", "test-000000_2_studio"]
     text = (output / "captures/test-000000/spec.json").read_bytes()
     spec = SceneSpec.model_validate_json(text)
-    cameras = held_out_cameras(spec, tiny(output).captures)
+    cameras = held_out_cameras(spec, tiny(output).capture)
     geometry = build(spec, edge=EDGE)
     for folder in folders:
         relit, light = read_capture_folder(folder), EnvironmentMap.load(folder / "environment.exr")

@@ -421,11 +421,11 @@ QUICK = (
     '"light.split_sum_resolution=64","score_every=10","radiance.density.most=600","initial.count=300","report.frames=2","report.side=32"'
 )
 CAPTURES = (
-    '"experiment=captures","captures.scenes=1","captures.views=9","captures.width=32","captures.height=32",'
-    '"captures.path_spp=4","captures.reference_spp=4","mesh_edge=0.2","environment_height=32","cluster=null"'
+    '"experiment=captures","capture.scenes=1","capture.views=9","capture.width=32","capture.height=32",'
+    '"capture.path_spp=4","capture.reference_spp=4","mesh_edge=0.2","environment_height=32","cluster=null"'
 )
 
-RELIT = '"captures.relight_spp=4"'
+RELIT = '"capture.relight_spp=4"'
 SPLATS = '"up=[0,0,1]","splats.views=9","splats.side=32"'
 
 

@@ -1,0 +1,11 @@
+"""The form of all settings of the data engine: frozen, without unknown keys, finite."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict
+
+
+class SettingsModel(BaseModel):
+    """Settings that cannot change, refuse keys that they do not know, and hold finite numbers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

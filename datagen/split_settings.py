@@ -1,0 +1,72 @@
+"""The settings of one split of a dataset."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from datagen.lights import LightChoice
+from datagen.settings_model import SettingsModel
+from datagen.styles import StyleChoice
+
+
+class SplitSettings(SettingsModel):
+    """One split: how many scenes of which kind, and how they are rendered."""
+
+    scenes: int = Field(ge=0, le=1_000_000, description="Number of scenes.")
+    style: StyleChoice | Annotated[list[StyleChoice], Field(min_length=1)] = Field(
+        default="A",
+        description="What stands in a scene, on what, and how it is filmed. Scenes take those of a list in "
+        "turns.",
+        examples=["[mixed,A]"],
+    )
+    lights: list[LightChoice] = Field(
+        default=["any"] * 4,
+        min_length=1,
+        max_length=64,
+        description="Light of each clip of a scene, one clip for each in the list. any draws one of "
+        "families; high, medium and low draw one of such contrast; hdri takes one of the maps in "
+        "environments.",
+    )
+    lights_share_path: bool | None = Field(
+        default=None,
+        description="All clips of a scene show it from the same cameras: each frame is path-traced under all "
+        "lights at once, which share its paths, rays and G-buffers. null: in every style but A and B, "
+        "whose clips begin at places of their own.",
+    )
+    moving_objects: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Share of scenes in whose clips an object is lifted and turned; their frames cost more.",
+    )
+    moving_lights: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Share of lights that turn about the zenith within their clip; their frames cost more.",
+    )
+    frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
+    width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
+    height: int = Field(default=256, ge=8, le=8192, description="Frame height in pixels.")
+    path_spp: int = Field(
+        default=256,
+        ge=1,
+        description="Paths per pixel of path-traced frames; rounded up to a product of near numbers.",
+    )
+    guidance_spp: int = Field(
+        default=64, ge=2, multiple_of=2, description="Shadow rays per pixel of the surfels' irradiance, even."
+    )
+    reference_buffers: bool = Field(
+        default=False,
+        description="Also store Mitsuba's direct irradiance, with and without shadows, base color, normals, "
+        "depth, roughness and metallic, and the surfels' own.",
+    )
+    reference_spp: int = Field(
+        default=128, ge=2, description="Shadow rays per pixel of Mitsuba's direct irradiance."
+    )
+
+    def style_of(self, index: int) -> StyleChoice:
+        """Style of the scene of that number."""
+        return self.style[index % len(self.style)] if isinstance(self.style, list) else self.style
