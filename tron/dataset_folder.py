@@ -47,7 +47,9 @@ class DatasetFolder:
             TronError: the store does not answer.
         """
         try:
-            return int(self._files.size(self._path(name)) or 0) if self._files.isfile(self._path(name)) else None
+            return (
+                int(self._files.size(self._path(name)) or 0) if self._files.isfile(self._path(name)) else None
+            )
         except Exception as error:  # stores raise whatever their package does
             raise self._unreadable(name, error) from error
 
