@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from eval.datagen.hostile import measure_hostile
 from eval.datagen.kills import measure_kills
 from eval.datagen.parts import Found
 from eval.datagen.settings import DatagenSettings, Part
@@ -39,6 +40,7 @@ HEADLINE = {
     "frames_per_hour.256": "Frames an hour, 256²",
     "soak.rss_growth_mb": "Growth of memory over the soak",
     "kills.identical": "Kills that left no trace",
+    "hostile.refused": "Hostile files refused",
 }
 
 
@@ -92,6 +94,7 @@ class Datagen(DatagenSettings):
                 [*_of(tiny, self.specified_scenes), *self.specified], at
             ),
             "throughput": lambda at: measure_throughput(self.throughput, self.sizes, at),
+            "hostile": measure_hostile,
         }
         stages = Stages(folder)
         stages.restart(part)  # a figure of this run, never of one before

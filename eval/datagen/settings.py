@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat
 
 from eval.benchmark import Benchmark
 
-Part = Literal["variety", "sharing", "workers", "soak", "kills", "specifications", "throughput"]
+Part = Literal["variety", "sharing", "workers", "soak", "kills", "specifications", "throughput", "hostile"]
 
 
 class VarietySettings(BaseModel):

@@ -1,0 +1,91 @@
+"""Child process of ``eval.datagen.hostile``: reads files of one kind, and prints what that cost."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from eval.datagen.hostile_files import CANARY
+from tron.errors import TronError
+
+
+def _shard(path: Path) -> None:
+    from tron.shards.reader import read_clips
+
+    for _ in read_clips(path, "train"):
+        pass
+
+
+def _picture(path: Path) -> None:
+    from tron.images import read_image
+
+    read_image(path)
+
+
+def _surfels(path: Path) -> None:
+    from tron.gaussians.scene import GaussianScene
+
+    GaussianScene.load(path).validate()
+
+
+def _capture(path: Path) -> None:
+    from tron.captures import LoadSettings, load_capture
+
+    for view in load_capture(path, LoadSettings()).views:
+        view.read()
+
+
+def _weights(path: Path) -> None:
+    from tron.neural.weights import load_renderer
+
+    load_renderer(path)
+
+
+def _recipe(path: Path) -> None:
+    from tron.claim import read_recipe
+
+    read_recipe(path)
+
+
+READERS: dict[str, Callable[[Path], None]] = {
+    "shard": _shard,
+    "manifest": _shard,
+    "picture": _picture,
+    "surfels": _surfels,
+    "capture": _capture,
+    "weights": _weights,
+    "recipe": _recipe,
+}
+
+
+def peak() -> int:
+    """Greatest resident memory since it was last counted anew, kB."""
+    text = Path("/proc/self/status").read_text()
+    return int(text.split("VmHWM:")[1].split()[0])
+
+
+def main(kind: str, paths: list[str]) -> None:
+    """Print a line of JSON for each path, after an @: libraries print as well."""
+    for name in paths:
+        path = Path(name)
+        os.chdir(path if path.is_dir() else path.parent)  # where a program in it would leave its mark
+        Path("/proc/self/clear_refs").write_text("5")
+        before, start = peak(), time.process_time()
+        said = None
+        try:
+            READERS[kind](path)
+        except TronError as error:
+            said = str(error)
+        except Exception as error:  # a reader that falls over has not refused
+            said = f"not refused:\n{type(error).__name__}: {error}"
+        seconds, grown = time.process_time() - start, (peak() - before) / 1024
+        line = {"said": said, "seconds": seconds, "megabytes": grown, "executed": Path(CANARY).exists()}
+        print(f"\n@{json.dumps(line)}", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2:])
