@@ -1,0 +1,324 @@
+"""The ten promises of the data engine (docs/data.md), each held to both sources: scenes and captures."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import datagen.run
+import datagen.scene_files
+from datagen.run import make
+from datagen.settings import Settings
+from datagen.validate import validate
+from tron.cli.recipes import check, compose_recipe
+from tron.errors import TronError
+from tron.images import read_image
+from tron.shards.manifest import Manifest
+from tron.shards.reader import read_clips
+from tron.shards.verify import verify
+from tron.storage import locked
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+SCRIPT = Path(sys.executable).with_name("tron-datagen")
+
+
+@dataclass(frozen=True)
+class Source:
+    """One of the two sources at its smallest.
+
+    Attributes:
+        words: overrides of tron-datagen for two scenes or captures, in this process.
+        maker: name in datagen.run of what makes one.
+        outside: a word that is refused, and what the line must name.
+    """
+
+    name: str
+    words: Sequence[str]
+    maker: str
+    outside: tuple[str, str]
+
+    def settings(self, output: Path, *more: str) -> Settings:
+        """Settings of a dataset in ``output``."""
+        words = [*self.words, "cluster=none", f"output_dir={output}", *more]
+        return check(compose_recipe("conf.datagen", Settings, words), Settings)
+
+
+@pytest.fixture(scope="module", params=["synthetic", "captured"])
+def source(request: pytest.FixtureRequest, tiny_scenes: list[str]) -> Source:
+    if request.param == "synthetic":
+        return Source("synthetic", tiny_scenes, "make_scene", ("train.frames=94", "train.frames"))
+    captures = request.getfixturevalue("tiny_captures")
+    words = ["source=captured", f"captures={captures}", "prior=ground_truth"]
+    words += request.getfixturevalue("quick_reconstruction")
+    return Source("captured", words, "make_capture", ("captured.frames=0", "captured.frames"))
+
+
+@pytest.fixture(scope="module")
+def dataset(source: Source, variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A whole dataset of the source; nobody writes into it."""
+    output = tmp_path_factory.mktemp(source.name) / "dataset"
+    assert make(source.settings(output)) == 0
+    return output
+
+
+def names(dataset: Path) -> list[str]:
+    """Names of a dataset's scenes."""
+    return sorted(path.parent.name for path in dataset.glob("scenes/*/record.json"))
+
+
+def without(dataset: Path, copy: Path, name: str) -> Path:
+    """A copy of a dataset in which one scene has never been made."""
+    shutil.copytree(dataset, copy)
+    record = json.loads((copy / "scenes" / name / "record.json").read_text())
+    for entry in record["shards"]:
+        (copy / entry["name"]).unlink()
+    shutil.rmtree(copy / "scenes" / name)
+    return copy
+
+
+def test_1_deterministic_a_scene_depends_on_its_seed_and_number_alone(
+    source: Source, dataset: Path, tmp_path: Path, files_of: Callable
+) -> None:
+    last = names(dataset)[-1]
+    assert make(source.settings(tmp_path / "alone", f"only=[{last}]")) == 0
+    whole, alone = files_of(dataset), files_of(tmp_path / "alone")
+    own = [path for path in whole if path.startswith(f"scenes/{last}/")]
+    own += [entry.name for entry in Manifest.load(tmp_path / "alone").shards]
+    assert len(own) > 2
+    assert {path: alone[path] for path in own} == {path: whole[path] for path in own}
+
+
+def test_2_resumable_what_is_missing_is_made_again_and_nothing_else(
+    source: Source, dataset: Path, tmp_path: Path, files_of: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = without(dataset, tmp_path / "broken", names(dataset)[0])
+    (broken / ".train-00000.part.tar").write_bytes(b"half a shard")
+    assert make(source.settings(broken)) == 0
+    assert files_of(broken) == files_of(dataset)
+
+    def never(*_: object) -> None:
+        raise AssertionError("nothing is left to make")
+
+    monkeypatch.setattr(datagen.run, source.maker, never)
+    before = {path: os.stat(dataset / path).st_mtime_ns for path in files_of(dataset)}
+    assert make(source.settings(dataset)) == 0
+    assert {path: os.stat(dataset / path).st_mtime_ns for path in files_of(dataset)} == before
+
+
+@pytest.mark.long
+def test_2_resumable_after_sigkill_at_any_moment(
+    source: Source, dataset: Path, tmp_path: Path, files_of: Callable
+) -> None:
+    output, killed = tmp_path / "killed", 0
+    for attempt in range(8):
+        with subprocess.Popen(
+            [SCRIPT, *source.words, "cluster=none", f"output_dir={output}"], stderr=subprocess.DEVNULL
+        ) as process:
+            deadline = time.monotonic() + 90
+            # Each attempt lives a little longer beyond the moment at which there is anything to lose.
+            while not (output / "config.yaml").is_file() and process.poll() is None:
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+            time.sleep(0.4 * attempt)
+            if process.poll() is None:
+                process.send_signal(signal.SIGKILL)
+                killed += 1
+    assert killed >= 2
+    assert make(source.settings(output)) == 0
+    assert files_of(output) == files_of(dataset)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
+    """Mounts a disk of so many bytes, or changes its size."""
+    folder = tmp_path / "disk"
+
+    def mount(size: int) -> Path:
+        how = f"remount,size={size}" if folder.is_mount() else f"size={size}"
+        folder.mkdir(exist_ok=True)
+        done = subprocess.run(["mount", "-t", "tmpfs", "-o", how, "tmpfs", folder], capture_output=True)
+        if done.returncode:
+            pytest.skip(f"no tmpfs can be mounted: {done.stderr.decode().strip()}")
+        return folder
+
+    yield mount
+    if folder.is_mount():
+        subprocess.run(["umount", folder], check=True)
+
+
+def test_3_atomic_a_full_disk_leaves_nothing_half_written(
+    source: Source,
+    dataset: Path,
+    small_disk: Callable[[int], Path],
+    files_of: Callable,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    size = sum(len(data) for data in files_of(dataset).values())
+    full = small_disk(size // 3)
+    # What the check beforehand cannot know: others fill the disk while the scenes are made.
+    monkeypatch.setattr(datagen.run, "require_free_space", lambda *_: None)
+    try:
+        assert make(source.settings(full / "dataset")) > 0
+    except TronError as error:
+        assert "space" in str(error).lower()
+    whole = files_of(dataset)
+    for path, data in files_of(full / "dataset").items():
+        if path in whole and path.endswith((".tar", ".ply", "record.json", "spec.json")):
+            assert data == whole[path], f"{path} is not whole"
+        assert not path.endswith((".part", ".part.tar")), path
+    small_disk(40 * size)
+    assert make(source.settings(full / "dataset")) == 0
+    assert files_of(full / "dataset") == whole
+
+
+def test_3_atomic_too_small_a_disk_and_a_read_only_one_are_told_before_the_first_scene(
+    source: Source, small_disk: Callable[[int], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: object) -> None:
+        raise AssertionError("a scene is made")
+
+    monkeypatch.setattr(datagen.run, source.maker, never)
+    disk = small_disk(100_000)
+    with pytest.raises(TronError, match="not enough disk space"):
+        make(source.settings(disk / "dataset"))
+    assert not list(disk.rglob("*.tar"))
+    subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
+    with pytest.raises(TronError, match="Read-only"):
+        make(source.settings(disk / "other"))
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "missing", "record"])
+def test_4_accounted_for_validation_finds_what_is_damaged(
+    dataset: Path, tmp_path: Path, damage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert validate(dataset) == 0
+    copy = tmp_path / "copy"
+    shutil.copytree(dataset, copy)
+    entry = Manifest.load(copy).shards[-1]
+    shard = copy / entry.name
+    data = shard.read_bytes()
+    if damage == "cut":
+        shard.write_bytes(data[:-2048])
+    elif damage == "flipped":
+        middle = len(data) // 2
+        shard.write_bytes(data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :])
+    elif damage == "missing":
+        shard.unlink()
+    else:
+        (copy / "scenes" / names(copy)[0] / "surfels.ply").unlink()
+    capsys.readouterr()
+    assert validate(copy) > 0
+    said = "".join(capsys.readouterr())
+    assert (entry.name if damage != "record" else names(copy)[0]) in said
+
+
+def test_5_failures_are_data_with_a_command_that_tries_again(
+    source: Source, dataset: Path, tmp_path: Path, files_of: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, output = names(dataset)[0], tmp_path / "out"
+    real = getattr(datagen.run, source.maker)
+
+    def fails(item, *rest):  # noqa: ANN001, ANN202
+        if item.name == first:
+            raise RuntimeError("no memory\nfor this")
+        return real(item, *rest)
+
+    monkeypatch.setattr(datagen.run, source.maker, fails)
+    assert make(source.settings(output)) == 1
+    failure = json.loads((output / "failures.jsonl").read_text())
+    assert (failure["scene"], failure["reason"]) == (first, "RuntimeError: no memory for this")
+    assert (output / failure["traceback"]).read_text().endswith("no memory\nfor this\n")
+    assert names(output) == names(dataset)[1:], "the others are made"
+    assert verify(output) == []
+    monkeypatch.undo()
+    words = shlex.split(failure["command"])
+    assert make(check(compose_recipe("conf.datagen", Settings, words[1:]), Settings)) == 0
+    assert files_of(output) == files_of(dataset)
+
+
+def test_6_finite_a_clip_with_nan_is_set_aside_and_never_in_a_shard(
+    source: Source, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    split = Manifest.load(dataset).shards[0].split
+    key = Manifest.load(dataset).shards[0].keys[0]
+    real = datagen.scene_files.first_bad_value
+
+    def spoilt(frames):  # noqa: ANN001, ANN202
+        frames = [dict(frame) for frame in frames]
+        frames[0]["pbr"] = np.full_like(frames[0]["pbr"], np.nan)
+        return real(frames)
+
+    monkeypatch.setattr(datagen.scene_files, "first_bad_value", spoilt)
+    assert make(source.settings(tmp_path)) >= 1
+    assert "pbr has" in json.loads((tmp_path / "failures.jsonl").read_text().splitlines()[0])["reason"]
+    assert key not in {clip for entry in Manifest.load(tmp_path).shards for clip in entry.keys}
+    assert (tmp_path / "quarantine" / f"{key}.npz").is_file()
+    monkeypatch.undo()
+    for clip in read_clips(dataset, split):
+        assert all(np.isfinite(member).all() for member in clip.frames.values())
+
+
+def test_7_bounded_two_runs_of_one_folder_do_not_mix(source: Source, tmp_path: Path) -> None:
+    with locked(tmp_path), pytest.raises(TronError, match="in use by another run"):
+        make(source.settings(tmp_path))
+
+
+@pytest.mark.long
+def test_7_bounded_memory_stays_flat_over_many_scenes(tiny_scenes: list[str], tmp_path: Path) -> None:
+    """Workers are replaced: the benchmark's soak watches 500 scenes, this one 60 and three lives."""
+    from eval.datagen.soak import measure_soak
+
+    words = [each for each in tiny_scenes if not each.startswith("train.scenes")]
+    soak = measure_soak([*words, "recycle_after=10"], 60, tmp_path)
+    assert soak.peak(4) - soak.peak(1) < 150
+
+
+# 8, hostile input, is tests/robustness/test_hostile_files.py.
+
+
+def test_9_wrong_configuration_fails_before_anything_in_a_line_that_names_the_key(
+    source: Source, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from datagen.cli import cli
+
+    word, named = source.outside
+    with pytest.raises(SystemExit) as stop:
+        cli([*source.words, f"output_dir={tmp_path / 'out'}", word])
+    said = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert len(said.splitlines()) == 1
+    assert named in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_10_visible_sheets_page_card_and_a_bar(
+    source: Source, dataset: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    page, card = ((dataset / name).read_text() for name in ("index.html", "README.md"))
+    for entry in Manifest.load(dataset).shards:
+        sheet = f"previews/{entry.name.removesuffix('.tar')}.png"
+        assert read_image(dataset / sheet).std() > 0.01
+        assert sheet in page
+    assert "tron-datagen" in card
+    assert "mitsuba" in card
+    done = subprocess.run(
+        [SCRIPT, *source.words, "cluster=none", f"only=[{names(dataset)[0]}]", f"output_dir={tmp_path}"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "1/1" in done.stderr.replace(" ", "") or "100%" in done.stderr
