@@ -9,15 +9,14 @@ from pathlib import Path
 
 from datagen.captured_settings import Shares
 from datagen.settings import SPLITS, Settings, Split
+from tron.captures.photo_files import SUFFIXES
 from tron.captures.transforms import has_transforms
 from tron.errors import TronError
 from tron.seeds import integer
 
 log = logging.getLogger(__name__)
 
-PICTURES = frozenset(
-    (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".exr", ".heic", ".heif", ".dng")
-)
+PICTURES = frozenset(SUFFIXES)
 """Suffixes of files that are counted as photos, to estimate bytes and time; what reads them decides."""
 
 
@@ -92,7 +91,8 @@ def split_of(names: Sequence[str], shares: Shares, seed: int) -> dict[Split, lis
     >>> {k: len(v) for k, v in split_of(list("abcdefghij"), Shares(), seed=0).items()}
     {'train': 8, 'validation': 1, 'test': 1}
     """
-    counts = apportioned({split: getattr(shares, split) for split in SPLITS}, len(names))
+    wanted: dict[Split, float] = {split: getattr(shares, split) for split in SPLITS}
+    counts = apportioned(wanted, len(names))
     order = sorted(names, key=lambda name: (integer(seed, "captured", "split", name, bits=64), name))
     found: dict[Split, list[str]] = {}
     begin = 0
@@ -106,7 +106,7 @@ def split_of(names: Sequence[str], shares: Shares, seed: int) -> dict[Split, lis
 def apportioned(shares: Mapping[Split, float], total: int) -> dict[Split, int]:
     """Whole numbers that sum to ``total``, in proportion to shares: see :func:`split_of`."""
     wanted = sorted((name for name in shares if shares[name] > 0), key=lambda name: -shares[name])
-    counts = {name: int(name in wanted[:total]) for name in shares}
+    counts: dict[Split, int] = {name: int(name in wanted[:total]) for name in shares}
     whole = sum(shares.values())
     while sum(counts.values()) < total:
         lacking = {name: shares[name] / whole * total - counts[name] for name in wanted}

@@ -30,7 +30,7 @@ class CapturedSettings(SettingsModel):
         default_factory=list, description="Names of the captures to use; empty: all sub-folders of captures."
     )
     shares: Shares = Field(
-        Shares(),
+        default_factory=lambda: Shares(),
         description="Share of the captures in each split, every capture in one of them, drawn by seed and "
         "name; each split with a share has a capture where there are enough, the largest shares first.",
     )
@@ -54,7 +54,7 @@ class CapturedSettings(SettingsModel):
         default=64, ge=2, multiple_of=2, description="Shadow rays per pixel of the surfels' irradiance, even."
     )
     photos: CaptureSettings = Field(
-        CaptureSettings(test_every=0),
+        default_factory=lambda: CaptureSettings(test_every=0),
         description="How captures are read, as by tron-reconstruct; max_side and downscale are those of the "
         "reconstruction alone. test_every holds photos out of both, to judge surfels by, and breaks clips.",
     )

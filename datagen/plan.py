@@ -284,8 +284,8 @@ def require_adoptable(settings: Settings) -> None:
             raise TronError("config.yaml is damaged", path, CHOOSE_ANOTHER) from error
         require_schema(schema, settings.output_dir)
         now = settings.recipe()
-        sources = [{"source": each.get("source", "synthetic")} for each in (before, now)]
-        require_same(*sources, settings.output_dir, "a dataset")
+        then, asked = ({"source": each.get("source", "synthetic")} for each in (before, now))
+        require_same(then, asked, settings.output_dir, "a dataset")
         if settings.source == "captured":
             _require_same_captures(before, scenes, settings)
             return
@@ -310,8 +310,10 @@ def require_adoptable(settings: Settings) -> None:
 
 
 def _require_same_captures(before: dict[str, Any], scenes: dict[str, Any], settings: Settings) -> None:
-    """Raise TronError unless a dataset of captures is this one: one more would move others to other splits."""
-    require_same(before, settings.recipe(), settings.output_dir, "a dataset", defaults=model_defaults(Settings))
+    """Raise TronError unless a dataset has these captures: one more would move others between splits."""
+    require_same(
+        before, settings.recipe(), settings.output_dir, "a dataset", defaults=model_defaults(Settings)
+    )
     if scenes != _scenes(settings):
         then, now = (
             {name for names in each.values() for name in names} for each in (scenes, _scenes(settings))

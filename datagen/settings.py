@@ -101,8 +101,8 @@ class Settings(SettingsModel):
     )
     source: Literal["synthetic", "captured"] = Field(
         "synthetic",
-        description="What is made: synthetic scenes, drawn from seeds and path-traced; or captured ones: each "
-        "folder of photos in captures is reconstructed and lit, and its photos are the truth. Only seed, "
+        description="What is made: synthetic scenes, drawn from seeds and path-traced; or captured ones: "
+        "each folder of photos in captures is reconstructed and lit, and its photos are the truth. Only seed, "
         "clips_per_shard, variant, estimation of the light and keys of the run concern both: with captured, "
         "other keys of synthetic scenes are refused.",
     )
@@ -111,7 +111,9 @@ class Settings(SettingsModel):
         description="Local folder with a capture a sub-folder, whatever tron-reconstruct reads, for "
         "source=captured.",
     )
-    captured: CapturedSettings = Field(CapturedSettings(), description="Training pairs of captures.")
+    captured: CapturedSettings = Field(
+        default_factory=lambda: CapturedSettings(), description="Training pairs of captures."
+    )
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."
     )
