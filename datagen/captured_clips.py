@@ -1,4 +1,4 @@
-"""Clips of a capture: photos in a row, and what the surfels show from the same places in the capture's light."""
+"""Clips of a capture: photos in a row, and what its surfels show from their places in the capture's light."""
 
 from __future__ import annotations
 

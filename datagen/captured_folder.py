@@ -105,8 +105,10 @@ def split_of(names: Sequence[str], shares: Shares, seed: int) -> dict[Split, lis
 
 def apportioned(shares: Mapping[Split, float], total: int) -> dict[Split, int]:
     """Whole numbers that sum to ``total``, in proportion to shares: see :func:`split_of`."""
-    wanted = sorted((name for name in shares if shares[name] > 0), key=lambda name: -shares[name])
-    counts: dict[Split, int] = {name: int(name in wanted[:total]) for name in shares}
+    wanted: list[Split] = sorted(
+        (name for name in SPLITS if shares[name] > 0), key=lambda name: -shares[name]
+    )
+    counts: dict[Split, int] = {name: int(name in wanted[:total]) for name in SPLITS}
     whole = sum(shares.values())
     while sum(counts.values()) < total:
         lacking = {name: shares[name] / whole * total - counts[name] for name in wanted}

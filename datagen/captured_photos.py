@@ -130,7 +130,7 @@ def _covered(view: View, width: int, height: int) -> Box:
     shrink = min(camera.width / width, camera.height / height)
     if shrink < 1:
         raise TronError(
-            f"a photo of {camera.width} x {camera.height} pixels is smaller than a frame of {width} x {height}",
+            f"a photo has {camera.width} x {camera.height} pixels, fewer than a frame, {width} x {height}",
             f"view {view.name}",
             "make captured.width and captured.height smaller",
         )

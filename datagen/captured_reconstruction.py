@@ -1,8 +1,8 @@
 """Surfels and light of a capture, found once and kept beside the shards.
 
 Poses of bare photos and the checkpoint of the reconstruction are kept in ``scenes/NAME/work`` until the scene
-is finished. Surfels and light are written when they are found, and are read back by whoever goes on from there, the
-run that found them included: so a run that was killed gives the same bytes.
+is finished. Surfels and light are written when they are found, and are read back by whoever goes on from
+there, the run that found them included: so a run that was killed gives the same bytes.
 """
 
 from __future__ import annotations

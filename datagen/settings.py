@@ -102,9 +102,9 @@ class Settings(SettingsModel):
     source: Literal["synthetic", "captured"] = Field(
         "synthetic",
         description="What is made: synthetic scenes, drawn from seeds and path-traced; or captured ones: "
-        "each folder of photos in captures is reconstructed and lit, and its photos are the truth. Only seed, "
-        "clips_per_shard, variant, estimation of the light and keys of the run concern both: with captured, "
-        "other keys of synthetic scenes are refused.",
+        "each folder of photos in captures is reconstructed and lit, and its photos are the truth. Only "
+        "seed, clips_per_shard, variant, estimation of the light and keys of the run concern both: other "
+        "keys of synthetic scenes are refused with captured.",
     )
     captures: Path | None = Field(
         None,
