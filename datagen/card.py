@@ -13,13 +13,14 @@ from omegaconf import OmegaConf
 
 import tron
 from datagen.assets import Asset
+from datagen.captured_settings import CapturedSettings
 from datagen.clip_rows import ClipRow
 from datagen.contact_sheet import SHEET_NAME
 from datagen.hub import configurations, front_matter
 from datagen.plan import Figures, Refinement, Sources, config_sha256
 from datagen.settings import OUTSIDE, SPLITS, Settings
 from datagen.variety import MEASURES, VARIETY_NAME, Histograms, Other, median
-from tron.cli.recipes import compose_recipe
+from tron.cli.recipes import complete, compose_recipe
 from tron.nested import leaves
 from tron.runtime import describe_machine
 from tron.shards.manifest import Manifest
@@ -34,8 +35,15 @@ def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), 
     It does not lean on recipes, whose content may change. ``output_dir`` and ``only`` are the caller's;
     without ``machine`` it leaves out what decides nothing of the content: cluster and workers.
     """
-    shipped = cast(dict, OmegaConf.to_container(compose_recipe("conf.datagen", Settings), resolve=False))
+    recipe = compose_recipe("conf.datagen", Settings)
     values = settings.model_dump(mode="json") | {"output_dir": output_dir, "only": list(only)}
+    if settings.source == "captured":
+        recipe = complete(recipe)
+        for part in ("reconstruction", "light"):
+            values["captured"][part]["seed"] = "${seed}"  # as it is shipped: each capture has its own
+    else:
+        values["captured"] = CapturedSettings().model_dump(mode="json")
+    shipped = cast(dict, OmegaConf.to_container(recipe, resolve=False))
     if not machine:
         values = {key: value for key, value in values.items() if key not in OUTSIDE}
         values |= {"output_dir": output_dir}
@@ -92,7 +100,8 @@ def card_text(
         front_matter(settings, clips, [file.licence for file in files]),
         "# Dataset card",
         "",
-        f"Clips of synthetic scenes for TRON's neural renderer, made by `tron-datagen` {tron.__version__} "
+        f"Clips of {settings.source} scenes for TRON's neural renderer, made by `tron-datagen` "
+        f"{tron.__version__} "
         f"(shard schema {SCHEMA_VERSION}, configuration {config_sha256(settings)[:12]}).",
         "Open `index.html` to look at every clip.",
         "",
@@ -120,8 +129,7 @@ def card_text(
         "",
         "    " + command_line(settings, "DIR", machine=False),
         "",
-        f"Root seed {settings.seed}. Frames by Mitsuba's path tracer, guidance by TRON's surfel tracer on "
-        f"about {settings.surfels:,} surfels a scene, from {settings.views} views. Buffers are linear; "
+        f"Root seed {settings.seed}. {_origin(settings)} "
         "`exposure` in a clip's metadata is the scalar to apply before AgX.",
         *_refinement(refinements),
         "",
@@ -142,6 +150,9 @@ def card_text(
         lines += ["| model | reason |", "|---|---|"]
         lines += [f"| {_cell(model.path)} | {_cell(model.reason)} |" for model in sources.refused]
         lines += [""]
+    if settings.source == "captured":
+        lines += _captures(rows)
+        return "\n".join(lines) + "\n"
     if not sources.assets and not sources.textures:
         lines.append("Shapes and materials are procedural: no asset of anybody's is in it.")
     elif not sources.assets:
@@ -149,6 +160,27 @@ def card_text(
     if not sources.maps:
         lines.append("Lights are procedural; skies follow Mitsuba's `sunsky`.")
     return "\n".join(lines) + "\n"
+
+
+def _origin(settings: Settings) -> str:
+    """Where frames and guidance come from, in a sentence or two."""
+    if settings.source == "synthetic":
+        return (
+            "Frames by Mitsuba's path tracer, guidance by TRON's surfel tracer on "
+            f"about {settings.surfels:,} surfels a scene, from {settings.views} views. Buffers are linear;"
+        )
+    shown = "as the mean photo of their capture would show them" if settings.captured.balance else "as stored"
+    return (
+        f"Frames (`rgb`) are photos, display values, {shown}; guidance by TRON's surfel tracer on surfels and "
+        "light that were reconstructed from the same photos, `scenes/NAME/spec.json` says how well. Guidance "
+        "is linear;"
+    )
+
+
+def _captures(rows: Sequence[ClipRow]) -> list[str]:
+    """What photos say of their origin: nothing, so that their owner has to."""
+    scenes = {row.scene for row in rows}
+    return [f"{len(scenes)} captures. Photos are their owners': say under which licence before you publish."]
 
 
 def _refinement(found: Sequence[Refinement]) -> list[str]:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from datagen.preview import DEPTHS, displayable, is_light
+from datagen.preview import DEPTHS, displayable, is_light, shown_as_is
 from tron.color import to_display
 from tron.images import encode_jpeg, encode_png
 from tron.shards.schema import MEMBERS, TARGET, ClipMeta
@@ -35,9 +35,9 @@ TILE_BYTES = 6
 def write_preview(folder: Path, meta: ClipMeta, frames: Sequence[dict[str, np.ndarray]]) -> None:
     """Write ``previews/KEY.jpg`` and ``previews/KEY.js`` of a clip, the same bytes for the same frames."""
     picture = shrink(frames[0][TARGET])
-    write_atomic(
-        folder / thumbnail_name(meta.key), encode_jpeg(np.asarray(to_display(picture, meta.exposure)))
-    )
+    if not shown_as_is(meta, TARGET):
+        picture = np.asarray(to_display(picture, meta.exposure))
+    write_atomic(folder / thumbnail_name(meta.key), encode_jpeg(picture))
     write_atomic(folder / script_name(meta.key), script(meta, frames))
 
 
@@ -53,9 +53,9 @@ def script_name(key: str) -> str:
 
 def script(meta: ClipMeta, frames: Sequence[dict[str, np.ndarray]]) -> str:
     """A call of the page's ``showClip`` with every tile: member, frame, whether it is light, PNG."""
-    tiles = [_tile(TARGET, number, frames[number]) for number in shown_frames(len(frames))]
+    tiles = [_tile(meta, TARGET, number, frames[number]) for number in shown_frames(len(frames))]
     members = [name for name in MEMBERS if name in frames[0] and name not in (TARGET, *DEPTHS)]
-    tiles += [_tile(name, 0, frames[0]) for name in members]
+    tiles += [_tile(meta, name, 0, frames[0]) for name in members]
     return f"showClip({json.dumps({'key': meta.key, 'tiles': tiles}, separators=(',', ':'))});\n"
 
 
@@ -71,9 +71,9 @@ def shown_frames(count: int) -> list[int]:
     return sorted({round(k) for k in np.linspace(0, count - 1, min(count, MOST_FRAMES))})
 
 
-def _tile(member: str, number: int, frame: dict[str, np.ndarray]) -> dict[str, Any]:
+def _tile(meta: ClipMeta, member: str, number: int, frame: dict[str, np.ndarray]) -> dict[str, Any]:
     image = shrink(frame[member])
-    light = is_light(member)
+    light = is_light(member) and not shown_as_is(meta, member)
     png = encode_png(log_pixels(image) if light else displayable(member, image))
     return {
         "member": member,

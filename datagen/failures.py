@@ -97,6 +97,7 @@ def _line(
     """A scene, clip or capture with the command that tries it again."""
     return {
         "scene": item.name,
+        **({"capture": item.capture} if item.capture else {}),
         "clip": clip,
         "split": item.split,
         "index": item.index,

@@ -65,7 +65,7 @@ def front_matter(settings: Settings, clips: Mapping[str, int], licences: Sequenc
         "license": licence_names(licences),
         "task_categories": ["image-to-image"],
         "tags": [
-            *("relighting", "inverse-rendering", "neural-rendering", "hdr", "synthetic", "webdataset"),
+            *("relighting", "inverse-rendering", "neural-rendering", "hdr", settings.source, "webdataset"),
             *("mitsuba", "gaussian-splatting"),
         ],
         "size_categories": [size_category(sum(clips.values()))],

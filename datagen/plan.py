@@ -11,11 +11,13 @@ import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from datagen.assets import Asset, Refused, find_environments, find_models
+from datagen.captured_folder import find_captures, split_of
 from datagen.clip_preview import preview_bytes
 from datagen.clip_rows import ClipRow
 from datagen.lights import HdriSpec
@@ -37,12 +39,25 @@ SURFEL_BYTES = 320
 
 @dataclass(frozen=True)
 class Work:
-    """One scene to make: its split, index and name, and the number of its first shard."""
+    """One scene to make: its split, index and name, and the number of its first shard.
+
+    Attributes:
+        capture: name of the capture that it is; empty where it is synthetic.
+        photos: about how many that has.
+    """
 
     split: str
     index: int
     name: str
     first_shard: int
+    capture: str = ""
+    photos: int = 0
+
+    def clips(self, settings: Settings) -> int:
+        """Clips that it gives: one a light, or as many as its photos are cut into, about."""
+        if self.capture:
+            return max(self.photos // settings.captured.frames, 1)
+        return len(settings.split(self.split).lights)
 
 
 @dataclass(frozen=True)
@@ -102,6 +117,7 @@ class Record(BaseModel):
     """scenes/NAME/record.json: the scene is finished, and this is what it gave.
 
     Attributes:
+        capture: name of the capture that it is; None where it is synthetic.
         clips: a row each; empty in records of older versions.
         variety: histograms of the scene (``datagen.variety``); likewise.
     """
@@ -109,6 +125,7 @@ class Record(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     name: str
+    capture: str | None = None
     shards: list[ShardEntry]
     quarantined: list[Quarantined]
     refinement: Refinement | None = None
@@ -116,8 +133,16 @@ class Record(BaseModel):
     variety: Histograms = Field(default_factory=dict)
 
 
+CAPTURE_SHARDS = 100
+"""Numbers of shards that a capture has to itself: how many clips it gives is known only when it is read."""
+
+LARGEST_SHARD = 999_999
+
+
 def plan(settings: Settings) -> list[Work]:
     """Every scene of the dataset, in order of split and index."""
+    if settings.source == "captured":
+        return _plan_captured(settings)
     items = []
     for split in settings.used_splits():
         recipe = settings.split(split)
@@ -128,16 +153,32 @@ def plan(settings: Settings) -> list[Work]:
     return items
 
 
+def _plan_captured(settings: Settings) -> list[Work]:
+    photos = {each.name: each.photos for each in find_captures(settings)}
+    splits = split_of(list(photos), settings.captured.shares, settings.seed)
+    items = [
+        Work(split, i, scene_name(split, i), i * CAPTURE_SHARDS, name, photos[name])
+        for split, names in splits.items()
+        for i, name in enumerate(names)
+    ]
+    if max(item.first_shard for item in items) + CAPTURE_SHARDS - 1 > LARGEST_SHARD:
+        most = (LARGEST_SHARD + 1) // CAPTURE_SHARDS
+        raise TronError(
+            f"a split has more than {most} captures", settings.captures, "make several datasets of them"
+        )
+    return items
+
+
 def chosen(items: list[Work], only: Iterable[str]) -> list[Work]:
-    """The scenes named by ``only``, all if it is empty; TronError names one that the plan lacks."""
+    """The scenes, or captures, named by ``only``, all if it is empty; TronError names one that lacks."""
     names = list(only)
-    known = {item.name for item in items}
+    known = {name for item in items for name in (item.name, item.capture) if name}
     for name in names:
         if name not in known:
             raise TronError(
                 "no such scene in this dataset", name, f"scenes are {items[0].name} to {items[-1].name}"
             )
-    return [item for item in items if not names or item.name in names]
+    return [item for item in items if not names or item.name in names or item.capture in names]
 
 
 def find_sources(settings: Settings) -> Sources:
@@ -185,21 +226,33 @@ def _size(path: Path) -> int | None:
 def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
     """Bytes that scenes may take on disk: half-precision EXR hardly compresses noise."""
     total = 0
+    surfels = settings.surfels
+    if settings.source == "captured":
+        surfels = settings.captured.reconstruction.radiance.density.most
     for item in items:
         recipe = settings.split(item.split)
         members = [MEMBERS[name] for name in clip_members(recipe.reference_buffers)]
         pixel = sum(member.bytes * member.channels for member in members)
         frame = recipe.width * recipe.height * pixel + 16_384
         previews = preview_bytes(recipe.width, recipe.height, recipe.frames, len(members))
-        total += len(recipe.lights) * (recipe.frames * frame + previews) + settings.surfels * SURFEL_BYTES
+        total += item.clips(settings) * (recipe.frames * frame + previews) + surfels * SURFEL_BYTES
     return total
 
 
 def config_text(settings: Settings) -> str:
     """config.yaml of the dataset: schema, recipe and numbers of scenes, without where and by whom."""
-    counts = {split: settings.split(split).scenes for split in SPLITS}
-    described = {"schema": SCHEMA_VERSION, "scenes": counts, "recipe": settings.recipe()}
+    described = {"schema": SCHEMA_VERSION, "scenes": _scenes(settings), "recipe": settings.recipe()}
     return yaml.safe_dump(described, sort_keys=True, allow_unicode=True)
+
+
+def _scenes(settings: Settings) -> dict[str, Any]:
+    """Split -> number of its scenes, or the names of its captures."""
+    if settings.source == "synthetic":
+        return {split: settings.split(split).scenes for split in SPLITS}
+    found: dict[str, Any] = {}
+    for item in plan(settings):
+        found.setdefault(item.split, []).append(item.capture)
+    return found
 
 
 def config_sha256(settings: Settings) -> str:
@@ -231,6 +284,11 @@ def require_adoptable(settings: Settings) -> None:
             raise TronError("config.yaml is damaged", path, CHOOSE_ANOTHER) from error
         require_schema(schema, settings.output_dir)
         now = settings.recipe()
+        then, asked = ({"source": each.get("source", "synthetic")} for each in (before, now))
+        require_same(then, asked, settings.output_dir, "a dataset")
+        if settings.source == "captured":
+            _require_same_captures(before, scenes, settings)
+            return
         for split in SPLITS:
             if not scenes.get(split):  # there is nothing of it yet, so it may be anything from now on
                 before.pop(split, None)
@@ -248,6 +306,23 @@ def require_adoptable(settings: Settings) -> None:
     elif any(settings.output_dir.glob("*.tar")):
         raise TronError(
             "output_dir holds shards of something else", settings.output_dir, "choose an empty folder"
+        )
+
+
+def _require_same_captures(before: dict[str, Any], scenes: dict[str, Any], settings: Settings) -> None:
+    """Raise TronError unless a dataset has these captures: one more would move others between splits."""
+    require_same(
+        before, settings.recipe(), settings.output_dir, "a dataset", defaults=model_defaults(Settings)
+    )
+    if scenes != _scenes(settings):
+        then, now = (
+            {name for names in each.values() for name in names} for each in (scenes, _scenes(settings))
+        )
+        changed = sorted(then ^ now)
+        raise TronError(
+            f"output_dir holds a dataset of other captures: {', '.join(changed[:3]) or 'in other splits'}",
+            settings.output_dir,
+            "choose another output_dir, or name the ones to use: captured.names=[...]",
         )
 
 

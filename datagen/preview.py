@@ -28,7 +28,7 @@ def contact_row(meta: ClipMeta, frame: dict[str, np.ndarray]) -> np.ndarray:
         image = image if image.ndim == 3 else image[..., None]
         step = -(-max(image.shape[:2]) // LARGEST_TILE)
         image = np.broadcast_to(image[::step, ::step], (*image[::step, ::step].shape[:2], 3))
-        if is_light(member):
+        if is_light(member) and not shown_as_is(meta, member):
             image = np.asarray(to_display(image, meta.exposure), np.float32)
         else:
             image = displayable(member, image)
@@ -41,6 +41,11 @@ def contact_row(meta: ClipMeta, frame: dict[str, np.ndarray]) -> np.ndarray:
 def is_light(member: str) -> bool:
     """Whether a member is radiance or irradiance, which exposure applies to; base color is neither."""
     return MEMBERS[member].color_space == "linear" and not member.startswith("base_color")
+
+
+def shown_as_is(meta: ClipMeta, member: str) -> bool:
+    """Whether a clip holds a member as display values, as it does photos."""
+    return meta.color_space.get(member) == "display"
 
 
 def displayable(member: str, image: np.ndarray) -> np.ndarray:

@@ -12,7 +12,16 @@ from statistics import fmean
 
 from datagen.account import read_other
 from datagen.clusters import LOCAL, cores, logs_folder, require_cluster
-from datagen.plan import Work, chosen, find_sources, plan, read_record, require_adoptable, scene_folder
+from datagen.plan import (
+    Work,
+    chosen,
+    estimate_bytes,
+    find_sources,
+    plan,
+    read_record,
+    require_adoptable,
+    scene_folder,
+)
 from datagen.probe import SceneCost, probe
 from datagen.scheduling import TIMES_NAME
 from datagen.settings import Settings
@@ -20,6 +29,10 @@ from tron.cli.termination import termination_unwinds
 from tron.runtime import activate
 
 log = logging.getLogger(__name__)
+
+SECONDS_A_STEP = 0.03
+SECONDS_A_PIXEL = 2e-5
+ROUGHLY = "a rough law: no capture is made yet"
 
 NAMED = 4
 """Missing scenes that are named."""
@@ -62,7 +75,9 @@ def project(settings: Settings) -> str:
         if missing:
             made = [item for item in items if item.split == split and item.name in there]
             cost = _of_made(settings, made, times)
-            if cost is None:
+            if cost is None and settings.source == "captured":
+                cost = captured_cost(missing, settings)
+            elif cost is None:
                 log.info("a small scene of %s is rendered to see what it costs", split)
                 with termination_unwinds():  # the probe's clips wait in a folder that goes away
                     cost = probe(missing[0], settings, sources)
@@ -96,12 +111,27 @@ def _of_made(settings: Settings, made: Sequence[Work], times: Mapping[str, float
     return SceneCost(fmean(times[name] for name in timed), fmean(sizes), float("nan"), source)
 
 
+def captured_cost(missing: Sequence[Work], settings: Settings) -> SceneCost:
+    """Mean cost of captures of which none is made yet: bytes by their photos, seconds by a rough law.
+
+    The law is :data:`SECONDS_A_STEP` for the steps, and :data:`SECONDS_A_PIXEL` for guidance: both of one core,
+    measured with some thousand surfels. Photos of another size and more surfels take longer.
+    """
+    wanted = settings.captured
+    photos = fmean(item.photos for item in missing)
+    how = wanted.reconstruction
+    steps = how.steps_scaler * (how.radiance.steps + how.materials.steps)
+    pixels = photos * wanted.width * wanted.height
+    seconds = SECONDS_A_STEP * steps + SECONDS_A_PIXEL * pixels
+    return SceneCost(seconds, estimate_bytes(settings, missing) / len(missing), float("nan"), ROUGHLY)
+
+
 def scene_bytes(output: Path, name: str) -> int:
     """Bytes of a finished scene: its shards, surfels and previews."""
     record = read_record(output, name)
     if record is None:
         return 0
-    folders = (scene_folder(output, name).iterdir(), (output / "previews").glob(f"{name}-l*"))
+    folders = (scene_folder(output, name).glob("*.*"), (output / "previews").glob(f"{name}-l*"))
     return sum(entry.bytes for entry in record.shards) + sum(
         path.stat().st_size for folder in folders for path in folder
     )
@@ -142,7 +172,7 @@ def report(settings: Settings, splits: Sequence[SplitPlan]) -> str:
 def _row(settings: Settings, split: SplitPlan) -> tuple[str, ...]:
     recipe, number = settings.split(split.name), len(split.missing)
     cost = split.cost or SceneCost(0.0, 0.0, 0.0, "")
-    clips = number * len(recipe.lights)
+    clips = sum(item.clips(settings) for item in split.missing)
     return (
         split.name,
         str(split.scenes),

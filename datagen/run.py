@@ -8,19 +8,16 @@ record.
 from __future__ import annotations
 
 import gc
-import io
 import logging
 from collections.abc import Sequence
-from pathlib import Path
 
 import drjit as dr
-import numpy as np
 
 from datagen.account import read_other, write_account
 from datagen.assets import for_split, load_models
 from datagen.build import Geometry
-from datagen.clip_preview import thumbnail_name, write_preview
-from datagen.clip_rows import ClipRow, clip_row
+from datagen.captured_reconstruction import clear_work, require_prior
+from datagen.captured_scene import make_capture
 from datagen.clock import stage
 from datagen.clusters import logs_folder, require_cluster
 from datagen.failures import Failure, summary
@@ -30,7 +27,6 @@ from datagen.parts import outline
 from datagen.pathtrace import gbuffers
 from datagen.plan import (
     RECORD_NAME,
-    Quarantined,
     Record,
     Sources,
     Work,
@@ -43,26 +39,25 @@ from datagen.plan import (
     read_record,
     scene_folder,
 )
-from datagen.preview import contact_row, sheet_name, write_sheet
 from datagen.scene import SceneSpec, draw_scene
+from datagen.scene_files import write_clips
 from datagen.scene_geometry import scene_geometry
 from datagen.scheduling import make_each
 from datagen.settings import Settings
+from datagen.spool import Frame
 from datagen.styles import Choice
-from datagen.synthetic import Frame, first_bad_value, make_clips, make_surfels
-from datagen.variety import COUNTED_MEMBERS, Histograms, frame_histograms, surface_members, total
+from datagen.synthetic import make_clips, make_surfels
+from datagen.variety import Histograms, frame_histograms, surface_members, total
 from tron.cameras import Camera
 from tron.runtime import activate
-from tron.shards.manifest import ShardEntry
 from tron.shards.schema import ClipMeta
-from tron.shards.writer import ShardWriter
 from tron.storage import locked, require_free_space, write_atomic
 
 log = logging.getLogger(__name__)
 
 
 def make(settings: Settings) -> int:
-    """Make what is missing of a dataset; return how many scenes or clips failed.
+    """Make what is missing of a dataset of either source; return how many scenes or clips failed.
 
     Raises:
         TronError: wrong settings, a folder in use, made otherwise or not writable, too little space: all
@@ -75,16 +70,22 @@ def make(settings: Settings) -> int:
     sources = find_sources(settings)
     other = read_other(settings.variety_against) if settings.variety_against is not None else None
     output = settings.output_dir
+    if settings.source == "captured":
+        require_prior(settings)
     with locked(output):
         clear_temporaries(output)
         adopt(settings)
         missing = [item for item in wanted if read_record(output, item.name) is None]
+        for item in (item for item in wanted if item.capture and item not in missing):
+            clear_work(scene_folder(output, item.name))  # killed between its record and this
         failed: dict[str, Failure] = {}
         if missing:
             require_free_space(output, estimate_bytes(settings, missing))
             log.info("%d of %d scenes to make in %s", len(missing), len(items), output)
-            clips = {item: len(settings.split(item.split).lights) for item in missing}
-            failed = make_each(make_scene, missing, settings, sources, clips.__getitem__, "clips")
+            make_one = make_capture if settings.source == "captured" else make_scene
+            failed = make_each(
+                make_one, missing, settings, sources, lambda item: item.clips(settings), "clips"
+            )
         failures = write_account(settings, items, sources, failed, other)
     if failures:
         log.error("%s", summary(failures, output, logs_folder(settings)))
@@ -106,41 +107,21 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
     surfels, refinement = make_surfels(spec, geometry, settings)
     surfels.save(folder / "surfels.ply")
 
-    quarantined: list[Quarantined] = []
-    rows: dict[str, np.ndarray] = {}
-    made: list[tuple[ClipMeta, Frame]] = []
-    with ShardWriter(output, item.split, settings.clips_per_shard, item.first_shard) as writer:
-        for meta, frames in make_clips(spec, geometry, surfels, settings):
-            problem = first_bad_value(frames)
-            if problem is not None:
-                quarantined.append(Quarantined(key=meta.key, reason=problem))
-                _set_aside(output / "quarantine" / f"{meta.key}.npz", frames)
-                continue
-            with stage("write"):
-                writer.write(meta, frames)
-                write_preview(output, meta, frames)
-                rows[meta.key] = contact_row(meta, frames[0])
-            made.append((meta, {name: frames[0][name] for name in COUNTED_MEMBERS if name in frames[0]}))
-    for entry in writer.entries:
-        write_sheet(output / sheet_name(entry.name), [rows[key] for key in entry.keys])
+    clips = make_clips(spec, geometry, surfels, settings)
+    files = write_clips(output, item, clips, settings.clips_per_shard)
     record = Record(
         name=item.name,
-        shards=writer.entries,
-        quarantined=quarantined,
+        shards=files.shards,
+        quarantined=files.quarantined,
         refinement=refinement,
-        clips=_clip_rows([meta for meta, _ in made], writer.entries),
-        variety=_variety(geometry, made),
+        clips=files.rows(),
+        variety=_variety(geometry, files.made),
     )
     write_atomic(folder / RECORD_NAME, record.model_dump_json(indent=1) + "\n")
     del geometry, surfels
     gc.collect()
     dr.flush_malloc_cache()
     return record
-
-
-def _clip_rows(metas: Sequence[ClipMeta], entries: Sequence[ShardEntry]) -> list[ClipRow]:
-    shards = {key: entry.name for entry in entries for key in entry.keys}
-    return [clip_row(meta, shards[meta.key], thumbnail_name(meta.key)) for meta in metas]
 
 
 def _variety(geometry: Geometry, made: Sequence[tuple[ClipMeta, Frame]]) -> Histograms:
@@ -182,10 +163,3 @@ def draw_and_build(
         moving=Share(recipe.moving_objects, recipe.moving_lights),
     )
     return spec, scene_geometry(spec, settings, sources)
-
-
-def _set_aside(path: Path, frames: Sequence[dict[str, np.ndarray]]) -> None:
-    buffer = io.BytesIO()
-    arrays = {member: np.stack([frame[member] for frame in frames]) for member in frames[0]}
-    np.savez_compressed(buffer, allow_pickle=False, **arrays)
-    write_atomic(path, buffer.getvalue())

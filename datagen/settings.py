@@ -15,6 +15,7 @@ from pydantic import (
 )
 
 from datagen.capture_settings import CaptureSettings
+from datagen.captured_settings import CapturedSettings
 from datagen.lights import PROCEDURAL, Family, LightChoice
 from datagen.settings_model import SettingsModel
 from datagen.split_settings import SplitSettings
@@ -56,6 +57,12 @@ CAPTURED = {
 }
 """Keys that decide what is in a capture."""
 
+OF_CAPTURES = {"source", "captures", "captured"}
+"""Keys of source=captured alone; the other source ignores ``captured``."""
+
+OF_BOTH_SOURCES = {"seed", "clips_per_shard", "variant", *ESTIMATED}
+"""Keys that decide what is in a dataset of either source."""
+
 SPLITS: tuple[Split, ...] = ("train", "train_b", "validation", "test")
 
 
@@ -91,6 +98,21 @@ class Settings(SettingsModel):
         "output_dir/captures; measure on the test scenes in output_dir how long the path tracer takes to be "
         "as near the truth as guidance is (equal_error); or measure what it saves to path-trace under many "
         "lights at once (sharing).",
+    )
+    source: Literal["synthetic", "captured"] = Field(
+        "synthetic",
+        description="What is made: synthetic scenes, drawn from seeds and path-traced; or captured ones: "
+        "each folder of photos in captures is reconstructed and lit, and its photos are the truth. Only "
+        "seed, clips_per_shard, variant, estimation of the light and keys of the run concern both: other "
+        "keys of synthetic scenes are refused with captured.",
+    )
+    captures: Path | None = Field(
+        None,
+        description="Local folder with a capture a sub-folder, whatever tron-reconstruct reads, for "
+        "source=captured.",
+    )
+    captured: CapturedSettings = Field(
+        default_factory=lambda: CapturedSettings(), description="Training pairs of captures."
     )
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."
@@ -276,8 +298,20 @@ class Settings(SettingsModel):
             raise ValueError("a cluster has a _target_: choose one by cluster=NAME")
         return value or None
 
+    @field_validator("captures", mode="before")
+    @classmethod
+    def _local_captures(cls, value: Any) -> Any:
+        if "://" in str(value):
+            raise ValueError("captures must be a local folder, not an address: copy them here first")
+        return value
+
     @model_validator(mode="after")
     def _consistent(self) -> Settings:
+        if self.source == "captured":
+            self._require_captured()
+            return self
+        if self.captures is not None:
+            raise ValueError("captures is of source=captured: give source=captured, or leave it out")
         captures = self.mode == "captures"
         lights = {"capture": self.capture.lights} if captures else {}
         for name in ["test"] if captures else self.used_splits():
@@ -296,11 +330,27 @@ class Settings(SettingsModel):
         require_bounces(self.bounces, self.reflections)
         return self
 
+    def _require_captured(self) -> None:
+        """Raise ValueError where keys do not go with source=captured."""
+        if self.captures is None:
+            raise ValueError("source=captured needs captures=DIR, a folder with a capture a sub-folder")
+        if self.mode not in ("make", "plan", "validate"):
+            raise ValueError(f"mode={self.mode} is of source=synthetic")
+        ours = OF_CAPTURES | OF_BOTH_SOURCES | OUTSIDE - {"variety_against"}
+        for name, field in type(self).model_fields.items():
+            if name not in ours and getattr(self, name) != field.get_default(call_default_factory=True):
+                raise ValueError(f"{name} is of source=synthetic: leave it out with source=captured")
+        require_bounces(self.bounces, self.reflections)
+
     def _ask_hdri(self, lights: list[LightChoice]) -> bool:
         return "hdri" in {*lights, *(self.light_families() or ())}
 
     def split(self, name: str) -> SplitSettings:
-        """The settings of one split."""
+        """The settings of one split; of captures, how large and long its clips are."""
+        if self.source == "captured":
+            wanted = self.captured
+            size = {key: getattr(wanted, key) for key in ("frames", "width", "height", "guidance_spp")}
+            return SplitSettings(scenes=0, lights=["any"], **size)
         return getattr(self, name)
 
     def estimation(self, split: str) -> Estimation:
@@ -309,7 +359,9 @@ class Settings(SettingsModel):
         return Estimation(rays=self.split(split).guidance_spp, **chosen)
 
     def used_splits(self) -> list[Split]:
-        """The splits that have scenes."""
+        """The splits that have scenes; of captures, those with a share of them."""
+        if self.source == "captured":
+            return [name for name in SPLITS if getattr(self.captured.shares, name)]
         return [name for name in SPLITS if self.split(name).scenes]
 
     def light_families(self) -> list[Family] | None:
@@ -320,7 +372,14 @@ class Settings(SettingsModel):
 
     def recipe(self) -> dict[str, Any]:
         """Keys that decide a scene's content, plain values: not where it goes, who makes it or how many."""
-        values = self.model_dump(mode="json", exclude=OUTSIDE)
+        if self.source == "captured":
+            seeded = {"reconstruction": {"seed", "checkpoint_every"}, "light": {"seed"}}
+            return self.model_dump(
+                mode="json",
+                include={"source", "captured", *OF_BOTH_SOURCES},
+                exclude={"captured": {"names": True, **seeded}},
+            )
+        values = self.model_dump(mode="json", exclude=OUTSIDE | OF_CAPTURES)
         for name in SPLITS:
             if name in self.used_splits():
                 del values[name]["scenes"]

@@ -287,16 +287,6 @@ def _meta(spec: SceneSpec, lit: _Lit, cameras: Sequence[Camera], recipe: SplitSe
     )
 
 
-def first_bad_value(frames: Sequence[Frame]) -> str | None:
-    """First place where a clip is not finite, in words, or None: such a clip must not reach a shard."""
-    for i, frame in enumerate(frames):
-        for member, image in frame.items():
-            bad = int((~np.isfinite(image)).sum())
-            if bad:
-                return f"frame {i}: {member} has {bad} values that are not finite"
-    return None
-
-
 def _seeds(spec: SceneSpec, frames: int, what: str, *path: str | int) -> list[int]:
     return [integer(spec.seed, spec.split, spec.index, *path, i, what) for i in range(frames)]
 

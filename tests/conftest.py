@@ -141,3 +141,40 @@ def write_glb() -> Callable[[Path, dict[str, Any], Sequence[Any]], Path]:
         return path
 
     return write
+
+
+@pytest.fixture(scope="session")
+def tiny_captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of three captures, path-traced, with true maps: 9 views of 24 x 24, two of them held out."""
+    from datagen.capture_export import make_captures
+    from datagen.settings import Settings
+    from tron.cli.recipes import check, compose_recipe
+
+    output = tmp_path_factory.mktemp("tiny_captures")
+    wanted = [
+        *("mode=captures", f"output_dir={output}", "cluster=none", "seed=77", "test.style=A"),
+        *("capture.scenes=3", "capture.views=9", "capture.width=24", "capture.height=24"),
+        *("capture.path_spp=9", "capture.reference_spp=2", "mesh_edge=0.2", "environment_height=16"),
+        *("texels_per_unit=16", "objects=[2,2]"),
+    ]
+    assert make_captures(check(compose_recipe("conf.datagen", Settings, wanted), Settings)) == 0
+    return output / "captures"
+
+
+@pytest.fixture(scope="session")
+def quick_reconstruction() -> list[str]:
+    """Overrides of `tron-datagen source=captured` for captures with true maps, made in seconds each."""
+    surfels = [
+        *("steps_scaler=1", "checkpoint_every=4", "initial.source=depth", "initial.count=400"),
+        *("radiance.steps=10", "radiance.density.most=400", "radiance.consistency.most_voxels=16"),
+        "materials.steps=4",
+    ]
+    light = [
+        *("steps=6", "resolution=8", "rays=4", "pixels=64", "scale_steps=3", "scale_pixels=256"),
+        *("scale_rays=4", "split_sum_resolution=64"),
+    ]
+    return [
+        *("captured.frames=3", "captured.width=20", "captured.height=16", "captured.guidance_spp=2"),
+        *(f"captured.reconstruction.{value}" for value in surfels),
+        *(f"captured.light.{value}" for value in light),
+    ]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from datagen.spool import Spool, stored
-from datagen.synthetic import first_bad_value
+from datagen.scene_files import first_bad_value
 from tron.errors import TronError
 from tron.images import decode_exr, encode_exr
 from tron.seeds import generator

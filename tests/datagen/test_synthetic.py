@@ -10,7 +10,8 @@ from datagen.plan import Sources, Work
 from datagen.run import draw_and_build
 from datagen.scene import draw_scene
 from datagen.settings import Settings
-from datagen.synthetic import first_bad_value, make_clips, make_surfels
+from datagen.scene_files import first_bad_value
+from datagen.synthetic import make_clips, make_surfels
 from tron import metrics
 from tron.cli.recipes import check, compose_recipe
 from tron.color import luminance, to_display

@@ -1,0 +1,172 @@
+"""Clips of a capture: photos in a row, and what its surfels show from their places in the capture's light."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from datagen.captured_photos import Photo, frame_of, require_size, rows_of_photos, starts
+from datagen.captured_reconstruction import Found
+from datagen.lights import classify, contrast_share
+from datagen.plan import Work, scene_folder
+from datagen.settings import Settings
+from datagen.spool import Frame, Spool
+from tron.cameras import Camera
+from tron.captures import Capture, View
+from tron.color import luminance
+from tron.errors import TronError
+from tron.priors.linear_light import inverse_agx
+from tron.seeds import integer
+from tron.shading.bounce import BounceTransport
+from tron.shading.guidance import Lighting, render_guidance
+from tron.shards.schema import MEMBERS, TARGET, ClipMeta, clip_members
+from tron.tracing import SurfelTracer
+
+OPAQUE = 0.9
+"""Opacity of surfels at pixels that the exposure is measured at."""
+UNCLIPPED = (0.05, 0.95)
+SAMPLES = 4096
+"""Such pixels of a photo, at most."""
+BLACK = (0.0, 0.0, 0.0)
+
+
+@contextmanager
+def made_clips(
+    item: Work, settings: Settings, capture: Capture, found: Found
+) -> Iterator[list[tuple[ClipMeta, Sequence[Frame]]]]:
+    """Clips of a capture with their frames, which are read when they are asked for, within the block.
+
+    Each frame holds the schema's members: guidance in the capture's own light, linear, and the photo as rgb,
+    display values.
+
+    Args:
+        item, settings: the capture and its recipe.
+        capture: with photos as large as they are.
+        found: its surfels and light.
+
+    Raises:
+        TronError: there are too few photos in a row, or they are too small.
+    """
+    wanted = settings.captured
+    rows = [row for row in rows_of_photos(capture) if len(row) >= wanted.frames]
+    if not rows:
+        longest = max(map(len, rows_of_photos(capture)), default=0)
+        raise TronError(
+            f"{longest} photos are the most in a row, a clip has {wanted.frames}",
+            str(settings.captures and settings.captures / item.capture),
+            "make captured.frames smaller, or hold out fewer (captured.photos.test_every=0)",
+        )
+    views = [view for row in rows for view in row]
+    require_size(views, wanted.width, wanted.height)
+    with Spool(scene_folder(settings.output_dir, item.name), clips=1) as spool:
+        cameras, exposure = _film(item, settings, capture, found, views, spool)
+        about = _About(item, settings, found, exposure, capture.exposure)
+        clips, first, frames = [], 0, spool.clip(0)
+        for row in rows:
+            for start in starts(len(row), wanted.frames):
+                which = slice(first + start, first + start + wanted.frames)
+                clips.append((about.meta(len(clips), views[which], cameras[which]), frames[which]))
+            first += len(row)
+        yield clips
+
+
+def _film(
+    item: Work, settings: Settings, capture: Capture, found: Found, views: Sequence[View], spool: Spool
+) -> tuple[list[Camera], float]:
+    """Put every photo and its guidance into the spool; their cameras, and the exposure of the guidance."""
+    wanted, estimation = settings.captured, settings.estimation(item.split)
+    tracer, lighting = SurfelTracer(found.scene), Lighting(found.environment)
+    path = ("captured", item.capture)
+    bounce = None
+    if estimation.bounces:
+        transport = BounceTransport.trace(
+            tracer.sided(estimation.two_sided), seed=integer(settings.seed, *path, "bounce")
+        )
+        seed = integer(settings.seed, *path, "light", "bounce")
+        bounce = transport.bake(lighting, estimation, seed=seed)
+    # A subject without its surroundings is in front of black, in photos and guidance alike.
+    alone = any(view.has("mask") and not view.has("sky_mask") for view in views)
+    cameras, ratios = [], []
+    for view in views:
+        gain = found.gains.get(view.name, np.ones(3)) if wanted.balance else np.ones(3)
+        photo = frame_of(view, gain, capture.tone_curve, wanted.width, wanted.height)
+        seed = integer(settings.seed, *path, "frame", view.name, "guidance")
+        guidance = render_guidance(
+            tracer, photo.camera, lighting, estimation, seed, BLACK if alone else None, bounce
+        )
+        opaque = guidance.mask > 0.5
+        seen = (opaque if photo.foreground is None else photo.foreground) & photo.believed
+        frame = {name: guidance[name] for name in guidance.BUFFERS if name in MEMBERS}
+        spool.add(0, frame | {TARGET: photo.shown, "foreground": seen.astype(np.float32)})
+        ratios.append(light_ratio(photo, guidance.lit * capture.exposure, seen & (guidance.mask > OPAQUE)))
+        cameras.append(photo.camera)
+    measured = np.concatenate(ratios)
+    factor = float(np.exp(np.median(measured))) if measured.size else 1.0
+    return cameras, capture.exposure * factor
+
+
+def light_ratio(photo: Photo, lit: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """(N,) logarithms of what AgX makes a photo of, over ``lit``, at some of the pixels that show surfaces.
+
+    Training and evaluation look at guidance through AgX, at photos as they are. So the exposure that makes
+    guidance as bright as the photos is measured against light that AgX would show as them, whatever curve
+    they went through.
+
+    Args:
+        photo: the truth.
+        lit: (H, W, 3) guidance, linear.
+        seen: (H, W) bool, pixels that count.
+    """
+    low, high = UNCLIPPED
+    usable = seen & (photo.shown > low).all(-1) & (photo.shown < high).all(-1) & (luminance(lit) > 1e-6)
+    places = np.flatnonzero(usable)
+    places = places[:: max(1, -(-len(places) // SAMPLES))]
+    wanted = luminance(inverse_agx(photo.shown.reshape(-1, 3)[places]))
+    shown = luminance(lit.reshape(-1, 3)[places])
+    kept = wanted > 1e-6
+    return np.log(wanted[kept].astype(np.float64)) - np.log(shown[kept].astype(np.float64))
+
+
+class _About:
+    """What the metadata of a capture's clips say."""
+
+    def __init__(
+        self, item: Work, settings: Settings, found: Found, exposure: float, own_exposure: float
+    ) -> None:
+        self.item, self.settings, self.found, self.exposure = item, settings, found, exposure
+        self.shared: Mapping[str, object] = {
+            "style": "captured",
+            "capture": item.capture,
+            "contrast": classify(found.environment),
+            "contrast_share": contrast_share(found.environment),
+            "balanced": settings.captured.balance,
+            "light_factor": round(exposure / own_exposure, 6),
+        }
+
+    def meta(self, number: int, views: Sequence[View], cameras: Sequence[Camera]) -> ClipMeta:
+        """Metadata of one clip."""
+        item, wanted = self.item, self.settings.captured
+        spaces = {name: MEMBERS[name].color_space for name in clip_members(reference=False)}
+        gains = [self.found.gains.get(view.name, np.ones(3)) for view in views]
+        return ClipMeta(
+            key=f"{item.name}-l0-c{number:04d}",
+            scene=item.name,
+            light=f"{item.name}-captured",
+            light_family="captured",
+            split=item.split,
+            frames=len(cameras),
+            width=wanted.width,
+            height=wanted.height,
+            cameras=[camera.to_dict() for camera in cameras],
+            exposure=self.exposure,
+            color_space={name: space for name, space in spaces.items() if space} | {TARGET: "display"},
+            seeds={"root": self.settings.seed},
+            spp={"guidance": wanted.guidance_spp},
+            extra={
+                **self.shared,
+                "photos": [view.name for view in views],
+                "gains": [[float(value) for value in gain] for gain in gains],
+            },
+        )

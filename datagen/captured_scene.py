@@ -1,0 +1,60 @@
+"""A capture as a scene of a dataset: its surfels and its light, then its clips, and at last its record."""
+
+from __future__ import annotations
+
+import gc
+
+import drjit as dr
+
+from datagen.captured_clips import made_clips
+from datagen.captured_reconstruction import clear_work, find, kept, load, tell
+from datagen.clock import stage
+from datagen.plan import CAPTURE_SHARDS, RECORD_NAME, Record, Sources, Work, scene_folder
+from datagen.scene_files import write_clips
+from datagen.settings import Settings
+from tron.errors import TronError
+from tron.runtime import activate, set_torch_threads
+from tron.storage import write_atomic
+
+
+def make_capture(item: Work, settings: Settings, sources: Sources) -> Record:  # noqa: ARG001 as all makers
+    """Make one capture: surfels, light, shards, contact sheets and at last its record.
+
+    Runs in a worker. Everything is written under final names atomically; a second run writes the same bytes.
+
+    Raises:
+        TronError: the capture cannot be read, holds too few photos in a row or too small ones, or cannot be
+            reconstructed or lit.
+    """
+    activate(settings.variant, threads=1)
+    set_torch_threads(1)
+    folder = scene_folder(settings.output_dir, item.name)
+    tell(item, "read")
+    with stage("read"):
+        capture = load(item, settings, folder, reduced=True)
+        photos = load(item, settings, folder, reduced=False)
+    found = kept(folder, capture)
+    if found is None:
+        with stage("reconstruct"):
+            find(item, settings, capture, folder)
+        found = kept(folder, capture)
+        if found is None:
+            raise TronError("surfels or light cannot be read back", folder, "look for a full or failing disk")
+    tell(item, "guidance")
+    with stage("guidance"), made_clips(item, settings, photos, found) as clips:
+        tell(item, "write")
+        per_shard = max(settings.clips_per_shard, -(-len(clips) // CAPTURE_SHARDS))
+        files = write_clips(settings.output_dir, item, clips, per_shard)
+    record = Record(
+        name=item.name,
+        capture=item.capture,
+        shards=files.shards,
+        quarantined=files.quarantined,
+        clips=files.rows(),
+    )
+    write_atomic(folder / RECORD_NAME, record.model_dump_json(indent=1) + "\n")
+    clear_work(folder)
+    del found, capture, photos
+    gc.collect()
+    dr.flush_malloc_cache()
+    return record
