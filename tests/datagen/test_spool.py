@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datagen.spool import Spool, stored
 from datagen.scene_files import first_bad_value
+from datagen.spool import Spool, stored
 from tron.errors import TronError
 from tron.images import decode_exr, encode_exr
 from tron.seeds import generator

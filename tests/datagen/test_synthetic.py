@@ -9,8 +9,8 @@ from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.plan import Sources, Work
 from datagen.run import draw_and_build
 from datagen.scene import draw_scene
-from datagen.settings import Settings
 from datagen.scene_files import first_bad_value
+from datagen.settings import Settings
 from datagen.synthetic import make_clips, make_surfels
 from tron import metrics
 from tron.cli.recipes import check, compose_recipe
