@@ -171,8 +171,8 @@ def _origin(settings: Settings) -> str:
     shown = "as the mean photo of their capture would show them" if settings.captured.balance else "as stored"
     return (
         f"Frames (`rgb`) are photos, display values, {shown}; guidance by TRON's surfel tracer on surfels "
-        "and light that were reconstructed from the same photos, `scenes/NAME/spec.json` says how well. Guidance "
-        "is linear;"
+        "and light that were reconstructed from the same photos, `scenes/NAME/spec.json` says how well. "
+        "Guidance is linear;"
     )
 
 

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from eval.datagen.captured import measure_captured
 from eval.datagen.kills import measure_kills
 from eval.datagen.parts import Found
 from eval.datagen.settings import DatagenSettings, Part
@@ -39,6 +40,8 @@ HEADLINE = {
     "frames_per_hour.256": "Frames an hour, 256²",
     "soak.rss_growth_mb": "Growth of memory over the soak",
     "kills.identical": "Kills that left no trace",
+    "captured.kill_identical": "Kills of captures, one a phase, that left no trace",
+    "captured.seconds_per_scene": "Seconds of a capture, 48 views of 128²",
 }
 
 
@@ -92,6 +95,7 @@ class Datagen(DatagenSettings):
                 [*_of(tiny, self.specified_scenes), *self.specified], at
             ),
             "throughput": lambda at: measure_throughput(self.throughput, self.sizes, at),
+            "captured": lambda at: measure_captured(self.captured, self.seed, at),
         }
         stages = Stages(folder)
         stages.restart(part)  # a figure of this run, never of one before

@@ -68,7 +68,7 @@ def test_every_capture_is_wholly_in_one_split_and_all_of_it_is_accounted_for(pai
         assert {clip.meta.extra["capture"] for clip in read_clips(pairs, split)} == set(names)
     assert not list(pairs.glob("scenes/*/work")), "what only an interrupted run needs is left"
     card = (pairs / "README.md").read_text()
-    assert "| train | 1 | 2 | 6 | 20 x 16 |" in card
+    assert "| train | 1 | 3 | 9 | 20 x 16 |" in card
     assert "photos" in card
     assert "Mitsuba's path tracer" not in card
 
