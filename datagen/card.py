@@ -13,7 +13,6 @@ from omegaconf import OmegaConf
 
 import tron
 from datagen.assets import Asset
-from datagen.captured_settings import CapturedSettings
 from datagen.clip_rows import ClipRow
 from datagen.contact_sheet import SHEET_NAME
 from datagen.hub import configurations, front_matter
@@ -41,9 +40,9 @@ def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), 
         recipe = complete(recipe)
         for part in ("reconstruction", "light"):
             values["captured"][part]["seed"] = "${seed}"  # as it is shipped: each capture has its own
-    else:
-        values["captured"] = CapturedSettings().model_dump(mode="json")
     shipped = cast(dict, OmegaConf.to_container(recipe, resolve=False))
+    if settings.source == "synthetic":
+        values["captured"] = shipped["captured"]
     if not machine:
         values = {key: value for key, value in values.items() if key not in OUTSIDE}
         values |= {"output_dir": output_dir}
@@ -171,9 +170,9 @@ def _origin(settings: Settings) -> str:
         )
     shown = "as the mean photo of their capture would show them" if settings.captured.balance else "as stored"
     return (
-        f"Frames (`rgb`) are photos, display values, {shown}; guidance by TRON's surfel tracer on surfels and "
-        "light that were reconstructed from the same photos, `scenes/NAME/spec.json` says how well. Guidance "
-        "is linear;"
+        f"Frames (`rgb`) are photos, display values, {shown}; guidance by TRON's surfel tracer on surfels "
+        "and light that were reconstructed from the same photos, `scenes/NAME/spec.json` says how well. "
+        "Guidance is linear;"
     )
 
 

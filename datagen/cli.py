@@ -19,8 +19,8 @@ def main(settings: Settings) -> int:
     tracer; the pairs land in tar shards with a manifest. With mode=plan nothing is made: a small scene is
     timed, and what is missing is printed with its bytes, memory and hours. With mode=captures scenes are
     path-traced from all sides instead, with true maps, as folders that tron-reconstruct and nerfstudio read.
-    With source=captured each folder of photos in captures=DIR is reconstructed and lit, and its photos are the
-    pairs' truth.
+    With source=captured each folder of photos in captures=DIR is reconstructed and lit, and its photos are
+    the pairs' truth.
     With mode=equal_error guidance of a dataset's test scenes is held against the path tracer:
     equal_error.json; with mode=sharing frames under many lights at once against frames one by one:
     sharing.json. An interrupted run resumes. The exit code is 1 if a scene could not be made

@@ -114,8 +114,8 @@ def _of_made(settings: Settings, made: Sequence[Work], times: Mapping[str, float
 def captured_cost(missing: Sequence[Work], settings: Settings) -> SceneCost:
     """Mean cost of captures of which none is made yet: bytes by their photos, seconds by a rough law.
 
-    The law is :data:`SECONDS_A_STEP` for the steps, and :data:`SECONDS_A_PIXEL` for guidance: both of one core,
-    measured with some thousand surfels. Photos of another size and more surfels take longer.
+    The law is :data:`SECONDS_A_STEP` for the steps, and :data:`SECONDS_A_PIXEL` for guidance: both of one
+    core, measured with some thousand surfels. Larger photos and more surfels take longer.
     """
     wanted = settings.captured
     photos = fmean(item.photos for item in missing)

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from eval.datagen.captured import measure_captured
 from eval.datagen.hostile import measure_hostile
 from eval.datagen.kills import measure_kills
 from eval.datagen.parts import Found
@@ -41,6 +42,8 @@ HEADLINE = {
     "soak.rss_growth_mb": "Growth of memory over the soak",
     "kills.identical": "Kills that left no trace",
     "hostile.refused": "Hostile files refused",
+    "captured.kill_identical": "Kills of captures, one a phase, that left no trace",
+    "captured.seconds_per_scene": "Seconds of a capture, 48 views of 128²",
 }
 
 
@@ -95,6 +98,7 @@ class Datagen(DatagenSettings):
             ),
             "throughput": lambda at: measure_throughput(self.throughput, self.sizes, at),
             "hostile": measure_hostile,
+            "captured": lambda at: measure_captured(self.captured, self.seed, at),
         }
         stages = Stages(folder)
         stages.restart(part)  # a figure of this run, never of one before

@@ -9,7 +9,20 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat
 
 from eval.benchmark import Benchmark
 
-Part = Literal["variety", "sharing", "workers", "soak", "kills", "specifications", "throughput", "hostile"]
+Part = Literal[
+    "variety",
+    "sharing",
+    "workers",
+    "soak",
+    "kills",
+    "specifications",
+    "throughput",
+    "captured",
+    "hostile",
+    "reader",
+    "merge",
+    "paper_smoke",
+]
 
 
 class VarietySettings(BaseModel):
@@ -36,6 +49,20 @@ class VarietySettings(BaseModel):
     pictures: NonNegativeInt = Field(default=3, description="scenes of each judge that are shown")
 
 
+class CapturedSettings(BaseModel):
+    """Captures, and their training pairs; recipes are arguments of tron-datagen."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    views: list[str] = Field(description="captures of the run that is timed, of development seeds")
+    timed: list[str] = Field(description="their pairs")
+    small_views: list[str] = Field(description="captures of the runs that are killed")
+    small: list[str] = Field(description="their pairs")
+    most_steps_seconds: PositiveFloat = Field(
+        default=5.0, description="seconds into the steps of stage 1 within which one is killed"
+    )
+
+
 class DatagenSettings(Benchmark):
     """Sizes and recipes of the parts; recipes are arguments of tron-datagen."""
 
@@ -57,3 +84,4 @@ class DatagenSettings(Benchmark):
     )
     throughput: list[str] = Field(description="recipe of the frames that are counted")
     sizes: dict[PositiveInt, list[str]] = Field(description="width of a frame -> further arguments")
+    captured: CapturedSettings
