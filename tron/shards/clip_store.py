@@ -78,7 +78,7 @@ class ClipStore:
     def read_frames(
         self, number: int, frames: Sequence[int] | None = None, members: Iterable[str] | None = None
     ) -> Clip:
-        """Clip of chosen frames, in that order, (K, H, W, C) float32 a member; the metadata are the whole one's.
+        """Clip of chosen frames, in that order, (K, H, W, C) float32 a member; all metadata.
 
         Args:
             number: of the clip in the split, from 0.

@@ -36,7 +36,8 @@ class ShardWriter:
     A shard appears under its final name only when it is whole; if the block ends by an exception, the shard
     in hand is dropped and earlier ones stay. Its index (`tron.shards.index`) follows it: a run that is killed
     between the two leaves a shard without one, which is read as well. `entries` lists the finished shards for
-    the manifest. `first_index` numbers the first shard (a resumed run goes on where the last whole shard ended).
+    the manifest. `first_index` numbers the first shard (a resumed run goes on where the last whole shard
+    ended).
     """
 
     def __init__(self, folder: str | Path, split: str, samples_per_shard: int = 64, first_index: int = 0):
