@@ -120,8 +120,9 @@ class TrainingData(lightning.LightningDataModule):
         self._budget = settings.cache_gb * 1e9
         self._held_out: HeldOutClips | None = None
         self.validation_split = validation.split
-        if validation.split == ValidationSettings.DEFAULT and validation.split not in self.splits:
-            log.info("No validation: this dataset has no split '%s'", validation.split)
+        default = ValidationSettings.DEFAULT
+        if validation.split == default and default not in self.splits:
+            log.info("No validation: this dataset has no split '%s'", default)
             self.validation_split = None
         elif validation.split is not None:
             self.splits.clips(validation.split)  # a wrong name ends the run now, not after hours

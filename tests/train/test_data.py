@@ -1,4 +1,4 @@
-"""Batches: a function of seed, stage and step, shared by ranks; buffers stay aligned; memory and disk give the same."""
+"""Batches: functions of seed, stage and step, shared by ranks; memory and disk give the same."""
 
 import itertools
 import shutil
