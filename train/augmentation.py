@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from train.framing import random_start
 from train.settings import DataSettings
 from train.sources import Sample
 from tron.color import agx, luminance
@@ -32,10 +33,7 @@ def augmented(
             raise TronError(
                 f"crop of {crop} pixels from frames of {width} x {height}", mend="make it smaller"
             )
-        top, left = (
-            int(random.integers((side - crop) // settings.crop_alignment + 1)) * settings.crop_alignment
-            for side in (height, width)
-        )
+        top, left = (random_start(random, side, crop, settings.crop_alignment) for side in (height, width))
         rows, columns = slice(top, top + crop), slice(left, left + crop)
     mirrored = random.random() < settings.flip
     order = random.permutation(3) if random.random() < settings.permute_colors else np.arange(3)

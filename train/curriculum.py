@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from tron.neural.windows import TEMPORAL_FACTOR
+
+FrameSide = Annotated[int, Field(ge=8, le=16_384)]
 
 
 class Stage(BaseModel):
@@ -26,6 +29,12 @@ class Stage(BaseModel):
     batch_size: int = Field(default=8, ge=1, description="Samples of a step, on each device.")
     crop: int | None = Field(
         default=None, ge=8, description="Side of the random square crop, pixels; null trains on whole frames."
+    )
+    size: tuple[FrameSide, FrameSide] | None = Field(
+        default=None,
+        description="Width and height, pixels: frames are made smaller, by means of areas, until they just "
+        "cover it, and a random window of it is taken (before the crop); validation takes the centre. "
+        "null: frames as they are.",
     )
     learning_rate: float = Field(
         default=1.0, gt=0, description="Factor on the optimizer's learning rates at the stage's peak."

@@ -28,6 +28,7 @@ from train.data import TrainingData
 from train.module import RendererModule
 from train.processes import Processes, launch
 from train.settings import Settings
+from train.splits import manifest_hash, split_hashes
 from tron import seeds
 from tron.claim import read_recipe, require_same
 from tron.cli.instantiation import make
@@ -37,8 +38,7 @@ from tron.neural.losses import RendererLoss
 from tron.neural.protocols import Renderer
 from tron.neural.weights import restore_renderer, save_renderer
 from tron.runtime import set_torch_threads
-from tron.shards.manifest import MANIFEST_NAME
-from tron.storage import locked, sha256, write_atomic
+from tron.storage import locked, write_atomic
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +60,9 @@ def train(processes: Processes, settings: Settings) -> None:
         set_torch_threads(settings.threads)
     stages = [stage for stage in settings.stages if stage.steps > 0]
     data = processes.together(
-        lambda: TrainingData(settings.dataset, settings.data, settings.seed, settings.validation, processes)
+        lambda: TrainingData(
+            settings.dataset, settings.data, settings.seed, settings.validation, processes, settings.splits
+        )
     )
     with ExitStack() as held:
         folder = settings.output_dir / "checkpoints"
@@ -136,7 +138,7 @@ def _run_stage(
     share = stage.steps / sum(each.steps for each in stages)
     limit = settings.max_seconds * share if settings.max_seconds else None
     clock = StageClock(stage.steps, limit, processes.number_of_first)
-    _announce(number, stages, settings.max_seconds, position.step, data.stands_in(stage.split))
+    _announce(number, stages, settings.max_seconds, position.step, _kind(data, stage.split))
     if position.checkpoint and clock.seconds_limit is None and position.step >= stage.steps:
         # Interrupted between its last step and its end: Lightning would not even start, nor average weights.
         checkpoint = position.checkpoint
@@ -188,7 +190,7 @@ def _end_stage(folder: Path, number: int, stage: Stage, module: RendererModule) 
 
 
 def _announce(
-    number: int, stages: list[Stage], max_seconds: float | None, first_step: int, stands_in: bool
+    number: int, stages: list[Stage], max_seconds: float | None, first_step: int, kind: str
 ) -> None:
     stage = stages[number - 1]
     length = f"{stage.steps} steps"
@@ -201,12 +203,18 @@ def _announce(
         len(stages),
         stage.name,
         stage.split,
-        " (path-traced, it stands in for photographs)" if stands_in else "",
+        kind,
         mixed,
         stage.frames,
         length,
         f", from step {first_step}" if first_step else "",
     )
+
+
+def _kind(data: TrainingData, split: str) -> str:
+    if data.stands_in(split):
+        return " (path-traced, it stands in for photographs)"
+    return " (photographs)" if data.photographs(split) else ""
 
 
 def _claim_settings(settings: Settings, processes: int) -> None:
@@ -216,14 +224,15 @@ def _claim_settings(settings: Settings, processes: int) -> None:
     """
     path = settings.output_dir / "config.yaml"
     described = yaml.safe_load(yaml.safe_dump(settings.model_dump(mode="json")))
-    described["dataset_sha256"] = sha256(settings.dataset / MANIFEST_NAME)
+    described["dataset_sha256"] = manifest_hash(settings.dataset)
+    described["splits_sha256"] = split_hashes(settings.splits)
     described["processes"] = processes
     earlier = read_recipe(path)
     if earlier is None:
         write_atomic(path, yaml.safe_dump(described, sort_keys=False))
         return
     # A run may move; its data are known by their hash.
-    kept = [key for key in described if key not in ("output_dir", "dataset", "devices", "nodes")]
+    kept = [key for key in described if key not in ("output_dir", "dataset", "splits", "devices", "nodes")]
     before, now = ({key: each[key] for key in kept if key in each} for each in (earlier, described))
-    defaults = {**model_defaults(Settings), "processes": 1}
+    defaults = {**model_defaults(Settings), "processes": 1, "splits_sha256": {}}
     require_same(before, now, settings.output_dir, "a run", defaults=defaults)

@@ -8,9 +8,13 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from train.curriculum import Stage
+from train.split_place import SplitPlace
 
 HELD_OUT = "test"
 """The split that evaluation judges by."""
+
+RemoteFolder = Annotated[str, Field(pattern=r"^[a-z0-9+.-]+://.")]
+"""URL of a folder in an object store."""
 
 
 class OptimizerSettings(BaseModel):
@@ -59,19 +63,11 @@ class DataSettings(BaseModel):
     cache_gb: float = Field(
         default=4.0,
         ge=0,
-        description="Keep decoded splits in memory up to this size, in each process; larger ones are "
-        "streamed.",
+        description="Keep decoded splits in memory up to this size, in each process; of larger ones each "
+        "sample reads its frames.",
     )
     workers: int = Field(
-        default=0, ge=0, description="Loader processes of streamed splits; cached ones use none."
-    )
-    shuffle_buffer: int = Field(
-        default=64,
-        ge=1,
-        description="Streamed samples to shuffle among, shared out over the places of a batch.",
-    )
-    samples_per_clip: int = Field(
-        default=1, ge=1, description="Random windows taken from a streamed clip each time it is read."
+        default=0, ge=0, description="Loader processes of splits that are not in memory; others use none."
     )
     flip: float = Field(default=0.5, ge=0, le=1, description="Probability of mirroring left and right.")
     permute_colors: float = Field(
@@ -98,6 +94,12 @@ class ValidationSettings(BaseModel):
     )
     clips: int = Field(default=8, ge=1, description="How many of its clips, spread evenly over it.")
     every: int = Field(default=250, ge=1, description="Steps between validations.")
+    batch_pixels: int = Field(
+        default=2**22,
+        ge=1,
+        description="Pixels that go through the network at a time, all frames counted; a window of a stage's "
+        "K frames is never split.",
+    )
 
 
 # Half of the samples come from stage 1's split, against forgetting it.
@@ -118,7 +120,12 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    dataset: Path = Field(description="Dataset folder that tron-datagen wrote.")
+    dataset: Path | RemoteFolder = Field(description="Dataset folder that tron-datagen wrote, or its URL.")
+    splits: dict[str, str] = Field(
+        default={},
+        description="Splits, by the names that stages and validation use, that come from another dataset: "
+        "FOLDER, or FOLDER#SPLIT where the split has another name there.",
+    )
     output_dir: Path = Field(
         description="Folder for renderer.safetensors, checkpoints, metrics.csv, config.yaml."
     )
@@ -166,6 +173,24 @@ class Settings(BaseModel):
         if not any(stage.steps for stage in stages):
             raise ValueError("no stage has any steps")
         return stages
+
+    @field_validator("splits")
+    @classmethod
+    def _places(cls, splits: dict[str, str]) -> dict[str, str]:
+        for name, value in splits.items():
+            if SplitPlace.parse(name, value).split == HELD_OUT:
+                raise ValueError(
+                    f"{name} asks for the split '{HELD_OUT}', which is kept for evaluation: training never "
+                    "reads it"
+                )
+        return splits
+
+    @model_validator(mode="after")
+    def _splits_are_read(self) -> Settings:
+        read = {self.validation.split}.union(*(stage.splits() for stage in self.stages))
+        if unread := sorted(set(self.splits) - read):
+            raise ValueError(f"splits names '{unread[0]}', which neither a stage nor validation reads")
+        return self
 
     @model_validator(mode="after")
     def _test_is_held_out(self) -> Settings:

@@ -11,6 +11,7 @@ from eval.datagen.captured import measure_captured
 from eval.datagen.hostile import measure_hostile
 from eval.datagen.kills import measure_kills
 from eval.datagen.parts import Found
+from eval.datagen.reader import measure_reader
 from eval.datagen.settings import DatagenSettings, Part
 from eval.datagen.sharing import measure_sharing
 from eval.datagen.soak import measure_soak
@@ -96,6 +97,7 @@ class Datagen(DatagenSettings):
             "specifications": lambda at: measure_specifications(
                 [*_of(tiny, self.specified_scenes), *self.specified], at
             ),
+            "reader": lambda at: measure_reader(self.reader, self.seed, at),
             "throughput": lambda at: measure_throughput(self.throughput, self.sizes, at),
             "hostile": measure_hostile,
             "captured": lambda at: measure_captured(self.captured, self.seed, at),

@@ -63,6 +63,16 @@ class CapturedSettings(BaseModel):
     )
 
 
+class ReaderSettings(BaseModel):
+    """Clips that are written to be read."""
+
+    clips: PositiveInt = Field(default=3, description="clips, each a shard")
+    frames: int = Field(default=93, ge=5, description="frames of a clip")
+    width: PositiveInt = Field(default=256, description="width and height of a frame, pixels")
+    samples: PositiveInt = Field(default=20, description="samples by index of a round")
+    rounds: PositiveInt = Field(default=5, description="rounds, in which all ways take turns")
+
+
 class DatagenSettings(Benchmark):
     """Sizes and recipes of the parts; recipes are arguments of tron-datagen."""
 
@@ -83,5 +93,6 @@ class DatagenSettings(Benchmark):
         default=["train.lights=[any,high,low]"], description="further arguments of tron-datagen for those"
     )
     throughput: list[str] = Field(description="recipe of the frames that are counted")
+    reader: ReaderSettings = Field(default=ReaderSettings(), description="clips that are read")
     sizes: dict[PositiveInt, list[str]] = Field(description="width of a frame -> further arguments")
     captured: CapturedSettings

@@ -14,9 +14,19 @@ from tron.shards.writer import ShardWriter
 
 
 def write_dataset(
-    folder: Path, splits: dict[str, int], frames: int = 6, size: int = 24, shard: int = 2
+    folder: Path,
+    splits: dict[str, int],
+    frames: int = 6,
+    size: int = 24,
+    shard: int = 2,
+    width: int | None = None,
+    spaces: dict[str, str] | None = None,
 ) -> Path:
-    """Clips of smooth colours whose picture is the product of pbr and irradiance, frames x size x size."""
+    """Clips of smooth colours whose picture is the product of pbr and irradiance, frames x size x size.
+
+    width: of frames that are not square. spaces: of colours that are not linear.
+    """
+    width = width or size
     entries = []
     for split, count in splits.items():
         with ShardWriter(folder, split, shard) as writer:
@@ -29,23 +39,23 @@ def write_dataset(
                     light_family="studio",
                     split=split,
                     frames=frames,
-                    width=size,
+                    width=width,
                     height=size,
                     cameras=[{}] * frames,
                     exposure=1.0,
-                    color_space=dict.fromkeys((*GUIDANCE, TARGET), "linear"),
+                    color_space=dict.fromkeys((*GUIDANCE, TARGET), "linear") | (spaces or {}),
                 )
-                writer.write(meta, [_frame(random, size) for _ in range(frames)])
+                writer.write(meta, [_frame(random, size, width) for _ in range(frames)])
         entries += writer.entries
     Manifest(config_sha256="0" * 64, shards=entries).save(folder)
     return folder
 
 
-def _frame(random: np.random.Generator, size: int) -> dict[str, np.ndarray]:
-    ramp = np.linspace(0, 1, size, dtype=np.float32)
-    pbr = 0.1 + random.random(3) * ramp[:, None, None] + np.zeros((size, size, 3))
-    irradiance = 0.2 + random.random(3) * ramp[None, :, None] + np.zeros((size, size, 3))
-    one = np.ones((size, size, 1))
+def _frame(random: np.random.Generator, height: int, width: int) -> dict[str, np.ndarray]:
+    down, right = (np.linspace(0, 1, side, dtype=np.float32) for side in (height, width))
+    pbr = 0.1 + random.random(3) * down[:, None, None] + np.zeros((height, width, 3))
+    irradiance = 0.2 + random.random(3) * right[None, :, None] + np.zeros((height, width, 3))
+    one = np.ones((height, width, 1))
     images = dict.fromkeys(light_members(), pbr) | {"irradiance": irradiance, "unshadowed": irradiance}
     return images | {"rgb": pbr * irradiance, "mask": one, "foreground": one}
 

@@ -1,4 +1,4 @@
-"""Batches: a function of seed, stage and step, shared by ranks; buffers stay aligned; streams resume."""
+"""Batches: functions of seed, stage and step, shared by ranks; memory and disk give the same."""
 
 import itertools
 import shutil
@@ -10,17 +10,19 @@ import torch
 from pydantic import ValidationError
 from torch.utils.data import DataLoader
 
-from train import data as training_data
 from train.augmentation import augmented, display_encoded
 from train.curriculum import Stage
-from train.data import Batches, TrainingData, network_input
+from train.data import Batches, TrainingData
+from train.held_out import network_input
 from train.processes import Processes
 from train.settings import DataSettings, Settings, ValidationSettings
-from train.sources import CachedSplit, Sample
+from train.sources import CachedSplit, Draw, IndexedSplit, Passes, Sample
 from tron import seeds
 from tron.color import luminance, to_display
 from tron.errors import TronError
-from tron.shards import GUIDANCE, read_clips
+from tron.shards import GUIDANCE, ClipStore, read_clips
+from tron.shards.byte_ranges import ByteRanges
+from tron.shards.schema import TARGET
 
 BUFFERS = (*GUIDANCE, "rgb")
 STAGE = Stage(name="one", split="train", steps=10, batch_size=3, crop=16)
@@ -38,9 +40,9 @@ MIXED = Stage(
 
 
 def batches(dataset: Path, stage: Stage = STAGE, cache: bool = True, **options) -> Batches:
-    settings = DataSettings(shuffle_buffer=4)
-    cached = {split: CachedSplit(dataset, split, BUFFERS, 0) for split in stage.splits()} if cache else {}
-    return Batches(stage, cached, dataset, BUFFERS, settings, options.pop("seed", 0), **options)
+    source, seed = CachedSplit if cache else IndexedSplit, options.pop("seed", 0)
+    sources = {name: source(ClipStore(dataset, name), name, BUFFERS, seed) for name in stage.splits()}
+    return Batches(stage, sources, BUFFERS, DataSettings(), seed, **options)
 
 
 def take(stream, count: int) -> list[torch.Tensor]:
@@ -53,8 +55,7 @@ def same(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
 
 @pytest.mark.parametrize("stage", [STAGE, MIXED])
 @pytest.mark.parametrize("cache", [True, False])
-def test_batches_repeat_and_a_resumed_run_sees_the_same_ones(dataset, monkeypatch, stage, cache):
-    monkeypatch.setattr(training_data, "SEGMENT", 4)
+def test_batches_repeat_and_a_resumed_run_sees_the_same_ones(dataset, stage, cache):
     whole = take(batches(dataset, stage, cache), 10)
     for step, batch in enumerate(whole):
         assert batch.shape == (len(BUFFERS), stage.batch_size, 3, stage.frames_of(step), 16, 16)
@@ -65,23 +66,34 @@ def test_batches_repeat_and_a_resumed_run_sees_the_same_ones(dataset, monkeypatc
     assert not torch.equal(whole[1], whole[2])
 
 
-def test_streams_resume_with_several_loader_processes(dataset, monkeypatch):
-    monkeypatch.setattr(training_data, "SEGMENT", 4)
+@pytest.mark.parametrize("stage", [STAGE, MIXED])
+@pytest.mark.parametrize("workers", [0, 1, 3])
+def test_a_split_in_memory_and_one_read_by_any_number_of_processes_give_the_same(dataset, stage, workers):
+    stream = batches(dataset, stage, cache=False, first_step=2)
+    loaded = take(DataLoader(stream, batch_size=None, num_workers=workers), 7)
+    assert same(take(batches(dataset, stage, first_step=2), 7), loaded)
 
-    def loaded(first: int, count: int) -> list[torch.Tensor]:
-        stream = batches(dataset, STAGE, cache=False, first_step=first)
-        return take(DataLoader(stream, batch_size=None, num_workers=2), count)
 
-    whole = loaded(0, 9)
-    assert same(whole[3:], loaded(3, 6))
+def test_a_sample_of_one_frame_reads_one_frame(dataset, monkeypatch):
+    read: list[int] = []
+    ranges = ByteRanges.read
+
+    def counted(self, name, spans):
+        spans = list(spans)
+        read.append(len(spans))
+        return ranges(self, name, spans)
+
+    monkeypatch.setattr(ByteRanges, "read", counted)
+    source = IndexedSplit(ClipStore(dataset, "train"), "train", BUFFERS, 0)
+    for number in range(10):
+        source.sample(Draw(number, seeds.generator(0, "x", number), 1))
+    assert sorted(read) == [1] * 5 + [len(BUFFERS)] * 10  # each clip's metadata once, then a frame a sample
 
 
 @pytest.mark.parametrize("stage", [STAGE, MIXED])
 @pytest.mark.parametrize("cache", [True, False])
 @pytest.mark.parametrize("workers", [0, 2])
-def test_ranks_together_see_the_batches_of_one_process(dataset, monkeypatch, stage, cache, workers):
-    monkeypatch.setattr(training_data, "SEGMENT", 4)
-
+def test_ranks_together_see_the_batches_of_one_process(dataset, stage, cache, workers):
     def loaded(stream: Batches) -> list[torch.Tensor]:
         return take(DataLoader(stream, batch_size=None, num_workers=workers), 6)
 
@@ -98,12 +110,12 @@ def test_ranks_share_each_pass_over_the_clips(dataset):
     assert sorted(number for ((_, number, _),) in ranks) == list(range(10))
 
 
-def test_every_clip_is_seen_once_a_pass(dataset):
-    source = CachedSplit(dataset, "train", BUFFERS, 0)
-    for number in range(10):
-        source.sample(training_data.Draw(number, seeds.generator(0, "x"), 1))
-        if number % 5 == 0:
-            assert sorted(source._order.tolist()) == [0, 1, 2, 3, 4]
+def test_every_clip_is_seen_once_a_pass_and_passes_differ():
+    passes = Passes(0, "train", 50)
+    first, second = ([passes.clip(n) for n in range(start, start + 50)] for start in (0, 50))
+    assert sorted(first) == sorted(second) == list(range(50))
+    assert first != second
+    assert [Passes(0, "train", 50).clip(n) for n in (70, 3, 71)] == [second[20], first[3], second[21]]
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.25, 0.5, 1.0])
@@ -183,11 +195,11 @@ def test_exposure_and_agx_are_applied_to_linear_members_and_not_to_photos(datase
         np.testing.assert_allclose(batch[1].numpy(), network_input(other, name).numpy(), atol=1e-5)
 
 
-def test_what_does_not_fit_the_budget_is_streamed(dataset):
-    for budget, cached in ((4.0, {"train"}), (1e-6, set())):
+def test_what_does_not_fit_the_budget_is_read_as_needed(dataset):
+    for budget, kind in ((4.0, CachedSplit), (1e-6, IndexedSplit)):
         data = TrainingData(dataset, DataSettings(cache_gb=budget), 0, ValidationSettings())
         data.open([STAGE])
-        assert set(data.cached) == cached
+        assert isinstance(data.sources["train"], kind)
         data.begin(STAGE, 0)
         batch = next(iter(data.train_dataloader()))
         assert batch["rgb"].shape == (3, 3, 1, 16, 16)
@@ -220,14 +232,16 @@ def test_ranks_validate_on_each_clip_once(dataset):
     assert [len(held_out(rank, 6)) for rank in range(6)] == [1, 1, 1, 1, 0, 0]
 
 
-def test_a_path_traced_second_split_stands_in_for_photographs_and_photographs_do_not(dataset, monkeypatch):
+def test_a_path_traced_second_split_stands_in_for_photographs_and_photographs_do_not(
+    dataset, make_dataset, tmp_path
+):
+    captures = make_dataset(tmp_path / "captures", {"photos": 1}, spaces={TARGET: "display"})
     data = TrainingData(dataset, DataSettings(), 0, ValidationSettings())
     assert [data.stands_in(split) for split in ("train", "train_b", "test")] == [False, True, False]
-    photographs = next(read_clips(dataset, "train_b")).meta.model_copy(
-        update={"color_space": {"rgb": "display"}}
-    )
-    monkeypatch.setattr(training_data, "first_meta", lambda *_: photographs)
-    assert not data.stands_in("train_b")
+    elsewhere = {"train_b": f"{captures}#photos"}
+    data = TrainingData(dataset, DataSettings(), 0, ValidationSettings(), splits=elsewhere)
+    assert [data.stands_in(split) for split in ("train", "train_b")] == [False, False]
+    assert [data.photographs(split) for split in ("train", "train_b")] == [False, True]
 
 
 def test_validation_is_on_its_own_split_and_the_test_split_is_never_opened(
@@ -244,8 +258,9 @@ def test_validation_is_on_its_own_split_and_the_test_split_is_never_opened(
     assert len(list(data.calibration(settings.stages, 4))) > 0
     data.begin(settings.stages[0], 0)
     next(iter(data.train_dataloader()))
-    held_out = {clip.meta.split for clip in (list(data.val_dataloader()), data._held_out)[1] or []}
-    assert held_out == {"validation"}
+    assert len(list(data.val_dataloader())) == 2
+    assert data._held_out is not None
+    assert data._held_out.clips.split == "validation"
     for change in (
         {"validation": {"split": "test"}},
         {"stages": [{"name": "a", "split": "test", "steps": 1}]},
@@ -282,7 +297,7 @@ def test_stages_that_the_dataset_cannot_serve_fail_before_training(dataset, chan
         data.open([STAGE.model_copy(update=change)])
 
 
-def test_a_stream_reports_a_damaged_shard(dataset, tmp_path):
+def test_a_damaged_shard_is_reported(dataset, tmp_path):
     folder = tmp_path / "copy"
     shutil.copytree(dataset, folder)
     for path in folder.glob("train-*.tar"):

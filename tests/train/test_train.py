@@ -83,12 +83,12 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_by_bit(
 
 
 @pytest.mark.parametrize("saves", [2, 3, 4])
-def test_resuming_holds_with_muon_an_averaged_model_and_streamed_data(
+def test_resuming_holds_with_muon_an_averaged_model_and_data_read_as_needed(
     train, monkeypatch, dataset, tmp_path, saves
 ):
     changes = {
         "optimizer": {"warmup_steps": 2, "ema_decay": 0.5, "muon_learning_rate": 0.02},
-        "data": {"cache_gb": 0.0, "shuffle_buffer": 2},
+        "data": {"cache_gb": 0.0},
         "validation": {"split": None},
     }
     train(dataset, tmp_path / "whole", **changes)

@@ -21,10 +21,12 @@ from tron.shards.schema import (
     parse_name,
     require_schema,
 )
+from tron.shards.tar_headers import BoundedTarInfo
 
 LARGEST_MEMBER = 256 * 2**20
 LARGEST_META = 16 * 2**20
 MOST_FILES = 200_000  # of one shard: 64 clips of 93 frames x 12 members are 71,424
+DAMAGED = "make the shard again with tron-datagen"
 _DECODERS: dict[str, Callable[[bytes], np.ndarray]] = {"exr": decode_exr, "png": decode_png}
 
 
@@ -36,25 +38,30 @@ def tar_files(path: str | Path, members: Collection[str] | None = None) -> Itera
     compressed or damaged tars and files beyond the size limit; such a file's bytes are not read.
     """
     try:
-        with tarfile.open(path, "r:") as tar:  # "r:" reads plain tars only: no decompression bombs
+        with tarfile.open(
+            path, "r:", tarinfo=BoundedTarInfo
+        ) as tar:  # "r:" reads plain tars only: no decompression bombs
             for count, info in enumerate(tar):
-                if not info.isreg() or info.issparse():
-                    raise TronError(f"member {info.name[:80]!r} is not a plain file", str(path))
-                if info.size > LARGEST_MEMBER or count >= MOST_FILES:
-                    raise TronError(f"member {info.name[:80]!r} goes beyond the size limits", str(path))
-                key, _, member = parse_name(info.name)
+                key, member = require_plain(info, count, str(path))
                 if members is not None and member != "meta" and member not in members:
                     continue
                 file = tar.extractfile(info)
                 data = file.read() if file else b""
                 if len(data) != info.size:
-                    raise TronError(f"shard ends within member {info.name!r}", str(path), _MEND)
+                    raise TronError(f"shard ends within member {info.name!r}", str(path), DAMAGED)
                 yield key, info.name[len(key) + 1 :], data
     except (tarfile.TarError, OSError, EOFError, UnicodeError, ValueError) as error:
-        raise TronError(f"shard is damaged: {error}", str(path), _MEND) from error
+        raise TronError(f"shard is damaged: {error}", str(path), DAMAGED) from error
 
 
-_MEND = "make the shard again with tron-datagen"
+def require_plain(info: tarfile.TarInfo, count: int, where: str) -> tuple[str, str]:
+    """Key and member of a tar's entry number ``count``; TronError unless it is a file of a clip."""
+    if not info.isreg() or info.issparse():
+        raise TronError(f"member {info.name[:80]!r} is not a plain file", where)
+    if info.size > LARGEST_MEMBER or count >= MOST_FILES:
+        raise TronError(f"member {info.name[:80]!r} goes beyond the size limits", where)
+    key, _, member = parse_name(info.name)
+    return key, member
 
 
 def decode_member(name: str, data: bytes) -> np.ndarray:
@@ -99,14 +106,24 @@ def decode_clip(
         raise TronError("clip has no meta.json")
     meta = decode_meta(files[META_SUFFIX])
     indices = range(meta.frames) if frames is None else frames
-    if members is None:
-        every = clip_members(reference=False)
-        members = clip_members(reference=any(_file_name(0, m) in files for m in MEMBERS if m not in every))
+    return decode_frames(meta, files, present_members(files) if members is None else members, indices)
+
+
+def present_members(files: Collection[str]) -> tuple[str, ...]:
+    """Members that a clip of these files holds: all, or all but those for reference."""
+    every = clip_members(reference=False)
+    return clip_members(reference=any(file_name(0, m) in files for m in MEMBERS if m not in every))
+
+
+def decode_frames(
+    meta: ClipMeta, files: Mapping[str, bytes], members: Iterable[str], indices: Sequence[int]
+) -> Clip:
+    """Decode frames of a clip whose metadata are known; TronError as decode_clip."""
     decoded: dict[str, np.ndarray] = {}
     for member in members:
         images = []
         for index in indices:
-            name = _file_name(index, member)
+            name = file_name(index, member)
             if name not in files:
                 optional = MEMBERS[member].clips == "reference"
                 mend = "its split was made without reference_buffers" if optional else None
@@ -121,7 +138,8 @@ def decode_clip(
     return Clip(meta, decoded)
 
 
-def _file_name(frame: int, member: str) -> str:
+def file_name(frame: int, member: str) -> str:
+    """Name within a clip of a member's file, "f00.pbr.exr"; TronError where no member is called so."""
     if member not in MEMBERS:
         raise TronError(f"no member is called {member!r}", mend=f"they are {', '.join(MEMBERS)}")
     return f"f{frame:02d}.{member}.{MEMBERS[member].extension}"

@@ -16,6 +16,7 @@ import numpy as np
 
 from tron.errors import TronError
 from tron.images import encode_exr, encode_png
+from tron.shards.index import Entry, index_name, index_text, padded
 from tron.shards.manifest import ShardEntry
 from tron.shards.schema import (
     MEMBERS,
@@ -26,15 +27,17 @@ from tron.shards.schema import (
     meta_name,
     shard_name,
 )
-from tron.storage import atomic_path
+from tron.storage import atomic_path, write_atomic
 
 
 class ShardWriter:
     """Context manager that fills `folder/{split}-00000.tar`, `-00001.tar`, ... with clips.
 
     A shard appears under its final name only when it is whole; if the block ends by an exception, the shard
-    in hand is dropped and earlier ones stay. `entries` lists the finished shards for the manifest.
-    `first_index` numbers the first shard (a resumed run goes on where the last whole shard ended).
+    in hand is dropped and earlier ones stay. Its index (`tron.shards.index`) follows it: a run that is killed
+    between the two leaves a shard without one, which is read as well. `entries` lists the finished shards for
+    the manifest. `first_index` numbers the first shard (a resumed run goes on where the last whole shard
+    ended).
     """
 
     def __init__(self, folder: str | Path, split: str, samples_per_shard: int = 64, first_index: int = 0):
@@ -48,6 +51,7 @@ class ShardWriter:
         self.entries: list[ShardEntry] = []
         self._index = first_index
         self._keys: list[str] = []
+        self._files: list[Entry] = []
         self._stack = ExitStack()
         self._tar: tarfile.TarFile | None = None
         self._file: _HashingFile | None = None
@@ -93,6 +97,7 @@ class ShardWriter:
             info = tarfile.TarInfo(name)  # mtime 0, uid 0, mode 0644: no clock and no user in the bytes
             info.size = len(data)
             tar.addfile(info, io.BytesIO(data))
+            self._files.append((name, tar.offset - padded(len(data)), len(data)))
         self._keys.append(meta.key)
         if len(self._keys) == self.samples_per_shard:
             self._finish_shard()
@@ -117,9 +122,10 @@ class ShardWriter:
             sha256=self._file.hash.hexdigest(),
         )
         self._stack.close()  # renames the temporary file: only now does the shard exist
+        write_atomic(self.folder / index_name(entry.name), index_text(self._files))
         self.entries.append(entry)
         self._index += 1
-        self._keys, self._tar, self._file = [], None, None
+        self._keys, self._files, self._tar, self._file = [], [], None, None
 
 
 class _HashingFile(io.RawIOBase):

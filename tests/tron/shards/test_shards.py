@@ -159,7 +159,7 @@ def test_an_exception_drops_the_shard_in_hand_and_keeps_whole_ones(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
-    assert [path.name for path in tmp_path.iterdir()] == ["train-00000.tar"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["train-00000.idx", "train-00000.tar"]
 
 
 @pytest.mark.parametrize("key", ["a.b", "", "a/b", "ä", "x" * 61])

@@ -1,0 +1,182 @@
+"""Clips of a split by number, of which only the frames and members that are asked for are read."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from itertools import accumulate
+from tarfile import BLOCKSIZE
+
+from tron.dataset_folder import Place
+from tron.errors import TronError
+from tron.shards.byte_ranges import ByteRanges
+from tron.shards.index import LARGEST_INDEX, ShardIndex, index_name, parse_index, require_header, scan_index
+from tron.shards.manifest import Manifest, ShardEntry
+from tron.shards.reader import LARGEST_META, decode_frames, decode_meta, file_name, present_members
+from tron.shards.schema import META_SUFFIX, Clip, ClipMeta
+
+MOST_METAS = 256
+"""Clips whose metadata are kept."""
+MOST_INDEXED = 12_000_000
+"""Files whose places are kept, 16 bytes each; the shards that were used longest ago are forgotten."""
+
+
+class ClipStore:
+    """Clips of a split in the manifest's order, read by number.
+
+    A shard's index lies beside it, or is found by walking its headers. What is read is what `read_clips`
+    gives, bit by bit; a shard may be read by several processes, and by one thread of each.
+
+    Args:
+        place: the dataset's folder, or its URL.
+        split: of it.
+        members: that are read, unless a call says others; None: all that a clip holds.
+        manifest: of the folder, where it has been loaded already.
+
+    Raises:
+        TronError: this is no dataset, or it has no such split.
+    """
+
+    def __init__(
+        self,
+        place: Place,
+        split: str,
+        members: Iterable[str] | None = None,
+        manifest: Manifest | None = None,
+    ) -> None:
+        manifest = Manifest.load(place) if manifest is None else manifest
+        self.split, self.members = split, None if members is None else tuple(members)
+        self._entries = [entry for entry in manifest.of_split(split) if entry.keys]
+        self._ends = list(accumulate(len(entry.keys) for entry in self._entries))
+        self._ranges = ByteRanges(place)
+        self._indexes: OrderedDict[str, ShardIndex] = OrderedDict()
+        self._scanned: set[str] = set()
+        self._metas: OrderedDict[int, ClipMeta] = OrderedDict()
+
+    def __len__(self) -> int:
+        return self._ends[-1]
+
+    def key(self, number: int) -> str:
+        """Key of a clip; IndexError where there is no such number."""
+        entry, place = self._find(number)
+        return entry.keys[place]
+
+    def meta(self, number: int) -> ClipMeta:
+        """Metadata of a clip; TronError where they are missing, damaged or of another clip."""
+        if number not in self._metas:
+            key = self.key(number)
+            meta = decode_meta(self._files(number, [META_SUFFIX])[META_SUFFIX])
+            if meta.key != key:
+                raise TronError(f"clip {key} has the metadata of {meta.key}", self._where(number))
+            while len(self._metas) >= MOST_METAS:
+                self._metas.popitem(last=False)
+            self._metas[number] = meta
+        self._metas.move_to_end(number)
+        return self._metas[number]
+
+    def read_frames(
+        self, number: int, frames: Sequence[int] | None = None, members: Iterable[str] | None = None
+    ) -> Clip:
+        """Clip of chosen frames, in that order, (K, H, W, C) float32 a member; all metadata.
+
+        Args:
+            number: of the clip in the split, from 0.
+            frames: indices; None: all.
+            members: to read; None: the store's.
+
+        Raises:
+            TronError: shard or clip is damaged, or lacks a frame or member.
+            IndexError: there is no such clip.
+        """
+        meta = self.meta(number)
+        frames = range(meta.frames) if frames is None else frames
+        if wrong := [frame for frame in frames if not 0 <= frame < meta.frames]:
+            raise TronError(f"clip {meta.key} has no frame {wrong[0]}", self._where(number))
+        if members is None:
+            members = self.members or present_members(self._index(number)[meta.key].places.keys())
+        members = tuple(members)
+        names = {file_name(frame, member) for frame in frames for member in members}
+        return decode_frames(meta, self._files(number, names), members, frames)
+
+    def close(self) -> None:
+        """Close the shards that are open; they open again when they are read."""
+        self._ranges.close()
+
+    def _find(self, number: int) -> tuple[ShardEntry, int]:
+        if not 0 <= number < len(self):
+            raise IndexError(f"split '{self.split}' has {len(self)} clips, no number {number}")
+        shard = bisect_right(self._ends, number)
+        return self._entries[shard], number - (self._ends[shard] - len(self._entries[shard].keys))
+
+    def _where(self, number: int) -> str:
+        return self._ranges.folder.where(self._find(number)[0].name)
+
+    def _files(self, number: int, names: Iterable[str]) -> dict[str, bytes]:
+        """Those files of a clip that it has, by name; by a new index where the kept one leads astray."""
+        shard, names = self._find(number)[0].name, list(names)
+        if shard not in self._scanned:
+            try:
+                return self._indexed_files(number, names)
+            except TronError:
+                self._scanned.add(shard)
+                self._indexes.pop(shard, None)
+        return self._indexed_files(number, names)
+
+    def _indexed_files(self, number: int, names: Iterable[str]) -> dict[str, bytes]:
+        entry, place = self._find(number)
+        key, where = entry.keys[place], self._where(number)
+        clip = self._index(number)[key]
+        wanted = {}
+        for name in names:
+            if name in clip:
+                offset, size = clip.span(name)
+                if name == META_SUFFIX and size > LARGEST_META:
+                    raise TronError("a clip's meta.json is too large to be one", where)
+                wanted[offset - BLOCKSIZE, offset + size] = name
+            elif name == META_SUFFIX:
+                raise TronError(f"clip {key} has no meta.json", where)
+        files = {}
+        for span, data in self._ranges.read(entry.name, wanted):
+            name = wanted[span]
+            require_header(data[:BLOCKSIZE], f"{key}.{name}", len(data) - BLOCKSIZE, where)
+            files[name] = data[BLOCKSIZE:]
+        return files
+
+    def _index(self, number: int) -> ShardIndex:
+        entry, _ = self._find(number)
+        if entry.name not in self._indexes:
+            index = self._load(entry)
+            held = sum(_files_of(each) for each in self._indexes.values()) + _files_of(index)
+            while self._indexes and held > MOST_INDEXED:
+                held -= _files_of(self._indexes.popitem(last=False)[1])
+            self._indexes[entry.name] = index
+        self._indexes.move_to_end(entry.name)
+        return self._indexes[entry.name]
+
+    def _load(self, entry: ShardEntry) -> ShardIndex:
+        """A shard's kept index where that can be right, else that of its headers."""
+        folder, name = self._ranges.folder, index_name(entry.name)
+        where = folder.where(entry.name)
+        shard_bytes = folder.size(entry.name)
+        if shard_bytes is None:
+            raise TronError("shard is missing", where, "make it again with tron-datagen")
+        kept_bytes = None if entry.name in self._scanned else folder.size(name)
+        if kept_bytes is not None and kept_bytes <= LARGEST_INDEX:
+            index = parse_index(folder.read(name), shard_bytes, where)
+            if index is not None and list(index) == entry.keys:
+                return index
+        self._scanned.add(entry.name)
+        with folder.open(entry.name) as file:
+            index = scan_index(file, where)
+        if list(index) != entry.keys:
+            raise TronError(
+                f"shard holds {len(index)} clips, the manifest names {len(entry.keys)}",
+                where,
+                "check the dataset with tron-datagen's validate, then make the shard again",
+            )
+        return index
+
+
+def _files_of(index: ShardIndex) -> int:
+    return sum(len(clip.sizes) for clip in index.values())
