@@ -59,12 +59,18 @@ class Batches(IterableDataset):
         self.seed, self.first_step, self.rank, self.ranks = seed, first_step, rank, ranks
         self.places = stage.batch_size * ranks
 
-    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+    def __iter__(self) -> Iterator[dict[str, Tensor] | TronError]:
         worker = get_worker_info()
         number, workers = (worker.id, worker.num_workers) if worker else (0, 1)
         step = self.first_step + number  # torch takes batches from process 0, 1, ... in turn
         while True:
-            yield self._batch(step)
+            try:
+                yield self._batch(step)
+            except TronError as error:
+                if worker is None:
+                    raise
+                yield error  # `Loader` raises it: torch would make a traceback of many lines of it
+                return
             step += workers
 
     def _plan(self, step: int) -> list[tuple[str, int, int]]:
@@ -95,6 +101,16 @@ class Batches(IterableDataset):
         if len(shapes) > 1:
             raise TronError(f"stage {stage.name} meets frames of several sizes", mend="give it a size")
         return {name: display_encoded(samples, name) for name in self.members}
+
+
+class Loader(DataLoader):
+    """A DataLoader whose processes' TronErrors arrive as they were raised."""
+
+    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+        for batch in super().__iter__():
+            if isinstance(batch, TronError):
+                raise batch
+            yield batch
 
 
 class TrainingData(lightning.LightningDataModule):
@@ -197,7 +213,7 @@ class TrainingData(lightning.LightningDataModule):
             self.processes.count,
         )
         in_memory = all(isinstance(source, CachedSplit) for source in sources.values())
-        return DataLoader(batches, batch_size=None, num_workers=0 if in_memory else self.settings.workers)
+        return Loader(batches, batch_size=None, num_workers=0 if in_memory else self.settings.workers)
 
     def val_dataloader(self) -> DataLoader | list[Any]:
         """This process's share of the held-out clips as windows of the stage's K frames, in batches."""

@@ -1,4 +1,4 @@
-"""Where a split of a training run is read from, as it is typed."""
+"""Folder that a split of a training run is read from, as it is typed."""
 
 from __future__ import annotations
 

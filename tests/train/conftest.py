@@ -9,7 +9,7 @@ import pytest
 
 from tron import seeds
 from tron.shards.manifest import Manifest
-from tron.shards.schema import GUIDANCE, TARGET, ClipMeta, light_members
+from tron.shards.schema import GUIDANCE, TARGET, ClipMeta, ColorSpace, light_members
 from tron.shards.writer import ShardWriter
 
 
@@ -20,13 +20,14 @@ def write_dataset(
     size: int = 24,
     shard: int = 2,
     width: int | None = None,
-    spaces: dict[str, str] | None = None,
+    spaces: dict[str, ColorSpace] | None = None,
 ) -> Path:
     """Clips of smooth colours whose picture is the product of pbr and irradiance, frames x size x size.
 
     width: of frames that are not square. spaces: of colours that are not linear.
     """
     width = width or size
+    colors: dict[str, ColorSpace] = dict.fromkeys((*GUIDANCE, TARGET), "linear")
     entries = []
     for split, count in splits.items():
         with ShardWriter(folder, split, shard) as writer:
@@ -43,7 +44,7 @@ def write_dataset(
                     height=size,
                     cameras=[{}] * frames,
                     exposure=1.0,
-                    color_space=dict.fromkeys((*GUIDANCE, TARGET), "linear") | (spaces or {}),
+                    color_space=colors | (spaces or {}),
                 )
                 writer.write(meta, [_frame(random, size, width) for _ in range(frames)])
         entries += writer.entries

@@ -297,10 +297,17 @@ def test_stages_that_the_dataset_cannot_serve_fail_before_training(dataset, chan
         data.open([STAGE.model_copy(update=change)])
 
 
-def test_a_damaged_shard_is_reported(dataset, tmp_path):
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_damaged_shard_is_one_line_from_any_process(dataset, tmp_path, workers):
     folder = tmp_path / "copy"
     shutil.copytree(dataset, folder)
+    settings = DataSettings(cache_gb=0, workers=workers)
+    data = TrainingData(folder, settings, 0, ValidationSettings())
+    data.open([STAGE])
+    data.begin(STAGE, 0)
     for path in folder.glob("train-*.tar"):
         path.write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(TronError, match="shard"):
-        take(batches(folder, STAGE, cache=False), 1)
+    with pytest.raises(TronError, match="shard") as caught:
+        take(data.train_dataloader(), 1)
+    assert "\n" not in str(caught.value)
+    assert "Traceback" not in str(caught.value)

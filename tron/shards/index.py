@@ -32,7 +32,7 @@ Entry = tuple[str, int, int]
 
 @dataclass(frozen=True)
 class ClipIndex:
-    """Where the files of one clip lie.
+    """Offsets and sizes of the files of one clip.
 
     Attributes:
         places: file's name within the clip, "f00.pbr.exr" -> its number; clips with the same files share it.

@@ -10,7 +10,7 @@ from pathlib import Path
 import fsspec
 import numpy as np
 import pytest
-import webdataset
+from webdataset.compat import WebDataset
 
 from tron import seeds
 from tron.errors import TronError
@@ -132,7 +132,7 @@ def test_a_written_index_is_what_the_headers_say(folder):
 
 
 def test_shards_open_with_webdatasets_own_reader(folder):
-    opened = list(webdataset.WebDataset(str(folder / SHARD), shardshuffle=False))
+    opened = list(WebDataset(str(folder / SHARD), shardshuffle=False))
     assert [sample["__key__"] for sample in opened] == ["a0", "a1"]
     assert len(opened[0]["f00.rgb.exr"]) > 100
 
