@@ -183,13 +183,15 @@ def test_a_capture_that_cannot_be_used_is_a_failure_and_the_others_are_made(
     again = settings_of(*shlex.split(line["command"])[1:])
     assert again.recipe() == settings.recipe()
     assert again.captures == captures
+    assert make(recipe(tmp_path / "joint", "prior=joint", "captured.prior.sun=1", captures=captures)) == 0
+    assert "captured.prior.sun=1" in (tmp_path / "joint/README.md").read_text()
     with pytest.raises(TronError, match="other captures: bad"):
         make(settings)
 
 
 def test_photos_that_are_too_small_or_too_few_in_a_row_are_told(recipe, tmp_path):
     for override, said in (("captured.width=32", "fewer than a frame"), ("captured.frames=8", "in a row")):
-        output = tmp_path / override
+        output = tmp_path / override.partition("=")[0]
         assert make(recipe(output, override, "only=[train-000000]")) == 1
         assert said in (output / "failures.jsonl").read_text()
 
@@ -210,7 +212,7 @@ def test_a_plan_says_what_is_missing_and_makes_nothing(recipe, tmp_path):
         ("environments=maps", "environments is of source=synthetic"),
         ("mode=captures", "mode=captures is of source=synthetic"),
         ("captured.shares={train:0,validation:0,test:0}", "all shares are 0"),
-        ("captured.prior=null", "prior=NAME"),
+        ("prior=magic", "unknown prior"),
     ],
 )
 def test_settings_that_do_not_go_with_captures_are_refused_in_a_line(override, said):
