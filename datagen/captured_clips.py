@@ -21,7 +21,7 @@ from tron.priors.linear_light import inverse_agx
 from tron.seeds import integer
 from tron.shading.bounce import BounceTransport
 from tron.shading.guidance import Lighting, render_guidance
-from tron.shards.schema import MEMBERS, TARGET, ClipMeta, clip_members
+from tron.shards.schema import MEMBERS, TARGET, ClipMeta, ColorSpace, clip_members
 from tron.tracing import SurfelTracer
 
 OPAQUE = 0.9
@@ -148,7 +148,11 @@ class _About:
     def meta(self, number: int, views: Sequence[View], cameras: Sequence[Camera]) -> ClipMeta:
         """Metadata of one clip."""
         item, wanted = self.item, self.settings.captured
-        spaces = {name: MEMBERS[name].color_space for name in clip_members(reference=False)}
+        spaces: dict[str, ColorSpace] = {
+            name: space
+            for name in clip_members(reference=False)
+            if (space := MEMBERS[name].color_space) is not None
+        }
         gains = [self.found.gains.get(view.name, np.ones(3)) for view in views]
         return ClipMeta(
             key=f"{item.name}-l0-c{number:04d}",
@@ -161,7 +165,7 @@ class _About:
             height=wanted.height,
             cameras=[camera.to_dict() for camera in cameras],
             exposure=self.exposure,
-            color_space={name: space for name, space in spaces.items() if space} | {TARGET: "display"},
+            color_space={**spaces, TARGET: "display"},
             seeds={"root": self.settings.seed},
             spp={"guidance": wanted.guidance_spp},
             extra={

@@ -77,7 +77,7 @@ def starts(count: int, frames: int) -> list[int]:
 def frame_of(view: View, gain: np.ndarray, curve: ToneCurve, width: int, height: int) -> Photo:
     """A photo in a frame's pixels.
 
-    It is made smaller, by means over pixels in display space, until it just covers the frame, and what
+    It is made smaller, by Pillow's Hamming filter in display space, until it just covers the frame, and what
     stands over at two edges is cut off.
 
     Args:
@@ -158,7 +158,7 @@ def _resized(image: np.ndarray, box: Box, width: int, height: int) -> np.ndarray
     channels = np.atleast_3d(np.asarray(image, np.float32))
     made = [
         Image.fromarray(np.ascontiguousarray(channels[..., k])).resize(
-            (width, height), Image.Resampling.BOX, box=box
+            (width, height), Image.Resampling.HAMMING, box=box
         )
         for k in range(channels.shape[2])
     ]

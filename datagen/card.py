@@ -13,13 +13,14 @@ from omegaconf import OmegaConf
 
 import tron
 from datagen.assets import Asset
+from datagen.captured_settings import CapturedSettings
 from datagen.clip_rows import ClipRow
 from datagen.contact_sheet import SHEET_NAME
 from datagen.hub import configurations, front_matter
 from datagen.plan import Figures, Refinement, Sources, config_sha256
 from datagen.settings import OUTSIDE, SPLITS, Settings
 from datagen.variety import MEASURES, VARIETY_NAME, Histograms, Other, median
-from tron.cli.recipes import complete, compose_recipe
+from tron.cli.recipes import complete, compose_recipe, group_options
 from tron.nested import leaves
 from tron.runtime import describe_machine
 from tron.shards.manifest import Manifest
@@ -34,7 +35,8 @@ def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), 
     It does not lean on recipes, whose content may change. ``output_dir`` and ``only`` are the caller's;
     without ``machine`` it leaves out what decides nothing of the content: cluster and workers.
     """
-    recipe = compose_recipe("conf.datagen", Settings)
+    groups = _prior_group(settings)
+    recipe = compose_recipe("conf.datagen", Settings, groups)
     values = settings.model_dump(mode="json") | {"output_dir": output_dir, "only": list(only)}
     if settings.source == "captured":
         recipe = complete(recipe)
@@ -48,7 +50,7 @@ def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), 
         values |= {"output_dir": output_dir}
     defaults, wanted = leaves(shipped), leaves(values)
     parents = {key.rsplit(".", 1)[0] for key in defaults if "." in key}
-    words = ["tron-datagen"]
+    words = ["tron-datagen", *groups]
     for key, value in wanted.items():
         if key not in defaults and key not in parents:
             words.append(f"+{key}={_hydra(value)}")
@@ -58,6 +60,20 @@ def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), 
     inside = {key.rsplit(".", 1)[0] for key in wanted if "." in key}
     words += [f"~{key}" for key in defaults if key not in wanted and key.rsplit(".", 1)[0] in inside]
     return " ".join(shlex.quote(word) for word in words)
+
+
+def _prior_group(settings: Settings) -> list[str]:
+    """The override that chooses the prior of captures, where it is a shipped one and not the default."""
+    if settings.source == "synthetic":
+        return []
+    target = settings.captured.prior["_target_"]
+    if target == CapturedSettings().prior["_target_"]:
+        return []
+    for name in group_options("conf.datagen")["prior"]:
+        shipped = compose_recipe("conf.datagen", Settings, [f"prior={name}"])
+        if shipped.captured.prior["_target_"] == target:
+            return [f"prior={name}"]
+    return []
 
 
 def _hydra(value: Any) -> str:

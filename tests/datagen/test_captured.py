@@ -1,8 +1,13 @@
 """Captures as a source: photos are the truth, guidance is comparable with them, runs repeat and resume."""
 
 import json
+import os
 import shlex
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +20,7 @@ import datagen.captured_reconstruction
 import datagen.captured_scene
 from datagen.captured_folder import apportioned, split_of
 from datagen.captured_photos import balanced, frame_of, in_order, rows_of_photos, starts
+from datagen.captured_reconstruction import PHASES
 from datagen.captured_settings import Shares
 from datagen.plan import plan
 from datagen.projection import project
@@ -183,13 +189,15 @@ def test_a_capture_that_cannot_be_used_is_a_failure_and_the_others_are_made(
     again = settings_of(*shlex.split(line["command"])[1:])
     assert again.recipe() == settings.recipe()
     assert again.captures == captures
+    assert make(recipe(tmp_path / "joint", "prior=joint", "captured.prior.sun=1", captures=captures)) == 0
+    assert "captured.prior.sun=1" in (tmp_path / "joint/README.md").read_text()
     with pytest.raises(TronError, match="other captures: bad"):
         make(settings)
 
 
 def test_photos_that_are_too_small_or_too_few_in_a_row_are_told(recipe, tmp_path):
     for override, said in (("captured.width=32", "fewer than a frame"), ("captured.frames=8", "in a row")):
-        output = tmp_path / override
+        output = tmp_path / override.partition("=")[0]
         assert make(recipe(output, override, "only=[train-000000]")) == 1
         assert said in (output / "failures.jsonl").read_text()
 
@@ -210,7 +218,7 @@ def test_a_plan_says_what_is_missing_and_makes_nothing(recipe, tmp_path):
         ("environments=maps", "environments is of source=synthetic"),
         ("mode=captures", "mode=captures is of source=synthetic"),
         ("captured.shares={train:0,validation:0,test:0}", "all shares are 0"),
-        ("captured.prior=null", "prior=NAME"),
+        ("prior=magic", "unknown prior"),
     ],
 )
 def test_settings_that_do_not_go_with_captures_are_refused_in_a_line(override, said):
@@ -291,3 +299,32 @@ def test_a_photo_in_a_frame_shows_points_where_its_camera_says():
     rays = photo.camera.rays()
     pixels, _ = camera.project(camera.position + rays.reshape(-1, 3))
     np.testing.assert_allclose(photo.shown.reshape(-1, 3)[:, 0], pixels[:, 0] / 90, atol=2e-3)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_run_that_is_killed_in_any_phase_goes_on_to_the_same_bytes(
+    phase, variant, pairs, recipe, tiny_captures, quick_reconstruction, tmp_path, files_of
+):
+    output, log = tmp_path / "again", tmp_path / "log"
+    wanted = [
+        *("source=captured", f"captures={tiny_captures}", f"output_dir={output}", "cluster=none"),
+        *("prior=ground_truth", *quick_reconstruction),
+    ]
+    with log.open("wb") as file:
+        command = [sys.executable, "-c", "from datagen.cli import cli; cli()", *wanted]
+        process = subprocess.Popen(command, stdout=file, stderr=file, start_new_session=True)
+        while PHASES[phase].encode() not in log.read_bytes():
+            assert process.poll() is None, log.read_text()
+            time.sleep(0.01)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    assert not (output / "manifest.json").exists()
+    assert make(recipe(output)) == 0
+    assert files_of(output) == files_of(pairs)
+
+
+def test_the_benchmark_waits_for_the_words_that_the_log_says():
+    from eval.datagen.captured import PHASES as AWAITED
+
+    assert list(AWAITED.values()) == list(PHASES.values())
