@@ -41,20 +41,34 @@ def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), 
         values |= {"output_dir": output_dir}
     defaults, wanted = leaves(shipped), leaves(values)
     parents = {key.rsplit(".", 1)[0] for key in defaults if "." in key}
-    words = ["tron-datagen"]
-    for key, value in wanted.items():
+    folded, words = _folded(wanted, defaults), ["tron-datagen"]
+    for key, value in folded.items():
         if key not in defaults and key not in parents:
             words.append(f"+{key}={_hydra(value)}")
         elif defaults.get(key, ...) != value:
             words.append(f"{key}={_hydra(value)}")
     # A cluster of another kind has other options: those of the shipped one must go.
     inside = {key.rsplit(".", 1)[0] for key in wanted if "." in key}
-    words += [f"~{key}" for key in defaults if key not in wanted and key.rsplit(".", 1)[0] in inside]
+    words += [f"~{key}" for key in defaults if key not in folded and key.rsplit(".", 1)[0] in inside]
     return " ".join(shlex.quote(word) for word in words)
+
+
+def _folded(wanted: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """The leaves, but a mapping whose default is none stays whole: nothing can be added under a plain value."""
+    folded: dict[str, Any] = {}
+    for key, value in wanted.items():
+        parent, _, name = key.rpartition(".")
+        if defaults.get(parent) is not None:
+            folded.setdefault(parent, {})[name] = value
+        else:
+            folded[key] = value
+    return folded
 
 
 def _hydra(value: Any) -> str:
     """A value in the grammar of Hydra's overrides."""
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{name}:{_hydra(item)}" for name, item in value.items()) + "}"
     if isinstance(value, str):
         plain = value != "" and all(c.isalnum() or c in "_-./" for c in value)
         return value if plain else json.dumps(value)
