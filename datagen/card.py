@@ -18,6 +18,7 @@ from datagen.contact_sheet import SHEET_NAME
 from datagen.hub import configurations, front_matter
 from datagen.plan import Figures, Refinement, Sources, config_sha256
 from datagen.settings import OUTSIDE, SPLITS, Settings
+from datagen.source_list import SOURCES_NAME, SourceList
 from datagen.variety import MEASURES, VARIETY_NAME, Histograms, Other, median
 from tron.cli.recipes import compose_recipe
 from tron.nested import leaves
@@ -54,7 +55,7 @@ def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), 
 
 
 def _folded(wanted: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """The leaves, but a mapping whose default is none stays whole: nothing can be added under a plain value."""
+    """The leaves; a mapping in a plain value's place stays whole, for nothing can be added under that."""
     folded: dict[str, Any] = {}
     for key, value in wanted.items():
         parent, _, name = key.rpartition(".")
@@ -86,6 +87,7 @@ def card_text(
     variety: Histograms | None = None,
     other: Other | None = None,
     pictures: Sequence[str] = (),
+    listed: SourceList | None = None,
 ) -> str:
     """README.md, the same bytes for the same dataset.
 
@@ -98,6 +100,7 @@ def card_text(
         variety: its histograms.
         other: those of another dataset, drawn beside its own.
         pictures: files beside the card that it shows.
+        listed: its sources by split.
     """
     by_split = {split: [row for row in rows if row.split == split] for split in SPLITS}
     clips = {split: len(found) for split, found in by_split.items() if found}
@@ -147,10 +150,16 @@ def card_text(
     lines += _variety(variety or {}, other, pictures)
     lines += _reading(settings, clips)
     lines += ["", "## What it was made from", ""]
+    if listed is not None and listed.stand_ins is not None:
+        lines += [listed.stand_ins.sentence, ""]
     if files := _files(sources):
         lines += ["| asset | licence | author | source | sha256 |", "|---|---|---|---|---|"]
         lines += [_asset_row(asset) for asset in files]
-        lines += [""]
+        lines += [
+            "",
+            f"`{SOURCES_NAME}` lists every file of theirs with its hash, and the splits it serves.",
+            "",
+        ]
     if sources.refused:
         lines += [f"Models left out because they cannot be used: {len(sources.refused)}.", ""]
         lines += ["| model | reason |", "|---|---|"]
