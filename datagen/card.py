@@ -157,7 +157,7 @@ def card_text(
         lines += [_asset_row(asset) for asset in files]
         lines += [
             "",
-            f"`{SOURCES_NAME}` lists every file of theirs with its hash, and the splits it serves.",
+            f"`{SOURCES_NAME}` has the hash of every file, and the splits that it serves.",
             "",
         ]
     if sources.refused:

@@ -135,8 +135,8 @@ class Filled:
         ]
         if self.models < wanted.count:
             lines.append(
-                f"  missing: {wanted.count - self.models} models ({wanted.source}, licence {wanted.licence}); "
-                f"put each in {models}/NAME/NAME.gltf"
+                f"  missing: {wanted.count - self.models} models ({wanted.source}, licence "
+                f"{wanted.licence}); put each in {models}/NAME/NAME.gltf"
             )
         if self.missing or self.models < wanted.count:
             lines.append(

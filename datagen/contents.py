@@ -78,9 +78,11 @@ def _references(path: Path) -> Iterator[tuple[Path, ContentKind]]:
             named.append((line.decode("utf-8", "replace"), "library"))
     else:
         tree = read_document(path).tree
-        for key, kind in (("buffers", "buffer"), ("images", "texture")):
+        kinds: dict[str, ContentKind] = {"buffers": "buffer", "images": "texture"}
+        for key, kind in kinds.items():
             uris = [entry.get("uri") for entry in tree.get(key, []) if isinstance(entry, dict)]
-            named += [(unquote(uri), kind) for uri in uris if isinstance(uri, str) and uri[:5] != "data:"]
+            own = [unquote(uri) for uri in uris if isinstance(uri, str) and not uri.startswith("data:")]
+            named += zip(own, [kind] * len(own))
     for name, kind in named:
         try:
             file = confined(path, name)

@@ -58,7 +58,7 @@ def shared_scenes(output: Path, others: Sequence[Path]) -> Iterator[str]:
     """Scenes of a dataset whose specification is that of a scene another one trains on, a line each."""
     own = dict(_scenes(output))
     for folder in others:
-        trained = {digest: name for digest, name in _scenes(folder, TRAINED)}
+        trained = dict(_scenes(folder, TRAINED))
         for digest, name in own.items():
             if digest in trained:
                 yield f"scenes/{name}: is trained on in {folder.name}, as {trained[digest]}"

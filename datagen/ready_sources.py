@@ -1,4 +1,4 @@
-"""The user's files, ready to be drawn from: catalogued, held against the checklist and against other datasets."""
+"""The user's files, ready to be drawn from: catalogued, held against the checklist and other datasets."""
 
 from __future__ import annotations
 
