@@ -15,14 +15,18 @@ from typing import Any, Literal
 from urllib.parse import unquote
 
 import numpy as np
+from PIL import Image
 from pydantic import BaseModel, ConfigDict
 
 from datagen.gltf.document import confined, read_document
+from datagen.gltf.images import require_size
 from datagen.parts import Part
 from tron.errors import TronError
 from tron.storage import sha256
 
-ContentKind = Literal["model", "buffer", "library", "mesh", "texture", "map"]
+ContentKind = Literal["model", "buffer", "library", "mesh", "texture", "plain", "map"]
+_UNCOMPARED = ("library", "plain")
+_READ = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "TGA", "TIFF", "GIF")
 _IMAGES = ("base_color", "roughness", "metallic", "normal_map")
 _OBJ_FILE = re.compile(rb"^\s*mtllib\s+(.+?)\s*$", re.MULTILINE)
 _MTL_FILE = re.compile(r"^\s*(?:map_\w+|bump|norm|disp|decal)\s+(?:-\w+\s+\S+\s+)*(.+?)\s*$", re.MULTILINE)
@@ -33,7 +37,8 @@ class Content(BaseModel):
 
     Attributes:
         path: relative to the folder; what was decoded from a file is named behind a ``#``.
-        kind: what it is; a ``library`` (an OBJ's .mtl) is neither mesh, texture nor map.
+        kind: what it is; a ``library`` (an OBJ's .mtl) is neither mesh, texture nor map, and a ``plain``
+            image of a single colour is nobody's: neither tells that two things share anything.
         sha256: 64 hexadecimal digits.
     """
 
@@ -46,7 +51,7 @@ class Content(BaseModel):
 
 def compared(contents: Sequence[Content]) -> frozenset[str]:
     """Hashes by which two things are told to share something."""
-    return frozenset(each.sha256 for each in contents if each.kind != "library")
+    return frozenset(each.sha256 for each in contents if each.kind not in _UNCOMPARED)
 
 
 def model_contents(folder: Path, path: str, parts: Sequence[Part]) -> tuple[Content, ...]:
@@ -60,6 +65,7 @@ def model_contents(folder: Path, path: str, parts: Sequence[Part]) -> tuple[Cont
     found = [Content(path=path, kind="model", sha256=sha256(folder / path))]
     for file, kind in _references(folder / path):
         name = file.relative_to(folder.resolve()).as_posix()
+        kind = texture_kind(file) if kind == "texture" else kind
         found.append(Content(path=name, kind=kind, sha256=sha256(file)))
     found.append(Content(path=f"{path}#mesh", kind="mesh", sha256=_mesh_hash(parts)))
     images = [_image_hash(image) for image in _images(parts)]
@@ -81,8 +87,9 @@ def _references(path: Path) -> Iterator[tuple[Path, ContentKind]]:
         kinds: dict[str, ContentKind] = {"buffers": "buffer", "images": "texture"}
         for key, kind in kinds.items():
             uris = [entry.get("uri") for entry in tree.get(key, []) if isinstance(entry, dict)]
-            own = [unquote(uri) for uri in uris if isinstance(uri, str) and not uri.startswith("data:")]
-            named += zip(own, [kind] * len(own))
+            own = (unquote(uri) for uri in uris if isinstance(uri, str) and not uri.startswith("data:"))
+            for uri in own:
+                named.append((uri, kind))
     for name, kind in named:
         try:
             file = confined(path, name)
@@ -96,6 +103,17 @@ def _references(path: Path) -> Iterator[tuple[Path, ContentKind]]:
                     yield target, "texture"
 
 
+def texture_kind(path: Path) -> ContentKind:
+    """``plain`` for an image of one colour, such as a flat normal map; what cannot be read is a texture."""
+    try:
+        with Image.open(path, formats=_READ) as image:
+            require_size(image.width, image.height)
+            ranges = np.atleast_2d(image.getextrema())
+    except (OSError, SyntaxError, ValueError, TronError, Image.DecompressionBombError):
+        return "texture"
+    return "plain" if (ranges[:, 0] == ranges[:, 1]).all() else "texture"
+
+
 def _mesh_hash(parts: Sequence[Part]) -> str:
     """Hash of all triangles as float32, in an order of their own: how they are dressed is not in it."""
     corners = [np.asarray(part.vertices, np.float32)[np.asarray(part.faces)] for part in parts]
@@ -104,7 +122,7 @@ def _mesh_hash(parts: Sequence[Part]) -> str:
 
 
 def _images(parts: Sequence[Part]) -> list[np.ndarray]:
-    """Images on the parts that show something; one of a single colour is no one's, and tells nothing."""
+    """Images on the parts, but those of a single colour."""
     found: dict[int, Any] = {}
     for part in parts:
         for name in _IMAGES:

@@ -7,6 +7,7 @@ import json
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
+from datagen.contents import Content, compared
 from datagen.plan import Sources
 from datagen.settings import Settings
 from datagen.source_list import TRAINED, Source, SourceList, read_source_list, source_list
@@ -37,21 +38,25 @@ def overlaps(own: SourceList, other: SourceList, folder: Path) -> Iterator[str]:
     there: dict[str, tuple[Source, str]] = {}
     for source in other.sources:
         if set(source.splits) & set(TRAINED):
-            for each in source.files:
-                if each.kind != "library":
-                    there.setdefault(each.sha256, (source, each.path))
+            for each in _compared(source):
+                there.setdefault(each.sha256, (source, each.path))
     for source in own.sources:
-        shared = [each for each in source.files if each.sha256 in there] if source.splits else []
-        for each in shared[:1]:
-            twin, path = there[each.sha256]
+        shared = next((each for each in _compared(source) if each.sha256 in there), None)
+        if source.splits and shared is not None:
+            twin, path = there[shared.sha256]
             yield (
-                f"{source.kind} '{source.id}' is trained on in {folder.name}: {each.path} is {path} of "
+                f"{source.kind} '{source.id}' is trained on in {folder.name}: {shared.path} is {path} of "
                 f"{twin.kind} '{twin.id}' there"
             )
     if own.seed == other.seed:
         for split in own.splits:
             if split in other.splits and split in TRAINED:
                 yield f"scenes of {split} are those of {folder.name}: both are drawn from seed {own.seed}"
+
+
+def _compared(source: Source) -> list[Content]:
+    hashes = compared(source.files)
+    return [each for each in source.files if each.sha256 in hashes]
 
 
 def shared_scenes(output: Path, others: Sequence[Path]) -> Iterator[str]:

@@ -18,7 +18,7 @@ from typing import get_args
 import numpy as np
 
 from datagen.assets import CATALOGUE_NAME, Asset, read_catalogue
-from datagen.contents import Content
+from datagen.contents import Content, texture_kind
 from datagen.materials import Material
 from datagen.materials.photographed import Photographed, PhotographedSpec, height_from_normals
 from datagen.shapes.shape import Role
@@ -120,7 +120,9 @@ def find_texture_sets(
                 f"state it in {CATALOGUE_NAME}, or use it nevertheless with allow_unlicensed=[{name}]",
             )
         contents = tuple(
-            Content(path=maps[kind], kind="texture", sha256=sha256(folder / maps[kind]))
+            Content(
+                path=maps[kind], kind=texture_kind(folder / maps[kind]), sha256=sha256(folder / maps[kind])
+            )
             for kind in sorted(maps)
         )
         digest = hashlib.sha256("".join(each.sha256 for each in contents).encode())

@@ -69,7 +69,7 @@ class Relighting(Benchmark):
         manifest = Manifest.load(self._dataset())
         manifest.of_split(self.test_split)
         fitted_on = Manifest.load(self._fitted_on())
-        if self.fitted_on is None and not set(self.train_splits) & set(manifest.splits()):
+        if self.fitted_on is None and set(manifest.splits()) == {self.test_split}:
             raise TronError(
                 f"the data set has no split {self.train_splits[0]} to fit the baselines on",
                 self._dataset(),

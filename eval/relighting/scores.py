@@ -83,7 +83,7 @@ GAINS: dict[str, dict[str, list[str]]] = {
 
 
 class Where(NamedTuple):
-    """Part of the scores: a region, of all clips, of one family of lights, one style of scenes or one clip."""
+    """Part of the scores: a region, of all clips, or of one family of lights, style of scene, or clip."""
 
     region: Region = "foreground"
     family: str | None = None
@@ -92,7 +92,7 @@ class Where(NamedTuple):
 
     @property
     def tail(self) -> str:
-        """End of the rows' names: ``_full`` for frames, ``.FAMILY`` for one family, ``.STYLE`` for a style."""
+        """End of the rows' names: ``_full`` for frames, ``.FAMILY`` or ``.STYLE`` for one of them."""
         kind = self.family or self.style
         return ("_full" if self.region == "frame" else "") + (f".{kind}" if kind else "")
 
