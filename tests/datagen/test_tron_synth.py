@@ -273,10 +273,8 @@ def test_a_map_of_any_size_fills_its_slot_and_others_are_left_out(tmp_path: Path
     assert found.map_share == pytest.approx(2 / 33)
     report = found.report(maps, None)
     assert "maps present: 2 of 33" in report
-    assert (
-        f"missing: studio_small_01_4k (https://polyhaven.com/a/studio_small_01, licence CC0); put it in {maps}/"
-        in report
-    )
+    where = f"(https://polyhaven.com/a/studio_small_01, licence CC0); put it in {maps}/studio_small_01_4k.hdr"
+    assert f"missing: studio_small_01_4k {where}" in report
     assert "moon_lab" not in report
     assert (
         "missing: 29 models (https://polyhaven.com/models, licence CC0); put each in assets=FOLDER/" in report
