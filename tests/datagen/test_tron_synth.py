@@ -199,9 +199,8 @@ def test_a_training_map_is_refused_whatever_it_is_called(trained: Path, tmp_path
 def test_a_texture_under_another_name_on_another_model_is_refused(tmp_path: Path, variant: str):
     picture = generator(0, "pictures").uniform(size=(8, 8, 3)).astype(np.float32)
     for side, name in (("theirs", "brick"), ("mine", "clay")):
-        write_image(tmp_path / side / f"{name}_albedo.png", picture) if (
-            tmp_path / side
-        ).mkdir() is None else 0
+        (tmp_path / side).mkdir()
+        write_image(tmp_path / side / f"{name}_albedo.png", picture)
         (tmp_path / side / "catalogue.json").write_text(json.dumps([{"path": name, "licence": "CC0-1.0"}]))
     there = composed(f"textures={tmp_path / 'theirs'}", "seed=1")
     here = composed("experiment=tron_synth", f"textures={tmp_path / 'mine'}")
