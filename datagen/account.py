@@ -14,6 +14,7 @@ from datagen.page.index_page import index_page
 from datagen.plan import Record, Sources, Work, config_sha256, read_record
 from datagen.preview import sheet_name
 from datagen.settings import Settings
+from datagen.source_list import SOURCES_NAME, source_list
 from datagen.variety import MEASURES, VARIETY_NAME, Histograms, Other, shard_histograms, total
 from tron.report.histograms import Histogram, histograms_png
 from tron.shards.manifest import Manifest
@@ -58,6 +59,8 @@ def write_account(
     manifest = Manifest(config_sha256=config_sha256(settings), shards=shards, failures=failures)
     rows = [row for record in made for row in _rows(output, record)]
 
+    listed = source_list(settings, sources)
+    write_if_changed(output / SOURCES_NAME, listed.model_dump_json(indent=1) + "\n")
     write_if_changed(output / METADATA_NAME, metadata_parquet(rows))
     sheet = contact_sheet(output, rows)
     if sheet is not None:
@@ -67,7 +70,7 @@ def write_account(
         write_if_changed(output / VARIETY_NAME, _variety_png(own, other))
     shown = [name for name in (SHEET_NAME, VARIETY_NAME) if (output / name).is_file()]
     refinements = [record.refinement for record in made if record.refinement is not None]
-    text = card_text(settings, manifest, sources, rows, refinements, own, other, shown)
+    text = card_text(settings, manifest, sources, rows, refinements, own, other, shown, listed)
     write_if_changed(output / CARD_NAME, text)
     links = {CARD_NAME: CARD_NAME, METADATA_NAME: METADATA_NAME} | {name: name for name in shown}
     links |= {f"{entry.name}, all members": sheet_name(entry.name) for entry in shards[:MOST_LINKS]}

@@ -22,6 +22,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
+from datagen.contents import Content, compared, model_contents
 from datagen.lights import Contrast, HdriSpec, classify
 from datagen.models import SUFFIXES, load_model
 from datagen.parts import Part
@@ -33,8 +34,6 @@ log = logging.getLogger(__name__)
 
 CATALOGUE_NAME = "catalogue.json"
 LARGEST_CATALOGUE = 64 * 2**20
-HELD_OUT = 4
-"""Every fourth map of a folder lights the test split only, where there are at least as many."""
 
 
 class Asset(BaseModel):
@@ -44,6 +43,7 @@ class Asset(BaseModel):
         id: name by which specifications call it: the file's stem, or its path where stems collide.
         path: relative to the folder, with forward slashes.
         sha256: of the file itself (a .gltf's textures are files of their own).
+        contents: all that it was made from, where it was read.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -55,6 +55,11 @@ class Asset(BaseModel):
     author: str | None = None
     source: str | None = None
     up: Literal["y", "z"] = "y"
+    contents: tuple[Content, ...] = ()
+
+    def hashes(self) -> frozenset[str]:
+        """What it must not share with another to be another."""
+        return compared(self.contents) or frozenset([self.sha256])
 
 
 class Refused(BaseModel):
@@ -147,14 +152,15 @@ def find_models(
     usable, refused = [], []
     for asset in find_assets(folder, SUFFIXES, catalogue, allow_unlicensed, names):
         try:
-            load_model(folder / asset.path, asset.up)
+            parts = load_model(folder / asset.path, asset.up)
         except TronError as error:
             if names:
                 raise
             reason = f"{error.what}: {error.mend}" if error.mend else error.what
             refused.append(Refused(id=asset.id, path=asset.path, reason=" ".join(reason.split())))
         else:
-            usable.append(asset)
+            contents = model_contents(folder, asset.path, parts)
+            usable.append(asset.model_copy(update={"contents": contents}))
     for model in refused if usable else ():
         log.warning("model left out: %s: %s", folder / model.path, model.reason)
     if not usable:
@@ -168,7 +174,10 @@ def find_environments(
     folder: Path, catalogue: Path | None = None, allow_unlicensed: Collection[str] = ()
 ) -> tuple[list[Asset], list[HdriSpec]]:
     """List the maps of a folder with their measured contrast; raises as :func:`find_assets` does."""
-    assets = find_assets(folder, (".hdr", ".exr"), catalogue, allow_unlicensed)
+    assets = [
+        asset.model_copy(update={"contents": (Content(path=asset.path, kind="map", sha256=asset.sha256),)})
+        for asset in find_assets(folder, (".hdr", ".exr"), catalogue, allow_unlicensed)
+    ]
     specs = [
         HdriSpec(
             path=a.path, sha256=a.sha256, rotation_deg=0.0, contrast=_contrast(str(folder / a.path), a.sha256)
@@ -181,16 +190,6 @@ def find_environments(
 @lru_cache(maxsize=4096)
 def _contrast(path: str, _sha256: str) -> Contrast:
     return classify(EnvironmentMap.load(path))
-
-
-def for_split(maps: Sequence[HdriSpec], split: str) -> list[HdriSpec]:
-    """The maps that light a split: every HELD_OUT-th is the test split's own; a few maps are shared.
-
-    Validation has those of training: to hold out more would take them from it.
-    """
-    if len(maps) < HELD_OUT:
-        return list(maps)
-    return [m for i, m in enumerate(maps) if (i % HELD_OUT == HELD_OUT - 1) == (split == "test")]
 
 
 def load_models(folder: Path, assets: Sequence[Asset]) -> dict[str, list[Part]]:

@@ -29,7 +29,8 @@ from datagen.clusters import logs_folder, require_cluster
 from datagen.failures import record_failures, summary
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.photographs import Photograph, described, drift
-from datagen.plan import Sources, Work, chosen, find_sources
+from datagen.plan import Sources, Work, chosen
+from datagen.ready_sources import ready_sources
 from datagen.relit import RELIT, record_relit, relit_folders, straightened, write_relit
 from datagen.run import draw_and_build
 from datagen.scene import SceneSpec, scene_name
@@ -81,7 +82,7 @@ def make_captures(settings: Settings) -> int:
     items = chosen(items, settings.only)
     require_cluster(settings)
     activate(settings.variant, threads=1)
-    sources = find_sources(settings)
+    sources = ready_sources(settings)
     folder = settings.output_dir / CAPTURES
     with locked(settings.output_dir):
         _adopt(settings, folder)

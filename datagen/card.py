@@ -19,6 +19,7 @@ from datagen.contact_sheet import SHEET_NAME
 from datagen.hub import configurations, front_matter
 from datagen.plan import Figures, Refinement, Sources, config_sha256
 from datagen.settings import OUTSIDE, SPLITS, Settings
+from datagen.source_list import SOURCES_NAME, SourceList
 from datagen.variety import MEASURES, VARIETY_NAME, Histograms, Other, median
 from tron.cli.recipes import complete, compose_recipe, group_options
 from tron.nested import leaves
@@ -50,15 +51,15 @@ def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), 
         values |= {"output_dir": output_dir}
     defaults, wanted = leaves(shipped), leaves(values)
     parents = {key.rsplit(".", 1)[0] for key in defaults if "." in key}
-    words = ["tron-datagen", *groups]
-    for key, value in wanted.items():
+    folded, words = _folded(wanted, defaults), ["tron-datagen", *groups]
+    for key, value in folded.items():
         if key not in defaults and key not in parents:
             words.append(f"+{key}={_hydra(value)}")
         elif defaults.get(key, ...) != value:
             words.append(f"{key}={_hydra(value)}")
     # A cluster of another kind has other options: those of the shipped one must go.
     inside = {key.rsplit(".", 1)[0] for key in wanted if "." in key}
-    words += [f"~{key}" for key in defaults if key not in wanted and key.rsplit(".", 1)[0] in inside]
+    words += [f"~{key}" for key in defaults if key not in folded and key.rsplit(".", 1)[0] in inside]
     return " ".join(shlex.quote(word) for word in words)
 
 
@@ -76,8 +77,22 @@ def _prior_group(settings: Settings) -> list[str]:
     return []
 
 
+def _folded(wanted: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """The leaves; a mapping in a plain value's place stays whole, for nothing can be added under that."""
+    folded: dict[str, Any] = {}
+    for key, value in wanted.items():
+        parent, _, name = key.rpartition(".")
+        if defaults.get(parent) is not None:
+            folded.setdefault(parent, {})[name] = value
+        else:
+            folded[key] = value
+    return folded
+
+
 def _hydra(value: Any) -> str:
     """A value in the grammar of Hydra's overrides."""
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{name}:{_hydra(item)}" for name, item in value.items()) + "}"
     if isinstance(value, str):
         plain = value != "" and all(c.isalnum() or c in "_-./" for c in value)
         return value if plain else json.dumps(value)
@@ -95,6 +110,7 @@ def card_text(
     variety: Histograms | None = None,
     other: Other | None = None,
     pictures: Sequence[str] = (),
+    listed: SourceList | None = None,
 ) -> str:
     """README.md, the same bytes for the same dataset.
 
@@ -107,6 +123,7 @@ def card_text(
         variety: its histograms.
         other: those of another dataset, drawn beside its own.
         pictures: files beside the card that it shows.
+        listed: its sources by split.
     """
     by_split = {split: [row for row in rows if row.split == split] for split in SPLITS}
     clips = {split: len(found) for split, found in by_split.items() if found}
@@ -156,10 +173,16 @@ def card_text(
     lines += _variety(variety or {}, other, pictures)
     lines += _reading(settings, clips)
     lines += ["", "## What it was made from", ""]
+    if listed is not None and listed.stand_ins is not None:
+        lines += [listed.stand_ins.sentence, ""]
     if files := _files(sources):
         lines += ["| asset | licence | author | source | sha256 |", "|---|---|---|---|---|"]
         lines += [_asset_row(asset) for asset in files]
-        lines += [""]
+        lines += [
+            "",
+            f"`{SOURCES_NAME}` has the hash of every file, and the splits that it serves.",
+            "",
+        ]
     if sources.refused:
         lines += [f"Models left out because they cannot be used: {len(sources.refused)}.", ""]
         lines += ["| model | reason |", "|---|---|"]

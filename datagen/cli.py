@@ -27,7 +27,7 @@ def main(settings: Settings) -> int:
     (failures.jsonl says why, that of captures lies among them) or if validation found a problem.
     """
     if settings.mode == "validate":
-        return 1 if validate(settings.output_dir) else 0
+        return 1 if validate(settings.output_dir, settings.disjoint_from) else 0
     if settings.mode == "plan":
         print(project(settings))
         return 0

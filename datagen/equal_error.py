@@ -24,7 +24,8 @@ import numpy as np
 from datagen.build import Geometry
 from datagen.lights import HdriSpec
 from datagen.pathtrace import gbuffers, render_frames
-from datagen.plan import Work, chosen, find_sources, plan, scene_folder
+from datagen.plan import Work, chosen, plan, scene_folder
+from datagen.ready_sources import ready_sources
 from datagen.scene import SceneSpec
 from datagen.scene_geometry import scene_geometry
 from datagen.settings import EqualErrorSettings, Settings
@@ -74,7 +75,7 @@ def measure_equal_error(settings: Settings) -> None:
         name = missing[0] if missing else "test"
         raise TronError(f"scene {name} is not there", settings.output_dir, "make it by mode=make first")
     activate(settings.variant, settings.equal_error.threads)
-    sources = find_sources(settings)
+    sources = ready_sources(settings)
     cases: list[dict[str, Any]] = []
     for item in scenes:
         spec = SceneSpec.model_validate_json(_surfels(settings, item).with_name("spec.json").read_bytes())

@@ -16,15 +16,16 @@ from datagen.plan import (
     Work,
     chosen,
     estimate_bytes,
-    find_sources,
     plan,
     read_record,
     require_adoptable,
     scene_folder,
 )
 from datagen.probe import SceneCost, probe
+from datagen.ready_sources import ready_sources
 from datagen.scheduling import TIMES_NAME
 from datagen.settings import Settings
+from datagen.source_list import slots
 from tron.cli.termination import termination_unwinds
 from tron.runtime import activate
 
@@ -63,7 +64,7 @@ def project(settings: Settings) -> str:
     require_cluster(settings)
     require_adoptable(settings)
     activate(settings.variant, threads=1)
-    sources = find_sources(settings)
+    sources = ready_sources(settings)
     if settings.variety_against is not None:
         read_other(settings.variety_against)
     there = {item.name for item in items if read_record(settings.output_dir, item.name) is not None}
@@ -82,7 +83,9 @@ def project(settings: Settings) -> str:
                 with termination_unwinds():  # the probe's clips wait in a folder that goes away
                     cost = probe(missing[0], settings, sources)
         splits.append(SplitPlan(split, sum(item.split == split for item in items), missing, cost))
-    return report(settings, splits)
+    checked = slots(settings, sources)
+    slot_lines = [checked.report(settings.environments, settings.assets), ""] if checked else []
+    return "\n".join([*slot_lines, report(settings, splits)])
 
 
 def read_times(path: Path) -> dict[str, float]:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import drjit as dr
 
 from datagen.account import read_other, write_account
-from datagen.assets import for_split, load_models
+from datagen.assets import load_models
 from datagen.build import Geometry
 from datagen.captured_reconstruction import clear_work, require_prior
 from datagen.captured_scene import make_capture
@@ -34,16 +34,17 @@ from datagen.plan import (
     chosen,
     clear_temporaries,
     estimate_bytes,
-    find_sources,
     plan,
     read_record,
     scene_folder,
 )
+from datagen.ready_sources import ready_sources
 from datagen.scene import SceneSpec, draw_scene
 from datagen.scene_files import write_clips
 from datagen.scene_geometry import scene_geometry
 from datagen.scheduling import make_each
 from datagen.settings import Settings
+from datagen.source_list import of_split, slots
 from datagen.spool import Frame
 from datagen.styles import Choice
 from datagen.synthetic import make_clips, make_surfels
@@ -67,7 +68,7 @@ def make(settings: Settings) -> int:
     wanted = chosen(items, settings.only)
     require_cluster(settings)
     activate(settings.variant, threads=1)
-    sources = find_sources(settings)
+    sources = ready_sources(settings)
     other = read_other(settings.variety_against) if settings.variety_against is not None else None
     output = settings.output_dir
     if settings.source == "captured":
@@ -139,6 +140,7 @@ def draw_and_build(
 ) -> tuple[SceneSpec, Geometry]:
     """A scene's specification, with a light of each of the given families, and its meshes."""
     recipe = settings.split(item.split)
+    checked, sources = slots(settings, sources), of_split(settings, sources, item.split)
     models = load_models(settings.assets, sources.assets) if settings.assets is not None else {}
     spec = draw_scene(
         settings.seed,
@@ -147,12 +149,11 @@ def draw_and_build(
         style=recipe.style_of(item.index),
         lights=lights,
         families=settings.light_families(),
-        environments=sources.environments
-        if settings.share_maps
-        else for_split(sources.environments, item.split),
+        environments=sources.environments,
+        map_share=settings.map_share * (checked.map_share if checked else 1.0),
         choice=Choice(
             assets={name: outline(parts) for name, parts in models.items()},
-            asset_share=settings.asset_share,
+            asset_share=settings.asset_share * (checked.model_share if checked else 1.0),
             objects=settings.objects,
             textures=sources.textures,
             texture_share=settings.texture_share,

@@ -111,6 +111,7 @@ def draw_scene(
     lights: Sequence[LightChoice],
     families: Sequence[Family] | None = None,
     environments: Sequence[HdriSpec] = (),
+    map_share: float = 1.0,
     choice: Choice | None = None,
     frames: int = 5,
     path_frames: int = 93,
@@ -126,6 +127,8 @@ def draw_scene(
         lights: for each light of the scene a family, ``any`` of ``families``, or a class of contrast.
         families: what ``any`` and classes choose from; None: the style's own, and every one.
         environments: files for the family ``hdri``.
+        map_share: probability that a light which is not of a family by name is drawn from those, where
+            ``families`` are these alone.
         choice: what the recipe says of objects; None leaves it to the style.
         frames, path_frames: length of a clip and of the path it is cut from.
         lights_share_path: whether the clips of all lights begin at one place; None: in all styles but OLD.
@@ -146,8 +149,15 @@ def draw_scene(
     except TronError as error:
         raise TronError(error.what, error.where or scene_name(split, index), error.mend) from error
     own = PROCEDURAL if style in OLD else USUAL
+
+    def drawn_from(k: int, wanted: LightChoice) -> Sequence[Family]:
+        usual = own if wanted == "any" else EVERY
+        if not families or (list(families) == ["hdri"] and streams("map", k).random() >= map_share):
+            return usual
+        return families
+
     drawn = [
-        draw_light(streams("light", k), wanted, families or (own if wanted == "any" else EVERY), environments)
+        draw_light(streams("light", k), wanted, drawn_from(k, wanted), environments)
         for k, wanted in enumerate(lights)
     ]
     dressing = partial(_dressed, choice=choice or Choice(), rng=streams("textures"))

@@ -24,7 +24,7 @@ from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounc
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
     *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
-    *("capture", "equal_error", "sharing", "variety_against"),
+    *("capture", "equal_error", "sharing", "variety_against", "disjoint_from"),
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
@@ -46,7 +46,10 @@ CAPTURED = {
     "textures": True,
     "texture_share": True,
     "environments": True,
+    "map_share": True,
     "share_maps": True,
+    "share_models": True,
+    "checklist": True,
     "catalogue": True,
     "allow_unlicensed": True,
     "variant": True,
@@ -228,6 +231,29 @@ class Settings(SettingsModel):
         0.5, ge=0, le=1, description="Share of pieces with a texture set, among those that one suits."
     )
     environments: Path | None = Field(None, description="Folder of .hdr and .exr maps to use as lights.")
+    map_share: float = Field(
+        1.0,
+        ge=0,
+        le=1,
+        description="Share of lights drawn from environments, where given, of those that any or a contrast "
+        "asks for.",
+    )
+    share_models: bool = Field(
+        False,
+        description="All models and texture sets serve every split; false: every fourth of each serves the "
+        "test split alone, where there are four.",
+    )
+    checklist: str | None = Field(
+        None,
+        description="Named maps and models of a benchmark, a YAML file or tron_synth: of environments those "
+        "alone are used; for what is missing something procedural stands in, by share, and mode=plan lists "
+        "it.",
+    )
+    disjoint_from: list[Path] = Field(
+        default_factory=list,
+        description="Folders of datasets that are trained on: a model, texture or map of theirs, by hash, or "
+        "a scene is refused before any is made; with mode=validate it is a problem.",
+    )
     share_maps: bool = Field(
         False,
         description="All maps light every split; false: every fourth lights the test split alone, where "

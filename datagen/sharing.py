@@ -26,7 +26,8 @@ from datagen.build import Geometry
 from datagen.equal_error import equal, timed
 from datagen.lights import FAMILIES, classify
 from datagen.pathtrace import render_frames, render_lights, stacked_lights
-from datagen.plan import Work, find_sources
+from datagen.plan import Work
+from datagen.ready_sources import ready_sources
 from datagen.run import draw_and_build
 from datagen.scene import scene_name
 from datagen.settings import Settings
@@ -56,7 +57,7 @@ def measure_sharing(settings: Settings) -> None:
         TronError: a scene cannot be made.
     """
     activate(settings.variant, settings.sharing.threads)
-    sources, cases = find_sources(settings), []
+    sources, cases = ready_sources(settings), []
     for index in range(settings.sharing.scenes):
         item = Work("test", index, scene_name("test", index), first_shard=0)
         spec, geometry = draw_and_build(item, settings, sources, ["overcast"])

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+import numpy as np
+from pydantic import Field, PositiveInt, ValidationInfo, field_validator
 
 from datagen.lights import LightChoice
 from datagen.settings_model import SettingsModel
-from datagen.styles import StyleChoice
+from datagen.styles import STYLES, StyleChoice
 
 
 class SplitSettings(SettingsModel):
     """One split: how many scenes of which kind, and how they are rendered."""
 
     scenes: int = Field(ge=0, le=1_000_000, description="Number of scenes.")
-    style: StyleChoice | Annotated[list[StyleChoice], Field(min_length=1)] = Field(
+    style: (
+        StyleChoice
+        | Annotated[list[StyleChoice], Field(min_length=1)]
+        | Annotated[dict[str, PositiveInt], Field(min_length=1)]
+    ) = Field(
         default="A",
         description="What stands in a scene, on what, and how it is filmed. Scenes take those of a list in "
-        "turns.",
+        "turns; {object: 15, table: 25} makes the first 15 scenes of one and the next 25 of another.",
         examples=["[mixed,A]"],
     )
     lights: list[LightChoice] = Field(
@@ -67,6 +72,22 @@ class SplitSettings(SettingsModel):
         default=128, ge=2, description="Shadow rays per pixel of Mitsuba's direct irradiance."
     )
 
+    @field_validator("style")
+    @classmethod
+    def _counts_every_scene(cls, value: Any, info: ValidationInfo) -> Any:
+        if not isinstance(value, dict):
+            return value
+        if unknown := [name for name in value if name not in ("mixed", *STYLES)]:
+            raise ValueError(f"no style '{unknown[0]}'; there are mixed, {', '.join(STYLES)}")
+        scenes = info.data.get("scenes")
+        if scenes is not None and sum(value.values()) != scenes:
+            counts = " + ".join(map(str, value.values()))
+            raise ValueError(f"it counts {counts} scenes, but scenes={scenes}: make them equal")
+        return value
+
     def style_of(self, index: int) -> StyleChoice:
-        """Style of the scene of that number."""
+        """Style of the scene of that number; counts begin anew behind the last of them, as lists do."""
+        if isinstance(self.style, dict):
+            ends = np.cumsum(list(self.style.values()))
+            return list(self.style)[int(np.searchsorted(ends, index % ends[-1], side="right"))]
         return self.style[index % len(self.style)] if isinstance(self.style, list) else self.style

@@ -18,6 +18,7 @@ from typing import get_args
 import numpy as np
 
 from datagen.assets import CATALOGUE_NAME, Asset, read_catalogue
+from datagen.contents import Content, texture_kind
 from datagen.materials import Material
 from datagen.materials.photographed import Photographed, PhotographedSpec, height_from_normals
 from datagen.shapes.shape import Role
@@ -118,7 +119,13 @@ def find_texture_sets(
                 folder / maps["albedo"],
                 f"state it in {CATALOGUE_NAME}, or use it nevertheless with allow_unlicensed=[{name}]",
             )
-        digest = hashlib.sha256("".join(sha256(folder / maps[kind]) for kind in sorted(maps)).encode())
+        contents = tuple(
+            Content(
+                path=maps[kind], kind=texture_kind(folder / maps[kind]), sha256=sha256(folder / maps[kind])
+            )
+            for kind in sorted(maps)
+        )
+        digest = hashlib.sha256("".join(each.sha256 for each in contents).encode())
         asset = Asset(
             id=name,
             path=maps["albedo"],
@@ -126,6 +133,7 @@ def find_texture_sets(
             licence=entry.licence if entry else None,
             author=entry.author if entry else None,
             source=entry.source if entry else None,
+            contents=contents,
         )
         sets.append(TextureSet(asset, tuple(sorted(maps.items())), directx, _role(name)))
     return sets

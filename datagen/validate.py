@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 from datagen.capture_export import CAPTURES
 from datagen.capture_manifest import capture_names, verify_captures
+from datagen.disjoint import overlaps, shared_scenes
 from datagen.relit import RELIT
+from datagen.source_list import read_source_list
 from tron.shards.manifest import MANIFEST_NAME, Manifest
 from tron.shards.verify import verify
 
 log = logging.getLogger(__name__)
 
 
-def validate(folder: Path) -> int:
+def validate(folder: Path, disjoint_from: Sequence[Path] = ()) -> int:
     """Log every problem of a dataset and of the captures beside it, one line each, and return their number.
 
     Beside what ``tron.shards.verify`` finds in the shards, every scene that has clips must still
-    have its specification and its surfels. A folder may hold captures alone.
+    have its specification and its surfels. A folder may hold captures alone. What it shares with the
+    datasets of ``disjoint_from`` is a problem too.
 
     Raises:
-        TronError: the folder holds neither a dataset nor captures.
+        TronError: the folder holds neither a dataset nor captures; one of ``disjoint_from`` has no list of
+            its sources.
     """
     captures = folder / CAPTURES
     problems = [
@@ -32,6 +37,11 @@ def validate(folder: Path) -> int:
     ]
     if (folder / MANIFEST_NAME).exists() or not captures.is_dir():
         problems = _dataset_problems(folder) + problems
+        if disjoint_from:
+            own = read_source_list(folder)
+            for other in disjoint_from:
+                problems += overlaps(own, read_source_list(other), other)
+            problems += shared_scenes(folder, disjoint_from)
     else:
         log.info("no dataset here, captures alone")
     for problem in problems:

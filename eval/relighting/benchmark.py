@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -53,6 +54,11 @@ class Relighting(Benchmark):
     train_splits: list[str] = Field(
         default=["train"], description="splits that the fitted baselines see", min_length=1
     )
+    fitted_on: Path | None = Field(
+        default=None,
+        description="data set whose training splits they see; null: dataset, which has none where it is a "
+        "benchmark such as TRON-Synth",
+    )
     test_split: str = "test"
     pictures: NonNegativeInt = Field(default=6, description="held-out clips shown side by side")
     threads: PositiveInt = 1
@@ -61,8 +67,16 @@ class Relighting(Benchmark):
     def check(self) -> None:
         """Find the data sets, their splits and the weights; TronError names what is missing."""
         manifest = Manifest.load(self._dataset())
-        for split in (self.test_split, *self.train_splits):
-            manifest.of_split(split)
+        manifest.of_split(self.test_split)
+        fitted_on = Manifest.load(self._fitted_on())
+        if self.fitted_on is None and set(manifest.splits()) == {self.test_split}:
+            raise TronError(
+                f"the data set has no split {self.train_splits[0]} to fit the baselines on",
+                self._dataset(),
+                "give benchmark.fitted_on=DIR, a data set that is trained on",
+            )
+        for split in self.train_splits:
+            fitted_on.of_split(split)
         if self.ood is not None:
             Manifest.load(self.ood).of_split(self.test_split)
         for path in (*(path for _, path in self._weights()), self.vae):
@@ -104,13 +118,14 @@ class Relighting(Benchmark):
             "fitted_weights": {name: each.weights.round(4).tolist() for name, each in fitted.items()},
             **{f"{name}_sha256": sha256(network.path) for name, network in networks.items()},
         }
-        if self.ood is not None:
-            inputs["ood_config_sha256"] = Manifest.load(self.ood).config_sha256
+        for name, folder in (("ood", self.ood), ("fitted_on", self.fitted_on)):
+            if folder is not None:
+                inputs[f"{name}_config_sha256"] = Manifest.load(folder).config_sha256
         return Outcome(
             rows=rows,
             title="Relighting held-out scenes under held-out lights",
             verdict=page.verdict(measured),
-            lead=page.LEAD,
+            lead=(*page.LEAD, *stand_ins(dataset)),
             sections=page.sections(measured, output_dir / "pictures"),
             headline=page.HEADLINE,
             reproduce=[self._typed(output_dir)],
@@ -140,9 +155,12 @@ class Relighting(Benchmark):
             raise TronError("no data set to evaluate on", mend="give dataset=DIR, made by tron-datagen")
         return self.dataset
 
+    def _fitted_on(self) -> Path:
+        return self._dataset() if self.fitted_on is None else self.fitted_on
+
     def _training_clips(self) -> Iterator[Clip]:
         for split in self.train_splits:
-            yield from read_clips(self._dataset(), split, MEMBERS)
+            yield from read_clips(self._fitted_on(), split, MEMBERS)
 
     def _weights(self) -> Iterator[tuple[str, Path]]:
         """Kind of network and file of all weights that were given."""
@@ -166,8 +184,9 @@ class Relighting(Benchmark):
     def _typed(self, output_dir: Path) -> str:
         inputs = {name: getattr(self, name) for name in ("dataset", "renderer", "pixel_mlp")}
         given = [f"{name}={_typed_value(value)}" for name, value in inputs.items() if value is not None]
-        if self.ood is not None:
-            given.append(f"benchmark.ood={self.ood}")
+        for name in ("fitted_on", "ood"):
+            if getattr(self, name) is not None:
+                given.append(f"benchmark.{name}={getattr(self, name)}")
         return " \\\n    ".join(["tron-eval benchmark=relighting", *given, f"output_dir={output_dir}"])
 
     def _examples(self, dataset: Path, methods: Mapping[str, Show], keys: list[str]) -> list[Example]:
@@ -210,6 +229,20 @@ def load_network(path: Path, vae: Path | None = None) -> Network:
         return render_clip(renderer, {each: buffers.displayed(each) for each in guidance})
 
     return Network(show, path, "lit" in guidance)
+
+
+def stand_ins(dataset: Path) -> Sequence[str]:
+    """What the data set's sources.json says of named assets that something else stands in for."""
+    path = dataset / "sources.json"
+    try:
+        found = json.loads(path.read_bytes())["stand_ins"] if path.is_file() else None
+        if found is None:
+            return ()
+        named = found["maps"] + found["models"]
+        empty = len(found["empty_maps"]) + found["empty_models"]
+        return (f"{found['title']}: {empty} of {named} named assets are procedural stand-ins.",)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise TronError("sources.json is damaged", path, "run tron-datagen on the data set again") from error
 
 
 def choose_clips(scores: Scores, count: int) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from eval.relighting.baselines import BASELINES, DIRECT, METHODS, NETWORKS, NEURAL, ON_LIT, SIMPLE
@@ -86,6 +86,8 @@ def sections(measured: Measured, pictures: Path) -> list[Section]:
         Section("results", "Every method, every held-out frame", _methods(measured)),
         Section("lights", "By kind of light", [_families(measured)]),
     ]
+    if judged.scores.styles:
+        found.append(Section("styles", "By style of scene", [_styles(measured)]))
     if judged.examples:
         intro = Text(
             "Middle frames of held-out clips, evenly spaced in the ranking by gain: the first is the clip "
@@ -202,22 +204,35 @@ def _gain_cell(row: Row | None) -> Cell:
 
 
 def _families(measured: Measured) -> Table:
+    families = measured.judged.scores.families
+    return _by_part(measured, "kind of light", families, lambda region, name: Where(region, name))
+
+
+def _styles(measured: Measured) -> Table:
+    styles = measured.judged.scores.styles
+    return _by_part(measured, "style of scene", styles, lambda region, name: Where(region, style=name))
+
+
+def _by_part(
+    measured: Measured, what: str, names: Sequence[str], where_of: Callable[[Region, str], Where]
+) -> Table:
+    """PSNR of every method on each part of the frames, and the network's gains there."""
     scores = measured.judged.scores
-    families, network = scores.families, scores.network
-    places = [Where(region, family) for region in REGIONS for family in families]
+    network = scores.network
+    places = [where_of(region, name) for region in REGIONS for name in names]
     rows: list[Sequence[Cell | str]] = []
     for method in scores.methods:
         tone = "strong" if method in NETWORKS else "plain"
         means = [measured.rows.get(f"{method.name}.psnr{where.tail}") for where in places]
         rows.append([Cell(method.title, tone), *(row_cell(mean, tone, unit=False) for mean in means)])
-    name = network.name if network else ""
+    title = network.name if network else ""
     for group, words in GROUP_WORDS.items() if network else ():
-        gains = [measured.rows.get(f"{name}.gain_over_{group}{where.tail}") for where in places]
+        gains = [measured.rows.get(f"{title}.gain_over_{group}{where.tail}") for where in places]
         rows.append([f"gain over the {words}", *map(_gain_cell, gains)])
-    counts = {family: len(scores.of("pbr", Where("frame", family))) for family in families}
-    frames = ", ".join(f"{family}: {count} frames" for family, count in counts.items())
-    groups = [("", 1), *((REGION_WORDS[region], len(families)) for region in REGIONS)]
-    return Table(f"PSNR in dB by kind of light ({frames}).", ["Method", *families, *families], rows, groups)
+    counts = {name: len(scores.of("pbr", where_of("frame", name))) for name in names}
+    frames = ", ".join(f"{name}: {count} frames" for name, count in counts.items())
+    groups = [("", 1), *((REGION_WORDS[region], len(names)) for region in REGIONS)]
+    return Table(f"PSNR in dB by {what} ({frames}).", ["Method", *names, *names], rows, groups)
 
 
 def _guidance_section(measured: Measured, pictures: Path) -> list[Section]:

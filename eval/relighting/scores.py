@@ -83,16 +83,18 @@ GAINS: dict[str, dict[str, list[str]]] = {
 
 
 class Where(NamedTuple):
-    """Part of the scores: a region, of all clips, of one family of lights or of one clip."""
+    """Part of the scores: a region, of all clips, or of one family of lights, style of scene, or clip."""
 
     region: Region = "foreground"
     family: str | None = None
     clip: str | None = None
+    style: str | None = None
 
     @property
     def tail(self) -> str:
-        """End of the rows' names: ``_full`` for frames, ``.FAMILY`` for one family."""
-        return ("_full" if self.region == "frame" else "") + (f".{self.family}" if self.family else "")
+        """End of the rows' names: ``_full`` for frames, ``.FAMILY`` or ``.STYLE`` for one of them."""
+        kind = self.family or self.style
+        return ("_full" if self.region == "frame" else "") + (f".{kind}" if kind else "")
 
 
 ALL = Where()
@@ -106,6 +108,7 @@ class Score:
     scene: str
     clip: str
     figures: Mapping[str, float]
+    style: str = ""
 
 
 @dataclass
@@ -128,7 +131,7 @@ class Scores:
             shown: region -> method -> (K, H, W, 3) display values.
             truth: (K, H, W, 3) display values.
         """
-        meta = clip.meta
+        meta, style = clip.meta, str(clip.meta.extra.get("style", ""))
         for region, images in shown.items():
             inside = region_mask(clip, region)
             for method, frames in images.items():
@@ -136,7 +139,7 @@ class Scores:
                     if mask.any():
                         where = None if region == "frame" else mask
                         figures = {metric.name: metric.measure(image, target, where) for metric in METRICS}
-                        score = Score(meta.light_family, meta.scene, meta.key, figures)
+                        score = Score(meta.light_family, meta.scene, meta.key, figures, style)
                         self.kept[method, region].append(score)
 
     @property
@@ -150,6 +153,12 @@ class Scores:
         return sorted({score.family for scores in self.kept.values() for score in scores})
 
     @property
+    def styles(self) -> list[str]:
+        """Styles of the scenes that were scored, sorted; none where all are of one."""
+        found = sorted({score.style for scores in self.kept.values() for score in scores})
+        return found if len(found) > 1 else []
+
+    @property
     def methods(self) -> list[Method]:
         """Methods that were scored, in the order of METHODS."""
         scored = {method for method, _ in self.kept}
@@ -158,7 +167,13 @@ class Scores:
     def of(self, method: str, where: Where) -> list[Score]:
         """A method's scores, in the order of the frames."""
         kept = self.kept.get((method, where.region), ())
-        return [s for s in kept if where.family in (None, s.family) and where.clip in (None, s.clip)]
+        return [
+            s
+            for s in kept
+            if where.family in (None, s.family)
+            and where.clip in (None, s.clip)
+            and where.style in (None, s.style)
+        ]
 
     def psnr(self, method: str, where: Where = ALL) -> float | None:
         """Mean PSNR over frames in dB; None where nothing was scored."""
@@ -188,7 +203,9 @@ class Scores:
 
         ``seed`` draws the scenes of the intervals.
         """
-        for where in (Where(region, family) for family in (None, *self.families) for region in REGIONS):
+        parts = [(family, None) for family in (None, *self.families)]
+        parts += [(None, style) for style in self.styles]
+        for where in (Where(region, kind, style=style) for kind, style in parts for region in REGIONS):
             for method in self.methods:
                 scores = self.of(method.name, where)
                 for metric in METRICS if scores else ():

@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from datagen.assets import find_assets, find_environments, for_split
-from datagen.lights import HdriSpec
+from datagen.assets import find_assets, find_environments
 from tron.errors import TronError
 from tron.shading.environment import EnvironmentMap
 from tron.storage import sha256
@@ -83,11 +82,3 @@ def test_environment_maps_are_classified_by_what_they_hold(tmp_path, variant):
     catalogue(tmp_path, "flat.exr", "lamp.hdr")
     _, specs = find_environments(tmp_path)
     assert [(spec.path, spec.contrast) for spec in specs] == [("flat.exr", "low"), ("lamp.hdr", "high")]
-
-
-def test_test_lights_are_held_out_where_there_are_enough():
-    maps = [HdriSpec(path=str(i), sha256="", rotation_deg=0.0, contrast="low") for i in range(9)]
-    train, test = ({m.path for m in for_split(maps, split)} for split in ("train", "test"))
-    assert not train & test
-    assert len(train | test) == 9
-    assert for_split(maps[:3], "train") == for_split(maps[:3], "test")

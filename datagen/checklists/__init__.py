@@ -1,0 +1,1 @@
+"""Checklists that are shipped."""
