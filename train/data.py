@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from train.augmentation import augmented, display_encoded
-from train.curriculum import Stage
+from train.curriculum import Stage, require_splits
 from train.processes import Processes
 from train.settings import DataSettings, ValidationSettings
 from train.sources import (
@@ -176,6 +176,7 @@ class TrainingData(lightning.LightningDataModule):
 
         guidance: members that the network is conditioned on.
         """
+        require_splits(stages, self.manifest.splits())
         self.members = (*guidance, TARGET)
         budget = self.settings.cache_gb * 1e9
         for stage in stages:

@@ -21,6 +21,7 @@ from tron import seeds
 from tron.color import luminance, to_display
 from tron.errors import TronError
 from tron.shards import GUIDANCE, read_clips
+from tron.shards.manifest import Manifest
 
 BUFFERS = (*GUIDANCE, "rgb")
 STAGE = Stage(name="one", split="train", steps=10, batch_size=3, crop=16)
@@ -289,3 +290,16 @@ def test_a_stream_reports_a_damaged_shard(dataset, tmp_path):
         path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(TronError, match="shard"):
         take(batches(folder, STAGE, cache=False), 1)
+
+
+def test_a_curriculum_without_its_captures_says_what_to_give(dataset, tmp_path):
+    folder = tmp_path / "dataset"
+    shutil.copytree(dataset, folder)
+    manifest = Manifest.load(folder)
+    kept = [entry for entry in manifest.shards if entry.split != "train_b"]
+    manifest.model_copy(update={"shards": kept}).save(folder)
+    data = TrainingData(folder, DataSettings(), 0, ValidationSettings())
+    stages = [Stage(name="one", split="train", steps=1), Stage(name="two", split="train_b", steps=1)]
+    with pytest.raises(TronError, match=r"stage two .*source=captured: splits=\{train_b: FOLDER\}"):
+        data.open(stages)
+    data.open(stages[:1])
