@@ -102,6 +102,8 @@ class Record(BaseModel):
     """scenes/NAME/record.json: the scene is finished, and this is what it gave.
 
     Attributes:
+        refinement: of surfels that were made from G-buffers.
+        reconstruction: of surfels that were reconstructed from pictures.
         clips: a row each; empty in records of older versions.
         variety: histograms of the scene (``datagen.variety``); likewise.
     """
@@ -112,6 +114,7 @@ class Record(BaseModel):
     shards: list[ShardEntry]
     quarantined: list[Quarantined]
     refinement: Refinement | None = None
+    reconstruction: Figures | None = None
     clips: list[ClipRow] = Field(default_factory=list)
     variety: Histograms = Field(default_factory=dict)
 

@@ -41,7 +41,8 @@ def refine_surfels(
     settings = RefinementSettings(steps=steps)
     refined = refine(surfels, seen, settings, seed, device)
     seconds = time.perf_counter() - started
-    found = Refinement(steps=steps, before=_figures(surfels, held_out), after=_figures(refined, held_out))
+    before, after = (figures_of(SurfelTracer(scene), held_out) for scene in (surfels, refined))
+    found = Refinement(steps=steps, before=before, after=after)
     log.info(
         "surfels refined in %.1f s: base color %.1f -> %.1f dB, normals %.2f -> %.2f degrees",
         seconds, found.before.base_color_psnr, found.after.base_color_psnr,
@@ -50,8 +51,8 @@ def refine_surfels(
     return refined, found
 
 
-def _figures(surfels: GaussianScene, views: Sequence[View]) -> Figures:
-    tracer = SurfelTracer(surfels)
+def figures_of(tracer: SurfelTracer, views: Sequence[View]) -> Figures:
+    """Surfels against the true G-buffers of views, one read at a time."""
     means = mean_figures(score_views(tracer, views))
     errors = [
         np.abs(tracer.gbuffer(view.camera).numpy()["opacity"] - view.read("mask")).mean() for view in views

@@ -44,6 +44,7 @@ from datagen.plan import (
     scene_folder,
 )
 from datagen.preview import contact_row, sheet_name, write_sheet
+from datagen.reconstructed import forget_reconstruction, reconstruct_surfels
 from datagen.scene import SceneSpec, draw_scene
 from datagen.scene_geometry import scene_geometry
 from datagen.scheduling import make_each
@@ -103,7 +104,11 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
     spec, geometry = draw_and_build(item, settings, sources, settings.split(item.split).lights)
     folder = scene_folder(output, item.name)
     write_atomic(folder / "spec.json", spec.to_json())
-    surfels, refinement = make_surfels(spec, geometry, settings)
+    refinement = reconstruction = None
+    if settings.surfels_from.of(settings.seed, item.split, item.index) == "reconstruction":
+        surfels, reconstruction = reconstruct_surfels(spec, geometry, settings)
+    else:
+        surfels, refinement = make_surfels(spec, geometry, settings)
     surfels.save(folder / "surfels.ply")
 
     quarantined: list[Quarantined] = []
@@ -128,9 +133,11 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
         shards=writer.entries,
         quarantined=quarantined,
         refinement=refinement,
+        reconstruction=reconstruction,
         clips=_clip_rows([meta for meta, _ in made], writer.entries),
         variety=_variety(geometry, made),
     )
+    forget_reconstruction(folder)
     write_atomic(folder / RECORD_NAME, record.model_dump_json(indent=1) + "\n")
     del geometry, surfels
     gc.collect()

@@ -28,6 +28,7 @@ from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from datagen.split_settings import SplitSettings
 from datagen.spool import Frame, Spool
+from datagen.surfel_settings import Source
 from datagen.view_spool import ViewSpool
 from tron.cameras import Camera
 from tron.estimation import Estimation
@@ -237,7 +238,8 @@ def _film(
             spool.add(k, frame)
     if spec.motion is not None:
         _move(spec, geometry, 0.0)
-    return [_meta(spec, light, cameras, recipe) for light in first]
+    source = settings.surfels_from.of(spec.seed, spec.split, spec.index)
+    return [_meta(spec, light, cameras, recipe, source) for light in first]
 
 
 def _prepare(
@@ -263,7 +265,9 @@ def _prepare(
     return _Lit(number, environment, lighting, bounce, seeds, environment.exposure())
 
 
-def _meta(spec: SceneSpec, lit: _Lit, cameras: Sequence[Camera], recipe: SplitSettings) -> ClipMeta:
+def _meta(
+    spec: SceneSpec, lit: _Lit, cameras: Sequence[Camera], recipe: SplitSettings, surfels_from: Source
+) -> ClipMeta:
     light = spec.lights[lit.number]
     spp = {"path": recipe.path_spp, "guidance": recipe.guidance_spp}
     if recipe.reference_buffers:
@@ -288,6 +292,7 @@ def _meta(spec: SceneSpec, lit: _Lit, cameras: Sequence[Camera], recipe: SplitSe
         spp=spp,
         extra={
             "style": spec.style,
+            "surfels_from": surfels_from,
             "contrast": classify(lit.environment),
             "contrast_share": contrast_share(lit.environment),
             "turn_deg": spec.turns_deg[lit.number] if spec.turns_deg else 0.0,

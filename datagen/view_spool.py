@@ -1,7 +1,7 @@
 """Views on disk while a scene's surfels are made from them and fitted to them.
 
-290 G-buffers of 800 x 800 pixels are nine gigabytes; one at a time is read back. The file has no name, so that
-nothing is left of it however the process ends.
+290 G-buffers of 800 x 800 pixels are nine gigabytes; one at a time is read back. The file has no name, so
+that nothing is left of it however the process ends.
 """
 
 from __future__ import annotations

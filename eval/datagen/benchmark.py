@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from eval.datagen.kills import measure_kills
+from eval.datagen.paper_smoke import measure_paper_smoke
 from eval.datagen.parts import Found
 from eval.datagen.settings import DatagenSettings, Part
 from eval.datagen.sharing import measure_sharing
@@ -48,7 +49,7 @@ class Datagen(DatagenSettings):
     def check(self) -> None:
         """Find the commands that the parts call."""
         require_own_packages("datagen", "train")
-        for name in ("tron-datagen", "tron-train"):
+        for name in ("tron-datagen", "tron-train", "tron-eval"):
             script_path(name)
 
     def run(self, output_dir: Path) -> Outcome:
@@ -91,6 +92,7 @@ class Datagen(DatagenSettings):
             "specifications": lambda at: measure_specifications(
                 [*_of(tiny, self.specified_scenes), *self.specified], at
             ),
+            "paper_smoke": measure_paper_smoke,
             "throughput": lambda at: measure_throughput(self.throughput, self.sizes, at),
         }
         stages = Stages(folder)

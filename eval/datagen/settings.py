@@ -9,7 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat
 
 from eval.benchmark import Benchmark
 
-Part = Literal["variety", "sharing", "workers", "soak", "kills", "specifications", "throughput"]
+Part = Literal[
+    "variety", "sharing", "workers", "soak", "kills", "specifications", "throughput", "paper_smoke"
+]
 
 
 class VarietySettings(BaseModel):

@@ -80,8 +80,9 @@ def surfels_from_gbuffers(
     """A scene of about ``count`` surfels through the surfaces that the views see.
 
     It does not depend on the order of the views, and holds fewer surfels only where the views have fewer
-    samples. Views may come one by one from an iterator: none is kept, and of their samples no more than
-    :func:`sample_bytes` says. SH degree 0 is the views' mean rgb, display space, or else the sRGB-encoded base colour.
+    samples. SH degree 0 is the views' mean rgb, display space, or else the sRGB-encoded base colour. Views
+    may come one by one from an iterator: none is kept, and of their samples no more than
+    :func:`sample_bytes`.
 
     Args:
         views: of one world.
@@ -169,7 +170,7 @@ class _Samples:
 
 
 def sample_bytes(count: int, pixels: int) -> int:
-    """Memory at the most that ``count`` surfels take while they are made from views of so many pixels in all."""
+    """Most memory that ``count`` surfels take while they are made from views of so many pixels in all."""
     return min(pixels, _bound(count)) * _SAMPLE_BYTES
 
 
