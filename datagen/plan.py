@@ -18,8 +18,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from datagen.assets import Asset, Refused, find_environments, find_models
 from datagen.clip_preview import preview_bytes
 from datagen.clip_rows import ClipRow
+from datagen.clusters import worker_count
 from datagen.lights import HdriSpec
 from datagen.scene import scene_name
+from datagen.scratch import scratch_bytes
 from datagen.settings import SPLITS, Settings
 from datagen.texture_sets import TextureSet, find_texture_sets
 from datagen.variety import Histograms
@@ -186,8 +188,12 @@ def _size(path: Path) -> int | None:
 
 
 def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
-    """Bytes that scenes may take on disk: half-precision EXR hardly compresses noise."""
-    total = 0
+    """Bytes that making scenes may take on disk: half-precision EXR hardly compresses noise.
+
+    Previews are counted, and what waits on disk in the scenes that are under way at one time.
+    """
+    total, waiting = 0, 0
+    items = list(items)
     for item in items:
         recipe = settings.split(item.split)
         members = [MEMBERS[name] for name in clip_members(recipe.reference_buffers)]
@@ -195,7 +201,8 @@ def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
         frame = recipe.width * recipe.height * pixel + 16_384
         previews = preview_bytes(recipe.width, recipe.height, recipe.frames, len(members))
         total += len(recipe.lights) * (recipe.frames * frame + previews) + settings.surfels * SURFEL_BYTES
-    return total
+        waiting = max(waiting, scratch_bytes(settings, item.split))
+    return total + waiting * worker_count(settings, len(items))[0]
 
 
 def config_text(settings: Settings) -> str:

@@ -29,7 +29,12 @@ from tron.gaussians.initialize import surfels_from_gbuffers
 from tron.gaussians.scene import GaussianScene
 from tron.priors import GroundTruth, Prior
 from tron.reconstruction import Joint, reconstruct
-from tron.reconstruction.settings import DensitySettings, RadianceSettings, ReconstructionSettings
+from tron.reconstruction.settings import (
+    DensitySettings,
+    MaterialSettings,
+    RadianceSettings,
+    ReconstructionSettings,
+)
 from tron.runtime import set_torch_threads, torch_device
 from tron.seeds import integer
 from tron.tracing import SurfelTracer
@@ -68,6 +73,12 @@ def reconstruct_surfels(
     found = reconstruct(capture, prior, recipe, checkpoint=folder / "checkpoint.safetensors", device=device)
     scene = found.scene if spec.motion is None else _with_objects(found.scene, spec, geometry, settings)
     return scene, _judged(scene, spec, geometry, settings)
+
+
+def reconstruction_steps(settings: Settings) -> int:
+    """Optimisation steps of a scene's reconstruction, both stages."""
+    steps = RadianceSettings().steps + MaterialSettings().steps
+    return round(steps * settings.surfel_reconstruction.steps_scaler)
 
 
 def forget_reconstruction(scene: Path) -> None:

@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from eval.results import Row
 from eval.stages import Child, Stages
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from torch import nn
 
 EXPERIMENT = "experiment=paper_smoke"
-WAN = {"base_dim": 8, "num_res_blocks": 1}
+WAN: dict[str, Any] = {"base_dim": 8, "num_res_blocks": 1}
 """Shape of the tiny autoencoder; its latents are the published one's."""
 VGG = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
 """Channels of VGG-16's convolutions, M between them where it pools."""
@@ -51,8 +51,8 @@ class PaperSmoke:
         rows = [[name, f"{seconds:.1f} s"] for name, seconds in self.seconds.items()]
         clips = ", ".join(f"{count} of {split}" for split, count in self.clips.items())
         caption = (
-            f"The paper's recipes at 64 x 64 through every command: {clips} clips, three stages of training on "
-            "tiny random weights in the published files' formats, and evaluation on the test split."
+            f"The paper's recipes at 64 x 64 through every command: {clips} clips, three stages of training "
+            "on tiny random weights in the published files' formats, and evaluation on the test split."
         )
         return [
             Section("paper_smoke", "The paper's recipes, small", [Table(caption, ["", "wall time"], rows)])
@@ -96,13 +96,13 @@ def write_tiny_weights(folder: Path) -> None:
     from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
 
     from train.settings import Settings
+    from tron.cli.instantiation import make
     from tron.cli.recipes import compose_recipe, resolve
     from tron.neural.backbone import transformer
-    from tron.neural.configs import CosmosConfig
 
     torch.manual_seed(0)
     recipe = resolve(compose_recipe("conf.train", Settings, [EXPERIMENT, "dataset=.", "output_dir=."]))
-    config = CosmosConfig.model_validate(recipe["renderer"]["config"])
+    config = make(recipe["renderer"]["config"], "renderer.config")
     vae = AutoencoderKLWan(**WAN).eval()
     vae.save_pretrained(folder / "vae")
     channels = vae.config["z_dim"]
