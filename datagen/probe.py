@@ -41,7 +41,7 @@ MOST_LIGHTS, VIEWS, STEPS = 4, 4, 10
 """Lights, views and optimisation steps of a probe, where the recipe has more."""
 
 VIEW_BYTES = 49
-"""Bytes of a pixel of a true G-buffer in memory; a group of LANES / 2 pixels is rendered at a time, and copied."""
+"""Bytes of a pixel of a true G-buffer in memory; LANES / 2 pixels are rendered at a time, and copied."""
 
 Result = TypeVar("Result")
 

@@ -134,8 +134,8 @@ def report(settings: Settings, splits: Sequence[SplitPlan]) -> str:
         ("bytes on disk", f"{total_bytes / 1e9:.3g} GB"),
         (
             "asked for",
-            f"{needed / 1e9:.3g} GB before the first scene: as if nothing compressed, with what waits on disk "
-            f"in {count} scene{'s' * (count > 1)} under way",
+            f"{needed / 1e9:.3g} GB before the first scene: as if nothing compressed, with what waits "
+            f"on disk in {count} scene{'s' * (count > 1)} under way",
         ),
         (
             "free",

@@ -97,11 +97,12 @@ def write_tiny_weights(folder: Path) -> None:
 
     from train.settings import Settings
     from tron.cli.instantiation import make
-    from tron.cli.recipes import compose_recipe, resolve
+    from tron.cli.recipes import complete, compose_recipe, resolve
     from tron.neural.backbone import transformer
 
     torch.manual_seed(0)
-    recipe = resolve(compose_recipe("conf.train", Settings, [EXPERIMENT, "dataset=.", "output_dir=."]))
+    recipe = complete(compose_recipe("conf.train", Settings, [EXPERIMENT, "dataset=.", "output_dir=."]))
+    recipe = resolve(recipe)
     config = make(recipe["renderer"]["config"], "renderer.config")
     vae = AutoencoderKLWan(**WAN).eval()
     vae.save_pretrained(folder / "vae")
