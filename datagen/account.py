@@ -70,7 +70,8 @@ def write_account(
         write_if_changed(output / VARIETY_NAME, _variety_png(own, other))
     shown = [name for name in (SHEET_NAME, VARIETY_NAME) if (output / name).is_file()]
     refinements = [record.refinement for record in made if record.refinement is not None]
-    text = card_text(settings, manifest, sources, rows, refinements, own, other, shown, listed)
+    rebuilt = [record.reconstruction for record in made if record.reconstruction is not None]
+    text = card_text(settings, manifest, sources, rows, refinements, own, other, shown, listed, rebuilt)
     write_if_changed(output / CARD_NAME, text)
     links = {CARD_NAME: CARD_NAME, METADATA_NAME: METADATA_NAME} | {name: name for name in shown}
     links |= {f"{entry.name}, all members": sheet_name(entry.name) for entry in shards[:MOST_LINKS]}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
+import statistics
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
@@ -111,6 +112,7 @@ def card_text(
     other: Other | None = None,
     pictures: Sequence[str] = (),
     listed: SourceList | None = None,
+    reconstructed: Sequence[Figures] = (),
 ) -> str:
     """README.md, the same bytes for the same dataset.
 
@@ -124,6 +126,7 @@ def card_text(
         other: those of another dataset, drawn beside its own.
         pictures: files beside the card that it shows.
         listed: its sources by split.
+        reconstructed: surfels that were reconstructed from pictures, against the truth.
     """
     by_split = {split: [row for row in rows if row.split == split] for split in SPLITS}
     clips = {split: len(found) for split, found in by_split.items() if found}
@@ -164,6 +167,7 @@ def card_text(
         f"Root seed {settings.seed}. {_origin(settings)} "
         "`exposure` in a clip's metadata is the scalar to apply before AgX.",
         *_refinement(refinements),
+        *_reconstruction(reconstructed),
         "",
         "| software | version |",
         "|---|---|",
@@ -219,6 +223,19 @@ def _captures(rows: Sequence[ClipRow]) -> list[str]:
     """What photos say of their origin: nothing, so that their owner has to."""
     scenes = {row.scene for row in rows}
     return [f"{len(scenes)} captures. Photos are their owners': say under which licence before you publish."]
+
+
+def _reconstruction(found: Sequence[Figures]) -> list[str]:
+    if not found:
+        return []
+    return [
+        "",
+        f"Surfels of {len(found)} scene{'s' * (len(found) > 1)} were reconstructed from path-traced "
+        "pictures, as a capture's are; on views that were not among them base color reaches "
+        f"{statistics.median(each.base_color_psnr for each in found):.1f} dB and normals are off by "
+        f"{statistics.median(each.normal_mae_deg for each in found):.2f}° (medians). `surfels_from` in a "
+        "clip's metadata says which they are.",
+    ]
 
 
 def _refinement(found: Sequence[Refinement]) -> list[str]:

@@ -163,3 +163,14 @@ def cores() -> int:
 
 def _where(options: Mapping[str, Any]) -> str:
     return str(options.get("address") or options.get("scheduler_file") or options["_target_"])
+
+
+def worker_count(settings: Settings, most: int) -> tuple[int, str]:
+    """Workers that the cluster will have, one at the least, and a remark where only it knows."""
+    if settings.cluster is None:
+        return 1, ", this process"
+    if settings.workers is not None:
+        return max(min(settings.workers, most), 1), ""
+    if settings.cluster["_target_"] == LOCAL:
+        return max(min(int(settings.cluster.get("n_workers") or cores()), most), 1), ""
+    return 1, "; the cluster has its own number: give workers=N"

@@ -11,7 +11,7 @@ cross between NumPy and Dr.Jit a coordinate at a time, for interleaved ones name
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import drjit as dr
@@ -139,20 +139,25 @@ def _pass_seed(seed: int, done: int) -> int:
 
 
 def gbuffers(geometry: Geometry, cameras: Sequence[Camera]) -> list[GBufferView]:
-    """True G-buffers, one view a camera, along pixel-centre rays.
+    """All views of :func:`stream_gbuffers` at once."""
+    return list(stream_gbuffers(geometry, cameras))
+
+
+def stream_gbuffers(geometry: Geometry, cameras: Iterable[Camera]) -> Iterator[GBufferView]:
+    """True G-buffers, one view a camera, along pixel-centre rays; no more than a group of them at a time.
 
     Base color is the material's own, of metals too; normals are shading normals (normal maps included) on the
     camera's side. ``rgb`` is None.
     """
     scene = geometry.lit()
-    views: list[GBufferView] = []
     waiting: list[Camera] = []
     for camera in cameras:
         waiting.append(camera)
         if sum(c.width * c.height for c in waiting) >= LANES // 2:
-            views += _views(geometry, scene, waiting)
+            yield from _views(geometry, scene, waiting)
             waiting = []
-    return views + (_views(geometry, scene, waiting) if waiting else [])
+    if waiting:
+        yield from _views(geometry, scene, waiting)
 
 
 def _views(geometry: Geometry, scene: mi.Scene, cameras: Sequence[Camera]) -> list[GBufferView]:

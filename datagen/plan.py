@@ -20,8 +20,10 @@ from datagen.assets import Asset, Refused, find_environments, find_models
 from datagen.captured_folder import find_captures, split_of
 from datagen.clip_preview import preview_bytes
 from datagen.clip_rows import ClipRow
+from datagen.clusters import worker_count
 from datagen.lights import HdriSpec
 from datagen.scene import scene_name
+from datagen.scratch import scratch_bytes
 from datagen.settings import SPLITS, Settings
 from datagen.texture_sets import TextureSet, find_texture_sets
 from datagen.variety import Histograms
@@ -118,6 +120,8 @@ class Record(BaseModel):
 
     Attributes:
         capture: name of the capture that it is; None where it is synthetic.
+        refinement: of surfels that were made from G-buffers.
+        reconstruction: of surfels that were reconstructed from pictures.
         clips: a row each; empty in records of older versions.
         variety: histograms of the scene (``datagen.variety``); likewise.
     """
@@ -129,6 +133,7 @@ class Record(BaseModel):
     shards: list[ShardEntry]
     quarantined: list[Quarantined]
     refinement: Refinement | None = None
+    reconstruction: Figures | None = None
     clips: list[ClipRow] = Field(default_factory=list)
     variety: Histograms = Field(default_factory=dict)
 
@@ -224,9 +229,12 @@ def _size(path: Path) -> int | None:
 
 
 def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
-    """Bytes that scenes may take on disk: half-precision EXR hardly compresses noise."""
-    total = 0
-    surfels = settings.surfels
+    """Bytes that making scenes may take on disk: half-precision EXR hardly compresses noise.
+
+    Previews are counted, and what waits on disk in the scenes that are under way at one time.
+    """
+    total, waiting = 0, 0
+    items, surfels = list(items), settings.surfels
     if settings.source == "captured":
         surfels = settings.captured.reconstruction.radiance.density.most
     for item in items:
@@ -236,7 +244,8 @@ def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
         frame = recipe.width * recipe.height * pixel + 16_384
         previews = preview_bytes(recipe.width, recipe.height, recipe.frames, len(members))
         total += item.clips(settings) * (recipe.frames * frame + previews) + surfels * SURFEL_BYTES
-    return total
+        waiting = max(waiting, scratch_bytes(settings, item.split))
+    return total + waiting * worker_count(settings, len(items))[0]
 
 
 def config_text(settings: Settings) -> str:

@@ -23,10 +23,12 @@ from datagen.build import Geometry
 from datagen.clip_preview import preview_bytes, write_preview
 from datagen.pathtrace import LANES
 from datagen.plan import Sources, Work
+from datagen.reconstructed import reconstruction_steps
 from datagen.run import draw_and_build
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from datagen.synthetic import make_clips, make_surfels
+from tron.gaussians.initialize import sample_bytes
 from tron.gaussians.scene import GaussianScene
 from tron.shards.schema import clip_members
 from tron.shards.writer import ShardWriter
@@ -37,6 +39,9 @@ FRAMES = (1, 3)
 """Frames of its clips."""
 MOST_LIGHTS, VIEWS, STEPS = 4, 4, 10
 """Lights, views and optimisation steps of a probe, where the recipe has more."""
+
+VIEW_BYTES = 49
+"""Bytes of a pixel of a true G-buffer in memory; LANES / 2 pixels are rendered at a time, and copied."""
 
 Result = TypeVar("Result")
 
@@ -86,22 +91,30 @@ def probe(item: Work, settings: Settings, sources: Sources) -> SceneCost:
     lights = recipe.lights[:MOST_LIGHTS]
     sizes = [_scaled(recipe.width, recipe.height, side) for side in SIDES]
     pixels = [width * height for width, height in sizes]
+    begun = _peak()
     spec, geometry = draw_and_build(item, settings, sources, lights)
     _, building = _timed(lambda: draw_and_build(item, settings, sources, lights))
 
     def surfels(steps: int) -> tuple[GaussianScene, float]:
         views = min(settings.views, VIEWS)
-        few = settings.model_copy(update={"views": views, "refine_steps": steps})
-        (made, _), seconds = _timed(lambda: make_surfels(spec, geometry, few))
+        with TemporaryDirectory() as folder:
+            few = {"views": views, "refine_steps": steps, "output_dir": Path(folder)}
+            there = settings.model_copy(update=few)
+            (made, _), seconds = _timed(lambda: make_surfels(spec, geometry, there))
         return made, seconds
 
     surfels(1)  # compiles
     plain, viewing = surfels(0)
     viewing *= settings.views / min(settings.views, VIEWS)
-    refining = 0.0
-    if settings.refine_steps:
+    refining, shares = 0.0, settings.surfels_from
+    rebuilt = shares.reconstruction / (shares.gbuffers + shares.reconstruction)
+    if settings.refine_steps or rebuilt:
         (_, once), (_, often) = surfels(1), surfels(1 + STEPS)
-        refining = once - surfels(0)[1] + (settings.refine_steps - 1) * (often - once) / STEPS
+        step = (often - once) / STEPS
+        refining = (
+            (once - surfels(0)[1] + (settings.refine_steps - 1) * step) if settings.refine_steps else 0.0
+        )
+        refining = (1 - rebuilt) * refining + rebuilt * reconstruction_steps(settings) * step
 
     def clips(size: tuple[int, int], frames: int) -> _Clips:
         return _clips(spec, geometry, plain, _small(settings, item.split, size, frames))
@@ -135,11 +148,23 @@ def probe(item: Work, settings: Settings, sources: Sources) -> SceneCost:
     with TemporaryDirectory() as folder:
         plain.save(Path(folder) / "surfels.ply")
         kept = (Path(folder) / "surfels.ply").stat().st_size
-    held = recipe.frames * whole * 4 * 64  # some sixty float channels a pixel until the clip is written
+    # One frame's buffers under every light, and a clip's encoded files until they are in the shard.
+    held = share * whole * 4 * 64 + recipe.frames * frame_bytes
+    views_pixels = settings.views * settings.view_width * settings.view_height
+    gathered = sample_bytes(settings.surfels, views_pixels) + 2 * LANES * VIEW_BYTES
+    pictures = rebuilt * settings.views * settings.view_width * settings.view_height
+    pictures *= settings.surfel_reconstruction.path_spp / (whole * recipe.path_spp)  # in frames of a clip
     return SceneCost(
-        seconds=building + viewing + refining + share * (fixed + recipe.frames * frame_seconds),
+        seconds=building
+        + viewing
+        + refining
+        + share * (fixed + recipe.frames * frame_seconds)
+        + pictures * frame_seconds,
         bytes=kept + share * (recipe.frames * frame_bytes + preview),
-        memory=_peak() + growth * max(min(LANES, whole * recipe.path_spp) - lanes[1], 0) + held,
+        memory=max(
+            begun + gathered,
+            _peak() + growth * max(min(LANES, whole * recipe.path_spp) - lanes[1], 0) + held,
+        ),
         source=f"probe: {item.name}, {len(lights)} lights, {sizes[1][0]} x {sizes[1][1]}",
     )
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import fmean
 
 from datagen.account import read_other
-from datagen.clusters import LOCAL, cores, logs_folder, require_cluster
+from datagen.clusters import logs_folder, require_cluster, worker_count
 from datagen.plan import (
     Work,
     chosen,
@@ -151,14 +151,20 @@ def report(settings: Settings, splits: Sequence[SplitPlan]) -> str:
     seconds = sum(len(split.missing) * split.cost.seconds for split in splits if split.cost)
     memory = [split.cost.memory for split in splits if split.cost and split.cost.memory > 0]
     count, known = worker_count(settings, len(missing))
+    needed = estimate_bytes(settings, missing)
     free = shutil.disk_usage(_existing(settings.output_dir)).free
     facts = [
         ("scenes to make", f"{len(missing)} of {sum(split.scenes for split in splits)}{_names(missing)}"),
         ("bytes on disk", f"{total_bytes / 1e9:.3g} GB"),
         (
+            "asked for",
+            f"{needed / 1e9:.3g} GB before the first scene: as if nothing compressed, with what waits "
+            f"on disk in {count} scene{'s' * (count > 1)} under way",
+        ),
+        (
             "free",
             f"{free / 1e9:.3g} GB on the disk of {settings.output_dir}: "
-            + ("enough" if free > total_bytes else "NOT ENOUGH"),
+            + ("enough" if free > needed else "NOT ENOUGH"),
         ),
         ("memory", f"about {max(memory) / 1e9:.2g} GB a worker" if memory else "not measured"),
         ("core hours", f"{seconds / 3600:.3g}, by cores as fast as this one"),
@@ -199,17 +205,6 @@ def _names(missing: Sequence[Work]) -> str:
         return ""
     shown = ", ".join(item.name for item in missing[:NAMED])
     return f": {shown}{f', ... {missing[-1].name}' if len(missing) > NAMED else ''}"
-
-
-def worker_count(settings: Settings, most: int) -> tuple[int, str]:
-    """Workers that the cluster will have, one at the least, and a remark where only it knows."""
-    if settings.cluster is None:
-        return 1, ", this process"
-    if settings.workers is not None:
-        return max(min(settings.workers, most), 1), ""
-    if settings.cluster["_target_"] == LOCAL:
-        return max(min(int(settings.cluster.get("n_workers") or cores()), most), 1), ""
-    return 1, "; the cluster has its own number: give workers=N"
 
 
 def _existing(folder: Path) -> Path:

@@ -11,8 +11,6 @@ import numpy as np
 from datagen.clock import stage
 from datagen.plan import Figures, Refinement
 from tron.captures import View
-from tron.color import linear_to_srgb
-from tron.gaussians.initialize import GBufferView
 from tron.gaussians.scene import GaussianScene
 from tron.reconstruction.evaluation import mean_figures, score_views
 from tron.reconstruction.gbuffer_fitting import RefinementSettings, refine
@@ -25,13 +23,13 @@ log = logging.getLogger(__name__)
 @stage("refine")
 def refine_surfels(
     surfels: GaussianScene,
-    seen: Sequence[GBufferView],
-    held_out: Sequence[GBufferView],
+    seen: Sequence[View],
+    held_out: Sequence[View],
     steps: int,
     seed: int,
     device: str,
 ) -> tuple[GaussianScene, Refinement]:
-    """Fit surfels to what ``seen`` shows of them, and judge them by ``held_out``.
+    """Fit surfels to what ``seen`` shows of them, and judge them by ``held_out``; one view is read at a time.
 
     Args:
         surfels: as made from ``seen``. steps: of the optimisation. seed: of the order of views.
@@ -41,10 +39,10 @@ def refine_surfels(
     set_torch_threads(1)
     started = time.perf_counter()
     settings = RefinementSettings(steps=steps)
-    refined = refine(surfels, [as_view(i, view) for i, view in enumerate(seen)], settings, seed, device)
+    refined = refine(surfels, seen, settings, seed, device)
     seconds = time.perf_counter() - started
-    judges = [as_view(i, view) for i, view in enumerate(held_out)]
-    found = Refinement(steps=steps, before=_figures(surfels, judges), after=_figures(refined, judges))
+    before, after = (figures_of(SurfelTracer(scene), held_out) for scene in (surfels, refined))
+    found = Refinement(steps=steps, before=before, after=after)
     log.info(
         "surfels refined in %.1f s: base color %.1f -> %.1f dB, normals %.2f -> %.2f degrees",
         seconds, found.before.base_color_psnr, found.after.base_color_psnr,
@@ -53,30 +51,14 @@ def refine_surfels(
     return refined, found
 
 
-def as_view(number: int, seen: GBufferView) -> View:
-    """A true G-buffer as what a reconstruction learns from; no light is on, so the picture is base color."""
-    inside = seen.valid[..., None]
-    base_color = np.where(inside, seen.base_color, 0)
-    return View(
-        name=f"{number:04d}",
-        camera=seen.camera,
-        image=linear_to_srgb(base_color),
-        space="display",
-        normal=np.where(inside, seen.normal, 0),
-        base_color=base_color,
-        roughness=np.where(seen.valid, seen.roughness, 0),
-        metallic=np.where(seen.valid, seen.metallic, 0),
-        mask=seen.valid.astype(np.float32),
-    )
-
-
-def _figures(surfels: GaussianScene, views: Sequence[View]) -> Figures:
-    tracer = SurfelTracer(surfels)
+def figures_of(tracer: SurfelTracer, views: Sequence[View]) -> Figures:
+    """Surfels against the true G-buffers of views, one read at a time."""
     means = mean_figures(score_views(tracer, views))
-    opacity = [tracer.gbuffer(view.camera).numpy()["opacity"] for view in views]
-    error = np.mean([np.abs(o - view.read("mask")).mean() for o, view in zip(opacity, views)])
+    errors = [
+        np.abs(tracer.gbuffer(view.camera).numpy()["opacity"] - view.read("mask")).mean() for view in views
+    ]
     return Figures(
         base_color_psnr=round(means["base_color_psnr"], 4),
         normal_mae_deg=round(means["normal_mae_deg"], 4),
-        silhouette_error=round(float(error), 6),
+        silhouette_error=round(float(np.mean(errors)), 6),
     )

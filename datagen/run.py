@@ -39,6 +39,7 @@ from datagen.plan import (
     scene_folder,
 )
 from datagen.ready_sources import ready_sources
+from datagen.reconstructed import forget_reconstruction, reconstruct_surfels
 from datagen.scene import SceneSpec, draw_scene
 from datagen.scene_files import write_clips
 from datagen.scene_geometry import scene_geometry
@@ -105,7 +106,11 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
     spec, geometry = draw_and_build(item, settings, sources, settings.split(item.split).lights)
     folder = scene_folder(output, item.name)
     write_atomic(folder / "spec.json", spec.to_json())
-    surfels, refinement = make_surfels(spec, geometry, settings)
+    refinement = reconstruction = None
+    if settings.surfels_from.of(settings.seed, item.split, item.index) == "reconstruction":
+        surfels, reconstruction = reconstruct_surfels(spec, geometry, settings)
+    else:
+        surfels, refinement = make_surfels(spec, geometry, settings)
     surfels.save(folder / "surfels.ply")
 
     clips = make_clips(spec, geometry, surfels, settings)
@@ -117,7 +122,9 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
         refinement=refinement,
         clips=files.rows(),
         variety=_variety(geometry, files.made),
+        reconstruction=reconstruction,
     )
+    forget_reconstruction(folder)
     write_atomic(folder / RECORD_NAME, record.model_dump_json(indent=1) + "\n")
     del geometry, surfels
     gc.collect()

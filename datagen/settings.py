@@ -19,6 +19,7 @@ from datagen.captured_settings import CapturedSettings
 from datagen.lights import PROCEDURAL, Family, LightChoice
 from datagen.settings_model import SettingsModel
 from datagen.split_settings import SplitSettings
+from datagen.surfel_settings import SurfelReconstruction, SurfelSources
 from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounces
 
 Split = Literal["train", "train_b", "validation", "test"]
@@ -168,6 +169,14 @@ class Settings(SettingsModel):
         ge=0,
         le=100_000,
         description="Optimisation steps that fit a scene's surfels to its G-buffers; 0 takes them as made.",
+    )
+    surfels_from: SurfelSources = Field(
+        SurfelSources(),
+        description="What scenes' surfels are made from: gbuffers, reconstruction, or shares of the scenes.",
+        examples=["{gbuffers: 3, reconstruction: 1}"],
+    )
+    surfel_reconstruction: SurfelReconstruction = Field(
+        SurfelReconstruction(), description="Reconstruction of surfels, where they are made by it."
     )
     estimator: Estimator = Field(
         FINAL.estimator,

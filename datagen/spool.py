@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, overload
 
@@ -33,9 +33,13 @@ class Spool:
     Args:
         folder: where; made if it is missing.
         clips: how many.
+        store: name and image -> what is written of it; by default what a shard would store.
     """
 
-    def __init__(self, folder: Path, clips: int) -> None:
+    def __init__(
+        self, folder: Path, clips: int, store: Callable[[str, np.ndarray], np.ndarray] | None = None
+    ) -> None:
+        self._store = store or stored
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 closed by __exit__
@@ -56,7 +60,7 @@ class Spool:
         """
         places = {}
         for name, image in frame.items():
-            image = np.ascontiguousarray(stored(name, image))
+            image = np.ascontiguousarray(self._store(name, image))
             places[name] = _Place(self._file.tell(), image.dtype, image.shape)
             try:
                 self._file.write(image.data)
@@ -97,6 +101,10 @@ class Clip(Sequence[Frame]):
         if isinstance(index, slice):
             return Clip(self._spool, self._places[index])
         return {name: self._spool.read(place) for name, place in self._places[index].items()}
+
+    def image(self, index: int, name: str) -> np.ndarray:
+        """One member of one frame, float32."""
+        return self._spool.read(self._places[index][name])
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))

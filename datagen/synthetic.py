@@ -20,6 +20,7 @@ from datagen.pathtrace import (
     render_frames,
     render_lights,
     stacked_lights,
+    stream_gbuffers,
 )
 from datagen.plan import Refinement, scene_folder
 from datagen.refinement import refine_surfels
@@ -27,6 +28,8 @@ from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from datagen.split_settings import SplitSettings
 from datagen.spool import Frame, Spool
+from datagen.surfel_settings import Source
+from datagen.view_spool import ViewSpool
 from tron.cameras import Camera
 from tron.estimation import Estimation
 from tron.gaussians.edit import moved
@@ -52,26 +55,34 @@ def make_surfels(
 
     They are judged by the cameras of the first clip, which are not among those.
     """
-    cameras = spec.views(settings.views, settings.view_width, settings.view_height)
-    seen = gbuffers(geometry, cameras)
-    if spec.motion is not None:
-        seen += _uncovered(spec, geometry, cameras)
-    surfels = surfels_from_gbuffers(seen, count=settings.surfels)
+    seen = _seen(spec, geometry, spec.views(settings.views, settings.view_width, settings.view_height))
     if not settings.refine_steps:
-        return surfels, None
+        return surfels_from_gbuffers(seen, count=settings.surfels), None
     recipe = settings.split(spec.split)
-    held_out = gbuffers(geometry, spec.clip(0, recipe.frames, recipe.width, recipe.height))
+    folder = scene_folder(settings.output_dir, spec.name)
     device = torch_device(settings.variant)
     seed = integer(spec.seed, spec.split, spec.index, "refinement")
-    return refine_surfels(surfels, seen, held_out, settings.refine_steps, seed, device)
+    with ViewSpool(folder) as shown, ViewSpool(folder) as judges:
+        surfels = surfels_from_gbuffers(shown.passing(seen), count=settings.surfels)
+        cameras = spec.clip(0, recipe.frames, recipe.width, recipe.height)
+        for _ in judges.passing(stream_gbuffers(geometry, cameras)):
+            pass
+        views, held_out = shown.views(), judges.views()
+        return refine_surfels(surfels, views, held_out, settings.refine_steps, seed, device)
 
 
-def _uncovered(spec: SceneSpec, geometry: Geometry, cameras: Sequence[Camera]) -> list[GBufferView]:
-    """Every other view once more with the moving object away and left out: what it rests on has no hole."""
-    number = _move(spec, geometry, 1.0)
-    views = gbuffers(geometry, cameras[::2])
-    _move(spec, geometry, 0.0)
-    return [replace(view, valid=view.valid & (view.object_id != number)) for view in views]
+def _seen(spec: SceneSpec, geometry: Geometry, cameras: Sequence[Camera]) -> Iterator[GBufferView]:
+    """True G-buffers of the views that surfels are made from, a few in memory at a time.
+
+    Where an object moves, every other view comes once more with the object away and left out: what it rests
+    on has no hole.
+    """
+    yield from stream_gbuffers(geometry, cameras)
+    if spec.motion is not None:
+        number = _move(spec, geometry, 1.0)
+        for view in stream_gbuffers(geometry, cameras[::2]):
+            yield replace(view, valid=view.valid & (view.object_id != number))
+        _move(spec, geometry, 0.0)
 
 
 def _move(spec: SceneSpec, geometry: Geometry, time: float) -> int:
@@ -227,7 +238,8 @@ def _film(
             spool.add(k, frame)
     if spec.motion is not None:
         _move(spec, geometry, 0.0)
-    return [_meta(spec, light, cameras, recipe) for light in first]
+    source = settings.surfels_from.of(spec.seed, spec.split, spec.index)
+    return [_meta(spec, light, cameras, recipe, source) for light in first]
 
 
 def _prepare(
@@ -253,7 +265,9 @@ def _prepare(
     return _Lit(number, environment, lighting, bounce, seeds, environment.exposure())
 
 
-def _meta(spec: SceneSpec, lit: _Lit, cameras: Sequence[Camera], recipe: SplitSettings) -> ClipMeta:
+def _meta(
+    spec: SceneSpec, lit: _Lit, cameras: Sequence[Camera], recipe: SplitSettings, surfels_from: Source
+) -> ClipMeta:
     light = spec.lights[lit.number]
     spp = {"path": recipe.path_spp, "guidance": recipe.guidance_spp}
     if recipe.reference_buffers:
@@ -278,6 +292,7 @@ def _meta(spec: SceneSpec, lit: _Lit, cameras: Sequence[Camera], recipe: SplitSe
         spp=spp,
         extra={
             "style": spec.style,
+            "surfels_from": surfels_from,
             "contrast": classify(lit.environment),
             "contrast_share": contrast_share(lit.environment),
             "turn_deg": spec.turns_deg[lit.number] if spec.turns_deg else 0.0,

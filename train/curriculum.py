@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Container, Sequence
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from tron.errors import TronError
 from tron.neural.windows import TEMPORAL_FACTOR
 
 FrameSide = Annotated[int, Field(ge=8, le=16_384)]
+CAPTURES = "train_b"
+"""Split of reconstructed captures, or of path-traced scenes that stand in for them."""
 
 
 class Stage(BaseModel):
@@ -69,6 +72,21 @@ class Stage(BaseModel):
         return [self.split] + (
             [self.rehearsal_split] if self.rehearsal_split and self.rehearsal_ratio else []
         )
+
+
+def require_splits(stages: Sequence[Stage], there: Container[str]) -> None:
+    """Make sure that a curriculum's captures are there; other splits are missed where they are opened.
+
+    Raises:
+        TronError: a stage learns from train_b, and there is no such split.
+    """
+    for stage in stages:
+        if CAPTURES in stage.splits() and CAPTURES not in there:
+            raise TronError(
+                f"stage {stage.name} learns from the split '{CAPTURES}', which is not there",
+                mend="give a dataset of captures, made by tron-datagen source=captured: "
+                f"splits={{{CAPTURES}: FOLDER}}; or make one with {CAPTURES}.scenes above 0 to stand in",
+            )
 
 
 class StageClock:

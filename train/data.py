@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from train.augmentation import augmented, display_encoded
-from train.curriculum import Stage
+from train.curriculum import Stage, require_splits
 from train.framing import centred, covering_size, sized
 from train.held_out import HeldOutClips, Windows, network_input, spread
 from train.processes import Processes
@@ -148,6 +148,7 @@ class TrainingData(lightning.LightningDataModule):
 
         guidance: members that the network is conditioned on.
         """
+        require_splits(stages, self.splits)
         self.members = (*guidance, TARGET)
         for stage in stages:
             for split in stage.splits():

@@ -32,7 +32,9 @@ class OptimizerSettings(BaseModel):
     betas: tuple[float, float] = Field(default=(0.9, 0.99), description="AdamW's averaging rates.")
     weight_decay: float = Field(default=1e-2, ge=0, description="AdamW's decoupled weight decay.")
     warmup_steps: int = Field(default=50, ge=0, description="Steps of linear warm-up in each stage.")
-    gradient_clip: float = Field(default=1.0, gt=0, description="Largest norm of the gradient.")
+    gradient_clip: float | None = Field(
+        default=1.0, gt=0, description="Largest norm of the gradient; null: any."
+    )
     ema_decay: float | None = Field(
         default=None,
         gt=0,

@@ -10,6 +10,7 @@ from pathlib import Path
 from eval.datagen.captured import measure_captured
 from eval.datagen.hostile import measure_hostile
 from eval.datagen.kills import measure_kills
+from eval.datagen.paper_smoke import measure_paper_smoke
 from eval.datagen.parts import Found
 from eval.datagen.reader import measure_reader
 from eval.datagen.settings import DatagenSettings, Part
@@ -54,7 +55,7 @@ class Datagen(DatagenSettings):
     def check(self) -> None:
         """Find the commands that the parts call."""
         require_own_packages("datagen", "train")
-        for name in ("tron-datagen", "tron-train"):
+        for name in ("tron-datagen", "tron-train", "tron-eval"):
             script_path(name)
 
     def run(self, output_dir: Path) -> Outcome:
@@ -98,6 +99,7 @@ class Datagen(DatagenSettings):
                 [*_of(tiny, self.specified_scenes), *self.specified], at
             ),
             "reader": lambda at: measure_reader(self.reader, self.seed, at),
+            "paper_smoke": measure_paper_smoke,
             "throughput": lambda at: measure_throughput(self.throughput, self.sizes, at),
             "hostile": measure_hostile,
             "captured": lambda at: measure_captured(self.captured, self.seed, at),

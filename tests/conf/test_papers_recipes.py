@@ -5,9 +5,11 @@ from collections import Counter
 import pytest
 
 from datagen.settings import Settings as DatagenSettings
+from train.curriculum import learning_rate_factor
 from train.settings import Settings as TrainSettings
 from tron.apps.relight_settings import QUALITY
 from tron.cli.recipes import check, compose_recipe
+from tron.errors import TronError
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +20,11 @@ def datagen() -> DatagenSettings:
 
 @pytest.fixture(scope="module")
 def train() -> TrainSettings:
-    overrides = ["experiment=paper", "renderer=cosmos", "dataset=in", "output_dir=out"]
+    return composed_training("paper")
+
+
+def composed_training(experiment: str) -> TrainSettings:
+    overrides = [f"experiment={experiment}", "dataset=in", "output_dir=out", "loss.vgg_weights=vgg.pth"]
     overrides += ["renderer.transformer_path=a", "renderer.vae_path=b"]
     return check(compose_recipe("conf.train", TrainSettings, overrides), TrainSettings)
 
@@ -53,6 +59,64 @@ def test_the_curriculum_has_three_stages_of_32000_steps(train: TrainSettings) ->
     assert {stage.batch_size for stage in train.stages} == {1}
     assert (train.optimizer.learning_rate, train.optimizer.muon_learning_rate) == (2e-5, None)
     assert (train.loss.l2, train.loss.lpips) == (1.0, 1.0)
+
+
+def test_nothing_is_done_that_the_paper_does_not_speak_of(train: TrainSettings) -> None:
+    """A constant rate from the first step to the last, frames as they are, one split a stage."""
+    optimizer, data = train.optimizer, train.data
+    rates = {
+        learning_rate_factor(stage, progress, step, optimizer.warmup_steps)
+        for stage in train.stages
+        for step, progress in ((0, 0.0), (1, 0.3), (31_999, 1.0))
+    }
+    assert rates == {1.0}
+    assert (optimizer.gradient_clip, optimizer.ema_decay) == (None, None)
+    assert (data.flip, data.permute_colors, data.tint) == (0, 0, 0)
+    assert [stage.splits() for stage in train.stages] == [["train"], ["train_b"], ["train_b"]]
+    assert {stage.still_ratio for stage in train.stages} == {0}
+    assert train.max_seconds is None
+
+
+def test_lpips_is_not_left_out_unseen() -> None:
+    with pytest.raises(TronError, match="vgg_weights"):
+        check(
+            compose_recipe("conf.train", TrainSettings, ["experiment=paper", "dataset=in", "output_dir=out"]),
+            TrainSettings,
+        )
+
+
+@pytest.mark.parametrize("experiment", ["paper", "paper_smoke"])
+def test_what_is_made_fits_what_is_trained_on(experiment: str) -> None:
+    """Splits, clips and frames of the two recipes of a name; the captures of the paper are the user's."""
+    overrides = [f"experiment={experiment}", "output_dir=out"]
+    made = check(compose_recipe("conf.datagen", DatagenSettings, overrides), DatagenSettings)
+    training = composed_training(experiment)
+    there = set(made.used_splits())
+    assert {"train", "validation", "test"} <= there
+    for stage in training.stages:
+        if stage.split not in there:
+            assert (experiment, stage.split) == ("paper", "train_b")
+            continue
+        split = made.split(stage.split)
+        assert stage.frames <= split.frames
+        assert stage.crop is None or stage.crop == split.width == split.height
+    assert made.validation.frames >= max(stage.frames for stage in training.stages)
+    assert (made.validation.width, made.validation.height) == (made.train.width, made.train.height)
+    assert set(made.train.style) == set(made.validation.style) == {"object", "table"}
+
+
+def test_the_smoke_run_is_the_papers_in_all_but_size() -> None:
+    """Every key of it that differs from the paper's own is a number, a size or a machine's."""
+    paper, smoke = (composed_training(name) for name in ("paper", "paper_smoke"))
+    sizes = {"steps", "crop"}
+    assert [each.model_dump(exclude=sizes) for each in smoke.stages] == [
+        each.model_dump(exclude=sizes) for each in paper.stages
+    ]
+    assert (smoke.optimizer, smoke.loss) == (paper.optimizer, paper.loss)
+    configs = [dict(each.renderer["config"], backbone=None) for each in (paper, smoke)]
+    assert configs[0] == configs[1]
+    chosen = {name: smoke.renderer["config"]["backbone"][name] for name in ("patch", "padding_channel")}
+    assert chosen == {name: paper.renderer["config"]["backbone"][name] for name in chosen}
 
 
 def test_the_renderer_averages_the_two_latents_at_timestep_250_of_1000(train: TrainSettings) -> None:

@@ -100,11 +100,14 @@ def test_no_key_is_stated_twice_with_one_value(path: Path):
     """Defaults are the model's: YAML says what differs from the model and from the YAML beneath it."""
     folder, *group, _ = path.relative_to(ROOT / "conf").with_suffix("").parts
     command = load_command(folder)
-    said = {key: value for key, value in yaml.safe_load(path.read_text()).items() if key != "defaults"}
+    written = yaml.safe_load(path.read_text())
+    said = {key: value for key, value in written.items() if key != "defaults"}
+    others = [each for each in written.get("defaults", ()) if isinstance(each, str) and each != "_self_"]
     if not group:
         beneath = OmegaConf.create(model_defaults(command.settings))
     elif "@package _global_" in path.read_text():
-        beneath = complete(compose_recipe(command.config_module, command.settings))
+        overrides = [f"{'/'.join(group)}={name}" for name in others]
+        beneath = complete(compose_recipe(command.config_module, command.settings, overrides))
     else:
         beneath = complete(OmegaConf.create(only_targets(said)))
     known = leaves(cast(dict, OmegaConf.to_container(beneath)))

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from datagen.cli import cli, main
-from datagen.projection import project, read_times, scene_bytes, worker_count
+from datagen.clusters import worker_count
+from datagen.projection import project, read_times, scene_bytes
 from tron.errors import TronError
 
 

@@ -8,7 +8,11 @@ import pytest
 
 from datagen.scene_files import first_bad_value
 from datagen.spool import Spool, stored
+from datagen.view_spool import ViewSpool
+from tron.cameras import Camera
+from tron.color import linear_to_srgb
 from tron.errors import TronError
+from tron.gaussians.initialize import GBufferView
 from tron.images import decode_exr, encode_exr
 from tron.seeds import generator
 
@@ -71,3 +75,30 @@ def test_a_full_disk_is_one_line(tmp_path: Path, scale: int):
                 spool.add(0, {"rgb": np.ones((5 * scale, 7, 3), np.float32)})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_views_come_back_bit_by_bit(tmp_path):
+    rng = generator(1, "view spool")
+    camera = Camera.look_at((4, 0, 2), (0, 0, 0), width=7, height=5, fov_deg=50)
+    normal = rng.normal(size=(5, 7, 3))
+    seen = GBufferView(
+        camera=camera,
+        position=rng.random((5, 7, 3), np.float32),
+        normal=(normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32),
+        base_color=rng.random((5, 7, 3), np.float32),
+        roughness=rng.random((5, 7), np.float32),
+        metallic=rng.random((5, 7), np.float32),
+        rgb=None,
+        valid=rng.random((5, 7)) < 0.7,
+        object_id=np.ones((5, 7), np.int32),
+    )
+    with ViewSpool(tmp_path / "new") as spool:
+        assert list(spool.passing([seen, seen])) == [seen, seen]
+        assert not list((tmp_path / "new").iterdir())
+        first, second = spool.views()
+        for name in ("base_color", "roughness", "metallic", "normal"):
+            there = getattr(seen, name)[seen.valid]
+            np.testing.assert_array_equal(second.read(name)[seen.valid], there)
+            assert not first.read(name)[~seen.valid].any()
+        np.testing.assert_array_equal(first.read("mask"), seen.valid)
+        np.testing.assert_array_equal(first.read(), linear_to_srgb(first.read("base_color")))

@@ -22,6 +22,7 @@ from tron.color import luminance, to_display
 from tron.errors import TronError
 from tron.shards import GUIDANCE, ClipStore, read_clips
 from tron.shards.byte_ranges import ByteRanges
+from tron.shards.manifest import Manifest
 from tron.shards.schema import TARGET
 
 BUFFERS = (*GUIDANCE, "rgb")
@@ -311,3 +312,16 @@ def test_a_damaged_shard_is_one_line_from_any_process(dataset, tmp_path, workers
         take(data.train_dataloader(), 1)
     assert "\n" not in str(caught.value)
     assert "Traceback" not in str(caught.value)
+
+
+def test_a_curriculum_without_its_captures_says_what_to_give(dataset, tmp_path):
+    folder = tmp_path / "dataset"
+    shutil.copytree(dataset, folder)
+    manifest = Manifest.load(folder)
+    kept = [entry for entry in manifest.shards if entry.split != "train_b"]
+    manifest.model_copy(update={"shards": kept}).save(folder)
+    data = TrainingData(folder, DataSettings(), 0, ValidationSettings())
+    stages = [Stage(name="one", split="train", steps=1), Stage(name="two", split="train_b", steps=1)]
+    with pytest.raises(TronError, match=r"stage two .*source=captured: splits=\{train_b: FOLDER\}"):
+        data.open(stages)
+    data.open(stages[:1])

@@ -8,7 +8,7 @@ surfel's scale is a fixed fraction of the distance to its neighbours on the same
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +30,8 @@ SCALE_CAP = 3.0
 # More samples than this are first merged in cells FINE times smaller than those of the surfels.
 _SAMPLES_AT_ONCE = 2_000_000
 _FINE = 4
+# Measured while samples are merged: their values, keys, and what sorting takes.
+_SAMPLE_BYTES = 200
 _OBJECTS = 2**20
 # Looked at to find three that face the same way.
 _NEIGHBOURS = 12
@@ -68,7 +70,7 @@ class GBufferView:
 
 
 def surfels_from_gbuffers(
-    views: Sequence[GBufferView],
+    views: Iterable[GBufferView],
     count: int = 20000,
     kernel_degree: int = 4,
     scale: float = 0.4,
@@ -78,7 +80,9 @@ def surfels_from_gbuffers(
     """A scene of about ``count`` surfels through the surfaces that the views see.
 
     It does not depend on the order of the views, and holds fewer surfels only where the views have fewer
-    samples. SH degree 0 is the views' mean rgb, display space, or else the sRGB-encoded base colour.
+    samples. SH degree 0 is the views' mean rgb, display space, or else the sRGB-encoded base colour. Views
+    may come one by one from an iterator: none is kept, and of their samples no more than
+    :func:`sample_bytes`.
 
     Args:
         views: of one world.
@@ -95,8 +99,8 @@ def surfels_from_gbuffers(
     """
     if count < 1:
         raise TronError(f"surfel count is {count}", mend="ask for at least one")
-    has_rgb = _agree_on_rgb(views)
     samples = _gather(views, count)
+    has_rgb = "rgb" in samples.values
     if not len(samples.weight):
         raise TronError("no view sees any surface, so there are no surfels to make")
     samples = samples.merged(_cell_size(samples, count))
@@ -155,8 +159,9 @@ class _Samples:
 
     @staticmethod
     def joined(parts: Sequence[_Samples]) -> _Samples:
-        names = parts[0].values
-        values = {name: np.concatenate([part.values[name] for part in parts]) for name in names}
+        """One of all parts, which lose their values to it, channel by channel: both never lie in memory."""
+        names = list(parts[0].values)
+        values = {name: np.concatenate([part.values.pop(name) for part in parts]) for name in names}
         return _Samples(
             values,
             np.concatenate([part.weight for part in parts]),
@@ -164,20 +169,38 @@ class _Samples:
         )
 
 
-def _gather(views: Sequence[GBufferView], count: int) -> _Samples:
+def sample_bytes(count: int, pixels: int) -> int:
+    """Most memory that ``count`` surfels take while they are made from views of so many pixels in all."""
+    return min(pixels, _bound(count)) * _SAMPLE_BYTES
+
+
+def _bound(count: int) -> int:
+    return max(_SAMPLES_AT_ONCE, 3 * _FINE**2 * count)
+
+
+def _gather(views: Iterable[GBufferView], count: int) -> _Samples:
     """All samples of all views; beyond a bound they are merged in cells much finer than the surfels'."""
-    bound = max(_SAMPLES_AT_ONCE, 3 * _FINE**2 * count)
+    bound = _bound(count)
     parts: list[_Samples] = []
-    held = 0
+    held, with_rgb, index = 0, 0, -1
     for index, view in enumerate(views):
         part = _samples(view, index)
+        with_rgb += view.rgb is not None
+        if with_rgb not in (0, index + 1):
+            raise TronError(
+                f"{with_rgb} of {index + 1} views have rgb", mend="give it in all views or in none"
+            )
         parts.append(part)
+        del view  # the next one is made while this function holds on to it
         held += len(part.weight)
         if held > bound:
             # The cell size only grows with what is still to be seen, so these cells stay fine enough.
             everything = _Samples.joined(parts)
             parts = [everything.merged(_cell_size(everything, count) / _FINE)]
             held = len(parts[0].weight)
+            del everything
+    if index < 0:
+        raise TronError("no views to make surfels from")
     return _Samples.joined(parts)
 
 
@@ -204,15 +227,6 @@ def _samples(view: GBufferView, index: int) -> _Samples:
     if len(object_id) and not 0 <= object_id.min() <= object_id.max() < _OBJECTS:
         raise TronError(f"an object_id of view {index} is outside 0..{_OBJECTS - 1}")
     return _Samples(values, np.ones(len(lengths)), object_id.astype(np.int64))
-
-
-def _agree_on_rgb(views: Sequence[GBufferView]) -> bool:
-    if not views:
-        raise TronError("no views to make surfels from")
-    with_rgb = sum(view.rgb is not None for view in views)
-    if with_rgb not in (0, len(views)):
-        raise TronError(f"{with_rgb} of {len(views)} views have rgb", mend="give it in all views or in none")
-    return with_rgb > 0
 
 
 def _cell_size(samples: _Samples, count: int) -> float:

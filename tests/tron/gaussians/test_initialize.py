@@ -1,6 +1,7 @@
 """Surfels from G-buffers, on surfaces whose every ray is known in closed form."""
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -180,3 +181,24 @@ def test_rgb_in_only_some_views_is_refused():
         surfels_from_gbuffers([view((4, 0, 2)), view((4, 0, 2), rgb=True)], count=100)
     with pytest.raises(TronError, match="no views"):
         surfels_from_gbuffers([], count=100)
+
+
+def test_views_may_come_one_by_one_and_none_is_kept(scene):
+    """Ten times as many views take no more memory than their samples' bound, and give the same surfels."""
+    streamed = surfels_from_gbuffers(iter(ring()), count=4000)
+    for field in dataclasses.fields(scene):
+        np.testing.assert_array_equal(getattr(streamed, field.name), getattr(scene, field.name))
+
+
+def test_memory_does_not_grow_with_the_number_of_views(monkeypatch):
+    monkeypatch.setattr(initialize, "_SAMPLES_AT_ONCE", 20_000)
+    few = view((4, 0, 2))
+    peaks = []
+    for count in (8, 32):
+        tracemalloc.start()
+        surfels_from_gbuffers((dataclasses.replace(few) for _ in range(count)), count=200)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0]
+    pixels = 32 * few.valid.size
+    assert peaks[1] < initialize.sample_bytes(200, pixels) + 200 * few.valid.size < 200 * pixels
