@@ -27,7 +27,7 @@ from datagen.capture_manifest import CaptureManifest
 from datagen.capture_settings import CaptureSettings
 from datagen.clusters import logs_folder, require_cluster
 from datagen.failures import record_failures, summary
-from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
+from datagen.pathtrace import gbuffers, render_frames
 from datagen.photographs import Photograph, described, drift
 from datagen.plan import Sources, Work, chosen, find_sources
 from datagen.relit import RELIT, record_relit, relit_folders, straightened, write_relit
@@ -35,6 +35,7 @@ from datagen.run import draw_and_build
 from datagen.scene import SceneSpec, scene_name
 from datagen.scheduling import make_each
 from datagen.settings import Settings
+from datagen.true_maps import MAPS, true_maps
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder, write_capture
@@ -200,7 +201,7 @@ def surface_points(capture: Capture, count: int, spec: SceneSpec) -> tuple[np.nd
 class _Shots:
     """Views that are rendered a group at a time, the group of the one that is asked for; the last is kept."""
 
-    FIELDS = ("image", "mask", "normal", "base_color", "roughness", "metallic", "irradiance", "depth")
+    FIELDS = ("image", "mask", *MAPS)
 
     def __init__(
         self,
@@ -233,25 +234,8 @@ class _Shots:
         frames = render_frames(self._scene, cameras, self._settings.path_spp, seeds, transparent=True)
         shots = []
         for i, (camera, truth, frame) in enumerate(zip(cameras, gbuffers(self._geometry, cameras), frames)):
-            seen = truth.valid
-            direct = direct_irradiance(
-                self._geometry,
-                self._scene,
-                camera,
-                self._settings.reference_spp,
-                self._seed(first + i, "reference"),
-            )
-            maps = {
-                "normal": truth.normal,
-                "base_color": truth.base_color,
-                "roughness": truth.roughness,
-                "metallic": truth.metallic,
-                "irradiance": direct.shadowed,
-                "depth": np.linalg.norm(truth.position - camera.position, axis=-1),
-            }
-            maps = {
-                name: np.where(seen if x.ndim == 2 else seen[..., None], x, 0) for name, x in maps.items()
-            }
+            seed = self._seed(first + i, "reference")
+            maps = true_maps(self._geometry, self._scene, camera, truth, self._settings.reference_spp, seed)
             straight, mask = straightened(frame, f"view {first + i} of {self._spec.name}")
             image = self._picture(first + i, straight, mask)
             shots.append({"image": image, "mask": mask, **maps})
