@@ -20,10 +20,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import yaml
 
 from datagen.build import Geometry
 from datagen.capture_manifest import CaptureManifest
+from datagen.capture_recipe import adopt_recipe
 from datagen.capture_settings import CaptureSettings
 from datagen.clusters import logs_folder, require_cluster
 from datagen.failures import record_failures, summary
@@ -39,15 +39,13 @@ from datagen.true_maps import MAPS, true_maps
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder, write_capture
-from tron.claim import read_recipe, require_same
-from tron.cli.recipes import model_defaults
 from tron.color import to_display
 from tron.errors import TronError
 from tron.images import encode_exr
 from tron.runtime import activate
 from tron.seeds import generator, integer
 from tron.shading.environment import EnvironmentMap
-from tron.storage import locked, require_free_space, write_if_changed
+from tron.storage import locked, require_free_space
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +58,6 @@ GROUP_PIXELS = 2**20
 CAPTURES = "captures"
 """Folder of the captures within output_dir."""
 
-CONFIG_NAME = "config.yaml"
 ENVIRONMENT_NAME = "environment.exr"
 SPEC_NAME = "spec.json"
 PHOTOGRAPHS_NAME = "photographs.json"
@@ -85,7 +82,7 @@ def make_captures(settings: Settings) -> int:
     sources = find_sources(settings)
     folder = settings.output_dir / CAPTURES
     with locked(settings.output_dir):
-        _adopt(settings, folder)
+        adopt_recipe(folder, settings.capture_recipe())
         manifest = CaptureManifest.load(folder)
         missing = [item for item in items if not _finished(folder / item.name, wanted)]
         require_free_space(folder, len(missing) * _estimate_bytes(settings))
@@ -254,21 +251,6 @@ class _Shots:
     def _seed(self, number: int, what: str) -> int:
         spec = self._spec
         return integer(spec.seed, spec.split, spec.index, "capture", number, what)
-
-
-def _adopt(settings: Settings, folder: Path) -> None:
-    """Make the folder of captures this recipe's, or make sure that it is already."""
-    path, recipe = folder / CONFIG_NAME, settings.capture_recipe()
-    before = read_recipe(path)
-    if before is not None:
-        if "captures" in before:  # as the key was called at first
-            before["capture"] = before.pop("captures")
-        require_same(before, recipe, folder, "captures", defaults=model_defaults(Settings))
-    elif folder.is_dir() and any(folder.iterdir()):
-        raise TronError(
-            "folder holds something else than these captures", folder, "choose another output_dir"
-        )
-    write_if_changed(path, yaml.safe_dump(recipe, sort_keys=True, allow_unicode=True))
 
 
 def _finished(folder: Path, settings: CaptureSettings) -> bool:

@@ -10,9 +10,7 @@ from scipy.spatial.transform import Rotation
 from tron.cameras import Camera
 
 
-def disturbed(
-    camera: Camera, rotation_deg: float, translation: float, rng: np.random.Generator
-) -> Camera:
+def disturbed(camera: Camera, rotation_deg: float, translation: float, rng: np.random.Generator) -> Camera:
     """The camera turned and moved by normal errors.
 
     Args:

@@ -1,4 +1,4 @@
-"""The settings of pseudo-captures: how their photos are taken and stored, and how well their poses are known."""
+"""The settings of pseudo-captures: how photos are taken and stored, and how well poses are known."""
 
 from __future__ import annotations
 

@@ -21,6 +21,7 @@ from datagen.settings_model import SettingsModel
 from datagen.split_settings import SplitSettings
 from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounces
 
+Mode = Literal["make", "plan", "validate", "captures", "pseudo_captures", "equal_error", "sharing"]
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
     *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
@@ -84,17 +85,15 @@ class Settings(SettingsModel):
     """Settings of ``tron-datagen``."""
 
     output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
-    mode: Literal[
-        "make", "plan", "validate", "captures", "pseudo_captures", "equal_error", "sharing"
-    ] = Field(
+    mode: Mode = Field(
         "make",
         description="make the dataset; plan it: print what is missing, the bytes and hours it takes and the "
         "memory of a worker, measured by a small probe here, and render nothing else; validate the one in "
         "output_dir and list every problem; path-trace captures for tron-reconstruct into "
         "output_dir/captures; photograph the splits' scenes as a phone would, with the truth kept apart in "
-        "output_dir/truth (pseudo_captures); measure on the test scenes in output_dir how long the path tracer takes to be "
-        "as near the truth as guidance is (equal_error); or measure what it saves to path-trace under many "
-        "lights at once (sharing).",
+        "output_dir/truth (pseudo_captures); measure on the test scenes in output_dir how long the path "
+        "tracer takes to be as near the truth as guidance is (equal_error); or measure what it saves to "
+        "path-trace under many lights at once (sharing).",
     )
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from datagen.capture_export import CAPTURES
 from datagen.capture_manifest import capture_names, verify_captures
+from datagen.pseudo_captures import TRUTH
 from datagen.relit import RELIT
 from tron.shards.manifest import MANIFEST_NAME, Manifest
 from tron.shards.verify import verify
@@ -26,7 +27,7 @@ def validate(folder: Path) -> int:
     captures = folder / CAPTURES
     problems = [
         f"{name}/{problem}"
-        for name in (CAPTURES, RELIT)
+        for name in (CAPTURES, TRUTH, RELIT)
         if (folder / name).is_dir()
         for problem in verify_captures(folder / name)
     ]

@@ -174,7 +174,7 @@ def encode_png(image: np.ndarray) -> bytes:
 
 
 def encode_jpeg(image: np.ndarray, quality: int = _JPEG_QUALITY) -> bytes:
-    """Encode display values in [0, 1] (clipped), or uint8, of 1 or 3 channels as a JPEG of a quality to 95."""
+    """Encode display values in [0, 1] (clipped), or uint8, of 1 or 3 channels as a JPEG; quality 1 to 95."""
     return _encode_display(image, "JPEG", quality)
 
 
