@@ -73,6 +73,11 @@ class PseudoCaptureSettings(ViewSettings):
         description="Least and greatest number of photos; each capture draws its own.",
         examples=["[8,8]"],
     )
+    indoor_spp: int | None = Field(
+        default=None,
+        ge=1,
+        description="Paths per pixel in rooms, where most of them find no window; null: path_spp.",
+    )
     file: Literal["jpeg", "png"] = Field(default="jpeg", description="Format of the photos, 8 bits.")
     jpeg_quality: int = Field(default=92, ge=1, le=95, description="Quality of JPEG photos, Pillow's scale.")
     filmic_share: float = Field(

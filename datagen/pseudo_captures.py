@@ -32,12 +32,13 @@ from datagen.capture_export import (
 from datagen.capture_manifest import CaptureManifest
 from datagen.capture_recipe import CONFIG_NAME, adopt_recipe, require_nobodys
 from datagen.clusters import logs_folder, require_cluster
+from datagen.exposure import metered
 from datagen.failures import record_failures, summary
 from datagen.pathtrace import gbuffers, render_frames
 from datagen.phone import Phone, draw_phone
 from datagen.plan import Sources, Work, chosen, find_sources, plan
 from datagen.pose_noise import disturbed
-from datagen.relit import RELIT, record_relit, relit_folders, shown_with, straightened, write_relit
+from datagen.relit import RELIT, record_relit, relit_folders, straightened, write_relit
 from datagen.run import draw_and_build
 from datagen.scene import SceneSpec
 from datagen.scheduling import make_each
@@ -131,13 +132,13 @@ def make_pseudo_capture(item: Work, settings: Settings, sources: Sources) -> Pat
     write_relit(settings.output_dir / RELIT, spec, geometry, others, held_out, wanted)
 
     seeds = [integer(spec.seed, spec.split, spec.index, STREAM, name, "path") for name in names]
-    frames = render_frames(
-        geometry.lit(environment), list(cameras.values()), wanted.path_spp, seeds, transparent=True
-    )
+    spp = wanted.path_spp if wanted.indoor_spp is None or not spec.metered else wanted.indoor_spp
+    frames = render_frames(geometry.lit(environment), list(cameras.values()), spp, seeds, transparent=True)
     buffers = dict(zip(names, gbuffers(geometry, list(cameras.values()))))
     shots = dict(zip(names, frames))
     phone = draw_phone(wanted, names, spec.seed, spec.split, spec.index, STREAM)
-    exposure = shown_with(spec, environment, frames)
+    # A phone meters what it sees, outdoors as well.
+    exposure = metered(frames[..., :3], frames[..., 3] >= 1, environment.exposure())
 
     true_capture = _true_capture(spec, geometry, environment, cameras, shots, buffers, exposure, settings)
     told = {"exposure": exposure, **phone.described()}
