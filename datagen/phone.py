@@ -18,7 +18,7 @@ from tron.seeds import generator
 
 @dataclass(frozen=True)
 class Phone:
-    """What stays and what changes while a capture is photographed.
+    """Lens, sensor and curve of one capture: what all photos share and what is each one's own.
 
     Attributes:
         curve: from linear light to display values: "agx", or "srgb", clipped at white.
