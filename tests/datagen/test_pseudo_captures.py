@@ -9,6 +9,7 @@ import pytest
 
 import datagen.pseudo_captures
 from datagen.capture_settings import SensorSettings
+from datagen.density import texels_per_unit
 from datagen.failures import LIST_NAME
 from datagen.phone import draw_phone
 from datagen.plan import Work, plan
@@ -226,6 +227,15 @@ def test_the_number_of_photos_spans_the_range_and_names_carry_the_split():
     assert set(numbers) == {40, 41, 42, 43, 44}
     assert numbers == [len(photo_names(work, settings)) for work in works]
     assert {item.name for item in plan(settings)} == set(NAMES)
+
+
+def test_what_the_recipe_leaves_out_decides_nothing(output):
+    """Sizes of a dataset's frames and views are not kept, so textures may not depend on them."""
+    spec = SceneSpec.model_validate_json((output / "truth/test-000000/spec.json").read_bytes())
+    plain, other = tiny(output), tiny(output, "view_width=999", "test.width=999", "capture.width=999")
+    assert plain.pseudo_capture_recipe() == other.pseudo_capture_recipe()
+    assert texels_per_unit(spec, plain) == texels_per_unit(spec, other)
+    assert texels_per_unit(spec, tiny(output, "pseudo_capture.width=48")) != texels_per_unit(spec, plain)
 
 
 def test_curves_are_drawn_by_share():
