@@ -49,7 +49,9 @@ class CaptureManifest(BaseModel):
             return cls()
         except (OSError, ValidationError) as error:
             raise TronError(
-                "the manifest of the captures is damaged", path, "delete it and run mode=captures again"
+                "the manifest of the captures is damaged",
+                path,
+                "delete it and run again with the same settings",
             ) from error
 
     def record(self, capture: Path) -> None:
@@ -100,7 +102,7 @@ def verify_captures(folder: Path) -> list[str]:
             continue
         recorded = manifest.captures.get(name)
         if recorded is None:
-            problems.append(f"{name}: not in the manifest: mode=captures with the same settings records it")
+            problems.append(f"{name}: not in the manifest: a run with the same settings records it")
         else:
             problems += [f"{name}/{problem}" for problem in _changes(folder / name, recorded)]
         problems += [f"{name}: {problem}" for problem in _unreadable(folder / name)]
