@@ -51,7 +51,7 @@ class CaptureManifest(BaseModel):
             raise TronError(
                 "the manifest of the captures is damaged",
                 path,
-                "delete it and run again with the same settings",
+                "delete it and run the same again",
             ) from error
 
     def record(self, capture: Path) -> None:
