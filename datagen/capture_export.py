@@ -20,14 +20,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import yaml
 
 from datagen.build import Geometry
 from datagen.capture_manifest import CaptureManifest
+from datagen.capture_recipe import adopt_recipe
 from datagen.capture_settings import CaptureSettings
 from datagen.clusters import logs_folder, require_cluster
 from datagen.failures import record_failures, summary
-from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
+from datagen.pathtrace import gbuffers, render_frames
 from datagen.photographs import Photograph, described, drift
 from datagen.plan import Sources, Work, chosen
 from datagen.ready_sources import ready_sources
@@ -36,18 +36,17 @@ from datagen.run import draw_and_build
 from datagen.scene import SceneSpec, scene_name
 from datagen.scheduling import make_each
 from datagen.settings import Settings
+from datagen.true_maps import MAPS, true_maps
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder, write_capture
-from tron.claim import read_recipe, require_same
-from tron.cli.recipes import model_defaults
 from tron.color import to_display
 from tron.errors import TronError
 from tron.images import encode_exr
 from tron.runtime import activate
 from tron.seeds import generator, integer
 from tron.shading.environment import EnvironmentMap
-from tron.storage import locked, require_free_space, write_if_changed
+from tron.storage import locked, require_free_space
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +59,6 @@ GROUP_PIXELS = 2**20
 CAPTURES = "captures"
 """Folder of the captures within output_dir."""
 
-CONFIG_NAME = "config.yaml"
 ENVIRONMENT_NAME = "environment.exr"
 SPEC_NAME = "spec.json"
 PHOTOGRAPHS_NAME = "photographs.json"
@@ -85,7 +83,7 @@ def make_captures(settings: Settings) -> int:
     sources = ready_sources(settings)
     folder = settings.output_dir / CAPTURES
     with locked(settings.output_dir):
-        _adopt(settings, folder)
+        adopt_recipe(folder, settings.capture_recipe())
         manifest = CaptureManifest.load(folder)
         missing = [item for item in items if not _finished(folder / item.name, wanted)]
         require_free_space(folder, len(missing) * _estimate_bytes(settings))
@@ -201,7 +199,7 @@ def surface_points(capture: Capture, count: int, spec: SceneSpec) -> tuple[np.nd
 class _Shots:
     """Views that are rendered a group at a time, the group of the one that is asked for; the last is kept."""
 
-    FIELDS = ("image", "mask", "normal", "base_color", "roughness", "metallic", "irradiance", "depth")
+    FIELDS = ("image", "mask", *MAPS)
 
     def __init__(
         self,
@@ -234,25 +232,8 @@ class _Shots:
         frames = render_frames(self._scene, cameras, self._settings.path_spp, seeds, transparent=True)
         shots = []
         for i, (camera, truth, frame) in enumerate(zip(cameras, gbuffers(self._geometry, cameras), frames)):
-            seen = truth.valid
-            direct = direct_irradiance(
-                self._geometry,
-                self._scene,
-                camera,
-                self._settings.reference_spp,
-                self._seed(first + i, "reference"),
-            )
-            maps = {
-                "normal": truth.normal,
-                "base_color": truth.base_color,
-                "roughness": truth.roughness,
-                "metallic": truth.metallic,
-                "irradiance": direct.shadowed,
-                "depth": np.linalg.norm(truth.position - camera.position, axis=-1),
-            }
-            maps = {
-                name: np.where(seen if x.ndim == 2 else seen[..., None], x, 0) for name, x in maps.items()
-            }
+            seed = self._seed(first + i, "reference")
+            maps = true_maps(self._geometry, self._scene, camera, truth, self._settings.reference_spp, seed)
             straight, mask = straightened(frame, f"view {first + i} of {self._spec.name}")
             image = self._picture(first + i, straight, mask)
             shots.append({"image": image, "mask": mask, **maps})
@@ -271,21 +252,6 @@ class _Shots:
     def _seed(self, number: int, what: str) -> int:
         spec = self._spec
         return integer(spec.seed, spec.split, spec.index, "capture", number, what)
-
-
-def _adopt(settings: Settings, folder: Path) -> None:
-    """Make the folder of captures this recipe's, or make sure that it is already."""
-    path, recipe = folder / CONFIG_NAME, settings.capture_recipe()
-    before = read_recipe(path)
-    if before is not None:
-        if "captures" in before:  # as the key was called at first
-            before["capture"] = before.pop("captures")
-        require_same(before, recipe, folder, "captures", defaults=model_defaults(Settings))
-    elif folder.is_dir() and any(folder.iterdir()):
-        raise TronError(
-            "folder holds something else than these captures", folder, "choose another output_dir"
-        )
-    write_if_changed(path, yaml.safe_dump(recipe, sort_keys=True, allow_unicode=True))
 
 
 def _finished(folder: Path, settings: CaptureSettings) -> bool:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from datagen.blind_capture import read_blind_capture
 from datagen.failures import TRACEBACKS
-from tron.captures.folder import read_capture_folder
+from tron.captures.folder import is_capture_folder, read_capture_folder
 from tron.errors import TronError
 from tron.storage import sha256, write_if_changed
 
@@ -48,7 +49,9 @@ class CaptureManifest(BaseModel):
             return cls()
         except (OSError, ValidationError) as error:
             raise TronError(
-                "the manifest of the captures is damaged", path, "delete it and run mode=captures again"
+                "the manifest of the captures is damaged",
+                path,
+                "delete it and run the same again",
             ) from error
 
     def record(self, capture: Path) -> None:
@@ -56,6 +59,11 @@ class CaptureManifest(BaseModel):
         self.captures[capture.name] = {
             name: FileEntry(bytes=path.stat().st_size, sha256=sha256(path)) for name, path in _files(capture)
         }
+
+    def holds(self, capture: Path) -> bool:
+        """Whether every file that was taken down of a capture is there and as long as it was."""
+        sizes = {name: path.stat().st_size for name, path in _files(capture)}
+        return sizes == {name: entry.bytes for name, entry in self.captures.get(capture.name, {}).items()}
 
     def save(self, folder: Path) -> None:
         """Write folder/manifest.json, captures and files in order of name."""
@@ -94,7 +102,7 @@ def verify_captures(folder: Path) -> list[str]:
             continue
         recorded = manifest.captures.get(name)
         if recorded is None:
-            problems.append(f"{name}: not in the manifest: mode=captures with the same settings records it")
+            problems.append(f"{name}: not in the manifest: a run with the same settings records it")
         else:
             problems += [f"{name}/{problem}" for problem in _changes(folder / name, recorded)]
         problems += [f"{name}: {problem}" for problem in _unreadable(folder / name)]
@@ -118,7 +126,8 @@ def _changes(capture: Path, recorded: dict[str, FileEntry]) -> Iterator[str]:
 def _unreadable(capture: Path) -> Iterator[str]:
     """Problems of reading a capture, or the picture or a map of a view."""
     try:
-        views = read_capture_folder(capture).views
+        ours = is_capture_folder(capture)
+        views = (read_capture_folder(capture) if ours else read_blind_capture(capture)).views
     except TronError as error:
         yield str(error)
         return

@@ -31,26 +31,14 @@ class SensorSettings(SettingsModel):
     read_noise: float = Field(default=3.0, ge=0, description="Standard deviation of reading them, electrons.")
 
 
-class CaptureSettings(SettingsModel):
-    """Scenes of the test split as captures: views from all sides, path-traced under one light, true maps."""
+class ViewSettings(SettingsModel):
+    """Views of any capture: their light, size and samples, and the other lights that some are seen under."""
 
-    scenes: int = Field(
-        default=4,
-        ge=1,
-        le=1_000_000,
-        description="Captures that mode=captures makes, of as many test scenes.",
-    )
     lights: list[LightChoice] = Field(
         default=["overcast", "studio", "sun"],
         min_length=1,
         max_length=64,
         description="Light of each capture, in rotation, as in a split's lights.",
-    )
-    views: int = Field(
-        default=64,
-        ge=2,
-        le=100_000,
-        description="Views of a capture from all sides; each 8th is held out, from the first.",
     )
     width: int = Field(default=128, ge=8, le=8192, description="View width in pixels.")
     height: int = Field(default=128, ge=8, le=8192, description="View height in pixels.")
@@ -66,11 +54,6 @@ class CaptureSettings(SettingsModel):
         le=10_000_000,
         description="Also store about so many points on surfaces, with their colours, as photos would give.",
     )
-    photographs: bool = Field(
-        default=False,
-        description="Take training views as photographs, each with its own exposure, white balance and noise "
-        "by sensor; held-out views stay true renders, which reconstructions are judged by.",
-    )
     sensor: SensorSettings = Field(default=SensorSettings(), description="Camera of the photographs.")
     relights: list[LightChoice] = Field(
         default=[],
@@ -79,3 +62,25 @@ class CaptureSettings(SettingsModel):
         "well, into output_dir/relit: the truth of relighting.",
     )
     relight_spp: int = Field(default=144, ge=1, description="Paths per pixel of those.")
+
+
+class CaptureSettings(ViewSettings):
+    """Scenes of the test split as captures: views from all sides, path-traced under one light, true maps."""
+
+    scenes: int = Field(
+        default=4,
+        ge=1,
+        le=1_000_000,
+        description="Captures that mode=captures makes, of as many test scenes.",
+    )
+    views: int = Field(
+        default=64,
+        ge=2,
+        le=100_000,
+        description="Views of a capture from all sides; each 8th is held out, from the first.",
+    )
+    photographs: bool = Field(
+        default=False,
+        description="Take training views as photographs, each with its own exposure, white balance and noise "
+        "by sensor; held-out views stay true renders, which reconstructions are judged by.",
+    )

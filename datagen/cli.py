@@ -5,6 +5,7 @@ from __future__ import annotations
 from datagen.capture_export import make_captures
 from datagen.equal_error import measure_equal_error
 from datagen.projection import project
+from datagen.pseudo_captures import make_pseudo_captures
 from datagen.run import make
 from datagen.settings import Settings
 from datagen.sharing import measure_sharing
@@ -18,10 +19,10 @@ def main(settings: Settings) -> int:
     Scenes are drawn from seeds, path-traced by Mitsuba, turned into surfels and rendered again by TRON's
     tracer; the pairs land in tar shards with a manifest. With mode=plan nothing is made: a small scene is
     timed, and what is missing is printed with its bytes, memory and hours. With mode=captures scenes are
-    path-traced from all sides instead, with true maps, as folders that tron-reconstruct and nerfstudio read.
-    With source=captured each folder of photos in captures=DIR is reconstructed and lit, and its photos are
-    the pairs' truth.
-    With mode=equal_error guidance of a dataset's test scenes is held against the path tracer:
+    path-traced from all sides instead, with true maps, as folders that tron-reconstruct and nerfstudio read;
+    with mode=pseudo_captures they are photographed as by a phone, and the truth is kept apart. With
+    source=captured each folder of photos in captures=DIR is reconstructed and lit, and its photos are the
+    pairs' truth. With mode=equal_error guidance of a dataset's test scenes is held against the path tracer:
     equal_error.json; with mode=sharing frames under many lights at once against frames one by one:
     sharing.json. An interrupted run resumes. The exit code is 1 if a scene could not be made
     (failures.jsonl says why, that of captures lies among them) or if validation found a problem.
@@ -33,6 +34,8 @@ def main(settings: Settings) -> int:
         return 0
     if settings.mode == "captures":
         return 1 if make_captures(settings) else 0
+    if settings.mode == "pseudo_captures":
+        return 1 if make_pseudo_captures(settings) else 0
     if settings.mode == "equal_error":
         measure_equal_error(settings)
         return 0
@@ -54,5 +57,6 @@ cli = command(
         "tron-datagen output_dir=outputs/dataset mode=validate",
         "tron-datagen experiment=captures output_dir=outputs/synthetic",
         "tron-datagen experiment=captured captures=photos output_dir=outputs/pairs",
+        "tron-datagen experiment=pseudo_captures output_dir=outputs/pseudo",
     ),
 )

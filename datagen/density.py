@@ -41,8 +41,10 @@ def most_texels(spec: SceneSpec, settings: Settings) -> int:
 
 def _cameras(spec: SceneSpec, settings: Settings) -> list[list[Camera]]:
     """Some cameras of each path that pictures are taken from."""
-    recipe, capture = settings.split(spec.split), settings.capture
-    if settings.mode == "captures":
+    recipe = settings.split(spec.split)
+    captures = {"captures": settings.capture, "pseudo_captures": settings.pseudo_capture}
+    if settings.mode in captures:
+        capture = captures[settings.mode]
         return [spec.views(PATH_SAMPLES, capture.width, capture.height)]
     return [
         spec.views(PATH_SAMPLES, settings.view_width, settings.view_height),

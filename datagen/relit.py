@@ -13,7 +13,8 @@ import numpy as np
 
 from datagen.build import Geometry
 from datagen.capture_manifest import CaptureManifest
-from datagen.capture_settings import CaptureSettings
+from datagen.capture_settings import ViewSettings
+from datagen.exposure import metered
 from datagen.pathtrace import render_frames
 from datagen.scene import SceneSpec
 from tron.cameras import Camera
@@ -39,7 +40,7 @@ def write_relit(
     geometry: Geometry,
     environments: Sequence[EnvironmentMap],
     cameras: Mapping[str, Camera],
-    settings: CaptureSettings,
+    settings: ViewSettings,
 ) -> None:
     """Path-trace the views under each of the lights, and write a capture folder of each.
 
@@ -62,11 +63,13 @@ def write_relit(
             integer(spec.seed, spec.split, spec.index, "relit", number, name, "path") for name in cameras
         ]
         frames = render_frames(scene, list(cameras.values()), settings.relight_spp, seeds, transparent=True)
-        views = []
-        for (name, camera), frame in zip(cameras.items(), frames):
-            straight, mask = straightened(frame, f"{name} of {path.name}")
-            views.append(View(name, camera, straight, "linear", mask=mask))
-        capture = Capture(tuple(views), up=np.array([0.0, 0.0, 1.0]), exposure=environment.exposure())
+        shots = [straightened(frame, f"{name} of {path.name}") for name, frame in zip(cameras, frames)]
+        views = [
+            View(name, camera, straight, "linear", mask=mask)
+            for (name, camera), (straight, mask) in zip(cameras.items(), shots)
+        ]
+        exposure = shown_with(spec, environment, frames)
+        capture = Capture(tuple(views), up=np.array([0.0, 0.0, 1.0]), exposure=exposure)
         beside = {"environment.exr": encode_exr(environment.image, half=False)}
         path.parent.mkdir(parents=True, exist_ok=True)
         write_capture(path, capture, overwrite=True, beside=beside)
@@ -81,6 +84,18 @@ def record_relit(folder: Path, names: Sequence[str], families: Sequence[str]) ->
         for path in relit_folders(folder, name, families):
             manifest.record(path)
     manifest.save(folder)
+
+
+def shown_with(spec: SceneSpec, environment: EnvironmentMap, frames: np.ndarray) -> float:
+    """Exposure of views under a light: the light's own; indoors, that of what covers their pixels.
+
+    Args:
+        spec: of the scene; says whether it is metered.
+        environment: the light.
+        frames: (K, H, W, 4) linear radiance and coverage.
+    """
+    exposure = environment.exposure()
+    return metered(frames[..., :3], frames[..., 3] >= 1, exposure) if spec.metered else exposure
 
 
 def straightened(frame: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:

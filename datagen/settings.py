@@ -17,15 +17,17 @@ from pydantic import (
 from datagen.capture_settings import CaptureSettings
 from datagen.captured_settings import CapturedSettings
 from datagen.lights import PROCEDURAL, Family, LightChoice
+from datagen.pseudo_capture_settings import PseudoCaptureSettings
 from datagen.settings_model import SettingsModel
 from datagen.split_settings import SplitSettings
 from datagen.surfel_settings import SurfelReconstruction, SurfelSources
 from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounces
 
+Mode = Literal["make", "plan", "validate", "captures", "pseudo_captures", "equal_error", "sharing"]
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
     *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
-    *("capture", "equal_error", "sharing", "variety_against", "disjoint_from"),
+    *("capture", "pseudo_capture", "equal_error", "sharing", "variety_against", "disjoint_from"),
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
@@ -94,14 +96,15 @@ class Settings(SettingsModel):
     """Settings of ``tron-datagen``."""
 
     output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
-    mode: Literal["make", "plan", "validate", "captures", "equal_error", "sharing"] = Field(
+    mode: Mode = Field(
         "make",
         description="make the dataset; plan it: print what is missing, the bytes and hours it takes and the "
         "memory of a worker, measured by a small probe here, and render nothing else; validate the one in "
         "output_dir and list every problem; path-trace captures for tron-reconstruct into "
-        "output_dir/captures; measure on the test scenes in output_dir how long the path tracer takes to be "
-        "as near the truth as guidance is (equal_error); or measure what it saves to path-trace under many "
-        "lights at once (sharing).",
+        "output_dir/captures; photograph the splits' scenes as a phone would, with the truth kept apart in "
+        "output_dir/truth (pseudo_captures); measure on the test scenes in output_dir how long the path "
+        "tracer takes to be as near the truth as guidance is (equal_error); or measure what it saves to "
+        "path-trace under many lights at once (sharing).",
     )
     source: Literal["synthetic", "captured"] = Field(
         "synthetic",
@@ -135,6 +138,9 @@ class Settings(SettingsModel):
     )
     capture: CaptureSettings = Field(
         CaptureSettings(), description="Captures to reconstruct, of the test scenes."
+    )
+    pseudo_capture: PseudoCaptureSettings = Field(
+        PseudoCaptureSettings(), description="Captures whose truth is hidden, of the splits' scenes."
     )
     sharing: SharingSettings = Field(
         SharingSettings(),
@@ -355,7 +361,9 @@ class Settings(SettingsModel):
                 raise ValueError(
                     f"{name}.frames is {split.frames}, longer than path_frames, {self.path_frames}"
                 )
-            if not captures:
+            if self.mode == "pseudo_captures":
+                lights["pseudo_capture"] = [*self.pseudo_capture.lights, *self.pseudo_capture.relights]
+            elif not captures:
                 lights[name] = split.lights
         for name, wanted in lights.items():
             if self.environments is None and self._ask_hdri(wanted):
@@ -425,6 +433,12 @@ class Settings(SettingsModel):
     def capture_recipe(self) -> dict[str, Any]:
         """Keys that decide a capture's content, as plain values."""
         return self.model_dump(mode="json", include=CAPTURED)
+
+    def pseudo_capture_recipe(self) -> dict[str, Any]:
+        """Keys that decide a pseudo-capture's content, as plain values; of the splits that have scenes."""
+        splits = {name: {"style", "frames"} for name in self.used_splits()}
+        shared = {key: True for key in CAPTURED if key not in ("capture", "test")}
+        return self.model_dump(mode="json", include={**shared, **splits, "pseudo_capture": True})
 
 
 def _without_scenes(split: Any) -> bool:

@@ -9,6 +9,7 @@ from pathlib import Path
 from datagen.capture_export import CAPTURES
 from datagen.capture_manifest import capture_names, verify_captures
 from datagen.disjoint import overlaps, shared_scenes
+from datagen.pseudo_captures import TRUTH
 from datagen.relit import RELIT
 from datagen.source_list import read_source_list
 from tron.shards.manifest import MANIFEST_NAME, Manifest
@@ -31,7 +32,7 @@ def validate(folder: Path, disjoint_from: Sequence[Path] = ()) -> int:
     captures = folder / CAPTURES
     problems = [
         f"{name}/{problem}"
-        for name in (CAPTURES, RELIT)
+        for name in (CAPTURES, TRUTH, RELIT)
         if (folder / name).is_dir()
         for problem in verify_captures(folder / name)
     ]

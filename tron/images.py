@@ -173,9 +173,9 @@ def encode_png(image: np.ndarray) -> bytes:
     return _encode_display(image, "PNG")
 
 
-def encode_jpeg(image: np.ndarray) -> bytes:
-    """Encode display values in [0, 1] (clipped), or uint8, of 1 or 3 channels as a JPEG of quality 95."""
-    return _encode_display(image, "JPEG")
+def encode_jpeg(image: np.ndarray, quality: int = _JPEG_QUALITY) -> bytes:
+    """Encode display values in [0, 1] (clipped), or uint8, of 1 or 3 channels as a JPEG; quality 1 to 95."""
+    return _encode_display(image, "JPEG", quality)
 
 
 def decode_png(data: bytes) -> np.ndarray:
@@ -202,13 +202,13 @@ def decode_png(data: bytes) -> np.ndarray:
     return pixels.reshape(*pixels.shape[:2], -1)
 
 
-def _encode_display(image: np.ndarray, file_format: str) -> bytes:
+def _encode_display(image: np.ndarray, file_format: str, quality: int = _JPEG_QUALITY) -> bytes:
     image = _shaped(image, (1, 3, 4) if file_format == "PNG" else (1, 3))
     if image.dtype != np.uint8:
         image = np.round(np.clip(np.nan_to_num(image, nan=0.0), 0, 1) * 255).astype(np.uint8)
     stream = io.BytesIO()
     Image.fromarray(image[..., 0] if image.shape[2] == 1 else image).save(
-        stream, file_format, **({"quality": _JPEG_QUALITY} if file_format == "JPEG" else {})
+        stream, file_format, **({"quality": quality} if file_format == "JPEG" else {})
     )
     return stream.getvalue()
 
