@@ -8,9 +8,10 @@ record exists, which is written last.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -33,6 +34,7 @@ from tron.storage import write_if_changed
 RECORD_NAME = "record.json"
 CONFIG_NAME = "config.yaml"
 SURFEL_BYTES = 320
+NOTHING: Mapping[str, int] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -168,13 +170,21 @@ def scene_folder(output: Path, name: str) -> Path:
     return output / "scenes" / name
 
 
-def read_record(output: Path, name: str) -> Record | None:
-    """The record of a finished scene; None if it has to be made (again)."""
+def read_record(output: Path, name: str, stored: Mapping[str, int] = NOTHING) -> Record | None:
+    """The record of a finished scene; None if it has to be made (again).
+
+    Args:
+        output: folder of the dataset.
+        name: of the scene.
+        stored: bytes of the shards in the dataset's store, by name: they need not be in the folder.
+    """
     try:
         record = Record.model_validate_json((scene_folder(output, name) / RECORD_NAME).read_bytes())
     except (OSError, ValidationError):
         return None
-    whole = all(_size(output / entry.name) == entry.bytes for entry in record.shards)
+    whole = all(
+        entry.bytes in (_size(output / entry.name), stored.get(entry.name)) for entry in record.shards
+    )
     return record if whole else None
 
 
@@ -182,16 +192,20 @@ def _size(path: Path) -> int | None:
     return path.stat().st_size if path.is_file() else None
 
 
-def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
-    """Bytes that scenes may take on disk: half-precision EXR hardly compresses noise."""
+def estimate_bytes(settings: Settings, items: Iterable[Work], shards: bool = True) -> int:
+    """Bytes that scenes may take on disk, their shards too or the rest alone.
+
+    Half-precision EXR hardly compresses noise.
+    """
     total = 0
     for item in items:
         recipe = settings.split(item.split)
         members = [MEMBERS[name] for name in clip_members(recipe.reference_buffers)]
         pixel = sum(member.bytes * member.channels for member in members)
         frame = recipe.width * recipe.height * pixel + 16_384
+        clip = recipe.frames * frame if shards else 0
         previews = preview_bytes(recipe.width, recipe.height, recipe.frames, len(members))
-        total += len(recipe.lights) * (recipe.frames * frame + previews) + settings.surfels * SURFEL_BYTES
+        total += len(recipe.lights) * (clip + previews) + settings.surfels * SURFEL_BYTES
     return total
 
 
@@ -199,12 +213,15 @@ def config_text(settings: Settings) -> str:
     """config.yaml of the dataset: schema, recipe and numbers of scenes, without where and by whom."""
     counts = {split: settings.split(split).scenes for split in SPLITS}
     described = {"schema": SCHEMA_VERSION, "scenes": counts, "recipe": settings.recipe()}
+    if settings.shard is not None:
+        described["shard"] = settings.shard
     return yaml.safe_dump(described, sort_keys=True, allow_unicode=True)
 
 
 def config_sha256(settings: Settings) -> str:
-    """Hash of the resolved configuration, 64 hexadecimal digits."""
-    return hashlib.sha256(config_text(settings).encode()).hexdigest()
+    """Hash of the resolved configuration, 64 hexadecimal digits; all parts of a dataset have its own."""
+    whole = settings.model_copy(update={"shard": None})
+    return hashlib.sha256(config_text(whole).encode()).hexdigest()
 
 
 def adopt(settings: Settings) -> None:
@@ -230,6 +247,7 @@ def require_adoptable(settings: Settings) -> None:
         except (KeyError, TypeError, ValueError) as error:
             raise TronError("config.yaml is damaged", path, CHOOSE_ANOTHER) from error
         require_schema(schema, settings.output_dir)
+        _require_same_part(old.get("shard"), scenes, settings)
         now = settings.recipe()
         for split in SPLITS:
             if not scenes.get(split):  # there is nothing of it yet, so it may be anything from now on
@@ -248,6 +266,20 @@ def require_adoptable(settings: Settings) -> None:
     elif any(settings.output_dir.glob("*.tar")):
         raise TronError(
             "output_dir holds shards of something else", settings.output_dir, "choose an empty folder"
+        )
+
+
+def _require_same_part(part: str | None, scenes: Mapping[str, int], settings: Settings) -> None:
+    """Refuse a folder that holds another part, or the same of another number of scenes."""
+    if part != settings.shard:
+        held = f"part {part}" if part else "a whole dataset"
+        wanted = f"shard={settings.shard}" if settings.shard else "a whole dataset"
+        raise TronError(f"output_dir holds {held}, not {wanted}", settings.output_dir, CHOOSE_ANOTHER)
+    if part and any(scenes.get(split, 0) != settings.split(split).scenes for split in SPLITS):
+        raise TronError(  # every n-th scene of a longer plan would be others
+            f"output_dir holds part {part} of a dataset with other numbers of scenes",
+            settings.output_dir,
+            CHOOSE_ANOTHER,
         )
 
 

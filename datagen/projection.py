@@ -14,6 +14,7 @@ from datagen.account import read_other
 from datagen.clusters import LOCAL, cores, logs_folder, require_cluster
 from datagen.plan import Work, chosen, find_sources, plan, read_record, require_adoptable, scene_folder
 from datagen.probe import SceneCost, probe
+from datagen.scale_settings import part_of
 from datagen.scheduling import TIMES_NAME
 from datagen.settings import Settings
 from tron.cli.termination import termination_unwinds
@@ -45,7 +46,7 @@ def project(settings: Settings) -> str:
     Raises:
         TronError: wherever making the dataset would, before its first scene.
     """
-    items = plan(settings)
+    items = part_of(plan(settings), settings.shard)
     wanted = chosen(items, settings.only)
     require_cluster(settings)
     require_adoptable(settings)

@@ -14,15 +14,18 @@ from tron.shards.verify import verify
 log = logging.getLogger(__name__)
 
 
-def validate(folder: Path) -> int:
+def validate(folder: Path, store: str | None = None) -> int:
     """Log every problem of a dataset and of the captures beside it, one line each, and return their number.
 
     Beside what ``tron.shards.verify`` finds in the shards, every scene that has clips must still
-    have its specification and its surfels. A folder may hold captures alone.
+    have its specification and its surfels. A folder may hold captures alone. With a store, its shards and
+    manifest are looked at, and nothing else.
 
     Raises:
         TronError: the folder holds neither a dataset nor captures.
     """
+    if store is not None:
+        return _store_problems(store)
     captures = folder / CAPTURES
     problems = [
         f"{name}/{problem}"
@@ -39,6 +42,14 @@ def validate(folder: Path) -> int:
     if captures.is_dir():
         log.info("%d captures", len(capture_names(captures)))
     log.info("%d problems", len(problems))
+    return len(problems)
+
+
+def _store_problems(store: str) -> int:
+    problems = verify(store)
+    for problem in problems:
+        log.error("%s", problem)
+    log.info("%d problems in %s", len(problems), store)
     return len(problems)
 
 
