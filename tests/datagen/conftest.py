@@ -39,3 +39,36 @@ def small_dataset(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Pat
     output = tmp_path_factory.mktemp("small") / "dataset"
     assert make(small(output)) == 0
     return output
+
+
+@pytest.fixture(scope="session")
+def running_s3():
+    """moto's S3 server, for the session."""
+    pytest.importorskip("moto.server", reason="no S3 server: pip install 'moto[server]'")
+    pytest.importorskip("s3fs", reason="no S3 client: pip install s3fs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ACCESS_KEY_ID", "tron-test-key")
+        patch.setenv("AWS_SECRET_ACCESS_KEY", "tron-test-secret")
+        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+        patch.setenv("AWS_MAX_ATTEMPTS", "1")
+        from tests.datagen.s3_server import S3Server
+
+        server = S3Server()
+        yield server
+        server.stop()
+
+
+@pytest.fixture
+def s3_server(running_s3, monkeypatch: pytest.MonkeyPatch):
+    """The server, running, with the environment of a client that finds it."""
+    running_s3.stop()
+    running_s3.start()
+    for name, value in (
+        ("AWS_ACCESS_KEY_ID", "tron-test-key"),
+        ("AWS_SECRET_ACCESS_KEY", "tron-test-secret"),
+        ("AWS_DEFAULT_REGION", "us-east-1"),
+        ("AWS_MAX_ATTEMPTS", "1"),
+    ):
+        monkeypatch.setenv(name, value)
+    running_s3.point_to(running_s3.address, monkeypatch)
+    return running_s3
