@@ -1,7 +1,8 @@
 """The object store that shards leave output_dir for, as soon as they are whole.
 
 Records stay in output_dir. A scene is finished when its record is there and each of its shards is in the
-folder or, with its bytes, in the store; what lies in the folder still is sent when the command is given again.
+folder or, with its bytes, in the store; what still lies in the folder is sent when the command is given
+again.
 """
 
 from __future__ import annotations

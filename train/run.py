@@ -32,13 +32,14 @@ from tron import seeds
 from tron.claim import read_recipe, require_same
 from tron.cli.instantiation import make
 from tron.cli.recipes import model_defaults
+from tron.dataset_folder import DatasetFolder
 from tron.errors import TronError
 from tron.neural.losses import RendererLoss
 from tron.neural.protocols import Renderer
 from tron.neural.weights import restore_renderer, save_renderer
 from tron.runtime import set_torch_threads
 from tron.shards.manifest import MANIFEST_NAME
-from tron.storage import locked, sha256, write_atomic
+from tron.storage import locked, write_atomic
 
 log = logging.getLogger(__name__)
 
@@ -216,7 +217,7 @@ def _claim_settings(settings: Settings, processes: int) -> None:
     """
     path = settings.output_dir / "config.yaml"
     described = yaml.safe_load(yaml.safe_dump(settings.model_dump(mode="json")))
-    described["dataset_sha256"] = sha256(settings.dataset / MANIFEST_NAME)
+    described["dataset_sha256"] = DatasetFolder(settings.dataset).sha256(MANIFEST_NAME)
     described["processes"] = processes
     earlier = read_recipe(path)
     if earlier is None:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from train.curriculum import Stage
+from tron.dataset_folder import DatasetPlace
 
 HELD_OUT = "test"
 """The split that evaluation judges by."""
@@ -118,7 +119,9 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    dataset: Path = Field(description="Dataset folder that tron-datagen wrote.")
+    dataset: DatasetPlace = Field(
+        description="Dataset folder that tron-datagen wrote, or its URL, such as s3://bucket/dataset."
+    )
     output_dir: Path = Field(
         description="Folder for renderer.safetensors, checkpoints, metrics.csv, config.yaml."
     )

@@ -13,7 +13,7 @@ from tron.errors import TronError
 def test_parts_are_disjoint_and_together_the_plan(small_settings, tmp_path, count):
     items = plan(small_settings(tmp_path))
     parts = [part_of(items, f"{number}/{count}") for number in range(1, count + 1)]
-    assert sorted(sum(parts, []), key=items.index) == items
+    assert sorted((item for part in parts for item in part), key=items.index) == items
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
 
 

@@ -31,7 +31,8 @@ def bucket(s3_server) -> str:
 
 def test_shards_leave_for_the_store_and_are_read_there(tiny_scenes, bucket, s3_server, files_of, tmp_path):
     local, output, url = tmp_path / "local", tmp_path / "out", f"{bucket}/set"
-    assert make(check(compose_recipe("conf.datagen", Settings, [*tiny_scenes, "cluster=none", f"output_dir={local}"]), Settings)) == 0
+    recipe = [*tiny_scenes, "cluster=none", f"output_dir={local}"]
+    assert make(check(compose_recipe("conf.datagen", Settings, recipe), Settings)) == 0
     assert make(stored(tiny_scenes, output, url)) == 0
     assert not list(output.glob("*.tar"))
     here = files_of(local)
@@ -52,7 +53,9 @@ def test_shards_leave_for_the_store_and_are_read_there(tiny_scenes, bucket, s3_s
     assert all(after[name] == before[name] for name in before if name.endswith(".tar")), "sent once"
 
 
-def test_what_the_store_lost_is_made_again_and_what_is_damaged_is_told(tiny_scenes, bucket, s3_server, tmp_path):
+def test_what_the_store_lost_is_made_again_and_what_is_damaged_is_told(
+    tiny_scenes, bucket, s3_server, tmp_path
+):
     output, url = tmp_path / "out", f"{bucket}/set"
     assert make(stored(tiny_scenes, output, url)) == 0
     entry = Manifest.load(url).shards[0]
