@@ -101,7 +101,7 @@ class DatasetFolder:
         return found.hexdigest()
 
     def sizes(self, below: str = "") -> dict[str, int]:
-        """Bytes of the files in this folder, or in one within it, by name; none where there is no such folder.
+        """Bytes of the files in this folder, or in one within it, by name; none where it is not.
 
         Raises:
             TronError: the store does not answer.

@@ -53,9 +53,7 @@ def test_shards_leave_for_the_store_and_are_read_there(tiny_scenes, bucket, s3_s
     assert all(after[name] == before[name] for name in before if name.endswith(".tar")), "sent once"
 
 
-def test_what_the_store_lost_is_made_again_and_what_is_damaged_is_told(
-    tiny_scenes, bucket, s3_server, tmp_path
-):
+def test_what_the_store_lost_is_made_again_and_damage_is_told(tiny_scenes, bucket, s3_server, tmp_path):
     output, url = tmp_path / "out", f"{bucket}/set"
     assert make(stored(tiny_scenes, output, url)) == 0
     entry = Manifest.load(url).shards[0]

@@ -11,7 +11,7 @@ from tron.shards.reader import decode_clip, tar_files
 
 
 def verify(folder: Place) -> list[str]:
-    """Problems of a dataset folder, a path or a URL, one line each, naming shard and clip; empty when it is whole.
+    """Problems of a dataset folder (path or URL), one line each, with shard and clip; empty when it is whole.
 
     Finds missing, stray and truncated shards (a tar cut at a member's end reads without an error: only the
     count shows it), flipped bytes, missing, repeated and unknown members, and files that do not decode.
