@@ -89,9 +89,9 @@ class Settings(ScaleSettings):
         description="make the dataset; plan it: print what is missing, the bytes and hours it takes and the "
         "memory of a worker, measured by a small probe here, and render nothing else; validate the one in "
         "output_dir and list every problem; join the parts in `merge`; path-trace captures for "
-        "tron-reconstruct into output_dir/captures; measure on the test scenes in output_dir how long "
-        "the path tracer takes to be as near the truth as guidance is (equal_error); or measure what it saves to path-trace under many "
-        "lights at once (sharing).",
+        "tron-reconstruct into output_dir/captures; measure on the test scenes in output_dir how long the "
+        "path tracer takes to be as near the truth as guidance is (equal_error); or measure what it saves to "
+        "path-trace under many lights at once (sharing).",
     )
     seed: int = Field(
         0, description="Root of all randomness; a scene depends on it, its split and its index alone."

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from eval.datagen.kills import measure_kills
+from eval.datagen.merge import measure_merge
 from eval.datagen.parts import Found
 from eval.datagen.settings import DatagenSettings, Part
 from eval.datagen.sharing import measure_sharing
@@ -88,6 +89,7 @@ class Datagen(DatagenSettings):
             "workers": lambda at: measure_workers(self.workers, self.rounds, at),
             "soak": lambda at: measure_soak(tiny, self.soak_scenes, at),
             "kills": lambda at: measure_kills(_of(tiny, self.kill_scenes), self.kills, self.seed, at),
+            "merge": lambda at: measure_merge(_of(tiny, self.merge_scenes), at),
             "specifications": lambda at: measure_specifications(
                 [*_of(tiny, self.specified_scenes), *self.specified], at
             ),
