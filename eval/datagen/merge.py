@@ -33,7 +33,8 @@ class Merge:
         verdict = Cell("same bytes", "good") if same else Cell(f"{self.different[0]} differs", "bad")
         caption = (
             f"{PARTS} commands, shard=1/{PARTS} to {PARTS}/{PARTS}, each into a folder of its own; "
-            "mode=merge links their files into one, which is held against one run of the whole, all files but logs."
+            "mode=merge links their files into one, which is held against one run of the whole, all files "
+            "but logs."
         )
         rows = [[f"{self.files}", f"{self.copied}", verdict]]
         return [Section("merge", "Parts and the whole", [Table(caption, ["Files", "Copied", ""], rows)])]

@@ -1,7 +1,9 @@
 """A small dataset of three splits, made once for all tests that read one."""
 
+import socket
 from pathlib import Path
 
+import fsspec
 import pytest
 
 from datagen.run import make
@@ -41,6 +43,63 @@ def small_dataset(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return output
 
 
+class S3Server:
+    """moto's S3 server on a free port, and what tests do to it behind the data engine's back.
+
+    It can be stopped and started again on the same port, and is empty then. `address` is http://127.0.0.1:PORT.
+    """
+
+    def __init__(self) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self._port = free.getsockname()[1]
+        self.address = f"http://127.0.0.1:{self._port}"
+        self._count = 0
+        self.start()
+
+    def start(self) -> None:
+        from moto.server import ThreadedMotoServer
+
+        self._server = ThreadedMotoServer("127.0.0.1", self._port, verbose=False)
+        self._server.start()
+        self._running = True
+
+    def stop(self) -> None:
+        if self._running:
+            self._server.stop()
+            self._running = False
+
+    def bucket(self, url: str | None = None) -> str:
+        """URL of a new bucket, or of that one again."""
+        self._count += 1
+        url = url or f"s3://tron-{self._count}"
+        if not self._files().exists(url):
+            self._files().mkdir(url)
+        return url
+
+    def write(self, url: str, data: bytes) -> None:
+        self._files().pipe_file(url, data)
+
+    def times(self, url: str) -> dict[str, str]:
+        """When each file was written, by its name."""
+        listed = self._files().ls(url, detail=True)
+        return {
+            each["name"].rpartition("/")[2]: str(each["LastModified"])
+            for each in listed
+            if each["type"] == "file"
+        }
+
+    def point_to(self, address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Let clients look for the store there."""
+        monkeypatch.setenv("AWS_ENDPOINT_URL", address)
+        fsspec.get_filesystem_class("s3").clear_instance_cache()
+
+    def _files(self):
+        import s3fs
+
+        return s3fs.S3FileSystem(endpoint_url=self.address, skip_instance_cache=True)
+
+
 @pytest.fixture(scope="session")
 def running_s3():
     """moto's S3 server, for the session."""
@@ -51,8 +110,6 @@ def running_s3():
         patch.setenv("AWS_SECRET_ACCESS_KEY", "tron-test-secret")
         patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
         patch.setenv("AWS_MAX_ATTEMPTS", "1")
-        from tests.datagen.s3_server import S3Server
-
         server = S3Server()
         yield server
         server.stop()
