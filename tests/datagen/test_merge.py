@@ -12,7 +12,7 @@ from datagen.run import make
 from datagen.validate import validate
 from tron.errors import TronError
 
-pytestmark = pytest.mark.usefixtures("variant")
+pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.long]
 
 
 @pytest.fixture(scope="module")

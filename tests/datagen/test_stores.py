@@ -16,7 +16,7 @@ from tron.shards.manifest import Manifest
 from tron.shards.reader import read_clips
 from tron.shards.verify import verify
 
-pytestmark = pytest.mark.usefixtures("variant")
+pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.long]
 
 
 def stored(tiny_scenes, output: Path, url: str, *more: str) -> Settings:
