@@ -8,19 +8,31 @@ from pathlib import Path
 from datagen.card import card_text
 from datagen.clip_rows import ClipRow, rows_of_shard
 from datagen.contact_sheet import SHEET_NAME, contact_sheet
-from datagen.failures import Failure, record_failures
+from datagen.failures import LIST_NAME, Failure, record_failures
 from datagen.hub import METADATA_NAME, metadata_parquet
 from datagen.page.index_page import index_page
-from datagen.plan import Record, Sources, Work, config_sha256, read_record
+from datagen.plan import CONFIG_NAME, NOTHING, Record, Sources, Work, config_sha256, read_record
 from datagen.preview import sheet_name
 from datagen.settings import Settings
 from datagen.source_list import SOURCES_NAME, source_list
 from datagen.variety import MEASURES, VARIETY_NAME, Histograms, Other, shard_histograms, total
 from tron.report.histograms import Histogram, histograms_png
-from tron.shards.manifest import Manifest
+from tron.shards.manifest import MANIFEST_NAME, Manifest
 from tron.storage import write_if_changed
 
 CARD_NAME = "README.md"
+PAGE_NAME = "index.html"
+ACCOUNT = (
+    CONFIG_NAME,
+    CARD_NAME,
+    METADATA_NAME,
+    SHEET_NAME,
+    VARIETY_NAME,
+    PAGE_NAME,
+    LIST_NAME,
+    MANIFEST_NAME,
+)
+"""Files that are of the whole dataset and of no scene, the manifest last."""
 
 
 def read_other(folder: Path) -> Other:
@@ -43,6 +55,7 @@ def write_account(
     sources: Sources,
     failed: Mapping[str, Failure],
     other: Other | None = None,
+    stored: Mapping[str, int] = NOTHING,
 ) -> int:
     """Write failures, manifest, card, tables, sheets and page from the records; return how many failures.
 
@@ -50,9 +63,10 @@ def write_account(
         settings, items, sources: of the dataset.
         failed: scenes that this run tried in vain.
         other: another dataset to draw beside this one.
+        stored: bytes of the shards in its store, by name.
     """
     output = settings.output_dir
-    made = [record for item in items if (record := read_record(output, item.name)) is not None]
+    made = [record for item in items if (record := read_record(output, item.name, stored)) is not None]
     finished = {record.name: record.quarantined for record in made}
     failures = record_failures(output, settings, items, failed, finished)
     shards = sorted((entry for record in made for entry in record.shards), key=lambda entry: entry.name)
@@ -75,7 +89,7 @@ def write_account(
     write_if_changed(output / CARD_NAME, text)
     links = {CARD_NAME: CARD_NAME, METADATA_NAME: METADATA_NAME} | {name: name for name in shown}
     links |= {f"{entry.name}, all members": sheet_name(entry.name) for entry in shards[:MOST_LINKS]}
-    write_if_changed(output / "index.html", index_page("TRON dataset", rows, links))
+    write_if_changed(output / PAGE_NAME, index_page("TRON dataset", rows, links))
     manifest.save(output)
     return failures
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datagen.capture_export import make_captures
 from datagen.equal_error import measure_equal_error
+from datagen.merge import merge
 from datagen.projection import project
 from datagen.pseudo_captures import make_pseudo_captures
 from datagen.run import make
@@ -18,9 +19,10 @@ def main(settings: Settings) -> int:
 
     Scenes are drawn from seeds, path-traced by Mitsuba, turned into surfels and rendered again by TRON's
     tracer; the pairs land in tar shards with a manifest. With mode=plan nothing is made: a small scene is
-    timed, and what is missing is printed with its bytes, memory and hours. With mode=captures scenes are
-    path-traced from all sides instead, with true maps, as folders that tron-reconstruct and nerfstudio read;
-    with mode=pseudo_captures they are photographed as by a phone, and the truth is kept apart. With
+    timed, and what is missing is printed with its bytes, memory and hours. With shard=i/n one part of a
+    dataset is made; mode=merge joins them. With mode=captures scenes are path-traced from all sides
+    instead, with true maps, as folders that tron-reconstruct and nerfstudio read; with
+    mode=pseudo_captures they are photographed as by a phone, and the truth is kept apart. With
     source=captured each folder of photos in captures=DIR is reconstructed and lit, and its photos are the
     pairs' truth. With mode=equal_error guidance of a dataset's test scenes is held against the path tracer:
     equal_error.json; with mode=sharing frames under many lights at once against frames one by one:
@@ -28,10 +30,12 @@ def main(settings: Settings) -> int:
     (failures.jsonl says why, that of captures lies among them) or if validation found a problem.
     """
     if settings.mode == "validate":
-        return 1 if validate(settings.output_dir, settings.disjoint_from) else 0
+        return 1 if validate(settings.output_dir, settings.disjoint_from, settings.store) else 0
     if settings.mode == "plan":
         print(project(settings))
         return 0
+    if settings.mode == "merge":
+        return 1 if merge(settings) else 0
     if settings.mode == "captures":
         return 1 if make_captures(settings) else 0
     if settings.mode == "pseudo_captures":
@@ -55,6 +59,8 @@ cli = command(
         "tron-datagen experiment=demo output_dir=outputs/mine assets=models environments=hdris workers=8",
         "tron-datagen experiment=paper output_dir=outputs/paper workers=64 mode=plan",
         "tron-datagen output_dir=outputs/dataset mode=validate",
+        "tron-datagen experiment=demo output_dir=outputs/part1 shard=1/3",
+        "tron-datagen experiment=demo output_dir=outputs/dataset mode=merge 'merge=[outputs/part1,...]'",
         "tron-datagen experiment=captures output_dir=outputs/synthetic",
         "tron-datagen experiment=captured captures=photos output_dir=outputs/pairs",
         "tron-datagen experiment=pseudo_captures output_dir=outputs/pseudo",

@@ -8,9 +8,10 @@ record exists, which is written last.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import yaml
@@ -37,6 +38,7 @@ from tron.storage import write_if_changed
 RECORD_NAME = "record.json"
 CONFIG_NAME = "config.yaml"
 SURFEL_BYTES = 320
+NOTHING: Mapping[str, int] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -214,13 +216,21 @@ def scene_folder(output: Path, name: str) -> Path:
     return output / "scenes" / name
 
 
-def read_record(output: Path, name: str) -> Record | None:
-    """The record of a finished scene; None if it has to be made (again)."""
+def read_record(output: Path, name: str, stored: Mapping[str, int] = NOTHING) -> Record | None:
+    """The record of a finished scene; None if it has to be made (again).
+
+    Args:
+        output: folder of the dataset.
+        name: of the scene.
+        stored: bytes of the shards in the dataset's store, by name: they need not be in the folder.
+    """
     try:
         record = Record.model_validate_json((scene_folder(output, name) / RECORD_NAME).read_bytes())
     except (OSError, ValidationError):
         return None
-    whole = all(_size(output / entry.name) == entry.bytes for entry in record.shards)
+    whole = all(
+        entry.bytes in (_size(output / entry.name), stored.get(entry.name)) for entry in record.shards
+    )
     return record if whole else None
 
 
@@ -228,10 +238,11 @@ def _size(path: Path) -> int | None:
     return path.stat().st_size if path.is_file() else None
 
 
-def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
-    """Bytes that making scenes may take on disk: half-precision EXR hardly compresses noise.
+def estimate_bytes(settings: Settings, items: Iterable[Work], shards: bool = True) -> int:
+    """Bytes that making scenes may take on disk, their shards too or the rest alone.
 
-    Previews are counted, and what waits on disk in the scenes that are under way at one time.
+    Half-precision EXR hardly compresses noise. Previews are counted, and what waits on disk in the scenes
+    that are under way at one time.
     """
     total, waiting = 0, 0
     items, surfels = list(items), settings.surfels
@@ -242,19 +253,22 @@ def estimate_bytes(settings: Settings, items: Iterable[Work]) -> int:
         members = [MEMBERS[name] for name in clip_members(recipe.reference_buffers)]
         pixel = sum(member.bytes * member.channels for member in members)
         frame = recipe.width * recipe.height * pixel + 16_384
+        clip = recipe.frames * frame if shards else 0
         previews = preview_bytes(recipe.width, recipe.height, recipe.frames, len(members))
-        total += item.clips(settings) * (recipe.frames * frame + previews) + surfels * SURFEL_BYTES
+        total += item.clips(settings) * (clip + previews) + surfels * SURFEL_BYTES
         waiting = max(waiting, scratch_bytes(settings, item.split))
     return total + waiting * worker_count(settings, len(items))[0]
 
 
 def config_text(settings: Settings) -> str:
     """config.yaml of the dataset: schema, recipe and numbers of scenes, without where and by whom."""
-    described = {"schema": SCHEMA_VERSION, "scenes": _scenes(settings), "recipe": settings.recipe()}
+    described = {"schema": SCHEMA_VERSION, "scenes": planned_scenes(settings), "recipe": settings.recipe()}
+    if settings.shard is not None:
+        described["shard"] = settings.shard
     return yaml.safe_dump(described, sort_keys=True, allow_unicode=True)
 
 
-def _scenes(settings: Settings) -> dict[str, Any]:
+def planned_scenes(settings: Settings) -> dict[str, Any]:
     """Split -> number of its scenes, or the names of its captures."""
     if settings.source == "synthetic":
         return {split: settings.split(split).scenes for split in SPLITS}
@@ -265,8 +279,9 @@ def _scenes(settings: Settings) -> dict[str, Any]:
 
 
 def config_sha256(settings: Settings) -> str:
-    """Hash of the resolved configuration, 64 hexadecimal digits."""
-    return hashlib.sha256(config_text(settings).encode()).hexdigest()
+    """Hash of the resolved configuration, 64 hexadecimal digits; all parts of a dataset have its own."""
+    whole = settings.model_copy(update={"shard": None})
+    return hashlib.sha256(config_text(whole).encode()).hexdigest()
 
 
 def adopt(settings: Settings) -> None:
@@ -292,6 +307,7 @@ def require_adoptable(settings: Settings) -> None:
         except (KeyError, TypeError, ValueError) as error:
             raise TronError("config.yaml is damaged", path, CHOOSE_ANOTHER) from error
         require_schema(schema, settings.output_dir)
+        _require_same_part(old.get("shard"), scenes, settings)
         now = settings.recipe()
         then, asked = ({"source": each.get("source", "synthetic")} for each in (before, now))
         require_same(then, asked, settings.output_dir, "a dataset")
@@ -323,15 +339,30 @@ def _require_same_captures(before: dict[str, Any], scenes: dict[str, Any], setti
     require_same(
         before, settings.recipe(), settings.output_dir, "a dataset", defaults=model_defaults(Settings)
     )
-    if scenes != _scenes(settings):
+    if scenes != planned_scenes(settings):
         then, now = (
-            {name for names in each.values() for name in names} for each in (scenes, _scenes(settings))
+            {name for names in each.values() for name in names} for each in (scenes, planned_scenes(settings))
         )
         changed = sorted(then ^ now)
         raise TronError(
             f"output_dir holds a dataset of other captures: {', '.join(changed[:3]) or 'in other splits'}",
             settings.output_dir,
             "choose another output_dir, or name the ones to use: captured.names=[...]",
+        )
+
+
+def _require_same_part(part: str | None, scenes: Mapping[str, int], settings: Settings) -> None:
+    """Refuse a folder that holds another part, or the same of another number of scenes."""
+    if part != settings.shard:
+        held = f"part {part}" if part else "a whole dataset"
+        wanted = f"shard={settings.shard}" if settings.shard else "a whole dataset"
+        raise TronError(f"output_dir holds {held}, not {wanted}", settings.output_dir, CHOOSE_ANOTHER)
+    now = planned_scenes(settings)
+    if part and any((scenes.get(split) or 0) != (now.get(split) or 0) for split in SPLITS):
+        raise TronError(  # every n-th scene of a longer plan would be others
+            f"output_dir holds part {part} of a dataset with other numbers of scenes",
+            settings.output_dir,
+            CHOOSE_ANOTHER,
         )
 
 

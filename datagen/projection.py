@@ -23,6 +23,7 @@ from datagen.plan import (
 )
 from datagen.probe import SceneCost, probe
 from datagen.ready_sources import ready_sources
+from datagen.scale_settings import part_of
 from datagen.scheduling import TIMES_NAME
 from datagen.settings import Settings
 from datagen.source_list import slots
@@ -59,7 +60,7 @@ def project(settings: Settings) -> str:
     Raises:
         TronError: wherever making the dataset would, before its first scene.
     """
-    items = plan(settings)
+    items = part_of(plan(settings), settings.shard)
     wanted = chosen(items, settings.only)
     require_cluster(settings)
     require_adoptable(settings)

@@ -33,13 +33,13 @@ from datagen.plan import (
     adopt,
     chosen,
     clear_temporaries,
-    estimate_bytes,
     plan,
     read_record,
     scene_folder,
 )
 from datagen.ready_sources import ready_sources
 from datagen.reconstructed import forget_reconstruction, reconstruct_surfels
+from datagen.scale_settings import part_of
 from datagen.scene import SceneSpec, draw_scene
 from datagen.scene_files import write_clips
 from datagen.scene_geometry import scene_geometry
@@ -47,6 +47,7 @@ from datagen.scheduling import make_each
 from datagen.settings import Settings
 from datagen.source_list import of_split, slots
 from datagen.spool import Frame
+from datagen.store import Store, held_bytes
 from datagen.styles import Choice
 from datagen.synthetic import make_clips, make_surfels
 from datagen.variety import Histograms, frame_histograms, surface_members, total
@@ -62,12 +63,14 @@ def make(settings: Settings) -> int:
     """Make what is missing of a dataset of either source; return how many scenes or clips failed.
 
     Raises:
-        TronError: wrong settings, a folder in use, made otherwise or not writable, too little space: all
-            before the first scene.
+        TronError: wrong settings, a folder in use, made otherwise or not writable, a store that cannot be
+            written, too little space: all before the first scene; or the store is gone, whenever that is.
     """
-    items = plan(settings)
+    items = part_of(plan(settings), settings.shard)
     wanted = chosen(items, settings.only)
     require_cluster(settings)
+    store = Store.of(settings)
+    stored = store.shards() if store else {}
     activate(settings.variant, threads=1)
     sources = ready_sources(settings)
     other = read_other(settings.variety_against) if settings.variety_against is not None else None
@@ -77,18 +80,24 @@ def make(settings: Settings) -> int:
     with locked(output):
         clear_temporaries(output)
         adopt(settings)
-        missing = [item for item in wanted if read_record(output, item.name) is None]
+        missing = [item for item in wanted if read_record(output, item.name, stored) is None]
         for item in (item for item in wanted if item.capture and item not in missing):
             clear_work(scene_folder(output, item.name))  # killed between its record and this
+        missing = [item for item in wanted if read_record(output, item.name, stored) is None]
         failed: dict[str, Failure] = {}
         if missing:
-            require_free_space(output, estimate_bytes(settings, missing))
+            require_free_space(output, held_bytes(settings, missing))
             log.info("%d of %d scenes to make in %s", len(missing), len(items), output)
             make_one = make_capture if settings.source == "captured" else make_scene
             failed = make_each(
                 make_one, missing, settings, sources, lambda item: item.clips(settings), "clips"
             )
-        failures = write_account(settings, items, sources, failed, other)
+        if store:
+            store.empty(output, items)
+            stored = store.shards()
+        failures = write_account(settings, items, sources, failed, other, stored)
+        if store:
+            store.finish(settings)
     if failures:
         log.error("%s", summary(failures, output, logs_folder(settings)))
     else:
@@ -126,6 +135,9 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
     )
     forget_reconstruction(folder)
     write_atomic(folder / RECORD_NAME, record.model_dump_json(indent=1) + "\n")
+    if settings.store is not None:
+        with stage("upload"):
+            Store(settings.store).send(output, record)
     del geometry, surfels
     gc.collect()
     dr.flush_malloc_cache()

@@ -19,6 +19,7 @@ from datagen.failures import Failure
 from datagen.patience import Patience
 from datagen.plan import Sources, Work
 from datagen.settings import Settings
+from datagen.store import StoreError
 from tron.cli.progress import Progress
 from tron.cli.termination import termination_unwinds
 from tron.errors import TronError
@@ -35,11 +36,15 @@ Task = Callable[[Work, Settings, Sources], Made]
 
 @dataclass(frozen=True)
 class Attempt(Generic[Made]):
-    """Result of a task, or why there is none; its seconds by stage; the worker's name, as in its log."""
+    """Result of a task, or why there is none; its seconds by stage; the worker's name, as in its log.
+
+    ``fatal`` is an error that every other scene would meet too, so that the run ends by it.
+    """
 
     outcome: Made | Failure
     seconds: dict[str, float] = field(default_factory=dict)
     worker: str = ""
+    fatal: StoreError | None = None
 
 
 def make_each(
@@ -58,7 +63,8 @@ def make_each(
         unit: what weights count.
 
     Raises:
-        TronError: the cluster does not start, its scheduler is gone, or a time cannot be written.
+        TronError: the cluster does not start, its scheduler or its store is gone, or a time cannot be
+            written.
     """
     failed: dict[str, Failure] = {}
     # Closed here, whatever ends the block: workers do not outlive it.
@@ -68,6 +74,8 @@ def make_each(
         Progress("scenes", sum(map(size, items)), unit=unit) as progress,
     ):
         for item, attempt in made:
+            if attempt.fatal is not None:
+                raise attempt.fatal
             if isinstance(attempt.outcome, Failure):
                 failed[item.name] = attempt.outcome
                 log.error("%s failed: %s", item.name, attempt.outcome.reason)
@@ -111,13 +119,16 @@ def _by_workers(
 
 def try_it(task: Task[Made], settings: Settings, sources: Sources, item: Work) -> Attempt[Made]:
     """Do a task; whatever goes wrong is an outcome: one scene's failure is not the run's."""
+    fatal = None
     with clocked() as seconds:
         try:
             outcome = task(item, settings, sources)
+        except StoreError as error:
+            outcome, fatal = Failure.of(error), error
         except Exception as error:
             log.debug("scene %s", item.name, exc_info=True)
             outcome = Failure.of(error)
-    return Attempt(outcome, seconds)
+    return Attempt(outcome, seconds, fatal=fatal)
 
 
 def try_in_worker(task: Task[Made], settings: Settings, sources: Sources, item: Work) -> Attempt[Made]:
@@ -131,7 +142,7 @@ def try_in_worker(task: Task[Made], settings: Settings, sources: Sources, item: 
         log.error("%s failed: %s\n%s", item.name, outcome.reason, outcome.traceback)
     else:
         log.info("%s is made", item.name)
-    return Attempt(outcome, made.seconds, str(get_worker().name))
+    return Attempt(outcome, made.seconds, str(get_worker().name), made.fatal)
 
 
 @contextmanager

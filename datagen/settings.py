@@ -18,16 +18,18 @@ from datagen.capture_settings import CaptureSettings
 from datagen.captured_settings import CapturedSettings
 from datagen.lights import PROCEDURAL, Family, LightChoice
 from datagen.pseudo_capture_settings import PseudoCaptureSettings
+from datagen.scale_settings import SCALING, ScaleSettings
 from datagen.settings_model import SettingsModel
 from datagen.split_settings import SplitSettings
 from datagen.surfel_settings import SurfelReconstruction, SurfelSources
 from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounces
 
-Mode = Literal["make", "plan", "validate", "captures", "pseudo_captures", "equal_error", "sharing"]
+Mode = Literal["make", "plan", "validate", "merge", "captures", "pseudo_captures", "equal_error", "sharing"]
 Split = Literal["train", "train_b", "validation", "test"]
 OUTSIDE = {
     *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
     *("capture", "pseudo_capture", "equal_error", "sharing", "variety_against", "disjoint_from"),
+    *SCALING,
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
@@ -92,7 +94,7 @@ class SharingSettings(SettingsModel):
     threads: int | None = Field(default=1, ge=1, description="Threads of both ways; null: all.")
 
 
-class Settings(SettingsModel):
+class Settings(ScaleSettings):
     """Settings of ``tron-datagen``."""
 
     output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
@@ -100,7 +102,8 @@ class Settings(SettingsModel):
         "make",
         description="make the dataset; plan it: print what is missing, the bytes and hours it takes and the "
         "memory of a worker, measured by a small probe here, and render nothing else; validate the one in "
-        "output_dir and list every problem; path-trace captures for tron-reconstruct into "
+        "output_dir and list every problem; join the parts in `merge`; path-trace captures for "
+        "tron-reconstruct into "
         "output_dir/captures; photograph the splits' scenes as a phone would, with the truth kept apart in "
         "output_dir/truth (pseudo_captures); measure on the test scenes in output_dir how long the path "
         "tracer takes to be as near the truth as guidance is (equal_error); or measure what it saves to "

@@ -18,17 +18,20 @@ from tron.shards.verify import verify
 log = logging.getLogger(__name__)
 
 
-def validate(folder: Path, disjoint_from: Sequence[Path] = ()) -> int:
+def validate(folder: Path, disjoint_from: Sequence[Path] = (), store: str | None = None) -> int:
     """Log every problem of a dataset and of the captures beside it, one line each, and return their number.
 
     Beside what ``tron.shards.verify`` finds in the shards, every scene that has clips must still
     have its specification and its surfels. A folder may hold captures alone. What it shares with the
-    datasets of ``disjoint_from`` is a problem too.
+    datasets of ``disjoint_from`` is a problem too. With a store, its shards and manifest are looked at, and
+    nothing else.
 
     Raises:
         TronError: the folder holds neither a dataset nor captures; one of ``disjoint_from`` has no list of
             its sources.
     """
+    if store is not None:
+        return _store_problems(store)
     captures = folder / CAPTURES
     problems = [
         f"{name}/{problem}"
@@ -50,6 +53,14 @@ def validate(folder: Path, disjoint_from: Sequence[Path] = ()) -> int:
     if captures.is_dir():
         log.info("%d captures", len(capture_names(captures)))
     log.info("%d problems", len(problems))
+    return len(problems)
+
+
+def _store_problems(store: str) -> int:
+    problems = verify(store)
+    for problem in problems:
+        log.error("%s", problem)
+    log.info("%d problems in %s", len(problems), store)
     return len(problems)
 
 

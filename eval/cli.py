@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 from tron.cli.command_line import command
 from tron.cli.instantiation import make
+from tron.dataset_folder import DatasetPlace
 from tron.storage import locked
 
 
@@ -22,7 +23,9 @@ class Settings(BaseModel):
     output_dir: Path = Field(
         default=Path("outputs/eval"), description="folder for results.json, report.html and the pictures"
     )
-    dataset: Path | None = Field(default=None, description="data set to evaluate on, made by tron-datagen")
+    dataset: DatasetPlace | None = Field(
+        default=None, description="data set to evaluate on, made by tron-datagen: its folder or URL"
+    )
     renderer: Path | list[Path] | None = Field(
         default=None,
         description="weights of the neural renderer (.safetensors); [a,b]: one with lit, one of two buffers",

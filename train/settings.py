@@ -9,11 +9,11 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from train.curriculum import Stage
 from train.split_place import SplitPlace
+from tron.dataset_folder import DatasetPlace
 
 HELD_OUT = "test"
 """The split that evaluation judges by."""
 
-RemoteFolder = Annotated[str, Field(pattern=r"^[a-z0-9+.-]+://.")]
 """URL of a folder in an object store."""
 
 
@@ -122,7 +122,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    dataset: Path | RemoteFolder = Field(description="Dataset folder that tron-datagen wrote, or its URL.")
+    dataset: DatasetPlace = Field(description="Dataset folder that tron-datagen wrote, or its URL.")
     splits: dict[str, str] = Field(
         default={},
         description="Splits, by the names that stages and validation use, that come from another dataset: "

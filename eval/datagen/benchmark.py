@@ -10,6 +10,7 @@ from pathlib import Path
 from eval.datagen.captured import measure_captured
 from eval.datagen.hostile import measure_hostile
 from eval.datagen.kills import measure_kills
+from eval.datagen.merge import measure_merge
 from eval.datagen.paper_smoke import measure_paper_smoke
 from eval.datagen.parts import Found
 from eval.datagen.reader import measure_reader
@@ -95,6 +96,7 @@ class Datagen(DatagenSettings):
             "workers": lambda at: measure_workers(self.workers, self.rounds, at),
             "soak": lambda at: measure_soak(tiny, self.soak_scenes, at),
             "kills": lambda at: measure_kills(_of(tiny, self.kill_scenes), self.kills, self.seed, at),
+            "merge": lambda at: measure_merge(_of(tiny, self.merge_scenes), at),
             "specifications": lambda at: measure_specifications(
                 [*_of(tiny, self.specified_scenes), *self.specified], at
             ),

@@ -88,6 +88,7 @@ class DatagenSettings(Benchmark):
     soak_scenes: PositiveInt = Field(default=500, description="tiny scenes over which memory is watched")
     kills: PositiveInt = Field(default=20, description="times that runs are killed")
     kill_scenes: PositiveInt = Field(default=8, description="tiny scenes of such a run")
+    merge_scenes: PositiveInt = Field(default=7, description="tiny scenes that are made in three parts")
     specified_scenes: PositiveInt = Field(default=16, description="tiny scenes whose specifications are held")
     specified: list[str] = Field(
         default=["train.lights=[any,high,low]"], description="further arguments of tron-datagen for those"

@@ -22,6 +22,7 @@ from eval.relighting.measured import Judged, Measured
 from eval.relighting.scores import Scores, Where
 from eval.report.charts import training_curves
 from eval.report.outcome import Outcome
+from tron.dataset_folder import DatasetPlace, Place
 from tron.errors import TronError
 from tron.runtime import set_torch_threads
 from tron.shards.manifest import Manifest
@@ -39,13 +40,13 @@ class Relighting(Benchmark):
 
     name: ClassVar[str] = "relighting"
 
-    dataset: Path | None = Field(description="folder that tron-datagen wrote")
+    dataset: DatasetPlace | None = Field(description="folder that tron-datagen wrote, or its URL")
     renderer: Weights | None = Field(
         default=None,
         description="weights of the neural renderer, .safetensors; of two, [a,b], one sees lit, one does not",
     )
     pixel_mlp: Weights | None = Field(default=None, description="weights of the pixel MLP baseline, likewise")
-    ood: Path | None = Field(
+    ood: DatasetPlace | None = Field(
         default=None,
         description="data set of another kind (tron-datagen experiment=models): its test split gives rows "
         "that end in .ood, by the same weights and fits",
@@ -134,7 +135,7 @@ class Relighting(Benchmark):
 
     def _judged(
         self,
-        dataset: Path,
+        dataset: Place,
         methods: Mapping[str, Show],
         scores: Scores,
         guidance: GuidanceScores | None = None,
@@ -150,7 +151,7 @@ class Relighting(Benchmark):
         examples = self._examples(dataset, methods, choose_clips(scores, self.pictures))
         return Judged(scores, clips, examples)
 
-    def _dataset(self) -> Path:
+    def _dataset(self) -> Place:
         if self.dataset is None:
             raise TronError("no data set to evaluate on", mend="give dataset=DIR, made by tron-datagen")
         return self.dataset
@@ -189,7 +190,7 @@ class Relighting(Benchmark):
                 given.append(f"benchmark.{name}={getattr(self, name)}")
         return " \\\n    ".join(["tron-eval benchmark=relighting", *given, f"output_dir={output_dir}"])
 
-    def _examples(self, dataset: Path, methods: Mapping[str, Show], keys: list[str]) -> list[Example]:
+    def _examples(self, dataset: Place, methods: Mapping[str, Show], keys: list[str]) -> list[Example]:
         """The middle frames of the chosen clips by every method, in that order: a second pass."""
         if not keys:
             return []

@@ -1,7 +1,9 @@
 """A small dataset of three splits, made once for all tests that read one."""
 
+import socket
 from pathlib import Path
 
+import fsspec
 import pytest
 
 from datagen.run import make
@@ -39,3 +41,91 @@ def small_dataset(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Pat
     output = tmp_path_factory.mktemp("small") / "dataset"
     assert make(small(output)) == 0
     return output
+
+
+class S3Server:
+    """moto's S3 server on a free port, and what tests do to it behind the data engine's back.
+
+    It can be stopped and started again on the same port, and is empty then. `address` is http://127.0.0.1:PORT.
+    """
+
+    def __init__(self) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self._port = free.getsockname()[1]
+        self.address = f"http://127.0.0.1:{self._port}"
+        self._count = 0
+        self.start()
+
+    def start(self) -> None:
+        from moto.server import ThreadedMotoServer
+
+        self._server = ThreadedMotoServer("127.0.0.1", self._port, verbose=False)
+        self._server.start()
+        self._running = True
+
+    def stop(self) -> None:
+        if self._running:
+            self._server.stop()
+            self._running = False
+
+    def bucket(self, url: str | None = None) -> str:
+        """URL of a new bucket, or of that one again."""
+        self._count += 1
+        url = url or f"s3://tron-{self._count}"
+        if not self._files().exists(url):
+            self._files().mkdir(url)
+        return url
+
+    def write(self, url: str, data: bytes) -> None:
+        self._files().pipe_file(url, data)
+
+    def times(self, url: str) -> dict[str, str]:
+        """When each file was written, by its name."""
+        listed = self._files().ls(url, detail=True)
+        return {
+            each["name"].rpartition("/")[2]: str(each["LastModified"])
+            for each in listed
+            if each["type"] == "file"
+        }
+
+    def point_to(self, address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Let clients look for the store there."""
+        monkeypatch.setenv("AWS_ENDPOINT_URL", address)
+        fsspec.get_filesystem_class("s3").clear_instance_cache()
+
+    def _files(self):
+        import s3fs
+
+        return s3fs.S3FileSystem(endpoint_url=self.address, skip_instance_cache=True)
+
+
+@pytest.fixture(scope="session")
+def running_s3():
+    """moto's S3 server, for the session."""
+    pytest.importorskip("moto.server", reason="no S3 server: pip install 'moto[server]'")
+    pytest.importorskip("s3fs", reason="no S3 client: pip install s3fs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ACCESS_KEY_ID", "tron-test-key")
+        patch.setenv("AWS_SECRET_ACCESS_KEY", "tron-test-secret")
+        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+        patch.setenv("AWS_MAX_ATTEMPTS", "1")
+        server = S3Server()
+        yield server
+        server.stop()
+
+
+@pytest.fixture
+def s3_server(running_s3, monkeypatch: pytest.MonkeyPatch):
+    """The server, running, with the environment of a client that finds it."""
+    running_s3.stop()
+    running_s3.start()
+    for name, value in (
+        ("AWS_ACCESS_KEY_ID", "tron-test-key"),
+        ("AWS_SECRET_ACCESS_KEY", "tron-test-secret"),
+        ("AWS_DEFAULT_REGION", "us-east-1"),
+        ("AWS_MAX_ATTEMPTS", "1"),
+    ):
+        monkeypatch.setenv(name, value)
+    running_s3.point_to(running_s3.address, monkeypatch)
+    return running_s3

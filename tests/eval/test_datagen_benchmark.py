@@ -72,7 +72,7 @@ def values(rows) -> dict[str, Row]:
 
 @pytest.mark.long
 def test_every_part_but_variety_at_toy_sizes(tmp_path: Path):
-    parts = "benchmark.parts=[workers,soak,kills,specifications,throughput]"
+    parts = "benchmark.parts=[workers,soak,kills,merge,specifications,throughput]"
     sizes = 'benchmark.sizes={16: ["train.frames=2"],24: ["train.frames=1"]}'
     with pytest.raises(SystemExit) as end:
         cli(["benchmark=datagen", f"output_dir={tmp_path}", parts, sizes, *words(TOY)])
@@ -80,6 +80,7 @@ def test_every_part_but_variety_at_toy_sizes(tmp_path: Path):
     results = Results.load(tmp_path / "results.json")
     for metric in ("workers.identical", "specifications.identical"):
         assert results.value(metric) == 1.0
+    assert results.find("merge.identical").value == 1
     row = results.find("kills.identical")
     assert row is not None
     assert (row.value, row.n) == (2, 2)
@@ -88,7 +89,7 @@ def test_every_part_but_variety_at_toy_sizes(tmp_path: Path):
     for metric in ("workers.speedup_2", "soak.rss_growth_mb", "soak.rss_peak_mb"):
         assert results.find(metric) is not None
     page = (tmp_path / "report.html").read_text()
-    for part in ("workers", "soak", "kills", "specifications", "throughput", "stages"):
+    for part in ("workers", "soak", "kills", "merge", "specifications", "throughput", "stages"):
         assert f'<section id="{part}">' in page
     left = {path.name for folder in tmp_path.iterdir() if folder.is_dir() for path in folder.iterdir()}
     assert not [name for name in left if not name.endswith(".log")], "datasets are removed"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from tron.dataset_folder import DatasetFolder, Place
 from tron.errors import TronError
 from tron.shards.schema import SCHEMA_VERSION, SHARD_PATTERN, require_schema
 from tron.storage import write_if_changed
@@ -49,21 +50,27 @@ class Manifest(BaseModel):
     failures: int = Field(default=0, ge=0)
 
     @classmethod
-    def load(cls, folder: str | Path) -> Manifest:
-        """Read folder/manifest.json; TronError where it is missing, unreadable or of another version."""
-        path = Path(folder) / MANIFEST_NAME
+    def load(cls, folder: Place) -> Manifest:
+        """Read folder/manifest.json; TronError where it is missing, unreadable or of another version.
+
+        Args:
+            folder: path, or URL such as ``s3://bucket/dataset``.
+        """
+        place = DatasetFolder(folder)
+        path = place.where(MANIFEST_NAME)
         mend = "give the folder that tron-datagen wrote"
-        if not path.is_file():
+        size = place.size(MANIFEST_NAME)
+        if size is None:
             raise TronError("no manifest.json, so this is no dataset folder", str(folder), mend)
-        if path.stat().st_size > LARGEST_MANIFEST:
-            raise TronError("manifest.json is too large to be one", str(path), mend)
+        if size > LARGEST_MANIFEST:
+            raise TronError("manifest.json is too large to be one", path, mend)
         try:
-            manifest = cls.model_validate_json(path.read_bytes())
+            manifest = cls.model_validate_json(place.read(MANIFEST_NAME))
         except ValidationError as error:
             first = error.errors()[0]
             field = ".".join(str(part) for part in first["loc"])
-            raise TronError(f"manifest is damaged at '{field}': {first['msg']}", str(path), mend) from error
-        require_schema(manifest.schema_version, folder)
+            raise TronError(f"manifest is damaged at '{field}': {first['msg']}", path, mend) from error
+        require_schema(manifest.schema_version, str(folder))
         return manifest
 
     def save(self, folder: str | Path) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import tarfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from contextlib import contextmanager
+from typing import IO
 
 import numpy as np
 from pydantic import ValidationError
 
+from tron.dataset_folder import DatasetFolder, Place, is_url
 from tron.errors import TronError
 from tron.images import decode_exr, decode_png
 from tron.shards.manifest import Manifest
@@ -30,17 +32,17 @@ DAMAGED = "make the shard again with tron-datagen"
 _DECODERS: dict[str, Callable[[bytes], np.ndarray]] = {"exr": decode_exr, "png": decode_png}
 
 
-def tar_files(path: str | Path, members: Collection[str] | None = None) -> Iterator[tuple[str, str, bytes]]:
+def tar_files(path: Place, members: Collection[str] | None = None) -> Iterator[tuple[str, str, bytes]]:
     """Files of one shard in order: (key, name within the clip such as "f00.pbr.exr", bytes).
 
+    path: of the shard, or its URL: that is read as it comes, a few megabytes at a time.
     members: only these members and the metadata; the bytes of others are skipped (default: all). Refuses
     with TronError links, devices, folders, names outside the schema (so also absolute paths and `..`),
     compressed or damaged tars and files beyond the size limit; such a file's bytes are not read.
     """
     try:
-        with tarfile.open(
-            path, "r:", tarinfo=BoundedTarInfo
-        ) as tar:  # "r:" reads plain tars only: no decompression bombs
+        # "r:" reads plain tars only: no decompression bombs
+        with _opened(path) as opened, tarfile.open(fileobj=opened, mode="r:", tarinfo=BoundedTarInfo) as tar:
             for count, info in enumerate(tar):
                 key, member = require_plain(info, count, str(path))
                 if members is not None and member != "meta" and member not in members:
@@ -50,8 +52,28 @@ def tar_files(path: str | Path, members: Collection[str] | None = None) -> Itera
                 if len(data) != info.size:
                     raise TronError(f"shard ends within member {info.name!r}", str(path), DAMAGED)
                 yield key, info.name[len(key) + 1 :], data
-    except (tarfile.TarError, OSError, EOFError, UnicodeError, ValueError) as error:
+    except _DAMAGED as error:
         raise TronError(f"shard is damaged: {error}", str(path), DAMAGED) from error
+
+
+@contextmanager
+def _opened(path: Place) -> Iterator[IO[bytes]]:
+    """A shard to read, on a disk or in a store."""
+    if not is_url(path):
+        with open(path, "rb") as file:
+            yield file
+        return
+    folder, _, name = str(path).rpartition("/")
+    with DatasetFolder(folder).open(name) as file:
+        try:
+            yield file
+        except (TronError, *_DAMAGED):
+            raise
+        except Exception as error:  # stores raise whatever their package does
+            raise TronError(f"cannot read: {type(error).__name__}: {error}", str(path)) from error
+
+
+_DAMAGED = (tarfile.TarError, OSError, EOFError, UnicodeError, ValueError)
 
 
 def require_plain(info: tarfile.TarInfo, count: int, where: str) -> tuple[str, str]:
@@ -145,22 +167,23 @@ def file_name(frame: int, member: str) -> str:
     return f"f{frame:02d}.{member}.{MEMBERS[member].extension}"
 
 
-def read_clips(folder: str | Path, split: str, members: Iterable[str] | None = None) -> Iterator[Clip]:
-    """All clips of a split in the manifest's order, (K, H, W, C) float32 a member.
+def read_clips(folder: Place, split: str, members: Iterable[str] | None = None) -> Iterator[Clip]:
+    """All clips of a split in the manifest's order, (K, H, W, C) float32 a member; folder: path or URL.
 
     Raises TronError where the folder is no dataset, lacks the split, or a shard does not hold the clips
     that its manifest names.
     """
     wanted = None if members is None else list(members)
+    place = DatasetFolder(folder)
     for entry in Manifest.load(folder).of_split(split):
         seen: list[str] = []
-        for key, files in group_clips(tar_files(Path(folder) / entry.name, wanted)):
+        for key, files in group_clips(tar_files(place.where(entry.name), wanted)):
             seen.append(key)
             yield decode_clip(files, wanted)
         if seen != entry.keys:
             raise TronError(
                 f"shard holds {len(seen)} clips, the manifest names {len(entry.keys)}",
-                str(Path(folder) / entry.name),
+                place.where(entry.name),
                 "check the dataset with tron-datagen's validate, then make the shard again",
             )
 

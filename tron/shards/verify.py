@@ -3,41 +3,42 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 
+from tron.dataset_folder import DatasetFolder, Place
 from tron.errors import TronError
 from tron.shards.manifest import Manifest, ShardEntry
 from tron.shards.reader import decode_clip, tar_files
-from tron.storage import sha256
 
 
-def verify(folder: str | Path) -> list[str]:
-    """Problems of a dataset folder, one line each, naming shard and clip; empty when it is whole.
+def verify(folder: Place) -> list[str]:
+    """Problems of a dataset folder (path or URL), one line each, with shard and clip; empty when it is whole.
 
     Finds missing, stray and truncated shards (a tar cut at a member's end reads without an error: only the
     count shows it), flipped bytes, missing, repeated and unknown members, and files that do not decode.
     """
-    folder = Path(folder)
+    place = DatasetFolder(folder)
     manifest = Manifest.load(folder)
+    sizes = place.sizes()
     problems: list[str] = []
     listed = Counter(entry.name for entry in manifest.shards)
     problems += [f"{name}: listed {count} times" for name, count in listed.items() if count > 1]
     problems += [
-        f"{p.name}: not in the manifest" for p in sorted(folder.glob("*.tar")) if p.name not in listed
+        f"{name}: not in the manifest"
+        for name in sorted(sizes)
+        if name.endswith(".tar") and name not in listed
     ]
     owner: dict[str, str] = {}
     for entry in manifest.shards:
-        path = folder / entry.name
-        if not path.is_file():
+        if entry.name not in sizes:
             problems.append(f"{entry.name}: missing ({entry.samples} clips)")
             continue
-        if path.stat().st_size != entry.bytes:
-            problems.append(f"{entry.name}: {path.stat().st_size} bytes, should be {entry.bytes}")
-        elif sha256(path) != entry.sha256:
+        if sizes[entry.name] != entry.bytes:
+            problems.append(f"{entry.name}: {sizes[entry.name]} bytes, should be {entry.bytes}")
+        elif place.sha256(entry.name) != entry.sha256:
             problems.append(f"{entry.name}: sha256 differs: its bytes have changed")
         clips: dict[str, dict[str, bytes]] = {}
         try:
-            for key, name, data in tar_files(path):
+            for key, name, data in tar_files(place.where(entry.name)):
                 files = clips.setdefault(key, {})
                 if name in files:
                     problems.append(f"{entry.name}: {key}: member {name} is there twice")

@@ -1,0 +1,45 @@
+"""Parts of a dataset: disjoint, complete, and each a folder that knows which one it is."""
+
+import pytest
+import yaml
+
+from datagen.plan import config_sha256, plan
+from datagen.run import make
+from datagen.scale_settings import part_of
+from tron.errors import TronError
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_parts_are_disjoint_and_together_the_plan(small_settings, tmp_path, count):
+    items = plan(small_settings(tmp_path))
+    parts = [part_of(items, f"{number}/{count}") for number in range(1, count + 1)]
+    assert sorted((item for part in parts for item in part), key=items.index) == items
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+@pytest.mark.parametrize("shard", ["0/3", "4/3", "1", "1/0", "a/b", "-1/3", "1/3/5", " 1/3", "1/3\n"])
+def test_a_part_that_there_is_not_is_refused(small_settings, tmp_path, shard):
+    with pytest.raises(TronError, match="shard"):
+        small_settings(tmp_path, f"shard='{shard}'")
+
+
+def test_more_parts_than_scenes_are_refused_before_anything_is_written(small_settings, tmp_path):
+    with pytest.raises(TronError, match="more parts than there are scenes, 4"):
+        make(small_settings(tmp_path / "out", "shard=1/5"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_part_makes_its_scenes_alone_and_its_folder_takes_no_other(variant, small_settings, tmp_path):
+    settings = small_settings(tmp_path / "out", "shard=2/4")
+    assert make(settings) == 0
+    (item,) = part_of(plan(settings), "2/4")
+    assert [path.name for path in (tmp_path / "out" / "scenes").iterdir()] == [item.name]
+    assert yaml.safe_load((tmp_path / "out" / "config.yaml").read_text())["shard"] == "2/4"
+    for other in (["shard=1/4"], [], ["shard=2/4", "train.scenes=3"]):
+        with pytest.raises(TronError, match="output_dir holds part 2/4"):
+            make(small_settings(tmp_path / "out", *other))
+
+
+def test_parts_have_the_hash_of_the_whole(small_settings, tmp_path):
+    whole, part = small_settings(tmp_path), small_settings(tmp_path, "shard=1/2", "store=s3://a/b")
+    assert config_sha256(whole) == config_sha256(part)
