@@ -130,7 +130,7 @@ def light_ratio(photo: Photo, lit: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 class _About:
-    """What the metadata of a capture's clips say."""
+    """Metadata of the clips of a capture."""
 
     def __init__(
         self, item: Work, settings: Settings, found: Found, exposure: float, own_exposure: float

@@ -110,7 +110,7 @@ def load(item: Work, settings: Settings, folder: Path, reduced: bool) -> Capture
 
 
 def kept(folder: Path, capture: Capture) -> Found | None:
-    """What a run found of the same photos; None where it has to be found (again)."""
+    """Findings of a run on the same photos; None where there are none, and it has to be done (again)."""
     try:
         facts = json.loads((folder / SPEC_NAME).read_text("utf-8"))
         if facts["content"] != capture.content:

@@ -205,7 +205,7 @@ def card_text(
 
 
 def _origin(settings: Settings) -> str:
-    """Where frames and guidance come from, in a sentence or two."""
+    """Origin of frames and guidance, in a sentence or two."""
     if settings.source == "synthetic":
         return (
             "Frames by Mitsuba's path tracer, guidance by TRON's surfel tracer on "
@@ -220,7 +220,7 @@ def _origin(settings: Settings) -> str:
 
 
 def _captures(rows: Sequence[ClipRow]) -> list[str]:
-    """What photos say of their origin: nothing, so that their owner has to."""
+    """Rights in photos: nothing in the files tells them, so their owner has to."""
     scenes = {row.scene for row in rows}
     return [f"{len(scenes)} captures. Photos are their owners': say under which licence before you publish."]
 

@@ -132,7 +132,7 @@ def _files(parts: Sequence[Path]) -> dict[str, Path]:
 
 
 def _names(part: Path) -> Iterator[str]:
-    """What a part holds of scenes: neither its account nor hidden files."""
+    """Names of the files of scenes in a part: neither its account nor hidden files."""
     for folder, folders, names in os.walk(part):
         inner = Path(folder).relative_to(part)
         if inner == Path():
