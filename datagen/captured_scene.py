@@ -11,6 +11,7 @@ from datagen.captured_reconstruction import clear_work, find, kept, load, tell
 from datagen.clock import stage
 from datagen.plan import CAPTURE_SHARDS, RECORD_NAME, Record, Sources, Work, scene_folder
 from datagen.scene_files import write_clips
+from datagen.store import Store
 from datagen.settings import Settings
 from tron.errors import TronError
 from tron.runtime import activate, set_torch_threads
@@ -54,6 +55,9 @@ def make_capture(item: Work, settings: Settings, sources: Sources) -> Record:  #
     )
     write_atomic(folder / RECORD_NAME, record.model_dump_json(indent=1) + "\n")
     clear_work(folder)
+    if settings.store is not None:
+        with stage("upload"):
+            Store(settings.store).send(settings.output_dir, record)
     del found, capture, photos
     gc.collect()
     dr.flush_malloc_cache()

@@ -22,7 +22,7 @@ from eval.relighting.measured import Judged, Measured
 from eval.relighting.scores import Scores, Where
 from eval.report.charts import training_curves
 from eval.report.outcome import Outcome
-from tron.dataset_folder import DatasetPlace, Place
+from tron.dataset_folder import DatasetFolder, DatasetPlace, Place
 from tron.errors import TronError
 from tron.runtime import set_torch_threads
 from tron.shards.manifest import Manifest
@@ -156,7 +156,7 @@ class Relighting(Benchmark):
             raise TronError("no data set to evaluate on", mend="give dataset=DIR, made by tron-datagen")
         return self.dataset
 
-    def _fitted_on(self) -> Path:
+    def _fitted_on(self) -> Place:
         return self._dataset() if self.fitted_on is None else self.fitted_on
 
     def _training_clips(self) -> Iterator[Clip]:
@@ -232,18 +232,18 @@ def load_network(path: Path, vae: Path | None = None) -> Network:
     return Network(show, path, "lit" in guidance)
 
 
-def stand_ins(dataset: Path) -> Sequence[str]:
+def stand_ins(dataset: Place) -> Sequence[str]:
     """What the data set's sources.json says of named assets that something else stands in for."""
-    path = dataset / "sources.json"
+    folder, name = DatasetFolder(dataset), "sources.json"
     try:
-        found = json.loads(path.read_bytes())["stand_ins"] if path.is_file() else None
+        found = json.loads(folder.read(name))["stand_ins"] if folder.size(name) is not None else None
         if found is None:
             return ()
         named = found["maps"] + found["models"]
         empty = len(found["empty_maps"]) + found["empty_models"]
         return (f"{found['title']}: {empty} of {named} named assets are procedural stand-ins.",)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise TronError("sources.json is damaged", path, "run tron-datagen on the data set again") from error
+        raise TronError("sources.json is damaged", folder.where(name), "run tron-datagen on the data set again") from error
 
 
 def choose_clips(scores: Scores, count: int) -> list[str]:
