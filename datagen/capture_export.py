@@ -26,12 +26,12 @@ from datagen.build import Geometry
 from datagen.capture_manifest import CaptureManifest
 from datagen.capture_settings import CaptureSettings
 from datagen.clusters import logs_folder, require_cluster
+from datagen.drawn_scene import draw_and_build
 from datagen.failures import record_failures, summary
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.photographs import Photograph, described, drift
 from datagen.plan import Sources, Work, chosen, find_sources
 from datagen.relit import RELIT, record_relit, relit_folders, straightened, write_relit
-from datagen.run import draw_and_build
 from datagen.scene import SceneSpec, scene_name
 from datagen.scheduling import make_each
 from datagen.settings import Settings

@@ -17,16 +17,13 @@ import drjit as dr
 import numpy as np
 
 from datagen.account import read_other, write_account
-from datagen.assets import for_split, load_models
 from datagen.build import Geometry
 from datagen.clip_preview import thumbnail_name, write_preview
 from datagen.clip_rows import ClipRow, clip_row
 from datagen.clock import stage
 from datagen.clusters import logs_folder, require_cluster
+from datagen.drawn_scene import draw_and_build
 from datagen.failures import Failure, summary
-from datagen.lights import LightChoice
-from datagen.motion import Share
-from datagen.parts import outline
 from datagen.pathtrace import gbuffers
 from datagen.plan import (
     RECORD_NAME,
@@ -45,11 +42,8 @@ from datagen.plan import (
 )
 from datagen.preview import contact_row, sheet_name, write_sheet
 from datagen.reconstructed import forget_reconstruction, reconstruct_surfels
-from datagen.scene import SceneSpec, draw_scene
-from datagen.scene_geometry import scene_geometry
 from datagen.scheduling import make_each
 from datagen.settings import Settings
-from datagen.styles import Choice
 from datagen.synthetic import Frame, first_bad_value, make_clips, make_surfels
 from datagen.variety import COUNTED_MEMBERS, Histograms, frame_histograms, surface_members, total
 from tron.cameras import Camera
@@ -157,38 +151,6 @@ def _variety(geometry: Geometry, made: Sequence[tuple[ClipMeta, Frame]]) -> Hist
         frame_histograms(frame | surface_members(truth), camera, meta.extra.get("contrast_share"))
         for (meta, frame), camera, truth in zip(made, cameras, gbuffers(geometry, cameras))
     )
-
-
-@stage("build")
-def draw_and_build(
-    item: Work, settings: Settings, sources: Sources, lights: Sequence[LightChoice]
-) -> tuple[SceneSpec, Geometry]:
-    """A scene's specification, with a light of each of the given families, and its meshes."""
-    recipe = settings.split(item.split)
-    models = load_models(settings.assets, sources.assets) if settings.assets is not None else {}
-    spec = draw_scene(
-        settings.seed,
-        item.split,
-        item.index,
-        style=recipe.style_of(item.index),
-        lights=lights,
-        families=settings.light_families(),
-        environments=sources.environments
-        if settings.share_maps
-        else for_split(sources.environments, item.split),
-        choice=Choice(
-            assets={name: outline(parts) for name, parts in models.items()},
-            asset_share=settings.asset_share,
-            objects=settings.objects,
-            textures=sources.textures,
-            texture_share=settings.texture_share,
-        ),
-        frames=recipe.frames,
-        path_frames=settings.path_frames,
-        lights_share_path=recipe.lights_share_path,
-        moving=Share(recipe.moving_objects, recipe.moving_lights),
-    )
-    return spec, scene_geometry(spec, settings, sources)
 
 
 def _set_aside(path: Path, frames: Sequence[dict[str, np.ndarray]]) -> None:
