@@ -26,13 +26,13 @@ from datagen.capture_manifest import CaptureManifest
 from datagen.capture_recipe import adopt_recipe
 from datagen.capture_settings import CaptureSettings
 from datagen.clusters import logs_folder, require_cluster
+from datagen.drawn_scene import draw_and_build
 from datagen.failures import record_failures, summary
 from datagen.pathtrace import gbuffers, render_frames
 from datagen.photographs import Photograph, described, drift
 from datagen.plan import Sources, Work, chosen
 from datagen.ready_sources import ready_sources
 from datagen.relit import RELIT, record_relit, relit_folders, straightened, write_relit
-from datagen.run import draw_and_build
 from datagen.scene import SceneSpec, scene_name
 from datagen.scheduling import make_each
 from datagen.settings import Settings

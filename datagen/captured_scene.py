@@ -11,8 +11,8 @@ from datagen.captured_reconstruction import clear_work, find, kept, load, tell
 from datagen.clock import stage
 from datagen.plan import CAPTURE_SHARDS, RECORD_NAME, Record, Sources, Work, scene_folder
 from datagen.scene_files import write_clips
-from datagen.store import Store
 from datagen.settings import Settings
+from datagen.store import Store
 from tron.errors import TronError
 from tron.runtime import activate, set_torch_threads
 from tron.storage import write_atomic

@@ -21,10 +21,10 @@ from typing import TypeVar
 from datagen import refinement
 from datagen.build import Geometry
 from datagen.clip_preview import preview_bytes, write_preview
+from datagen.drawn_scene import draw_and_build
 from datagen.pathtrace import LANES
 from datagen.plan import Sources, Work
 from datagen.reconstructed import reconstruction_steps
-from datagen.run import draw_and_build
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from datagen.synthetic import make_clips, make_surfels

@@ -32,6 +32,7 @@ from datagen.capture_export import (
 from datagen.capture_manifest import CaptureManifest
 from datagen.capture_recipe import CONFIG_NAME, adopt_recipe, require_nobodys
 from datagen.clusters import logs_folder, require_cluster
+from datagen.drawn_scene import draw_and_build
 from datagen.exposure import metered
 from datagen.failures import record_failures, summary
 from datagen.pathtrace import gbuffers, render_frames
@@ -39,7 +40,6 @@ from datagen.phone import Phone, draw_phone
 from datagen.plan import Sources, Work, chosen, find_sources, plan
 from datagen.pose_noise import disturbed
 from datagen.relit import RELIT, record_relit, relit_folders, straightened, write_relit
-from datagen.run import draw_and_build
 from datagen.scene import SceneSpec
 from datagen.scheduling import make_each
 from datagen.settings import SPLITS, Settings

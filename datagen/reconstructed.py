@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from datagen.build import Geometry
+from datagen.capture_export import captured
 from datagen.capture_settings import CaptureSettings
 from datagen.clock import stage
 from datagen.pathtrace import stream_gbuffers
@@ -93,10 +94,6 @@ def light_of_pictures(spec: SceneSpec) -> int:
 
 def _pictures(spec: SceneSpec, geometry: Geometry, settings: Settings, folder: Path) -> Capture:
     """The scene's views as a capture on disk, path-traced unless they are there."""
-    from datagen.capture_export import (
-        captured,  # it makes scenes as datagen.run does, which needs this module
-    )
-
     where = folder / "pictures"
     if not where.is_dir():
         shutil.rmtree(folder, ignore_errors=True)  # half a capture

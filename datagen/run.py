@@ -14,16 +14,13 @@ from collections.abc import Sequence
 import drjit as dr
 
 from datagen.account import read_other, write_account
-from datagen.assets import load_models
 from datagen.build import Geometry
 from datagen.captured_reconstruction import clear_work, require_prior
 from datagen.captured_scene import make_capture
 from datagen.clock import stage
 from datagen.clusters import logs_folder, require_cluster
+from datagen.drawn_scene import draw_and_build
 from datagen.failures import Failure, summary
-from datagen.lights import LightChoice
-from datagen.motion import Share
-from datagen.parts import outline
 from datagen.pathtrace import gbuffers
 from datagen.plan import (
     RECORD_NAME,
@@ -40,15 +37,11 @@ from datagen.plan import (
 from datagen.ready_sources import ready_sources
 from datagen.reconstructed import forget_reconstruction, reconstruct_surfels
 from datagen.scale_settings import part_of
-from datagen.scene import SceneSpec, draw_scene
 from datagen.scene_files import write_clips
-from datagen.scene_geometry import scene_geometry
 from datagen.scheduling import make_each
 from datagen.settings import Settings
-from datagen.source_list import of_split, slots
 from datagen.spool import Frame
 from datagen.store import Store, held_bytes
-from datagen.styles import Choice
 from datagen.synthetic import make_clips, make_surfels
 from datagen.variety import Histograms, frame_histograms, surface_members, total
 from tron.cameras import Camera
@@ -151,35 +144,3 @@ def _variety(geometry: Geometry, made: Sequence[tuple[ClipMeta, Frame]]) -> Hist
         frame_histograms(frame | surface_members(truth), camera, meta.extra.get("contrast_share"))
         for (meta, frame), camera, truth in zip(made, cameras, gbuffers(geometry, cameras))
     )
-
-
-@stage("build")
-def draw_and_build(
-    item: Work, settings: Settings, sources: Sources, lights: Sequence[LightChoice]
-) -> tuple[SceneSpec, Geometry]:
-    """A scene's specification, with a light of each of the given families, and its meshes."""
-    recipe = settings.split(item.split)
-    checked, sources = slots(settings, sources), of_split(settings, sources, item.split)
-    models = load_models(settings.assets, sources.assets) if settings.assets is not None else {}
-    spec = draw_scene(
-        settings.seed,
-        item.split,
-        item.index,
-        style=recipe.style_of(item.index),
-        lights=lights,
-        families=settings.light_families(),
-        environments=sources.environments,
-        map_share=settings.map_share * (checked.map_share if checked else 1.0),
-        choice=Choice(
-            assets={name: outline(parts) for name, parts in models.items()},
-            asset_share=settings.asset_share * (checked.model_share if checked else 1.0),
-            objects=settings.objects,
-            textures=sources.textures,
-            texture_share=settings.texture_share,
-        ),
-        frames=recipe.frames,
-        path_frames=settings.path_frames,
-        lights_share_path=recipe.lights_share_path,
-        moving=Share(recipe.moving_objects, recipe.moving_lights),
-    )
-    return spec, scene_geometry(spec, settings, sources)

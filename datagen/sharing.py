@@ -23,12 +23,12 @@ from typing import Any
 import numpy as np
 
 from datagen.build import Geometry
+from datagen.drawn_scene import draw_and_build
 from datagen.equal_error import equal, timed
 from datagen.lights import FAMILIES, classify
 from datagen.pathtrace import render_frames, render_lights, stacked_lights
 from datagen.plan import Work
 from datagen.ready_sources import ready_sources
-from datagen.run import draw_and_build
 from datagen.scene import scene_name
 from datagen.settings import Settings
 from tron.cameras import Camera

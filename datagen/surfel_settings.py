@@ -42,7 +42,7 @@ class SurfelSources(SettingsModel):
         return self
 
     def of(self, seed: int, split: str, index: int) -> Source:
-        """What the surfels of a scene are made from, a function of root seed, split and index alone."""
+        """Source of a scene's surfels, a function of root seed, split and index alone."""
         total = self.gbuffers + self.reconstruction
         drawn = generator(seed, split, index, "surfels_from").random() * total
         return "reconstruction" if drawn < self.reconstruction else "gbuffers"

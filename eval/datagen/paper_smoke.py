@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import yaml
+
 from eval.results import Row
-from eval.stages import Child, Stages
+from eval.stages import Child, Stages, script_path
 from tron.report.page import Section, Table
 from tron.shards.manifest import Manifest
 
@@ -95,21 +98,31 @@ def write_tiny_weights(folder: Path) -> None:
     import torch
     from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
 
-    from train.settings import Settings
-    from tron.cli.instantiation import make
-    from tron.cli.recipes import complete, compose_recipe, resolve
     from tron.neural.backbone import transformer
+    from tron.neural.configs import BackboneConfig
 
     torch.manual_seed(0)
-    recipe = complete(compose_recipe("conf.train", Settings, [EXPERIMENT, "dataset=.", "output_dir=."]))
-    recipe = resolve(recipe)
-    config = make(recipe["renderer"]["config"], "renderer.config")
     vae = AutoencoderKLWan(**WAN).eval()
     vae.save_pretrained(folder / "vae")
     channels = vae.config["z_dim"]
-    transformer(config.backbone, channels, channels).save_pretrained(folder / "transformer")
+    shape = BackboneConfig.model_validate(_training_recipe()["renderer"]["config"]["backbone"])
+    transformer(shape, channels, channels).save_pretrained(folder / "transformer")
     state = {f"features.{name}": value for name, value in _vgg16_features().state_dict().items()}
     torch.save(state, folder / "vgg16.pth")
+
+
+def _training_recipe() -> dict[str, Any]:
+    """Recipe of the training, as tron-train understands it."""
+    command = [
+        script_path("tron-train"),
+        EXPERIMENT,
+        "dataset=.",
+        "output_dir=.",
+        "loss.vgg_weights=.",
+        "--cfg",
+        "job",
+    ]
+    return yaml.safe_load(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 
 def _vgg16_features() -> nn.Sequential:

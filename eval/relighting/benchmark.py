@@ -243,7 +243,9 @@ def stand_ins(dataset: Place) -> Sequence[str]:
         empty = len(found["empty_maps"]) + found["empty_models"]
         return (f"{found['title']}: {empty} of {named} named assets are procedural stand-ins.",)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise TronError("sources.json is damaged", folder.where(name), "run tron-datagen on the data set again") from error
+        raise TronError(
+            "sources.json is damaged", folder.where(name), "run tron-datagen on the data set again"
+        ) from error
 
 
 def choose_clips(scores: Scores, count: int) -> list[str]:

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from datagen.build import build
+from datagen.drawn_scene import draw_and_build
 from datagen.lights import Family
 from datagen.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.plan import Sources, Work
-from datagen.run import draw_and_build
 from datagen.scene import draw_scene
 from datagen.scene_files import first_bad_value
 from datagen.settings import Settings

@@ -25,7 +25,6 @@ def test_the_papers_recipes_run_from_data_to_figures(tmp_path):
     """Data from reconstructions, three stages with LPIPS, evaluation of the network that came of it."""
     found = measure_paper_smoke(tmp_path / "smoke")
     assert set(found.seconds) == {"datagen", "train", "eval"}
-    assert sum(found.seconds.values()) < 300
     assert found.clips == {"train": 4, "train_b": 1, "validation": 1, "test": 2}
     assert math.isfinite(found.psnr["neural.psnr"])
     made = {
