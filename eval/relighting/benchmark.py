@@ -232,7 +232,7 @@ def load_network(path: Path, vae: Path | None = None) -> Network:
 
 
 def stand_ins(dataset: Path) -> Sequence[str]:
-    """What the data set's sources.json says of named assets that something else stands in for."""
+    """Sentence of the data set's sources.json on named assets that something else stands in for."""
     path = dataset / "sources.json"
     try:
         found = json.loads(path.read_bytes())["stand_ins"] if path.is_file() else None
