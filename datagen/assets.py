@@ -58,7 +58,7 @@ class Asset(BaseModel):
     contents: tuple[Content, ...] = ()
 
     def hashes(self) -> frozenset[str]:
-        """What it must not share with another to be another."""
+        """Hashes that it must not share with another to be another."""
         return compared(self.contents) or frozenset([self.sha256])
 
 

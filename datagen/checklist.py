@@ -54,11 +54,10 @@ class Checklist(BaseModel):
 
 
 class StandIns(BaseModel):
-    """What stands in for named assets, as the dataset says it.
+    """Named assets that something procedural stands in for, as the dataset says it.
 
     Attributes:
         title: of the checklist.
-        slots: number of named assets.
         empty_maps: names of the maps that are not there.
         maps, models: numbers of slots for each.
         empty_models: models that are not there.
@@ -74,7 +73,7 @@ class StandIns(BaseModel):
 
     @property
     def sentence(self) -> str:
-        """How many of the named assets are stand-ins."""
+        """Sentence with the number of named assets that are stand-ins."""
         empty = len(self.empty_maps) + self.empty_models
         return (
             f"{empty} of {self.maps + self.models} named assets of {self.title} are procedural stand-ins "
@@ -109,7 +108,7 @@ class Filled:
         return self.models / self.checklist.models.count if self.checklist.models.count else 1.0
 
     def stand_ins(self) -> StandIns:
-        """What the dataset says of its slots."""
+        """The slots as the dataset says it."""
         wanted = self.checklist.models.count
         return StandIns(
             title=self.checklist.title,
@@ -120,7 +119,7 @@ class Filled:
         )
 
     def report(self, environments: Path | None, assets: Path | None) -> str:
-        """What is there and what is missing, a line each, with where to get it and where to put it."""
+        """Lines for people: numbers, and for all that is missing where to get it and where to put it."""
         wanted = self.checklist.models
         maps = str(environments) if environments is not None else "environments=FOLDER"
         models = str(assets) if assets is not None else "assets=FOLDER"

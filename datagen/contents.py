@@ -1,4 +1,4 @@
-"""What the user's files hold, by hash: what makes two files under two names the same model, texture or map.
+"""Contents of the user's files, by hash: two files under two names may be one model, texture or map.
 
 A model is its own file, the files that it refers to, and what comes out of them: its triangles, and each
 image on them. So a copy under another name, stored as another kind of file or dressed anew is found by what

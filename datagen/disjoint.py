@@ -14,7 +14,7 @@ from datagen.source_list import TRAINED, Source, SourceList, read_source_list, s
 from tron.errors import TronError
 
 PLACE = ("name", "split", "index", "seed")
-"""What a specification says of its scene's place, not of the scene."""
+"""Keys of a specification that say a scene's place, nothing of the scene."""
 
 
 def require_disjoint(settings: Settings, sources: Sources) -> None:
@@ -34,7 +34,7 @@ def require_disjoint(settings: Settings, sources: Sources) -> None:
 
 
 def overlaps(own: SourceList, other: SourceList, folder: Path) -> Iterator[str]:
-    """What is shared with the splits that ``other`` trains on, a line for each file and each split."""
+    """Lines for what is shared with the splits that ``other`` trains on, one for each source and split."""
     there: dict[str, tuple[Source, str]] = {}
     for source in other.sources:
         if set(source.splits) & set(TRAINED):

@@ -1,4 +1,4 @@
-"""Which of the user's files serve which split: what is tested on is never trained on."""
+"""Splits that the user's files serve: what is tested on is never trained on."""
 
 from __future__ import annotations
 
@@ -51,5 +51,5 @@ def for_split(items: Sequence[Item], split: str, hashes: Callable[[Item], Collec
 
 
 def separable(items: Sequence[Item], hashes: Callable[[Item], Collection[str]]) -> bool:
-    """Whether there are families enough to hold some out."""
+    """True where there are families enough to hold some out."""
     return len(items) > 0 and int(families([hashes(item) for item in items]).max()) + 1 >= HELD_OUT

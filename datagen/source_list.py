@@ -136,7 +136,7 @@ def tell_shared(settings: Settings, sources: Sources) -> None:
 
 
 def source_list(settings: Settings, sources: Sources) -> SourceList:
-    """What a dataset draws from, each file with the splits that may."""
+    """The files that a dataset draws from, each with the splits that may."""
     used = settings.used_splits()
     served = {split: of_split(settings, sources, split) for split in used}
 

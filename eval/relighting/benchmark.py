@@ -233,7 +233,7 @@ def load_network(path: Path, vae: Path | None = None) -> Network:
 
 
 def stand_ins(dataset: Place) -> Sequence[str]:
-    """What the data set's sources.json says of named assets that something else stands in for."""
+    """Sentence of the data set's sources.json on named assets that something else stands in for."""
     folder, name = DatasetFolder(dataset), "sources.json"
     try:
         found = json.loads(folder.read(name))["stand_ins"] if folder.size(name) is not None else None

@@ -80,7 +80,7 @@ def test_every_part_but_variety_at_toy_sizes(tmp_path: Path):
     results = Results.load(tmp_path / "results.json")
     for metric in ("workers.identical", "specifications.identical"):
         assert results.value(metric) == 1.0
-    assert results.find("merge.identical").value == 1
+    assert results.value("merge.identical") == 1
     row = results.find("kills.identical")
     assert row is not None
     assert (row.value, row.n) == (2, 2)

@@ -9,13 +9,14 @@ import pytest
 
 from eval.cli import cli
 from eval.relighting.baselines import BASELINES, FINER, METHODS
-from eval.relighting.benchmark import Relighting, choose_clips
+from eval.relighting.benchmark import Relighting, choose_clips, stand_ins
 from eval.relighting.scores import GROUPS, METRICS, Score, Scores
 from eval.report.outcome import Outcome
 from eval.results import Results
 from tron.errors import TronError
 from tron.images import read_image
 from tron.report.page import Pictures, Table
+from tron.shards.manifest import Manifest
 
 REQUIRED = [
     *(
@@ -261,3 +262,35 @@ def test_a_renderer_of_two_buffers_alone_is_the_one_that_is_reported(
     assert "neural.gain_over_best_simple_baseline" in values(found)
     pictures = next(section for section in found.sections if section.name == "pictures").blocks
     assert pictures[1].pictures[-1].title == "|neural renderer of two buffers − truth| ×3"  # type: ignore[union-attr]
+
+
+@pytest.fixture
+def benchmark_alone(dataset: Path, tmp_path: Path) -> Path:
+    """The data set without its training splits."""
+    folder = tmp_path / "alone"
+    folder.mkdir()
+    whole = Manifest.load(dataset)
+    kept = whole.of_split("test")
+    for entry in kept:
+        (folder / entry.name).write_bytes((dataset / entry.name).read_bytes())
+    whole.model_copy(update={"shards": kept}).save(folder)
+    return folder
+
+
+def test_a_benchmark_without_training_data_is_judged_by_the_fits_of_another_data_set(
+    benchmark_alone: Path, dataset: Path, tmp_path: Path
+):
+    with pytest.raises(TronError, match=r"no split train to fit.*benchmark\.fitted_on=DIR"):
+        Relighting(dataset=benchmark_alone).run(tmp_path / "none")
+    found = Relighting(dataset=benchmark_alone, fitted_on=dataset, pictures=0).run(tmp_path / "out")
+    assert values(found) == values(Relighting(dataset=dataset, pictures=0).run(tmp_path / "same"))
+
+
+def test_the_report_says_how_many_named_assets_are_stand_ins(benchmark_alone: Path):
+    assert stand_ins(benchmark_alone) == ()
+    found = {"title": "TRON-Synth", "maps": 33, "models": 29, "empty_maps": ["a", "b"], "empty_models": 1}
+    (benchmark_alone / "sources.json").write_text(json.dumps({"stand_ins": found}))
+    assert stand_ins(benchmark_alone) == ("TRON-Synth: 3 of 62 named assets are procedural stand-ins.",)
+    (benchmark_alone / "sources.json").write_text("[]")
+    with pytest.raises(TronError, match=r"sources\.json is damaged"):
+        stand_ins(benchmark_alone)

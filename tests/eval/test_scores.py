@@ -1,6 +1,7 @@
 """Scores of predictions with known errors, and the rows made of them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -205,3 +206,17 @@ def test_a_captured_photo_is_shown_as_it_is(drawn_clip: MakeClip):
     clip = drawn_clip()
     clip.meta.color_space["rgb"] = "display"
     np.testing.assert_array_equal(clip.displayed("rgb"), clip.frames["rgb"])
+
+
+def test_styles_of_scenes_have_rows_of_their_own_where_there_are_several(drawn_clip):
+    scores = Scores()
+    for number, style in enumerate(("object", "table")):
+        clip = drawn_clip(seed=number)
+        clip = replace(clip, meta=clip.meta.model_copy(update={"extra": {"style": style}}))
+        truth = clip.displayed("rgb")
+        scores.add(clip, {"foreground": {"pbr": np.clip(truth + 0.1 * (number + 1), 0, 1)}}, truth)
+        assert scores.styles == ([] if number == 0 else ["object", "table"])
+    rows = {row.metric: row for row in scores.rows()}
+    both = [rows[f"pbr.psnr.{style}"] for style in ("object", "table")]
+    assert both[0].value > both[1].value
+    assert rows["pbr.psnr"].value == pytest.approx(np.mean([row.value for row in both]))
