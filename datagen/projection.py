@@ -11,7 +11,8 @@ from pathlib import Path
 from statistics import fmean
 
 from datagen.account import read_other
-from datagen.clusters import logs_folder, require_cluster, worker_count
+from datagen.clusters import LOCAL, logs_folder, require_cluster, worker_count
+from datagen.first_limit import first_limit
 from datagen.plan import (
     Work,
     chosen,
@@ -118,8 +119,8 @@ def _of_made(settings: Settings, made: Sequence[Work], times: Mapping[str, float
 def captured_cost(missing: Sequence[Work], settings: Settings) -> SceneCost:
     """Mean cost of captures of which none is made yet: bytes by their photos, seconds by a rough law.
 
-    The law is :data:`SECONDS_A_STEP` for the steps, and :data:`SECONDS_A_PIXEL` for guidance: both of one
-    core, measured with some thousand surfels. Larger photos and more surfels take longer.
+    The law is :data:`SECONDS_A_STEP` for the steps, and :data:`SECONDS_A_PIXEL` for guidance, both of one
+    core: the order of what captures of some thousand surfels took here. Larger photos take longer.
     """
     wanted = settings.captured
     photos = fmean(item.photos for item in missing)
@@ -174,6 +175,18 @@ def report(settings: Settings, splits: Sequence[SplitPlan]) -> str:
             f"{seconds / 3600 / count:.3g} with {count} worker{'s' * (count > 1)}{known}"
             if missing
             else "none: nothing is missing",
+        ),
+        (
+            "binds first",
+            first_limit(
+                needed=needed,
+                free=free,
+                memory=max(memory, default=0.0),
+                workers=count,
+                here=settings.cluster is None or settings.cluster["_target_"] == LOCAL,
+                seconds=seconds,
+                written=total_bytes,
+            ),
         ),
     ]
     return "\n".join([*_aligned(rows), "", *_aligned(facts)])

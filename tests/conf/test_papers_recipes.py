@@ -47,15 +47,24 @@ def test_the_benchmark_has_40_scenes_under_5_lights_seen_from_290_and_93_cameras
     assert test.reference_buffers
 
 
+def test_the_benchmark_is_tron_synth(datagen: DatagenSettings) -> None:
+    overrides = ["experiment=tron_synth", "output_dir=out"]
+    synth = check(compose_recipe("conf.datagen", DatagenSettings, overrides), DatagenSettings)
+    assert datagen.test == synth.test
+    for key in ("path_frames", "views", "view_width", "view_height", "surfels", "environment_height"):
+        assert getattr(datagen, key) == getattr(synth, key)
+
+
 def test_shadows_take_2_rays_for_a_preview_and_64_in_the_end(datagen: DatagenSettings) -> None:
     assert (QUALITY["preview"].rays, QUALITY["final"].rays) == (2, 64)
     assert {datagen.split(name).guidance_spp for name in datagen.used_splits()} == {64}
 
 
 def test_the_curriculum_has_three_stages_of_32000_steps(train: TrainSettings) -> None:
-    """Synthetic 512 x 512 with one frame, then real pictures whole, with one and with five."""
+    """Synthetic 512 x 512 with one frame, then real pictures at 1024 x 576, with one and with five."""
     assert [(stage.steps, stage.frames) for stage in train.stages] == [(32_000, 1), (32_000, 1), (32_000, 5)]
     assert [stage.crop for stage in train.stages] == [512, None, None]
+    assert [stage.size for stage in train.stages] == [None, (1024, 576), (1024, 576)]
     assert {stage.batch_size for stage in train.stages} == {1}
     assert (train.optimizer.learning_rate, train.optimizer.muon_learning_rate) == (2e-5, None)
     assert (train.loss.l2, train.loss.lpips) == (1.0, 1.0)
@@ -101,14 +110,18 @@ def test_what_is_made_fits_what_is_trained_on(experiment: str) -> None:
         assert stage.frames <= split.frames
         assert stage.crop is None or stage.crop == split.width == split.height
     assert made.validation.frames >= max(stage.frames for stage in training.stages)
-    assert (made.validation.width, made.validation.height) == (made.train.width, made.train.height)
+    held_out = made.validation
+    for stage in training.stages:
+        width, height = stage.size or (stage.crop, stage.crop)
+        assert (held_out.width, held_out.height) >= (width, height)
+        assert held_out.height >= height
     assert set(made.train.style) == set(made.validation.style) == {"object", "table"}
 
 
 def test_the_smoke_run_is_the_papers_in_all_but_size() -> None:
     """Every key of it that differs from the paper's own is a number, a size or a machine's."""
     paper, smoke = (composed_training(name) for name in ("paper", "paper_smoke"))
-    sizes = {"steps", "crop"}
+    sizes = {"steps", "crop", "size"}
     assert [each.model_dump(exclude=sizes) for each in smoke.stages] == [
         each.model_dump(exclude=sizes) for each in paper.stages
     ]
