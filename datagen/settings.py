@@ -109,6 +109,9 @@ class Settings(ScaleSettings):
         "tracer takes to be as near the truth as guidance is (equal_error); or measure what it saves to "
         "path-trace under many lights at once (sharing).",
     )
+    seed: int = Field(
+        0, description="Root of all randomness; a scene depends on it, its split and its index alone."
+    )
     source: Literal["synthetic", "captured"] = Field(
         "synthetic",
         description="What is made: synthetic scenes, drawn from seeds and path-traced; or captured ones: "
@@ -123,9 +126,6 @@ class Settings(ScaleSettings):
     )
     captured: CapturedSettings = Field(
         default_factory=lambda: CapturedSettings(), description="Training pairs of captures."
-    )
-    seed: int = Field(
-        0, description="Root of all randomness; a scene depends on it, its split and its index alone."
     )
     train: SplitSettings = Field(SplitSettings(scenes=16), description="First training split.")
     train_b: SplitSettings = Field(
