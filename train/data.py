@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from train.augmentation import augmented, display_encoded
-from train.curriculum import Stage, require_splits
+from train.curriculum import CAPTURES, Stage, require_splits
 from train.framing import centred, covering_size, sized
 from train.held_out import HeldOutClips, Windows, network_input, spread
 from train.processes import Processes
@@ -30,8 +30,6 @@ from tron.errors import TronError
 from tron.shards.schema import GUIDANCE, TARGET, ClipMeta
 
 log = logging.getLogger(__name__)
-
-STAND_IN = "train_b"  # the second distribution that tron-datagen makes, for want of photographs
 
 
 class Batches(IterableDataset):
@@ -178,7 +176,7 @@ class TrainingData(lightning.LightningDataModule):
 
     def stands_in(self, split: str) -> bool:
         """Whether a split holds path-traced pictures where the curriculum would have photographs."""
-        return split == STAND_IN and not self.photographs(split)
+        return split == CAPTURES and not self.photographs(split)
 
     def calibration(self, stages: Sequence[Stage], temporal_factor: int, clips: int = 64) -> Iterator[Tensor]:
         """Training videos (1, 3, K, H, W), all buffers, of the longest stage's K, to calibrate a codec on."""

@@ -14,8 +14,6 @@ from tron.dataset_folder import DatasetPlace
 HELD_OUT = "test"
 """The split that evaluation judges by."""
 
-"""URL of a folder in an object store."""
-
 
 class OptimizerSettings(BaseModel):
     """The optimiser and its schedule, the same in every stage."""

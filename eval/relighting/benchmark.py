@@ -55,7 +55,7 @@ class Relighting(Benchmark):
     train_splits: list[str] = Field(
         default=["train"], description="splits that the fitted baselines see", min_length=1
     )
-    fitted_on: Path | None = Field(
+    fitted_on: DatasetPlace | None = Field(
         default=None,
         description="data set whose training splits they see; null: dataset, which has none where it is a "
         "benchmark such as TRON-Synth",

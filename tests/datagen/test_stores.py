@@ -1,14 +1,22 @@
 """A dataset in an object store: a real S3 server of this machine, through the code that users run."""
 
 import socket
+from itertools import islice
 from pathlib import Path
 
 import pytest
+import torch
 
 from datagen.merge import merge
 from datagen.run import make
 from datagen.settings import Settings
 from datagen.validate import validate
+from eval.datagen.reader import write_clips
+from eval.datagen.settings import ReaderSettings
+from eval.relighting.benchmark import Relighting
+from train.curriculum import Stage
+from train.data import TrainingData
+from train.settings import DataSettings, ValidationSettings
 from tron.cli.recipes import check, compose_recipe
 from tron.dataset_folder import DatasetFolder
 from tron.errors import TronError
@@ -111,6 +119,26 @@ def test_parts_go_to_one_store_and_merge_there(tiny_scenes, bucket, tmp_path):
     assert verify(url) == []
     assert not list(output.glob("*.tar"))
     assert Manifest.load(url) == Manifest.load(output)
+
+
+def test_loader_processes_train_from_the_store(bucket, s3_server, tmp_path):
+    local, url = tmp_path / "clips", f"{bucket}/clips"
+    write_clips(local, ReaderSettings(clips=4, frames=5, width=16), 3)
+    for path in local.iterdir():
+        s3_server.write(f"{url}/{path.name}", path.read_bytes())
+    stage = Stage(name="one", split="train", steps=4, batch_size=1)
+    found = []
+    for place, workers in ((local, 0), (url, 2)):
+        data = TrainingData(place, DataSettings(cache_gb=0, workers=workers), 7, ValidationSettings())
+        data.open([stage])  # reads the first shard in this process: its connections are not the loaders'
+        data.begin(stage, 0)
+        found.append(list(islice(data.train_dataloader(), 4)))
+    for here, there in zip(*found, strict=True):
+        torch.testing.assert_close(there, here, rtol=0, atol=0)
+
+
+def test_baselines_may_be_fitted_on_a_dataset_in_a_store(bucket):
+    assert Relighting(dataset=None, fitted_on=f"{bucket}/set").fitted_on == f"{bucket}/set"
 
 
 def test_credentials_and_the_store_are_in_no_file_of_the_dataset(tiny_scenes, bucket, files_of, tmp_path):

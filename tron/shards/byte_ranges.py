@@ -25,9 +25,15 @@ class ByteRanges:
     """Reads ranges of a folder's files; may be sent to another process, or forked with one."""
 
     def __init__(self, place: Place) -> None:
-        self.folder = DatasetFolder(place)
-        self._process = os.getpid()
+        self._folder, self._process = DatasetFolder(place), os.getpid()
         self._open: OrderedDict[str, int] = OrderedDict()
+
+    @property
+    def folder(self) -> DatasetFolder:
+        """The folder, opened anew in a forked process: connections to stores do not outlive a fork."""
+        if self._process != os.getpid():
+            self._folder, self._process = DatasetFolder(self._folder.place), os.getpid()
+        return self._folder
 
     def read(self, name: str, ranges: Iterable[Range]) -> Iterator[tuple[Range, bytes]]:
         """Ranges with their bytes, by their place in the file; TronError where it ends before one does."""
@@ -52,8 +58,6 @@ class ByteRanges:
 
     def _read(self, name: str, start: int, size: int) -> bytes:
         if self.folder.local is None:
-            if self._process != os.getpid():  # stores' connections do not outlive a fork
-                self.folder, self._process = DatasetFolder(self.folder.place), os.getpid()
             return self.folder.read(name, start, size)
         try:
             return os.pread(self._file(name), size, start)

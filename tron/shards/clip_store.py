@@ -13,7 +13,7 @@ from tron.errors import TronError
 from tron.shards.byte_ranges import ByteRanges
 from tron.shards.index import LARGEST_INDEX, ShardIndex, index_name, parse_index, require_header, scan_index
 from tron.shards.manifest import Manifest, ShardEntry
-from tron.shards.reader import LARGEST_META, decode_frames, decode_meta, file_name, present_members
+from tron.shards.reader import DAMAGED, LARGEST_META, decode_frames, decode_meta, file_name, present_members
 from tron.shards.schema import META_SUFFIX, Clip, ClipMeta
 
 MOST_METAS = 256
@@ -48,6 +48,8 @@ class ClipStore:
         manifest = Manifest.load(place) if manifest is None else manifest
         self.split, self.members = split, None if members is None else tuple(members)
         self._entries = [entry for entry in manifest.of_split(split) if entry.keys]
+        if not self._entries:
+            raise TronError(f"manifest names no clip of the split '{split}'", str(place), DAMAGED)
         self._ends = list(accumulate(len(entry.keys) for entry in self._entries))
         self._ranges = ByteRanges(place)
         self._indexes: OrderedDict[str, ShardIndex] = OrderedDict()
@@ -119,6 +121,8 @@ class ClipStore:
             try:
                 return self._indexed_files(number, names)
             except TronError:
+                if shard in self._scanned:  # its headers have just been walked
+                    raise
                 self._scanned.add(shard)
                 self._indexes.pop(shard, None)
         return self._indexed_files(number, names)

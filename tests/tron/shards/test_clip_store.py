@@ -4,6 +4,7 @@ import io
 import pickle
 import shutil
 import tarfile
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from tron.errors import TronError
 from tron.shards import MEMBERS, Clip, ClipMeta, ClipStore, Manifest, ShardWriter, clip_members, read_clips
 from tron.shards import clip_store as clip_store_module
 from tron.shards.byte_ranges import LARGEST_READ, ByteRanges, _neighbours
-from tron.shards.index import index_name, parse_index, scan_index
+from tron.shards.index import index_name, index_of, parse_index, scan_index
 
 FRAMES = 3
 SHARD = "train-00000.tar"
@@ -180,6 +181,53 @@ def test_the_headers_are_walked_only_where_there_is_no_index(folder, monkeypatch
     (folder / INDEX).unlink()
     require_read_as_a_stream(folder)
     assert walked == [SHARD]
+
+
+def test_headers_of_a_damaged_shard_are_walked_once(folder, monkeypatch):
+    walked = []
+
+    def counted(file, where):
+        walked.append(where)
+        return scan_index(file, where)
+
+    monkeypatch.setattr(clip_store_module, "scan_index", counted)
+    (folder / INDEX).unlink()
+    rewritten(folder, lambda members: members[:1] + members)
+    with pytest.raises(TronError, match="twice"):
+        ClipStore(folder, "train").meta(0)
+    assert len(walked) == 1
+
+
+def test_a_file_that_is_there_twice_ends_the_walk():
+    met = []
+
+    def endless():
+        while True:
+            met.append(None)
+            yield "a.f00.pbr.exr", 512, 0
+
+    with pytest.raises(TronError, match=r"member f00\.pbr\.exr twice"):
+        index_of(endless(), "shard")
+    assert len(met) == 2
+
+
+def test_an_index_of_millions_of_entries_is_not_split():
+    data = b"v1.2 1\n" + b" 0 0 . " * 1_000_000 + b" 0 0 meta.json"
+    tracemalloc.start()
+    try:
+        assert parse_index(data, 10_240, "shard") is None
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_split_whose_clips_have_no_names_is_refused(folder):
+    manifest = Manifest.load(folder)
+    for entry in manifest.shards:
+        entry.keys = []
+    manifest.save(folder)
+    with pytest.raises(TronError, match="names no clip of the split 'train'"):
+        ClipStore(folder, "train")
 
 
 def rewritten(folder: Path, change: Callable[[list], list], **options) -> None:
