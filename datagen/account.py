@@ -25,6 +25,7 @@ PAGE_NAME = "index.html"
 ACCOUNT = (
     CONFIG_NAME,
     CARD_NAME,
+    SOURCES_NAME,
     METADATA_NAME,
     SHEET_NAME,
     VARIETY_NAME,

@@ -85,7 +85,8 @@ def require_splits(stages: Sequence[Stage], there: Container[str]) -> None:
             raise TronError(
                 f"stage {stage.name} learns from the split '{CAPTURES}', which is not there",
                 mend="give a dataset of captures, made by tron-datagen source=captured: "
-                f"splits={{{CAPTURES}: FOLDER}}; or make one with {CAPTURES}.scenes above 0 to stand in",
+                f"'splits={{{CAPTURES}: \"FOLDER#train\"}}'; or make one with {CAPTURES}.scenes above 0 to "
+                "stand in",
             )
 
 

@@ -1,12 +1,15 @@
 """Batches: functions of seed, stage and step, shared by ranks; memory and disk give the same."""
 
 import itertools
+import re
+import shlex
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from pydantic import ValidationError
 from torch.utils.data import DataLoader
 
@@ -322,6 +325,9 @@ def test_a_curriculum_without_its_captures_says_what_to_give(dataset, tmp_path):
     manifest.model_copy(update={"shards": kept}).save(folder)
     data = TrainingData(folder, DataSettings(), 0, ValidationSettings())
     stages = [Stage(name="one", split="train", steps=1), Stage(name="two", split="train_b", steps=1)]
-    with pytest.raises(TronError, match=r"stage two .*source=captured: splits=\{train_b: FOLDER\}"):
+    with pytest.raises(TronError, match=r"stage two .*source=captured: 'splits=") as caught:
         data.open(stages)
+    (typed,) = shlex.split(re.findall(r"'splits=.*?'", str(caught.value))[0])
+    override = OverridesParser.create().parse_override(typed)
+    assert override.value() == {"train_b": "FOLDER#train"}, "what a shell and Hydra make of the advice"
     data.open(stages[:1])
