@@ -11,7 +11,7 @@ SLOW_STORAGE = 100e6
 def first_limit(
     *, needed: float, free: float, memory: float, workers: int, here: bool, seconds: float, written: float
 ) -> str:
-    """What a plan runs into first, in words.
+    """The first limit that a plan runs into, in words.
 
     Args:
         needed, free: bytes that are asked of the disk, and that it has.
