@@ -43,6 +43,8 @@ log = logging.getLogger(__name__)
 
 APART = (*ACCOUNT, TRACEBACKS, "logs", "slurm")
 """Files and folders that the account is written anew to, or that no dataset is made of."""
+UNFINISHED = ("work", "reconstruction")
+"""Folders of a scene that a run goes on from; a link would let two runs write to one file."""
 NAMED = 3
 UNLINKABLE = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP)
 """What a file system says that cannot link this file: another one, one without links, too many of them."""
@@ -138,6 +140,8 @@ def _names(part: Path) -> Iterator[str]:
         if inner == Path():
             folders[:] = [name for name in folders if name not in APART]
             names = [name for name in names if name not in APART]
+        elif inner.parts[0] == "scenes":
+            folders[:] = [name for name in folders if name not in UNFINISHED]
         folders.sort()
         yield from ((inner / name).as_posix() for name in sorted(names) if not name.startswith("."))
 

@@ -256,7 +256,7 @@ def estimate_bytes(settings: Settings, items: Iterable[Work], shards: bool = Tru
         clip = recipe.frames * frame if shards else 0
         previews = preview_bytes(recipe.width, recipe.height, recipe.frames, len(members))
         total += item.clips(settings) * (clip + previews) + surfels * SURFEL_BYTES
-        waiting = max(waiting, scratch_bytes(settings, item.split))
+        waiting = max(waiting, scratch_bytes(settings, item.split, item.photos))
     return total + waiting * worker_count(settings, len(items))[0]
 
 

@@ -14,6 +14,7 @@ from datagen.account import read_other
 from datagen.clusters import LOCAL, logs_folder, require_cluster, worker_count
 from datagen.first_limit import first_limit
 from datagen.plan import (
+    NOTHING,
     Work,
     chosen,
     estimate_bytes,
@@ -28,6 +29,7 @@ from datagen.scale_settings import part_of
 from datagen.scheduling import TIMES_NAME
 from datagen.settings import Settings
 from datagen.source_list import slots
+from datagen.store import Store, held_bytes
 from tron.cli.termination import termination_unwinds
 from tron.runtime import activate
 
@@ -69,7 +71,9 @@ def project(settings: Settings) -> str:
     sources = ready_sources(settings)
     if settings.variety_against is not None:
         read_other(settings.variety_against)
-    there = {item.name for item in items if read_record(settings.output_dir, item.name) is not None}
+    stored = Store(settings.store).shards() if settings.store else NOTHING
+    output = settings.output_dir
+    there = {item.name for item in items if read_record(output, item.name, stored) is not None}
     times = read_times(logs_folder(settings) / TIMES_NAME)
     splits = []
     for split in settings.used_splits():
@@ -77,7 +81,7 @@ def project(settings: Settings) -> str:
         cost = None
         if missing:
             made = [item for item in items if item.split == split and item.name in there]
-            cost = _of_made(settings, made, times)
+            cost = _of_made(settings, made, times, stored)
             if cost is None and settings.source == "captured":
                 cost = captured_cost(missing, settings)
             elif cost is None:
@@ -106,12 +110,14 @@ def read_times(path: Path) -> dict[str, float]:
     return found
 
 
-def _of_made(settings: Settings, made: Sequence[Work], times: Mapping[str, float]) -> SceneCost | None:
+def _of_made(
+    settings: Settings, made: Sequence[Work], times: Mapping[str, float], stored: Mapping[str, int]
+) -> SceneCost | None:
     """Mean cost of the scenes that are there and whose seconds are known."""
     timed = [item.name for item in made if item.name in times]
     if not timed:
         return None
-    sizes = [scene_bytes(settings.output_dir, name) for name in timed]
+    sizes = [scene_bytes(settings.output_dir, name, stored) for name in timed]
     source = f"{len(timed)} scene{'s' * (len(timed) > 1)} made here"
     return SceneCost(fmean(times[name] for name in timed), fmean(sizes), float("nan"), source)
 
@@ -131,9 +137,9 @@ def captured_cost(missing: Sequence[Work], settings: Settings) -> SceneCost:
     return SceneCost(seconds, estimate_bytes(settings, missing) / len(missing), float("nan"), ROUGHLY)
 
 
-def scene_bytes(output: Path, name: str) -> int:
-    """Bytes of a finished scene: its shards, surfels and previews."""
-    record = read_record(output, name)
+def scene_bytes(output: Path, name: str, stored: Mapping[str, int] = NOTHING) -> int:
+    """Bytes of a finished scene: its shards, wherever they are, surfels and previews."""
+    record = read_record(output, name, stored)
     if record is None:
         return 0
     folders = (scene_folder(output, name).glob("*.*"), (output / "previews").glob(f"{name}-l*"))
@@ -153,7 +159,7 @@ def report(settings: Settings, splits: Sequence[SplitPlan]) -> str:
     seconds = sum(len(split.missing) * split.cost.seconds for split in splits if split.cost)
     memory = [split.cost.memory for split in splits if split.cost and split.cost.memory > 0]
     count, known = worker_count(settings, len(missing))
-    needed = estimate_bytes(settings, missing)
+    needed = held_bytes(settings, missing) if missing else 0
     free = shutil.disk_usage(_existing(settings.output_dir)).free
     facts = [
         ("scenes to make", f"{len(missing)} of {sum(split.scenes for split in splits)}{_names(missing)}"),

@@ -37,8 +37,9 @@ from datagen.exposure import metered
 from datagen.failures import record_failures, summary
 from datagen.pathtrace import gbuffers, render_frames
 from datagen.phone import Phone, draw_phone
-from datagen.plan import Sources, Work, chosen, find_sources, plan
+from datagen.plan import Sources, Work, chosen, plan
 from datagen.pose_noise import disturbed
+from datagen.ready_sources import ready_sources
 from datagen.relit import RELIT, record_relit, relit_folders, straightened, write_relit
 from datagen.scene import SceneSpec
 from datagen.scheduling import make_each
@@ -80,7 +81,7 @@ def make_pseudo_captures(settings: Settings) -> int:
     wanted = chosen(items, settings.only)
     require_cluster(settings)
     activate(settings.variant, threads=1)
-    sources = find_sources(settings)
+    sources = ready_sources(settings)
     captures, truth = settings.output_dir / CAPTURES, settings.output_dir / TRUTH
     with locked(settings.output_dir):
         if not (truth / CONFIG_NAME).exists():

@@ -76,7 +76,6 @@ def make(settings: Settings) -> int:
         missing = [item for item in wanted if read_record(output, item.name, stored) is None]
         for item in (item for item in wanted if item.capture and item not in missing):
             clear_work(scene_folder(output, item.name))  # killed between its record and this
-        missing = [item for item in wanted if read_record(output, item.name, stored) is None]
         failed: dict[str, Failure] = {}
         if missing:
             require_free_space(output, held_bytes(settings, missing))

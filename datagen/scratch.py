@@ -12,17 +12,23 @@ CHECKPOINT_BYTES = 1200
 """Bytes of a surfel in a reconstruction's checkpoint: parameters and two moments of Adam, and a copy."""
 
 
-def scratch_bytes(settings: Settings, split: str) -> int:
-    """Bytes on disk that one scene of a split takes at the most while it is made, and then no more."""
+def scratch_bytes(settings: Settings, split: str, photos: int = 0) -> int:
+    """Bytes on disk that one scene of a split takes at the most while it is made, and then no more.
+
+    A capture has its checkpoint, and frames of all its ``photos``, until its clips are written.
+    """
     recipe = settings.split(split)
+    members = (MEMBERS[name] for name in clip_members(recipe.reference_buffers))
+    pixel = sum(max(member.bytes, 2) * member.channels for member in members)
+    if settings.source == "captured":
+        most = settings.captured.reconstruction.radiance.density.most
+        return most * CHECKPOINT_BYTES + photos * recipe.width * recipe.height * pixel
     views = settings.views + (-(-settings.views // 2) if recipe.moving_objects else 0)
     clip = recipe.frames * recipe.width * recipe.height
     judges = view_bytes(recipe.frames, recipe.width, recipe.height)
     refined = view_bytes(views, settings.view_width, settings.view_height) + judges
     pictures = settings.views * settings.view_width * settings.view_height * PICTURE_BYTES
     reconstructed = pictures + settings.surfels * CHECKPOINT_BYTES
-    members = (MEMBERS[name] for name in clip_members(recipe.reference_buffers))
-    pixel = sum(max(member.bytes, 2) * member.channels for member in members)
     spooled = clip * pixel * (len(recipe.lights) if recipe.lights_share_path is not False else 1)
     shares, rebuilt = settings.surfels_from, 0
     if shares.reconstruction:  # it lies there until the clips are written

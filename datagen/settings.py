@@ -356,6 +356,8 @@ class Settings(ScaleSettings):
             return self
         if self.captures is not None:
             raise ValueError("captures is of source=captured: give source=captured, or leave it out")
+        if self.mode in ("captures", "pseudo_captures") and (self.shard or self.store):
+            raise ValueError(f"shard and store are of datasets: leave them out with mode={self.mode}")
         captures = self.mode == "captures"
         lights = {"capture": self.capture.lights} if captures else {}
         for name in ["test"] if captures else self.used_splits():
@@ -380,9 +382,9 @@ class Settings(ScaleSettings):
         """Raise ValueError where keys do not go with source=captured."""
         if self.captures is None:
             raise ValueError("source=captured needs captures=DIR, a folder with a capture a sub-folder")
-        if self.mode not in ("make", "plan", "validate"):
+        if self.mode not in ("make", "plan", "validate", "merge"):
             raise ValueError(f"mode={self.mode} is of source=synthetic")
-        ours = OF_CAPTURES | OF_BOTH_SOURCES | OUTSIDE - {"variety_against"}
+        ours = OF_CAPTURES | OF_BOTH_SOURCES | OUTSIDE - {"variety_against", "disjoint_from"}
         for name, field in type(self).model_fields.items():
             if name not in ours and getattr(self, name) != field.get_default(call_default_factory=True):
                 raise ValueError(f"{name} is of source=synthetic: leave it out with source=captured")

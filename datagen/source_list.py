@@ -58,7 +58,7 @@ class SourceList(BaseModel):
 
     Attributes:
         seed: root of what is procedural.
-        splits: that have scenes.
+        splits: that have scenes drawn from it; none of captures, which are drawn from no seed.
         stand_ins: for named assets, where there is a checklist.
     """
 
@@ -161,7 +161,7 @@ def source_list(settings: Settings, sources: Sources) -> SourceList:
     checked = slots(settings, sources)
     return SourceList(
         seed=settings.seed,
-        splits=tuple(used),
+        splits=tuple(used) if settings.source == "synthetic" else (),
         sources=tuple(found),
         stand_ins=None if checked is None else checked.stand_ins(),
     )

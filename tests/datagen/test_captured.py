@@ -22,10 +22,12 @@ from datagen.captured_folder import apportioned, split_of
 from datagen.captured_photos import balanced, frame_of, in_order, rows_of_photos, starts
 from datagen.captured_reconstruction import PHASES
 from datagen.captured_settings import Shares
-from datagen.plan import plan
+from datagen.merge import merge
+from datagen.plan import Work, estimate_bytes, plan
 from datagen.projection import project
 from datagen.run import make
 from datagen.settings import SPLITS, Settings
+from datagen.source_list import read_source_list
 from datagen.validate import validate
 from tron.cameras import Camera
 from tron.captures import Capture, View, load_capture
@@ -35,7 +37,7 @@ from tron.errors import TronError
 from tron.seeds import generator
 from tron.shards.manifest import Manifest
 from tron.shards.reader import read_clips
-from tron.shards.schema import clip_members
+from tron.shards.schema import MEMBERS, clip_members
 
 Recipe = Callable[..., Settings]
 CAMERA = Camera.look_at((0, -3, 1), (0, 0, 0), fov_deg=40, width=12, height=8)
@@ -122,6 +124,11 @@ def test_training_reads_the_pairs_as_they_are(pairs: Path):
         clip.frames["lit"] * clip.meta.exposure,
         rtol=1e-5,
     )
+
+
+def test_captures_are_drawn_from_no_seed(pairs: Path):
+    """Else a benchmark of the same seed would be said to share its scenes with them."""
+    assert read_source_list(pairs).splits == ()
 
 
 def test_a_finished_dataset_is_touched_by_no_rerun(pairs: Path, recipe: Recipe):
@@ -217,6 +224,7 @@ def test_a_plan_says_what_is_missing_and_makes_nothing(recipe, tmp_path):
         ("train.scenes=3", "train is of source=synthetic"),
         ("environments=maps", "environments is of source=synthetic"),
         ("mode=captures", "mode=captures is of source=synthetic"),
+        ("disjoint_from=[outputs/demo]", "disjoint_from is of source=synthetic"),
         ("captured.shares={train:0,validation:0,test:0}", "all shares are 0"),
         ("prior=magic", "unknown prior"),
     ],
@@ -225,6 +233,33 @@ def test_settings_that_do_not_go_with_captures_are_refused_in_a_line(override, s
     with pytest.raises(TronError, match=said) as error:
         settings_of("source=captured", "captures=photos", "output_dir=out", override)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.long
+def test_parts_and_a_store_have_the_bytes_of_one_run(pairs, recipe, files_of, tmp_path):
+    parts, merged, kept, store = (
+        [tmp_path / "1", tmp_path / "2"],
+        *(tmp_path / name for name in ("m", "s", "u")),
+    )
+    for number, part in enumerate(parts, start=1):
+        assert make(recipe(part, f"shard={number}/2")) == 0
+    assert merge(recipe(merged, "mode=merge", f"merge=[{parts[0]},{parts[1]}]")) == 0
+    assert files_of(merged) == files_of(pairs)
+    sent = recipe(kept, f"store=file://{store}")
+    for _ in range(2):
+        assert make(sent) == 0
+    assert files_of(pairs) == files_of(kept) | {
+        name: data for name, data in files_of(store).items() if name.endswith((".tar", ".idx"))
+    }
+    assert "scenes to make  0 of 3" in project(sent), "what is in the store is not missing"
+
+
+def test_the_space_of_a_capture_grows_with_its_photos(recipe, tmp_path):
+    """All its frames wait on disk until they are cut into clips, beside the shards of the same."""
+    settings = recipe(tmp_path)
+    few, many = (estimate_bytes(settings, [Work("train", 0, "a", 0, "a", n)], shards=False) for n in (3, 300))
+    frames = 297 * 20 * 16 * sum(MEMBERS[name].channels * 2 for name in clip_members(reference=False))
+    assert many - few >= frames
 
 
 def test_captures_without_the_source_are_refused():

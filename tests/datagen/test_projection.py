@@ -67,6 +67,15 @@ def test_a_finished_dataset_is_missing_nothing(small_settings, small_dataset: Pa
     assert "none: nothing is missing" in text
 
 
+def test_what_is_in_the_store_is_not_missing(small_settings, small_dataset: Path, tmp_path: Path):
+    there, store = tmp_path / "out", tmp_path / "store"
+    shutil.copytree(small_dataset, there)
+    store.mkdir()
+    for path in there.glob("*.tar"):
+        path.rename(store / path.name)
+    assert "scenes to make  0 of 4" in project(small_settings(there, f"store=file://{store}"))
+
+
 def test_a_plan_is_refused_where_the_dataset_would_be(small_settings, small_dataset: Path, tmp_path: Path):
     with pytest.raises(TronError, match=r"made with test\.path_spp=4, not 5"):
         project(small_settings(small_dataset, "test.path_spp=5"))

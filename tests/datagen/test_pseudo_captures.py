@@ -364,6 +364,23 @@ def test_more_scenes_may_be_added(output, tmp_path):
         make_pseudo_captures(tiny(copy, "test.style=table"))
 
 
+@pytest.mark.parametrize("wrong", ["shard=1/2", "store=file:///nowhere"])
+def test_parts_and_stores_are_of_datasets(tmp_path, wrong):
+    with pytest.raises(TronError, match="shard and store are of datasets"):
+        tiny(tmp_path, wrong)
+
+
+def test_a_checklist_that_cannot_be_read_is_told_before_anything(tmp_path):
+    with pytest.raises(TronError, match="checklist not found"):
+        make_pseudo_captures(tiny(tmp_path / "out", "checklist=nothing"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_nothing_that_a_dataset_trains_on_is_photographed_against_the_recipe(tmp_path):
+    with pytest.raises(TronError, match=r"dataset has no sources\.json"):
+        make_pseudo_captures(tiny(tmp_path / "out", f"disjoint_from=[{tmp_path}]"))
+
+
 @pytest.mark.parametrize(
     "wrong",
     [

@@ -1,8 +1,11 @@
 """Parts of a dataset: disjoint, complete, and each a folder that knows which one it is."""
 
+from pathlib import Path
+
 import pytest
 import yaml
 
+from datagen.account import ACCOUNT
 from datagen.plan import config_sha256, plan
 from datagen.run import make
 from datagen.scale_settings import part_of
@@ -43,3 +46,9 @@ def test_a_part_makes_its_scenes_alone_and_its_folder_takes_no_other(variant, sm
 def test_parts_have_the_hash_of_the_whole(small_settings, tmp_path):
     whole, part = small_settings(tmp_path), small_settings(tmp_path, "shard=1/2", "store=s3://a/b")
     assert config_sha256(whole) == config_sha256(part)
+
+
+def test_files_of_the_whole_are_all_known_to_merges_and_stores(small_dataset: Path):
+    """One that is not would be in two parts, and would never reach a store."""
+    own = {path.name for path in small_dataset.iterdir() if path.is_file() and path.name[0] != "."}
+    assert {name for name in own if not name.endswith((".tar", ".idx"))} <= set(ACCOUNT)
