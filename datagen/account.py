@@ -31,7 +31,6 @@ ACCOUNT = (
     VARIETY_NAME,
     PAGE_NAME,
     LIST_NAME,
-    SOURCES_NAME,
     MANIFEST_NAME,
 )
 """Files that are of the whole dataset and of no scene, the manifest last."""
