@@ -14,10 +14,30 @@ from tron.errors import TronError
 
 
 def _shard(path: Path) -> None:
+    """Refused only if both ways of reading refuse it: clip after clip, and by number as training reads."""
+    refusals = []
+    for way in (_clip_after_clip, _by_number):
+        try:
+            way(path)
+        except TronError as error:
+            refusals.append(error)
+    if len(refusals) == 2:
+        raise refusals[0]
+
+
+def _clip_after_clip(path: Path) -> None:
     from tron.shards.reader import read_clips
 
     for _ in read_clips(path, "train"):
         pass
+
+
+def _by_number(path: Path) -> None:
+    from tron.shards.clip_store import ClipStore
+
+    clips = ClipStore(path, "train")
+    for number in range(len(clips)):
+        clips.read_frames(number)
 
 
 def _picture(path: Path) -> None:
