@@ -57,14 +57,14 @@ def test_workers_are_replaced_one_by_one_and_a_scene_that_hangs_or_kills_is_name
 
     others = ["hangs-0", "fails-0", "kills-0", "stumbles-0", "quick-6"]
     names = ["slow-0", *(f"quick-{i}" for i in range(6)), *others]
-    settings = settings_of(tmp_path, "workers=2", "recycle_after=2", "scene_timeout=12")
+    settings = settings_of(tmp_path, "workers=2", "recycle_after=2", "scene_timeout=20")
     found = {item.name: each for item, each in attempts(task, works(*names), settings, Sources())}
     assert sorted(found) == sorted(names)
 
     failed = {name: each.outcome for name, each in found.items() if isinstance(each.outcome, Failure)}
     assert sorted(failed) == ["fails-0", "hangs-0", "kills-0"]
     assert failed["fails-0"].reason == "ValueError: no such shape"
-    assert failed["hangs-0"].reason.startswith("took longer than scene_timeout=12 s on tcp://")
+    assert failed["hangs-0"].reason.startswith("took longer than scene_timeout=20 s on tcp://")
     assert "in task" in failed["hangs-0"].traceback, "where it hung"
     assert failed["kills-0"].reason == "worker lost: 3 workers ended while they made it"
 
