@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.account import ACCOUNT, read_other, write_account
+from datagen.captured_reconstruction import WORK
 from datagen.clusters import logs_folder
 from datagen.failures import LIST_NAME, TRACEBACKS, Failure, summary
 from datagen.plan import (
@@ -31,6 +32,7 @@ from datagen.plan import (
     read_record,
 )
 from datagen.ready_sources import ready_sources
+from datagen.reconstructed import FOLDER
 from datagen.settings import Settings
 from datagen.store import Store
 from tron.claim import read_recipe, require_same
@@ -43,7 +45,7 @@ log = logging.getLogger(__name__)
 
 APART = (*ACCOUNT, TRACEBACKS, "logs", "slurm")
 """Files and folders that the account is written anew to, or that no dataset is made of."""
-UNFINISHED = ("work", "reconstruction")
+UNFINISHED = (WORK, FOLDER)
 """Folders of a scene that a run goes on from; a link would let two runs write to one file."""
 NAMED = 3
 UNLINKABLE = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP)

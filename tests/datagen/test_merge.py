@@ -41,6 +41,20 @@ def test_three_parts_are_the_bytes_of_one_run_and_share_their_disk_space(
     assert all(path.stat().st_nlink >= 2 for path in (*shards, *output.glob("scenes/*/record.json")))
 
 
+@pytest.mark.parametrize("folder", ["work", "reconstruction"])
+def test_what_an_unfinished_scene_goes_on_from_is_not_shared(
+    parts, small_settings, small_dataset, files_of, tmp_path, folder
+):
+    """Through a link a run that goes on in a part would write into the merged folder."""
+    first = tmp_path / "first"
+    shutil.copytree(parts[0], first)
+    left = next(first.glob("scenes/*")) / folder / "checkpoint.safetensors"
+    left.parent.mkdir()
+    left.write_bytes(b"half a reconstruction")
+    assert merge(merging(small_settings, tmp_path / "out", [first, *parts[1:]])) == 0
+    assert files_of(tmp_path / "out") == files_of(small_dataset)
+
+
 def test_a_merge_that_was_cut_short_goes_on(
     parts, small_settings, small_dataset, files_of, tmp_path, monkeypatch
 ):
