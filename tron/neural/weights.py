@@ -66,7 +66,13 @@ def load_renderer(path: str | Path, vae: str | Path | None = None) -> Renderer:
         if header.get("format") != FORMAT:
             raise TronError("safetensors file holds no TRON renderer", str(path), MEND)
         renderer = _build(header["kind"], header["config"], vae)
-    except (ValidationError, ValueError, KeyError, AttributeError, TypeError) as error:
+    except ValidationError as error:
+        first = error.errors()[0]
+        key, said = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
+        raise TronError(
+            f"the renderer's configuration is not one of ours: {key}: {said}", path, MEND
+        ) from error
+    except (ValueError, KeyError, AttributeError, TypeError) as error:
         raise TronError("the renderer's configuration is damaged", str(path), MEND) from error
     load_strictly(renderer, state, path)
     return renderer.eval()
