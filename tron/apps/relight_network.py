@@ -44,7 +44,7 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
 
 
 def describe_network(settings: Settings, renderer: Renderer | None) -> dict[str, Any] | None:
-    """What drew the pictures, for relight.json; weights null: equal ones."""
+    """Record of the network for relight.json, None without one; weights null: equal ones."""
     if renderer is None or settings.checkpoint is None:
         return None
     return {

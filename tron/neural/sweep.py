@@ -34,14 +34,14 @@ def weight_sweep(renderer: NeuralRenderer, displayed: Mapping[str, np.ndarray]) 
     Raises:
         TronError: the renderer is not given both buffers, or the clip does not fit it.
     """
-    guidance = renderer.config.guidance
-    if not set(PAPER_GUIDANCE) <= set(guidance):
+    names = renderer.config.guidance
+    if not set(PAPER_GUIDANCE) <= set(names):
         raise TronError(
             f"a sweep needs the buffers {' and '.join(PAPER_GUIDANCE)}", mend="take another renderer"
         )
-    weights = renderer.config.weights or dict.fromkeys(guidance, 1 / len(guidance))
+    weights = renderer.config.weights or dict.fromkeys(names, 1 / len(names))
     device = next(renderer.parameters()).device
-    buffers = {name: to_tensor(displayed[name]).to(device) for name in guidance if name in displayed}
+    buffers = {name: to_tensor(displayed[name]).to(device) for name in names if name in displayed}
     rows = []
     for pbr in SWEEP:
         for irradiance in SWEEP:
