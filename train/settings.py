@@ -130,7 +130,7 @@ class Settings(BaseModel):
         description="Folder for renderer.safetensors, checkpoints, metrics.csv, config.yaml."
     )
     renderer: dict[str, Any] = Field(
-        description="What is trained, a `_target_` (group: tiny, pixel_mlp, cosmos)."
+        description="What is trained, a `_target_` (group: tiny, unet, pixel_mlp, cosmos)."
     )
     stages: list[Stage] = Field(default=THREE_STAGES, min_length=1, description="The curriculum, in order.")
     optimizer: OptimizerSettings = OptimizerSettings()

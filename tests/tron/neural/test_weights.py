@@ -90,6 +90,8 @@ def test_files_from_before_lit_render_as_they_did(tmp_path, kind, named):
         torch.nn.init.normal_(parameter, std=0.1)
     config = renderer.config.model_dump(mode="json", exclude=unsaid | (set() if named else {"guidance"}))
     assert config.get("skip", "pbr") == "pbr"
+    config.pop("weights", None)
+    config.get("backbone", {}).pop("kind", None)  # there was one kind alone
     header = {"format": "tron-renderer 1", "kind": kind, "config": config}
     save_file(renderer.state_dict(), tmp_path / "old.safetensors", {"tron": json.dumps(header)})
     again = load_renderer(tmp_path / "old.safetensors")
