@@ -12,10 +12,10 @@ from torch.utils._pytree import tree_leaves
 
 
 class LiveMemory(TorchDispatchMode):
-    """Counts the bytes of all storages that operations make while it is entered, and their peak.
+    """Counts the bytes of all storages that operations make while it is entered.
 
-    What was there before is not counted, nor are an allocator's rounding and an operation's own scratch space.
-    Inside torch's FakeTensorMode it counts a pass of any size without doing it.
+    What was there before is not counted, nor are an allocator's rounding and an operation's own scratch
+    space. Inside torch's FakeTensorMode it counts a pass of any size without doing it.
 
     Attributes:
         live: bytes alive now.

@@ -86,8 +86,8 @@ def safetensors_state(path: Path, mend: str | None = None) -> tuple[dict[str, Te
 def load_strictly(module: nn.Module, state: Mapping[str, Tensor], path: Path) -> None:
     """Put weights into a module; TronError names the first that is missing, unknown or of another shape."""
     expected = module.state_dict()
-    wrong = {name: "missing" for name in expected.keys() - state.keys()}
-    wrong |= {name: "unknown" for name in state.keys() - expected.keys()}
+    wrong = dict.fromkeys(expected.keys() - state.keys(), "missing")
+    wrong |= dict.fromkeys(state.keys() - expected.keys(), "unknown")
     for name in expected.keys() & state.keys():
         if expected[name].shape != state[name].shape:
             wrong[name] = f"{_shape(state[name])}, not {_shape(expected[name])}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +88,7 @@ class WanCodec:
     def _chunks(self, frames: int) -> list[tuple[int, int]]:
         """Frames [start, stop) behind each latent frame: the first alone, then four and four."""
         edges = range(1, frames + 1, self.temporal_factor)
-        return [(0, 1), *zip(edges, edges[1:])]
+        return [(0, 1), *pairwise(edges)]
 
     def _decode_chunk(self, hidden: Tensor, cache: list[Any], first: bool) -> tuple[Tensor, list[Any]]:
         """Decode one latent frame; the feature cache goes in and out as values, so that it can be recomputed.

@@ -1,4 +1,4 @@
-"""Folders and files of published weights: an index is followed, what does not fit is one line, nothing runs."""
+"""Folders and files of published weights: an index is followed, misfits are one line, nothing runs."""
 
 import io
 import json
@@ -41,7 +41,7 @@ def test_a_folder_is_read_by_its_index(tmp_path):
 def test_a_file_that_the_index_lists_must_be_there(tmp_path):
     folder = sharded(tmp_path / "transformer")
     (folder / "diffusion_pytorch_model-00002-of-00002.safetensors").unlink()
-    with pytest.raises(TronError, match="a file of the index is not there .*00002-of-00002"):
+    with pytest.raises(TronError, match=r"a file of the index is not there .*00002-of-00002"):
         folder_state(folder)
 
 
@@ -65,7 +65,7 @@ def test_an_index_reads_no_file_outside_its_folder(tmp_path):
 def test_of_two_precisions_the_plain_one_is_read_and_others_are_not_mixed(tmp_path):
     save_file({"a": torch.ones(1)}, tmp_path / "model.fp16.safetensors")
     save_file({"a": torch.zeros(1)}, tmp_path / "model.bf16.safetensors")
-    with pytest.raises(TronError, match="2 .safetensors files and no index"):
+    with pytest.raises(TronError, match=r"2 \.safetensors files and no index"):
         folder_state(tmp_path)
     save_file({"a": torch.full((1,), 2.0)}, tmp_path / "diffusion_pytorch_model.safetensors")
     assert folder_state(tmp_path)["a"].item() == 2
