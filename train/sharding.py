@@ -2,7 +2,7 @@
 
 torch's FSDP2 shards every tensor along its first axis, block by block, on GPUs and, by gloo, on the CPU. A
 stage trains a sharded copy of the renderer; the whole one stays on the CPU of each process and takes the
-weights over at the stage's end. Checkpoints are the same whole files as DDP's: one process reads them, and a
+weights over at the stage's end. Validation gathers all weights for as long as it lasts. Checkpoints are the same whole files as DDP's: one process reads them, and a
 run may go on with either strategy.
 """
 
@@ -23,7 +23,7 @@ from torch.distributed.checkpoint.state_dict import (
     set_model_state_dict,
     set_optimizer_state_dict,
 )
-from torch.distributed.fsdp import fully_shard
+from torch.distributed.fsdp import FSDPModule, fully_shard
 
 from train.checkpoints import AtomicCheckpoints
 from train.module import RendererModule
@@ -72,6 +72,23 @@ class ShardedModule(RendererModule):
         fully_shard(self.renderer, mesh=mesh["data_parallel"])
         apply_options(self.renderer, self._options)
         self._sharded = True
+
+    def on_validation_epoch_start(self) -> None:
+        """Have all weights in every process: clips are shared out unevenly, and gathering takes everybody."""
+        super().on_validation_epoch_start()
+        for part in self._parts():
+            part.set_reshard_after_forward(False, recurse=False)
+            part.unshard()
+
+    def on_validation_epoch_end(self) -> None:
+        """Go back to shards."""
+        for part in self._parts():
+            part.reshard()
+            part.set_reshard_after_forward(part is not self.renderer, recurse=False)
+        super().on_validation_epoch_end()
+
+    def _parts(self) -> list[FSDPModule]:
+        return [part for part in self.renderer.modules() if isinstance(part, FSDPModule)]
 
     def give_weights_to(self, whole: RendererModule) -> None:
         """Gather the weights into a module that is whole, in every process."""
