@@ -2,8 +2,8 @@
 
 torch's FSDP2 shards every tensor along its first axis, block by block, on GPUs and, by gloo, on the CPU. A
 stage trains a sharded copy of the renderer; the whole one stays on the CPU of each process and takes the
-weights over at the stage's end. Validation gathers all weights for as long as it lasts. Checkpoints are the same whole files as DDP's: one process reads them, and a
-run may go on with either strategy.
+weights over at the stage's end. Validation gathers all weights for as long as it lasts. Checkpoints are the
+same whole files as DDP's, which one process reads.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Time and memory of the paper's renderer: one frame of Cosmos 0.6B with random weights, and a projection.
 
-What is measured: passes of the full architecture over small frames, on this machine's CPU. What is projected:
-a clip of 1024 x 576, K = 5, on the same processor. Time follows `a + b n + c n²` in the transformer's tokens n:
-all but attention is linear, the codec too. Memory of activations is counted at full size without doing the
-pass (tron.neural.live_memory); it is linear in tokens, for attention never holds the square matrix.
+Measured are passes of the full architecture over small frames, on this machine's CPU; projected is a clip of
+1024 x 576, K = 5, on the same processor. Time follows `a + b n + c n²` in the transformer's tokens n: all but
+attention is linear, the codec too. Memory of activations is counted at full size without doing the pass
+(tron.neural.live_memory); it is linear in tokens, for attention never holds the square matrix.
 """
 
 from __future__ import annotations
