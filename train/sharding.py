@@ -92,7 +92,7 @@ class ShardedModule(RendererModule):
 
     def give_weights_to(self, whole: RendererModule) -> None:
         """Gather the weights into a module that is whole, in every process."""
-        state = get_model_state_dict(self, options=WHOLE)
+        state: dict[str, Any] = get_model_state_dict(self, options=WHOLE)
         whole.load_state_dict({name: tensor.cpu() for name, tensor in state.items()})
 
 
@@ -119,7 +119,7 @@ class ShardedStrategy(ModelParallelStrategy):
         if isinstance(optimizer, LightningOptimizer):
             optimizer = optimizer._optimizer
         assert self.model is not None
-        state = get_optimizer_state_dict(self.model, optimizer, options=ON_FIRST)
+        state: dict[str, Any] = get_optimizer_state_dict(self.model, optimizer, options=ON_FIRST)
         if not state:
             return {}
         names = [name for group in state["param_groups"] for name in group["params"]]

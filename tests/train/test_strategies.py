@@ -11,6 +11,7 @@ import torch
 from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
 from pydantic import ValidationError
 from safetensors.torch import load_file
+from torch._inductor import config as inductor_config
 
 from train.cli import main
 from train.settings import Settings
@@ -138,11 +139,10 @@ def test_compiled_blocks_train_the_same_weights(train):
 
 
 def test_a_compiler_that_is_not_there_is_one_line_before_anything_is_written(train, monkeypatch, tmp_path):
-    monkeypatch.setenv("CXX", str(tmp_path / "no-compiler"))
     torch._dynamo.reset()
     for cached in ("TORCHINDUCTOR_CACHE_DIR", "TRITON_CACHE_DIR"):
         monkeypatch.setenv(cached, str(tmp_path / "cache"))
-    monkeypatch.setattr(torch._inductor.config.cpp, "cxx", (None, str(tmp_path / "no-compiler")))
+    monkeypatch.setattr(inductor_config.cpp, "cxx", (None, str(tmp_path / "no-compiler")))
     with pytest.raises(TronError, match=r"torch\.compile does not work") as caught:
         train("out", compile=True)
     assert "\n" not in str(caught.value)
