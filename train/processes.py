@@ -6,6 +6,7 @@ from the checked settings and watched, so that whatever ends one of them ends al
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import signal
@@ -173,6 +174,8 @@ def _joined(settings: Settings, devices: int) -> Iterator[Processes]:
     try:
         yield processes
     finally:  # gloo's threads, left running, abort the interpreter as it ends
+        # Garbage that holds a group, collected after this, waits for a thread that waits for the interpreter.
+        gc.collect()
         distributed.destroy_process_group()
 
 
@@ -252,5 +255,6 @@ def _quiet_lightning() -> None:
         ".*`srun` command is available.*",
         ".*`broadcast_buffers` is deprecated.*",  # what torch has instead is not in 2.6
         ".*LeafSpec.*",
+        ".*returned a view tensor.*",  # of FSDP2; nothing is done in place to a renderer's picture
     ):
         warnings.filterwarnings("ignore", message)

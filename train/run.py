@@ -28,7 +28,9 @@ from train.data import TrainingData
 from train.module import RendererModule
 from train.processes import Processes, launch
 from train.settings import Settings
+from train.sharding import ShardedModule, ShardedStrategy, require_shardable
 from train.splits import manifest_hash, split_hashes
+from train.transformer_options import apply_options, require_compiler
 from tron import seeds
 from tron.claim import read_recipe, require_same
 from tron.cli.instantiation import make
@@ -59,6 +61,8 @@ def train(processes: Processes, settings: Settings) -> None:
     if settings.threads is not None:
         set_torch_threads(settings.threads)
     stages = [stage for stage in settings.stages if stage.steps > 0]
+    require_shardable(settings, processes)
+    processes.together(lambda: require_compiler(settings))
     data = processes.together(
         lambda: TrainingData(
             settings.dataset, settings.data, settings.seed, settings.validation, processes, settings.splits
@@ -98,6 +102,7 @@ def _make_module(
     """The renderer as the stage before the position left it, with its loss; the data are opened for it."""
     torch.manual_seed(seeds.integer(settings.seed, "train", "weights", bits=63))
     renderer = build_renderer(settings.renderer)
+    apply_options(renderer, settings)
     module = RendererModule(renderer, RendererLoss(**settings.loss.model_dump()), settings.optimizer)
     data.open(stages, renderer.config.guidance)
     if position.stage > 0:
@@ -145,7 +150,8 @@ def _run_stage(
         state = processes.together(lambda: AtomicCheckpoints().load_checkpoint(checkpoint)["state_dict"])
         module.load_state_dict(state)
         return
-    module.begin(stage, clock)
+    trained = ShardedModule(module, settings) if settings.strategy == "fsdp" else module
+    trained.begin(stage, clock)
     data.begin(stage, position.step)
     callbacks: list[Callback] = [
         TrainingLog(settings.output_dir / "metrics.csv", stage, clock, first_step=position.step),
@@ -160,8 +166,7 @@ def _run_stage(
         accelerator=settings.accelerator,
         devices=settings.devices if processes.count == 1 else processes.count // settings.nodes,
         num_nodes=settings.nodes,
-        # Buffers are constants here; broadcasting them would also tie together how often ranks validate.
-        strategy="auto" if processes.count == 1 else DDPStrategy(broadcast_buffers=False),
+        strategy=_strategy(settings, processes),
         use_distributed_sampler=False,
         precision=settings.precision,  # type: ignore[arg-type]
         gradient_clip_val=settings.optimizer.gradient_clip,
@@ -177,11 +182,20 @@ def _run_stage(
         default_root_dir=settings.output_dir,
     )
     try:
-        trainer.fit(module, datamodule=data, ckpt_path=position.checkpoint, weights_only=True)
+        trainer.fit(trained, datamodule=data, ckpt_path=position.checkpoint, weights_only=True)
     except SystemExit as error:  # Lightning turns an interrupt into exit(1)
         raise KeyboardInterrupt from error
     if trainer.interrupted:
         raise KeyboardInterrupt
+    if isinstance(trained, ShardedModule):
+        trained.give_weights_to(module)
+
+
+def _strategy(settings: Settings, processes: Processes) -> Any:
+    if settings.strategy == "fsdp":
+        return ShardedStrategy(processes)
+    # Buffers are constants here; broadcasting them would also tie together how often ranks validate.
+    return "auto" if processes.count == 1 else DDPStrategy(broadcast_buffers=False)
 
 
 def _end_stage(folder: Path, number: int, stage: Stage, module: RendererModule) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from train.curriculum import Stage
+from train.memory_settings import MemorySettings
 from train.split_place import SplitPlace
 from tron.dataset_folder import DatasetPlace
 
@@ -164,6 +165,13 @@ class Settings(BaseModel):
         description="Machines, with a command on each: by torchrun or srun, or see docs/training.md.",
     )
     precision: str = Field(default="32-true", description="Lightning precision, e.g. 32-true or bf16-mixed.")
+    strategy: Literal["auto", "ddp", "fsdp"] = Field(
+        default="auto",
+        description="How several processes share the work: ddp (what auto means), each with all weights, or "
+        "fsdp, each with a share of the weights and of the optimiser's state.",
+    )
+    memory: MemorySettings = MemorySettings()
+    compile: bool = Field(default=False, description="Compile the transformer's blocks by torch.compile.")
 
     @field_validator("stages")
     @classmethod
@@ -190,6 +198,13 @@ class Settings(BaseModel):
         read = {self.validation.split}.union(*(stage.splits() for stage in self.stages))
         if unread := sorted(set(self.splits) - read):
             raise ValueError(f"splits names '{unread[0]}', which neither a stage nor validation reads")
+        return self
+
+    @model_validator(mode="after")
+    def _shards_follow_adamw(self) -> Settings:
+        for name in ("muon_learning_rate", "ema_decay"):
+            if self.strategy == "fsdp" and getattr(self.optimizer, name) is not None:
+                raise ValueError(f"strategy=fsdp trains without optimizer.{name}: give null, or strategy=ddp")
         return self
 
     @model_validator(mode="after")

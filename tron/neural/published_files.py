@@ -5,6 +5,8 @@ safetensors holds numbers and text, and `.pt`/`.pth` files are read with `weight
 
 from __future__ import annotations
 
+import io
+import json
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
@@ -29,7 +31,9 @@ def existing(path: str | Path | None, what: str, file: str) -> Path:
 def torch_state(path: Path) -> dict[str, Tensor]:
     """The tensors of a `.pt` or `.pth` file, by name."""
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        # Transformer Engine's layers leave byte buffers (`_extra_state`) in published files: data, no code.
+        with torch.serialization.safe_globals([io.BytesIO]):
+            state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError) as error:
         raise TronError("not a file of plain weights", str(path), "download it again") from error
     if not isinstance(state, dict):
@@ -38,14 +42,34 @@ def torch_state(path: Path) -> dict[str, Tensor]:
 
 
 def folder_state(folder: Path) -> dict[str, Tensor]:
-    """The tensors of all safetensors files of a diffusers folder, by name."""
-    files = sorted(folder.glob("*.safetensors"))
-    if not files:
-        raise TronError("folder holds no .safetensors file", str(folder))
+    """The tensors of a diffusers folder, by name: of the files that its index lists, else of the only one."""
     state: dict[str, Tensor] = {}
-    for path in files:
+    for path in _folder_files(folder):
         state.update(safetensors_state(path)[0])
     return state
+
+
+def _folder_files(folder: Path) -> list[Path]:
+    """The safetensors files of a diffusers folder; another precision's beside them is not mixed in."""
+    indices = sorted(folder.glob("*.safetensors.index.json"))
+    if not indices:
+        files = sorted(folder.glob("*.safetensors"))
+        plain = [path for path in files if path.name == "diffusion_pytorch_model.safetensors"]
+        if not files:
+            raise TronError("folder holds no .safetensors file", str(folder))
+        if len(plain or files) > 1:
+            mend = "leave the one that is to be loaded, or give its index.json"
+            raise TronError(f"folder holds {len(files)} .safetensors files and no index", str(folder), mend)
+        return plain or files
+    try:
+        names = sorted(set(json.loads(indices[0].read_text())["weight_map"].values()))
+        files = [folder / Path(name).name for name in names]  # an index names files of its own folder
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+        raise TronError("not an index of weights", str(indices[0]), "download it again") from error
+    for path in files:
+        if not path.is_file():
+            raise TronError("a file of the index is not there", str(path), "download it")
+    return files
 
 
 def safetensors_state(path: Path, mend: str | None = None) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -62,9 +86,17 @@ def safetensors_state(path: Path, mend: str | None = None) -> tuple[dict[str, Te
 def load_strictly(module: nn.Module, state: Mapping[str, Tensor], path: Path) -> None:
     """Put weights into a module; TronError names the first that is missing, unknown or of another shape."""
     expected = module.state_dict()
-    wrong = sorted(set(expected) ^ set(state))
-    wrong += [name for name in expected if name in state and expected[name].shape != state[name].shape]
+    wrong = dict.fromkeys(expected.keys() - state.keys(), "missing")
+    wrong |= dict.fromkeys(state.keys() - expected.keys(), "unknown")
+    for name in expected.keys() & state.keys():
+        if expected[name].shape != state[name].shape:
+            wrong[name] = f"{_shape(state[name])}, not {_shape(expected[name])}"
     if wrong:
+        first = min(wrong)
         more = f" and {len(wrong) - 1} more" if len(wrong) > 1 else ""
-        raise TronError(f"weights do not fit the model at '{wrong[0]}'{more}", str(path))
+        raise TronError(f"weights do not fit the model at '{first}' ({wrong[first]}){more}", str(path))
     module.load_state_dict(dict(state), strict=True, assign=True)
+
+
+def _shape(tensor: Tensor) -> str:
+    return " x ".join(str(side) for side in tensor.shape) or "a number"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,11 @@ class WanCodec:
         self._deviation = self._deviation.to(like)
 
     def encode(self, video: Tensor) -> Tensor:
-        """(B, 3, 1 + 4n, H, W) in [-1, 1] -> (B, 16, 1 + n, H / 8, W / 8); sides must be multiples of 16."""
+        """(B, 3, 1 + 4n, H, W) in [-1, 1] -> (B, 16, 1 + n, H / 8, W / 8); sides must be multiples of 16.
+
+        Without gradients, which training never asks for, and one latent frame at a time: what a frame needs
+        of those before it is in the feature cache, so that the memory hardly grows with the frames.
+        """
         check_frames(video.shape[2])
         if video.shape[3] % self.space_block or video.shape[4] % self.space_block:
             raise TronError(
@@ -58,23 +63,32 @@ class WanCodec:
             )
         self.move_to(video)
         with torch.no_grad():
-            return (self.vae.encode(video).latent_dist.mode() - self._mean) / self._deviation
+            cache: list[Any] = [None] * self.vae._cached_conv_counts["encoder"]
+            parts = [
+                self.vae.encoder(video[:, :, start:stop], feat_cache=cache, feat_idx=[0])
+                for start, stop in self._chunks(video.shape[2])
+            ]
+            moments = self.vae.quant_conv(torch.cat(parts, 2))
+            return (moments[:, : self.latent_channels] - self._mean) / self._deviation
 
     def decode(self, latent: Tensor) -> Tensor:
         """(B, 16, 1 + n, h, w) -> (B, 3, 1 + 4n, 8h, 8w), one latent frame at a time, not clamped."""
         self.move_to(latent)
         hidden = self.vae.post_quant_conv(latent * self._deviation + self._mean)
-        self.vae.clear_cache()
-        cache: list[Any] = list(self.vae._feat_map)
+        cache: list[Any] = [None] * self.vae._cached_conv_counts["decoder"]
         chunks = []
         for index in range(hidden.shape[2]):
             chunk, cache = self._decode_chunk(hidden[:, :, index : index + 1], cache, index == 0)
             chunks.append(chunk)
-        self.vae.clear_cache()
         return torch.cat(chunks, 2)
 
     def calibrate(self, videos: Iterable[Tensor]) -> None:
         """Nothing: the VAE brings its own normalisation."""
+
+    def _chunks(self, frames: int) -> list[tuple[int, int]]:
+        """Frames [start, stop) behind each latent frame: the first alone, then four and four."""
+        edges = range(1, frames + 1, self.temporal_factor)
+        return [(0, 1), *pairwise(edges)]
 
     def _decode_chunk(self, hidden: Tensor, cache: list[Any], first: bool) -> tuple[Tensor, list[Any]]:
         """Decode one latent frame; the feature cache goes in and out as values, so that it can be recomputed.

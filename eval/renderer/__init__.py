@@ -1,0 +1,1 @@
+"""The neural renderer, measured: `tron-eval benchmark=renderer`."""
