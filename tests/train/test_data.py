@@ -18,8 +18,9 @@ from train.curriculum import Stage
 from train.data import Batches, TrainingData
 from train.held_out import network_input
 from train.processes import Processes
+from train.samples import Sample
 from train.settings import DataSettings, Settings, ValidationSettings
-from train.sources import CachedSplit, Draw, IndexedSplit, Passes, Sample
+from train.sources import CachedSplit, Draw, IndexedSplit, Passes
 from tron import seeds
 from tron.color import luminance, to_display
 from tron.errors import TronError

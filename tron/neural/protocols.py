@@ -42,6 +42,8 @@ class Renderer(nn.Module):
 
     config: GuidedConfig
     temporal_factor: int = 1
+    space_block: int = 1
+    """Pixels that both sides of a training crop must be multiples of; other frames are padded."""
 
     def forward(self, buffers: Mapping[str, Tensor]) -> Tensor:
         """Guidance by name, each (B, 3, K, H, W) display-encoded in [-1, 1] -> the same shape, not clamped.
@@ -54,6 +56,10 @@ class Renderer(nn.Module):
     def hidden_matrices(self) -> list[nn.Parameter]:
         """Weights between hidden layers, 2-D, which Muon may optimise."""
         raise NotImplementedError
+
+    def temporal_parameters(self) -> list[nn.Parameter]:
+        """Weights of the paths between frames, which `train_only: temporal` trains alone; here none."""
+        return []
 
     def calibrate(self, videos: Iterable[Tensor]) -> None:
         """Fit what is fitted before training, to videos (B, 3, K, H, W) in [-1, 1]; here nothing."""
