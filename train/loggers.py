@@ -51,7 +51,7 @@ class RunLoggers:
     def close(self) -> None:
         """Write what is left."""
         if self._wandb is not None:
-            self._wandb.experiment.finish(quiet=True)
+            self._wandb.experiment.finish()
             self._wandb = None
 
     def _offline_run(self) -> WandbLogger:
