@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import tarfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -46,25 +47,24 @@ def refused(make_settings, dataset, tmp_path, monkeypatch) -> Callable[..., str]
     return said
 
 
-def test_a_buffer_that_the_data_do_not_hold_is_named(refused, make_settings, dataset):
+def test_a_buffer_that_the_data_do_not_hold_is_named(refused, make_settings, dataset, tmp_path):
     """Read from memory or as needed: there is no first sample that would be taken for a damaged one."""
     renderer = make_settings(dataset, "")["renderer"]
     renderer = renderer | {"config": renderer["config"] | {"guidance": ["pbr", "lit"]}}
-    manifest = dataset / "manifest.json"
-    assert manifest.is_file()
+    folder = without(dataset, "lit", tmp_path / "without")
     for cache_gb in (4.0, 0.0):
-        folder = without(dataset, "lit", cache_gb)
         said = refused(folder, renderer=renderer, data={"cache_gb": cache_gb})
         assert "gives no buffer 'lit'" in said
 
 
-def without(dataset: Path, member: str, number: float) -> Path:
-    """A copy of a dataset whose shards do not name a member."""
-    folder = dataset.parent / f"without_{member}_{number}"
+def without(dataset: Path, member: str, folder: Path) -> Path:
+    """A copy of a dataset whose clips lack a member."""
     shutil.copytree(dataset, folder)
     for path in folder.glob("*.tar"):
-        # Of the same length, so that nothing else moves.
-        path.write_bytes(path.read_bytes().replace(f".{member}.exr".encode(), b".xyz.exr"))
+        with tarfile.open(dataset / path.name) as whole, tarfile.open(path, "w") as left:
+            for each in whole.getmembers():
+                if f".{member}." not in each.name:
+                    left.addfile(each, whole.extractfile(each))
     for path in folder.glob("*.idx"):
         path.unlink()
     return folder
