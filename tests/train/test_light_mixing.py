@@ -16,7 +16,7 @@ def lit_twice(make_dataset, tmp_path_factory):
     return make_dataset(tmp_path_factory.mktemp("lights"), {"train": 3}, lights=3)
 
 
-def drawn(folder, kind=CachedSplit, mix=1.0, members=MEMBERS, frames=2):
+def drawn(folder, kind: type[IndexedSplit] = CachedSplit, mix=1.0, members=MEMBERS, frames=2):
     source = kind(ClipStore(folder, "train"), "train", members, 0, mix)
     return [source.sample(Draw(n, seeds.generator(0, "draw", n), frames)) for n in range(12)]
 

@@ -2,6 +2,7 @@
 
 import csv
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -34,8 +35,7 @@ def test_tensorboard_shows_what_metrics_csv_says_once_for_each_step(
 ):
     """Killed in its second stage and started again, with the weights of a run without loggers."""
     pytest.importorskip("tensorboard")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
+    reader = import_module("tensorboard.backend.event_processing.event_accumulator")
     train_a_step = RendererModule.training_step
 
     def killed(self, batch, index):
@@ -49,7 +49,7 @@ def test_tensorboard_shows_what_metrics_csv_says_once_for_each_step(
             run(make_settings, dataset, tmp_path / "seen", "tensorboard")
     seen = run(make_settings, dataset, tmp_path / "seen", "tensorboard")
     assert seen == run(make_settings, dataset, tmp_path / "plain")
-    events = EventAccumulator(str(tmp_path / "seen" / "tensorboard"))
+    events = reader.EventAccumulator(str(tmp_path / "seen" / "tensorboard"))
     events.Reload()
     with (tmp_path / "seen" / "metrics.csv").open() as file:
         rows = [row | {"at": int(row["step"]) + 6 * (row["stage"] == "two")} for row in csv.DictReader(file)]

@@ -146,7 +146,8 @@ def test_constants_stay_under_the_average_to_the_last_bit():
         averaged._average_model = torch.optim.swa_utils.AveragedModel(layer, **averaged._kwargs)
         for _ in range(5):
             averaged._average_model.update_parameters(layer)
-        assert torch.equal(averaged._average_model.module.weight, layer.weight)
+        (weight, _) = averaged._average_model.module.parameters()
+        assert torch.equal(weight, layer.weight)
 
 
 def test_a_renderer_without_temporal_weights_is_refused_in_one_line(train, tmp_path):
