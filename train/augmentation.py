@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from train.framing import random_start
+from train.samples import Sample
 from train.settings import DataSettings
-from train.sources import Sample
 from tron.color import agx, luminance
 from tron.errors import TronError
 from tron.shards.schema import TARGET
@@ -19,12 +19,13 @@ from tron.shards.schema import TARGET
 def augmented(
     sample: Sample, random: np.random.Generator, crop: int | None, settings: DataSettings
 ) -> Sample:
-    """Crop, mirror and recolour a sample, its buffers all alike.
+    """Crop, mirror, turn, recolour and expose a sample, its buffers all alike.
 
     Colours are changed in linear light, where permuting and scaling channels of the light gives exactly the
     permuted and scaled buffers: transport is linear and no channel knows another. A tint keeps the
-    luminance of white, so that the exposure rule still holds. Samples with display members keep their
-    colours.
+    luminance of white, so that the exposure rule still holds; a random exposure, a gain on all channels,
+    leaves that rule on purpose. Samples with display members keep their colours. A turned picture is what a
+    rolled camera sees: buffers are colours, and none holds a direction that would have to turn with it.
     """
     height, width = sample.buffers[TARGET].shape[-2:]
     rows, columns = slice(None), slice(None)
@@ -38,13 +39,23 @@ def augmented(
     mirrored = random.random() < settings.flip
     order = random.permutation(3) if random.random() < settings.permute_colors else np.arange(3)
     tint = np.exp(settings.tint * random.standard_normal(3))
-    gains = torch.tensor(tint / luminance(tint), dtype=torch.float32).view(3, 1, 1, 1)
+    # What came later is drawn only where it is asked for: other runs keep their random numbers.
+    stops = settings.exposure * random.standard_normal() if settings.exposure else 0.0
+    gains = torch.tensor(tint / luminance(tint) * 2.0**stops, dtype=torch.float32).view(3, 1, 1, 1)
+    turns = _quarter_turns(random, settings.rotate, (height, width) if crop is None else (crop, crop))
     buffers = {}
     for name, video in sample.buffers.items():
         video = video[..., rows, columns]
         video = video.flip(-1) if mirrored else video
+        video = torch.rot90(video, turns, (-2, -1)) if turns else video
         buffers[name] = video if sample.display else video[order.tolist()] * gains
     return Sample(buffers, sample.display)
+
+
+def _quarter_turns(random: np.random.Generator, probability: float, size: tuple[int, int]) -> int:
+    if not probability or random.random() >= probability:
+        return 0
+    return int(random.integers(1, 4)) if size[0] == size[1] else 2
 
 
 def display_encoded(samples: Sequence[Sample], name: str) -> Tensor:

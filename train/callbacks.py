@@ -11,6 +11,7 @@ import lightning
 from lightning.pytorch.callbacks import Callback
 
 from train.curriculum import Stage, StageClock
+from train.damage import DamageCount
 from tron.cli.progress import Progress
 from tron.storage import write_atomic
 
@@ -21,8 +22,13 @@ class TrainingLog(Callback):
     """Shows loss and validation PSNR on a bar (plain lines where there is no terminal) and in metrics.csv.
 
     metrics.csv has one row every `every` steps and at every checkpoint: stage, step, seconds of this stage,
-    smoothed loss (as trained: squared error of values in [-1, 1], plus LPIPS if on), learning rate, and the
-    latest validation's PSNR in dB. A resumed run goes on behind the rows it had reached.
+    smoothed loss (as trained: squared error of values in [-1, 1], plus LPIPS if on), learning rate, how many
+    of the stage's samples so far stood in for damaged ones, and the latest validation's PSNR in dB. Loggers
+    get the same numbers. A resumed run goes on behind the rows it had reached.
+
+    Args:
+        path: of metrics.csv. stage: that is trained. clock: its progress. damage: its count.
+        every: steps between rows. first_step: of the stage, where an earlier session left it.
     """
 
     columns: tuple[str, ...] = (
@@ -31,16 +37,26 @@ class TrainingLog(Callback):
         "seconds",
         "loss",
         "learning_rate",
+        "damaged",
         "val_psnr",
         "val_psnr_full",
     )
 
-    def __init__(self, path: Path, stage: Stage, clock: StageClock, every: int = 50, first_step: int = 0):
-        self.path, self.stage, self.clock, self.every = path, stage, clock, every
+    def __init__(
+        self,
+        path: Path,
+        stage: Stage,
+        clock: StageClock,
+        damage: DamageCount,
+        every: int = 50,
+        first_step: int = 0,
+    ):
+        self.path, self.stage, self.clock, self.damage, self.every = path, stage, clock, damage, every
         self._total = clock.seconds_limit or float(stage.steps)
         self.loss = float("nan")
         self.validated: dict[str, float] = {}
         self._rows = earlier_rows(path, stage.name, first_step)
+        self.steps_before = steps_before(self._rows, stage.name)
         self._progress: Progress | None = None
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
@@ -115,6 +131,9 @@ class TrainingLog(Callback):
     def _note(self, trainer: lightning.Trainer) -> None:
         """Add the row of this step, or bring it up to date."""
         row = self._row(trainer)
+        numbers = {key: float(value) for key, value in row.items() if key not in ("stage", "step", "seconds")}
+        for logger in trainer.loggers:
+            logger.log_metrics(numbers, self.steps_before + trainer.global_step)
         if self._rows and all(str(self._rows[-1][name]) == str(row[name]) for name in ("stage", "step")):
             self._rows.pop()
         self._rows.append(row)
@@ -127,6 +146,7 @@ class TrainingLog(Callback):
             "seconds": f"{self.clock.seconds():.1f}",
             "loss": f"{self.loss:.6g}",
             "learning_rate": f"{rate:.4g}",
+            "damaged": self.damage.total,
             **{name: f"{value:.3f}" for name, value in self.validated.items()},
         }
 
@@ -149,6 +169,12 @@ class TrainingLog(Callback):
         if self._progress is not None:
             self._progress.close()
             self._progress = None
+
+
+def steps_before(rows: list[dict[str, Any]], stage: str) -> int:
+    """Steps of a run's earlier stages, from the rows of metrics.csv."""
+    last = {row["stage"]: int(row["step"]) for row in rows if row["stage"] != stage}
+    return sum(last.values())
 
 
 def earlier_rows(path: Path, stage: str, first_step: int) -> list[dict[str, Any]]:

@@ -57,6 +57,11 @@ def periodic_checkpoint(folder: Path, number: int, stage: Stage, every: int) -> 
     )
 
 
+def checkpoint_path(folder: Path, number: int, stage: Stage, step: int) -> Path:
+    """File of a stage's whole state after a step, as `periodic_checkpoint` names it."""
+    return folder / f"{number}-{stage.name}-{step:08d}.ckpt"
+
+
 def stage_end(folder: Path, number: int, stage: Stage) -> Path:
     """File of the renderer at a stage's end."""
     return folder / f"{number}-{stage.name}.safetensors"

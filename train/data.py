@@ -13,14 +13,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import lightning
+import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from train.augmentation import augmented, display_encoded
 from train.curriculum import CAPTURES, Stage, require_splits
-from train.framing import centred, covering_size, sized
-from train.held_out import HeldOutClips, Windows, network_input, spread
+from train.framing import centred, sized
+from train.held_out import HeldOutClips, Windows, first_windows, network_input, spread
 from train.processes import Processes
+from train.requirements import first_whole, require_clips, require_fit, require_members, require_size
 from train.settings import DataSettings, ValidationSettings
 from train.sources import CachedSplit, Draw, IndexedSplit, Source
 from train.splits import Splits
@@ -31,9 +33,12 @@ from tron.shards.schema import GUIDANCE, TARGET, ClipMeta
 
 log = logging.getLogger(__name__)
 
+DAMAGED = "damaged"
+"""Key of a batch: how many of its samples stand in for damaged ones."""
+
 
 class Batches(IterableDataset):
-    """Endless batches {member: (B, 3, K, h, w)} of one stage, from step `first_step` on.
+    """Endless batches {member: (B, 3, K, h, w), damaged: count} of one stage, from step `first_step` on.
 
     Batch s is a function of (seed, stage, s), so that a resumed run has the same ones, whatever its number of
     loader processes. Ranks share it: together the batches of R ranks are the batch of R times the size that
@@ -89,16 +94,18 @@ class Batches(IterableDataset):
         return plan
 
     def _batch(self, step: int) -> dict[str, Tensor]:
-        stage, settings, samples = self.stage, self.settings, []
+        stage, settings, samples, damaged = self.stage, self.settings, [], 0
         for split, number, sample in self._plan(step):
             random = seeds.generator(self.seed, "train", "sample", stage.name, sample)
             drawn = self.sources[split].sample(Draw(number, random, stage.frames_of(step)))
+            damaged += drawn.stands_in
             drawn = sized(drawn, stage.size, random, settings.crop_alignment)
             samples.append(augmented(drawn, random, stage.crop, settings))
         shapes = {tuple(sample.buffers[TARGET].shape) for sample in samples}
         if len(shapes) > 1:
             raise TronError(f"stage {stage.name} meets frames of several sizes", mend="give it a size")
-        return {name: display_encoded(samples, name) for name in self.members}
+        videos = {name: display_encoded(samples, name) for name in self.members}
+        return videos | {DAMAGED: torch.tensor(damaged)}
 
 
 class Loader(DataLoader):
@@ -148,12 +155,17 @@ class TrainingData(lightning.LightningDataModule):
         """
         require_splits(stages, self.splits)
         self.members = (*guidance, TARGET)
+        used = list(dict.fromkeys(split for stage in stages for split in stage.splits()))
         for stage in stages:
             for split in stage.splits():
-                _require_fit(stage, split, self.first_meta(split))
+                require_fit(stage, split, self.first_meta(split))
             if self.validation_split is not None:
-                _require_size(stage, self.validation_split, self.first_meta(self.validation_split))
-        for split in dict.fromkeys(split for stage in stages for split in stage.splits()):
+                require_size(stage, self.validation_split, self.first_meta(self.validation_split))
+        for split in used:
+            require_clips(split, len(self.splits.clips(split)), self.processes.count)
+        for split in (*used, *([self.validation_split] if self.validation_split else ())):
+            require_members(self.splits.clips(split), split, self.members)
+        for split in used:
             self.sources[split] = self._source(split)
 
     def _source(self, split: str) -> CachedSplit | IndexedSplit:
@@ -162,13 +174,13 @@ class TrainingData(lightning.LightningDataModule):
         if size <= self._budget:
             self._budget -= size
             log.info("Split %s: in memory, %d clips, %.2f GB", split, len(clips), size / 1e9)
-            return CachedSplit(clips, split, self.members, self.seed)
+            return CachedSplit(clips, split, self.members, self.seed, self.settings.mix_lights)
         log.info("Split %s: read as needed, %.1f GB would not fit data.cache_gb", split, size / 1e9)
-        return IndexedSplit(clips, split, self.members, self.seed)
+        return IndexedSplit(clips, split, self.members, self.seed, self.settings.mix_lights)
 
     def first_meta(self, split: str) -> ClipMeta:
-        """Metadata of a split's first clip; TronError where there is no such split, or it cannot be read."""
-        return self.splits.clips(split).meta(0)
+        """Metadata of a split's first clip that has them; TronError where there is no such split or clip."""
+        return first_whole(self.splits.clips(split))
 
     def photographs(self, split: str) -> bool:
         """Whether a split's pictures are display-encoded, as photographs are."""
@@ -187,8 +199,11 @@ class TrainingData(lightning.LightningDataModule):
             frames = min(longest, self.first_meta(split).frames)
             frames -= (frames - 1) % temporal_factor
             for number in spread(len(store), clips):
-                whole = range(min(frames, store.meta(number).frames))
-                clip = centred(store.read_frames(number, whole, self.members), size)
+                try:
+                    whole = range(min(frames, store.meta(number).frames))
+                    clip = centred(store.read_frames(number, whole, self.members), size)
+                except TronError:  # damaged: samples of it will be replaced too, counted and named
+                    continue
                 for name in self.members:
                     yield network_input(clip, name)[None]
 
@@ -218,32 +233,19 @@ class TrainingData(lightning.LightningDataModule):
         """This process's share of the held-out clips as windows of the stage's K frames, in batches."""
         if self.stage is None or self.validation_split is None:
             return []
+        windows = Windows(self._held_out_clips(), self.stage, self.validation.batch_pixels)
+        return DataLoader(windows, batch_size=None)
+
+    def pictured_windows(self, stage: Stage) -> Iterator[dict[str, Tensor]]:
+        """First windows (1, 3, K, H, W) of a few of this process's held-out clips, without damaged ones."""
+        if self.validation_split is not None and self.validation.pictures:
+            yield from first_windows(self._held_out_clips(), stage, self.validation.pictures)
+
+    def _held_out_clips(self) -> HeldOutClips:
+        assert self.validation_split is not None
         if self._held_out is None:
             clips = self.splits.clips(self.validation_split)
             share = slice(self.processes.rank, None, self.processes.count)
             numbers = spread(len(clips), self.validation.clips)[share]
             self._held_out = HeldOutClips(clips, numbers, self.members, self._budget)
-        windows = Windows(self._held_out, self.stage, self.validation.batch_pixels)
-        return DataLoader(windows, batch_size=None)
-
-
-def _require_fit(stage: Stage, split: str, first: ClipMeta) -> None:
-    """TronError unless a stage finds its frames and sizes in clips like the first of a split."""
-    if first.frames < stage.frames:
-        raise TronError(
-            f"stage {stage.name} needs clips of {stage.frames} frames, split '{split}' has {first.frames}",
-            mend="make longer clips, or shorten the stage's frames",
-        )
-    width, height = _require_size(stage, split, first)
-    if stage.crop and stage.crop > min(width, height):
-        raise TronError(f"stage {stage.name} crops {stage.crop} pixels of {width} x {height}")
-
-
-def _require_size(stage: Stage, split: str, first: ClipMeta) -> tuple[int, int]:
-    """Size of a stage's frames before its crop; TronError where a split's are smaller."""
-    if stage.size is not None:
-        try:
-            covering_size((first.width, first.height), stage.size)
-        except TronError as error:
-            raise TronError(error.what, f"stage {stage.name}, split '{split}'", error.mend) from error
-    return stage.size or (first.width, first.height)
+        return self._held_out

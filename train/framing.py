@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from train.sources import Sample
+from train.samples import Sample
 from tron.color import linear_to_srgb, srgb_to_linear
 from tron.errors import TronError
 from tron.shards.schema import MEMBERS, TARGET, Clip

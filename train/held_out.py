@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -11,9 +12,12 @@ from torch.utils.data import IterableDataset
 
 from train.curriculum import Stage
 from train.framing import centred
-from train.sources import channels_first
+from train.samples import channels_first
+from tron.errors import TronError
 from tron.shards.clip_store import ClipStore
-from tron.shards.schema import Clip
+from tron.shards.schema import Clip, ClipMeta
+
+log = logging.getLogger(__name__)
 
 FOREGROUND = "foreground"
 
@@ -34,10 +38,11 @@ class HeldOutClips:
     """
 
     def __init__(self, clips: ClipStore, numbers: Sequence[int], members: Sequence[str], budget: float):
-        self.clips, self.numbers, self.members = clips, list(numbers), (*members, FOREGROUND)
-        pixels = sum(
-            meta.frames * meta.width * meta.height for meta in (clips.meta(number) for number in numbers)
-        )
+        self.clips, self.members = clips, (*members, FOREGROUND)
+        self._named: set[int] = set()
+        metas = {number: meta for number in numbers if (meta := self._meta(number)) is not None}
+        self.numbers = list(metas)
+        pixels = sum(meta.frames * meta.width * meta.height for meta in metas.values())
         self.bytes = pixels * (3 * len(members) + 1) * 4
         self.in_memory = self.bytes <= budget
         self._decoded: dict[int, Clip] = {}
@@ -47,10 +52,36 @@ class HeldOutClips:
         if not self.in_memory:
             return self.clips.read_frames(number, frames, self.members)
         if number not in self._decoded:
-            self._decoded[number] = self.clips.read_frames(number, members=self.members)
+            try:
+                self._decoded[number] = self.clips.read_frames(number, members=self.members)
+            except TronError:  # perhaps of frames that are not asked for
+                return self.clips.read_frames(number, frames, self.members)
         whole = self._decoded[number]
         part = slice(frames.start, frames.stop)
         return Clip(whole.meta, {name: images[part] for name, images in whole.frames.items()})
+
+    def windows(self, number: int, stage: Stage, frames: range) -> Iterator[dict[str, Tensor]]:
+        """Frames of a clip, n windows of a stage's K, in one batch; without those that are damaged."""
+        try:
+            yield windows_of(centred(self.read(number, frames), stage.size), stage.frames)
+        except TronError as error:
+            if len(frames) == stage.frames:
+                self._name(number, error)
+                return
+            for start in frames[:: stage.frames]:
+                yield from self.windows(number, stage, range(start, start + stage.frames))
+
+    def _meta(self, number: int) -> ClipMeta | None:
+        try:
+            return self.clips.meta(number)
+        except TronError as error:
+            self._name(number, error)
+            return None
+
+    def _name(self, number: int, error: TronError) -> None:
+        if number not in self._named:
+            self._named.add(number)
+            log.warning("Validation without frames of clip %s: %s", self.clips.key(number), error)
 
 
 class Windows(IterableDataset):
@@ -72,8 +103,15 @@ class Windows(IterableDataset):
             step = max(1, self.batch_pixels // (frames * width * height)) * frames
             end = meta.frames - meta.frames % frames
             for start in range(0, end, step):
-                clip = self.held_out.read(number, range(start, min(start + step, end)))
-                yield windows_of(centred(clip, self.stage.size), frames)
+                yield from self.held_out.windows(number, self.stage, range(start, min(start + step, end)))
+
+
+def first_windows(held_out: HeldOutClips, stage: Stage, count: int) -> Iterator[dict[str, Tensor]]:
+    """First window of each of `count` clips, spread evenly over those that are held out."""
+    for place in spread(len(held_out.numbers), count):
+        number = held_out.numbers[place]
+        if held_out.clips.meta(number).frames >= stage.frames:
+            yield from held_out.windows(number, stage, range(stage.frames))
 
 
 def windows_of(clip: Clip, frames: int) -> dict[str, Tensor]:

@@ -71,9 +71,8 @@ class RendererModule(lightning.LightningModule):
         sums, counts = self.trainer.strategy.reduce(self._psnr, reduce_op="sum").unbind(1)
         for name, total, count in zip(("val_psnr", "val_psnr_full"), sums, counts):
             if count > 0:
-                self.log(
-                    name, total / count, sync_dist=True
-                )  # they are equal: it keeps Lightning from asking
+                # They are equal (sync_dist keeps Lightning from asking); train.callbacks tells the loggers.
+                self.log(name, total / count, sync_dist=True, logger=False)
 
     def configure_optimizers(self) -> Any:
         """The stage's optimiser, with warm-up and a cosine over the stage."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal
 
 import torch
 from torch import nn
@@ -22,7 +23,9 @@ def make_optimizer(renderer: Renderer, settings: OptimizerSettings) -> torch.opt
     trained = [parameter for parameter in renderer.parameters() if parameter.requires_grad]
     if settings.muon_learning_rate is None:
         return _adamw(trained, settings)
-    hidden = renderer.hidden_matrices()
+    hidden = [matrix for matrix in renderer.hidden_matrices() if matrix.requires_grad]
+    if not hidden:
+        return _adamw(trained, settings)
     chosen = {id(matrix) for matrix in hidden}
     muon = torch.optim.Muon(
         hidden,
@@ -31,6 +34,22 @@ def make_optimizer(renderer: Renderer, settings: OptimizerSettings) -> torch.opt
         adjust_lr_fn="original",
     )
     return CombinedOptimizer([muon, _adamw([p for p in trained if id(p) not in chosen], settings)])
+
+
+@contextmanager
+def learning(renderer: Renderer, which: Literal["all", "temporal"]) -> Iterator[None]:
+    """Freeze, for the block, the weights that a stage does not train; `temporal`: all but those paths'."""
+    kept = {id(weight) for weight in renderer.temporal_weights().values()}
+    frozen = [
+        p for p in renderer.parameters() if which == "temporal" and p.requires_grad and id(p) not in kept
+    ]
+    for parameter in frozen:
+        parameter.requires_grad = False
+    try:
+        yield
+    finally:
+        for parameter in frozen:
+            parameter.requires_grad = True
 
 
 def _adamw(parameters: list[nn.Parameter], settings: OptimizerSettings) -> torch.optim.AdamW:

@@ -27,12 +27,16 @@ from torch import distributed
 from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException, start_processes
 
 from train.settings import Settings
+from train.termination import TERMINATED, Terminated
 from tron.cli.command_line import INTERRUPTED, USER_ERROR
 from tron.cli.log import configure_logging
+from tron.cli.termination import termination_unwinds
 from tron.errors import TronError
 
 GRACE_SECONDS = 15.0
 """Seconds that processes have to end by themselves after one of them has failed or was interrupted."""
+CHECKPOINT_SECONDS = 120.0
+"""Seconds that processes have to finish their step and write a checkpoint after SIGTERM."""
 
 Result = TypeVar("Result")
 
@@ -98,6 +102,11 @@ def launch(work: Callable[[Processes, Settings], None], settings: Settings) -> N
         KeyboardInterrupt: a process was interrupted; all have ended.
     """
     _quiet_lightning()
+    with termination_unwinds():
+        _launch(work, settings)
+
+
+def _launch(work: Callable[[Processes, Settings], None], settings: Settings) -> None:
     outer = _outer_launcher()
     devices = _devices(settings, outer)
     if outer is not None:
@@ -205,17 +214,22 @@ def _spawn(work: Callable[[Processes, Settings], None], settings: Settings, devi
             raise
         if error.exit_code == INTERRUPTED:
             raise KeyboardInterrupt from error
+        if error.exit_code == TERMINATED:
+            raise Terminated from error
         raise TronError(
             f"training {error}",
             mend="if that was for want of memory, make batch_size or data.cache_gb smaller",
         ) from error
+    except SystemExit:  # SIGTERM: they finish their step and write a checkpoint
+        _end(context.processes, signal.SIGTERM, CHECKPOINT_SECONDS)
+        raise
     finally:
-        _end(context.processes)
+        _end(context.processes, signal.SIGINT, GRACE_SECONDS)
 
 
-def _end(processes: list[Any]) -> None:
-    """Interrupt what still runs, and kill what does not listen."""
-    for number, seconds in ((signal.SIGINT, GRACE_SECONDS), (signal.SIGKILL, None)):
+def _end(processes: list[Any], gently: signal.Signals, grace: float) -> None:
+    """Ask what still runs to end, and kill what does not listen."""
+    for number, seconds in ((gently, grace), (signal.SIGKILL, None)):
         running = [process for process in processes if process.is_alive()]
         for process in running:
             os.kill(process.pid, number)
@@ -235,7 +249,7 @@ def _spawned(
     os.environ.update(environment, LOCAL_RANK=str(local_rank))
     _quiet_lightning()
     try:
-        with _joined(settings, devices) as processes:
+        with termination_unwinds(), _joined(settings, devices) as processes:
             work(processes, settings)
     except TronError as error:
         errors.put(error)

@@ -12,6 +12,8 @@ from train.memory_settings import MemorySettings
 from train.split_place import SplitPlace
 from tron.dataset_folder import DatasetPlace
 
+LoggerName = Literal["csv", "tensorboard", "wandb"]
+
 HELD_OUT = "test"
 """The split that evaluation judges by."""
 
@@ -77,6 +79,31 @@ class DataSettings(BaseModel):
     tint: float = Field(
         default=0.0, ge=0, description="Deviation of the logarithm of random gains on the light's R, G and B."
     )
+    exposure: float = Field(
+        default=0.0,
+        ge=0,
+        description="Deviation, in stops, of a random exposure that all linear buffers are given alike.",
+    )
+    rotate: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Probability of turning a sample by one, two or three quarters; by a half where it is no "
+        "square.",
+    )
+    mix_lights: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Share of the samples that show their scene under two of its lights at once.",
+    )
+    damaged_limit: float = Field(
+        default=0.01,
+        ge=0,
+        le=1,
+        description="Largest share of a stage's samples, counted over at least 1000, that may stand in for "
+        "damaged ones; beyond it the run ends.",
+    )
     crop_alignment: int = Field(
         default=4, ge=1, description="Crops start at multiples of this; 4 keeps the codec's blocks."
     )
@@ -95,6 +122,11 @@ class ValidationSettings(BaseModel):
     )
     clips: int = Field(default=8, ge=1, description="How many of its clips, spread evenly over it.")
     every: int = Field(default=250, ge=1, description="Steps between validations.")
+    pictures: int = Field(
+        default=3,
+        ge=0,
+        description="Held-out frames shown after each validation, in output_dir/validation and the loggers.",
+    )
     batch_pixels: int = Field(
         default=2**22,
         ge=1,
@@ -133,11 +165,21 @@ class Settings(BaseModel):
     renderer: dict[str, Any] = Field(
         description="What is trained, a `_target_` (group: tiny, unet, pixel_mlp, cosmos)."
     )
+    start_from: Path | None = Field(
+        default=None,
+        description="The renderer.safetensors of another run, of the same shape, to begin with; null begins "
+        "with random or published weights.",
+    )
     stages: list[Stage] = Field(default=THREE_STAGES, min_length=1, description="The curriculum, in order.")
     optimizer: OptimizerSettings = OptimizerSettings()
     loss: LossSettings = LossSettings()
     data: DataSettings = DataSettings()
     validation: ValidationSettings = ValidationSettings()
+    logger: list[LoggerName] = Field(
+        default=["csv"],
+        description="Where progress is written: csv (metrics.csv, always), tensorboard, wandb (offline); in "
+        "output_dir.",
+    )
     seed: int = Field(
         default=0, description="Root of all randomness: initial weights, batches, augmentation."
     )

@@ -5,42 +5,24 @@ Exposure is applied when a clip is loaded, AgX after augmentation (train.augment
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-import torch
-from torch import Tensor
 
+from train.light_mixing import OtherLights
+from train.samples import Sample
 from tron import seeds
 from tron.errors import TronError
 from tron.shards.clip_store import ClipStore
-from tron.shards.schema import TARGET, Clip
+from tron.shards.schema import TARGET
 
+log = logging.getLogger(__name__)
 
-def channels_first(frames: np.ndarray) -> np.ndarray:
-    """(K, H, W, C) -> (C, K, H, W) float32."""
-    return np.ascontiguousarray(np.moveaxis(frames, -1, 0), np.float32)
-
-
-@dataclass(frozen=True)
-class Sample:
-    """Frames of one clip.
-
-    Attributes:
-        buffers: (3, K, H, W) by name: linear under the clip's exposure, or in [0, 1] where display-encoded.
-        display: names of the display-encoded ones.
-    """
-
-    buffers: dict[str, Tensor]
-    display: frozenset[str] = frozenset()
-
-    @classmethod
-    def of(cls, clip: Clip) -> Sample:
-        """All frames of a clip, in the members that it was read with."""
-        buffers = {name: torch.from_numpy(channels_first(clip.exposed(name))) for name in clip.frames}
-        return cls(buffers, frozenset(name for name in buffers if clip.is_display(name)))
+MOST_TRIES = 64
+"""Clips in a row that may be damaged before a run ends."""
 
 
 @dataclass(frozen=True)
@@ -87,46 +69,107 @@ class Passes:
         return int(self._order[place])
 
 
+class ShortClip(TronError):
+    """Clip of fewer frames than a sample has: a mistake in the dataset's recipe, not damage."""
+
+
 def _window(draw: Draw, count: int, split: str) -> slice:
     """Frames of the sample out of a clip of `count`, at a random start."""
     if count < draw.frames:
-        raise TronError(f"split '{split}' has a clip of {count} frames", mend=f"{draw.frames} are needed")
+        raise ShortClip(f"split '{split}' has a clip of {count} frames", mend=f"{draw.frames} are needed")
     start = int(draw.random.integers(count - draw.frames + 1))
     return slice(start, start + draw.frames)
 
 
-class CachedSplit:
-    """A split decoded into memory; sample number n is of clip n of its passes.
-
-    Args:
-        clips: of the split. split: its name in this run. members: that samples have. seed: of the run.
-    """
-
-    def __init__(self, clips: ClipStore, split: str, members: Sequence[str], seed: int):
-        self.split = split
-        self.samples = [Sample.of(clips.read_frames(n, members=members)) for n in range(len(clips))]
-        self._passes = Passes(seed, split, len(clips))
-
-    def sample(self, draw: Draw) -> Sample:
-        """Frames of clip `draw.number` of the passes, from a random start."""
-        clip = self.samples[self._passes.clip(draw.number)]
-        window = _window(draw, clip.buffers[TARGET].shape[1], self.split)
-        return Sample({name: video[:, window] for name, video in clip.buffers.items()}, clip.display)
-
-
 class IndexedSplit:
-    """A split on a disk or in a store, of which each sample reads its own frames: CachedSplit's, bit by bit.
+    """A split on a disk or in a store, of which each sample reads its own frames.
+
+    Sample number n is of clip n of the split's passes. Where that clip's frames are damaged, those of clip
+    n + 1, n + 2, ... stand in, so that which samples there are follows from the data alone; the log names
+    each damaged clip once.
 
     Args:
         clips: of the split. split: its name in this run. members: that samples have. seed: of the run.
+        mix_lights: share of the samples that show their scene under two of its lights (train.light_mixing).
     """
 
-    def __init__(self, clips: ClipStore, split: str, members: Sequence[str], seed: int):
+    def __init__(
+        self, clips: ClipStore, split: str, members: Sequence[str], seed: int, mix_lights: float = 0.0
+    ):
         self.clips, self.split, self.members = clips, split, tuple(members)
         self._passes = Passes(seed, split, len(clips))
+        self._lights = OtherLights(clips, mix_lights, self.read) if mix_lights > 0 else None
+        self._named: set[int] = set()
 
     def sample(self, draw: Draw) -> Sample:
-        """Frames of clip `draw.number` of the passes, from a random start."""
-        number = self._passes.clip(draw.number)
-        window = _window(draw, self.clips.meta(number).frames, self.split)
+        """Frames of clip `draw.number` of the passes, from a random start.
+
+        Raises:
+            TronError: a clip is too short; or no clip of the next 64, or of a whole pass, is whole.
+        """
+        failure: TronError | None = None
+        for ahead in range(min(MOST_TRIES, len(self.clips))):
+            number = self._passes.clip(draw.number + ahead)
+            try:
+                found = self._drawn(number, draw)
+            except ShortClip:
+                raise
+            except TronError as error:
+                failure = error
+                self._name(number, error)
+            else:
+                return replace(found, stands_in=ahead > 0)
+        assert failure is not None
+        raise failure
+
+    def frames(self, number: int) -> int:
+        """Frames of a clip; TronError where its metadata are damaged."""
+        return self.clips.meta(number).frames
+
+    def read(self, number: int, window: slice) -> Sample:
+        """Frames of a clip; TronError where they are damaged."""
         return Sample.of(self.clips.read_frames(number, range(window.start, window.stop), self.members))
+
+    def _drawn(self, number: int, draw: Draw) -> Sample:
+        window = _window(draw, self.frames(number), self.split)
+        sample = self.read(number, window)
+        return sample if self._lights is None else self._lights.mixed(sample, number, window, draw.random)
+
+    def _name(self, number: int, error: TronError) -> None:
+        if number not in self._named:
+            self._named.add(number)
+            key = self.clips.key(number)
+            log.warning("Split %s: clip %s is damaged, others stand in: %s", self.split, key, error)
+
+
+class CachedSplit(IndexedSplit):
+    """A split decoded into memory: IndexedSplit's samples, bit by bit. Damaged clips are left where they lie.
+
+    Args:
+        clips, split, members, seed, mix_lights: as IndexedSplit's.
+    """
+
+    def __init__(
+        self, clips: ClipStore, split: str, members: Sequence[str], seed: int, mix_lights: float = 0.0
+    ):
+        super().__init__(clips, split, members, seed, mix_lights)
+        decoded = ((number, self._whole(number)) for number in range(len(clips)))
+        self._decoded = {number: sample for number, sample in decoded if sample is not None}
+
+    def frames(self, number: int) -> int:
+        """Frames of a clip; TronError where its metadata are damaged."""
+        clip = self._decoded.get(number)
+        return super().frames(number) if clip is None else clip.buffers[TARGET].shape[1]
+
+    def read(self, number: int, window: slice) -> Sample:
+        """Frames of a clip; TronError where they are damaged."""
+        clip = self._decoded.get(number)
+        if clip is None:
+            return super().read(number, window)
+        return Sample({name: video[:, window] for name, video in clip.buffers.items()}, clip.display)
+
+    def _whole(self, number: int) -> Sample | None:
+        try:
+            return Sample.of(self.clips.read_frames(number, members=self.members))
+        except TronError:  # perhaps of one frame: the samples of the others are whole
+            return None

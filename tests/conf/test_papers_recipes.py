@@ -3,13 +3,18 @@
 from collections import Counter
 
 import pytest
+import torch
 
 from datagen.settings import Settings as DatagenSettings
+from eval.datagen.paper_smoke import write_tiny_weights
 from train.curriculum import learning_rate_factor
+from train.optimizers import make_optimizer
+from train.run import build_renderer
 from train.settings import Settings as TrainSettings
 from tron.apps.relight_settings import QUALITY
 from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
+from tron.neural.losses import RendererLoss
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +86,8 @@ def test_nothing_is_done_that_the_paper_does_not_speak_of(train: TrainSettings) 
     assert rates == {1.0}
     assert (optimizer.gradient_clip, optimizer.ema_decay) == (None, None)
     assert (data.flip, data.permute_colors, data.tint) == (0, 0, 0)
+    assert (data.exposure, data.rotate, data.mix_lights) == (0, 0, 0)
+    assert (train.start_from, {stage.train_only for stage in train.stages}) == (None, {"all"})
     assert [stage.splits() for stage in train.stages] == [["train"], ["train_b"], ["train_b"]]
     assert {stage.still_ratio for stage in train.stages} == {0}
     assert train.max_seconds is None
@@ -136,3 +143,29 @@ def test_the_renderer_averages_the_two_latents_at_timestep_250_of_1000(train: Tr
     config = train.renderer["config"]
     assert (config["codec"], config["fusion"]) == ("wan", "average")
     assert (config["sigma"], config["window"]) == (0.25, 5)
+    assert tuple(config["guidance"]) == ("pbr", "irradiance")
+
+
+def test_adamw_trains_the_transformer_alone_without_its_text_branch(tmp_path) -> None:
+    """The VAE is frozen, and so is what the null text embedding goes through; files of the published form."""
+    write_tiny_weights(tmp_path)
+    paths = [f"renderer.transformer_path={tmp_path / 'transformer'}", f"renderer.vae_path={tmp_path / 'vae'}"]
+    overrides = [
+        "experiment=paper_smoke",
+        "dataset=in",
+        "output_dir=out",
+        f"loss.vgg_weights={tmp_path}/vgg16.pth",
+    ]
+    smoke = check(compose_recipe("conf.train", TrainSettings, [*overrides, *paths]), TrainSettings)
+    renderer = build_renderer(smoke.renderer)
+    optimizer = make_optimizer(renderer, smoke.optimizer)
+    assert type(optimizer) is torch.optim.AdamW
+    trained = {id(weight) for group in optimizer.param_groups for weight in group["params"]}
+    names = {name for name, weight in renderer.named_parameters() if id(weight) in trained}
+    assert all(name.startswith("backbone.transformer.") for name in names)
+    text = {name for name, _ in renderer.named_parameters() if ".attn2." in name or ".norm2." in name}
+    assert text
+    assert not text & names
+    assert names | text == {name for name, _ in renderer.named_parameters()}
+    losses = RendererLoss(**smoke.loss.model_dump())
+    assert losses.perceptual is not None

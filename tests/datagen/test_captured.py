@@ -113,7 +113,7 @@ def test_guidance_times_exposure_is_as_bright_as_the_photos(pairs: Path):
 
 
 def test_training_reads_the_pairs_as_they_are(pairs: Path):
-    from train.sources import Sample
+    from train.samples import Sample
 
     clip = next(iter(read_clips(pairs, "train")))
     sample = Sample.of(clip)

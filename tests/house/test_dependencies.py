@@ -43,7 +43,7 @@ OF_COMMANDS = {"relight", "reconstruct", "datagen", "train", "eval"}
 DECLARED = BASE | names(EXTRAS["all"])
 DEV, CLUSTER = (names(EXTRAS[extra]) for extra in ("dev", "cluster"))
 # Left out, or refused, where they are not installed.
-PEERS = names(EXTRAS["gpu-peers"]) | names(EXTRAS["heic"]) | names(EXTRAS["ktx2"])
+PEERS = set().union(*(names(EXTRAS[extra]) for extra in ("gpu-peers", "heic", "ktx2", "loggers")))
 # A network is loaded where a checkpoint is given: tron-relight then asks for the extra `train`.
 ASKED_FOR = {("tron.apps.relight_network", "tron.neural.weights"), ("tron.apps.clip", "tron.neural.renderer")}
 # Called by those alone that import torch or Mitsuba themselves.

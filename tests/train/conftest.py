@@ -1,5 +1,7 @@
 """A dataset folder small enough to train on in a second, and the settings to do so."""
 
+import itertools
+import tarfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,22 +23,24 @@ def write_dataset(
     shard: int = 2,
     width: int | None = None,
     spaces: dict[str, ColorSpace] | None = None,
+    lights: int = 1,
 ) -> Path:
     """Clips of smooth colours whose picture is the product of pbr and irradiance, frames x size x size.
 
-    width: of frames that are not square. spaces: of colours that are not linear.
+    splits: number of scenes by name. width: of frames that are not square. spaces: of colours that are not
+    linear. lights: clips of each scene.
     """
     width = width or size
     colors: dict[str, ColorSpace] = dict.fromkeys((*GUIDANCE, TARGET), "linear")
     entries = []
     for split, count in splits.items():
         with ShardWriter(folder, split, shard) as writer:
-            for number in range(count):
-                random = seeds.generator(0, "dataset", split, number)
+            for number, light in itertools.product(range(count), range(lights)):
+                random = seeds.generator(0, "dataset", split, number + count * light)
                 meta = ClipMeta(
-                    key=f"{split}{number:03d}-l0",
+                    key=f"{split}{number:03d}-l{light}",
                     scene=f"{split}{number:03d}",
-                    light="l0",
+                    light=f"l{light}",
                     light_family="studio",
                     split=split,
                     frames=frames,
@@ -109,3 +113,21 @@ def small_settings(dataset: Path, output_dir: Path, **changes: Any) -> dict[str,
         "accelerator": "cpu",
     }
     return settings | changes
+
+
+@pytest.fixture(scope="session")
+def damage_frame() -> Callable[[Path, str], None]:
+    return overwrite
+
+
+def overwrite(folder: Path, name: str) -> None:
+    """Overwrite a member of one of a folder's shards, such as `train000-l0.f02.pbr.exr`, by zeros."""
+    for path in folder.glob("*.tar"):
+        with tarfile.open(path) as shard:
+            found = next((member for member in shard.getmembers() if member.name == name), None)
+        if found is not None:
+            with path.open("r+b") as file:
+                file.seek(found.offset_data)
+                file.write(bytes(found.size))
+            return
+    raise FileNotFoundError(name)

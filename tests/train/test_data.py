@@ -18,8 +18,9 @@ from train.curriculum import Stage
 from train.data import Batches, TrainingData
 from train.held_out import network_input
 from train.processes import Processes
+from train.samples import Sample
 from train.settings import DataSettings, Settings, ValidationSettings
-from train.sources import CachedSplit, Draw, IndexedSplit, Passes, Sample
+from train.sources import CachedSplit, Draw, IndexedSplit, Passes
 from tron import seeds
 from tron.color import luminance, to_display
 from tron.errors import TronError
@@ -108,6 +109,18 @@ def test_ranks_together_see_the_batches_of_one_process(dataset, stage, cache, wo
     assert not same(ranks[0], ranks[1])
 
 
+@pytest.mark.parametrize(("ranks", "workers", "first"), itertools.product((1, 2, 3), (0, 2), (0, 3)))
+def test_ranks_loader_processes_and_resuming_change_no_batch(dataset, ranks, workers, first):
+    """All together: of any number of ranks with any number of loaders, gone on with anywhere."""
+    whole = take(batches(dataset, MIXED.model_copy(update={"batch_size": 6})), 5)[first:]
+    stage = MIXED.model_copy(update={"batch_size": 6 // ranks})
+    parts = []
+    for rank in range(ranks):
+        stream = batches(dataset, stage, cache=False, first_step=first, rank=rank, ranks=ranks)
+        parts.append(take(DataLoader(stream, batch_size=None, num_workers=workers), 5 - first))
+    assert same(whole, [torch.cat(step, 1) for step in zip(*parts)])
+
+
 def test_ranks_share_each_pass_over_the_clips(dataset):
     stage = STAGE.model_copy(update={"batch_size": 1, "crop": None})
     ranks = [batches(dataset, stage, rank=rank, ranks=2)._plan(step) for step in range(5) for rank in (0, 1)]
@@ -174,10 +187,48 @@ def test_a_tint_scales_the_light_and_keeps_the_luminance_of_white():
     torch.testing.assert_close(out["irradiance"], picture * gains[7])
 
 
+def test_an_exposure_is_one_factor_for_all_buffers_of_the_given_deviation():
+    picture = torch.rand(3, 2, 8, 8) + 0.1
+    settings = DataSettings(flip=0.0, exposure=0.5)
+    stops = []
+    for number in range(200):
+        out = augmented(sample_of(picture), seeds.generator(0, "exposed", number), None, settings).buffers
+        factor = float(out["pbr"].sum() / picture.sum())
+        for name in BUFFERS:
+            torch.testing.assert_close(out[name], picture * factor)
+        stops.append(np.log2(factor))
+    assert abs(np.mean(stops)) < 0.15
+    assert 0.4 < np.std(stops) < 0.6
+
+
+@pytest.mark.parametrize(("height", "width", "turns"), [(8, 8, {0, 1, 2, 3}), (8, 12, {0, 2})])
+def test_turns_are_alike_in_all_buffers_and_keep_the_size(height, width, turns):
+    video = torch.rand(3, 2, height, width)
+    settings, seen = DataSettings(flip=0.0, rotate=0.75), []
+    for number in range(60):
+        out = augmented(sample_of(video), seeds.generator(0, "turned", number), None, settings).buffers
+        (turn,) = [n for n in turns if torch.equal(out["pbr"], torch.rot90(video, n, (-2, -1)))]
+        assert all(torch.equal(out[name], out["pbr"]) for name in BUFFERS)
+        seen.append(turn)
+    assert set(seen) == turns
+    assert 0.1 < seen.count(0) / 60 < 0.4
+
+
+def test_other_augmentations_keep_their_numbers_where_new_ones_are_off():
+    """So that a run of an earlier version goes on as it began."""
+    video = torch.rand(3, 1, 16, 16)
+    old = DataSettings(permute_colors=1.0, tint=0.3)
+    for number in range(5):
+        one = augmented(sample_of(video), seeds.generator(0, number), 8, old).buffers["rgb"]
+        new = old.model_copy(update={"exposure": 0.5})
+        two = augmented(sample_of(video), seeds.generator(0, number), 8, new).buffers["rgb"]
+        torch.testing.assert_close(two / one, (two / one).mean().expand_as(one))
+
+
 def test_colours_of_photos_are_left_alone():
     video = torch.rand(3, 1, 8, 8)
     photo = sample_of(video, frozenset({"rgb"}))
-    settings = DataSettings(flip=0.0, tint=0.5, permute_colors=1.0)
+    settings = DataSettings(flip=0.0, tint=0.5, permute_colors=1.0, exposure=0.5)
     out = augmented(photo, seeds.generator(0, 3), None, settings)
     assert all(torch.equal(out.buffers[name], video) for name in BUFFERS)
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from train.framing import area_resized, centred, covering_size, sized
-from train.sources import Sample
+from train.samples import Sample
 from tron import seeds
 from tron.color import linear_to_srgb
 from tron.errors import TronError

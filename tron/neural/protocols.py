@@ -42,6 +42,8 @@ class Renderer(nn.Module):
 
     config: GuidedConfig
     temporal_factor: int = 1
+    space_block: int = 1
+    """Pixels that both sides of a training crop must be multiples of; other frames are padded."""
 
     def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:
         """Guidance by name, each (B, 3, K, H, W) display-encoded in [-1, 1] -> the same shape, not clamped.
@@ -62,7 +64,8 @@ class Renderer(nn.Module):
         raise NotImplementedError
 
     def temporal_weights(self) -> dict[str, nn.Parameter]:
-        """Parameters by name that only windows of several frames use, and that start from adding nothing."""
+        """Parameters by name of the paths between frames: they start from adding nothing, and one frame alone
+        does not use them. Here none."""
         return {}
 
     def calibrate(self, videos: Iterable[Tensor]) -> None:

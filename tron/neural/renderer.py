@@ -32,7 +32,7 @@ class NeuralRenderer(Renderer):
         if self.config.codec not in CODECS:
             raise TronError(f"no codec is called {self.config.codec!r}", mend=f"they are {', '.join(CODECS)}")
         self.codec: Codec = codec if codec is not None else CODECS[self.config.codec](None)
-        self.temporal_factor = self.codec.temporal_factor
+        self.temporal_factor, self.space_block = self.codec.temporal_factor, self.codec.space_block
         check_frames(self.config.window, self.temporal_factor)
         channels = self.codec.latent_channels
         latents = len(self.config.guidance) if self.config.fusion == "concat" else 1

@@ -1,0 +1,158 @@
+"""What a run cannot be made of: one line before the first step, nothing executed, no folder bound."""
+
+import json
+import shutil
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from pydantic import ValidationError
+
+from train.cli import cli, main
+from train.curriculum import Stage
+from train.data import TrainingData
+from train.module import RendererModule
+from train.processes import Processes
+from train.requirements import require_renderer
+from train.settings import DataSettings, Settings, ValidationSettings
+from tron.cli.recipes import check, compose_recipe
+from tron.errors import TronError
+from tron.neural.renderer import NeuralRenderer
+
+STAGE = {"name": "one", "split": "train", "steps": 2, "batch_size": 1, "crop": 16}
+
+
+@pytest.fixture
+def refused(make_settings, dataset, tmp_path, monkeypatch) -> Callable[..., str]:
+    """What a run says that ends before its first step; after it another may use the folder."""
+
+    def step(*_: Any) -> None:
+        raise AssertionError("a step was made")
+
+    def said(place: Path = dataset, **changes: Any) -> str:
+        output = tmp_path / "out"
+        settings = Settings.model_validate(make_settings(place, output, **({"stages": [STAGE]} | changes)))
+        with monkeypatch.context() as patch:
+            patch.setattr(RendererModule, "training_step", step)
+            with pytest.raises(TronError) as error:
+                main(settings)
+        assert "\n" not in str(error.value)
+        assert not (output / "config.yaml").exists()
+        assert not (output / "metrics.csv").exists()
+        return str(error.value)
+
+    return said
+
+
+def test_a_buffer_that_the_data_do_not_hold_is_named(refused, make_settings, dataset, tmp_path):
+    """Read from memory or as needed: there is no first sample that would be taken for a damaged one."""
+    renderer = make_settings(dataset, "")["renderer"]
+    renderer = renderer | {"config": renderer["config"] | {"guidance": ["pbr", "lit"]}}
+    folder = without(dataset, "lit", tmp_path / "without")
+    for cache_gb in (4.0, 0.0):
+        said = refused(folder, renderer=renderer, data={"cache_gb": cache_gb})
+        assert "gives no buffer 'lit'" in said
+
+
+def without(dataset: Path, member: str, folder: Path) -> Path:
+    """A copy of a dataset whose clips lack a member."""
+    shutil.copytree(dataset, folder)
+    for path in folder.glob("*.tar"):
+        with tarfile.open(dataset / path.name) as whole, tarfile.open(path, "w") as left:
+            for each in whole.getmembers():
+                if f".{member}." not in each.name:
+                    left.addfile(each, whole.extractfile(each))
+    for path in folder.glob("*.idx"):
+        path.unlink()
+    return folder
+
+
+def test_shards_of_another_schema_are_named(refused, dataset, tmp_path):
+    folder = tmp_path / "older"
+    shutil.copytree(dataset, folder)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["schema_version"] = 2
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    assert "dataset of schema 2, this program reads schema 3" in refused(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"crop": 18}, "crop of 18 pixels, the renderer takes multiples of 4: give it 16"),
+        ({"size": [20, 18], "crop": None}, "size of 18 pixels, the renderer takes multiples of 4"),
+    ],
+)
+def test_sides_that_the_codecs_blocks_do_not_divide_are_refused(refused, change, message):
+    assert message in refused(stages=[STAGE | change])
+
+
+@pytest.mark.parametrize("frames", [2, 3, 4, 6])
+def test_frames_that_are_not_1_plus_4n_are_refused(make_settings, dataset, frames):
+    with pytest.raises(ValidationError, match=r"1 \+ 4n"):
+        Settings.model_validate(make_settings(dataset, "out", stages=[STAGE | {"frames": frames}]))
+
+
+def test_frames_are_those_that_the_renderer_takes():
+    renderer = NeuralRenderer()
+    renderer.temporal_factor = 8
+    for frames, fits in ((1, True), (5, False), (9, True)):
+        stage = Stage.model_validate(STAGE | {"frames": frames})
+        if fits:
+            require_renderer(stage, renderer)
+        else:
+            with pytest.raises(TronError, match=r"has 5 frames, the renderer takes 1 \+ 8n: give it 9"):
+                require_renderer(stage, renderer)
+
+
+def test_fewer_clips_than_processes_are_refused(dataset):
+    data = TrainingData(dataset, DataSettings(), 0, ValidationSettings(), Processes(0, 6))
+    with pytest.raises(TronError, match="split 'train' has 5 clips for 6 processes: train on fewer"):
+        data.open([Stage.model_validate(STAGE)])
+    few = TrainingData(dataset, DataSettings(), 0, ValidationSettings(), Processes(0, 5))
+    few.open([Stage.model_validate(STAGE)])
+
+
+class Malice:
+    def __reduce__(self):
+        return (Path.touch, (Path("executed"),))
+
+
+@pytest.mark.parametrize("kind", ["missing", "malicious", "other"])
+def test_lpips_weights_that_are_none_are_refused(refused, tmp_path, monkeypatch, kind):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "vgg.pth"
+    if kind != "missing":
+        torch.save({"features.0.weight": Malice() if kind == "malicious" else torch.zeros(3)}, path)
+    assert "vgg.pth" in refused(loss={"vgg_weights": path})
+    assert not Path("executed").exists()
+
+
+def test_the_papers_recipe_asks_for_the_lpips_weights(capsys, dataset, tmp_path):
+    words = [f"dataset={dataset}", f"output_dir={tmp_path / 'out'}", "experiment=paper", "accelerator=cpu"]
+    with pytest.raises(SystemExit) as ended:
+        cli([*words, "renderer.transformer_path=a.pt", "renderer.vae_path=b.pth"])
+    said = capsys.readouterr().err.strip()
+    assert ended.value.code == 2
+    assert "loss.vgg_weights" in said
+    assert "\n" not in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_clips_alone_teach_temporal_weights():
+    wrong = {"frames": 1}, {"frames": 5, "still_ratio": 0.5}
+    for change in wrong:
+        with pytest.raises(ValidationError, match="train_only=temporal learns from clips"):
+            Stage.model_validate(STAGE | {"train_only": "temporal"} | change)
+
+
+@pytest.mark.parametrize(
+    "override", ["logger=[mlflow]", "data.exposure=-1", "data.rotate=2", "data.damaged_limit=2"]
+)
+def test_settings_out_of_range_are_refused(override):
+    words = ["dataset=a", "output_dir=b", override]
+    with pytest.raises(TronError, match=override.split("=")[0].replace(".", r"\.")):
+        check(compose_recipe("conf.train", Settings, words), Settings)

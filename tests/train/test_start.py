@@ -1,0 +1,156 @@
+"""Warm starts: of a run with another's renderer, of a stage with averaged weights, with frozen ones."""
+
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from train.averaging import AveragedWeights
+from train.cli import main
+from train.module import RendererModule
+from train.settings import Settings
+from tron.errors import TronError
+from tron.neural.pixel_mlp import PixelMLP
+
+PIXELS = {"_target_": "tron.neural.pixel_mlp.PixelMLP"}
+STAGES = [
+    {"name": "one", "split": "train", "steps": 3, "batch_size": 2, "crop": 16},
+    {"name": "two", "split": "train_b", "frames": 5, "steps": 3, "batch_size": 1, "crop": 16},
+]
+
+
+@pytest.fixture(scope="module")
+def train(make_settings, dataset):
+    def run(output: Path, place: Path = dataset, **changes) -> dict[str, torch.Tensor]:
+        changes = {"stages": STAGES, "validation": {"split": None}} | changes
+        settings = make_settings(place, output, **changes)
+        main(Settings.model_validate(settings))
+        return load_file(output / "renderer.safetensors")
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def first(train, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("first")
+    train(folder, stages=STAGES[:1])
+    return folder / "renderer.safetensors"
+
+
+def test_a_run_begins_with_the_weights_and_constants_of_another(train, first, make_dataset, tmp_path):
+    """At a rate of almost nothing it also ends with them: the codec is not fitted again, to other data."""
+    other = make_dataset(tmp_path / "other", {"train": 1, "train_b": 1}, frames=5)
+    found = train(
+        tmp_path / "out",
+        other,
+        stages=STAGES[1:],
+        start_from=first,
+        seed=3,
+        optimizer={"learning_rate": 1e-12, "weight_decay": 0.0},
+    )
+    for name, value in load_file(first).items():
+        torch.testing.assert_close(found[name], value, rtol=0, atol=1e-9)
+
+
+def test_what_a_run_began_with_is_part_of_it(train, first, tmp_path):
+    train(tmp_path / "out", stages=STAGES[1:], start_from=first)
+    moved = tmp_path / "moved.safetensors"
+    moved.write_bytes(first.read_bytes())
+    train(tmp_path / "out", stages=STAGES[1:], start_from=moved)
+    train(tmp_path / "other", stages=STAGES[1:], seed=1)
+    with pytest.raises(TronError, match="a run made with start_from_sha256="):
+        train(tmp_path / "out", stages=STAGES[1:], start_from=tmp_path / "other" / "renderer.safetensors")
+    with pytest.raises(TronError, match="a run made with start_from_sha256="):
+        train(tmp_path / "out", stages=STAGES[1:])
+
+
+class Malice:
+    def __reduce__(self):
+        return (Path.touch, (Path("executed"),))
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("missing", "cannot read: No such file"),
+        ("pickle", "not a readable safetensors file"),
+        ("torch", "not a readable safetensors file"),
+        ("truncated", "not a readable safetensors file"),
+        ("shape", "weights do not fit the model"),
+    ],
+)
+def test_a_wrong_file_to_start_from_is_one_line_before_the_first_step(
+    train, first, tmp_path, monkeypatch, kind, message
+):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "start.safetensors"
+    if kind == "pickle":
+        path.write_bytes(pickle.dumps(Malice()))
+    elif kind == "torch":
+        torch.save({"a": Malice()}, path)
+    elif kind == "truncated":
+        path.write_bytes(first.read_bytes()[:-100])
+    elif kind == "shape":
+        path = first
+    output = tmp_path / "out"
+    with pytest.raises(TronError, match=message) as said:
+        train(output, start_from=path, **({"renderer": PIXELS} if kind == "shape" else {}))
+    assert "\n" not in str(said.value)
+    assert not Path("executed").exists()
+    assert not (output / "config.yaml").exists(), "the mended command may use the folder"
+    train(output, stages=STAGES[:1])
+
+
+def test_a_stage_ends_with_averaged_weights_and_the_next_begins_with_them(train, monkeypatch, tmp_path):
+    begun = {}
+
+    def note(self):
+        state = self.renderer.state_dict()
+        begun[self.stage.name] = {name: value.clone() for name, value in state.items()}
+        self.clock.start()
+
+    monkeypatch.setattr(RendererModule, "on_train_start", note)
+    plain = train(tmp_path / "plain", stages=STAGES[:1])
+    train(tmp_path / "averaged", optimizer={"ema_decay": 0.9})
+    ended = load_file(tmp_path / "averaged" / "checkpoints" / "1-one.safetensors")
+    assert all(torch.equal(begun["two"][name], ended[name]) for name in ended)
+    moved = {name for name in ended if not torch.equal(ended[name], plain[name])}
+    assert moved, "averages are not the last weights"
+    for name in moved:  # they lag behind them
+        assert (ended[name] - begun["one"][name]).norm() < (plain[name] - begun["one"][name]).norm()
+
+
+@pytest.mark.parametrize("optimizer", [{}, {"ema_decay": 0.5}, {"muon_learning_rate": 0.02}])
+def test_a_stage_may_train_temporal_weights_alone(train, monkeypatch, tmp_path, optimizer):
+    """The others stay as the stage before left them, to the last bit, averaged or not."""
+    named = {name for name, _ in PixelMLP().named_parameters()}
+    chosen = {sorted(named)[0]}
+
+    def temporal(self):
+        return {name: weight for name, weight in self.named_parameters() if name in chosen}
+
+    monkeypatch.setattr(PixelMLP, "temporal_weights", temporal)
+    stages = [STAGES[0], STAGES[1] | {"train_only": "temporal"}]
+    found = train(tmp_path, renderer=PIXELS, stages=stages, optimizer={"warmup_steps": 0, **optimizer})
+    before = load_file(tmp_path / "checkpoints" / "1-one.safetensors")
+    assert {name for name in found if not torch.equal(found[name], before[name])} == chosen
+
+
+def test_constants_stay_under_the_average_to_the_last_bit():
+    """Which Lightning's own formula would not grant."""
+    layer = torch.nn.Linear(64, 64)
+    for decay in (0.1, 0.9, 0.999):
+        averaged = AveragedWeights(decay)
+        averaged._average_model = torch.optim.swa_utils.AveragedModel(layer, **averaged._kwargs)
+        for _ in range(5):
+            averaged._average_model.update_parameters(layer)
+        (weight, _) = averaged._average_model.module.parameters()
+        assert torch.equal(weight, layer.weight)
+
+
+def test_a_renderer_without_temporal_weights_is_refused_in_one_line(train, tmp_path):
+    stages = [STAGES[1] | {"train_only": "temporal"}]
+    with pytest.raises(TronError, match="stage two trains temporal weights alone"):
+        train(tmp_path, renderer=PIXELS, stages=stages)
