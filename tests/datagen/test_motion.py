@@ -140,7 +140,7 @@ def test_flow_by_the_motion_in_the_metadata_is_where_the_truth_shows_the_object_
         for i, j in ((1, 0), (2, 1)):
             args = (seen[i], cameras[i], seen[j], cameras[j], moving.pixels[i])
             both = both_see(*args, moving.between(i, j))
-            assert both[moving.pixels[i]].mean() > 0.3
+            assert both[moving.pixels[i]].mean() > 0.1
             assert both[moving.pixels[i]].mean() > both_see(*args, np.eye(4))[moving.pixels[i]].mean()
             displacement = flow(seen[i], cameras[i], cameras[j], moving.pixels[i], moving.between(i, j))
             landed = warp(moving.pixels[j][..., None].astype(float), displacement)[..., 0]
