@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field, field_validator
@@ -33,6 +34,24 @@ class CapturedSettings(SettingsModel):
         default_factory=lambda: Shares(),
         description="Share of the captures in each split, every capture in one of them, drawn by seed and "
         "name; each split with a share has a capture where there are enough, the largest shares first.",
+    )
+    split_by_name: bool = Field(
+        default=False,
+        description="A capture whose name begins with a split's, such as train-000003, is in that split, as "
+        "pseudo-captures are; shares say nothing then, and any other name is refused.",
+    )
+    relit: Path | None = Field(
+        default=None,
+        description="Folder of path-traced views of the captures under other lights, relit/ of "
+        "pseudo-captures: reconstructions are lit by NAME_k_LIGHT/environment.exr as well, in the splits "
+        "train_relit, train_b_relit, validation_relit and test_relit.",
+    )
+    relit_frames: int = Field(
+        default=1,
+        ge=1,
+        le=1000,
+        description="Views of a relit clip, neighbours in the order of their names; those of "
+        "pseudo-captures are eight photos apart.",
     )
     frames: int = Field(
         default=5, ge=1, le=1000, description="Photos of a clip, neighbours in the order of their names."
