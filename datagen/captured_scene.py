@@ -11,6 +11,7 @@ import drjit as dr
 from datagen.captured_clips import made_clips
 from datagen.captured_reconstruction import clear_work, find, kept, load, tell
 from datagen.captured_relit_clips import relit_clips
+from datagen.captured_reuse import take_over
 from datagen.captured_surfels import CapturedSurfels
 from datagen.clock import stage
 from datagen.plan import CAPTURE_SHARDS, RECORD_NAME, Record, Sources, Work, scene_folder
@@ -43,7 +44,8 @@ def make_capture(item: Work, settings: Settings, sources: Sources) -> Record:  #
     found = kept(folder, capture)
     if found is None:
         with stage("reconstruct"):
-            find(item, settings, capture, folder)
+            if not take_over(item, settings, capture, folder):
+                find(item, settings, capture, folder)
         found = kept(folder, capture)
         if found is None:
             raise TronError("surfels or light cannot be read back", folder, "look for a full or failing disk")

@@ -85,6 +85,11 @@ class CapturedSettings(SettingsModel):
         default_factory=lambda: ReconstructionSettings(),
         description="Surfels, as tron-reconstruct finds them; each capture has a seed of its own.",
     )
+    reconstructed: Path | None = Field(
+        default=None,
+        description="Folder of a dataset of the same captures, made with the same seed, photos, prior, "
+        "reconstruction and light: what it found is taken over, and only guidance is made anew.",
+    )
     light: FitSettings = Field(
         default_factory=lambda: FitSettings(),
         description="Fit of the light where the prior is not joint, likewise.",

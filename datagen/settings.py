@@ -434,7 +434,7 @@ class Settings(ScaleSettings):
             values = self.model_dump(
                 mode="json",
                 include={"source", "captured", *OF_BOTH_SOURCES},
-                exclude={"captured": {"names": True, "relit": True, **seeded}},
+                exclude={"captured": {"names": True, "relit": True, "reconstructed": True, **seeded}},
             )
             if self.captured.relit is not None:  # that there are such clips, not where their truth lies
                 values["captured"]["relit"] = True

@@ -140,6 +140,31 @@ def test_a_run_that_ends_before_the_relit_clips_goes_on_to_the_same_bytes(
     assert files_of(tmp_path / "again") == files_of(pairs)
 
 
+def test_a_reconstruction_is_taken_over_and_gives_the_same_bytes(
+    pairs: Path, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files_of
+):
+    def find(*arguments):
+        raise AssertionError("it is reconstructed again")
+
+    monkeypatch.setattr(datagen.captured_scene, "find", find)
+    again = recipe(tmp_path / "again", f"captured.reconstructed={pairs}")
+    assert make(again) == 0
+    theirs, ours = files_of(pairs), files_of(again.output_dir)
+    card = "README.md"  # names the command, which says where it came from
+    assert ours.pop(card) != theirs.pop(card)
+    assert ours == theirs
+    with pytest.raises(TronError, match=r"captured\.reconstruction\.steps_scaler"):
+        make(
+            recipe(
+                tmp_path / "other",
+                f"captured.reconstructed={pairs}",
+                "captured.reconstruction.steps_scaler=2",
+            )
+        )
+    with pytest.raises(TronError, match="no dataset of captures"):
+        make(recipe(tmp_path / "other", f"captured.reconstructed={tmp_path}"))
+
+
 def test_a_dataset_without_relit_clips_is_another(pairs: Path, recipe: Recipe):
     with pytest.raises(TronError, match=r"captured\.relit"):
         make(recipe(pairs, "captured.relit=null"))
