@@ -46,7 +46,7 @@ class Moving:
 
     @classmethod
     def of(cls, meta: ClipMeta) -> Moving | None:
-        """What moves in a clip; None where nothing does.
+        """The object that moves in a clip; None where nothing does.
 
         Raises:
             TronError: the clip is of an older program, which moved an object and did not say how, or its
