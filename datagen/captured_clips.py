@@ -9,6 +9,7 @@ import numpy as np
 
 from datagen.captured_photos import Photo, frame_of, require_size, rows_of_photos, starts
 from datagen.captured_reconstruction import Found
+from datagen.captured_surfels import CapturedSurfels, stored_guidance
 from datagen.lights import classify, contrast_share
 from datagen.plan import Work, scene_folder
 from datagen.settings import Settings
@@ -18,11 +19,7 @@ from tron.captures import Capture, View
 from tron.color import luminance
 from tron.errors import TronError
 from tron.priors.linear_light import inverse_agx
-from tron.seeds import integer
-from tron.shading.bounce import BounceTransport
-from tron.shading.guidance import Lighting, render_guidance
 from tron.shards.schema import MEMBERS, TARGET, ClipMeta, ColorSpace, clip_members
-from tron.tracing import SurfelTracer
 
 OPAQUE = 0.9
 """Opacity of surfels at pixels that the exposure is measured at."""
@@ -34,7 +31,7 @@ BLACK = (0.0, 0.0, 0.0)
 
 @contextmanager
 def made_clips(
-    item: Work, settings: Settings, capture: Capture, found: Found
+    item: Work, settings: Settings, capture: Capture, found: Found, surfels: CapturedSurfels
 ) -> Iterator[list[tuple[ClipMeta, Sequence[Frame]]]]:
     """Clips of a capture with their frames, which are read when they are asked for, within the block.
 
@@ -44,7 +41,8 @@ def made_clips(
     Args:
         item, settings: the capture and its recipe.
         capture: with photos as large as they are.
-        found: its surfels and light.
+        found: its light, and the gains of its photos.
+        surfels: its reconstruction.
 
     Raises:
         TronError: there are too few photos in a row, or they are too small.
@@ -61,7 +59,7 @@ def made_clips(
     views = [view for row in rows for view in row]
     require_size(views, wanted.width, wanted.height)
     with Spool(scene_folder(settings.output_dir, item.name), clips=1) as spool:
-        cameras, exposure = _film(item, settings, capture, found, views, spool)
+        cameras, exposure = _film(settings, capture, found, surfels, views, spool)
         about = _About(item, settings, found, exposure, capture.exposure)
         clips, first, frames = [], 0, spool.clip(0)
         for row in rows:
@@ -73,33 +71,26 @@ def made_clips(
 
 
 def _film(
-    item: Work, settings: Settings, capture: Capture, found: Found, views: Sequence[View], spool: Spool
+    settings: Settings,
+    capture: Capture,
+    found: Found,
+    surfels: CapturedSurfels,
+    views: Sequence[View],
+    spool: Spool,
 ) -> tuple[list[Camera], float]:
     """Put every photo and its guidance into the spool; their cameras, and the exposure of the guidance."""
-    wanted, estimation = settings.captured, settings.estimation(item.split)
-    tracer, lighting = SurfelTracer(found.scene), Lighting(found.environment)
-    path = ("captured", item.capture)
-    bounce = None
-    if estimation.bounces:
-        transport = BounceTransport.trace(
-            tracer.sided(estimation.two_sided), seed=integer(settings.seed, *path, "bounce")
-        )
-        seed = integer(settings.seed, *path, "light", "bounce")
-        bounce = transport.bake(lighting, estimation, seed=seed)
+    wanted, lit = settings.captured, surfels.under(found.environment)
     # A subject without its surroundings is in front of black, in photos and guidance alike.
     alone = any(view.has("mask") and not view.has("sky_mask") for view in views)
     cameras, ratios = [], []
     for view in views:
         gain = found.gains.get(view.name, np.ones(3)) if wanted.balance else np.ones(3)
         photo = frame_of(view, gain, capture.tone_curve, wanted.width, wanted.height)
-        seed = integer(settings.seed, *path, "frame", view.name, "guidance")
-        guidance = render_guidance(
-            tracer, photo.camera, lighting, estimation, seed, BLACK if alone else None, bounce
-        )
+        guidance = lit.view(photo.camera, view.name, BLACK if alone else None)
         opaque = guidance.mask > 0.5
         seen = (opaque if photo.foreground is None else photo.foreground) & photo.believed
-        frame = {name: guidance[name] for name in guidance.BUFFERS if name in MEMBERS}
-        spool.add(0, frame | {TARGET: photo.shown, "foreground": seen.astype(np.float32)})
+        truth = {TARGET: photo.shown, "foreground": seen.astype(np.float32)}
+        spool.add(0, stored_guidance(guidance) | truth)
         ratios.append(light_ratio(photo, guidance.lit * capture.exposure, seen & (guidance.mask > OPAQUE)))
         cameras.append(photo.camera)
     measured = np.concatenate(ratios)

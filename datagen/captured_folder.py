@@ -103,6 +103,24 @@ def split_of(names: Sequence[str], shares: Shares, seed: int) -> dict[Split, lis
     return found
 
 
+def split_by_name(names: Sequence[str]) -> dict[Split, list[str]]:
+    """Split -> names of its captures, sorted, by what stands before the hyphen in each.
+
+    Raises:
+        TronError: a name that begins with no split's.
+    """
+    found: dict[Split, list[str]] = {}
+    for split in SPLITS:
+        if own := sorted(name for name in names if name.startswith(f"{split}-")):
+            found[split] = own
+    if others := sorted(set(names).difference(*found.values())):
+        raise TronError(
+            f"captured.split_by_name, but the capture {others[0]} begins with no split's name",
+            mend=f"rename it, such as train-{others[0]}, or leave captured.split_by_name out",
+        )
+    return found
+
+
 def apportioned(shares: Mapping[Split, float], total: int) -> dict[Split, int]:
     """Whole numbers that sum to ``total``, in proportion to shares: see :func:`split_of`."""
     wanted: list[Split] = sorted(

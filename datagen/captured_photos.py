@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,7 +89,7 @@ def frame_of(view: View, gain: np.ndarray, curve: ToneCurve, width: int, height:
     Raises:
         TronError: the photo is smaller than the frame, or cannot be read.
     """
-    box = _covered(view, width, height)
+    box = _covered(view.camera, width, height, view.name)
     mask = view.read("mask") if view.has("mask") and not view.has("sky_mask") else None
     shown = balanced(view.read(), gain, curve, mask)
     if view.has("mask"):
@@ -99,6 +99,18 @@ def frame_of(view: View, gain: np.ndarray, curve: ToneCurve, width: int, height:
     believed = _resized(view.believed().astype(np.float32), box, width, height) > 0.99
     shown = np.clip(_resized(shown, box, width, height), 0.0, 1.0)
     return Photo(_cut(view.camera, box, width, height), shown, foreground, believed)
+
+
+def resized_view(
+    camera: Camera, images: Sequence[np.ndarray], width: int, height: int
+) -> tuple[Camera, list[np.ndarray]]:
+    """A camera and its images (H, W) or (H, W, C) in a frame's pixels, as :func:`frame_of` makes them.
+
+    Raises:
+        TronError: they are smaller than the frame.
+    """
+    box = _covered(camera, width, height)
+    return _cut(camera, box, width, height), [_resized(image, box, width, height) for image in images]
 
 
 def balanced(
@@ -121,17 +133,16 @@ def balanced(
 def require_size(views: Iterable[View], width: int, height: int) -> None:
     """Raise TronError, naming the first photo, where one is smaller than a frame."""
     for view in views:
-        _covered(view, width, height)
+        _covered(view.camera, width, height, view.name)
 
 
-def _covered(view: View, width: int, height: int) -> Box:
+def _covered(camera: Camera, width: int, height: int, name: str = "") -> Box:
     """Left, top, right and bottom of what a frame shows of a photo, pixels of the photo."""
-    camera = view.camera
     shrink = min(camera.width / width, camera.height / height)
     if shrink < 1:
         raise TronError(
             f"a photo has {camera.width} x {camera.height} pixels, fewer than a frame, {width} x {height}",
-            f"view {view.name}",
+            f"view {name}" if name else None,
             "make captured.width and captured.height smaller",
         )
     left, top = (camera.width - shrink * width) / 2, (camera.height - shrink * height) / 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field, field_validator
@@ -33,6 +34,24 @@ class CapturedSettings(SettingsModel):
         default_factory=lambda: Shares(),
         description="Share of the captures in each split, every capture in one of them, drawn by seed and "
         "name; each split with a share has a capture where there are enough, the largest shares first.",
+    )
+    split_by_name: bool = Field(
+        default=False,
+        description="A capture whose name begins with a split's, such as train-000003, is in that split, as "
+        "pseudo-captures are; shares say nothing then, and any other name is refused.",
+    )
+    relit: Path | None = Field(
+        default=None,
+        description="Folder of path-traced views of the captures under other lights, relit/ of "
+        "pseudo-captures: reconstructions are lit by NAME_k_LIGHT/environment.exr as well, in the splits "
+        "train_relit, train_b_relit, validation_relit and test_relit.",
+    )
+    relit_frames: int = Field(
+        default=1,
+        ge=1,
+        le=1000,
+        description="Views of a relit clip, neighbours in the order of their names; those of "
+        "pseudo-captures are eight photos apart.",
     )
     frames: int = Field(
         default=5, ge=1, le=1000, description="Photos of a clip, neighbours in the order of their names."
@@ -65,6 +84,11 @@ class CapturedSettings(SettingsModel):
     reconstruction: ReconstructionSettings = Field(
         default_factory=lambda: ReconstructionSettings(),
         description="Surfels, as tron-reconstruct finds them; each capture has a seed of its own.",
+    )
+    reconstructed: Path | None = Field(
+        default=None,
+        description="Folder of a dataset of the same captures, made with the same seed, photos, prior, "
+        "reconstruction and light: what it found is taken over, and only guidance is made anew.",
     )
     light: FitSettings = Field(
         default_factory=lambda: FitSettings(),

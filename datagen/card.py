@@ -19,7 +19,7 @@ from datagen.clip_rows import ClipRow
 from datagen.contact_sheet import SHEET_NAME
 from datagen.hub import configurations, front_matter
 from datagen.plan import Figures, Refinement, Sources, config_sha256
-from datagen.settings import OUTSIDE, SPLITS, Settings
+from datagen.settings import OUTSIDE, SHARD_SPLITS, Settings
 from datagen.source_list import SOURCES_NAME, SourceList
 from datagen.variety import MEASURES, VARIETY_NAME, Histograms, Other, median
 from tron.cli.recipes import complete, compose_recipe, group_options
@@ -128,7 +128,7 @@ def card_text(
         listed: its sources by split.
         reconstructed: surfels that were reconstructed from pictures, against the truth.
     """
-    by_split = {split: [row for row in rows if row.split == split] for split in SPLITS}
+    by_split = {split: [row for row in rows if row.split == split] for split in SHARD_SPLITS}
     clips = {split: len(found) for split, found in by_split.items() if found}
     files = _files(sources)
     lines = [
@@ -212,10 +212,14 @@ def _origin(settings: Settings) -> str:
             f"about {settings.surfels:,} surfels a scene, from {settings.views} views. Buffers are linear;"
         )
     shown = "as the mean photo of their capture would show them" if settings.captured.balance else "as stored"
+    relit = (
+        "In splits whose names end in `_relit`, guidance is of the same surfels under lights that the photos "
+        "never saw, and `rgb` is what was path-traced under them, linear. "
+    )
     return (
         f"Frames (`rgb`) are photos, display values, {shown}; guidance by TRON's surfel tracer on surfels "
         "and light that were reconstructed from the same photos, `scenes/NAME/spec.json` says how well. "
-        "Guidance is linear;"
+        f"{relit if settings.captured.relit is not None else ''}Guidance is linear;"
     )
 
 

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import yaml
 
 from datagen.clip_rows import ClipRow
-from datagen.settings import SPLITS, Settings
+from datagen.settings import SHARD_SPLITS, Settings
 
 METADATA_NAME = "metadata.parquet"
 LICENCES = frozenset(
@@ -77,7 +77,7 @@ def front_matter(settings: Settings, clips: Mapping[str, int], licences: Sequenc
 def configurations(settings: Settings, clips: Mapping[str, int]) -> list[dict[str, Any]]:
     """Splits by configuration: those whose clips hold the same files; the first is the default one."""
     kinds: dict[tuple[bool, int], list[str]] = {}
-    for split in (name for name in SPLITS if clips.get(name)):
+    for split in (name for name in SHARD_SPLITS if clips.get(name)):
         recipe = settings.split(split)
         kinds.setdefault((recipe.reference_buffers, recipe.frames), []).append(split)
     return [

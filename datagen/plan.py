@@ -18,7 +18,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from datagen.assets import Asset, Refused, find_environments, find_models
-from datagen.captured_folder import find_captures, split_of
+from datagen.captured_folder import find_captures, split_by_name, split_of
+from datagen.captured_relit import find_relit
 from datagen.clip_preview import preview_bytes
 from datagen.clip_rows import ClipRow
 from datagen.clusters import worker_count
@@ -48,6 +49,7 @@ class Work:
     Attributes:
         capture: name of the capture that it is; empty where it is synthetic.
         photos: about how many that has.
+        relit: how many views of it there are under other lights, all lights together.
     """
 
     split: str
@@ -56,12 +58,23 @@ class Work:
     first_shard: int
     capture: str = ""
     photos: int = 0
+    relit: int = 0
 
     def clips(self, settings: Settings) -> int:
-        """Clips that it gives: one a light, or as many as its photos are cut into, about."""
+        """Clips that it gives: one a light, or as many as its photos and relit views are cut into, about."""
         if self.capture:
-            return max(self.photos // settings.captured.frames, 1)
+            return self.photo_clips(settings) + self.relit // settings.captured.relit_frames
         return len(settings.split(self.split).lights)
+
+    def photo_clips(self, settings: Settings) -> int:
+        """Clips that a capture's photos are cut into, about."""
+        return max(self.photos // settings.captured.frames, 1)
+
+    def frames(self, settings: Settings) -> int:
+        """Frames of all its clips, about."""
+        if self.capture:
+            return self.photo_clips(settings) * settings.captured.frames + self.relit
+        return self.clips(settings) * settings.split(self.split).frames
 
 
 @dataclass(frozen=True)
@@ -162,9 +175,13 @@ def plan(settings: Settings) -> list[Work]:
 
 def _plan_captured(settings: Settings) -> list[Work]:
     photos = {each.name: each.photos for each in find_captures(settings)}
-    splits = split_of(list(photos), settings.captured.shares, settings.seed)
+    if settings.captured.split_by_name:
+        splits = split_by_name(list(photos))
+    else:
+        splits = split_of(list(photos), settings.captured.shares, settings.seed)
+    relit = {name: sum(truth.views for truth in find_relit(settings, name)) for name in photos}
     items = [
-        Work(split, i, scene_name(split, i), i * CAPTURE_SHARDS, name, photos[name])
+        Work(split, i, scene_name(split, i), i * CAPTURE_SHARDS, name, photos[name], relit[name])
         for split, names in splits.items()
         for i, name in enumerate(names)
     ]
@@ -253,9 +270,9 @@ def estimate_bytes(settings: Settings, items: Iterable[Work], shards: bool = Tru
         members = [MEMBERS[name] for name in clip_members(recipe.reference_buffers)]
         pixel = sum(member.bytes * member.channels for member in members)
         frame = recipe.width * recipe.height * pixel + 16_384
-        clip = recipe.frames * frame if shards else 0
+        stored = item.frames(settings) * frame if shards else 0
         previews = preview_bytes(recipe.width, recipe.height, recipe.frames, len(members))
-        total += item.clips(settings) * (clip + previews) + surfels * SURFEL_BYTES
+        total += stored + item.clips(settings) * previews + surfels * SURFEL_BYTES
         waiting = max(waiting, scratch_bytes(settings, item.split, item.photos))
     return total + waiting * worker_count(settings, len(items))[0]
 

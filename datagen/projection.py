@@ -129,7 +129,7 @@ def captured_cost(missing: Sequence[Work], settings: Settings) -> SceneCost:
     core: the order of what captures of some thousand surfels took here. Larger photos take longer.
     """
     wanted = settings.captured
-    photos = fmean(item.photos for item in missing)
+    photos = fmean(item.photos + item.relit for item in missing)
     how = wanted.reconstruction
     steps = how.steps_scaler * (how.radiance.steps + how.materials.steps)
     pixels = photos * wanted.width * wanted.height
@@ -207,7 +207,7 @@ def _row(settings: Settings, split: SplitPlan) -> tuple[str, ...]:
         str(split.scenes),
         str(number),
         str(clips),
-        str(clips * recipe.frames),
+        str(sum(item.frames(settings) for item in split.missing)),
         f"{recipe.width} x {recipe.height}",
         f"{number * cost.bytes / 1e9:.3g}",
         f"{number * cost.seconds / 3600:.3g}",

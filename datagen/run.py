@@ -16,6 +16,7 @@ import drjit as dr
 from datagen.account import read_other, write_account
 from datagen.build import Geometry
 from datagen.captured_reconstruction import clear_work, require_prior
+from datagen.captured_reuse import require_reusable
 from datagen.captured_scene import make_capture
 from datagen.clock import stage
 from datagen.clusters import logs_folder, require_cluster
@@ -70,6 +71,7 @@ def make(settings: Settings) -> int:
     output = settings.output_dir
     if settings.source == "captured":
         require_prior(settings)
+        require_reusable(settings)
     with locked(output):
         clear_temporaries(output)
         adopt(settings)

@@ -73,6 +73,12 @@ OF_BOTH_SOURCES = {"seed", "clips_per_shard", "variant", *ESTIMATED}
 
 SPLITS: tuple[Split, ...] = ("train", "train_b", "validation", "test")
 
+RELIT = "_relit"
+"""Behind the name of a split: its captures under lights that their photos never saw."""
+
+SHARD_SPLITS: tuple[str, ...] = tuple(f"{name}{suffix}" for suffix in ("", RELIT) for name in SPLITS)
+"""Splits that shards may be of."""
+
 
 class EqualErrorSettings(SettingsModel):
     """Comparison of guidance with the path tracer, on the test scenes of a dataset."""
@@ -397,8 +403,9 @@ class Settings(ScaleSettings):
         """The settings of one split; of captures, how large and long its clips are."""
         if self.source == "captured":
             wanted = self.captured
-            size = {key: getattr(wanted, key) for key in ("frames", "width", "height", "guidance_spp")}
-            return SplitSettings(scenes=0, lights=["any"], **size)
+            size = {key: getattr(wanted, key) for key in ("width", "height", "guidance_spp")}
+            frames = wanted.relit_frames if name.endswith(RELIT) else wanted.frames
+            return SplitSettings(scenes=0, lights=["any"], frames=frames, **size)
         return getattr(self, name)
 
     def estimation(self, split: str) -> Estimation:
@@ -407,8 +414,10 @@ class Settings(ScaleSettings):
         return Estimation(rays=self.split(split).guidance_spp, **chosen)
 
     def used_splits(self) -> list[Split]:
-        """The splits that have scenes; of captures, those with a share of them."""
+        """The splits that have scenes; of captures, those that may have some."""
         if self.source == "captured":
+            if self.captured.split_by_name:
+                return list(SPLITS)
             return [name for name in SPLITS if getattr(self.captured.shares, name)]
         return [name for name in SPLITS if self.split(name).scenes]
 
@@ -422,11 +431,14 @@ class Settings(ScaleSettings):
         """Keys that decide a scene's content, plain values: not where it goes, who makes it or how many."""
         if self.source == "captured":
             seeded = {"reconstruction": {"seed", "checkpoint_every"}, "light": {"seed"}}
-            return self.model_dump(
+            values = self.model_dump(
                 mode="json",
                 include={"source", "captured", *OF_BOTH_SOURCES},
-                exclude={"captured": {"names": True, **seeded}},
+                exclude={"captured": {"names": True, "relit": True, "reconstructed": True, **seeded}},
             )
+            if self.captured.relit is not None:  # that there are such clips, not where their truth lies
+                values["captured"]["relit"] = True
+            return values
         values = self.model_dump(mode="json", exclude=OUTSIDE | OF_CAPTURES)
         for name in SPLITS:
             if name in self.used_splits():

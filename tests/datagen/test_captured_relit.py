@@ -1,0 +1,200 @@
+"""Captures relit: guidance is of the light that the folder names, the truth is the folder's, runs go on."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+import datagen.captured_scene
+from datagen.captured_folder import split_by_name
+from datagen.plan import plan
+from datagen.run import make
+from datagen.settings import Settings
+from datagen.validate import validate
+from tron.cameras import Camera
+from tron.captures import Capture, View
+from tron.captures.folder import read_capture_folder, write_capture
+from tron.cli.recipes import check, compose_recipe
+from tron.errors import TronError
+from tron.images import encode_exr
+from tron.seeds import generator
+from tron.shading.environment import EnvironmentMap
+from tron.shards.manifest import Manifest
+from tron.shards.reader import read_clips
+
+NAME = "test-000001"
+LIGHTS = {"1_sun": (1.0, 0.5), "2_studio": (2.0, 0.25)}
+"""Light -> factor on the map, exposure."""
+
+Recipe = Callable[..., Settings]
+
+
+@pytest.fixture(scope="module")
+def relit(tiny_captures: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two views of a capture under two lights, the second twice the first."""
+    folder = tmp_path_factory.mktemp("relit") / "relit"
+    rng = generator(9, "test", "relit")
+    light = rng.uniform(0.1, 2.0, (8, 16, 3)).astype(np.float32)
+    views = read_capture_folder(tiny_captures / NAME).test_views
+    shots = [gaussian_filter(rng.uniform(0, 3, (24, 24, 3)), (2, 2, 0)).astype(np.float32) for _ in views]
+    mask = (np.arange(24) >= 8) * np.ones((24, 1), np.float32)
+    for name, (factor, exposure) in LIGHTS.items():
+        seen = tuple(
+            View(view.name, view.camera, factor * shot, "linear", mask=mask)
+            for view, shot in zip(views, shots)
+        )
+        capture = Capture(seen, up=np.array([0.0, 0.0, 1.0]), exposure=exposure)
+        beside = {"environment.exr": encode_exr(factor * light, half=False)}
+        write_capture(folder / f"{NAME}_{name}", capture, beside=beside)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recipe(variant: str, tiny_captures: Path, quick_reconstruction: list[str], relit: Path) -> Recipe:
+    def recipe(output: Path, *overrides: str) -> Settings:
+        wanted = [
+            *("source=captured", f"captures={tiny_captures}", f"output_dir={output}", "cluster=none"),
+            *("prior=ground_truth", f"captured.names=[{NAME}]", "captured.split_by_name=true"),
+            f"captured.relit={relit}",
+        ]
+        values = compose_recipe("conf.datagen", Settings, [*wanted, *quick_reconstruction, *overrides])
+        return check(values, Settings)
+
+    return recipe
+
+
+@pytest.fixture(scope="module")
+def pairs(recipe: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("pairs") / "pairs"
+    assert make(recipe(output)) == 0
+    return output
+
+
+def test_relit_clips_are_a_split_of_their_own_and_all_of_it_is_accounted_for(pairs: Path, recipe: Recipe):
+    assert validate(pairs) == 0
+    assert Manifest.load(pairs).splits() == ["test", "test_relit"]
+    assert "| test_relit | 1 | 4 | 4 | 20 x 16 | 2 studio, 2 sun |" in (pairs / "README.md").read_text()
+    clips = list(read_clips(pairs, "test_relit"))
+    assert {clip.meta.scene for clip in clips} == {clip.meta.scene for clip in read_clips(pairs, "test")}
+    assert {clip.meta.extra["relit"] for clip in clips} == {f"{NAME}_{name}" for name in LIGHTS}
+    (work,) = plan(recipe(pairs))
+    assert work.clips(recipe(pairs)) == len(clips) + work.photo_clips(recipe(pairs))
+    before = {path: path.stat().st_mtime_ns for path in pairs.rglob("*") if path.is_file()}
+    assert make(recipe(pairs)) == 0
+    assert {path: path.stat().st_mtime_ns for path in pairs.rglob("*") if path.is_file()} == before
+
+
+def test_the_truth_is_the_folders_in_front_of_its_light_under_its_exposure(pairs: Path, relit: Path):
+    for clip in read_clips(pairs, "test_relit"):
+        folder = relit / clip.meta.extra["relit"]
+        (name,) = clip.meta.extra["photos"]
+        views = {view.name: view for view in read_capture_folder(folder).views}
+        camera = Camera.from_dict(clip.meta.cameras[0])
+        np.testing.assert_allclose(camera.position, views[name].camera.position, atol=1e-9)
+        assert not clip.is_display("rgb")
+        assert clip.meta.exposure == LIGHTS[folder.name.removeprefix(f"{NAME}_")][1]
+        # What a pixel shows is the folder's where the same ray meets it; that picture is smooth.
+        pixels, _ = views[name].camera.project(camera.position + camera.rays().reshape(-1, 3))
+        column, row = np.clip(np.floor(pixels).astype(int), 0, 23).T
+        mask = views[name].read("mask")[row, column].reshape(16, 20)
+        seen = clip.frames["foreground"][0, ..., 0] > 0.5
+        sure = (mask == 1) & seen
+        expected = views[name].read()[row, column].reshape(16, 20, 3)
+        assert sure.sum() > 40
+        np.testing.assert_allclose(clip.frames["rgb"][0][sure], expected[sure], rtol=0.15, atol=0.05)
+        behind = EnvironmentMap.load(folder / "environment.exr").lookup(camera.rays())
+        assert ((mask == 0) == ~seen).mean() > 0.9
+        far = (mask == 0) & ~seen
+        assert far.sum() > 40
+        assert np.median(np.abs(clip.frames["rgb"][0] - behind)[far]) < 0.1
+
+
+def test_guidance_is_of_the_surfels_under_that_light(pairs: Path):
+    """Light is linear: under twice the light every noiseless buffer is twice as bright."""
+    by_light: dict[str, list[np.ndarray]] = {}
+    for clip in read_clips(pairs, "test_relit"):
+        by_light.setdefault(clip.meta.light_family, []).append(clip.frames["pbr"])
+    one, two = (np.concatenate(by_light[family]) for family in ("sun", "studio"))
+    assert one.max() > 0.05
+    np.testing.assert_allclose(two, 2 * one, rtol=2e-3, atol=1e-3)
+
+
+def test_a_run_that_ends_before_the_relit_clips_goes_on_to_the_same_bytes(
+    pairs: Path, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files_of
+):
+    real = datagen.captured_scene.relit_clips
+
+    def ends_after_one(*arguments):
+        yield next(iter(real(*arguments)))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(datagen.captured_scene, "relit_clips", ends_after_one)
+        with pytest.raises(KeyboardInterrupt):
+            make(recipe(tmp_path / "again"))
+    assert not list((tmp_path / "again").glob("*_relit-*.tar"))
+    assert make(recipe(tmp_path / "again")) == 0
+    assert files_of(tmp_path / "again") == files_of(pairs)
+
+
+def test_a_reconstruction_is_taken_over_and_gives_the_same_bytes(
+    pairs: Path, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files_of
+):
+    def find(*arguments):
+        raise AssertionError("it is reconstructed again")
+
+    monkeypatch.setattr(datagen.captured_scene, "find", find)
+    again = recipe(tmp_path / "again", f"captured.reconstructed={pairs}")
+    assert make(again) == 0
+    theirs, ours = files_of(pairs), files_of(again.output_dir)
+    card = "README.md"  # names the command, which says where it came from
+    assert ours.pop(card) != theirs.pop(card)
+    assert ours == theirs
+    with pytest.raises(TronError, match=r"captured\.reconstruction\.steps_scaler"):
+        make(
+            recipe(
+                tmp_path / "other",
+                f"captured.reconstructed={pairs}",
+                "captured.reconstruction.steps_scaler=2",
+            )
+        )
+    with pytest.raises(TronError, match="no dataset of captures"):
+        make(recipe(tmp_path / "other", f"captured.reconstructed={tmp_path}"))
+
+
+def test_a_dataset_without_relit_clips_is_another(pairs: Path, recipe: Recipe):
+    with pytest.raises(TronError, match=r"captured\.relit"):
+        make(recipe(pairs, "captured.relit=null"))
+
+
+def test_a_folder_that_does_not_go_with_the_captures_is_refused_in_a_line(
+    recipe: Recipe, relit: Path, tmp_path: Path
+):
+    without_light, photos = tmp_path / "a", tmp_path / "b"
+    shutil.copytree(relit, without_light)
+    (without_light / f"{NAME}_2_studio" / "environment.exr").unlink()
+    (photos / f"{NAME}_1_sun").mkdir(parents=True)
+    (photos / f"{NAME}_1_sun" / "environment.exr").touch()
+    for overrides, said in (
+        (["captured.names=[test-000000]"], "holds nothing of the capture test-000000"),
+        ([f"captured.relit={tmp_path / 'nothing'}"], "no folder"),
+        ([f"captured.relit={without_light}"], "light of the relit views is missing"),
+        ([f"captured.relit={photos}"], "no such capture folder|transforms"),
+        (["captured.relit_frames=9"], "a clip has 9"),
+    ):
+        with pytest.raises(TronError, match=said) as error:
+            make(recipe(tmp_path / "out", *overrides))
+        assert "\n" not in str(error.value)
+        assert not (tmp_path / "out").exists()
+
+
+def test_captures_keep_the_split_that_their_names_say():
+    found = split_by_name(["train-000002", "test-000000", "train-000001", "train_b-000001"])
+    assert found == {
+        "train": ["train-000001", "train-000002"], "train_b": ["train_b-000001"], "test": ["test-000000"],
+    }  # fmt: skip
+    with pytest.raises(TronError, match="the capture fox begins with no split's name"):
+        split_by_name(["train-000000", "fox"])
