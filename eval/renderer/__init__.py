@@ -1,0 +1,1 @@
+"""The renderer benchmark: the shipped checkpoints on data that nobody trained on."""
