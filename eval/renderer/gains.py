@@ -74,7 +74,7 @@ class Gains:
                         name = f"{start}.{self.prefix}{end}{tail}"
                         yield from _known(judged.scores.gain_row(name, method, over, where, seed))
                 for method in judged.scores.methods:
-                    name = f"renderer.{self.prefix}psnr{tail}.of_{method.name.replace('.', '_')}"
+                    name = f"renderer.{self.prefix}psnr.{method.name.replace('.', '_')}{tail}"
                     yield from _known(judged.scores.psnr_row(name, method.name, where, seed))
 
     def worst_over_lit(self, seed: int) -> dict[str, Row]:
