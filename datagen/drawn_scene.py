@@ -46,5 +46,6 @@ def draw_and_build(
         path_frames=settings.path_frames,
         lights_share_path=recipe.lights_share_path,
         moving=Share(recipe.moving_objects, recipe.moving_lights),
+        still_camera=recipe.still_camera,
     )
     return spec, scene_geometry(spec, settings, sources)

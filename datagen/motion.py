@@ -36,6 +36,13 @@ class Pose(NamedTuple):
     shift: np.ndarray
     pivot: np.ndarray
 
+    def matrix(self) -> np.ndarray:
+        """(4, 4) float64, from the world where it rests to the world where it has come to."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.rotation
+        matrix[:3, 3] = self.pivot + self.shift - self.rotation @ self.pivot
+        return matrix
+
 
 class MotionSpec(Spec):
     """One object that is lifted straight up and, once it is clear of the others, turned.

@@ -15,7 +15,7 @@ from pydantic import Field
 from datagen.lights import EVERY, PROCEDURAL, USUAL, Family, HdriSpec, LightChoice, LightSpec, draw_light
 from datagen.motion import STILL, MotionSpec, Share, draw_motion
 from datagen.objects import ObjectSpec
-from datagen.paths import PathSpec
+from datagen.paths import PathSpec, WalkPath
 from datagen.shapes import SHAPES
 from datagen.spec import Number, Spec
 from datagen.styles import MIXED, OLD, STYLES, Choice, Style, StyleChoice
@@ -117,6 +117,7 @@ def draw_scene(
     path_frames: int = 93,
     lights_share_path: bool | None = None,
     moving: Share = STILL,
+    still_camera: bool = False,
 ) -> SceneSpec:
     """Draw scene ``index`` of a split.
 
@@ -133,6 +134,7 @@ def draw_scene(
         frames, path_frames: length of a clip and of the path it is cut from.
         lights_share_path: whether the clips of all lights begin at one place; None: in all styles but OLD.
         moving: probabilities that something moves within a clip.
+        still_camera: all lights' clips are filmed from one place of the path.
 
     Raises:
         TronError: too few objects found a place, or a clip is longer than its path.
@@ -165,6 +167,9 @@ def draw_scene(
     motion, turns = draw_motion(streams("motion"), made.objects, len(lights), moving)
     rng = streams("clips")
     first = [int(rng.integers(path_frames - frames + 1)) for _ in (lights[:1] if shared else lights)]
+    film = made.film
+    if still_camera:
+        film, first = _standing(made.film, first[0], path_frames), [0] * len(first)
     return SceneSpec(
         name=scene_name(split, index),
         split=split,
@@ -180,10 +185,21 @@ def draw_scene(
         lights=tuple(drawn),
         cameras=CameraSpec(
             capture=made.capture,
-            film=made.film,
+            film=film,
             path_frames=path_frames,
             first_frame=first[0] if shared else tuple(first),
         ),
+    )
+
+
+def _standing(film: PathSpec, frame: int, path_frames: int) -> WalkPath:
+    """A path that stays at one frame of another."""
+    camera = film.cameras(path_frames, 2, 2)[frame]
+    target = camera.position + camera.forward
+    return WalkPath(
+        fov_deg=film.fov_deg,
+        positions=((*camera.position.tolist(),),),
+        targets=((*target.tolist(),),),
     )
 
 

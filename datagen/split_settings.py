@@ -52,6 +52,10 @@ class SplitSettings(SettingsModel):
         le=1,
         description="Share of lights that turn about the zenith within their clip; their frames cost more.",
     )
+    still_camera: bool = Field(
+        default=False,
+        description="All frames of a clip are seen from the place of its first: what changes is what moves.",
+    )
     frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
     width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
     height: int = Field(default=256, ge=8, le=8192, description="Frame height in pixels.")

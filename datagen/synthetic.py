@@ -13,6 +13,7 @@ from datagen.build import FIRST_ID, Geometry
 from datagen.clock import stage
 from datagen.exposure import metered
 from datagen.lights import classify, contrast_share
+from datagen.motion import Pose
 from datagen.pathtrace import (
     DirectIrradiance,
     direct_irradiance,
@@ -40,6 +41,8 @@ from tron.seeds import integer
 from tron.shading.bounce import BouncedLight, BounceTransport
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance, trace_views
+from tron.shards.moving import KEY as MOTION
+from tron.shards.moving import Moving
 from tron.shards.schema import MEMBERS, ClipMeta, clip_members
 from tron.tracing import SurfelTracer
 
@@ -87,10 +90,19 @@ def _seen(spec: SceneSpec, geometry: Geometry, cameras: Sequence[Camera]) -> Ite
 
 def _move(spec: SceneSpec, geometry: Geometry, time: float) -> int:
     """Put the object that moves where it is at a time; its id."""
-    assert spec.motion is not None
-    number = FIRST_ID + len(spec.surroundings) + spec.motion.object
-    geometry.move(number, spec.motion.pose(spec.objects[spec.motion.object], time))
+    number = _moving_id(spec)
+    geometry.move(number, _pose(spec, time))
     return number
+
+
+def _moving_id(spec: SceneSpec) -> int:
+    assert spec.motion is not None
+    return FIRST_ID + len(spec.surroundings) + spec.motion.object
+
+
+def _pose(spec: SceneSpec, time: float) -> Pose:
+    assert spec.motion is not None
+    return spec.motion.pose(spec.objects[spec.motion.object], time)
 
 
 def make_clips(
@@ -168,8 +180,7 @@ def _moment(
     if spec.motion is not None:
         which = tracer.scene.object_id == _move(spec, geometry, time)
         if time and which.any():
-            pose = spec.motion.pose(spec.objects[spec.motion.object], time)
-            tracer = tracer.moved(moved(tracer.scene, which, *pose))
+            tracer = tracer.moved(moved(tracer.scene, which, *_pose(spec, time)))
             transport = _transport(spec, tracer, settings.estimation(spec.split))
     lights = [_prepare(spec, transport, number, map_, settings, time) for number, map_ in maps.items()]
     together = spec.cameras.shared
@@ -206,12 +217,16 @@ def _film(
     first = now.lights
     finer = estimation.model_copy(update={"supersample": 2})
     mirrored = finer.model_copy(update={"reflections": REFERENCE_REFLECTIONS})
+    poses, shown = [], []
     for i, camera in enumerate(cameras):
+        time = i / max(len(cameras) - 1, 1)
         if i and not still:
-            time = i / (len(cameras) - 1)
             now = _moment(spec, geometry, tracer, transport, maps, settings, time)
         bounces = [light.bounce for light in now.lights]
         (truth,) = gbuffers(geometry, [camera])
+        if spec.motion is not None:
+            poses.append(_pose(spec, time).matrix())
+            shown.append(truth.valid & (truth.object_id == _moving_id(spec)))
         spp, seed = recipe.path_spp, first[0].seeds["path"][i]
         if now.stacked is None:
             rgb = render_frames(now.scenes[0], [camera], spp, [seed])
@@ -239,7 +254,8 @@ def _film(
     if spec.motion is not None:
         _move(spec, geometry, 0.0)
     source = settings.surfels_from.of(spec.seed, spec.split, spec.index)
-    return [_meta(spec, light, cameras, recipe, source) for light in first]
+    motion = Moving(np.stack(poses), np.stack(shown)).text() if poses else ""
+    return [_meta(spec, light, cameras, recipe, source, motion) for light in first]
 
 
 def _prepare(
@@ -266,7 +282,12 @@ def _prepare(
 
 
 def _meta(
-    spec: SceneSpec, lit: _Lit, cameras: Sequence[Camera], recipe: SplitSettings, surfels_from: Source
+    spec: SceneSpec,
+    lit: _Lit,
+    cameras: Sequence[Camera],
+    recipe: SplitSettings,
+    surfels_from: Source,
+    motion: str,
 ) -> ClipMeta:
     light = spec.lights[lit.number]
     spp = {"path": recipe.path_spp, "guidance": recipe.guidance_spp}
@@ -297,6 +318,7 @@ def _meta(
             "contrast_share": contrast_share(lit.environment),
             "turn_deg": spec.turns_deg[lit.number] if spec.turns_deg else 0.0,
             "moving_object": spec.motion is not None,
+            MOTION: motion,
             "light_spec": light.model_dump_json(),  # text: families differ in their keys, and tables cannot
         },
     )

@@ -7,7 +7,7 @@ import pytest
 from datagen.build import FIRST_ID, build
 from datagen.lights import Light
 from datagen.motion import STILL, Share, draw_motion
-from datagen.pathtrace import render_frames
+from datagen.pathtrace import gbuffers, render_frames
 from datagen.scene import draw_scene
 from datagen.settings import Settings
 from datagen.styles import Choice
@@ -15,7 +15,10 @@ from datagen.synthetic import make_clips, make_surfels
 from tron import metrics
 from tron.cameras import Camera
 from tron.color import to_display
+from tron.errors import TronError
+from tron.flow import both_see, flow, warp
 from tron.seeds import generator
+from tron.shards.moving import Moving
 
 SIZE = 48
 
@@ -117,6 +120,61 @@ def test_the_truth_shows_the_object_rise_and_guidance_follows_it(filmed):
         assert min(errors) > 20
         assert meta.extra["moving_object"]
         assert meta.extra["turn_deg"] in spec.turns_deg
+
+
+def test_flow_by_the_motion_in_the_metadata_is_where_the_truth_shows_the_object_again(filmed):
+    """Two frames of true geometry: points that both see are one place of the object in its own frame."""
+    spec, _, _, clips = filmed
+    geometry, number = build(spec, edge=0.2), FIRST_ID + len(spec.surroundings) + spec.motion.object
+    for meta, _ in clips:
+        moving = Moving.of(meta)
+        assert moving is not None
+        assert Moving.of(meta.model_copy(update={"extra": meta.extra | {"motion": moving.text()}}))
+        cameras = [Camera.from_dict(each) for each in meta.cameras]
+        seen = []
+        for i, camera in enumerate(cameras):
+            geometry.move(number, spec.motion.pose(spec.objects[spec.motion.object], i / 2))
+            (view,) = gbuffers(geometry, [camera])
+            np.testing.assert_array_equal(moving.pixels[i], view.valid & (view.object_id == number))
+            seen.append(np.where(view.valid, np.linalg.norm(view.position - camera.position, axis=-1), 0))
+        for i, j in ((1, 0), (2, 1)):
+            args = (seen[i], cameras[i], seen[j], cameras[j], moving.pixels[i])
+            both = both_see(*args, moving.between(i, j))
+            assert both[moving.pixels[i]].mean() > 0.1
+            assert both[moving.pixels[i]].mean() > both_see(*args, np.eye(4))[moving.pixels[i]].mean()
+            displacement = flow(seen[i], cameras[i], cameras[j], moving.pixels[i], moving.between(i, j))
+            landed = warp(moving.pixels[j][..., None].astype(float), displacement)[..., 0]
+            # where it touches what it rests on, depth tells no edge
+            assert (landed[both & moving.pixels[i]] > 0.99).mean() > 0.9
+
+
+def test_a_still_camera_stays_where_the_path_had_it():
+    walking, standing = (
+        draw_scene(5, "train", 1, style="table", lights=["sun"], frames=3, still_camera=still)
+        for still in (False, True)
+    )
+    first, *others = standing.clip(0, 3, SIZE, SIZE)
+    expected = walking.clip(0, 3, SIZE, SIZE)[0]
+    np.testing.assert_allclose(first.world_to_camera, expected.world_to_camera, atol=1e-5)
+    assert first.fx == expected.fx
+    for camera in others:
+        np.testing.assert_array_equal(camera.world_to_camera, first.world_to_camera)
+    assert standing.model_copy(update={"cameras": walking.cameras}) == walking
+
+
+def test_motion_that_is_damaged_or_was_not_written_is_told(filmed):
+    *_, clips = filmed
+    meta = clips[0][0]
+    for changes, said in (
+        ({"motion": "{}"}, "cannot be read"),
+        ({"motion": Moving.of(meta).text().replace("iVBOR", "iVBOS")}, "cannot be read"),
+    ):
+        with pytest.raises(TronError, match=said):
+            Moving.of(meta.model_copy(update={"extra": meta.extra | changes}))
+    older = {name: value for name, value in meta.extra.items() if name != "motion"}
+    with pytest.raises(TronError, match="does not say how"):
+        Moving.of(meta.model_copy(update={"extra": older}))
+    assert Moving.of(meta.model_copy(update={"extra": older | {"moving_object": False}})) is None
 
 
 def test_a_light_is_baked_once_a_clip_however_it_turns(variant, tmp_path, monkeypatch):
