@@ -1,8 +1,8 @@
 """Change of pictures against the truth's: sums over pixels, from which correlation and slope follow.
 
 An occluder moves between two frames, camera and light stand still. Where the surface stayed, what changes is
-the light that arrives: its shadow and what bounces off it. x is the truth's change of a displayed value, y a
-method's. Correlation is Pearson's; the slope is that of the least-squares line of y over x, cov(x, y) / var(x).
+the light that arrives: its shadow and what bounces off it. x is the truth's change of a displayed value, y
+a method's. Correlation is Pearson's; the slope is that of the least-squares line of y over x, cov(x, y) / var(x).
 """
 
 from __future__ import annotations

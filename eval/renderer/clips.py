@@ -96,10 +96,10 @@ class Clips:
             rows.append([title, format_value(self._rms(method).value, "fraction"), ratio, shown, gain])
         scenes = len({score.scene for score in next(iter(self.scores.values()))})
         text = Text(
-            "Warping error: each frame against that before it, warped by the exact flow of the true surfaces, "
+            "Warping error: each frame against that before it, warped by the exact flow of true surfaces, "
             "on foreground that both frames see (Lai et al. 2018). Shown as the root of the mean square, in "
-            "shares of full brightness; the ratio is of mean squares, as the measure is defined, windows over "
-            f"single frames of the same network. {interval_note(scenes)}"
+            "shares of full brightness; the ratio is of mean squares, as the measure is defined, windows "
+            f"over single frames of the same network. {interval_note(scenes)}"
         )
         headings = ["Method", "warping error, rms", "ratio to K = 1", "PSNR", "gain over K = 1"]
         blocks: list[Block] = [text, Table("Flicker and PSNR of clips, foreground.", headings, rows)]

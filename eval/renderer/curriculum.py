@@ -35,8 +35,9 @@ class Curriculum:
         """
         for (kind, number, place), found in self.psnr.items():
             yield mean_row(f"renderer.{kind}.stage{number}_psnr.{place}", "dB", found, seed)
-        first = next(iter(self.names))[0]
-        for kind in dict.fromkeys(kind for kind, _ in self.names):
+        kinds: list[Kind] = list(dict.fromkeys([kind for kind, _ in self.names]))
+        first = kinds[0]
+        for kind in kinds:
             start = "renderer" if kind == first else f"renderer.{kind}"
             yield from self._change(f"{start}.stage2_capture_gain_db", kind, 2, 1, CAPTURES, seed)
             losses = [
@@ -94,9 +95,7 @@ def stage_files(folder: Path) -> dict[int, tuple[str, Path]]:
     return dict(sorted(found.items()))
 
 
-def measure_curriculum(
-    training: Mapping[Kind, Path], judges: Mapping[str, tuple[Path, str]]
-) -> Curriculum:
+def measure_curriculum(training: Mapping[Kind, Path], judges: Mapping[str, tuple[Path, str]]) -> Curriculum:
     """Judge every stage.
 
     Args:

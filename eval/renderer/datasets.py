@@ -120,5 +120,7 @@ def require_data(data: Mapping[str, Path]) -> None:
     """TronError unless every folder that was given holds a data set."""
     for name, folder in data.items():
         if not folder.is_dir():
-            raise TronError(f"no data set {name}", folder, f"leave out benchmark.data.{name}: it is made then")
+            raise TronError(
+                f"no data set {name}", folder, f"leave out benchmark.data.{name}: it is made then"
+            )
         Manifest.load(folder)

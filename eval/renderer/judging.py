@@ -94,7 +94,7 @@ class Judging:
         if self.fit_split in manifest.splits():
             fitted = fit_baselines(read_clips(self.dataset, self.fit_split, MEMBERS), self.seed)
             methods = {name: each.show for name, each in fitted.items()}
-            return dict.fromkeys(scenes, methods)
+            return {scene: methods for scene in scenes}  # noqa: C420
         if len(scenes) < 2:
             raise TronError(
                 f"no split '{self.fit_split}' and one scene: nothing is left to fit baselines on",
@@ -104,9 +104,7 @@ class Judging:
         found: dict[str, Mapping[str, Show]] = {}
         for group in fold(scenes, self.folds, self.seed):
             others = (
-                clip
-                for clip in read_clips(self.dataset, self.split, MEMBERS)
-                if clip.meta.scene not in group
+                clip for clip in read_clips(self.dataset, self.split, MEMBERS) if clip.meta.scene not in group
             )
             fitted = fit_baselines(others, self.seed)
             found |= dict.fromkeys(group, {name: each.show for name, each in fitted.items()})

@@ -22,6 +22,8 @@ SIGNALS = (signal.SIGTERM, signal.SIGKILL)
 EACH_RUN = 4
 """Signals that a training suffers before it is finished and compared."""
 LOOK_SECONDS = 0.02
+BEGUN = b"Stage "
+"""What the log of tron-train says when a stage begins."""
 
 
 @dataclass(frozen=True)
@@ -72,21 +74,19 @@ def measure_kills(recipe: Sequence[str], dataset: Path, count: int, seed: int, f
     """
     arguments = [*recipe, f"dataset={dataset}", "threads=1"]
     whole, output = folder / "undisturbed", folder / "killed"
-    _forget(whole)
-    before = time.perf_counter()
-    _finish(arguments, whole)
-    took = time.perf_counter() - before
+    shutil.rmtree(whole, ignore_errors=True)
+    usual = _finish(arguments, whole)
     truth = (whole / WEIGHTS).read_bytes()
     rng = generator(seed, "eval", "renderer", "kills")
     trainings: list[tuple[list[Ended], bool]] = []
     left = count
     while left:
-        _forget(output)
+        shutil.rmtree(output, ignore_errors=True)
         ended: list[Ended] = []
         finished = False
         while not finished and len(ended) < min(EACH_RUN, left):
             number = sum(len(each) for each, _ in trainings) + len(ended)
-            found = _end(arguments, output, rng.uniform(0, took / 3), SIGNALS[number % len(SIGNALS)])
+            found = _end(arguments, output, rng.uniform(0, usual), SIGNALS[number % len(SIGNALS)])
             finished = found is None
             if found is not None:
                 ended.append(found)
@@ -97,15 +97,18 @@ def measure_kills(recipe: Sequence[str], dataset: Path, count: int, seed: int, f
     return Kills(trainings)
 
 
-def _forget(output: Path) -> None:
-    shutil.rmtree(output, ignore_errors=True)
+def _finish(arguments: Sequence[str], output: Path) -> float:
+    """Run to the end; seconds since the first stage began, 0 where the training was finished before.
+
+    Raises:
+        StageFailed: it failed.
+    """
     output.with_suffix(".log").unlink(missing_ok=True)
-
-
-def _finish(arguments: Sequence[str], output: Path) -> None:
     with running(arguments, output, ONE_THREAD, SCRIPT) as process:
+        begun = _begun(process, arguments, output)
         code = process.wait()
     require_success(code, arguments, output, SCRIPT)
+    return time.perf_counter() - begun if begun else 0.0
 
 
 def _end(arguments: Sequence[str], output: Path, seconds: float, number: signal.Signals) -> Ended | None:
@@ -114,15 +117,10 @@ def _end(arguments: Sequence[str], output: Path, seconds: float, number: signal.
     Raises:
         StageFailed: it failed before.
     """
-    log = output.with_suffix(".log")
-    skip = log.stat().st_size if log.is_file() else 0
+    output.with_suffix(".log").unlink(missing_ok=True)
     with running(arguments, output, ONE_THREAD, SCRIPT) as process:
-        while b"Stage " not in log.read_bytes()[skip:]:
-            try:
-                require_success(process.wait(LOOK_SECONDS), arguments, output, SCRIPT)
-                return None
-            except subprocess.TimeoutExpired:
-                continue
+        if _begun(process, arguments, output) is None:
+            return None
         try:
             require_success(process.wait(seconds), arguments, output, SCRIPT)
             return None
@@ -130,6 +128,22 @@ def _end(arguments: Sequence[str], output: Path, seconds: float, number: signal.
             process.send_signal(number)
         process.wait()
     return Ended(number.name, seconds, _last_step(output / "metrics.csv"))
+
+
+def _begun(process: subprocess.Popen[bytes], arguments: Sequence[str], output: Path) -> float | None:
+    """Wait for a run to say that a stage begins; when it did, None where it ended without.
+
+    Raises:
+        StageFailed: it failed before.
+    """
+    log = output.with_suffix(".log")
+    while BEGUN not in log.read_bytes():
+        try:
+            require_success(process.wait(LOOK_SECONDS), arguments, output, SCRIPT)
+            return None
+        except subprocess.TimeoutExpired:
+            continue
+    return time.perf_counter()
 
 
 def _last_step(path: Path) -> int:

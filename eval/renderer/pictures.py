@@ -1,4 +1,4 @@
-"""Pictures in which a person sees the difference: frames side by side, and an inset where they differ most."""
+"""Pictures in which a person sees the difference: frames side by side, and an inset where it is largest."""
 
 from __future__ import annotations
 

@@ -44,9 +44,7 @@ class Repeats:
     def rows(self, seed: int) -> Iterator[Row]:  # noqa: ARG002
         """Largest difference, and spread of the trainings' mean PSNR."""
         for kind, value in self.differences.items():
-            yield Row(
-                metric=f"renderer.{kind}.seed_max_difference", value=value, unit="abs", n=self.seeds
-            )
+            yield Row(metric=f"renderer.{kind}.seed_max_difference", value=value, unit="abs", n=self.seeds)
         if self.differences:
             worst = max(self.differences.values())
             yield Row(metric="renderer.seed_max_difference", value=worst, unit="abs", n=self.seeds)
@@ -60,8 +58,8 @@ class Repeats:
         """The differences, and a row for each training."""
         blocks: list[Block] = [
             Text(
-                f"{self.clips} clips rendered under {self.seeds} seeds of torch from the same buffers: largest "
-                "difference of a display value "
+                f"{self.clips} clips rendered under {self.seeds} seeds of torch from the same buffers: "
+                "largest difference of a display value "
                 + ", ".join(f"{value:g} ({kind})" for kind, value in self.differences.items())
                 + ". The networks draw nothing; the seed of tron-relight draws the rays of the buffers."
             )
@@ -86,7 +84,9 @@ def measure_repeats(
     """
     clips = [Buffers.of(clip) for clip in islice(read_clips(dataset, TEST, MEMBERS), settings.clips)]
     seeds = [integer(seed, "eval", "inference", k, bits=63) for k in range(settings.inference)]
-    differences = {kind: _difference(network, clips, seeds) for kind, network in networks.items()}
+    differences: dict[Kind, float] = {
+        kind: _difference(network, clips, seeds) for kind, network in networks.items()
+    }
     trained: dict[int, FramePsnr] = {}
     if settings.training and FIT in Manifest.load(dataset).splits():
         runs = {

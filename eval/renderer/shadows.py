@@ -84,9 +84,9 @@ class Shadows:
             for method in self.sums
         ]
         text = Text(
-            "An occluder moves between two frames; camera and light stand still. Over foreground pixels whose "
-            "true depth, normal and base color are unchanged, the change of displayed values is held against "
-            "the truth's: 1 and 1 is perfect, 0 a picture that does not react. The truth's own noise keeps "
+            "An occluder moves between two frames; camera and light stand still. Over foreground pixels "
+            "whose true depth, normal and base color are unchanged, the change of displayed values is held "
+            "against the truth's: 1 and 1 is perfect, 0 a picture that does not react. The truth's own noise keeps "
             f"correlation below 1. {interval_note(len(set(self.scenes)))}"
         )
         caption = f"Change of the picture against the truth's, {len(self.scenes)} pairs of frames."
@@ -97,7 +97,7 @@ class Shadows:
                 shown,
                 "change of the truth, display values",
                 "change of the picture",
-                "Each cell's shade: how many values lie there, logarithmic. On the dotted line both change alike.",
+                "Each cell's shade: how many values lie there, logarithmic. Dotted: both change alike.",
             )
         )
         if self.example is not None:

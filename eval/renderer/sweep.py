@@ -11,8 +11,9 @@ import numpy as np
 from eval.relighting.buffers import MEMBERS, Buffers
 from eval.renderer.networks import Network
 from eval.renderer.pictures import enlarge
-from eval.results import Row
 from eval.report.strips import write_strips
+from eval.results import Row
+from tron.errors import TronError
 from tron.report.page import Picture, Pictures, Section
 from tron.shards.reader import read_clips
 
@@ -22,9 +23,16 @@ WIDTH = 128
 
 @dataclass(frozen=True)
 class Sweep:
-    """Findings: (5, 5, H, W, 3) displays, w_pbr down and w_irr across, and of which clip."""
+    """Findings.
+
+    Attributes:
+        images: (5, 5, H, W, 3) displays, the weight of pbr down and that of irradiance across.
+        values: the weights.
+        key: of the clip.
+    """
 
     images: np.ndarray
+    values: tuple[float, ...]
     key: str
 
     def rows(self, seed: int) -> Iterator[Row]:  # noqa: ARG002
@@ -33,15 +41,14 @@ class Sweep:
 
     def sections(self, pictures: Path) -> list[Section]:
         """The sheet."""
-        count = self.images.shape[0]
-        values = np.linspace(0, 1, count)
+        count = len(self.values)
         scale = -(-WIDTH // self.images.shape[3])
         shown = [
             Picture(
                 enlarge(self.images[i, j], scale),
-                f"w_pbr {values[i]:g}, w_irr {values[j]:g}",
-                f"latents weighted {values[i]:g} and {values[j]:g}, clip {self.key}",
-                strong=values[i] == values[j] == 0.5,
+                f"w_pbr {self.values[i]:g}, w_irr {self.values[j]:g}",
+                f"latents weighted {self.values[i]:g} and {self.values[j]:g}, clip {self.key}",
+                strong=self.values[i] == self.values[j] == 0.5,
             )
             for i in range(count)
             for j in range(count)
@@ -53,11 +60,17 @@ class Sweep:
 
 
 def measure_sweep(dataset: Path, split: str, pair: Network) -> Sweep:
-    """The first frame of the first clip under all weights."""
-    from tron.neural.sweep import weight_sweep
+    """The first frame of the first clip under all weights.
 
+    Raises:
+        TronError: the network takes no weights, or not both buffers.
+    """
+    from tron.neural.renderer import NeuralRenderer
+    from tron.neural.sweep import SWEEP, weight_sweep
+
+    if not isinstance(pair.renderer, NeuralRenderer):
+        raise TronError("only neural renderers weight their buffers", pair.path)
     clip = next(iter(read_clips(dataset, split, MEMBERS)))
     buffers = Buffers.of(clip)
     displayed = {name: buffers.displayed(name)[:1] for name in pair.renderer.config.guidance}
-    images = np.asarray(weight_sweep(pair.renderer, displayed))
-    return Sweep(images[:, :, 0] if images.ndim == 6 else images, clip.meta.key)
+    return Sweep(weight_sweep(pair.renderer, displayed), SWEEP, clip.meta.key)

@@ -46,10 +46,12 @@ class Throughput:
         """A table and a chart over sizes."""
         sizes = sorted({size for _, _, size in self.seconds})
         lines = {}
-        for kind, way in dict.fromkeys((kind, way) for kind, way, _ in self.seconds):
+        kinds: list[Kind] = list(dict.fromkeys([kind for kind, _, _ in self.seconds]))
+        runs: list[tuple[Kind, Way]] = list(dict.fromkeys([(kind, way) for kind, way, _ in self.seconds]))
+        for kind, way in runs:
             points = [(size, 1 / statistics.median(self.seconds[kind, way, size])) for size in sizes]
             lines[f"{kind}, {way}"] = points
-        titles = "; ".join(f"{kind}: {TITLES[kind]}" for kind in dict.fromkeys(k for k, _, _ in self.seconds))
+        titles = "; ".join(f"{kind}: {TITLES[kind]}" for kind in kinds)
         rows = [[label, *(f"{rate:.2f}" for _, rate in points)] for label, points in lines.items()]
         caption = f"Frames a second on {self.threads} thread(s), single frames, medians of rounds in turns."
         text = Text(

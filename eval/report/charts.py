@@ -178,7 +178,9 @@ def density_chart(clouds: Mapping[str, np.ndarray], x_label: str, y_label: str, 
     from matplotlib.colors import LogNorm
 
     reach = max(float(np.abs(points).max(initial=0)) for points in clouds.values()) or 1.0
-    reach = min(reach, 1.05 * max(float(np.quantile(np.abs(points), 0.999)) for points in clouds.values()) or 1.0)
+    reach = min(
+        reach, 1.05 * max(float(np.quantile(np.abs(points), 0.999)) for points in clouds.values()) or 1.0
+    )
     with _canvas(caption, columns=len(clouds), legend=False) as (axes, svg):
         for place, (label, points) in zip(np.ravel(axes), clouds.items()):
             inside = points[(np.abs(points) <= reach).all(-1)]
