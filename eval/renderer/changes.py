@@ -2,7 +2,8 @@
 
 An occluder moves between two frames, camera and light stand still. Where the surface stayed, what changes is
 the light that arrives: its shadow and what bounces off it. x is the truth's change of a displayed value, y
-a method's. Correlation is Pearson's; the slope is that of the least-squares line of y over x, cov(x, y) / var(x).
+that of a method. Correlation is Pearson's; the slope is that of the least-squares line of y over x,
+cov(x, y) / var(x).
 """
 
 from __future__ import annotations
@@ -50,6 +51,11 @@ def slope(sums: np.ndarray) -> np.ndarray:
     """Slope from sums (..., 6); 0 where the truth never varies."""
     _, var_x, _, cov = _moments(sums)
     return np.divide(cov, var_x, out=np.zeros_like(cov), where=var_x > 1e-15)
+
+
+def slope_error(sums: np.ndarray) -> np.ndarray:
+    """Distance of the slope from 1."""
+    return np.abs(slope(sums) - 1)
 
 
 def _moments(sums: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -107,7 +107,8 @@ class Judging:
                 clip for clip in read_clips(self.dataset, self.split, MEMBERS) if clip.meta.scene not in group
             )
             fitted = fit_baselines(others, self.seed)
-            found |= dict.fromkeys(group, {name: each.show for name, each in fitted.items()})
+            methods = {name: each.show for name, each in fitted.items()}
+            found |= {scene: methods for scene in group}  # noqa: C420
         return found
 
 
@@ -116,8 +117,3 @@ def fold(scenes: list[str], folds: int, seed: int) -> list[list[str]]:
     order = generator(seed, "eval", "folds").permutation(len(scenes))
     count = min(folds, len(scenes))
     return [[scenes[k] for k in np.sort(order[start::count])] for start in range(count)]
-
-
-def without_pictures(judging: Judging) -> Judging:
-    """The same, of which no pictures are wanted."""
-    return replace(judging, pictures=0)

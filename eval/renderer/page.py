@@ -10,13 +10,13 @@ from eval.results import Row
 from tron.report.page import Cell, Section, Table
 
 LEAD = (
-    "TRON relights captured 3D worlds. A ray tracer turns surfels into quick pictures: pbr, shading "
-    "without shadows; irradiance, the light that arrives; and lit, the whole picture with shadows and bounced light. A "
-    "neural renderer makes the final picture of them: one checkpoint of the paper's two buffers, pbr and "
+    "TRON relights captured 3D worlds. A ray tracer turns surfels into quick pictures: pbr, shading without "
+    "shadows; irradiance, the light that arrives; and lit, the whole picture with shadows and bounced light. "
+    "A neural renderer makes the final picture of them: one checkpoint of the paper's two buffers, pbr and "
     "irradiance, and one that starts from lit, which is tron-relight's default.",
-    "This page judges both on scenes, lights and models that neither was trained on, by a path tracer's truth, "
-    "and holds them against the best picture that the same buffers give without a network: blends and factors "
-    "fitted, by least squares, on the very distribution that judges.",
+    "This page judges both on scenes, lights and models that neither was trained on, by a path tracer's "
+    "truth, and holds them against the best picture that the same buffers give without a network: blends and "
+    "factors fitted, by least squares, on the very distribution that judges.",
 )
 HEADLINE = {
     "renderer.gain_db": "Pair: gain, held-out scenes",

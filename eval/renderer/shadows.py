@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from eval.confidence import interval, scene_sums
+from eval.confidence import Statistic, interval, scene_sums
 from eval.relighting.buffers import MEMBERS, Buffers
-from eval.renderer.changes import SURFACE, change_sums, correlation, slope, stayed
+from eval.renderer.changes import SURFACE, change_sums, correlation, slope, slope_error, stayed
 from eval.renderer.networks import TITLES, Network
 from eval.renderer.pictures import LEAST_WIDTH, enlarge
 from eval.renderer.settings import Kind
@@ -72,6 +72,7 @@ class Shadows:
         if "lit" in self.sums:
             yield self._row("renderer.shadow_correlation", "lit", correlation, seed)
             yield self._row("renderer.shadow_slope", "lit", slope, seed)
+            yield self._row("renderer.shadow_slope_error", "lit", slope_error, seed)
 
     def sections(self, pictures: Path) -> list[Section]:
         """A table, a chart for each method, and the clip that changes most."""
@@ -86,8 +87,8 @@ class Shadows:
         text = Text(
             "An occluder moves between two frames; camera and light stand still. Over foreground pixels "
             "whose true depth, normal and base color are unchanged, the change of displayed values is held "
-            "against the truth's: 1 and 1 is perfect, 0 a picture that does not react. The truth's own noise keeps "
-            f"correlation below 1. {interval_note(len(set(self.scenes)))}"
+            "against the truth's: 1 and 1 is perfect, 0 a picture that does not react. The truth's own "
+            f"noise keeps correlation below 1. {interval_note(len(set(self.scenes)))}"
         )
         caption = f"Change of the picture against the truth's, {len(self.scenes)} pairs of frames."
         blocks: list[Block] = [text, Table(caption, ["Method", "correlation", "slope"], rows)]
@@ -106,7 +107,7 @@ class Shadows:
             blocks.append(group)
         return [Section("shadows", "Shadows that move", blocks)]
 
-    def _row(self, metric: str, method: str, measure, seed: int) -> Row:
+    def _row(self, metric: str, method: str, measure: Statistic, seed: int) -> Row:
         sums = np.stack(self.sums[method])
         row = Row(metric=metric, value=float(measure(sums.sum(0))), unit="1", n=len(sums))
         return row.within(interval(scene_sums(self.scenes, sums), measure, seed))
