@@ -45,7 +45,7 @@ DEV, CLUSTER = (names(EXTRAS[extra]) for extra in ("dev", "cluster"))
 # Left out, or refused, where they are not installed.
 PEERS = names(EXTRAS["gpu-peers"]) | names(EXTRAS["heic"]) | names(EXTRAS["ktx2"])
 # A network is loaded where a checkpoint is given: tron-relight then asks for the extra `train`.
-ASKED_FOR = {("tron.apps.relight", "tron.neural.weights"), ("tron.apps.clip", "tron.neural.renderer")}
+ASKED_FOR = {("tron.apps.relight_network", "tron.neural.weights"), ("tron.apps.clip", "tron.neural.renderer")}
 # Called by those alone that import torch or Mitsuba themselves.
 OF_THE_CALLER = {("tron.runtime", "torch"), ("tron.runtime", "mitsuba"), ("tron.runtime", "drjit")}
 # python-fcl is imported by trimesh, gsplat by whoever installed it.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +20,7 @@ from tron.color import to_display
 from tron.estimation import Estimation
 from tron.gaussians.scene import GaussianScene
 from tron.images import write_image
+from tron.neural.windows import Overlap
 from tron.shards.schema import GUIDANCE
 
 if TYPE_CHECKING:
@@ -29,9 +30,6 @@ if TYPE_CHECKING:
     from tron.shading.environment import EnvironmentMap
     from tron.shading.lighting import Lighting
     from tron.tracing import SurfelTracer
-
-# Frames that the neural renderer gets at once; bounds memory, not its view into the past.
-CLIP_FRAMES = 16
 
 
 @dataclass
@@ -85,26 +83,25 @@ class Clip:
         else:  # that of an earlier run may stand before another background
             self.folder.path(index, "relit", "exr").unlink(missing_ok=True)
 
-    def draw(self, renderer: Renderer) -> None:
-        """Write the neural renderer's pictures, as one window sliding over the clip gives them."""
-        from tron.neural.renderer import render_clip
+    def draw(
+        self,
+        renderer: Renderer,
+        window: int | None = None,
+        overlap: Overlap = "newest",
+        weights: Mapping[str, float] | None = None,
+    ) -> None:
+        """Write the neural renderer's pictures, as `render_frames` gives them."""
+        from tron.neural.renderer import render_frames
 
-        # A window that starts this many frames before a part makes the part's own frames independent of the
-        # cut.
-        before = renderer.config.window - 1
-        frames, step = len(self.rotations), max(CLIP_FRAMES, before + 1)
-        for start in track(range(0, frames, step), "neural"):
-            first, end = max(start - before, 0), min(start + step, frames)
-            guidance = {name: self._displayed(name, first, end) for name in self.guidance}
-            display = render_clip(renderer, guidance)
-            for index in range(start, end):
-                neural = display[index - first]
-                self.folder.write_picture(index, "neural", neural)
-                relit = self.picture.display(self.folder, index, self.exposure, neural)
-                self.folder.write_picture(index, "relit", relit)
+        frames = len(self.rotations)
+        drawn = render_frames(renderer, self._displayed, frames, window, overlap, weights)
+        for index, neural in enumerate(track(drawn, "neural", frames)):
+            self.folder.write_picture(index, "neural", neural)
+            relit = self.picture.display(self.folder, index, self.exposure, neural)
+            self.folder.write_picture(index, "relit", relit)
 
-    def _displayed(self, name: str, first: int, end: int) -> np.ndarray:
-        return to_display(np.stack([self.folder.read(i, name) for i in range(first, end)]), self.exposure)
+    def _displayed(self, index: int) -> dict[str, np.ndarray]:
+        return {name: to_display(self.folder.read(index, name), self.exposure) for name in self.guidance}
 
     def assemble(self, output_dir: Path, fps: float) -> None:
         """Write videos and the contact sheet from the pictures of all frames."""

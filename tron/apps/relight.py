@@ -21,22 +21,22 @@ from tron.apps.clip import Clip, trace
 from tron.apps.filmed_space import CAMERAS, filmed_cameras, filmed_orbit
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.framing import plan_cameras, turn_cameras, upright
+from tron.apps.relight_network import chosen_network, describe_network
 from tron.apps.relight_settings import Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
 from tron.cli.command_line import command
-from tron.cli.installation import require_extra
 from tron.cli.recipes import model_defaults
 from tron.errors import TronError
 from tron.gaussians.foreign_files import refuse_foreign
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
-from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
+from tron.neural.shipped import checkpoint_file
+from tron.runtime import activate, describe_machine
 from tron.shards.schema import GUIDANCE
 from tron.storage import locked, require_free_space, sha256, write_atomic
 
 if TYPE_CHECKING:
-    from tron.neural.protocols import Renderer
     from tron.shading.environment import EnvironmentMap
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,8 @@ def main(settings: Settings) -> None:
     size = settings.width, settings.height
     given = None if settings.cameras is None else read_cameras(settings.cameras, *size)
     environments = [EnvironmentMap.load(light.light) for light in lights]
-    renderer = _load_renderer(settings)
+    settings, renderer = chosen_network(settings)
+    lights = settings.by_light()
     scene = _load_scene(settings)
     turn = upright(scene.up)  # to +z, which is up in environment maps
     scene = scene if np.allclose(turn, np.eye(3)) else scene.rotated(turn)
@@ -84,13 +85,14 @@ def main(settings: Settings) -> None:
         clock.lap("guidance")
         if renderer is not None:
             for clip in clips:
-                clip.draw(renderer)
+                clip.draw(renderer, settings.window, settings.overlap, settings.weights)
             clock.lap("neural")
         for light, clip in zip(lights, clips):
             clip.assemble(light.output_dir, settings.fps)
         clock.lap("videos")
         for light, clip in zip(lights, clips):
             report = _report(light, clip, scene, turn_cameras(cameras, turn.T), clock)
+            report["network"] = describe_network(settings, renderer)
             write_atomic(light.output_dir / "relight.json", json.dumps(report, indent=1) + "\n")
             made = len(cameras), len(clip.seconds), light.output_dir / "relit.mp4"
             log.info("%d frames, %d of them rendered now: look at %s", *made)
@@ -135,7 +137,10 @@ class _Clock:
 def _check_paths(settings: Settings, lights: Sequence[Settings]) -> None:
     """Every file is there and is of its kind as far as names and headers tell, before anything is loaded."""
     maps = [light.light for light in lights]
-    for path in (settings.scene, *maps, settings.cameras, settings.checkpoint, settings.vae):
+    # The default checkpoint is no mistake where it is missing.
+    asked = None if settings.takes_default else settings.checkpoint
+    checkpoint = None if asked is None else checkpoint_file(asked)
+    for path in (settings.scene, *maps, settings.cameras, checkpoint, settings.vae):
         if path is not None and not path.is_file():
             if path.is_dir():
                 raise TronError("cannot read: is a folder", path, "give one file of it")
@@ -163,23 +168,6 @@ def _load_scene(settings: Settings) -> GaussianScene:
             settings.scene,
         )
     return scene
-
-
-def _load_renderer(settings: Settings) -> Renderer | None:
-    """The network, before any frame is traced, so that a wrong file is found at once; None without one."""
-    if settings.checkpoint is None:
-        return None
-    require_extra("checkpoint", "train")
-    from tron.neural.weights import load_renderer
-
-    if settings.threads is not None:
-        set_torch_threads(settings.threads)
-    renderer = load_renderer(settings.checkpoint, settings.vae)
-    if settings.bounces == 0 and "lit" in renderer.config.guidance:
-        what = "the network is given lit, which has no bounced light with bounces=0 (fidelity=paper sets it)"
-        mend = "give bounces=4, or take a checkpoint of pbr and irradiance"
-        raise TronError(what, settings.checkpoint, mend)
-    return renderer.to(torch_device(settings.variant))
 
 
 def _clip(light: Settings, environment: EnvironmentMap, frames: int, guidance: Sequence[str]) -> Clip:
@@ -251,6 +239,8 @@ cli = command(
         "tron-relight scene=surfels.ply environment=a.hdr trajectory=still rotation=[0,360] output_dir=out",
         "tron-relight scene=surfels.ply environment=a.hdr background=transparent output_dir=out",
         "tron-relight scene=surfels.ply environment=a.hdr checkpoint=renderer.safetensors output_dir=out",
+        "tron-relight scene=surfels.ply environment=a.hdr checkpoint=pair overlap=anchor "
+        "'weights={pbr: 0.3, irradiance: 0.7}' output_dir=out",
     ),
 )
 

@@ -12,6 +12,9 @@ from tron.apps.framing import TrajectoryName
 from tron.apps.relit import Background
 from tron.errors import TronError
 from tron.estimation import FINAL, FINEST, PREVIEW, Estimation, Estimator, require_bounces
+from tron.neural.configs import check_sizes
+from tron.neural.shipped import DEFAULT, SHIPPED
+from tron.neural.windows import Overlap
 from tron.shards.schema import light_members
 
 DEFAULT_BUFFERS = (*light_members(), "indirect", "foreground", "mask", "share")
@@ -112,7 +115,26 @@ class Settings(BaseModel):
         examples=["[0,0,1]"],
     )
     checkpoint: Path | None = Field(
-        None, description="renderer.safetensors: the relit picture is then the neural renderer's"
+        None if DEFAULT is None else Path(DEFAULT),
+        description="renderer.safetensors, or the name of a checkpoint that comes with the package "
+        f"({', '.join(SHIPPED)}): the relit picture is then the neural renderer's; null: no network",
+        examples=["pair"],
+    )
+    window: int | None = Field(
+        None,
+        ge=1,
+        description="frames that the neural renderer sees at once, sliding by one; null: as many as it was "
+        "trained for",
+    )
+    overlap: Overlap = Field(
+        "newest",
+        description="which window draws a frame that lies in several: the one that ends with it, the one in "
+        "whose middle it stands (anchor), or the mean of all",
+    )
+    weights: dict[str, float] | None = Field(
+        None,
+        description="weights of the neural renderer's buffers, one for each; null: the checkpoint's own",
+        examples=["{pbr: 0.3, irradiance: 0.7}"],
     )
     vae: Path | None = Field(None, description="WAN 2.1 VAE, for checkpoints that were trained with it")
     buffers: tuple[BufferName, ...] = Field(
@@ -137,11 +159,26 @@ class Settings(BaseModel):
 
     @model_validator(mode="after")
     def _has_radiance(self) -> Settings:
-        if self.checkpoint is not None and "relit" in self.buffers:
+        if self.checkpoint is not None and "relit" in self.buffers and not self.takes_default:
             raise ValueError(
                 "a network draws display values, so there is no relit.exr with a checkpoint: leave 'relit' "
                 "out of buffers, or take 'shadowed'"
             )
+        return self
+
+    @field_validator("weights")
+    @classmethod
+    def _weigh_something(cls, weights: dict[str, float] | None) -> dict[str, float] | None:
+        if weights is not None:
+            check_sizes(weights)
+        return weights
+
+    @model_validator(mode="after")
+    def _draws_what_it_tunes(self) -> Settings:
+        tuned = {"window": self.window, "weights": self.weights, "overlap": self.overlap != "newest"}
+        for name, given in tuned.items():
+            if given and self.checkpoint is None:
+                raise ValueError(f"{name} is the neural renderer's: give a checkpoint too, or leave it out")
         return self
 
     @model_validator(mode="after")
@@ -159,6 +196,11 @@ class Settings(BaseModel):
         }
         given = {name: value for name, value in said.items() if value is not None}
         return Estimation(**{**QUALITY[self.quality].model_dump(), **given})
+
+    @property
+    def takes_default(self) -> bool:
+        """Whether the checkpoint is the one that nobody has to ask for."""
+        return self.checkpoint is not None and str(self.checkpoint) == DEFAULT
 
     @property
     def source(self) -> Literal["neural", "lit", "shadowed"]:

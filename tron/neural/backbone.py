@@ -76,6 +76,15 @@ class Backbone(nn.Module):
                 block.attn2.requires_grad_(False)
                 block.norm2.requires_grad_(False)
 
+    def hidden_matrices(self) -> list[nn.Parameter]:
+        """Weights between hidden layers, 2-D: attention and feed-forward of every block."""
+        blocks = self.transformer.transformer_blocks
+        return [p for name, p in blocks.named_parameters() if ".attn1.to_" in name or ".ff." in name]
+
+    def temporal_weights(self) -> dict[str, nn.Parameter]:
+        """None: the same attention looks over space and time."""
+        return {}
+
     def forward(self, latent: Tensor, timestep: float) -> Tensor:
         """(B, in_channels, T, h, w) -> (B, out_channels, T, h, w), any h and w that the patch divides."""
         batch = latent.shape[0]

@@ -5,9 +5,20 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from tron.shards.schema import GUIDANCE, light_members
 
@@ -18,6 +29,24 @@ MEAN = "mean"
 """Start of a network that adds to the mean of all latents."""
 BEST_FIRST = ("lit", "pbr")
 """Buffers that a network starts from unless told otherwise: the first of them that it is given."""
+
+
+def check_weights(weights: Mapping[str, float], guidance: Sequence[str]) -> None:
+    """ValueError unless each name of the guidance, and none else, has a weight that `check_sizes` takes."""
+    if unknown := sorted(set(weights) - set(guidance)):
+        raise ValueError(f"weights name '{unknown[0]}': the network is given {', '.join(guidance)}")
+    if missing := [name for name in guidance if name not in weights]:
+        raise ValueError(f"weights lack '{missing[0]}': the network is given {', '.join(guidance)}")
+    check_sizes(weights)
+
+
+def check_sizes(weights: Mapping[str, float]) -> None:
+    """ValueError unless the weights are finite, >= 0, and not all 0."""
+    for name, weight in weights.items():
+        if not 0 <= weight < math.inf:
+            raise ValueError(f"the weight of '{name}' is {weight}: give a number of 0 or more")
+    if not any(weights.values()):
+        raise ValueError("all weights are 0: the network would be given nothing")
 
 
 class GuidedConfig(BaseModel):
@@ -72,6 +101,7 @@ class BackboneConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    kind: Literal["cosmos"] = "cosmos"
     heads: int = Field(default=3, ge=1)
     head_dim: int = Field(default=32, ge=6)
     layers: int = Field(default=4, ge=1)
@@ -83,6 +113,64 @@ class BackboneConfig(BaseModel):
     rope_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     padding_channel: bool = False
     cross_attention: Literal["frozen", "none"] = "none"
+
+
+Width = Annotated[int, Field(ge=1, le=4096)]
+Depth = Annotated[int, Field(ge=0, le=64)]
+
+
+class UNetConfig(BaseModel):
+    """Shape of a UNet (`unet.py`)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kind: Literal["unet"] = "unet"
+    patch: Literal[1, 2, 4] = Field(
+        default=2, description="Side of the squares of latent pixels that become one: the finest level."
+    )
+    widths: tuple[Width, ...] = Field(
+        default=(32, 64, 128), min_length=1, max_length=8, description="Channels of each level, finest first."
+    )
+    blocks: tuple[Depth, ...] = Field(default=(2, 2, 2), description="Blocks of each level on the way down.")
+    blocks_up: tuple[Depth, ...] = Field(
+        default=(1, 1), description="Blocks of each level but the coarsest on the way up, finest first."
+    )
+    spatial: Literal["depthwise", "dense"] = Field(
+        default="depthwise",
+        description="3 x 3 convolutions of a block: depthwise sees each channel alone, dense all of them.",
+    )
+    attention: bool = Field(
+        default=False,
+        description="Simplified channel attention: means over the whole picture scale the channels. What a "
+        "pixel becomes then depends on the size of the picture, which in training is a crop's.",
+    )
+    temporal: bool = Field(
+        default=True,
+        description="Paths between frames, which begin at zero and are skipped for single frames.",
+    )
+
+    @model_validator(mode="after")
+    def _levels(self) -> UNetConfig:
+        levels = len(self.widths)
+        if len(self.blocks) != levels or len(self.blocks_up) != levels - 1:
+            raise ValueError(
+                f"{levels} widths go with {levels} numbers in blocks and {levels - 1} in blocks_up, not "
+                f"{len(self.blocks)} and {len(self.blocks_up)}"
+            )
+        return self
+
+
+def _kind(backbone: Any) -> str:
+    """Which backbone is described; files from before there were two do not say."""
+    if isinstance(backbone, Mapping):
+        return str(backbone.get("kind", "cosmos"))
+    return getattr(backbone, "kind", "cosmos")
+
+
+AnyBackbone = Annotated[
+    Annotated[BackboneConfig, Tag("cosmos")] | Annotated[UNetConfig, Tag("unet")],
+    Discriminator(_kind),
+]
 
 
 class RendererConfig(GuidedConfig):
@@ -102,7 +190,22 @@ class RendererConfig(GuidedConfig):
         description="Noise level of the single denoising step (paper: 250 of 1000, i.e. 0.25): t = sigma / "
         "(1 + sigma), input (1 - t) z, result (1 - t) z - t net(...). None: the plain residual z + net(z).",
     )
-    backbone: BackboneConfig = BackboneConfig()
+    weights: dict[str, float] | None = Field(
+        default=None,
+        description="Weight of each buffer's latent, by name: average gives the backbone their weighted sum, "
+        "concat each times its weight and their number; null: equal weights. The start is not weighed, "
+        "unless it is the mean.",
+    )
+    backbone: AnyBackbone = Field(
+        default=BackboneConfig(), description="Network between the latents; kind: cosmos or unet."
+    )
+
+    @field_validator("weights")
+    @classmethod
+    def _weights(cls, weights: dict[str, float] | None, info: ValidationInfo) -> dict[str, float] | None:
+        if weights is not None and "guidance" in info.data:
+            check_weights(weights, info.data["guidance"])
+        return weights
 
 
 COSMOS_0_6B = BackboneConfig(
@@ -131,6 +234,13 @@ class CosmosConfig(RendererConfig):
     fusion: Literal["concat", "average"] = "average"
     sigma: float | None = Field(default=0.25, gt=0)
     backbone: BackboneConfig = COSMOS_0_6B
+
+
+class UNetRendererConfig(RendererConfig):
+    """Renderer of a UNet on the pixels themselves."""
+
+    codec: str = "pixels"
+    backbone: UNetConfig = UNetConfig()
 
 
 class PixelMLPConfig(GuidedConfig):

@@ -33,8 +33,9 @@ class PixelMLP(Renderer):
         nn.init.zeros_(last.bias)
         self.layers = nn.Sequential(*layers, last)
 
-    def forward(self, buffers: Mapping[str, Tensor]) -> Tensor:
+    def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:
         """As Renderer.forward."""
+        self.check_weights(weights)
         # A linear layer over the last axis is a 1 x 1 convolution, and much faster on a CPU.
         pixels = torch.cat(self.stacked(buffers), 1).movedim(1, -1)
         return buffers[self.config.skip] + self.layers(pixels).movedim(-1, 1)

@@ -43,17 +43,27 @@ class Renderer(nn.Module):
     config: GuidedConfig
     temporal_factor: int = 1
 
-    def forward(self, buffers: Mapping[str, Tensor]) -> Tensor:
+    def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:
         """Guidance by name, each (B, 3, K, H, W) display-encoded in [-1, 1] -> the same shape, not clamped.
 
-        Names that `config.guidance` does not hold are left alone. Raises TronError where one of them is
-        missing, or shapes differ.
+        weights: of the buffers' latents by name, instead of the configuration's; a renderer without latents
+        refuses them. Buffers that `config.guidance` does not name are left alone. Raises TronError where one
+        of those is missing, shapes differ, or weights do not fit.
         """
         raise NotImplementedError
+
+    def check_weights(self, weights: Mapping[str, float] | None) -> None:
+        """TronError unless `forward` takes such weights; None is always taken."""
+        if weights is not None:
+            raise TronError(f"a {type(self).__name__} has no latents to weigh", mend="leave weights out")
 
     def hidden_matrices(self) -> list[nn.Parameter]:
         """Weights between hidden layers, 2-D, which Muon may optimise."""
         raise NotImplementedError
+
+    def temporal_weights(self) -> dict[str, nn.Parameter]:
+        """Parameters by name that only windows of several frames use, and that start from adding nothing."""
+        return {}
 
     def calibrate(self, videos: Iterable[Tensor]) -> None:
         """Fit what is fitted before training, to videos (B, 3, K, H, W) in [-1, 1]; here nothing."""

@@ -1,8 +1,8 @@
-"""The neural renderer: guidance buffers to the picture, by one pass through a transformer."""
+"""The neural renderer: guidance buffers to the picture, by one pass through a backbone between latents."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import numpy as np
 import torch
@@ -12,15 +12,16 @@ from torch.nn.functional import pad
 from tron.errors import TronError
 from tron.neural.backbone import Backbone
 from tron.neural.codecs import CODECS
-from tron.neural.configs import MEAN, RendererConfig
+from tron.neural.configs import MEAN, RendererConfig, UNetConfig, check_weights
 from tron.neural.protocols import Codec, Renderer
-from tron.neural.windows import check_frames, windows
+from tron.neural.unet import UNet
+from tron.neural.windows import Overlap, check_frames, windows
 
 PLAIN_TIMESTEP = 0.2  # what the tiny transformer is told; any constant will do
 
 
 class NeuralRenderer(Renderer):
-    """Codec, transformer, codec. A new one with sigma None returns the buffer that `skip` names."""
+    """Codec, backbone, codec. A new one with sigma None returns the buffer that `skip` names."""
 
     config: RendererConfig
 
@@ -35,32 +36,58 @@ class NeuralRenderer(Renderer):
         check_frames(self.config.window, self.temporal_factor)
         channels = self.codec.latent_channels
         latents = len(self.config.guidance) if self.config.fusion == "concat" else 1
-        self.backbone = Backbone(self.config.backbone, latents * channels, channels)
+        shape = self.config.backbone
+        kind = UNet if isinstance(shape, UNetConfig) else Backbone
+        self.backbone: Backbone | UNet = kind(shape, latents * channels, channels)  # type: ignore[arg-type]
 
-    def forward(self, buffers: Mapping[str, Tensor]) -> Tensor:
+    def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:
         """As Renderer.forward, with 1 + temporal_factor * n frames of any H and W.
 
-        Sides are padded to the codec's block by repeating the edge, and cropped again. Raises TronError
-        for another number of frames.
+        Sides are padded to the codec's block by repeating the edge, and cropped again. Weights that are all 0
+        are taken here, where everything before lets none through: the backbone is then given zeros. Raises
+        TronError for another number of frames.
         """
         videos = self.stacked(buffers)
         check_frames(videos[0].shape[2], self.temporal_factor)
+        scales = self._scales(weights)
         height, width = videos[0].shape[-2:]
         latents = [self.codec.encode(self._padded(video)) for video in videos]
-        mean = torch.stack(latents).mean(0)
-        fused = torch.cat(latents, 1) if self.config.fusion == "concat" else mean
+        weighed = [z if scale == 1 else scale * z for scale, z in zip(scales, latents)]
+        mean = torch.stack(weighed).mean(0)
+        fused = torch.cat(weighed, 1) if self.config.fusion == "concat" else mean
         skip = self.config.skip
         start = mean if skip == MEAN else latents[self.config.guidance.index(skip)]
         return self.codec.decode(self._denoise(fused, start))[..., :height, :width]
 
+    def check_weights(self, weights: Mapping[str, float] | None) -> None:
+        """As Renderer.check_weights: one number >= 0 for each buffer of the guidance, not all of them 0."""
+        if weights is not None:
+            try:
+                check_weights(weights, self.config.guidance)
+            except ValueError as error:
+                raise TronError(str(error)) from error
+
     def hidden_matrices(self) -> list[nn.Parameter]:
-        """Weights between hidden layers, 2-D: attention and feed-forward of every block."""
-        blocks = self.backbone.transformer.transformer_blocks
-        return [p for name, p in blocks.named_parameters() if ".attn1.to_" in name or ".ff." in name]
+        """Weights between hidden layers, 2-D, of the backbone."""
+        return self.backbone.hidden_matrices()
+
+    def temporal_weights(self) -> dict[str, nn.Parameter]:
+        """As Renderer.temporal_weights: those of the backbone."""
+        return {f"backbone.{name}": p for name, p in self.backbone.temporal_weights().items()}
 
     def calibrate(self, videos: Iterable[Tensor]) -> None:
         """Calibrate the codec."""
         self.codec.calibrate(videos)
+
+    def _scales(self, weights: Mapping[str, float] | None) -> list[float]:
+        """Factors of the latents: weight times number, so that equal weights are factors of exactly 1."""
+        weights = self.config.weights if weights is None else weights
+        guidance = self.config.guidance
+        if weights is None:
+            return [1.0] * len(guidance)
+        if any(weights.values()):
+            self.check_weights(weights)
+        return [len(guidance) * weights[name] for name in guidance]
 
     def _denoise(self, fused: Tensor, start: Tensor) -> Tensor:
         if self.config.sigma is None:
@@ -87,35 +114,96 @@ def to_display_array(video: Tensor) -> np.ndarray:
     return np.ascontiguousarray(image.permute(1, 2, 3, 0).cpu().numpy())
 
 
-@torch.no_grad()
 def render_clip(
-    renderer: Renderer, displayed: Mapping[str, np.ndarray], window: int | None = None
+    renderer: Renderer,
+    displayed: Mapping[str, np.ndarray],
+    window: int | None = None,
+    overlap: Overlap = "newest",
+    weights: Mapping[str, float] | None = None,
 ) -> np.ndarray:
     """Render a clip of any length.
 
     Args:
         renderer: what renders.
         displayed: its guidance by name, (K, H, W, 3) display values in [0, 1], as `Clip.displayed` gives.
-        window: frames a pass, 1 + temporal_factor * n (default: the renderer's own). The first pass gives
-            all its frames; every later one, moved by one frame, the last of its frames.
+        window: frames a pass, 1 + temporal_factor * n (default: the renderer's own).
+        overlap: which of the windows that hold a frame draws it, see `tron.neural.windows`.
+        weights: of the latents by name, instead of the renderer's own.
 
     Returns:
         Display values (K, H, W, 3) in [0, 1], float32.
+
+    Raises:
+        TronError: the buffers are no clip, or window, overlap or weights do not fit the renderer.
     """
     shapes = {buffer.shape for buffer in displayed.values()}
     if len(shapes) != 1 or any(len(shape) != 4 or shape[-1] != 3 or not shape[0] for shape in shapes):
         given = " and ".join(str(shape) for shape in sorted(shapes)) or "none"
         raise TronError(f"clip buffers of shapes {given}", mend="give (K, H, W, 3) alike")
+
+    def read(index: int) -> dict[str, np.ndarray]:
+        return {name: buffer[index] for name, buffer in displayed.items()}
+
+    return np.stack(list(render_frames(renderer, read, next(iter(shapes))[0], window, overlap, weights)))
+
+
+def render_frames(
+    renderer: Renderer,
+    read: Callable[[int], Mapping[str, np.ndarray]],
+    frames: int,
+    window: int | None = None,
+    overlap: Overlap = "newest",
+    weights: Mapping[str, float] | None = None,
+) -> Iterator[np.ndarray]:
+    """Render a clip frame after frame, in the memory of one window however long it is.
+
+    Args:
+        renderer: what renders; it stays in evaluation until the last frame was taken.
+        read: gives the guidance of a frame by name, each (H, W, 3) display values; called once a frame, in
+            order.
+        frames: of the clip.
+        window: as render_clip has it.
+        overlap: likewise.
+        weights: likewise.
+
+    Yields:
+        Display values (H, W, 3) in [0, 1], float32, in order.
+
+    Raises:
+        TronError: as render_clip.
+    """
     size = window or renderer.config.window
     check_frames(size, renderer.temporal_factor)
+    renderer.check_weights(weights)
+    passes = windows(frames, size, renderer.temporal_factor, overlap)
     device = next(renderer.parameters()).device
-    buffers = {name: to_tensor(displayed[name]).to(device) for name in displayed}
+    given: dict[int, dict[str, Tensor]] = {}
+    sums: dict[int, np.ndarray] = {}
+    counts: dict[int, int] = {}
     was_training = renderer.training
     renderer.eval()
-    frames: list[np.ndarray] = []
-    for indices in windows(next(iter(shapes))[0], size, renderer.temporal_factor):
-        part = slice(indices[0], indices[-1] + 1)
-        shown = to_display_array(renderer({name: video[:, :, part] for name, video in buffers.items()}))
-        frames.extend(shown if not frames else shown[-1:])
-    renderer.train(was_training)
-    return np.stack(frames)
+    try:
+        for this, following in zip(passes, [*passes[1:], None]):
+            for index in [index for index in given if index < this.frames.start]:
+                del given[index]
+            for index in [index for index in this.frames if index not in given]:
+                shown = read(index)
+                wanted = [name for name in renderer.config.guidance if name in shown]
+                given[index] = {name: to_tensor(shown[name][None]).to(device) for name in wanted}
+            with torch.no_grad():
+                drawn = renderer(_joined([given[index] for index in this.frames]), weights)
+            display = to_display_array(drawn)
+            for index in this.kept:
+                frame = display[index - this.frames.start]
+                sums[index] = sums[index] + frame if index in sums else frame
+                counts[index] = counts.get(index, 0) + 1
+            # A frame is finished where no later window keeps it.
+            for index in sorted(i for i in sums if following is None or i < following.kept.start):
+                yield sums.pop(index) / np.float32(counts.pop(index))
+    finally:
+        renderer.train(was_training)
+
+
+def _joined(frames: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Frames (1, 3, 1, H, W) by name, one after another: (1, 3, K, H, W)."""
+    return {name: torch.cat([frame[name] for frame in frames], 2) for name in frames[0]}

@@ -6,6 +6,7 @@ Nothing is ever fetched from the network and nothing in a file is executed.
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from safetensors.torch import save as serialize
 from torch import Tensor
 
 from tron.errors import TronError
-from tron.neural.backbone import transformer
+from tron.neural.backbone import Backbone, transformer
 from tron.neural.codecs import CODECS
 from tron.neural.configs import (
     PAPER_GUIDANCE,
@@ -31,6 +32,8 @@ from tron.neural.protocols import Codec, Renderer
 from tron.neural.published_files import existing, folder_state, load_strictly, safetensors_state, torch_state
 from tron.neural.renderer import NeuralRenderer
 from tron.storage import write_atomic
+
+log = logging.getLogger(__name__)
 
 FORMAT = "tron-renderer 1"
 METADATA_KEY = "tron"
@@ -63,15 +66,31 @@ def load_renderer(path: str | Path, vae: str | Path | None = None) -> Renderer:
         if header.get("format") != FORMAT:
             raise TronError("safetensors file holds no TRON renderer", str(path), MEND)
         renderer = _build(header["kind"], header["config"], vae)
-    except (ValidationError, ValueError, KeyError, AttributeError, TypeError) as error:
+    except ValidationError as error:
+        first = error.errors()[0]
+        key, said = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
+        raise TronError(
+            f"the renderer's configuration is not one of ours: {key}: {said}", path, MEND
+        ) from error
+    except (ValueError, KeyError, AttributeError, TypeError) as error:
         raise TronError("the renderer's configuration is damaged", str(path), MEND) from error
     load_strictly(renderer, state, path)
     return renderer.eval()
 
 
 def restore_renderer(path: str | Path, renderer: Renderer) -> None:
-    """Put the weights that `save_renderer` wrote into a renderer of the same configuration."""
-    load_strictly(renderer, _read(Path(path))[0], Path(path))
+    """Put the weights that `save_renderer` wrote into a renderer of the same configuration.
+
+    A renderer with paths between frames also takes the weights of one without them: a warm start, from what
+    that one draws. TronError names the first weight that is missing, unknown or of another shape.
+    """
+    path = Path(path)
+    state = _read(path)[0]
+    temporal = renderer.temporal_weights()
+    if temporal and not set(temporal) & set(state):
+        log.info("%s was trained on single frames: the paths between frames start from zero", path)
+        state |= {name: parameter.detach() for name, parameter in temporal.items()}
+    load_strictly(renderer, state, path)
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -109,15 +128,21 @@ def load_cosmos(
     """
     if not isinstance(config, RendererConfig):
         config = CosmosConfig.model_validate(config or {})
+    shape = config.backbone
+    if not isinstance(shape, BackboneConfig):
+        raise TronError("published weights do not fit a U-Net", mend="leave backbone.kind=unet out")
     found = existing(transformer_path, "the Cosmos transformer", COSMOS_FILE)
     codec = CODECS[config.codec](vae_path)
     with torch.device("meta"):  # 2.4 GB of random numbers need not be drawn to be thrown away
         renderer = NeuralRenderer(config, codec)
-    state = load_cosmos_state(found, config.backbone, codec.latent_channels)
+    state = load_cosmos_state(found, shape, codec.latent_channels)
     if config.fusion == "concat":
-        state["patch_embed.proj.weight"] = _widened(state["patch_embed.proj.weight"], config, codec)
-    if config.backbone.cross_attention == "none":
+        state["patch_embed.proj.weight"] = _widened(
+            state["patch_embed.proj.weight"], len(config.guidance), shape, codec
+        )
+    if shape.cross_attention == "none":
         state = {k: v for k, v in state.items() if ".attn2." not in k and ".norm2." not in k}
+    assert isinstance(renderer.backbone, Backbone)
     load_strictly(renderer.backbone.transformer, state, found)
     return renderer
 
@@ -139,12 +164,12 @@ def load_cosmos_state(path: Path, config: BackboneConfig, channels: int) -> dict
     return {name: tensor.float() for name, tensor in state.items()}
 
 
-def _widened(weight: Tensor, config: RendererConfig, codec: Codec) -> Tensor:
+def _widened(weight: Tensor, latents: int, config: BackboneConfig, codec: Codec) -> Tensor:
     """Zero columns for the latents after the first, in front of the padding channel.
 
     The patch embedding's columns are ordered channel first, then the pixels of the patch.
     """
-    per_channel = weight.shape[1] // (codec.latent_channels + int(config.backbone.padding_channel))
+    per_channel = weight.shape[1] // (codec.latent_channels + int(config.padding_channel))
     split = codec.latent_channels * per_channel
-    zeros = [torch.zeros_like(weight[:, :split])] * (len(config.guidance) - 1)
+    zeros = [torch.zeros_like(weight[:, :split])] * (latents - 1)
     return torch.cat([weight[:, :split], *zeros, weight[:, split:]], 1)

@@ -7,7 +7,6 @@ import numpy as np
 import plyfile
 import pytest
 
-from tron.apps import clip as clips
 from tron.apps.clip import Clip
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.relight_settings import BUFFERS, DEFAULT_BUFFERS, Settings
@@ -233,7 +232,8 @@ def test_final_frames_without_bounces_have_no_reflections(tmp_path):
         Estimation(bounces=0, reflections=2)
 
 
-def test_a_clip_in_parts_is_the_clip_in_one(tmp_path, monkeypatch):
+@pytest.mark.parametrize("overlap", ["newest", "anchor"])
+def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap):
     import torch
 
     from tron.neural.configs import BackboneConfig, RendererConfig
@@ -242,17 +242,18 @@ def test_a_clip_in_parts_is_the_clip_in_one(tmp_path, monkeypatch):
     small = BackboneConfig(heads=2, head_dim=12, layers=1, adaln_lora_dim=8)
     renderer = NeuralRenderer(RendererConfig(window=5, backbone=small)).eval()
     torch.manual_seed(1)
-    torch.nn.init.normal_(renderer.backbone.transformer.proj_out.weight, std=0.1)
+    for parameter in renderer.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
     folder = FrameFolder(tmp_path, GUIDANCE)
     rng = generator(0, "test", "clip")
-    for index in range(13):
+    for index in range(8):
         folder.write(index, {name: rng.uniform(0, 2, (16, 16, 3)) for name in GUIDANCE})
-    monkeypatch.setattr(clips, "CLIP_FRAMES", 6)
     light, picture = EnvironmentMap.constant(1.0), RelitPicture("environment", "neural")
-    Clip(light, [0.0] * 13, 0.7, picture, folder).draw(renderer)
-    linear = {name: np.stack([folder.read(i, name) for i in range(13)]) for name in GUIDANCE}
-    whole = render_clip(renderer, {name: to_display(buffer, 0.7) for name, buffer in linear.items()})
-    for index in range(13):
+    Clip(light, [0.0] * 8, 0.7, picture, folder).draw(renderer, overlap=overlap)
+    linear = {name: np.stack([folder.read(i, name) for i in range(8)]) for name in GUIDANCE}
+    shown = {name: to_display(buffer, 0.7) for name, buffer in linear.items()}
+    whole = render_clip(renderer, shown, overlap=overlap)
+    for index in range(8):
         np.testing.assert_allclose(folder.row(index, ["neural"]), whole[index], atol=1.01 / 255)
 
 
@@ -305,6 +306,12 @@ def test_a_file_in_place_of_the_output_folder_is_one_line(relight, scene_path, l
         ({"background": "white"}, "a list is written background=[1,1,1]"),
         ({"background": "[0,0,255]"}, "'background.2' (255)"),
         ({"checkpoint": "absent.safetensors", "buffers": "[relit]"}, "no relit.exr with a checkpoint"),
+        ({"window": "5"}, "window is the neural renderer's: give a checkpoint too"),
+        ({"overlap": "mean"}, "overlap is the neural renderer's"),
+        ({"overlap": "oldest", "checkpoint": "a.safetensors"}, "'overlap'"),
+        ({"weights": "{pbr: -1}", "checkpoint": "a.safetensors"}, "the weight of 'pbr' is -1"),
+        ({"weights": "{pbr: 0}", "checkpoint": "a.safetensors"}, "all weights are 0"),
+        ({"weights": "0.5", "checkpoint": "a.safetensors"}, "'weights'"),
         ({"buffers": "[pbr,nonsense]"}, "'buffers"),
         ({"framse": "3"}, "framse"),
     ],

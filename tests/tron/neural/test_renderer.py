@@ -10,7 +10,6 @@ from tron.neural.backbone import Backbone
 from tron.neural.configs import BackboneConfig, CosmosConfig, PixelMLPConfig, RendererConfig
 from tron.neural.pixel_mlp import PixelMLP
 from tron.neural.renderer import NeuralRenderer, render_clip
-from tron.neural.windows import windows
 from tron.shards.schema import GUIDANCE, TARGET
 
 SMALL = BackboneConfig(heads=2, head_dim=12, layers=2, adaln_lora_dim=8)
@@ -28,6 +27,7 @@ def buffers(frames: int = 1, height: int = 16, width: int = 16, batch: int = 2, 
 def awake(renderer: NeuralRenderer) -> NeuralRenderer:
     """A renderer whose output layer is not zero."""
     torch.manual_seed(1)
+    assert isinstance(renderer.backbone, Backbone)
     torch.nn.init.normal_(renderer.backbone.transformer.proj_out.weight, std=0.1)
     return renderer.eval()
 
@@ -83,6 +83,7 @@ def test_averaging_keeps_the_pretrained_input_width_and_concatenation_multiplies
     padded = SMALL.model_copy(update={"padding_channel": True})
     for fusion, channels in (("average", 192 + 1), ("concat", len(GUIDANCE) * 192 + 1)):
         renderer = NeuralRenderer(RendererConfig.model_validate({"fusion": fusion, "backbone": padded}))
+        assert isinstance(renderer.backbone, Backbone)
         assert renderer.backbone.transformer.patch_embed.proj.in_features == channels
 
 
@@ -175,14 +176,6 @@ def test_a_pixel_mlp_sees_single_pixels():
     expected = mlp(given).flatten(2)[..., order].view_as(given["lit"])
     torch.testing.assert_close(mlp(shuffled), expected, atol=1e-6, rtol=0)
     assert (expected - shuffled["lit"]).abs().max() > 0.01
-
-
-@pytest.mark.parametrize(("frames", "size"), [(1, 1), (7, 1), (5, 5), (12, 5), (3, 5), (6, 9), (9, 9)])
-def test_windows_give_every_frame_once_and_the_newest_last(frames, size):
-    passes = windows(frames, size)
-    shown = [*passes[0], *(indices[-1] for indices in passes[1:])]
-    assert shown == list(range(frames))
-    assert all((len(p) - 1) % 4 == 0 and len(p) <= size for p in passes)
 
 
 @pytest.mark.parametrize("size", [1, 5])

@@ -1,0 +1,162 @@
+"""The network of tron-relight: where it comes from, what is tuned at it, when it gives way or is refused."""
+
+import json
+import pickle
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from tron.apps import relight_settings
+from tron.images import read_image
+from tron.neural import shipped
+from tron.neural.configs import PAPER_GUIDANCE, RendererConfig, UNetConfig
+from tron.neural.renderer import NeuralRenderer
+from tron.neural.weights import save_renderer
+
+SMALL = UNetConfig(widths=(4, 6), blocks=(1, 1), blocks_up=(1,))
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory):
+    """A folder of networks that change the picture a little, called as the shipped ones are."""
+    folder = tmp_path_factory.mktemp("shipped")
+    for name, guidance in (("pair", PAPER_GUIDANCE), ("lit", ("pbr", "irradiance", "lit"))):
+        torch.manual_seed(0)
+        config = RendererConfig(guidance=guidance, window=3, codec="pixels", fusion="average", backbone=SMALL)
+        renderer = NeuralRenderer(config)
+        for parameter in renderer.parameters():
+            torch.nn.init.normal_(parameter, std=0.3)
+        save_renderer(folder / f"{name}.safetensors", renderer)
+    return folder
+
+
+@pytest.fixture
+def run(relight, scene_path, light_path):
+    """Films three small frames into a folder with these settings; gives the exit code."""
+
+    def film(out, *settings: str) -> int:
+        base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=3"]
+        return relight(*base, "width=16", "height=16", *settings)
+
+    return film
+
+
+def pictures(out, name: str = "relit") -> np.ndarray:
+    return np.stack([read_image(out / "frames" / f"{index:04d}.{name}.png") for index in range(3)])
+
+
+def test_window_overlap_and_weights_change_the_pictures_and_are_on_record(run, checkpoints, tmp_path):
+    path, drawn = checkpoints / "pair.safetensors", {}
+    choices = {
+        "plain": (),
+        "single": ("window=1",),
+        "mean": ("overlap=mean", "window=2"),
+        "weighed": ("weights={pbr: 0.3, irradiance: 0.7}",),
+        "equal": ("weights={pbr: 0.5, irradiance: 0.5}",),
+    }
+    for name, settings in choices.items():
+        # The traced frames stay: what they are made of does not depend on the network.
+        assert run(tmp_path, f"checkpoint={path}", *settings) == 0
+        drawn[name] = pictures(tmp_path)
+        report = json.loads((tmp_path / "relight.json").read_text())
+        network = report["network"]
+        assert report["frames_rendered"] == (3 if name == "plain" else 0)
+        assert network["window"] == {"single": 1, "mean": 2}.get(name, 3)
+        assert network["overlap"] == ("mean" if name == "mean" else "newest")
+        assert network["guidance"] == ["pbr", "irradiance"]
+        if name == "weighed":
+            assert network["weights"] == {"pbr": 0.3, "irradiance": 0.7}
+    np.testing.assert_array_equal(drawn["equal"], drawn["plain"])
+    for name in ("single", "mean", "weighed"):
+        assert np.abs(drawn[name] - drawn["plain"]).max() > 2 / 255
+
+
+def test_a_shipped_checkpoint_is_given_by_name(run, checkpoints, tmp_path, monkeypatch, capsys):
+    assert run(tmp_path / "path", f"checkpoint={checkpoints / 'lit.safetensors'}") == 0
+    monkeypatch.setattr(shipped, "FOLDER", checkpoints)
+    assert run(tmp_path / "name", "checkpoint=lit") == 0
+    np.testing.assert_array_equal(pictures(tmp_path / "name"), pictures(tmp_path / "path"))
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path)
+    assert run(tmp_path / "absent", "checkpoint=lit") == 2
+    error = capsys.readouterr().err.strip()
+    assert "this installation has no checkpoint 'lit'" in error
+    assert "\n" not in error
+    assert not (tmp_path / "absent").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (("bounces=0",), "no bounced light with bounces=0"),
+        (("fidelity=paper",), "no bounced light with bounces=0"),
+        (("buffers=[relit]",), "buffers ask for relit.exr"),
+        ((), "this installation has no checkpoint 'lit'"),
+    ],
+)
+def test_the_default_checkpoint_gives_way_where_it_does_not_fit(
+    run, checkpoints, tmp_path, monkeypatch, caplog, settings, words
+):
+    monkeypatch.setattr(relight_settings, "DEFAULT", "lit")
+    monkeypatch.setattr(shipped, "FOLDER", checkpoints if settings else tmp_path)
+    with caplog.at_level("INFO"):
+        assert run(tmp_path / "out", "checkpoint=lit", *settings) == 0
+    assert words in caplog.text
+    report = json.loads((tmp_path / "out" / "relight.json").read_text())
+    assert report["relit"] == ("lit" if settings in ((), ("buffers=[relit]",)) else "shadowed")
+    assert report["network"] is None
+    assert not list((tmp_path / "out" / "frames").glob("*.neural.png"))
+
+
+def test_the_default_checkpoint_draws_where_it_fits(run, checkpoints, tmp_path, monkeypatch):
+    monkeypatch.setattr(relight_settings, "DEFAULT", "lit")
+    monkeypatch.setattr(shipped, "FOLDER", checkpoints)
+    assert run(tmp_path, "checkpoint=lit") == 0
+    assert json.loads((tmp_path / "relight.json").read_text())["relit"] == "neural"
+
+
+def test_the_default_is_a_shipped_one_whose_file_is_there():
+    assert shipped.DEFAULT is None or shipped.shipped(shipped.DEFAULT).is_file()
+    assert relight_settings.Settings.model_fields["checkpoint"].default in (None, shipped.DEFAULT)
+
+
+class _Explosive:
+    def __reduce__(self):
+        return (print, ("executed",))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (("weights={pbr: 1, lit: 1}",), "weights name 'lit': the network is given pbr, irradiance"),
+        (("weights={pbr: 1}",), "weights lack 'irradiance'"),
+        (("checkpoint=pickle.safetensors",), "not a readable safetensors file"),
+        (("checkpoint=weights.pt",), "not a readable safetensors file"),
+        (("checkpoint=foreign.safetensors",), "holds no TRON renderer"),
+        (("checkpoint=unknown.safetensors",), "guidance is one or more of pbr"),
+        (("checkpoint=dct.safetensors", "window=3"), "1 + 4n"),
+    ],
+)
+def test_networks_that_do_not_fit_are_one_line_before_any_frame(
+    run, checkpoints, tmp_path, monkeypatch, capsys, settings, words
+):
+    from safetensors.torch import save_file
+
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(checkpoints / "pair.safetensors", tmp_path)
+    (tmp_path / "pickle.safetensors").write_bytes(pickle.dumps(_Explosive()))
+    torch.save({"net.x": _Explosive()}, tmp_path / "weights.pt")
+    save_file({"x": torch.zeros(1)}, tmp_path / "foreign.safetensors")
+    header = {"format": "tron-renderer 1", "kind": "neural", "config": {"guidance": ["pbr", "thickness"]}}
+    save_file({"x": torch.zeros(1)}, tmp_path / "unknown.safetensors", {"tron": json.dumps(header)})
+    save_renderer(tmp_path / "dct.safetensors", NeuralRenderer(RendererConfig(backbone=SMALL)))
+    given = settings if settings[0].startswith("checkpoint=") else ("checkpoint=pair.safetensors", *settings)
+    assert run(tmp_path / "out", *given) == 2
+    captured = capsys.readouterr()
+    error = captured.err.strip()
+    assert words in error
+    assert given[0].removeprefix("checkpoint=") in error
+    assert "\n" not in error
+    assert "executed" not in captured.out + captured.err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,43 @@
+"""Checkpoints that come with the package, by name. Loads no torch.
+
+Their files lie in the folder `shipped` beside this one as NAME.safetensors; its README has a model card each.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tron.errors import TronError
+
+FOLDER = Path(__file__).with_name("shipped")
+SHIPPED = {
+    "lit": "of pbr, irradiance and lit",
+    "pair": "of pbr and irradiance, the paper's buffers",
+}
+"""Name -> what the network is given."""
+DEFAULT: str | None = None
+"""The one that tron-relight takes unless told otherwise; None: it draws without a network."""
+
+
+def shipped(name: str) -> Path:
+    """The file of a shipped checkpoint.
+
+    Raises:
+        TronError: no checkpoint has this name, or this installation came without its file.
+    """
+    if name not in SHIPPED:
+        raise TronError(f"no shipped checkpoint is called {name!r}", mend=f"they are {', '.join(SHIPPED)}")
+    path = FOLDER / f"{name}.safetensors"
+    if not path.is_file():
+        mend = "give the path of a renderer.safetensors that tron-train wrote"
+        raise TronError(f"this installation has no checkpoint '{name}'", path, mend)
+    return path
+
+
+def checkpoint_file(checkpoint: str | Path) -> Path:
+    """The file that a setting `checkpoint` means: that of a shipped name, or the path itself.
+
+    A name wins over a file that is called like it. Raises TronError where a name's file did not come with
+    this installation.
+    """
+    return shipped(str(checkpoint)) if str(checkpoint) in SHIPPED else Path(checkpoint)
