@@ -14,6 +14,7 @@ from eval.relighting.buffers import Buffers
 from eval.relighting.fits import Show
 from eval.renderer.settings import Kind, Overlap
 from tron.errors import TronError
+from tron.neural.shipped import SHIPPED, checkpoint_file
 
 if TYPE_CHECKING:
     from tron.neural.protocols import Renderer
@@ -55,14 +56,11 @@ def find_weights(given: str) -> Path:
     Raises:
         TronError: there is no such file, and nothing of that name is shipped.
     """
-    path = Path(given)
-    if path.is_file():
-        return path.absolute()
-    if path.suffix or len(path.parts) > 1:
-        raise TronError("weights not found", path, "give a file that tron-train wrote, or a shipped name")
-    from tron.neural.shipped import shipped
-
-    return shipped(given)
+    path = checkpoint_file(given)
+    if not path.is_file():
+        known = ", ".join(SHIPPED)
+        raise TronError("weights not found", path, f"give a file that tron-train wrote, or one of {known}")
+    return path.absolute()
 
 
 def load_networks(weights: Mapping[Kind, Path]) -> dict[Kind, Network]:

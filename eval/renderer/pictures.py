@@ -51,7 +51,7 @@ def busiest_square(a: np.ndarray, b: np.ndarray) -> tuple[tuple[int, int], int]:
     """Upper left corner (row, column) and side of the square in which two (H, W, 3) images differ most."""
     height, width = a.shape[:2]
     side = max(min(height, width) // ZOOM, 1)
-    error = uniform_filter(((a - b) ** 2).sum(-1), side, mode="constant", origin=-((side - 1) // 2))
+    error = uniform_filter(((a - b) ** 2).sum(-1), side, mode="constant", origin=-(side // 2))
     inside = error[: height - side + 1, : width - side + 1]
     row, column = np.unravel_index(int(np.argmax(inside)), inside.shape)
     return (int(row), int(column)), side

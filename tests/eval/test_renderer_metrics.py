@@ -41,7 +41,7 @@ def wall(drawn_clip: Callable[..., Clip], frames: int = 4, size: int = 24) -> tu
     for k in range(frames):
         world_to_camera = np.eye(4)
         world_to_camera[0, 3] = -step * k
-        cameras.append(Camera(world_to_camera, focal, focal, size / 2, size / 2, size, size))
+        cameras.append(Camera(focal, focal, size / 2, size / 2, size, size, world_to_camera))
     x, y = np.meshgrid(*[(np.arange(size) + 0.5 - size / 2) / focal] * 2)
     depth = distance * np.sqrt(1 + x**2 + y**2)
     clip.meta.cameras[:] = [camera.to_dict() for camera in cameras]
@@ -188,9 +188,7 @@ def test_gains_are_over_the_best_of_the_group_and_paired_by_scene():
 def test_sizes_after_the_first_stand_in_the_names_of_their_rows():
     scores = judged(pbr=20.0, lit=30.0, affine_lit=30.5, neural_lit=31.0)
     rows = values(Gains("synthetic", "", "S", "", {128: scores, 256: scores}).rows(0))
-    assert {"renderer.lit.gain_db", "renderer.lit.gain_db.256", "renderer.lit.gain_db_full.256.sun"} <= set(
-        rows
-    )
+    assert {f"renderer.lit.gain_db{end}" for end in ("", ".256", "_full.256.sun")} <= set(rows)
     assert "renderer.gain_db" not in rows, "there was no pair"
 
 
