@@ -72,7 +72,7 @@ class Gains:
                 for method, (start, rivals) in RIVALS.items():
                     for end, over in rivals.items():
                         name = f"{start}.{self.prefix}{end}{tail}"
-                        yield from _known(judged.scores.gain_row(name, method, over, where, seed))
+                        yield from _known(gain_over(judged.scores, name, method, over, where, seed))
                 for method in judged.scores.methods:
                     name = f"renderer.{self.prefix}psnr.{method.name.replace('.', '_')}{tail}"
                     yield from _known(judged.scores.psnr_row(name, method.name, where, seed))
@@ -140,7 +140,7 @@ class Gains:
         rows: list[Sequence[Cell | str]] = []
         for method, (_, rivals) in RIVALS.items():
             for end, over in rivals.items():
-                cells = [gain_cell(scores.gain_row("a.b", method, over, where)) for scores, where in places]
+                cells = [gain_cell(gain_over(scores, "a.b", method, over, where)) for scores, where in places]
                 if any(cell.text for cell in cells):
                     rows.append([Cell(GAIN_WORDS[method, end], "strong"), *cells])
         return rows
@@ -151,6 +151,14 @@ def places(scores: Scores) -> list[Where]:
     families = scores.families if len(scores.families) > 1 else []
     kinds = [(family, None) for family in (None, *families)] + [(None, style) for style in scores.styles]
     return [Where(region, family, style=style) for family, style in kinds for region in REGIONS]
+
+
+def gain_over(
+    scores: Scores, metric: str, method: str, over: Sequence[str], where: Where, seed: int = 0
+) -> Row | None:
+    """Row of a gain over the best of those that were scored: per-pixel networks are not always trained."""
+    there = {each.name for each in scores.methods}
+    return scores.gain_row(metric, method, [name for name in over if name in there], where, seed)
 
 
 def gain_cell(row: Row | None) -> Cell:
