@@ -9,6 +9,7 @@ cov(x, y) / var(x).
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from tron.shards.schema import Clip
 
@@ -23,7 +24,11 @@ SAME_COLOR = 5e-3
 
 
 def stayed(clip: Clip, before: int, now: int) -> np.ndarray:
-    """(H, W) bool: foreground in two frames whose true depth, normal and base color are unchanged."""
+    """(H, W) bool: foreground in two frames whose true depth, normal and base color are unchanged.
+
+    The eight pixels around have not changed either: a pixel's picture gathers light from half a pixel beyond
+    its centre and more, so that beside a silhouette that moves it shows the occluder, not its shadow.
+    """
     frames = {name: clip.frames[name] for name in (*SURFACE, "foreground")}
     (depth, other), (normal, turned), (color, dyed), (solid, there) = (
         (images[now], images[before]) for images in frames.values()
@@ -31,7 +36,8 @@ def stayed(clip: Clip, before: int, now: int) -> np.ndarray:
     same = np.abs(depth - other)[..., 0] <= SAME_DEPTH * np.maximum(other[..., 0], 1e-6)
     same &= (normal * turned).sum(-1) >= 1 - SAME_NORMAL
     same &= np.abs(color - dyed).max(-1) <= SAME_COLOR
-    return same & (solid[..., 0] > 0.5) & (there[..., 0] > 0.5)
+    far = ~binary_dilation(~same, np.ones((3, 3), bool))
+    return far & (solid[..., 0] > 0.5) & (there[..., 0] > 0.5)
 
 
 def change_sums(truth: np.ndarray, ours: np.ndarray) -> np.ndarray:

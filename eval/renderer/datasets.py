@@ -57,6 +57,12 @@ class Datasets:
         """Clips in which an occluder moves."""
         return self._made("shadows", self.settings.shadows)
 
+    def seeds(self) -> Path:
+        """What short trainings learn from: the checkpoints' own training data where they are at hand."""
+        if self.settings.train or "training" in self.settings.data:
+            return self._made("training", self.settings.training_recipes.data)
+        return self._made("seed_training", self.settings.seeds.data)
+
     def kills(self) -> Path:
         """The tiny data set of trainings that are killed."""
         return self._made("kills", self.settings.kills.data)

@@ -14,14 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from eval.relighting.buffers import MEMBERS, Buffers
-from eval.renderer.datasets import FIT, TEST, WEIGHTS, Datasets
+from eval.renderer.datasets import TEST, WEIGHTS, Datasets
 from eval.renderer.frames import FramePsnr, frame_psnr
 from eval.renderer.networks import Network, load_networks
 from eval.renderer.settings import Kind, SeedSettings
 from eval.results import Row
 from tron.report.page import Block, Section, Table, Text
 from tron.seeds import integer
-from tron.shards.manifest import Manifest
 from tron.shards.reader import read_clips
 
 
@@ -77,7 +76,14 @@ class Repeats:
 def measure_repeats(
     settings: SeedSettings, seed: int, dataset: Path, networks: Mapping[Kind, Network], made: Datasets
 ) -> Repeats:
-    """Render under several seeds, and train under several where the data set has a training split.
+    """Render under several seeds, and train under several.
+
+    Args:
+        settings: numbers and the short training's recipe.
+        seed: of the inference seeds.
+        dataset: whose test split judges.
+        networks: checkpoints.
+        made: makes the training data.
 
     Raises:
         StageFailed: a training failed.
@@ -88,9 +94,10 @@ def measure_repeats(
         kind: _difference(network, clips, seeds) for kind, network in networks.items()
     }
     trained: dict[int, FramePsnr] = {}
-    if settings.training and FIT in Manifest.load(dataset).splits():
+    if settings.training:
+        data = made.seeds()
         runs = {
-            f"seed_{each}": [*settings.recipe, f"dataset={dataset}", f"seed={each}"]
+            f"seed_{each}": [*settings.recipe, f"dataset={data}", f"seed={each}"]
             for each in settings.training
         }
         folders = made.train("seeds", runs, settings.side_by_side)

@@ -81,6 +81,11 @@ class SeedSettings(BaseModel):
     training: list[int] = Field(
         default=[0, 1, 2, 3], description="seeds of short trainings whose spread is measured; []: none"
     )
+    data: Recipe = Field(
+        default=[],
+        description="arguments of tron-datagen for what they learn; unused where benchmark.data "
+        "names a data set `training` or train=true makes it",
+    )
     recipe: Recipe = Field(default=[], description="arguments of tron-train for those")
     side_by_side: PositiveInt = Field(default=2, description="trainings at a time, of a thread each")
 
