@@ -36,8 +36,10 @@ def stayed(clip: Clip, before: int, now: int) -> np.ndarray:
     same = np.abs(depth - other)[..., 0] <= SAME_DEPTH * np.maximum(other[..., 0], 1e-6)
     same &= (normal * turned).sum(-1) >= 1 - SAME_NORMAL
     same &= np.abs(color - dyed).max(-1) <= SAME_COLOR
+    now_solid, then_solid = solid[..., 0] > 0.5, there[..., 0] > 0.5
+    same |= ~now_solid & ~then_solid  # sky has no normal
     far = ~binary_dilation(~same, np.ones((3, 3), bool))
-    return far & (solid[..., 0] > 0.5) & (there[..., 0] > 0.5)
+    return far & now_solid & then_solid
 
 
 def change_sums(truth: np.ndarray, ours: np.ndarray) -> np.ndarray:
