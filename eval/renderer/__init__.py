@@ -1,1 +1,1 @@
-"""The renderer benchmark: the shipped checkpoints on data that nobody trained on."""
+"""The neural renderer, measured: `tron-eval benchmark=renderer`."""

@@ -37,7 +37,7 @@ class Projection:
 
 
 def measure_projection(sizes: Sequence[int], threads: int) -> Projection:
-    """Run and project."""
+    """Measure a frame of 256 x 256, and project from square frames of these widths, multiples of 16."""
     from eval.renderer.cosmos_cost import measure_cosmos
 
-    return Projection(list(measure_cosmos(sizes, threads)))
+    return Projection(list(measure_cosmos([(size, size, 1) for size in sizes], threads)))

@@ -140,7 +140,9 @@ class RendererSettings(Benchmark):
     throughput: ThroughputSettings = ThroughputSettings()
     kills: KillSettings
     cosmos_sizes: list[PositiveInt] = Field(
-        default=[32, 48, 64], description="width of the small runs that memory and time are projected from"
+        default=[64, 128, 192],
+        min_length=3,
+        description="width of the small frames that time is projected from, multiples of 16",
     )
     pictures: NonNegativeInt = Field(default=3, description="scenes of each distribution that are shown")
     folds: PositiveInt = Field(
