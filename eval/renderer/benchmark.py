@@ -94,7 +94,7 @@ class Renderer(RendererSettings):
         )
 
     def _inputs(self, parts: Parts) -> dict[str, object]:
-        """What was measured, and by what."""
+        """Hashes of the checkpoints, and the settings."""
         judged = {} if set(self.parts) <= set(WITHOUT_WEIGHTS) else parts.weights
         return {
             **{f"{kind}_sha256": sha256(path) for kind, path in judged.items()},

@@ -58,7 +58,7 @@ class Datasets:
         return self._made("shadows", self.settings.shadows)
 
     def seeds(self) -> Path:
-        """What short trainings learn from: the checkpoints' own training data where they are at hand."""
+        """Data of short trainings: the checkpoints' own training data where they are at hand."""
         if self.settings.train or "training" in self.settings.data:
             return self._made("training", self.settings.training_recipes.data)
         return self._made("seed_training", self.settings.seeds.data)

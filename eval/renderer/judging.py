@@ -36,7 +36,7 @@ Fits = Mapping[str, Mapping[str, Show]]
 
 @dataclass(frozen=True)
 class Judging:
-    """How a data set is judged.
+    """A data set and the way in which it is judged.
 
     Attributes:
         dataset: its folder.

@@ -23,7 +23,7 @@ EACH_RUN = 4
 """Signals that a training suffers before it is finished and compared."""
 LOOK_SECONDS = 0.02
 BEGUN = b"Stage "
-"""What the log of tron-train says when a stage begins."""
+"""Words of tron-train's log when a stage begins."""
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ def verdict(rows: Mapping[str, Row]) -> str:
 
 
 def parts_section(what: Mapping[str, str]) -> list[Section]:
-    """What each part of this run asks."""
+    """A table of the parts of this run and their questions."""
     rows: list[Sequence[Cell | str]] = [[part, words] for part, words in what.items()]
     table = Table("Parts of this run.", ["Part", "What it asks"], rows, words=[1])
     return [Section("parts", "What was asked", [table])]
