@@ -79,6 +79,7 @@ cli = command(
         "tron-eval benchmark=tracing output_dir=outputs/tracing",
         "tron-eval benchmark=reconstruction output_dir=outputs/reconstruction",
         "tron-eval benchmark=datagen output_dir=outputs/datagen",
+        "tron-eval benchmark=renderer benchmark.parts=[synthetic,clips] output_dir=outputs/renderer",
     ),
 )
 

@@ -41,11 +41,14 @@ class SceneTime:
 
 @contextmanager
 def running(
-    arguments: Sequence[str], output: Path, environment: Mapping[str, str] | None = None
+    arguments: Sequence[str],
+    output: Path,
+    environment: Mapping[str, str] | None = None,
+    script: str = SCRIPT,
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """A run of tron-datagen into ``output``, its words in ``OUTPUT.log`` beside; the block's end ends it."""
+    """A run of a command into ``output``, its words in ``OUTPUT.log`` beside; the block's end ends it."""
     output.parent.mkdir(parents=True, exist_ok=True)
-    command = [script_path(SCRIPT), *arguments, f"output_dir={output}"]
+    command = [script_path(script), *arguments, f"output_dir={output}"]
     with termination_unwinds(), output.with_suffix(".log").open("ab") as log:
         process = subprocess.Popen(
             command,
@@ -92,11 +95,11 @@ def make(
     return seconds
 
 
-def require_success(code: int, arguments: Sequence[str], output: Path) -> None:
+def require_success(code: int, arguments: Sequence[str], output: Path, script: str = SCRIPT) -> None:
     """Raise StageFailed, with the last line of its log, for a run that ended with another code than 0."""
     if code:
         words = output.with_suffix(".log").read_text(errors="replace").splitlines()[-1:]
-        raise StageFailed(" ".join([SCRIPT, *arguments, f"output_dir={output}"]), code, " ".join(words))
+        raise StageFailed(" ".join([script, *arguments, f"output_dir={output}"]), code, " ".join(words))
 
 
 def scene_times(output: Path) -> list[SceneTime]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from eval.datagen.model_pixels import DEPTH, ModelPixels
 from eval.datagen.settings import VarietySettings
+from eval.real_models import has_models, model_arguments, model_names
 from eval.relighting.benchmark import load_network
 from eval.relighting.buffers import MEMBERS, Buffers, region_mask
 from eval.relighting.fits import Show
@@ -48,8 +49,6 @@ JUDGES = {
 REGIONS = {MODELS: "pixels of the models", FOREGROUND: "foreground"}
 PLACES = ((ALONE, MODELS), (MIXED, MODELS), (ALONE, FOREGROUND), (MIXED, FOREGROUND), (HOME, FOREGROUND))
 """What is judged: scenes, and which of their pixels."""
-MODEL_FILES = (".gltf", ".glb", ".obj")
-MAP_FILES = (".hdr", ".exr")
 Trained = tuple[str, str, int]
 """Distribution, renderer and seed of a training."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -226,13 +225,11 @@ def _make_judges(
 ) -> list[tuple[str, Path]]:
     """Datasets of real models, (judge, folder): one of each model alone, and some of all of them mixed."""
     data = settings.real_data
-    if data is None or not all((data / name).is_dir() for name in ("assets", "hdri")):
+    if data is None or not has_models(data):
         log.warning("no assets and hdri in %s: nothing is judged by real models", data)
         return []
-    data = data.absolute()
-    models, maps = _stems(data / "assets", MODEL_FILES), _stems(data / "hdri", MAP_FILES)
-    common = [*settings.judge, f"assets={data / 'assets'}", f"environments={data / 'hdri'}"]
-    common.append(f"allow_unlicensed=[{','.join((*models, *maps))}]")
+    models = model_names(data)
+    common = [*settings.judge, *model_arguments(data)]
     wanted = [
         (ALONE, f"{ALONE}_{model}", [*settings.alone, f"asset_names=[{model}]", f"seed={seed + number}"])
         for number, model in enumerate(models)
@@ -249,11 +246,6 @@ def _make_judges(
     for first in range(0, len(names), SIDE_BY_SIDE):
         _make_together(stages, [children[name] for name in names[first : first + SIDE_BY_SIDE]], found)
     return [(judge, folder / name) for judge, name, _ in wanted if name not in found.left_out]
-
-
-def _stems(folder: Path, suffixes: Sequence[str]) -> list[str]:
-    """Names of a folder's files as tron-datagen finds them: with its subfolders, suffixes in any case."""
-    return sorted(path.stem for path in folder.rglob("*") if path.suffix.lower() in suffixes)
 
 
 def _make_together(stages: Stages, children: Sequence[Child], found: Variety) -> None:

@@ -214,11 +214,24 @@ class Scores:
                     yield mean_row(name, metric.unit, found, seed)
             for method, rivals in GAINS.items():
                 for rival, over in rivals.items():
-                    gain = self.gain(method, over, where)
-                    if gain is not None:
-                        name = f"{method}.gain_over_{rival}{where.tail}{self.tail}"
-                        row = Row(metric=name, value=gain, unit="dB", n=len(self.of(method, where)))
-                        yield row.within(self._gain_interval(method, over, where, seed))
+                    name = f"{method}.gain_over_{rival}{where.tail}{self.tail}"
+                    if row := self.gain_row(name, method, over, where, seed):
+                        yield row
+
+    def gain_row(
+        self, metric: str, method: str, over: Sequence[str], where: Where = ALL, seed: int = 0
+    ) -> Row | None:
+        """Gain of a method over the best of others as a row of that name; None where one is not known."""
+        gain = self.gain(method, over, where)
+        if gain is None:
+            return None
+        row = Row(metric=metric, value=gain, unit="dB", n=len(self.of(method, where)))
+        return row.within(self._gain_interval(method, over, where, seed))
+
+    def psnr_row(self, metric: str, method: str, where: Where = ALL, seed: int = 0) -> Row | None:
+        """Mean PSNR of a method as a row of that name; None where nothing was scored."""
+        found = [(score.scene, score.figures["psnr"]) for score in self.of(method, where)]
+        return mean_row(metric, "dB", found, seed) if found else None
 
     def _gain_interval(self, method: str, over: Sequence[str], where: Where, seed: int) -> Interval:
         """The interval of a gain: in each resample over the one of the others that is the best there."""

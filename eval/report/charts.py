@@ -168,9 +168,40 @@ def bar_chart(bars: Mapping[str, Mapping[str, float]], x_label: str, caption: st
     return Chart(svg(), caption, f"Bar chart of {x_label}: {said}.")
 
 
+def density_chart(clouds: Mapping[str, np.ndarray], x_label: str, y_label: str, caption: str) -> Chart:
+    """Clouds of points side by side, as hexagons by how many points they hold, with the line y = x.
+
+    Args:
+        clouds: label -> (n, 2) points; all charts have the same square range.
+        x_label, y_label, caption: the words around it.
+    """
+    from matplotlib.colors import LogNorm
+
+    reach = max(float(np.abs(points).max(initial=0)) for points in clouds.values()) or 1.0
+    reach = min(
+        reach, 1.05 * max(float(np.quantile(np.abs(points), 0.999)) for points in clouds.values()) or 1.0
+    )
+    with _canvas(caption, columns=len(clouds), legend=False) as (axes, svg):
+        for place, (label, points) in zip(np.ravel(axes), clouds.items()):
+            inside = points[(np.abs(points) <= reach).all(-1)]
+            place.hexbin(
+                *inside.T,
+                gridsize=36,
+                extent=(-reach, reach, -reach, reach),
+                mincnt=1,
+                norm=LogNorm(),
+                cmap="viridis",
+                linewidths=0.2,
+            )
+            place.plot([-reach, reach], [-reach, reach], ":", color=INK, linewidth=0.8)
+            place.set(title=label, xlabel=x_label, ylabel=y_label, aspect="equal")
+    counted = "; ".join(f"{label}: {len(points):,} points" for label, points in clouds.items())
+    return Chart(svg(), caption, f"Density of {y_label} over {x_label}: {counted}.")
+
+
 @contextmanager
-def _canvas(name: str) -> Iterator[tuple[Any, Any]]:
-    """Axes in the page's style, and a function that gives their SVG afterwards.
+def _canvas(name: str, columns: int = 1, legend: bool = True) -> Iterator[tuple[Any, Any]]:
+    """Axes in the page's style (an array of them where there are several), and a function for their SVG.
 
     The ink of the SVG is the page's text colour; ``name`` makes its ids its own.
     """
@@ -198,9 +229,11 @@ def _canvas(name: str) -> Iterator[tuple[Any, Any]]:
     with rc_context(settings):
         figure = Figure(figsize=(9, 3.4), layout="constrained")
         FigureCanvasSVG(figure)
-        axes = figure.add_subplot()
+        axes = figure.subplots(1, columns)
         yield axes, svg
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(alpha=0.25, color=INK)
-        axes.legend(frameon=False)
+        for each in np.ravel(axes):
+            each.spines[["top", "right"]].set_visible(False)
+            each.grid(alpha=0.25, color=INK)
+            if legend:
+                each.legend(frameon=False)
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})

@@ -1,0 +1,106 @@
+"""Benchmark `renderer`: the shipped checkpoints against the best that there is without them."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+from pathlib import Path
+
+from eval.renderer import page
+from eval.renderer.datasets import require_data
+from eval.renderer.networks import find_weights
+from eval.renderer.parts import Found, Parts, worst_family
+from eval.renderer.settings import Part, RendererSettings
+from eval.report.outcome import Outcome
+from eval.report.stage_table import stage_section
+from eval.results import Row
+from eval.stages import script_path
+from tron.cli.installation import require_own_packages
+from tron.errors import TronError
+from tron.runtime import set_torch_threads
+from tron.storage import sha256
+
+log = logging.getLogger("tron.eval")
+
+WITHOUT_WEIGHTS: tuple[Part, ...] = ("kills", "cosmos")
+
+
+class Renderer(RendererSettings):
+    """Parts of the benchmark; data sets and trainings that are finished are not made again."""
+
+    def check(self) -> None:
+        """Find the commands, the checkpoints and the data sets that were given."""
+        require_own_packages("datagen", "train")
+        for name in ("tron-datagen", "tron-train"):
+            script_path(name)
+        require_data(self.data)
+        for kind, folder in self.training.items():
+            if not folder.is_dir():
+                raise TronError(f"no training of {kind}", folder, "give the output_dir of tron-train")
+        if self.train or set(self.parts) <= set(WITHOUT_WEIGHTS):
+            return
+        if self.pair is None and self.lit is None:
+            raise TronError(
+                "no checkpoint to judge", mend="give benchmark.pair or benchmark.lit, or train=true"
+            )
+        for given in (self.pair, self.lit):
+            if given is not None:
+                find_weights(given)
+
+    def run(self, output_dir: Path) -> Outcome:
+        """Measure part after part; one line on stderr for each figure.
+
+        Raises:
+            StageFailed: a command failed.
+            TronError: data or weights are not what they should be.
+        """
+        self.check()
+        set_torch_threads(self.threads)
+        folder = output_dir.absolute()
+        parts = Parts(self, folder)
+        found: dict[Part, list[Found]] = {}
+        rows: list[Row] = []
+        for part in self.parts:
+            stages = parts.datasets.stages
+            stages.restart(f"part {part}")  # a figure of this run, never of one before
+            with stages.timed(f"part {part}", [shlex.split(_typed([part], folder))]):
+                found[part] = parts.measure(part)
+                fresh = [row for each in found[part] for row in each.rows(self.seed)]
+            for row in fresh:
+                log.info("%s: %.4g %s", row.metric, row.value, row.unit)
+            rows += fresh
+        families = worst_family(found, self.seed)
+        if families:
+            worst = min(families.values(), key=lambda row: row.value)
+            rows.append(worst.model_copy(update={"metric": "renderer.lit.worst_family_gain_db"}))
+        pictures = folder / "pictures"
+        sections = [
+            section for part in found.values() for each in part for section in each.sections(pictures)
+        ]
+        return Outcome(
+            rows=rows,
+            title="The neural renderer: better than anything without it, on what it never saw",
+            verdict=page.verdict({row.metric: row for row in rows}),
+            lead=page.LEAD,
+            sections=[
+                *page.parts_section({part: self.what.get(part, "") for part in self.parts}),
+                *page.families_section(families),
+                *sections,
+                *stage_section(parts.datasets.stages.records),
+            ],
+            headline=page.HEADLINE,
+            reproduce=[_typed(self.parts, output_dir)],
+            inputs=self._inputs(parts),
+        )
+
+    def _inputs(self, parts: Parts) -> dict[str, object]:
+        """Hashes of the checkpoints, and the settings."""
+        judged = {} if set(self.parts) <= set(WITHOUT_WEIGHTS) else parts.weights
+        return {
+            **{f"{kind}_sha256": sha256(path) for kind, path in judged.items()},
+            "settings": self.model_dump(mode="json", exclude={"targets", "what"}),
+        }
+
+
+def _typed(parts: list[Part], output_dir: Path) -> str:
+    return f"tron-eval benchmark=renderer benchmark.parts=[{','.join(parts)}] output_dir={output_dir}"

@@ -1,0 +1,147 @@
+"""The benchmark `renderer` end to end at toy sizes, and what it says to bad input."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from eval.cli import cli
+from eval.results import Results
+from tron.images import read_image
+
+TINY = [
+    *("train_b.scenes=0", "validation.scenes=0", "train.scenes=0", "test.scenes=2", "test.style=table"),
+    *("test.lights=[sun]", "test.frames=5", "test.moving_objects=1", "test.still_camera=true"),
+    *("test.width=32", "test.height=32", "test.path_spp=16", "test.guidance_spp=2"),
+    *("views=4", "view_width=32", "view_height=32", "surfels=1500", "refine_steps=0", "mesh_edge=0.2"),
+    *("test.reference_spp=4", "environment_height=32", "workers=1"),
+]
+"""Clips in which an object moves before a still camera."""
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as end:
+        cli(["benchmark=renderer", *arguments])
+    return end.value.code  # type: ignore[return-value]
+
+
+def listed(values: list[str]) -> str:
+    return json.dumps(values).replace(", ", ",")
+
+
+def checkpoints(weights: Path) -> list[str]:
+    pair, lit = weights / "tiny_of_two.safetensors", weights / "tiny.safetensors"
+    return [f"benchmark.pair={pair}", f"benchmark.lit={lit}"]
+
+
+def test_untrained_networks_gain_nothing_over_the_buffer_that_they_start_from(
+    dataset: Path, weights: Path, tmp_path: Path
+):
+    """They return pbr and lit: gains over these are zero, and seeds change nothing."""
+    data = f"benchmark.data={{synthetic_128: {dataset},synthetic_256: {dataset}}}"
+    code = run(
+        f"output_dir={tmp_path}",
+        "benchmark.parts=[synthetic,seeds,throughput]",
+        data,
+        *checkpoints(weights),
+        *("benchmark.pixel_mlp=null", "benchmark.pictures=2", "benchmark.seeds.training=[]"),
+        *("benchmark.throughput.sizes=[16]", "benchmark.throughput.rounds=1"),
+    )
+    assert code == 0
+    results = Results.load(tmp_path / "results.json")
+    assert results.value("renderer.gain_over_pbr_db") == pytest.approx(0, abs=1e-3)
+    assert results.value("renderer.lit.gain_over_lit_db") == pytest.approx(0, abs=1e-3)
+    assert results.value("renderer.lit.worst_family_gain_db") == pytest.approx(0, abs=1e-3)
+    assert results.value("renderer.seed_max_difference") == 0
+    row = results.find("renderer.gain_db")
+    assert row is not None
+    assert row.value < 0
+    assert row.scenes == 2
+    assert row.reference == "target: at least 2 dB"
+    for end in ("_full", "_full.256", ".256.sun", ".studio"):
+        assert results.find(f"renderer.lit.gain_db{end}") is not None
+    assert (results.value("renderer.training_frames_per_second.16") or 0) > 0
+    page = (tmp_path / "report.html").read_text()
+    for section in ("parts", "families", "synthetic", "sweep", "seeds", "throughput"):
+        assert f'<section id="{section}">' in page
+    strips = sorted((tmp_path / "pictures").glob("renderer-synthetic-256-*.png"))
+    assert len(strips) == 2
+    assert read_image(strips[0]).shape == (256 + 4 + 256, 6 * 256, 3)
+
+
+@pytest.mark.long
+def test_clips_and_shadows_from_seeds(weights: Path, tmp_path: Path):
+    """The data are made by tron-datagen, once; an untrained network reacts to shadows as lit does."""
+    arguments = [
+        f"output_dir={tmp_path}",
+        "benchmark.parts=[clips,shadows]",
+        f"benchmark.synthetic={{128: {listed(TINY)}}}",
+        f"benchmark.shadows={listed(TINY)}",
+        *checkpoints(weights),
+    ]
+    assert run(*arguments) == 0
+    results = Results.load(tmp_path / "results.json")
+    for way in ("newest", "mean", "anchor"):
+        ratio = results.value(f"renderer.lit.warp_error_ratio.{way}")
+        assert ratio == pytest.approx(1, abs=1e-3), "it returns lit, whatever its window"
+    assert results.value("renderer.lit.shadow_correlation") == pytest.approx(
+        results.value("renderer.lit_buffer.shadow_correlation"), abs=1e-3
+    )
+    made = (tmp_path / "synthetic_128" / "manifest.json").stat().st_mtime_ns
+    assert run(*arguments) == 0
+    assert (tmp_path / "synthetic_128" / "manifest.json").stat().st_mtime_ns == made
+
+
+@pytest.mark.long
+def test_trainings_that_are_ended_come_out_the_same(dataset: Path, tmp_path: Path):
+    short = "stages=[{name: only, split: train, steps: 60, batch_size: 2, crop: 16}]"
+    code = run(
+        f"output_dir={tmp_path}",
+        "benchmark.parts=[kills]",
+        f"benchmark.data={{kills: {dataset}}}",
+        "benchmark.kills.count=2",
+        f"benchmark.kills.training={listed([short, 'validation.split=null', 'checkpoint_every=20'])}",
+    )
+    assert code == 0
+    row = Results.load(tmp_path / "results.json").find("renderer.kill_identical")
+    assert row is not None
+    assert (row.value, row.n) == (2, 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["benchmark.pair=nowhere.safetensors"], "weights not found"),
+        (["benchmark.pair=null", "benchmark.lit=null"], "no checkpoint to judge"),
+        (["benchmark.data={synthetic_128: nowhere}"], "no data set synthetic_128"),
+        (["benchmark.training={pair: nowhere}"], "no training of pair"),
+        (["benchmark.parts=[synthetics]"], "parts"),
+    ],
+)
+def test_bad_input_is_refused_in_a_line_before_anything_is_made(
+    arguments: list[str],
+    words: str,
+    weights: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    out = tmp_path / "out"
+    assert run(f"output_dir={out}", *checkpoints(weights), *arguments) == 2
+    assert words in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_checkpoint_is_given_for_what_it_sees(
+    dataset: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    given = ["benchmark.parts=[throughput]", f"benchmark.pair={weights / 'tiny.safetensors'}"]
+    assert run(f"output_dir={tmp_path / 'out'}", *given, "benchmark.lit=null") == 2
+    assert "give it as benchmark.lit" in capsys.readouterr().err
+
+
+def test_a_pickle_is_no_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = tmp_path / "evil.safetensors"
+    path.write_bytes(b"\x80\x04cos\nsystem\n(S'touch /tmp/owned'\ntR.")
+    given = ["benchmark.parts=[throughput]", f"benchmark.pair={path}", "benchmark.lit=null"]
+    assert run(f"output_dir={tmp_path / 'out'}", *given) == 2
+    assert str(path) in capsys.readouterr().err
