@@ -64,8 +64,7 @@ class Renderer(nn.Module):
         raise NotImplementedError
 
     def temporal_weights(self) -> dict[str, nn.Parameter]:
-        """Parameters by name of the paths between frames: they start from adding nothing, and one frame alone
-        does not use them. Here none."""
+        """Parameters by name of the paths between frames, which start from adding nothing; here none."""
         return {}
 
     def calibrate(self, videos: Iterable[Tensor]) -> None:
