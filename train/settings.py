@@ -15,7 +15,7 @@ from tron.dataset_folder import DatasetPlace
 LoggerName = Literal["csv", "tensorboard", "wandb"]
 
 HELD_OUT = "test"
-"""The split that evaluation judges by."""
+"""The split that evaluation judges by; so are those whose names begin with it, as test_relit."""
 
 
 class OptimizerSettings(BaseModel):
@@ -228,11 +228,7 @@ class Settings(BaseModel):
     @classmethod
     def _places(cls, splits: dict[str, str]) -> dict[str, str]:
         for name, value in splits.items():
-            if SplitPlace.parse(name, value).split == HELD_OUT:
-                raise ValueError(
-                    f"{name} asks for the split '{HELD_OUT}', which is kept for evaluation: training never "
-                    "reads it"
-                )
+            _require_training_split(name, SplitPlace.parse(name, value).split)
         return splits
 
     @model_validator(mode="after")
@@ -251,12 +247,15 @@ class Settings(BaseModel):
 
     @model_validator(mode="after")
     def _test_is_held_out(self) -> Settings:
-        read = {"validation.split": {self.validation.split}}
-        read |= {f"stage {stage.name}": set(stage.splits()) for stage in self.stages}
-        for name, splits in read.items():
-            if HELD_OUT in splits:
-                raise ValueError(
-                    f"{name} asks for the split '{HELD_OUT}', which is kept for evaluation: training never "
-                    "reads it"
-                )
+        _require_training_split("validation.split", self.validation.split)
+        for stage in self.stages:
+            for split in stage.splits():
+                _require_training_split(f"stage {stage.name}", split)
         return self
+
+
+def _require_training_split(name: str, split: str | None) -> None:
+    if split is not None and (split == HELD_OUT or split.startswith(f"{HELD_OUT}_")):
+        raise ValueError(
+            f"{name} asks for the split '{split}', which is kept for evaluation: training never reads it"
+        )

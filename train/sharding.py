@@ -47,8 +47,6 @@ def require_shardable(settings: Settings, processes: Processes) -> None:
             "strategy=fsdp shares the weights out among processes, and this run has one",
             mend="give devices=2 or more, or strategy=auto",
         )
-    if settings.optimizer.ema_decay is not None:
-        raise TronError("strategy=fsdp keeps no averages", mend="leave optimizer.ema_decay null")
     if settings.precision not in ("32-true", "bf16-mixed"):
         raise TronError(
             f"strategy=fsdp with precision={settings.precision}", mend="give 32-true or bf16-mixed"

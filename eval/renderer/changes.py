@@ -38,8 +38,8 @@ def stayed(clip: Clip, before: int, now: int) -> np.ndarray:
     same &= np.abs(color - dyed).max(-1) <= SAME_COLOR
     now_solid, then_solid = solid[..., 0] > 0.5, there[..., 0] > 0.5
     same |= ~now_solid & ~then_solid  # sky has no normal
-    far = ~binary_dilation(~same, np.ones((3, 3), bool))
-    return far & now_solid & then_solid
+    changed = np.asarray(binary_dilation(~same, np.ones((3, 3), bool)), bool)
+    return ~changed & now_solid & then_solid
 
 
 def change_sums(truth: np.ndarray, ours: np.ndarray) -> np.ndarray:

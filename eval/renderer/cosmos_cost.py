@@ -185,6 +185,7 @@ def measure(
     torch.manual_seed(0)
     dtype = torch.bfloat16 if bf16 else torch.float32
     renderer = NeuralRenderer(CosmosConfig(window=1), WanCodec(AutoencoderKLWan())).to(dtype)
+    assert isinstance(renderer.backbone, Backbone)
     transformer = renderer.backbone.transformer
     seconds: dict[str, list[float]] = {"forward": [], "step": []}
     for width, height, frames in shapes:
