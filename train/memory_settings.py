@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class MemorySettings(BaseModel):
-    """What is kept for the backward pass."""
+    """Memory of the backward pass."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

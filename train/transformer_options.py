@@ -1,4 +1,4 @@
-"""How a transformer's blocks are run: recomputed in the backward pass, compiled."""
+"""Options of a transformer's blocks: recomputed in the backward pass, compiled."""
 
 from __future__ import annotations
 
