@@ -1,4 +1,4 @@
-"""What a curriculum asks of its splits and of its network, checked before anything is decoded or trained."""
+"""Checks of a curriculum against its splits and its network, before anything is decoded or trained."""
 
 from __future__ import annotations
 
