@@ -124,6 +124,13 @@ class StageClock:
         self.shown = 0.0
         self._since: float | None = None
 
+    def __deepcopy__(self, memo: dict[int, object]) -> StageClock:
+        """The clock itself: the copy of a module that weights are averaged in goes by the same time.
+
+        What it agrees on the time with are other processes, of which there is no copy.
+        """
+        return self
+
     def start(self) -> None:
         """Let the clock run."""
         self._since = time.monotonic()

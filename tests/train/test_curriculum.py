@@ -1,5 +1,6 @@
 """Stages and their clock: what the schedule promises at its ends and in between."""
 
+import copy
 import time
 from itertools import pairwise
 
@@ -55,6 +56,18 @@ def test_a_pace_by_time_ignores_the_steps_and_stands_still_while_stopped():
     assert clock.seconds() == reached
     clock.shown = reached
     assert clock.progress(0) == reached / 10
+
+
+def test_a_copied_module_goes_by_the_same_clock():
+    """Averaging copies modules; what a clock of several processes agrees with cannot be copied."""
+    agree = (each for each in (1.5,))
+    with pytest.raises(TypeError):
+        copy.deepcopy(agree)
+    clock = StageClock(10, 3.0, lambda _, told=agree: next(told))
+    held = {"clock": clock, "again": [clock]}
+    assert copy.deepcopy(held)["clock"] is clock
+    clock.look()
+    assert clock.progress(0) == 0.5
 
 
 @pytest.mark.parametrize(
