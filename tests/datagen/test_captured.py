@@ -24,7 +24,7 @@ from datagen.captured_reconstruction import PHASES
 from datagen.captured_settings import Shares
 from datagen.merge import merge
 from datagen.plan import Work, estimate_bytes, plan
-from datagen.projection import project
+from datagen.projection import captured_cost, project
 from datagen.run import make
 from datagen.settings import SPLITS, Settings
 from datagen.source_list import read_source_list
@@ -212,8 +212,31 @@ def test_photos_that_are_too_small_or_too_few_in_a_row_are_told(recipe, tmp_path
 def test_a_plan_says_what_is_missing_and_makes_nothing(recipe, tmp_path):
     text = project(recipe(tmp_path / "out"))
     assert "3 of 3: train-000000" in text
-    assert "rough law" in text
+    assert "a rough law, within a factor of two" in text
     assert not (tmp_path / "out").exists()
+
+
+def gigabytes(text: str, row: str) -> float:
+    return float(text.split(f"\n{row}")[1].split()[0])
+
+
+def test_what_is_asked_for_bounds_what_stays_and_clips_are_those_that_photos_give(recipe, tmp_path):
+    """Scenes of several splits are under way at once no more than those of one."""
+    text = project(recipe(tmp_path / "out", "cluster=local", "workers=3"))
+    assert gigabytes(text, "asked for") > gigabytes(text, "bytes on disk") > 0
+    for photos, frames, every, clips in ((48, 5, 8, 12), (48, 5, 0, 10), (12, 5, 0, 3), (3, 5, 0, 1)):
+        settings = recipe(tmp_path, f"captured.frames={frames}", f"captured.photos.test_every={every}")
+        assert Work("train", 0, "a", 0, "a", photos).photo_clips(settings) == clips
+
+
+def test_hours_of_captures_are_near_what_sixteen_took(recipe, tmp_path):
+    paper = {"captured.reconstruction.radiance.steps": 30_000, "captured.reconstruction.materials.steps": 7000}
+    settings = recipe(
+        *(tmp_path, "captured.width=128", "captured.height=96", "captured.reconstruction.steps_scaler=0.1"),
+        *(f"{key}={value}" for key, value in paper.items()),
+    )
+    cost = captured_cost([Work("train", 0, "a", 0, "a", 47)], settings)
+    assert 0.8 < cost.seconds / (7.6 * 60) < 1.25
 
 
 @pytest.mark.parametrize(
