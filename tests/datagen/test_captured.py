@@ -79,6 +79,8 @@ def test_every_capture_is_wholly_in_one_split_and_all_of_it_is_accounted_for(pai
     assert "| train | 1 | 3 | 9 | 20 x 16 |" in card
     assert "photos" in card
     assert "Mitsuba's path tracer" not in card
+    assert "bytes of linear values, but for `rgb`: photos are display values" in card
+    assert "bytes of linear values, but for `rgb`: photos are display values" in card
 
 
 def test_clips_hold_neighbouring_photos_as_display_values_and_all_guidance(pairs: Path, tiny_captures: Path):
@@ -230,11 +232,9 @@ def test_what_is_asked_for_bounds_what_stays_and_clips_are_those_that_photos_giv
 
 
 def test_hours_of_captures_are_near_what_sixteen_took(recipe, tmp_path):
-    paper = {"captured.reconstruction.radiance.steps": 30_000, "captured.reconstruction.materials.steps": 7000}
-    settings = recipe(
-        *(tmp_path, "captured.width=128", "captured.height=96", "captured.reconstruction.steps_scaler=0.1"),
-        *(f"{key}={value}" for key, value in paper.items()),
-    )
+    how = ("steps_scaler=0.1", "radiance.steps=30000", "materials.steps=7000")
+    size = ("captured.width=128", "captured.height=96")
+    settings = recipe(tmp_path, *size, *(f"captured.reconstruction.{key}" for key in how))
     cost = captured_cost([Work("train", 0, "a", 0, "a", 47)], settings)
     assert 0.8 < cost.seconds / (7.6 * 60) < 1.25
 
@@ -244,7 +244,7 @@ def test_hours_of_captures_are_near_what_sixteen_took(recipe, tmp_path):
     [
         ("captures=null", "captures=DIR"),
         ("captures=s3://bucket/captures", "local folder"),
-        ("train.scenes=3", "train is of source=synthetic"),
+        ("train.scenes=3", "train.scenes is of source=synthetic"),
         ("environments=maps", "environments is of source=synthetic"),
         ("mode=captures", "mode=captures is of source=synthetic"),
         ("disjoint_from=[outputs/demo]", "disjoint_from is of source=synthetic"),
