@@ -18,9 +18,10 @@ from PIL import Image
 
 import datagen.captured_reconstruction
 import datagen.captured_scene
+from datagen.blind_capture import write_blind_capture
 from datagen.captured_folder import apportioned, split_of
 from datagen.captured_photos import balanced, frame_of, in_order, rows_of_photos, starts
-from datagen.captured_reconstruction import PHASES
+from datagen.captured_reconstruction import PHASES, load
 from datagen.captured_settings import Shares
 from datagen.merge import merge
 from datagen.plan import Work, estimate_bytes, plan
@@ -34,6 +35,7 @@ from tron.captures import Capture, View, load_capture
 from tron.cli.recipes import check, compose_recipe
 from tron.color import linear_to_srgb, srgb_to_linear
 from tron.errors import TronError
+from tron.images import encode_png
 from tron.seeds import generator
 from tron.shards.manifest import Manifest
 from tron.shards.reader import read_clips
@@ -209,6 +211,21 @@ def test_photos_that_are_too_small_or_too_few_in_a_row_are_told(recipe, tmp_path
         output = tmp_path / override.partition("=")[0]
         assert make(recipe(output, override, "only=[train-000000]")) == 1
         assert said in (output / "failures.jsonl").read_text()
+
+
+def test_a_photo_that_is_no_image_is_told_once(recipe, tiny_captures, tmp_path, caplog):
+    """A capture is read twice, its photos reduced and as they are."""
+    poses = {view.name: view.camera for view in load_capture(tiny_captures / "test-000000").views}
+    files = {name: encode_png(np.zeros((pose.height, pose.width, 3))) for name, pose in poses.items()}
+    broken = next(iter(files))
+    files[broken] = b"no image"
+    write_blind_capture(tmp_path / "captures" / "mine", poses, files, ".png", None)
+    item = Work("train", 0, "train-000000", 0, "mine")
+    settings = recipe(tmp_path / "out", captures=tmp_path / "captures")
+    for reduced in (True, False):
+        (reason,) = load(item, settings, tmp_path / "work", reduced).skipped.values()
+        assert reason == "damaged, or not an image"
+    assert caplog.text.count("(damaged, or not an image)") == 1
 
 
 def test_a_plan_says_what_is_missing_and_makes_nothing(recipe, tmp_path):
