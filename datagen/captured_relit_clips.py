@@ -87,7 +87,8 @@ def require_own_truth(item: Work, settings: Settings, photos: Capture) -> None:
 
 def _near(one: Camera, other: Camera, spread: float) -> bool:
     turned = np.degrees(np.arccos(np.clip(one.forward @ other.forward, -1, 1)))
-    return turned < MOST_TURNED and np.linalg.norm(one.position - other.position) < MOST_MOVED * spread
+    moved = np.linalg.norm(one.position - other.position)
+    return bool(turned < MOST_TURNED and moved < MOST_MOVED * spread)
 
 
 def _require_truth(views: Sequence[View], truth: RelitTruth) -> None:
