@@ -48,16 +48,8 @@ def made_clips(
         TronError: there are too few photos in a row, or they are too small.
     """
     wanted = settings.captured
-    rows = [row for row in rows_of_photos(capture) if len(row) >= wanted.frames]
-    if not rows:
-        longest = max(map(len, rows_of_photos(capture)), default=0)
-        raise TronError(
-            f"{longest} photos are the most in a row, a clip has {wanted.frames}",
-            str(settings.captures and settings.captures / item.capture),
-            "make captured.frames smaller, or hold out fewer (captured.photos.test_every=0)",
-        )
+    rows = usable_rows(item, settings, capture)
     views = [view for row in rows for view in row]
-    require_size(views, wanted.width, wanted.height)
     with Spool(scene_folder(settings.output_dir, item.name), clips=1) as spool:
         cameras, exposure = _film(settings, capture, found, surfels, views, spool)
         about = _About(item, settings, found, exposure, capture.exposure)
@@ -68,6 +60,24 @@ def made_clips(
                 clips.append((about.meta(len(clips), views[which], cameras[which]), frames[which]))
             first += len(row)
         yield clips
+
+
+def usable_rows(item: Work, settings: Settings, capture: Capture) -> list[list[View]]:
+    """Photos in rows that are long enough for a clip.
+
+    Raises:
+        TronError: there are none, or a photo of them is smaller than a frame.
+    """
+    wanted, found = settings.captured, rows_of_photos(capture)
+    rows = [row for row in found if len(row) >= wanted.frames]
+    if not rows:
+        raise TronError(
+            f"{max(map(len, found), default=0)} photos are the most in a row, a clip has {wanted.frames}",
+            str(settings.captures and settings.captures / item.capture),
+            "make captured.frames smaller, or hold out fewer (captured.photos.test_every=0)",
+        )
+    require_size((view for row in rows for view in row), wanted.width, wanted.height)
+    return rows
 
 
 def _film(

@@ -19,6 +19,9 @@ log = logging.getLogger(__name__)
 PICTURES = frozenset(SUFFIXES)
 """Suffixes of files that are counted as photos, to estimate bytes and time; what reads them decides."""
 
+OWN = Path("captures", "manifest.json")
+"""What tron-datagen's own captures have below its output_dir."""
+
 
 @dataclass(frozen=True)
 class FoundCapture:
@@ -44,6 +47,12 @@ def find_captures(settings: Settings) -> list[FoundCapture]:
     assert folder is not None
     if not folder.is_dir():
         raise TronError("captures is no folder", folder, "give the local folder that holds them")
+    if settings.output_dir.resolve().is_relative_to(folder.resolve()):
+        raise TronError(
+            "output_dir lies in captures, whose sub-folders are captures", settings.output_dir, "give another"
+        )
+    if (folder / OWN).is_file():
+        raise TronError("captures lie one folder down", folder, f"give captures={folder / OWN.parent}")
     if has_transforms(folder) or (folder / "sparse").is_dir():
         raise TronError(
             "captures is a capture itself", folder, "give the folder that holds it: one capture a sub-folder"
@@ -119,6 +128,13 @@ def split_by_name(names: Sequence[str]) -> dict[Split, list[str]]:
             mend=f"rename it, such as train-{others[0]}, or leave captured.split_by_name out",
         )
     return found
+
+
+def named_by_split(settings: Settings) -> bool:
+    """Whether all captures are named by splits, as pseudo-captures are, and the settings take no note."""
+    names = [each.name for each in find_captures(settings)]
+    heads = tuple(f"{split}-" for split in SPLITS)
+    return not settings.captured.split_by_name and all(name.startswith(heads) for name in names)
 
 
 def apportioned(shares: Mapping[Split, float], total: int) -> dict[Split, int]:

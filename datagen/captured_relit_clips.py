@@ -15,13 +15,16 @@ from datagen.plan import Work
 from datagen.settings import Settings
 from datagen.spool import Frame
 from tron.cameras import Camera
-from tron.captures import View
+from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder
 from tron.errors import TronError
 from tron.shading.environment import EnvironmentMap
 from tron.shards.schema import MEMBERS, TARGET, ClipMeta, clip_members
 
 log = logging.getLogger(__name__)
+
+MOST_TURNED, MOST_MOVED = 2.0, 0.05
+"""Degrees, and share of the photos' distance from their middle, that a named pose may be off the true one."""
 
 
 def relit_clips(
@@ -45,8 +48,6 @@ def relit_clips(
         log.info("%s (%s): relit by %s", item.name, item.capture, truth.folder.name)
         capture = read_capture_folder(truth.folder)
         views = sorted(capture.views, key=lambda view: in_order(view.name))
-        _require_truth(views, truth)
-        require_size(views, settings.captured.width, settings.captured.height)
         environment = EnvironmentMap.load(truth.environment)
         lit = surfels.under(environment, "relit", truth.number)
         for number, start in enumerate(starts(len(views), settings.captured.relit_frames)):
@@ -55,6 +56,39 @@ def relit_clips(
             cameras = [camera for camera, _ in made]
             meta = _meta(item, settings, truth, environment, capture.exposure, number, chosen, cameras)
             yield meta, [frame for _, frame in made]
+
+
+def require_own_truth(item: Work, settings: Settings, photos: Capture) -> None:
+    """Make sure that what ``captured.relit`` shows of a capture is of this very capture, and can be used.
+
+    Relit views are named after the photos whose places they are seen from, and a pseudo-capture's poses are
+    off by little.
+
+    Raises:
+        TronError: a folder cannot be read, is not linear or without masks, its views are too small, or seen
+            from elsewhere than the photos of their names.
+    """
+    cameras = {view.name: view.camera for view in photos.views}
+    centres = np.array([camera.position for camera in cameras.values()])
+    spread = float(np.median(np.linalg.norm(centres - np.median(centres, 0), axis=1)))
+    for truth in find_relit(settings, item.capture):
+        views = read_capture_folder(truth.folder).views
+        _require_truth(views, truth)
+        require_size(views, settings.captured.width, settings.captured.height)
+        for view in views:
+            own = cameras.get(view.name)
+            if own is None or not _near(own, view.camera, spread):
+                raise TronError(
+                    f"view {view.name} is not seen from where the photo of that name was taken",
+                    truth.folder,
+                    f"give the relit folder that was made with {settings.captures}",
+                )
+
+
+def _near(one: Camera, other: Camera, spread: float) -> bool:
+    turned = np.degrees(np.arccos(np.clip(one.forward @ other.forward, -1, 1)))
+    moved = np.linalg.norm(one.position - other.position)
+    return bool(turned < MOST_TURNED and moved < MOST_MOVED * spread)
 
 
 def _require_truth(views: Sequence[View], truth: RelitTruth) -> None:

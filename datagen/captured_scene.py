@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import drjit as dr
 
-from datagen.captured_clips import made_clips
+from datagen.captured_clips import made_clips, usable_rows
 from datagen.captured_reconstruction import clear_work, find, kept, load, tell
-from datagen.captured_relit_clips import relit_clips
+from datagen.captured_relit_clips import relit_clips, require_own_truth
 from datagen.captured_reuse import take_over
 from datagen.captured_surfels import CapturedSurfels
 from datagen.clock import stage
@@ -41,6 +41,9 @@ def make_capture(item: Work, settings: Settings, sources: Sources) -> Record:  #
     with stage("read"):
         capture = load(item, settings, folder, reduced=True)
         photos = load(item, settings, folder, reduced=False)
+        # Minutes of reconstruction later it would be too late to say so.
+        usable_rows(item, settings, photos)
+        require_own_truth(item, settings, photos)
     found = kept(folder, capture)
     if found is None:
         with stage("reconstruct"):

@@ -19,6 +19,7 @@ class ClipRow(BaseModel):
         light_family: of its light.
         contrast: class of its light. contrast_share: what that is by, the share of the light from the
             brightest hundredth of the sphere; None where a clip does not say.
+        capture: folder of photos that it is made from; empty for synthetic scenes.
         exposure: factor on linear values before AgX.
         width, height: of its frames, pixels.
         shard: file that holds it; thumbnail: its picture beside the shards, None where there is none.
@@ -33,6 +34,7 @@ class ClipRow(BaseModel):
     light_family: str
     contrast: str
     contrast_share: float | None
+    capture: str = ""
     exposure: float
     frames: int
     width: int
@@ -51,6 +53,7 @@ def clip_row(meta: ClipMeta, shard: str, thumbnail: str | None) -> ClipRow:
         light_family=meta.light_family,
         contrast=meta.extra.get("contrast", "unknown"),
         contrast_share=meta.extra.get("contrast_share"),
+        capture=meta.extra.get("capture", ""),
         exposure=meta.exposure,
         frames=meta.frames,
         width=meta.width,

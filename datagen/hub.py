@@ -36,6 +36,7 @@ COLUMNS = pa.schema(
         *(pa.field(name, pa.string()) for name in ("key", "scene", "split", "style", "light_family")),
         pa.field("contrast", pa.string()),
         pa.field("contrast_share", pa.float64()),
+        pa.field("capture", pa.string()),
         pa.field("exposure", pa.float64()),
         *(pa.field(name, pa.int32()) for name in ("frames", "width", "height")),
         pa.field("shard", pa.string()),

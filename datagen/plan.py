@@ -204,15 +204,23 @@ def _plan_captured(settings: Settings) -> list[Work]:
 
 
 def chosen(items: list[Work], only: Iterable[str]) -> list[Work]:
-    """The scenes, or captures, named by ``only``, all if it is empty; TronError names one that lacks."""
+    """The scenes named by ``only``, all if it is empty; TronError names one that lacks.
+
+    A name that no scene has may be a capture's: pseudo-captures are named as scenes are.
+    """
     names = list(only)
-    known = {name for item in items for name in (item.name, item.capture) if name}
+    scenes = {item.name for item in items}
+    captures = {item.capture for item in items if item.capture} - scenes
     for name in names:
-        if name not in known:
+        if name not in scenes | captures:
             raise TronError(
                 "no such scene in this dataset", name, f"scenes are {items[0].name} to {items[-1].name}"
             )
-    return [item for item in items if not names or item.name in names or item.capture in names]
+    return [
+        item
+        for item in items
+        if not names or item.name in names or (item.capture in captures and item.capture in names)
+    ]
 
 
 def find_sources(settings: Settings) -> Sources:

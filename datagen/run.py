@@ -15,6 +15,7 @@ import drjit as dr
 
 from datagen.account import read_other, write_account
 from datagen.build import Geometry
+from datagen.captured_folder import named_by_split
 from datagen.captured_reconstruction import clear_work, require_prior
 from datagen.captured_reuse import require_reusable
 from datagen.captured_scene import make_capture
@@ -70,6 +71,11 @@ def make(settings: Settings) -> int:
     other = read_other(settings.variety_against) if settings.variety_against is not None else None
     output = settings.output_dir
     if settings.source == "captured":
+        if named_by_split(settings):
+            log.warning(
+                "captures are named by split, and the shares put them elsewhere: "
+                "captured.split_by_name=true keeps test captures out of train"
+            )
         require_prior(settings)
         require_reusable(settings)
     with locked(output):

@@ -24,7 +24,7 @@ from datagen.captured_photos import balanced, frame_of, in_order, rows_of_photos
 from datagen.captured_reconstruction import PHASES, load
 from datagen.captured_settings import Shares
 from datagen.merge import merge
-from datagen.plan import Work, estimate_bytes, plan
+from datagen.plan import Work, chosen, estimate_bytes, plan
 from datagen.projection import captured_cost, project
 from datagen.run import make
 from datagen.settings import SPLITS, Settings
@@ -308,13 +308,30 @@ def test_captures_without_the_source_are_refused():
 
 
 def test_a_folder_that_is_no_folder_of_captures_is_refused(recipe, tiny_captures, tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "above/captures").mkdir(parents=True)
+    (tmp_path / "above/captures/manifest.json").touch()
     for captures, said in (
         (tmp_path / "nothing", "no folder"),
-        (tmp_path, "holds no captures"),
+        (tmp_path / "empty", "holds no captures"),
         (tiny_captures / "test-000000", "a capture itself"),
+        (tmp_path / "above", "one folder down"),
+        (tmp_path, "output_dir lies in captures"),
     ):
         with pytest.raises(TronError, match=said):
             plan(recipe(tmp_path / "out", captures=captures))
+
+
+def test_only_takes_the_scene_of_a_name_and_a_capture_where_no_scene_has_it():
+    items = [
+        Work("train", 0, "train-000000", 0, "train-000001"),
+        Work("train", 1, "train-000001", 100, "test-000000"),
+        Work("train", 2, "train-000002", 200, "fox"),
+    ]
+    assert [item.name for item in chosen(items, ["train-000001"])] == ["train-000001"]
+    assert [item.name for item in chosen(items, ["fox", "test-000000"])] == ["train-000001", "train-000002"]
+    with pytest.raises(TronError, match="no such scene"):
+        chosen(items, ["horse"])
 
 
 def test_the_folder_of_another_source_is_refused(pairs, tmp_path, tiny_scenes):

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import datagen.captured_scene
-from datagen.captured_folder import split_by_name
+from datagen.captured_folder import named_by_split, split_by_name
 from datagen.plan import plan
 from datagen.run import make
 from datagen.settings import Settings
@@ -189,6 +190,36 @@ def test_a_folder_that_does_not_go_with_the_captures_is_refused_in_a_line(
             make(recipe(tmp_path / "out", *overrides))
         assert "\n" not in str(error.value)
         assert not (tmp_path / "out").exists()
+
+
+def test_truth_of_another_capture_under_this_name_fails_before_reconstruction(
+    recipe: Recipe, relit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Names alone would pair a scene's surfels with another scene's truth."""
+    monkeypatch.setattr(datagen.captured_scene, "find", never)
+    for name in LIGHTS:
+        truth = read_capture_folder(relit / f"{NAME}_{name}")
+        views = [replace(view, camera=_turned(view.camera)) for view in truth.views]
+        light = {"environment.exr": (relit / f"{NAME}_{name}" / "environment.exr").read_bytes()}
+        write_capture(tmp_path / "relit" / f"{NAME}_{name}", replace(truth, views=tuple(views)), beside=light)
+    assert make(recipe(tmp_path / "out", f"captured.relit={tmp_path / 'relit'}")) == 1
+    assert "is not seen from where the photo" in (tmp_path / "out/failures.jsonl").read_text()
+
+
+def never(*_: object) -> None:
+    raise AssertionError("it is reconstructed")
+
+
+def _turned(camera: Camera) -> Camera:
+    """The camera on the other side of the up axis."""
+    half = np.diag([-1.0, -1.0, 1.0, 1.0])
+    return replace(camera, world_to_camera=camera.world_to_camera @ half)
+
+
+def test_captures_that_are_named_by_split_are_noticed(recipe: Recipe, tmp_path: Path):
+    assert not named_by_split(recipe(tmp_path / "out"))
+    settings = recipe(tmp_path / "out", "captured.split_by_name=false", "captured.relit=null")
+    assert named_by_split(settings)
 
 
 def test_captures_keep_the_split_that_their_names_say():
