@@ -10,13 +10,15 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import tron.captures
 from datagen.plan import Work
 from datagen.settings import Settings
 from tron.captures import Capture, LoadSettings, load_capture
@@ -93,20 +95,34 @@ def tell(item: Work, phase: str) -> None:
 
 
 def load(item: Work, settings: Settings, folder: Path, reduced: bool) -> Capture:
-    """The capture, its photos as large as the reconstruction wants them or as they are."""
+    """The capture, its photos as large as the reconstruction wants them or as they are.
+
+    What is wrong with photos is told of the reduced ones alone: of the others it is the same.
+    """
     wanted = settings.captured.photos
     whole = {} if reduced else {"max_side": None, "downscale": None}
     assert settings.captures is not None
-    return load_capture(
-        settings.captures / item.capture,
-        LoadSettings(
-            **{**{name: getattr(wanted, name) for name in type(wanted).model_fields}, **whole},
-            workspace=folder / WORK / "structure_from_motion",
-            threads=1,
-            seed=integer(settings.seed, "captured", item.capture, "poses", bits=31),
-            cache_bytes=CACHE_BYTES,
-        ),
+    how = LoadSettings(
+        **{**{name: getattr(wanted, name) for name in type(wanted).model_fields}, **whole},
+        workspace=folder / WORK / "structure_from_motion",
+        threads=1,
+        seed=integer(settings.seed, "captured", item.capture, "poses", bits=31),
+        cache_bytes=CACHE_BYTES,
     )
+    with nullcontext() if reduced else _quiet_reading():
+        return load_capture(settings.captures / item.capture, how)
+
+
+@contextmanager
+def _quiet_reading() -> Iterator[None]:
+    """Say nothing of what reading a capture finds."""
+    teller = logging.getLogger(tron.captures.__name__)
+    before = teller.level
+    teller.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        teller.setLevel(before)
 
 
 def kept(folder: Path, capture: Capture) -> Found | None:

@@ -19,7 +19,7 @@ from datagen.clip_rows import ClipRow
 from datagen.contact_sheet import SHEET_NAME
 from datagen.hub import configurations, front_matter
 from datagen.plan import Figures, Refinement, Sources, config_sha256
-from datagen.settings import OUTSIDE, SHARD_SPLITS, Settings
+from datagen.settings import OUTSIDE, RELIT, SHARD_SPLITS, Settings
 from datagen.source_list import SOURCES_NAME, SourceList
 from datagen.variety import MEASURES, VARIETY_NAME, Histograms, Other, median
 from tron.cli.recipes import complete, compose_recipe, group_options
@@ -310,9 +310,19 @@ def _reading(settings: Settings, clips: Mapping[str, int]) -> list[str]:
         lines += [f"Splits whose clips hold other files are configurations of their own: {others}.", ""]
     return [
         *lines,
-        "A frame's file is a column, such as `f00.rgb.exr`: OpenEXR bytes of linear values. `meta.json` "
-        "holds cameras, exposure and light.",
+        f"A frame's file is a column, such as `f00.rgb.exr`: OpenEXR bytes of {_values(settings, clips)}. "
+        "`meta.json` holds cameras, exposure and light.",
     ]
+
+
+def _values(settings: Settings, clips: Mapping[str, int]) -> str:
+    """Meaning of the numbers in a frame's files, in words."""
+    if settings.source == "synthetic":
+        return "linear values"
+    relit = any(split.endswith(RELIT) for split in clips)
+    return "linear values, but for `rgb`: photos are display values, as `color_space` in `meta.json` says" + (
+        f" (in splits whose names end in `{RELIT}` it is linear too)" if relit else ""
+    )
 
 
 def _files(sources: Sources) -> tuple[Asset, ...]:

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from datagen.assets import Asset, Refused, find_environments, find_models
 from datagen.captured_folder import find_captures, split_by_name, split_of
+from datagen.captured_photos import starts
 from datagen.captured_relit import find_relit
 from datagen.clip_preview import preview_bytes
 from datagen.clip_rows import ClipRow
@@ -49,7 +50,7 @@ class Work:
     Attributes:
         capture: name of the capture that it is; empty where it is synthetic.
         photos: about how many that has.
-        relit: how many views of it there are under other lights, all lights together.
+        relit: frames of its clips under other lights, all lights together.
     """
 
     split: str
@@ -67,8 +68,13 @@ class Work:
         return len(settings.split(self.split).lights)
 
     def photo_clips(self, settings: Settings) -> int:
-        """Clips that a capture's photos are cut into, about."""
-        return max(self.photos // settings.captured.frames, 1)
+        """Clips that a capture's photos are cut into: what is held out breaks their row."""
+        frames, every, clips = settings.captured.frames, settings.captured.photos.test_every, 0
+        last = self.photos
+        if every:
+            rows, rest = divmod(self.photos, every)
+            clips, last = rows * len(starts(every - 1, frames)), rest - 1
+        return max(clips + len(starts(last, frames)), 1)
 
     def frames(self, settings: Settings) -> int:
         """Frames of all its clips, about."""
@@ -179,7 +185,11 @@ def _plan_captured(settings: Settings) -> list[Work]:
         splits = split_by_name(list(photos))
     else:
         splits = split_of(list(photos), settings.captured.shares, settings.seed)
-    relit = {name: sum(truth.views for truth in find_relit(settings, name)) for name in photos}
+    frames = settings.captured.relit_frames
+    relit = {
+        name: sum(len(starts(truth.views, frames)) * frames for truth in find_relit(settings, name))
+        for name in photos
+    }
     items = [
         Work(split, i, scene_name(split, i), i * CAPTURE_SHARDS, name, photos[name], relit[name])
         for split, names in splits.items()
@@ -264,13 +274,24 @@ def _size(path: Path) -> int | None:
 
 
 def estimate_bytes(settings: Settings, items: Iterable[Work], shards: bool = True) -> int:
-    """Bytes that making scenes may take on disk, their shards too or the rest alone.
+    """Bytes that making scenes may take on disk: what stays, and what waits in those under way at one time.
 
-    Half-precision EXR hardly compresses noise. Previews are counted, and what waits on disk in the scenes
-    that are under way at one time.
+    Args:
+        settings: the recipe.
+        items: scenes to make.
+        shards: count their shards too, or the rest alone.
     """
-    total, waiting = 0, 0
-    items, surfels = list(items), settings.surfels
+    items = list(items)
+    waiting = max((scratch_bytes(settings, item.split, item.photos) for item in items), default=0)
+    return kept_bytes(settings, items, shards) + waiting * worker_count(settings, len(items))[0]
+
+
+def kept_bytes(settings: Settings, items: Iterable[Work], shards: bool = True) -> int:
+    """Bytes that finished scenes keep, as if nothing compressed: shards if asked for, previews, surfels.
+
+    Half-precision EXR hardly compresses noise.
+    """
+    total, surfels = 0, settings.surfels
     if settings.source == "captured":
         surfels = settings.captured.reconstruction.radiance.density.most
     for item in items:
@@ -281,8 +302,7 @@ def estimate_bytes(settings: Settings, items: Iterable[Work], shards: bool = Tru
         stored = item.frames(settings) * frame if shards else 0
         previews = preview_bytes(recipe.width, recipe.height, recipe.frames, len(members))
         total += stored + item.clips(settings) * previews + surfels * SURFEL_BYTES
-        waiting = max(waiting, scratch_bytes(settings, item.split, item.photos))
-    return total + waiting * worker_count(settings, len(items))[0]
+    return total
 
 
 def config_text(settings: Settings) -> str:

@@ -19,6 +19,7 @@ from datagen.failures import Failure
 from datagen.patience import Patience
 from datagen.plan import Sources, Work
 from datagen.settings import Settings
+from datagen.source_list import tell_stand_ins
 from datagen.store import StoreError
 from tron.cli.progress import Progress
 from tron.cli.termination import termination_unwinds
@@ -67,6 +68,8 @@ def make_each(
             written.
     """
     failed: dict[str, Failure] = {}
+    if items:
+        tell_stand_ins(settings, sources)
     # Closed here, whatever ends the block: workers do not outlive it.
     with (
         termination_unwinds(),

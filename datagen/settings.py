@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import (
+    BaseModel,
     Field,
     ValidationInfo,
     ValidatorFunctionWrapHandler,
@@ -23,6 +24,7 @@ from datagen.settings_model import SettingsModel
 from datagen.split_settings import SplitSettings
 from datagen.surfel_settings import SurfelReconstruction, SurfelSources
 from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounces
+from tron.nested import leaves
 
 Mode = Literal["make", "plan", "validate", "merge", "captures", "pseudo_captures", "equal_error", "sharing"]
 Split = Literal["train", "train_b", "validation", "test"]
@@ -362,8 +364,10 @@ class Settings(ScaleSettings):
             return self
         if self.captures is not None:
             raise ValueError("captures is of source=captured: give source=captured, or leave it out")
-        if self.mode in ("captures", "pseudo_captures") and (self.shard or self.store):
-            raise ValueError(f"shard and store are of datasets: leave them out with mode={self.mode}")
+        if self.mode in ("captures", "pseudo_captures"):
+            for name in ("shard", "store"):
+                if getattr(self, name):
+                    raise ValueError(f"{name} is of datasets: leave it out with mode={self.mode}")
         captures = self.mode == "captures"
         lights = {"capture": self.capture.lights} if captures else {}
         for name in ["test"] if captures else self.used_splits():
@@ -392,8 +396,10 @@ class Settings(ScaleSettings):
             raise ValueError(f"mode={self.mode} is of source=synthetic")
         ours = OF_CAPTURES | OF_BOTH_SOURCES | OUTSIDE - {"variety_against", "disjoint_from"}
         for name, field in type(self).model_fields.items():
-            if name not in ours and getattr(self, name) != field.get_default(call_default_factory=True):
-                raise ValueError(f"{name} is of source=synthetic: leave it out with source=captured")
+            default = field.get_default(call_default_factory=True)
+            if name not in ours and getattr(self, name) != default:
+                key = _first_difference(name, getattr(self, name), default)
+                raise ValueError(f"{key} is of source=synthetic: leave it out with source=captured")
         require_bounces(self.bounces, self.reflections)
 
     def _ask_hdri(self, lights: list[LightChoice]) -> bool:
@@ -460,3 +466,11 @@ class Settings(ScaleSettings):
 
 def _without_scenes(split: Any) -> bool:
     return isinstance(split, Mapping) and split.get("scenes") == 0
+
+
+def _first_difference(name: str, value: Any, default: Any) -> str:
+    """Dotted key, as it is typed, of the first setting below ``name`` that is not the default's."""
+    if not isinstance(value, BaseModel) or not isinstance(default, BaseModel):
+        return name
+    given, shipped = (leaves({name: each.model_dump(mode="json")}) for each in (value, default))
+    return next((key for key in given if given[key] != shipped.get(key)), name)

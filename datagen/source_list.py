@@ -79,12 +79,10 @@ def slots(settings: Settings, sources: Sources) -> Filled | None:
 
 
 def require_slots(settings: Settings, sources: Sources) -> Sources:
-    """The sources without maps that the checklist does not name, and a word on empty slots."""
+    """The sources without maps that the checklist does not name."""
     found = slots(settings, sources)
     if found is None:
         return sources
-    if found.missing or found.model_share < 1:
-        log.warning("%s mode=plan lists them", found.stand_ins().sentence)
     named = {asset.path for asset in found.present} if found.checklist.maps else None
     if named is None or len(named) == len(sources.maps):
         return sources
@@ -95,6 +93,13 @@ def require_slots(settings: Settings, sources: Sources) -> Sources:
         maps=tuple(asset for asset, keep in zip(sources.maps, kept) if keep),
         environments=tuple(light for light, keep in zip(sources.environments, kept) if keep),
     )
+
+
+def tell_stand_ins(settings: Settings, sources: Sources) -> None:
+    """Warn of empty slots of the checklist, which procedural things fill."""
+    found = slots(settings, sources)
+    if found is not None and (found.missing or found.model_share < 1):
+        log.warning("%s mode=plan lists them", found.stand_ins().sentence)
 
 
 def of_split(settings: Settings, sources: Sources, split: str) -> Sources:

@@ -17,6 +17,13 @@ from tron.shards.verify import verify
 
 log = logging.getLogger(__name__)
 
+CHECKED = (
+    (CAPTURES, "capture", "captures"),
+    (TRUTH, "folder of their truth", "folders of their truth"),
+    (RELIT, "folder of relit views", "folders of relit views"),
+)
+"""Folders of captures below a dataset's, and what one of theirs is called."""
+
 
 def validate(folder: Path, disjoint_from: Sequence[Path] = (), store: str | None = None) -> int:
     """Log every problem of a dataset and of the captures beside it, one line each, and return their number.
@@ -35,7 +42,7 @@ def validate(folder: Path, disjoint_from: Sequence[Path] = (), store: str | None
     captures = folder / CAPTURES
     problems = [
         f"{name}/{problem}"
-        for name in (CAPTURES, TRUTH, RELIT)
+        for name, _, _ in CHECKED
         if (folder / name).is_dir()
         for problem in verify_captures(folder / name)
     ]
@@ -50,17 +57,25 @@ def validate(folder: Path, disjoint_from: Sequence[Path] = (), store: str | None
         log.info("no dataset here, captures alone")
     for problem in problems:
         log.error("%s", problem)
-    if captures.is_dir():
-        log.info("%d captures", len(capture_names(captures)))
-    log.info("%d problems", len(problems))
+    if found := [
+        _number(len(capture_names(folder / name)), one, several)
+        for name, one, several in CHECKED
+        if (folder / name).is_dir()
+    ]:
+        log.info("checked, file by file: %s", ", ".join(found))
+    log.info("%s", _number(len(problems), "problem"))
     return len(problems)
+
+
+def _number(count: int, one: str, several: str = "") -> str:
+    return f"{count} {one if count == 1 else several or one + 's'}"
 
 
 def _store_problems(store: str) -> int:
     problems = verify(store)
     for problem in problems:
         log.error("%s", problem)
-    log.info("%d problems in %s", len(problems), store)
+    log.info("%s in %s", _number(len(problems), "problem"), store)
     return len(problems)
 
 
@@ -73,5 +88,5 @@ def _dataset_problems(folder: Path) -> list[str]:
             if not (folder / "scenes" / scene / name).is_file():
                 problems.append(f"scenes/{scene}/{name}: missing")
     clips = sum(entry.samples for entry in manifest.shards)
-    log.info("%d shards, %d clips", len(manifest.shards), clips)
+    log.info("%s, %s", _number(len(manifest.shards), "shard"), _number(clips, "clip"))
     return problems

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -86,20 +86,34 @@ class Stage(BaseModel):
         )
 
 
-def require_splits(stages: Sequence[Stage], there: Container[str]) -> None:
-    """Make sure that a curriculum's captures are there; other splits are missed where they are opened.
+def require_splits(stages: Sequence[Stage], there: Sequence[str]) -> None:
+    """Make sure that a curriculum's splits are there.
 
     Raises:
-        TronError: a stage learns from train_b, and there is no such split.
+        TronError: some are not; it names all of them, those of the first stage first.
     """
+    lacking: dict[str, list[str]] = {}
     for stage in stages:
-        if CAPTURES in stage.splits() and CAPTURES not in there:
-            raise TronError(
-                f"stage {stage.name} learns from the split '{CAPTURES}', which is not there",
-                mend="give a dataset of captures, made by tron-datagen source=captured: "
-                f"'splits={{{CAPTURES}: \"FOLDER#train\"}}'; or make one with {CAPTURES}.scenes above 0 to "
-                "stand in",
-            )
+        for split in stage.splits():
+            if split not in there:
+                lacking.setdefault(split, []).append(stage.name)
+    if not lacking:
+        return
+    named = [f"'{split}' (stage {', '.join(names)})" for split, names in lacking.items()]
+    mends = []
+    if lacking.keys() - {CAPTURES}:
+        first = next(split for split in lacking if split != CAPTURES)
+        mends.append(f"say where splits are: 'splits={{{first}: \"FOLDER#SPLIT\"}}'")
+    if CAPTURES in lacking:
+        mends.append(
+            f"'{CAPTURES}' is of captures, made by tron-datagen source=captured: "
+            f"'splits={{{CAPTURES}: \"FOLDER#train\"}}'; or make a dataset with {CAPTURES}.scenes above 0 to "
+            "stand in"
+        )
+    raise TronError(
+        f"no split {', '.join(named)} in the dataset, which has: {', '.join(there)}",
+        mend="; ".join(mends),
+    )
 
 
 class StageClock:

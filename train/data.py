@@ -153,7 +153,7 @@ class TrainingData(lightning.LightningDataModule):
 
         guidance: members that the network is conditioned on.
         """
-        require_splits(stages, self.splits)
+        require_splits(stages, self.splits.names())
         self.members = (*guidance, TARGET)
         used = list(dict.fromkeys(split for stage in stages for split in stage.splits()))
         for stage in stages:

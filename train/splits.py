@@ -36,6 +36,10 @@ class Splits:
     def __contains__(self, name: str) -> bool:
         return name in self._places or name in self._manifests[str(self._dataset)].splits()
 
+    def names(self) -> list[str]:
+        """All splits that can be read, by name."""
+        return sorted({*self._places, *self._manifests[str(self._dataset)].splits()})
+
     def clips(self, name: str) -> ClipStore:
         """Clips of a split; TronError, naming those there are, where there is none."""
         if name not in self._stores:

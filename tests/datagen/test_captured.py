@@ -18,13 +18,14 @@ from PIL import Image
 
 import datagen.captured_reconstruction
 import datagen.captured_scene
+from datagen.blind_capture import write_blind_capture
 from datagen.captured_folder import apportioned, split_of
 from datagen.captured_photos import balanced, frame_of, in_order, rows_of_photos, starts
-from datagen.captured_reconstruction import PHASES
+from datagen.captured_reconstruction import PHASES, load
 from datagen.captured_settings import Shares
 from datagen.merge import merge
 from datagen.plan import Work, chosen, estimate_bytes, plan
-from datagen.projection import project
+from datagen.projection import captured_cost, project
 from datagen.run import make
 from datagen.settings import SPLITS, Settings
 from datagen.source_list import read_source_list
@@ -34,6 +35,7 @@ from tron.captures import Capture, View, load_capture
 from tron.cli.recipes import check, compose_recipe
 from tron.color import linear_to_srgb, srgb_to_linear
 from tron.errors import TronError
+from tron.images import encode_png
 from tron.seeds import generator
 from tron.shards.manifest import Manifest
 from tron.shards.reader import read_clips
@@ -79,6 +81,8 @@ def test_every_capture_is_wholly_in_one_split_and_all_of_it_is_accounted_for(pai
     assert "| train | 1 | 3 | 9 | 20 x 16 |" in card
     assert "photos" in card
     assert "Mitsuba's path tracer" not in card
+    assert "bytes of linear values, but for `rgb`: photos are display values" in card
+    assert "bytes of linear values, but for `rgb`: photos are display values" in card
 
 
 def test_clips_hold_neighbouring_photos_as_display_values_and_all_guidance(pairs: Path, tiny_captures: Path):
@@ -209,11 +213,47 @@ def test_photos_that_are_too_small_or_too_few_in_a_row_are_told(recipe, tmp_path
         assert said in (output / "failures.jsonl").read_text()
 
 
+def test_a_photo_that_is_no_image_is_told_once(recipe, tiny_captures, tmp_path, caplog):
+    """A capture is read twice, its photos reduced and as they are."""
+    poses = {view.name: view.camera for view in load_capture(tiny_captures / "test-000000").views}
+    files = {name: encode_png(np.zeros((pose.height, pose.width, 3))) for name, pose in poses.items()}
+    broken = next(iter(files))
+    files[broken] = b"no image"
+    write_blind_capture(tmp_path / "captures" / "mine", poses, files, ".png", None)
+    item = Work("train", 0, "train-000000", 0, "mine")
+    settings = recipe(tmp_path / "out", captures=tmp_path / "captures")
+    for reduced in (True, False):
+        (reason,) = load(item, settings, tmp_path / "work", reduced).skipped.values()
+        assert reason == "damaged, or not an image"
+    assert caplog.text.count("(damaged, or not an image)") == 1
+
+
 def test_a_plan_says_what_is_missing_and_makes_nothing(recipe, tmp_path):
     text = project(recipe(tmp_path / "out"))
     assert "3 of 3: train-000000" in text
-    assert "rough law" in text
+    assert "a rough law, within a factor of two" in text
     assert not (tmp_path / "out").exists()
+
+
+def gigabytes(text: str, row: str) -> float:
+    return float(text.split(f"\n{row}")[1].split()[0])
+
+
+def test_what_is_asked_for_bounds_what_stays_and_clips_are_those_that_photos_give(recipe, tmp_path):
+    """Scenes of several splits are under way at once no more than those of one."""
+    text = project(recipe(tmp_path / "out", "cluster=local", "workers=3"))
+    assert gigabytes(text, "asked for") > gigabytes(text, "bytes on disk") > 0
+    for photos, frames, every, clips in ((48, 5, 8, 12), (48, 5, 0, 10), (12, 5, 0, 3), (3, 5, 0, 1)):
+        settings = recipe(tmp_path, f"captured.frames={frames}", f"captured.photos.test_every={every}")
+        assert Work("train", 0, "a", 0, "a", photos).photo_clips(settings) == clips
+
+
+def test_hours_of_captures_are_near_what_sixteen_took(recipe, tmp_path):
+    how = ("steps_scaler=0.1", "radiance.steps=30000", "materials.steps=7000")
+    size = ("captured.width=128", "captured.height=96")
+    settings = recipe(tmp_path, *size, *(f"captured.reconstruction.{key}" for key in how))
+    cost = captured_cost([Work("train", 0, "a", 0, "a", 47)], settings)
+    assert 0.8 < cost.seconds / (7.6 * 60) < 1.25
 
 
 @pytest.mark.parametrize(
@@ -221,7 +261,7 @@ def test_a_plan_says_what_is_missing_and_makes_nothing(recipe, tmp_path):
     [
         ("captures=null", "captures=DIR"),
         ("captures=s3://bucket/captures", "local folder"),
-        ("train.scenes=3", "train is of source=synthetic"),
+        ("train.scenes=3", "train.scenes is of source=synthetic"),
         ("environments=maps", "environments is of source=synthetic"),
         ("mode=captures", "mode=captures is of source=synthetic"),
         ("disjoint_from=[outputs/demo]", "disjoint_from is of source=synthetic"),

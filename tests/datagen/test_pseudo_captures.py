@@ -318,8 +318,27 @@ def test_validation_finds_damage_of_photos_and_of_truth(output, tmp_path, file, 
     assert f"{file}: " in caplog.text
 
 
-def test_whole_folders_are_valid(output):
+def test_whole_folders_are_valid_and_what_was_looked_at_is_said(output, caplog):
+    caplog.set_level("INFO")
     assert validate(output) == 0
+    assert "2 captures, 2 folders of their truth, 2 folders of relit views" in caplog.text
+    assert "0 problems" in caplog.text
+
+
+def test_several_machines_make_a_set_by_only(output, tmp_path, files_of):
+    """As docs/clusters.md says: each makes some, copies but manifests, and the command again."""
+    parts = [tmp_path / "a", tmp_path / "b"]
+    for part, name in zip(parts, NAMES):
+        assert make_pseudo_captures(tiny(part, f"only=[{name}]")) == 0
+    shutil.copytree(
+        parts[1], parts[0], dirs_exist_ok=True, ignore=shutil.ignore_patterns("manifest.json", "logs")
+    )
+    before = {path: path.stat().st_mtime_ns for path in parts[0].rglob("*.jpg")}
+    assert make_pseudo_captures(tiny(parts[0])) == 0
+    assert before == {path: path.stat().st_mtime_ns for path in before}, "nothing is made again"
+    assert validate(parts[0]) == 0
+    for folder in ("captures", "truth", "relit"):
+        assert files_of(parts[0] / folder) == files_of(output / folder)
 
 
 def test_a_failed_capture_is_accounted_for_and_leaves_nothing(tmp_path, monkeypatch):
@@ -366,7 +385,7 @@ def test_more_scenes_may_be_added(output, tmp_path):
 
 @pytest.mark.parametrize("wrong", ["shard=1/2", "store=file:///nowhere"])
 def test_parts_and_stores_are_of_datasets(tmp_path, wrong):
-    with pytest.raises(TronError, match="shard and store are of datasets"):
+    with pytest.raises(TronError, match=f"'?{wrong.partition('=')[0]} is of datasets: leave it out"):
         tiny(tmp_path, wrong)
 
 

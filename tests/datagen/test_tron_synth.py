@@ -19,6 +19,7 @@ from datagen.plan import find_sources, plan
 from datagen.ready_sources import ready_sources
 from datagen.run import make
 from datagen.scene import draw_scene
+from datagen.scheduling import make_each
 from datagen.settings import Settings
 from datagen.source_list import SOURCES_NAME, of_split, read_source_list, source_list
 from datagen.split_settings import SplitSettings
@@ -303,3 +304,17 @@ def test_a_damaged_checklist_is_one_line_and_exit_code_2(text: str, tmp_path: Pa
     assert stopped.value.code == 2
     assert "checklist cannot be read" in capsys.readouterr().err
     assert not (tmp_path / "out" / "manifest.json").exists()
+
+
+def test_stand_ins_are_told_when_work_begins_and_not_before(tmp_path: Path, variant: str, caplog):
+    settings = composed("experiment=tron_synth_small", "cluster=none", f"output_dir={tmp_path}")
+    sources = ready_sources(settings)
+    assert "stand-ins" not in caplog.text
+    make_each(_nothing, [], settings, sources, lambda _: 1, "clips")
+    assert "stand-ins" not in caplog.text
+    make_each(_nothing, plan(settings)[:2], settings, sources, lambda _: 1, "clips")
+    assert caplog.text.count("62 of 62 named assets of TRON-Synth are procedural stand-ins") == 1
+
+
+def _nothing(*_: object) -> None:
+    """What is made is not the question."""

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from train.curriculum import Stage, StageClock, learning_rate_factor
+from train.curriculum import Stage, StageClock, learning_rate_factor, require_splits
+from tron.errors import TronError
 
 STAGE = Stage(name="one", split="train", steps=1000, learning_rate=0.5, final_learning_rate=0.01)
 
@@ -68,6 +69,22 @@ def test_a_copied_module_goes_by_the_same_clock():
     assert copy.deepcopy(held)["clock"] is clock
     clock.look()
     assert clock.progress(0) == 0.5
+
+
+def test_all_splits_that_lack_are_named_at_once_the_first_stage_s_first():
+    names = [("images", "train"), ("adapt", "train_b"), ("video", "train_b")]
+    stages = [Stage(name=name, split=split, steps=1) for name, split in names]
+    require_splits(stages, ["test", "train", "train_b"])
+    with pytest.raises(TronError) as said:
+        require_splits(stages, ["test", "train_relit"])
+    assert said.value.what == (
+        "no split 'train' (stage images), 'train_b' (stage adapt, video) in the dataset, which has: test, "
+        "train_relit"
+    )
+    assert "splits={train: " in str(said.value)
+    assert "splits={train_b: " in str(said.value)
+    with pytest.raises(TronError, match=r"no split 'train_b' \(stage adapt, video\)"):
+        require_splits(stages, ["train"])
 
 
 @pytest.mark.parametrize(

@@ -376,7 +376,7 @@ def test_a_curriculum_without_its_captures_says_what_to_give(dataset, tmp_path):
     manifest.model_copy(update={"shards": kept}).save(folder)
     data = TrainingData(folder, DataSettings(), 0, ValidationSettings())
     stages = [Stage(name="one", split="train", steps=1), Stage(name="two", split="train_b", steps=1)]
-    with pytest.raises(TronError, match=r"stage two .*source=captured: 'splits=") as caught:
+    with pytest.raises(TronError, match=r"stage two\) .*source=captured: 'splits=") as caught:
         data.open(stages)
     (typed,) = shlex.split(re.findall(r"'splits=.*?'", str(caught.value))[0])
     override = OverridesParser.create().parse_override(typed)

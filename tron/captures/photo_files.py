@@ -106,7 +106,7 @@ def inspect_photo(path: Path) -> PhotoHeader:
     except TronError as error:
         raise TronError(error.what, path, error.mend) from error
     except UnidentifiedImageError as error:
-        raise TronError("not an image of a known format", path, f"use {', '.join(SUFFIXES)}") from error
+        raise TronError("damaged, or not an image", path) from error
     except OSError as error:
         raise TronError(f"cannot read image: {error.strerror or error}", path) from error
     except Exception as error:  # damaged files raise almost anything: SyntaxError, struct.error, ...

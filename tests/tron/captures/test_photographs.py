@@ -148,6 +148,12 @@ def test_a_jpeg_damaged_in_its_middle_is_found(tmp_path: Path, kind: str, progre
         inspect_photo(tmp_path / "a.jpg")
 
 
+def test_a_text_under_the_name_of_a_photo_is_no_image(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_text("not a photo")
+    with pytest.raises(TronError, match="damaged, or not an image"):
+        inspect_photo(tmp_path / "a.jpg")
+
+
 def test_a_png_damaged_in_its_middle_is_found(tmp_path: Path) -> None:
     Image.fromarray(noise(64, 80, 3)).save(tmp_path / "a.png")
     (tmp_path / "a.png").write_bytes(damaged((tmp_path / "a.png").read_bytes(), "zeros"))
