@@ -60,7 +60,8 @@ class ValidationStrips(Callback):
 
     def _rows(self, trainer: lightning.Trainer, module: RendererModule) -> Iterator[np.ndarray]:
         for window in self.data.pictured_windows(self.stage):
-            batch = {name: video.to(module.device) for name, video in window.items()}
+            moved = {name: video.to(module.device) for name, video in window.items()}
+            batch = trainer.precision_plugin.convert_input(moved)  # as Lightning does with every batch
             with torch.no_grad(), trainer.precision_plugin.forward_context():
                 shown = module.renderer(batch)
             videos = [*(batch[name] for name in module.renderer.config.guidance), shown, batch[TARGET]]
