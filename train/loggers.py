@@ -29,6 +29,7 @@ class RunLoggers:
         self.names, self.folder = set(names), folder
         for name in sorted(self.names - {"csv"}):
             try:
+                # Both spelled out: a test reads literals, to hold imports against pyproject.toml.
                 import_module("tensorboard") if name == "tensorboard" else import_module("wandb")
             except ImportError as error:
                 raise TronError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import lightning
 import numpy as np
@@ -42,12 +43,21 @@ class ValidationStrips(Callback):
         self.folder, self.stage, self.data = folder, stage, data
         self.earlier_steps = earlier_steps
 
-    def on_validation_epoch_start(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    def on_validation_batch_start(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
     ) -> None:
-        """Render the frames, while the network is that of the validation."""
+        """Render the frames before the first batch, with averaged weights in place and shards gathered.
+
+        At the epoch's start a callback comes before the module, and gathering takes all processes.
+        """
+        del batch, dataloader_idx
         assert isinstance(pl_module, RendererModule)
-        if not trainer.is_global_zero:
+        if batch_idx > 0 or not trainer.is_global_zero:
             return
         rows = list(self._rows(trainer, pl_module))
         if not rows:

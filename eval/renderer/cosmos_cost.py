@@ -3,7 +3,7 @@
 Measured are passes of the full architecture over small frames, on this machine's CPU; projected is a clip of
 1024 x 576, K = 5, on the same processor. Time follows `a + b n + c n²` in the transformer's tokens n: all but
 attention is linear, the codec too. Memory of activations is counted at full size without doing the pass
-(tron.neural.live_memory); it is linear in tokens, for attention never holds the square matrix.
+(eval.renderer.live_memory); it is linear in tokens, for attention never holds the square matrix.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ import numpy as np
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from eval.renderer.live_memory import LiveMemory
 from eval.results import Row
 from tron.errors import TronError
 from tron.neural.backbone import Backbone
 from tron.neural.configs import COSMOS_0_6B, BackboneConfig, CosmosConfig
-from tron.neural.live_memory import LiveMemory
 from tron.neural.renderer import NeuralRenderer
 from tron.neural.wan import WanCodec
 

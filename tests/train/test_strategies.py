@@ -13,13 +13,13 @@ from pydantic import ValidationError
 from safetensors.torch import load_file
 from torch._inductor import config as inductor_config
 
+from eval.renderer.live_memory import LiveMemory
 from train.cli import main
 from train.settings import Settings
 from train.transformer_options import apply_options, transformer_blocks
 from tron.errors import TronError
 from tron.neural.backbone import transformer
 from tron.neural.configs import COSMOS_0_6B, BackboneConfig
-from tron.neural.live_memory import LiveMemory
 from tron.neural.pixel_mlp import PixelMLP
 from tron.neural.weights import load_cosmos
 

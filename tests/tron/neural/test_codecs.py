@@ -90,23 +90,6 @@ def vae() -> AutoencoderKLWan:
     return AutoencoderKLWan(base_dim=8, num_res_blocks=1).eval()
 
 
-@pytest.mark.parametrize("frames", [1, 5])
-def test_wan_latents_and_pictures_are_diffusers_own(vae, frames):
-    x = video(frames, 32, 48, batch=1)
-    codec = WanCodec(vae)
-    mean, std = (
-        torch.tensor(v).view(1, -1, 1, 1, 1) for v in (vae.config.latents_mean, vae.config.latents_std)
-    )
-    with torch.no_grad():
-        z = codec.encode(x)
-        torch.testing.assert_close(z, (vae.encode(x).latent_dist.mode() - mean) / std, atol=0, rtol=0)
-        shown = codec.decode(z * 3)
-        torch.testing.assert_close(
-            shown.clamp(-1, 1), vae.decode(z * 3 * std + mean).sample, atol=1e-6, rtol=0
-        )
-    assert shown.shape == x.shape
-
-
 def test_wan_gradients_survive_checkpointing_and_saturation(vae):
     z = WanCodec(vae).encode(video(5, 32, 32, batch=1)) * 30
     gradients = []

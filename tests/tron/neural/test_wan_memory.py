@@ -4,7 +4,7 @@ import pytest
 import torch
 from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
 
-from tron.neural.live_memory import LiveMemory
+from eval.renderer.live_memory import LiveMemory
 from tron.neural.wan import WanCodec
 
 
