@@ -18,7 +18,7 @@ from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.color import luminance
 from tron.errors import TronError
-from tron.priors.linear_light import inverse_agx
+from tron.priors.linear_light import decoded, inverse_agx
 from tron.shards.schema import MEMBERS, TARGET, ClipMeta, ColorSpace, clip_members
 
 OPAQUE = 0.9
@@ -36,7 +36,7 @@ def made_clips(
     """Clips of a capture with their frames, which are read when they are asked for, within the block.
 
     Each frame holds the schema's members: guidance in the capture's own light, linear, and the photo as rgb,
-    display values.
+    display values, or with ``captured.linear`` linear light on the scale of the guidance.
 
     Args:
         item, settings: the capture and its recipe.
@@ -99,7 +99,10 @@ def _film(
         guidance = lit.view(photo.camera, view.name, BLACK if alone else None)
         opaque = guidance.mask > 0.5
         seen = (opaque if photo.foreground is None else photo.foreground) & photo.believed
-        truth = {TARGET: photo.shown, "foreground": seen.astype(np.float32)}
+        rgb = photo.shown
+        if wanted.linear:
+            rgb = decoded(rgb, capture.tone_curve) / np.float32(capture.exposure)
+        truth = {TARGET: rgb, "foreground": seen.astype(np.float32)}
         spool.add(0, stored_guidance(guidance) | truth)
         ratios.append(light_ratio(photo, guidance.lit * capture.exposure, seen & (guidance.mask > OPAQUE)))
         cameras.append(photo.camera)
@@ -166,7 +169,7 @@ class _About:
             height=wanted.height,
             cameras=[camera.to_dict() for camera in cameras],
             exposure=self.exposure,
-            color_space={**spaces, TARGET: "display"},
+            color_space={**spaces, TARGET: "linear" if wanted.linear else "display"},
             seeds={"root": self.settings.seed},
             spp={"guidance": wanted.guidance_spp},
             extra={

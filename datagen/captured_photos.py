@@ -13,9 +13,8 @@ from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.photo_files import SUFFIXES
 from tron.captures.view import ToneCurve
-from tron.color import agx, linear_to_srgb, srgb_to_linear
 from tron.errors import TronError
-from tron.priors.linear_light import inverse_agx
+from tron.priors.linear_light import decoded, encoded
 
 Box = tuple[float, float, float, float]
 """Left, top, right and bottom, pixels."""
@@ -120,12 +119,11 @@ def balanced(
 
     Both are done in linear light. A gain of one changes no bit.
     """
-    decode, encode = (srgb_to_linear, linear_to_srgb) if curve == "srgb" else (inverse_agx, agx)
-    linear = np.asarray(decode(display), np.float32)
-    moved = encode((linear / gain).astype(np.float32)) - encode(linear)
+    linear = np.asarray(decoded(display, curve), np.float32)
+    moved = encoded((linear / gain).astype(np.float32), curve) - encoded(linear, curve)
     shown = np.clip(display + moved, 0.0, 1.0)
     if mask is not None and (mask < 1).any():
-        over = encode(np.asarray(decode(shown), np.float32) * mask[..., None])
+        over = encoded(np.asarray(decoded(shown, curve), np.float32) * mask[..., None], curve)
         shown = np.where(mask[..., None] < 1, over, shown)
     return np.asarray(shown, np.float32)
 

@@ -69,6 +69,12 @@ class CapturedSettings(SettingsModel):
         description="Photos are shown as their capture's mean photo would: each divided by its own exposure "
         "and white balance, which the surfels tell. false: as stored; the gains are in the metadata.",
     )
+    linear: bool = Field(
+        default=False,
+        description="Photos become linear light, decoded by the curve that they are thought to have gone "
+        "through (sRGB; of path-traced ones AgX): training and evaluation then show them through AgX, like "
+        "all other data. false: display values, with the looks of their own curve.",
+    )
     guidance_spp: int = Field(
         default=64, ge=2, multiple_of=2, description="Shadow rays per pixel of the surfels' irradiance, even."
     )

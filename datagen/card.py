@@ -212,12 +212,13 @@ def _origin(settings: Settings) -> str:
             f"about {settings.surfels:,} surfels a scene, from {settings.views} views. Buffers are linear;"
         )
     shown = "as the mean photo of their capture would show them" if settings.captured.balance else "as stored"
+    values = "decoded to linear light" if settings.captured.linear else "display values"
     relit = (
         "In splits whose names end in `_relit`, guidance is of the same surfels under lights that the photos "
         "never saw, and `rgb` is what was path-traced under them, linear. "
     )
     return (
-        f"Frames (`rgb`) are photos, display values, {shown}; guidance by TRON's surfel tracer on surfels "
+        f"Frames (`rgb`) are photos, {values}, {shown}; guidance by TRON's surfel tracer on surfels "
         "and light that were reconstructed from the same photos, `scenes/NAME/spec.json` says how well. "
         f"{relit if settings.captured.relit is not None else ''}Guidance is linear;"
     )
@@ -317,7 +318,7 @@ def _reading(settings: Settings, clips: Mapping[str, int]) -> list[str]:
 
 def _values(settings: Settings, clips: Mapping[str, int]) -> str:
     """Meaning of the numbers in a frame's files, in words."""
-    if settings.source == "synthetic":
+    if settings.source == "synthetic" or settings.captured.linear:
         return "linear values"
     relit = any(split.endswith(RELIT) for split in clips)
     return "linear values, but for `rgb`: photos are display values, as `color_space` in `meta.json` says" + (

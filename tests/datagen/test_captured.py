@@ -33,7 +33,7 @@ from datagen.validate import validate
 from tron.cameras import Camera
 from tron.captures import Capture, View, load_capture
 from tron.cli.recipes import check, compose_recipe
-from tron.color import linear_to_srgb, srgb_to_linear
+from tron.color import agx, linear_to_srgb, srgb_to_linear
 from tron.errors import TronError
 from tron.images import encode_png
 from tron.seeds import generator
@@ -82,7 +82,6 @@ def test_every_capture_is_wholly_in_one_split_and_all_of_it_is_accounted_for(pai
     assert "photos" in card
     assert "Mitsuba's path tracer" not in card
     assert "bytes of linear values, but for `rgb`: photos are display values" in card
-    assert "bytes of linear values, but for `rgb`: photos are display values" in card
 
 
 def test_clips_hold_neighbouring_photos_as_display_values_and_all_guidance(pairs: Path, tiny_captures: Path):
@@ -114,6 +113,21 @@ def test_guidance_times_exposure_is_as_bright_as_the_photos(pairs: Path):
             [np.repeat((c.frames["mask"] > 0.9) & (c.frames["foreground"] > 0), 3) for c in clips]
         )
         assert abs(np.median(photos[solid]) - np.median(shown[solid])) < 0.08
+
+
+def test_linear_photos_are_the_light_that_their_curve_was_given(pairs, recipe, tiny_captures, tmp_path):
+    output = tmp_path / "linear"
+    assert make(recipe(output, "captured.linear=true", f"captured.reconstructed={pairs}")) == 0
+    for split in ("train", "validation", "test"):
+        for clip, shown in zip(read_clips(output, split), read_clips(pairs, split), strict=True):
+            capture = load_capture(tiny_captures / clip.meta.extra["capture"])
+            light = clip.frames["rgb"].astype(np.float64) * capture.exposure
+            assert capture.tone_curve == "agx"
+            np.testing.assert_allclose(agx(light), shown.frames["rgb"], atol=0.01)  # 8 bits, out of gamut
+            assert not clip.is_display("rgb")
+            np.testing.assert_array_equal(clip.frames["lit"], shown.frames["lit"])
+            assert clip.meta.exposure == shown.meta.exposure
+    assert "bytes of linear values." in (output / "README.md").read_text().replace("\n", " ")
 
 
 def test_training_reads_the_pairs_as_they_are(pairs: Path):

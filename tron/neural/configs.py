@@ -129,11 +129,16 @@ class UNetConfig(BaseModel):
         default=2, description="Side of the squares of latent pixels that become one: the finest level."
     )
     widths: tuple[Width, ...] = Field(
-        default=(32, 64, 128), min_length=1, max_length=8, description="Channels of each level, finest first."
+        default=(32, 64, 128, 128),
+        min_length=1,
+        max_length=8,
+        description="Channels of each level, finest first.",
     )
-    blocks: tuple[Depth, ...] = Field(default=(2, 2, 2), description="Blocks of each level on the way down.")
+    blocks: tuple[Depth, ...] = Field(
+        default=(2, 2, 2, 2), description="Blocks of each level on the way down."
+    )
     blocks_up: tuple[Depth, ...] = Field(
-        default=(1, 1), description="Blocks of each level but the coarsest on the way up, finest first."
+        default=(1, 1, 1), description="Blocks of each level but the coarsest on the way up, finest first."
     )
     spatial: Literal["depthwise", "dense"] = Field(
         default="depthwise",

@@ -8,7 +8,7 @@ import numpy as np
 
 from tron.captures import View
 from tron.captures.view import ToneCurve
-from tron.color import agx, srgb_to_linear
+from tron.color import agx, linear_to_srgb, srgb_to_linear
 
 _TABLE = 4096
 _AGX_STOPS = (-12.4, 4.0)  # within the range that AgX does not clip
@@ -23,7 +23,17 @@ def linear_light(view: View, exposure: float, curve: ToneCurve) -> np.ndarray:
     image = view.read()
     if view.space == "linear":
         return np.maximum(image * np.float32(exposure), 0.0)
-    return srgb_to_linear(image) if curve == "srgb" else inverse_agx(image)
+    return decoded(image, curve)
+
+
+def decoded(display: np.ndarray, curve: ToneCurve) -> np.ndarray:
+    """(..., 3) display values in [0, 1] -> (..., 3) linear light, by the inverse of a curve."""
+    return srgb_to_linear(display) if curve == "srgb" else inverse_agx(display)
+
+
+def encoded(linear: np.ndarray, curve: ToneCurve) -> np.ndarray:
+    """(..., 3) linear light -> (..., 3) display values in [0, 1], by a curve."""
+    return np.clip(linear_to_srgb(linear), 0, 1) if curve == "srgb" else agx(linear)
 
 
 def inverse_agx(display: np.ndarray) -> np.ndarray:

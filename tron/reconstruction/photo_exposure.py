@@ -17,8 +17,7 @@ from torch import Tensor
 
 from tron.captures import View
 from tron.captures.view import ToneCurve
-from tron.color import agx, linear_to_srgb, srgb_to_linear
-from tron.priors.linear_light import inverse_agx
+from tron.priors.linear_light import decoded, encoded
 
 _SAMPLES = 1 << 16
 _PATCHES = 16
@@ -66,8 +65,8 @@ class PhotoExposures:
         if "image" not in target or not np.isfinite(log[0]):
             return dict(target)
         image = target["image"]
-        linear = self._decoded(image.cpu().numpy())
-        moved = self._encoded(linear * np.exp(-log)) - self._encoded(linear)
+        linear = decoded(image.cpu().numpy(), self.curve)
+        moved = encoded(linear * np.exp(-log), self.curve) - encoded(linear, self.curve)
         shifted = image + torch.from_numpy(moved.astype(np.float32)).to(image.device)
         return {**target, "image": shifted.clamp(0, 1)}
 
@@ -120,7 +119,7 @@ class PhotoExposures:
         if kept.sum() < _FEWEST:
             return None
         light = [
-            sums(self._decoded(each[: rows * side, : columns * side]) * weights)[kept]
+            sums(decoded(each[: rows * side, : columns * side], self.curve) * weights)[kept]
             for each in (photo, picture)
         ]
         return np.median(np.log(light[0]) - np.log(light[1]), axis=0)
@@ -140,9 +139,3 @@ class PhotoExposures:
         that were compared lately would else seem bright.
         """
         return self._log - np.nanmean(self._log, axis=0) if np.isfinite(self._log).any() else self._log
-
-    def _decoded(self, display: np.ndarray) -> np.ndarray:
-        return srgb_to_linear(display) if self.curve == "srgb" else inverse_agx(display)
-
-    def _encoded(self, linear: np.ndarray) -> np.ndarray:
-        return np.clip(linear_to_srgb(linear), 0, 1) if self.curve == "srgb" else agx(linear)
