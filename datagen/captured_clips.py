@@ -19,7 +19,7 @@ from tron.captures import Capture, View
 from tron.color import luminance
 from tron.errors import TronError
 from tron.priors.linear_light import inverse_agx
-from tron.shards.schema import MEMBERS, TARGET, ClipMeta, ColorSpace, clip_members
+from tron.shards.schema import TARGET, ClipMeta, color_spaces
 
 OPAQUE = 0.9
 """Opacity of surfels at pixels that the exposure is measured at."""
@@ -149,11 +149,6 @@ class _About:
     def meta(self, number: int, views: Sequence[View], cameras: Sequence[Camera]) -> ClipMeta:
         """Metadata of one clip."""
         item, wanted = self.item, self.settings.captured
-        spaces: dict[str, ColorSpace] = {
-            name: space
-            for name in clip_members(reference=False)
-            if (space := MEMBERS[name].color_space) is not None
-        }
         gains = [self.found.gains.get(view.name, np.ones(3)) for view in views]
         return ClipMeta(
             key=f"{item.name}-l0-c{number:04d}",
@@ -166,7 +161,7 @@ class _About:
             height=wanted.height,
             cameras=[camera.to_dict() for camera in cameras],
             exposure=self.exposure,
-            color_space={**spaces, TARGET: "display"},
+            color_space={**color_spaces(reference=False), TARGET: "display"},
             seeds={"root": self.settings.seed},
             spp={"guidance": wanted.guidance_spp},
             extra={

@@ -43,7 +43,7 @@ from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance, trace_views
 from tron.shards.moving import KEY as MOTION
 from tron.shards.moving import Moving
-from tron.shards.schema import MEMBERS, ClipMeta, clip_members
+from tron.shards.schema import MEMBERS, ClipMeta, color_spaces
 from tron.tracing import SurfelTracer
 
 REFERENCE_REFLECTIONS = 16
@@ -304,11 +304,7 @@ def _meta(
         height=recipe.height,
         cameras=[camera.to_dict() for camera in cameras],
         exposure=lit.exposure,
-        color_space={
-            name: space
-            for name in clip_members(recipe.reference_buffers)
-            if (space := MEMBERS[name].color_space) is not None
-        },
+        color_space=color_spaces(recipe.reference_buffers),
         seeds={"root": spec.seed, **{f"{what}0": values[0] for what, values in lit.seeds.items()}},
         spp=spp,
         extra={
