@@ -9,11 +9,11 @@ import numpy as np
 
 from datagen.captured_photos import Photo, frame_of, require_size, rows_of_photos, starts
 from datagen.captured_reconstruction import Found
-from datagen.captured_surfels import CapturedSurfels, stored_guidance
+from datagen.captured_surfels import CapturedSurfels
 from datagen.lights import classify, contrast_share
 from datagen.plan import Work, scene_folder
 from datagen.settings import Settings
-from datagen.spool import Frame, Spool
+from datagen.spool import Frame, Spool, stored_guidance
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.color import luminance

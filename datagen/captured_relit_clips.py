@@ -9,11 +9,11 @@ import numpy as np
 
 from datagen.captured_photos import in_order, require_size, resized_view, starts
 from datagen.captured_relit import RelitTruth, find_relit
-from datagen.captured_surfels import CapturedSurfels, LitSurfels, stored_guidance
+from datagen.captured_surfels import CapturedSurfels, LitSurfels
 from datagen.lights import classify, contrast_share
 from datagen.plan import Work
 from datagen.settings import Settings
-from datagen.spool import Frame
+from datagen.spool import Frame, stored_guidance
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder
