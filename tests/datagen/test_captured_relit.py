@@ -11,6 +11,8 @@ from scipy.ndimage import gaussian_filter
 
 import datagen.captured_scene
 from datagen.captured_folder import named_by_split, split_by_name
+from datagen.captured_reconstruction import load
+from datagen.captured_reuse import take_over
 from datagen.plan import plan
 from datagen.run import make
 from datagen.settings import Settings
@@ -164,6 +166,22 @@ def test_a_reconstruction_is_taken_over_and_gives_the_same_bytes(
         )
     with pytest.raises(TronError, match="no dataset of captures"):
         make(recipe(tmp_path / "other", f"captured.reconstructed={tmp_path}"))
+
+
+def test_a_dataset_whose_surfels_are_gone_gives_no_reconstruction(
+    pairs: Path, recipe: Recipe, tmp_path: Path
+):
+    (item,) = plan(recipe(pairs))
+    other, mine = tmp_path / "other", tmp_path / "mine"
+    shutil.copytree(pairs / "scenes", other / "scenes")
+    (other / "scenes" / item.name / "environment.exr").unlink()
+    settings = recipe(tmp_path, f"captured.reconstructed={other}")
+    capture = load(item, settings, tmp_path, reduced=True)
+    mine.mkdir()
+    assert not take_over(item, settings, capture, mine)
+    assert not list(mine.iterdir())
+    shutil.copy(pairs / "scenes" / item.name / "environment.exr", other / "scenes" / item.name)
+    assert take_over(item, settings, capture, mine)
 
 
 def test_a_dataset_without_relit_clips_is_another(pairs: Path, recipe: Recipe):
