@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 import datagen.captured_scene
 from datagen.captured_folder import named_by_split, split_by_name
 from datagen.captured_reconstruction import load
+from datagen.captured_relit import find_relit
 from datagen.captured_reuse import take_over
 from datagen.plan import plan
 from datagen.run import make
@@ -182,6 +183,13 @@ def test_a_dataset_whose_surfels_are_gone_gives_no_reconstruction(
     assert not list(mine.iterdir())
     shutil.copy(pairs / "scenes" / item.name / "environment.exr", other / "scenes" / item.name)
     assert take_over(item, settings, capture, mine)
+
+
+def test_a_captures_name_is_no_pattern(recipe: Recipe, relit: Path, tmp_path: Path):
+    shutil.copytree(relit / f"{NAME}_1_sun", tmp_path / "relit" / "scan[1]_1_sun")
+    shutil.copytree(relit / f"{NAME}_1_sun", tmp_path / "relit" / "scan1_2_sun")
+    settings = recipe(tmp_path / "out", f"captured.relit={tmp_path / 'relit'}")
+    assert [truth.number for truth in find_relit(settings, "scan[1]")] == [1]
 
 
 def test_a_dataset_without_relit_clips_is_another(pairs: Path, recipe: Recipe):
