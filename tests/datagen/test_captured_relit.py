@@ -15,6 +15,7 @@ from datagen.captured_reconstruction import load
 from datagen.captured_relit import find_relit
 from datagen.captured_reuse import take_over
 from datagen.plan import plan
+from datagen.projection import captured_cost, project
 from datagen.run import make
 from datagen.settings import Settings
 from datagen.validate import validate
@@ -183,6 +184,14 @@ def test_a_dataset_whose_surfels_are_gone_gives_no_reconstruction(
     assert not list(mine.iterdir())
     shutil.copy(pairs / "scenes" / item.name / "environment.exr", other / "scenes" / item.name)
     assert take_over(item, settings, capture, mine)
+
+
+def test_a_plan_counts_no_reconstruction_that_is_taken_over(pairs: Path, recipe: Recipe, tmp_path: Path):
+    found = recipe(tmp_path / "out", f"captured.reconstructed={pairs}")
+    whole, rest = (captured_cost(plan(each), each).seconds for each in (recipe(tmp_path / "out"), found))
+    assert 0 < rest < 0.1 * whole
+    with pytest.raises(TronError, match="no dataset of captures"):
+        project(recipe(tmp_path / "out", f"captured.reconstructed={tmp_path}"))
 
 
 def test_a_captures_name_is_no_pattern(recipe: Recipe, relit: Path, tmp_path: Path):
