@@ -126,6 +126,18 @@ def test_the_default_checkpoint_gives_way_where_it_does_not_fit(
     assert not list((tmp_path / "out" / "frames").glob("*.neural.png"))
 
 
+def test_the_default_checkpoint_does_not_give_way_where_something_is_asked_of_it(
+    run, checkpoints, tmp_path, monkeypatch, capsys
+):
+    """Pictures without a network are no answer to a choice of its weights."""
+    monkeypatch.setattr(relight_settings, "DEFAULT", "lit")
+    monkeypatch.setattr(shipped, "FOLDER", checkpoints)
+    assert run(tmp_path / "out", "checkpoint=lit", "weights={pbr: 1, irradiance: 1}") == 2
+    assert "weights lack 'lit'" in capsys.readouterr().err
+    assert run(tmp_path / "out", "checkpoint=lit", "window=5", "buffers=[relit]") == 2
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_default_checkpoint_draws_where_it_fits(run, checkpoints, tmp_path, monkeypatch):
     monkeypatch.setattr(relight_settings, "DEFAULT", "lit")
     monkeypatch.setattr(shipped, "FOLDER", checkpoints)
