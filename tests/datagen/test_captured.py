@@ -82,7 +82,6 @@ def test_every_capture_is_wholly_in_one_split_and_all_of_it_is_accounted_for(pai
     assert "photos" in card
     assert "Mitsuba's path tracer" not in card
     assert "bytes of linear values, but for `rgb`: photos are display values" in card
-    assert "bytes of linear values, but for `rgb`: photos are display values" in card
 
 
 def test_clips_hold_neighbouring_photos_as_display_values_and_all_guidance(pairs: Path, tiny_captures: Path):
