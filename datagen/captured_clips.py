@@ -9,17 +9,17 @@ import numpy as np
 
 from datagen.captured_photos import Photo, frame_of, require_size, rows_of_photos, starts
 from datagen.captured_reconstruction import Found
-from datagen.captured_surfels import CapturedSurfels, stored_guidance
+from datagen.captured_surfels import CapturedSurfels
 from datagen.lights import classify, contrast_share
 from datagen.plan import Work, scene_folder
 from datagen.settings import Settings
-from datagen.spool import Frame, Spool
+from datagen.spool import Frame, Spool, stored_guidance
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.color import luminance
 from tron.errors import TronError
 from tron.priors.linear_light import decoded, inverse_agx
-from tron.shards.schema import MEMBERS, TARGET, ClipMeta, ColorSpace, clip_members
+from tron.shards.schema import TARGET, ClipMeta, color_spaces
 
 OPAQUE = 0.9
 """Opacity of surfels at pixels that the exposure is measured at."""
@@ -152,11 +152,6 @@ class _About:
     def meta(self, number: int, views: Sequence[View], cameras: Sequence[Camera]) -> ClipMeta:
         """Metadata of one clip."""
         item, wanted = self.item, self.settings.captured
-        spaces: dict[str, ColorSpace] = {
-            name: space
-            for name in clip_members(reference=False)
-            if (space := MEMBERS[name].color_space) is not None
-        }
         gains = [self.found.gains.get(view.name, np.ones(3)) for view in views]
         return ClipMeta(
             key=f"{item.name}-l0-c{number:04d}",
@@ -169,7 +164,10 @@ class _About:
             height=wanted.height,
             cameras=[camera.to_dict() for camera in cameras],
             exposure=self.exposure,
-            color_space={**spaces, TARGET: "linear" if wanted.linear else "display"},
+            color_space={
+                **color_spaces(reference=False),
+                TARGET: "linear" if wanted.linear else "display",
+            },
             seeds={"root": self.settings.seed},
             spp={"guidance": wanted.guidance_spp},
             extra={

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from glob import escape
 from pathlib import Path
 
 from datagen.settings import Settings
@@ -53,7 +54,7 @@ def find_relit(settings: Settings, capture: str) -> list[RelitTruth]:
     if not folder.is_dir():
         raise TronError("captured.relit is no folder", folder, "give the folder relit of pseudo-captures")
     found = []
-    for path in sorted(folder.glob(f"{capture}_*")):
+    for path in sorted(folder.glob(f"{escape(capture)}_*")):
         light = _LIGHT.fullmatch(path.name.removeprefix(f"{capture}_"))
         if light is not None and path.is_dir():
             found.append(RelitTruth(path, int(light[1]), light[2], _views(path, settings)))

@@ -9,17 +9,17 @@ import numpy as np
 
 from datagen.captured_photos import in_order, require_size, resized_view, starts
 from datagen.captured_relit import RelitTruth, find_relit
-from datagen.captured_surfels import CapturedSurfels, LitSurfels, stored_guidance
+from datagen.captured_surfels import CapturedSurfels, LitSurfels
 from datagen.lights import classify, contrast_share
 from datagen.plan import Work
 from datagen.settings import Settings
-from datagen.spool import Frame
+from datagen.spool import Frame, stored_guidance
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder
 from tron.errors import TronError
 from tron.shading.environment import EnvironmentMap
-from tron.shards.schema import MEMBERS, TARGET, ClipMeta, clip_members
+from tron.shards.schema import TARGET, ClipMeta, color_spaces
 
 log = logging.getLogger(__name__)
 
@@ -141,11 +141,7 @@ def _meta(
         height=wanted.height,
         cameras=[camera.to_dict() for camera in cameras],
         exposure=exposure,
-        color_space={
-            name: space
-            for name in clip_members(reference=False)
-            if (space := MEMBERS[name].color_space) is not None
-        },
+        color_space=color_spaces(reference=False),
         seeds={"root": settings.seed},
         spp={"guidance": wanted.guidance_spp},
         extra={

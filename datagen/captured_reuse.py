@@ -26,6 +26,9 @@ log = logging.getLogger(__name__)
 DECIDES = ("prior", "photos", "reconstruction", "light")
 """Keys of ``captured`` that decide what a reconstruction is, beside seed and variant."""
 
+FOUND = (SURFELS_NAME, ENVIRONMENT_NAME)
+"""Files of a reconstruction beside its spec.json."""
+
 
 def require_reusable(settings: Settings) -> None:
     """Make sure that ``captured.reconstructed`` is a dataset of captures, reconstructed as this one would be.
@@ -59,11 +62,12 @@ def take_over(item: Work, settings: Settings, capture: Capture, folder: Path) ->
             text = spec.read_text("utf-8")
             facts = json.loads(text)
             same = facts["capture"] == item.capture and facts["content"] == capture.content
+            same = same and all((spec.parent / name).is_file() for name in FOUND)
         except (OSError, ValueError, KeyError, TypeError):
             continue
         if same:
             log.info("%s (%s): reconstruction of %s", item.name, item.capture, spec.parent)
-            for name in (SURFELS_NAME, ENVIRONMENT_NAME):
+            for name in FOUND:
                 with atomic_path(folder / name) as path:
                     shutil.copyfile(spec.parent / name, path)
             write_atomic(folder / SPEC_NAME, text)

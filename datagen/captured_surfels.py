@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from datagen.captured_reconstruction import Found
 from datagen.plan import Work
 from datagen.settings import Settings
-from datagen.spool import Frame
 from tron.cameras import Camera
 from tron.estimation import Estimation
 from tron.seeds import integer
 from tron.shading.bounce import BouncedLight, BounceTransport
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
-from tron.shards.schema import MEMBERS
 from tron.tracing import SurfelTracer
 
 
@@ -69,8 +67,3 @@ class CapturedSurfels:
             seed = integer(self._root, *streams, "light", "bounce")
             bounce = self._transport.bake(lighting, self._estimation, seed=seed)
         return LitSurfels(self._tracer, lighting, bounce, self._estimation, self._root, streams)
-
-
-def stored_guidance(guidance: Guidance) -> Frame:
-    """Members of a frame that guidance gives."""
-    return {name: guidance[name] for name in guidance.BUFFERS if name in MEMBERS}

@@ -11,6 +11,8 @@ from pathlib import Path
 from statistics import fmean
 
 from datagen.account import read_other
+from datagen.captured_reconstruction import require_prior
+from datagen.captured_reuse import require_reusable
 from datagen.clusters import LOCAL, logs_folder, require_cluster, worker_count
 from datagen.first_limit import first_limit
 from datagen.plan import (
@@ -76,6 +78,9 @@ def project(settings: Settings) -> str:
     sources = ready_sources(settings)
     if settings.variety_against is not None:
         read_other(settings.variety_against)
+    if settings.source == "captured":
+        require_prior(settings)
+        require_reusable(settings)
     stored = Store(settings.store).shards() if settings.store else NOTHING
     output = settings.output_dir
     there = {item.name for item in items if read_record(output, item.name, stored) is not None}
@@ -130,13 +135,16 @@ def _of_made(
 def captured_cost(missing: Sequence[Work], settings: Settings) -> SceneCost:
     """Mean cost of captures of which none is made yet: bytes by their photos, seconds by a rough law.
 
-    The law is :data:`SECONDS_A_STEP` for the steps, and :data:`SECONDS_A_PIXEL` for guidance. Larger photos
-    take longer. Bytes are of what stays alone: what waits on disk is no scene's own.
+    The law is :data:`SECONDS_A_STEP` for the steps, none where a reconstruction is taken over, and
+    :data:`SECONDS_A_PIXEL` for guidance. Larger photos take longer. Bytes are of what stays alone: what
+    waits on disk is no scene's own.
     """
     wanted = settings.captured
     photos = fmean(item.photos + item.relit for item in missing)
     how = wanted.reconstruction
     steps = how.steps_scaler * (how.radiance.steps + how.materials.steps)
+    if wanted.reconstructed is not None:
+        steps = 0
     pixels = photos * wanted.width * wanted.height
     seconds = SECONDS_A_STEP * steps + SECONDS_A_PIXEL * pixels
     return SceneCost(seconds, kept_bytes(settings, missing) / len(missing), float("nan"), ROUGHLY)

@@ -10,12 +10,15 @@ import contextlib
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, overload
+from typing import TYPE_CHECKING, NamedTuple, overload
 
 import numpy as np
 
 from tron.errors import TronError
 from tron.shards.schema import MEMBERS
+
+if TYPE_CHECKING:
+    from tron.shading.guidance import Guidance
 
 Frame = dict[str, np.ndarray]
 LARGEST = float(np.finfo(np.float16).max)
@@ -116,3 +119,8 @@ def stored(name: str, image: np.ndarray) -> np.ndarray:
         return np.asarray(image, np.float32)
     bounded = np.where(np.isfinite(image), np.clip(image, -LARGEST, LARGEST), image)
     return bounded.astype(np.float16)
+
+
+def stored_guidance(guidance: Guidance) -> Frame:
+    """Members of a frame that guidance gives."""
+    return {name: guidance[name] for name in guidance.BUFFERS if name in MEMBERS}

@@ -28,7 +28,7 @@ from datagen.refinement import refine_surfels
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from datagen.split_settings import SplitSettings
-from datagen.spool import Frame, Spool
+from datagen.spool import Frame, Spool, stored_guidance
 from datagen.surfel_settings import Source
 from datagen.view_spool import ViewSpool
 from tron.cameras import Camera
@@ -43,7 +43,7 @@ from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance, trace_views
 from tron.shards.moving import KEY as MOTION
 from tron.shards.moving import Moving
-from tron.shards.schema import MEMBERS, ClipMeta, clip_members
+from tron.shards.schema import ClipMeta, color_spaces
 from tron.tracing import SurfelTracer
 
 REFERENCE_REFLECTIONS = 16
@@ -242,7 +242,7 @@ def _film(
                 render_guidance, now.tracer, camera, light.lighting, seed=seed, bounce=light.bounce
             )
             guidance = view(estimation, gbuffer=views[k])
-            frame = {name: guidance[name] for name in guidance.BUFFERS if name in MEMBERS}
+            frame = stored_guidance(guidance)
             frame |= {"rgb": rgb[k], "foreground": truth.valid.astype(np.float32)}
             if recipe.reference_buffers:
                 seed = light.seeds["reference"][i]
@@ -304,11 +304,7 @@ def _meta(
         height=recipe.height,
         cameras=[camera.to_dict() for camera in cameras],
         exposure=lit.exposure,
-        color_space={
-            name: space
-            for name in clip_members(recipe.reference_buffers)
-            if (space := MEMBERS[name].color_space) is not None
-        },
+        color_space=color_spaces(recipe.reference_buffers),
         seeds={"root": spec.seed, **{f"{what}0": values[0] for what, values in lit.seeds.items()}},
         spp=spp,
         extra={

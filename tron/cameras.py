@@ -149,11 +149,15 @@ class Camera:
 
     def rays(self) -> np.ndarray:
         """Unit world directions (height, width, 3) float32 through the pixel centres, from ``position``."""
+        return self.exact_rays().astype(np.float32)
+
+    def exact_rays(self) -> np.ndarray:
+        """:meth:`rays` in float64, for what may have no error but rounding."""
         x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
         y = (np.arange(self.height) + 0.5 - self.cy) / self.fy
         local = np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=-1)
         local /= np.linalg.norm(local, axis=-1, keepdims=True)
-        return (local @ self.camera_to_world[:3, :3].T).astype(np.float32)
+        return local @ self.camera_to_world[:3, :3].T
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project world points (N, 3) to pixels (N, 2), x then y, and depths (N,) along the optical axis.

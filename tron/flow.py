@@ -117,20 +117,18 @@ def _seen_from(
     if (moving is None) != (motion is None):
         raise TronError("flow of a moving surface needs both its pixels and its motion")
     surface = distance > 0
-    rays = _rays(camera)
+    rays = camera.exact_rays()
     points = camera.position + rays * distance[..., None]
     if moving is not None and motion is not None:
         which = _plane(moving, camera, "the moving pixels") > 0
         matrix = np.asarray(motion, np.float64)
         points = np.where(which[..., None], points @ matrix[:3, :3].T + matrix[:3, 3], points)
-    # A direction is a point at infinity: only the rotation acts on it.
-    rotation = other.world_to_camera[:3, :3]
-    local = np.where(surface[..., None], (points - other.position) @ rotation.T, rays @ rotation.T)
-    z = local[..., 2]
+    # What is infinitely far is seen in its direction from wherever the other camera stands.
+    points = np.where(surface[..., None], points, other.position + rays)
+    pixels, z = other.project(points.reshape(-1, 3))
+    place, z = pixels.reshape(*surface.shape, 2), z.reshape(surface.shape)
     in_front = z > 0
-    inverse = np.divide(1.0, z, out=np.zeros_like(z), where=in_front)
-    place = local[..., :2] * inverse[..., None] * (other.fx, other.fy) + (other.cx, other.cy)
-    return place, in_front, np.where(surface, inverse, 0.0)
+    return place, in_front, np.divide(1.0, z, out=np.zeros_like(z), where=in_front & surface)
 
 
 def _plane(image: np.ndarray, camera: Camera, what: str) -> np.ndarray:
@@ -144,17 +142,9 @@ def _plane(image: np.ndarray, camera: Camera, what: str) -> np.ndarray:
     return values
 
 
-def _rays(camera: Camera) -> np.ndarray:
-    """(H, W, 3) float64 unit world directions; those of ``Camera.rays`` are rounded to float32."""
-    at = (_centres(camera) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    local = np.concatenate([at, np.ones((*at.shape[:2], 1))], -1)
-    local /= np.linalg.norm(local, axis=-1, keepdims=True)
-    return local @ camera.camera_to_world[:3, :3].T
-
-
 def _inverse_z(distance: np.ndarray, camera: Camera) -> np.ndarray:
     """(H, W) 1 / z from distances along the rays; 0 where there is no surface."""
-    z = distance * (_rays(camera) @ camera.forward)
+    z = distance * (camera.exact_rays() @ camera.forward)
     return np.divide(1.0, z, out=np.zeros_like(z), where=z > 0)
 
 

@@ -200,3 +200,11 @@ def test_the_line_that_help_shows_is_a_whole_sentence(path: Path):
 def test_every_group_option_says_what_it_is_for(folder: str):
     options = group_options(load_command(folder).config_module)
     assert [f"{group}={name}" for group in options for name, said in options[group].items() if not said] == []
+
+
+def test_the_seeds_of_trainings_are_compared_on_surfels_of_g_buffers():
+    """A mapping on the command line is merged into the recipe's, and would leave its other shares."""
+    benchmark = yaml.safe_load((ROOT / "conf/eval/benchmark/renderer.yaml").read_text())
+    datagen = load_command("datagen")
+    values = compose_recipe("conf.datagen", datagen.settings, [*benchmark["seeds"]["data"], "output_dir=out"])
+    assert check(values, datagen.settings).surfels_from.model_dump() == {"gbuffers": 1, "reconstruction": 0}

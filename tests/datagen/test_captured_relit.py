@@ -11,7 +11,11 @@ from scipy.ndimage import gaussian_filter
 
 import datagen.captured_scene
 from datagen.captured_folder import named_by_split, split_by_name
+from datagen.captured_reconstruction import load
+from datagen.captured_relit import find_relit
+from datagen.captured_reuse import take_over
 from datagen.plan import plan
+from datagen.projection import captured_cost, project
 from datagen.run import make
 from datagen.settings import Settings
 from datagen.validate import validate
@@ -164,6 +168,37 @@ def test_a_reconstruction_is_taken_over_and_gives_the_same_bytes(
         )
     with pytest.raises(TronError, match="no dataset of captures"):
         make(recipe(tmp_path / "other", f"captured.reconstructed={tmp_path}"))
+
+
+def test_a_dataset_whose_surfels_are_gone_gives_no_reconstruction(
+    pairs: Path, recipe: Recipe, tmp_path: Path
+):
+    (item,) = plan(recipe(pairs))
+    other, mine = tmp_path / "other", tmp_path / "mine"
+    shutil.copytree(pairs / "scenes", other / "scenes")
+    (other / "scenes" / item.name / "environment.exr").unlink()
+    settings = recipe(tmp_path, f"captured.reconstructed={other}")
+    capture = load(item, settings, tmp_path, reduced=True)
+    mine.mkdir()
+    assert not take_over(item, settings, capture, mine)
+    assert not list(mine.iterdir())
+    shutil.copy(pairs / "scenes" / item.name / "environment.exr", other / "scenes" / item.name)
+    assert take_over(item, settings, capture, mine)
+
+
+def test_a_plan_counts_no_reconstruction_that_is_taken_over(pairs: Path, recipe: Recipe, tmp_path: Path):
+    found = recipe(tmp_path / "out", f"captured.reconstructed={pairs}")
+    whole, rest = (captured_cost(plan(each), each).seconds for each in (recipe(tmp_path / "out"), found))
+    assert 0 < rest < 0.1 * whole
+    with pytest.raises(TronError, match="no dataset of captures"):
+        project(recipe(tmp_path / "out", f"captured.reconstructed={tmp_path}"))
+
+
+def test_a_captures_name_is_no_pattern(recipe: Recipe, relit: Path, tmp_path: Path):
+    shutil.copytree(relit / f"{NAME}_1_sun", tmp_path / "relit" / "scan[1]_1_sun")
+    shutil.copytree(relit / f"{NAME}_1_sun", tmp_path / "relit" / "scan1_2_sun")
+    settings = recipe(tmp_path / "out", f"captured.relit={tmp_path / 'relit'}")
+    assert [truth.number for truth in find_relit(settings, "scan[1]")] == [1]
 
 
 def test_a_dataset_without_relit_clips_is_another(pairs: Path, recipe: Recipe):

@@ -60,6 +60,7 @@ def main(settings: Settings) -> None:
     given = None if settings.cameras is None else read_cameras(settings.cameras, *size)
     environments = [EnvironmentMap.load(light.light) for light in lights]
     settings, renderer = chosen_network(settings)
+    network = describe_network(settings, renderer)
     lights = settings.by_light()
     scene = _load_scene(settings)
     turn = upright(scene.up)  # to +z, which is up in environment maps
@@ -92,7 +93,7 @@ def main(settings: Settings) -> None:
         clock.lap("videos")
         for light, clip in zip(lights, clips):
             report = _report(light, clip, scene, turn_cameras(cameras, turn.T), clock)
-            report["network"] = describe_network(settings, renderer)
+            report["network"] = network
             write_atomic(light.output_dir / "relight.json", json.dumps(report, indent=1) + "\n")
             made = len(cameras), len(clip.seconds), light.output_dir / "relit.mp4"
             log.info("%d frames, %d of them rendered now: look at %s", *made)

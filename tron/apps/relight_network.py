@@ -25,7 +25,8 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
 
     A checkpoint that was asked for has to fit. The default one gives way with a line in the log: where the
     libraries of networks or its file are not installed, where nothing bounces and it is given lit, and where
-    radiance is asked for, which a network does not draw.
+    radiance is asked for, which a network does not draw. Where window, overlap or weights are chosen, it has
+    to fit too.
 
     Raises:
         TronError: the checkpoint is missing, damaged, or does not fit the settings.
@@ -39,6 +40,8 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
             raise TronError("buffers ask for relit.exr, and a network draws display values")
         return settings, _loaded(settings)
     except TronError as error:
+        if settings.tuned:
+            raise
         log.info("No network: %s", error)
         return settings.model_copy(update={"checkpoint": None}), None
 

@@ -175,10 +175,9 @@ class Settings(BaseModel):
 
     @model_validator(mode="after")
     def _draws_what_it_tunes(self) -> Settings:
-        tuned = {"window": self.window, "weights": self.weights, "overlap": self.overlap != "newest"}
-        for name, given in tuned.items():
-            if given and self.checkpoint is None:
-                raise ValueError(f"{name} is the neural renderer's: give a checkpoint too, or leave it out")
+        if self.tuned and self.checkpoint is None:
+            what = f"{self.tuned[0]} is the neural renderer's"
+            raise ValueError(f"{what}: give a checkpoint too, or leave it out")
         return self
 
     @model_validator(mode="after")
@@ -196,6 +195,12 @@ class Settings(BaseModel):
         }
         given = {name: value for name, value in said.items() if value is not None}
         return Estimation(**{**QUALITY[self.quality].model_dump(), **given})
+
+    @property
+    def tuned(self) -> list[str]:
+        """Settings of the neural renderer that were chosen."""
+        chosen = {"window": self.window, "weights": self.weights, "overlap": self.overlap != "newest"}
+        return [name for name, given in chosen.items() if given]
 
     @property
     def takes_default(self) -> bool:

@@ -17,6 +17,9 @@ from torch import Tensor, nn
 
 from tron.errors import TronError
 
+PLAIN_FILE = "diffusion_pytorch_model.safetensors"
+"""What diffusers calls the weights of a folder; those of another precision have its name in theirs."""
+
 
 def existing(path: str | Path | None, what: str, file: str) -> Path:
     """The path, if it is there; TronError names the file to download."""
@@ -51,21 +54,25 @@ def folder_state(folder: Path) -> dict[str, Tensor]:
 
 def _folder_files(folder: Path) -> list[Path]:
     """The safetensors files of a diffusers folder; another precision's beside them is not mixed in."""
-    indices = sorted(folder.glob("*.safetensors.index.json"))
-    if not indices:
-        files = sorted(folder.glob("*.safetensors"))
-        plain = [path for path in files if path.name == "diffusion_pytorch_model.safetensors"]
+    plain, index = folder / PLAIN_FILE, folder / f"{PLAIN_FILE}.index.json"
+    if not index.is_file():
+        if plain.is_file():
+            return [plain]
+        files, indices = (sorted(folder.glob(f"*.safetensors{end}")) for end in ("", ".index.json"))
         if not files:
             raise TronError("folder holds no .safetensors file", str(folder))
-        if len(plain or files) > 1:
+        if len(files) == 1 and not indices:
+            return files
+        if len(indices) != 1:
+            said = f"{len(files)} .safetensors files and {len(indices) or 'no'} index{'es' * bool(indices)}"
             mend = "leave the one that is to be loaded, or give its index.json"
-            raise TronError(f"folder holds {len(files)} .safetensors files and no index", str(folder), mend)
-        return plain or files
+            raise TronError(f"folder holds {said}", str(folder), mend)
+        (index,) = indices
     try:
-        names = sorted(set(json.loads(indices[0].read_text())["weight_map"].values()))
+        names = sorted(set(json.loads(index.read_text())["weight_map"].values()))
         files = [folder / Path(name).name for name in names]  # an index names files of its own folder
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
-        raise TronError("not an index of weights", str(indices[0]), "download it again") from error
+        raise TronError("not an index of weights", str(index), "download it again") from error
     for path in files:
         if not path.is_file():
             raise TronError("a file of the index is not there", str(path), "download it")

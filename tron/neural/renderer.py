@@ -85,7 +85,7 @@ class NeuralRenderer(Renderer):
         guidance = self.config.guidance
         if weights is None:
             return [1.0] * len(guidance)
-        if any(weights.values()):
+        if any(weights.values()) or set(weights) != set(guidance):
             self.check_weights(weights)
         return [len(guidance) * weights[name] for name in guidance]
 

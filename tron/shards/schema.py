@@ -107,6 +107,13 @@ def light_members() -> tuple[str, ...]:
     )
 
 
+def color_spaces(reference: bool) -> dict[str, ColorSpace]:
+    """Colour space of each member of a clip that holds colours, as ``ClipMeta.color_space`` names them."""
+    return {
+        name: space for name in clip_members(reference) if (space := MEMBERS[name].color_space) is not None
+    }
+
+
 META_SUFFIX = "meta.json"
 
 KEY_PATTERN = re.compile(r"[A-Za-z0-9_-]{1,60}")

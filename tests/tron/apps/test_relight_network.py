@@ -3,17 +3,20 @@
 import json
 import pickle
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from tron.apps import relight_settings
+from tron.apps.clip import Clip
 from tron.images import read_image
 from tron.neural import shipped
 from tron.neural.configs import PAPER_GUIDANCE, RendererConfig, UNetConfig
 from tron.neural.renderer import NeuralRenderer
 from tron.neural.weights import save_renderer
+from tron.storage import sha256
 
 SMALL = UNetConfig(widths=(4, 6), blocks=(1, 1), blocks_up=(1,))
 
@@ -73,6 +76,20 @@ def test_window_overlap_and_weights_change_the_pictures_and_are_on_record(run, c
         assert np.abs(drawn[name] - drawn["plain"]).max() > 2 / 255
 
 
+def test_the_record_is_of_the_file_that_was_loaded(run, checkpoints, tmp_path, monkeypatch):
+    """A training may write the next checkpoint in its place while frames are drawn."""
+    path, draw = Path(shutil.copy(checkpoints / "pair.safetensors", tmp_path)), Clip.draw
+
+    def drawn(*arguments):
+        path.write_bytes(b"the next one")
+        draw(*arguments)
+
+    monkeypatch.setattr(Clip, "draw", drawn)
+    assert run(tmp_path / "out", f"checkpoint={path}") == 0
+    network = json.loads((tmp_path / "out" / "relight.json").read_text())["network"]
+    assert network["sha256"] == sha256(checkpoints / "pair.safetensors")
+
+
 def test_a_shipped_checkpoint_is_given_by_name(run, checkpoints, tmp_path, monkeypatch, capsys):
     assert run(tmp_path / "path", f"checkpoint={checkpoints / 'lit.safetensors'}") == 0
     monkeypatch.setattr(shipped, "FOLDER", checkpoints)
@@ -107,6 +124,18 @@ def test_the_default_checkpoint_gives_way_where_it_does_not_fit(
     assert report["relit"] == ("lit" if settings in ((), ("buffers=[relit]",)) else "shadowed")
     assert report["network"] is None
     assert not list((tmp_path / "out" / "frames").glob("*.neural.png"))
+
+
+def test_the_default_checkpoint_does_not_give_way_where_something_is_asked_of_it(
+    run, checkpoints, tmp_path, monkeypatch, capsys
+):
+    """Pictures without a network are no answer to a choice of its weights."""
+    monkeypatch.setattr(relight_settings, "DEFAULT", "lit")
+    monkeypatch.setattr(shipped, "FOLDER", checkpoints)
+    assert run(tmp_path / "out", "checkpoint=lit", "weights={pbr: 1, irradiance: 1}") == 2
+    assert "weights lack 'lit'" in capsys.readouterr().err
+    assert run(tmp_path / "out", "checkpoint=lit", "window=5", "buffers=[relit]") == 2
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_default_checkpoint_draws_where_it_fits(run, checkpoints, tmp_path, monkeypatch):

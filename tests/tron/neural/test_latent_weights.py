@@ -128,6 +128,13 @@ def test_weights_that_mean_nothing_are_one_line(weights, words):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("weights", [{}, {"pbr": 0.0}, {"pbr": 0.0, "irradiance": 0.0, "lit": 0.0}])
+def test_weights_of_zero_have_the_right_names_too(weights):
+    """A pass takes weights that are all 0, which a sweep's corner is made of."""
+    with pytest.raises(TronError, match=r"weights (lack|name)"):
+        renderer()(buffers(), weights=weights)
+
+
 def test_a_network_without_latents_takes_no_weights():
     names = PixelMLP().config.guidance
     shown = dict.fromkeys(names, np.zeros((1, 8, 8, 3), np.float32))

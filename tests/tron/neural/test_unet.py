@@ -211,7 +211,7 @@ def test_the_recipes_renderer_is_a_unet_of_pixels():
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ({"widths": (8, 8)}, "2 widths go with 2 numbers in blocks and 1 in blocks_up, not 3 and 2"),
+        ({"widths": (8, 8)}, "2 widths go with 2 numbers in blocks and 1 in blocks_up, not 4 and 3"),
         ({"widths": ()}, "widths"),
         ({"widths": (10**9,), "blocks": (1,), "blocks_up": ()}, "less than or equal to 4096"),
         ({"patch": 3}, "1, 2 or 4"),

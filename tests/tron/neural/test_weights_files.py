@@ -71,6 +71,19 @@ def test_of_two_precisions_the_plain_one_is_read_and_others_are_not_mixed(tmp_pa
     assert folder_state(tmp_path)["a"].item() == 2
 
 
+def test_of_two_indices_the_plain_one_is_followed(tmp_path):
+    """Hugging Face's folders hold another precision as NAME.fp16.safetensors, with an index of its own."""
+    folder = sharded(tmp_path / "transformer")
+    half = {"weight_map": {"a": "diffusion_pytorch_model.fp16.safetensors"}}
+    (folder / "diffusion_pytorch_model.safetensors.index.fp16.json").write_text(json.dumps(half))
+    (folder / "diffusion_pytorch_model.fp16.safetensors.index.json").write_text(json.dumps(half))
+    assert folder_state(folder)["a"].tolist() == [1, 1]
+    (folder / INDEX).unlink()
+    assert folder_state(folder)["a"].tolist() == [7, 7]
+    save_file({"a": torch.zeros(2)}, folder / "diffusion_pytorch_model.safetensors")
+    assert folder_state(folder)["a"].tolist() == [0, 0]
+
+
 def test_byte_buffers_of_transformer_engine_are_left_out(tmp_path):
     held = {"net.w": torch.ones(2), "net.q_norm._extra_state": io.BytesIO(b"bytes")}
     torch.save(held, tmp_path / "model.pt")
