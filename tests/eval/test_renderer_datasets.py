@@ -1,0 +1,67 @@
+"""Commands by which the renderer benchmark makes data and trainings: their settings, and what they read."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from datagen.settings import Settings as DatagenSettings
+from eval.cli import Settings as EvalSettings
+from eval.renderer.benchmark import Renderer
+from eval.renderer.datasets import Datasets
+from eval.stages import Child
+from train.settings import Settings as TrainSettings
+from tron.cli.instantiation import make
+from tron.cli.recipes import check, compose_recipe
+
+COMMANDS = {"tron-datagen": ("conf.datagen", DatagenSettings), "tron-train": ("conf.train", TrainSettings)}
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Name of what is made -> settings of its command, which is not run."""
+    found: dict[str, Any] = {}
+
+    def note(children: Sequence[Child]) -> None:
+        for child in children:
+            module, model = COMMANDS[child.script]
+            found[child.label] = check(compose_recipe(module, model, child.arguments), model)
+
+    monkeypatch.setattr("eval.stages.run_together", note)
+    return found
+
+
+def datasets(folder: Path, *overrides: str) -> Datasets:
+    recipe = compose_recipe("conf.eval", EvalSettings, ["benchmark=renderer", *overrides])
+    benchmark = make(check(recipe, EvalSettings).benchmark, "benchmark")
+    assert isinstance(benchmark, Renderer)
+    return Datasets(benchmark, folder)
+
+
+def test_the_commands_accept_every_recipe_and_no_data_share_a_seed(asked: dict[str, Any], tmp_path: Path):
+    for kind in ("assets/a", "hdri"):
+        (tmp_path / "real" / kind).mkdir(parents=True)
+    (tmp_path / "real" / "assets" / "a" / "chess-board.glb").touch()
+    (tmp_path / "real" / "hdri" / "night_1k.hdr").touch()
+    made = datasets(tmp_path / "out", f"benchmark.real_data={tmp_path / 'real'}", "benchmark.max_seconds=9")
+    for size in (128, 256):
+        made.synthetic(size)
+    for make_it in (made.captures, made.shadows, made.seeds, made.kills, made.trained):
+        make_it()
+    made.models(128)
+    assert asked["models_128"].allow_unlicensed == ["chess-board", "night_1k"]
+    assert asked["captures"].captures == tmp_path / "out" / "captures_views" / "captures"
+    assert asked["captures"].captured.split_by_name
+    assert asked["trained_pair"].renderer["config"]["guidance"] == ["pbr", "irradiance"]
+    assert asked["trained_lit"].splits == {"train_b": f"{tmp_path / 'out' / 'training_captures'}#train"}
+    assert asked["trained_lit"].max_seconds == 9
+    views = ("synthetic_128", "models_128", "captures_views", "training_captures_views", "shadows")
+    seeds = [asked[name].seed for name in (*views, "training", "seed_training")]
+    assert len(set(seeds)) == len(seeds)
+
+
+def test_short_trainings_learn_from_surfels_of_buffers_alone(asked: dict[str, Any], tmp_path: Path):
+    """Reconstructing them would take most of the part's time."""
+    datasets(tmp_path).seeds()
+    assert asked["seed_training"].surfels_from.reconstruction == 0
