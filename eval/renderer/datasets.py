@@ -97,10 +97,12 @@ class Datasets:
         recipe = self.settings.pixel_mlp
         if recipe is None or split not in Manifest.load(dataset).splits():
             return {}
+        # The recipe's stages name FIT, which may be there beside the split and hold other pictures.
+        place = [] if split == FIT else [f'splits={{{FIT}: "{dataset}#{split}"}}']
         runs = {
             f"{dataset.name}_{name}": [
                 *("renderer=pixel_mlp", f"renderer.config.guidance=[{','.join(buffers)}]"),
-                *(*recipe, f"dataset={dataset}"),
+                *(*recipe, f"dataset={dataset}", *place),
             ]
             for name, buffers in BASELINE_BUFFERS.items()
         }

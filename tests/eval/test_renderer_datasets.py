@@ -12,6 +12,7 @@ from eval.renderer.benchmark import Renderer
 from eval.renderer.datasets import Datasets
 from eval.stages import Child
 from train.settings import Settings as TrainSettings
+from train.splits import Splits
 from tron.cli.instantiation import make
 from tron.cli.recipes import check, compose_recipe
 
@@ -65,3 +66,18 @@ def test_short_trainings_learn_from_surfels_of_buffers_alone(asked: dict[str, An
     """Reconstructing them would take most of the part's time."""
     datasets(tmp_path).seeds()
     assert asked["seed_training"].surfels_from.reconstruction == 0
+
+
+def test_per_pixel_baselines_learn_from_the_split_that_fits_are_made_on(
+    asked: dict[str, Any], dataset: Path, tmp_path: Path
+):
+    """A captures' `train` holds photographs; relit truth, which judges, is in `train_relit`."""
+    for split in ("train", "train_b"):
+        datasets(tmp_path / split).pixel_mlps(dataset, split)
+        for name in ("pixel_mlp", "pixel_mlp_lit"):
+            settings = asked[f"{dataset.name}_{name}"]
+            splits = Splits(settings.dataset, settings.splits)
+            (learnt,) = {split for stage in settings.stages for split in stage.splits()}
+            clips = splits.clips(learnt)
+            assert {clips.meta(number).split for number in range(len(clips))} == {split}
+    assert datasets(tmp_path / "none").pixel_mlps(dataset, "train_relit") == {}
