@@ -33,7 +33,7 @@ class Renderer(RendererSettings):
         require_own_packages("datagen", "train")
         for name in ("tron-datagen", "tron-train"):
             script_path(name)
-        require_data(self.data)
+        require_data(self)
         for kind, folder in self.training.items():
             if not folder.is_dir():
                 raise TronError(f"no training of {kind}", folder, "give the output_dir of tron-train")

@@ -124,9 +124,16 @@ class Datasets:
         return output
 
 
-def require_data(data: Mapping[str, Path]) -> None:
-    """TronError unless every folder that was given holds a data set."""
-    for name, folder in data.items():
+def require_data(settings: RendererSettings) -> None:
+    """TronError unless every folder that was given holds a data set, and is given for one that is made."""
+    known = [f"synthetic_{size}" for size in settings.synthetic]
+    known += [f"models_{size}" for size in settings.models]
+    known += ["captures", "shadows", "training", "training_captures", "seed_training", "kills"]
+    for name, folder in settings.data.items():
+        if name not in known:
+            raise TronError(
+                f"no data set is called '{name}'", "benchmark.data", f"names are {', '.join(known)}"
+            )
         if not folder.is_dir():
             raise TronError(
                 f"no data set {name}", folder, f"leave out benchmark.data.{name}: it is made then"

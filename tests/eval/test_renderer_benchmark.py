@@ -114,6 +114,7 @@ def test_trainings_that_are_ended_come_out_the_same(dataset: Path, tmp_path: Pat
         (["benchmark.pair=nowhere.safetensors"], "weights not found"),
         (["benchmark.pair=null", "benchmark.lit=null"], "no checkpoint to judge"),
         (["benchmark.data={synthetic_128: nowhere}"], "no data set synthetic_128"),
+        (["benchmark.data={synthetic: .}"], "no data set is called 'synthetic'"),
         (["benchmark.training={pair: nowhere}"], "no training of pair"),
         (["benchmark.parts=[synthetics]"], "parts"),
     ],
