@@ -18,7 +18,7 @@ import numpy as np
 
 from eval.datagen.model_pixels import DEPTH, ModelPixels
 from eval.datagen.settings import VarietySettings
-from eval.real_models import has_models, model_arguments, model_names
+from eval.real_models import has_models, model_arguments, model_names, typed_list
 from eval.relighting.benchmark import load_network
 from eval.relighting.buffers import MEMBERS, Buffers, region_mask
 from eval.relighting.fits import Show
@@ -231,7 +231,11 @@ def _make_judges(
     models = model_names(data)
     common = [*settings.judge, *model_arguments(data)]
     wanted = [
-        (ALONE, f"{ALONE}_{model}", [*settings.alone, f"asset_names=[{model}]", f"seed={seed + number}"])
+        (
+            ALONE,
+            f"{ALONE}_{model.replace('/', '_')}",
+            [*settings.alone, f"asset_names={typed_list([model])}", f"seed={seed + number}"],
+        )
         for number, model in enumerate(models)
     ]
     wanted += [

@@ -6,8 +6,10 @@ from typing import Any
 
 import pytest
 
+from datagen.assets import find_assets
 from datagen.settings import Settings as DatagenSettings
 from eval.cli import Settings as EvalSettings
+from eval.real_models import model_names
 from eval.renderer.benchmark import Renderer
 from eval.renderer.datasets import Datasets
 from eval.stages import Child
@@ -60,6 +62,26 @@ def test_the_commands_accept_every_recipe_and_no_data_share_a_seed(asked: dict[s
     views = ("synthetic_128", "models_128", "captures_views", "training_captures_views", "shadows")
     seeds = [asked[name].seed for name in (*views, "training", "seed_training")]
     assert len(set(seeds)) == len(seeds)
+
+
+def test_models_of_one_file_name_and_with_spaces_are_called_as_tron_datagen_calls_them(
+    asked: dict[str, Any], tmp_path: Path
+):
+    """Many downloads hold a scene.gltf."""
+    for name in (
+        "assets/cup/scene.gltf",
+        "assets/jar/scene.gltf",
+        "assets/chess board.glb",
+        "hdri/2024.hdr",
+        "hdri/o'clock.exr",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    names = model_names(tmp_path)
+    assert sorted(names) == ["chess board", "cup/scene", "jar/scene"]
+    assert {each.id for each in find_assets(tmp_path / "assets", allow_unlicensed=names)} == set(names)
+    datasets(tmp_path / "out", f"benchmark.real_data={tmp_path}").models(128)
+    assert asked["models_128"].allow_unlicensed == [*names, "2024", "o'clock"]
 
 
 def test_short_trainings_learn_from_surfels_of_buffers_alone(asked: dict[str, Any], tmp_path: Path):
