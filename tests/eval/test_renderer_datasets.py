@@ -84,6 +84,11 @@ def test_models_of_one_file_name_and_with_spaces_are_called_as_tron_datagen_call
     assert asked["models_128"].allow_unlicensed == [*names, "2024", "o'clock"]
 
 
+def test_threads_and_seed_of_the_command_are_those_of_the_benchmark(tmp_path: Path):
+    settings = datasets(tmp_path, "threads=3", "seed=5").settings
+    assert (settings.threads, settings.seed) == (3, 5)
+
+
 def test_short_trainings_learn_from_surfels_of_buffers_alone(asked: dict[str, Any], tmp_path: Path):
     """Reconstructing them would take most of the part's time."""
     datasets(tmp_path).seeds()
