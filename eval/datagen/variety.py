@@ -26,7 +26,7 @@ from eval.report.figures import row_cell
 from eval.report.intervals import interval_note
 from eval.report.strips import write_strips
 from eval.results import Row, mean_row
-from eval.stages import Child, StageFailed, Stages
+from eval.stages import ONE_THREAD, Child, StageFailed, Stages
 from tron import metrics
 from tron.report.page import Block, Picture, Pictures, Section, Table, Text
 from tron.runtime import set_torch_threads
@@ -51,7 +51,6 @@ PLACES = ((ALONE, MODELS), (MIXED, MODELS), (ALONE, FOREGROUND), (MIXED, FOREGRO
 """What is judged: scenes, and which of their pixels."""
 Trained = tuple[str, str, int]
 """Distribution, renderer and seed of a training."""
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 SIDE_BY_SIDE = 2
 """Commands of one thread that run at the same time."""
 

@@ -7,11 +7,10 @@ from pathlib import Path
 
 from eval.real_models import has_models, model_arguments
 from eval.renderer.settings import CaptureRecipes, Kind, RendererSettings
-from eval.stages import Child, Stages
+from eval.stages import ONE_THREAD, Child, Stages
 from tron.errors import TronError
 from tron.shards.manifest import Manifest
 
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 WEIGHTS = "renderer.safetensors"
 TEST, TEST_RELIT = "test", "test_relit"
 FIT, FIT_RELIT = "train", "train_relit"
