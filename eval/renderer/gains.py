@@ -104,9 +104,7 @@ class Gains:
         return [Section(self.name, self.title, [*blocks, *shown])]
 
     def _tail(self, size: int, where: Where) -> str:
-        kind = where.family or where.style
-        full = "_full" if where.region == "frame" else ""
-        return full + ("" if size == next(iter(self.sizes)) else f".{size}") + (f".{kind}" if kind else "")
+        return where.tail_after("" if size == next(iter(self.sizes)) else f".{size}")
 
     def _methods(self) -> Table:
         """PSNR of every method, by size and region."""
