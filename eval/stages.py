@@ -26,6 +26,8 @@ from tron.errors import TronError
 from tron.runtime import describe_machine
 from tron.storage import write_atomic
 
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""Environment of a command that computes on one thread."""
 MESSAGE_LINES = 12
 """Last lines of a failed child that are kept for its error message."""
 PATIENCE = 20.0

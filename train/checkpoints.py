@@ -6,7 +6,6 @@ leaves `checkpoints/2-adapt.safetensors`, the renderer at its end, and its `.ckp
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +47,7 @@ def periodic_checkpoint(folder: Path, number: int, stage: Stage, every: int) -> 
     """Write the run's whole state every `every` steps, keeping the newest."""
     return ModelCheckpoint(
         dirpath=folder,
-        filename=f"{number}-{stage.name}-{{step:08d}}",
+        filename=_name(number, stage),
         auto_insert_metric_name=False,
         every_n_train_steps=every,
         save_top_k=1,
@@ -59,7 +58,22 @@ def periodic_checkpoint(folder: Path, number: int, stage: Stage, every: int) -> 
 
 def checkpoint_path(folder: Path, number: int, stage: Stage, step: int) -> Path:
     """File of a stage's whole state after a step, as `periodic_checkpoint` names it."""
-    return folder / f"{number}-{stage.name}-{step:08d}.ckpt"
+    return folder / f"{_name(number, stage).format(step=step)}.ckpt"
+
+
+def _name(number: int, stage: Stage) -> str:
+    """Name of a stage's checkpoints, in which Lightning and str.format put the step."""
+    return f"{number}-{stage.name}-{{step:08d}}"
+
+
+def _checkpoints(folder: Path, number: int, stage: Stage) -> dict[int, Path]:
+    """Step -> file of a stage's whole state after it."""
+    found = {}
+    for path in folder.glob("*.ckpt"):
+        step = path.stem.rpartition("-")[2]
+        if step.isdecimal() and path == checkpoint_path(folder, number, stage, int(step)):
+            found[int(step)] = path
+    return found
 
 
 def stage_end(folder: Path, number: int, stage: Stage) -> Path:
@@ -81,8 +95,7 @@ def find_position(folder: Path, stages: Sequence[Stage]) -> Position:
     for index, stage in enumerate(stages):
         if stage_end(folder, index + 1, stage).is_file():
             continue
-        name = re.compile(rf"{index + 1}-{stage.name}-(\d+)\.ckpt")
-        steps = {int(found[1]): p for p in folder.glob("*.ckpt") if (found := name.fullmatch(p.name))}
+        steps = _checkpoints(folder, index + 1, stage)
         if not steps:
             return Position(index)
         return Position(index, max(steps), steps[max(steps)])
@@ -91,5 +104,5 @@ def find_position(folder: Path, stages: Sequence[Stage]) -> Position:
 
 def remove_checkpoints(folder: Path, number: int, stage: Stage) -> None:
     """Remove a stage's `.ckpt` files, once its end is kept."""
-    for path in folder.glob(f"{number}-{stage.name}-*.ckpt"):
+    for path in _checkpoints(folder, number, stage).values():
         path.unlink()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Callable
 
@@ -12,7 +13,9 @@ from tron.shards.clip_store import ClipStore
 
 
 class OtherLights:
-    """Clips of the same scene and cameras under other lights, found by the clips' keys, SCENE-LIGHT.
+    """Clips of the same scene and cameras under other lights, found by the clips' keys.
+
+    Keys are SCENE-LIGHT, or SCENE-LIGHT-cNUMBER where a scene has several clips under each light.
 
     Args:
         clips: of the split.
@@ -22,9 +25,9 @@ class OtherLights:
 
     def __init__(self, clips: ClipStore, ratio: float, read: Callable[[int, slice], Sample]):
         self.clips, self.ratio, self.read = clips, ratio, read
-        self._scenes: dict[str, list[int]] = defaultdict(list)
+        self._places: dict[str, list[int]] = defaultdict(list)
         for number in range(len(clips)):
-            self._scenes[_scene(clips.key(number))].append(number)
+            self._places[_place(clips.key(number))].append(number)
 
     def mixed(self, sample: Sample, number: int, window: slice, random: np.random.Generator) -> Sample:
         """A clip's frames, in `ratio` of all cases with those under another of its lights in a random share.
@@ -36,7 +39,7 @@ class OtherLights:
         """
         if sample.display or random.random() >= self.ratio:
             return sample
-        others = [each for each in self._scenes[_scene(self.clips.key(number))] if each != number]
+        others = [each for each in self._places[_place(self.clips.key(number))] if each != number]
         if not others:
             return sample
         other, weight = others[int(random.integers(len(others)))], float(random.random())
@@ -53,5 +56,6 @@ class OtherLights:
         return Sample(buffers)
 
 
-def _scene(key: str) -> str:
-    return key.rpartition("-")[0] or key
+def _place(key: str) -> str:
+    """A clip's key without its light."""
+    return re.sub(r"-[^-]+(-c\d+)?$", r"\1", key)

@@ -13,7 +13,7 @@ import signal
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -220,7 +220,8 @@ def _spawn(work: Callable[[Processes, Settings], None], settings: Settings, devi
             f"training {error}",
             mend="if that was for want of memory, make batch_size or data.cache_gb smaller",
         ) from error
-    except SystemExit:  # SIGTERM: they finish their step and write a checkpoint
+    except SystemExit:  # SIGTERM: they finish their step, write a checkpoint, and judge what comes after it
+        signal.signal(signal.SIGTERM, lambda *_: _tell(context.processes, signal.SIGTERM))
         _end(context.processes, signal.SIGTERM, CHECKPOINT_SECONDS)
         raise
     finally:
@@ -230,12 +231,19 @@ def _spawn(work: Callable[[Processes, Settings], None], settings: Settings, devi
 def _end(processes: list[Any], gently: signal.Signals, grace: float) -> None:
     """Ask what still runs to end, and kill what does not listen."""
     for number, seconds in ((gently, grace), (signal.SIGKILL, None)):
-        running = [process for process in processes if process.is_alive()]
-        for process in running:
-            os.kill(process.pid, number)
+        running = _tell(processes, number)
         deadline = None if seconds is None else time.monotonic() + seconds
         for process in running:
             process.join(None if deadline is None else max(0.0, deadline - time.monotonic()))
+
+
+def _tell(processes: list[Any], number: signal.Signals) -> list[Any]:
+    """Send a signal to what still runs; these processes."""
+    running = [process for process in processes if process.is_alive()]
+    for process in running:
+        with suppress(ProcessLookupError):  # ended since
+            os.kill(process.pid, number)
+    return running
 
 
 def _spawned(

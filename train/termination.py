@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,10 @@ log = logging.getLogger(__name__)
 
 TERMINATED = 128 + signal.SIGTERM
 """Exit code of a command that SIGTERM has ended."""
+SAME_SECONDS = 5.0
+"""Seconds in which further SIGTERMs say nothing new: `timeout` and Slurm tell every process of a group, and
+the command that started some of them tells these too.
+"""
 
 
 class Terminated(SystemExit):
@@ -29,7 +34,7 @@ class Terminated(SystemExit):
 class CheckpointOnTermination(Callback):
     """Ends all processes of a run behind one step and a checkpoint, once SIGTERM has reached one of them.
 
-    A second SIGTERM ends its process at once. Lightning's own handler talks to the other processes from
+    A later SIGTERM ends its process at once. Lightning's own handler talks to the other processes from
     within the signal, amid whatever they are saying to each other; so it is replaced while training runs.
 
     Args:
@@ -37,8 +42,14 @@ class CheckpointOnTermination(Callback):
     """
 
     def __init__(self, path: Callable[[int], Path]):
-        self.path, self.asked = path, False
+        self.path = path
+        self._asked_at: float | None = None
         self._before: Any = None
+
+    @property
+    def asked(self) -> bool:
+        """Whether SIGTERM has come."""
+        return self._asked_at is not None
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Take over the signal."""
@@ -85,6 +96,8 @@ class CheckpointOnTermination(Callback):
             self._before = None
 
     def _note(self, _signum: int, _frame: object) -> None:
-        if self.asked:
+        now = time.monotonic()
+        if self._asked_at is None:
+            self._asked_at = now
+        elif now - self._asked_at >= SAME_SECONDS:
             raise Terminated
-        self.asked = True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -83,7 +82,7 @@ class Datagen(DatagenSettings):
             lead=LEAD,
             sections=[*sections, *stage_section(records)],
             headline=HEADLINE,
-            reproduce=[_typed(self.parts, output_dir)],
+            reproduce=[" ".join(_typed(self.parts, output_dir))],
             inputs={"settings": self.model_dump(mode="json", exclude={"targets"})},
         )
 
@@ -108,7 +107,7 @@ class Datagen(DatagenSettings):
         }
         stages = Stages(folder)
         stages.restart(part)  # a figure of this run, never of one before
-        with stages.timed(part, [shlex.split(_typed([part], folder))]):
+        with stages.timed(part, [_typed([part], folder)]):
             return measures[part](folder / part)
 
 
@@ -116,8 +115,9 @@ def _of(recipe: Sequence[str], scenes: int) -> list[str]:
     return [*recipe, f"train.scenes={scenes}"]
 
 
-def _typed(parts: Sequence[str], output_dir: Path) -> str:
-    return f"tron-eval benchmark=datagen benchmark.parts=[{','.join(parts)}] output_dir={output_dir}"
+def _typed(parts: Sequence[str], output_dir: Path) -> list[str]:
+    given = ("benchmark=datagen", f"benchmark.parts=[{','.join(parts)}]", f"output_dir={output_dir}")
+    return ["tron-eval", *given]
 
 
 def _verdict(found: Mapping[str, Row]) -> str:

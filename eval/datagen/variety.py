@@ -18,7 +18,7 @@ import numpy as np
 
 from eval.datagen.model_pixels import DEPTH, ModelPixels
 from eval.datagen.settings import VarietySettings
-from eval.real_models import has_models, model_arguments, model_names
+from eval.real_models import has_models, model_arguments, model_names, typed_list
 from eval.relighting.benchmark import load_network
 from eval.relighting.buffers import MEMBERS, Buffers, region_mask
 from eval.relighting.fits import Show
@@ -26,7 +26,7 @@ from eval.report.figures import row_cell
 from eval.report.intervals import interval_note
 from eval.report.strips import write_strips
 from eval.results import Row, mean_row
-from eval.stages import Child, StageFailed, Stages
+from eval.stages import ONE_THREAD, Child, StageFailed, Stages
 from tron import metrics
 from tron.report.page import Block, Picture, Pictures, Section, Table, Text
 from tron.runtime import set_torch_threads
@@ -51,7 +51,6 @@ PLACES = ((ALONE, MODELS), (MIXED, MODELS), (ALONE, FOREGROUND), (MIXED, FOREGRO
 """What is judged: scenes, and which of their pixels."""
 Trained = tuple[str, str, int]
 """Distribution, renderer and seed of a training."""
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 SIDE_BY_SIDE = 2
 """Commands of one thread that run at the same time."""
 
@@ -231,7 +230,11 @@ def _make_judges(
     models = model_names(data)
     common = [*settings.judge, *model_arguments(data)]
     wanted = [
-        (ALONE, f"{ALONE}_{model}", [*settings.alone, f"asset_names=[{model}]", f"seed={seed + number}"])
+        (
+            ALONE,
+            f"{ALONE}_{model.replace('/', '_')}",
+            [*settings.alone, f"asset_names={typed_list([model])}", f"seed={seed + number}"],
+        )
         for number, model in enumerate(models)
     ]
     wanted += [

@@ -14,11 +14,10 @@ from eval.relighting.benchmark import Relighting
 from eval.report.outcome import Outcome
 from eval.report.stage_table import stage_section
 from eval.results import Row, Target
-from eval.stages import Child, Stages, script_path
+from eval.stages import ONE_THREAD, Child, Stages, script_path
 from tron.cli.installation import require_own_packages
 from tron.shards.manifest import Manifest
 
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 WORDS = {
     "datagen": "path-trace scenes, make surfels, render pbr, irradiance and lit",
     "train": "train the neural renderer and, at the same time, one of two buffers and the pixel MLP",

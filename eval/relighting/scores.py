@@ -93,8 +93,12 @@ class Where(NamedTuple):
     @property
     def tail(self) -> str:
         """End of the rows' names: ``_full`` for frames, ``.FAMILY`` or ``.STYLE`` for one of them."""
+        return self.tail_after("")
+
+    def tail_after(self, size: str) -> str:
+        """The same with something between the region and the kind; in lower case, which style A is not."""
         kind = self.family or self.style
-        return ("_full" if self.region == "frame" else "") + (f".{kind}" if kind else "")
+        return ("_full" if self.region == "frame" else "") + size + (f".{kind.lower()}" if kind else "")
 
 
 ALL = Where()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shlex
 from pathlib import Path
 
 from eval.renderer import page
@@ -33,7 +32,7 @@ class Renderer(RendererSettings):
         require_own_packages("datagen", "train")
         for name in ("tron-datagen", "tron-train"):
             script_path(name)
-        require_data(self.data)
+        require_data(self)
         for kind, folder in self.training.items():
             if not folder.is_dir():
                 raise TronError(f"no training of {kind}", folder, "give the output_dir of tron-train")
@@ -63,7 +62,7 @@ class Renderer(RendererSettings):
         for part in self.parts:
             stages = parts.datasets.stages
             stages.restart(f"part {part}")  # a figure of this run, never of one before
-            with stages.timed(f"part {part}", [shlex.split(_typed([part], folder))]):
+            with stages.timed(f"part {part}", [_typed([part], folder)]):
                 found[part] = parts.measure(part)
                 fresh = [row for each in found[part] for row in each.rows(self.seed)]
             for row in fresh:
@@ -89,7 +88,7 @@ class Renderer(RendererSettings):
                 *stage_section(parts.datasets.stages.records),
             ],
             headline=page.HEADLINE,
-            reproduce=[_typed(self.parts, output_dir)],
+            reproduce=[" ".join(_typed(self.parts, output_dir))],
             inputs=self._inputs(parts),
         )
 
@@ -102,5 +101,6 @@ class Renderer(RendererSettings):
         }
 
 
-def _typed(parts: list[Part], output_dir: Path) -> str:
-    return f"tron-eval benchmark=renderer benchmark.parts=[{','.join(parts)}] output_dir={output_dir}"
+def _typed(parts: list[Part], output_dir: Path) -> list[str]:
+    given = ("benchmark=renderer", f"benchmark.parts=[{','.join(parts)}]", f"output_dir={output_dir}")
+    return ["tron-eval", *given]

@@ -7,11 +7,10 @@ from pathlib import Path
 
 from eval.real_models import has_models, model_arguments
 from eval.renderer.settings import CaptureRecipes, Kind, RendererSettings
-from eval.stages import Child, Stages
+from eval.stages import ONE_THREAD, Child, Stages
 from tron.errors import TronError
 from tron.shards.manifest import Manifest
 
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 WEIGHTS = "renderer.safetensors"
 TEST, TEST_RELIT = "test", "test_relit"
 FIT, FIT_RELIT = "train", "train_relit"
@@ -97,10 +96,12 @@ class Datasets:
         recipe = self.settings.pixel_mlp
         if recipe is None or split not in Manifest.load(dataset).splits():
             return {}
+        # The recipe's stages name FIT, which may be there beside the split and hold other pictures.
+        place = [] if split == FIT else [f'splits={{{FIT}: "{dataset}#{split}"}}']
         runs = {
             f"{dataset.name}_{name}": [
                 *("renderer=pixel_mlp", f"renderer.config.guidance=[{','.join(buffers)}]"),
-                *(*recipe, f"dataset={dataset}"),
+                *(*recipe, f"dataset={dataset}", *place),
             ]
             for name, buffers in BASELINE_BUFFERS.items()
         }
@@ -122,9 +123,16 @@ class Datasets:
         return output
 
 
-def require_data(data: Mapping[str, Path]) -> None:
-    """TronError unless every folder that was given holds a data set."""
-    for name, folder in data.items():
+def require_data(settings: RendererSettings) -> None:
+    """TronError unless every folder that was given holds a data set, and is given for one that is made."""
+    known = [f"synthetic_{size}" for size in settings.synthetic]
+    known += [f"models_{size}" for size in settings.models]
+    known += ["captures", "shadows", "training", "training_captures", "seed_training", "kills"]
+    for name, folder in settings.data.items():
+        if name not in known:
+            raise TronError(
+                f"no data set is called '{name}'", "benchmark.data", f"names are {', '.join(known)}"
+            )
         if not folder.is_dir():
             raise TronError(
                 f"no data set {name}", folder, f"leave out benchmark.data.{name}: it is made then"

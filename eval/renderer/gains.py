@@ -16,6 +16,8 @@ from eval.relighting.baselines import BASELINES, DIRECT, NEURAL, NEURAL_LIT, ON_
 from eval.relighting.buffers import REGIONS
 from eval.relighting.measured import Judged
 from eval.relighting.scores import GROUPS, Scores, Where
+from eval.renderer.networks import METHODS
+from eval.renderer.networks import TITLES as NETWORK_TITLES
 from eval.renderer.pictures import comparison
 from eval.report.figures import row_cell, with_interval
 from eval.report.intervals import interval_note
@@ -33,9 +35,8 @@ PAIR_RIVALS: dict[str, list[str]] = {
 LIT_RIVALS: dict[str, list[str]] = {"gain_db": ["lit", *GROUPS[ON_LIT]], "gain_over_lit_db": ["lit"]}
 RIVALS = {NEURAL.name: ("renderer", PAIR_RIVALS), NEURAL_LIT.name: ("renderer.lit", LIT_RIVALS)}
 """Method -> beginning of its rows, and what its gains are over by the end of their names."""
-TITLES = {method.name: method.title for method in (*BASELINES,)} | {
-    NEURAL.name: "network of the paper's pair",
-    NEURAL_LIT.name: "network that starts from lit",
+TITLES = {method.name: method.title for method in BASELINES} | {
+    METHODS[kind]: title for kind, title in NETWORK_TITLES.items()
 }
 GAIN_WORDS = {
     (NEURAL.name, "gain_db"): "pair: gain over the best of direct light",
@@ -103,9 +104,7 @@ class Gains:
         return [Section(self.name, self.title, [*blocks, *shown])]
 
     def _tail(self, size: int, where: Where) -> str:
-        kind = where.family or where.style
-        full = "_full" if where.region == "frame" else ""
-        return full + ("" if size == next(iter(self.sizes)) else f".{size}") + (f".{kind}" if kind else "")
+        return where.tail_after("" if size == next(iter(self.sizes)) else f".{size}")
 
     def _methods(self) -> Table:
         """PSNR of every method, by size and region."""

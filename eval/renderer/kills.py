@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eval.datagen.runs import require_success, running
-from eval.renderer.datasets import ONE_THREAD, WEIGHTS
+from eval.renderer.datasets import WEIGHTS
 from eval.results import Row
+from eval.stages import ONE_THREAD
 from tron.report.page import Cell, Section, Table
 from tron.seeds import generator
 

@@ -108,14 +108,17 @@ def drawn_clip() -> Callable[..., Clip]:
 
 @pytest.fixture(scope="session")
 def write_dataset() -> Callable[..., Path]:
-    """Write a data set: write_dataset(folder, size=32, frames=2); train, train_b and test splits."""
+    """Write a data set: write_dataset(folder, size=32, frames=2); train, train_b and test splits.
 
-    def write(folder: Path, size: int = 32, frames: int = 2, scenes: int = 2) -> Path:
+    judged: name of the last one, such as test_relit.
+    """
+
+    def write(folder: Path, size: int = 32, frames: int = 2, scenes: int = 2, judged: str = "test") -> Path:
         entries = []
         for split, first, lights, count in (
             ("train", 0, ("noon", "softbox", "grey"), 1),
             ("train_b", 20, ("noon",), 1),
-            ("test", 10, ("dusk", "window", "grey"), frames),
+            (judged, 10, ("dusk", "window", "grey"), frames),
         ):
             with ShardWriter(folder, split, samples_per_shard=4) as writer:
                 for seed in range(first, first + scenes):
@@ -124,7 +127,7 @@ def write_dataset() -> Callable[..., Path]:
                             f"s{seed:06d}-{light}", split, f"s{seed:06d}", light, count, size
                         )
                         members = [draw_frame(size, seed, light, k) for k in range(count)]
-                        if split != "test":
+                        if split != judged:
                             members = [_without_references(frame) for frame in members]
                         writer.write(meta, members)
             entries += writer.entries

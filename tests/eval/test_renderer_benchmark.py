@@ -1,6 +1,8 @@
 """The benchmark `renderer` end to end at toy sizes, and what it says to bad input."""
 
 import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -69,6 +71,38 @@ def test_untrained_networks_gain_nothing_over_the_buffer_that_they_start_from(
     assert read_image(strips[0]).shape == (256 + 4 + 256, 6 * 256, 3)
 
 
+def test_models_captures_and_stages_are_judged_on_their_own_splits(
+    dataset: Path, weights: Path, write_dataset: Callable[..., Path], tmp_path: Path
+):
+    """Untrained networks: gains over what they start from are zero, and no stage adds anything."""
+    captures = write_dataset(tmp_path / "captures", frames=1, scenes=3, judged="test_relit")
+    checkpoint_folder = tmp_path / "training" / "checkpoints"
+    checkpoint_folder.mkdir(parents=True)
+    for name in ("1-synthetic", "2-adapt", "3-video"):
+        shutil.copy(weights / "tiny.safetensors", checkpoint_folder / f"{name}.safetensors")
+    code = run(
+        f"output_dir={tmp_path / 'out'}",
+        "benchmark.parts=[models,captures,stages]",
+        f"benchmark.models={{128: {listed(['unused'])}}}",
+        f"benchmark.data={{synthetic_128: {dataset},models_128: {dataset},captures: {captures}}}",
+        f"benchmark.training={{lit: {checkpoint_folder.parent}}}",
+        *checkpoints(weights),
+        *("benchmark.pixel_mlp=null", "benchmark.pictures=1"),
+    )
+    assert code == 0
+    results = Results.load(tmp_path / "out" / "results.json")
+    for name in ("ood_gain_over_pbr_db", "capture_gain_over_pbr_db", "lit.ood_gain_over_lit_db"):
+        assert results.value(f"renderer.{name}") == pytest.approx(0, abs=1e-3)
+    row = results.find("renderer.lit.capture_gain_over_lit_db")
+    assert row is not None
+    assert (row.n, row.scenes) == (9, 3)
+    assert results.value("renderer.stage2_capture_gain_db") == pytest.approx(0, abs=1e-6)
+    assert results.value("renderer.stage3_single_frame_loss_db") == pytest.approx(0, abs=1e-6)
+    page = (tmp_path / "out" / "report.html").read_text()
+    for section in ("models", "captures", "curriculum"):
+        assert f'<section id="{section}">' in page
+
+
 @pytest.mark.long
 def test_clips_and_shadows_from_seeds(weights: Path, tmp_path: Path):
     """The data are made by tron-datagen, once; an untrained network reacts to shadows as lit does."""
@@ -114,6 +148,7 @@ def test_trainings_that_are_ended_come_out_the_same(dataset: Path, tmp_path: Pat
         (["benchmark.pair=nowhere.safetensors"], "weights not found"),
         (["benchmark.pair=null", "benchmark.lit=null"], "no checkpoint to judge"),
         (["benchmark.data={synthetic_128: nowhere}"], "no data set synthetic_128"),
+        (["benchmark.data={synthetic: .}"], "no data set is called 'synthetic'"),
         (["benchmark.training={pair: nowhere}"], "no training of pair"),
         (["benchmark.parts=[synthetics]"], "parts"),
     ],

@@ -208,15 +208,17 @@ def test_a_captured_photo_is_shown_as_it_is(drawn_clip: MakeClip):
     np.testing.assert_array_equal(clip.displayed("rgb"), clip.frames["rgb"])
 
 
-def test_styles_of_scenes_have_rows_of_their_own_where_there_are_several(drawn_clip):
+@pytest.mark.parametrize("styles", [("object", "table"), ("A", "object")])
+def test_styles_of_scenes_have_rows_of_their_own_where_there_are_several(drawn_clip, styles):
+    """In lower case, as names of rows are."""
     scores = Scores()
-    for number, style in enumerate(("object", "table")):
+    for number, style in enumerate(styles):
         clip = drawn_clip(seed=number)
         clip = replace(clip, meta=clip.meta.model_copy(update={"extra": {"style": style}}))
         truth = clip.displayed("rgb")
         scores.add(clip, {"foreground": {"pbr": np.clip(truth + 0.1 * (number + 1), 0, 1)}}, truth)
-        assert scores.styles == ([] if number == 0 else ["object", "table"])
+        assert scores.styles == ([] if number == 0 else list(styles))
     rows = {row.metric: row for row in scores.rows()}
-    both = [rows[f"pbr.psnr.{style}"] for style in ("object", "table")]
+    both = [rows[f"pbr.psnr.{style.lower()}"] for style in styles]
     assert both[0].value > both[1].value
     assert rows["pbr.psnr"].value == pytest.approx(np.mean([row.value for row in both]))

@@ -24,21 +24,23 @@ def write_dataset(
     width: int | None = None,
     spaces: dict[str, ColorSpace] | None = None,
     lights: int = 1,
+    views: int = 0,
 ) -> Path:
     """Clips of smooth colours whose picture is the product of pbr and irradiance, frames x size x size.
 
     splits: number of scenes by name. width: of frames that are not square. spaces: of colours that are not
-    linear. lights: clips of each scene.
+    linear. lights: clips of each scene; with views, so many of each light, from other cameras, with keys as
+    those of captures.
     """
     width = width or size
     colors: dict[str, ColorSpace] = dict.fromkeys((*GUIDANCE, TARGET), "linear")
     entries = []
     for split, count in splits.items():
         with ShardWriter(folder, split, shard) as writer:
-            for number, light in itertools.product(range(count), range(lights)):
-                random = seeds.generator(0, "dataset", split, number + count * light)
+            for number, light, view in itertools.product(range(count), range(lights), range(max(views, 1))):
+                random = seeds.generator(0, "dataset", split, number + count * (light + lights * view))
                 meta = ClipMeta(
-                    key=f"{split}{number:03d}-l{light}",
+                    key=f"{split}{number:03d}-l{light}" + (f"-c{view:04d}" if views else ""),
                     scene=f"{split}{number:03d}",
                     light=f"l{light}",
                     light_family="studio",
@@ -46,7 +48,7 @@ def write_dataset(
                     frames=frames,
                     width=width,
                     height=size,
-                    cameras=[{}] * frames,
+                    cameras=[{"view": view} if views else {}] * frames,
                     exposure=1.0,
                     color_space=colors | (spaces or {}),
                 )

@@ -71,3 +71,11 @@ def test_scenes_with_one_light_and_photographs_stay_as_they_are(make_dataset, da
     for folder in (dataset, photos):
         for a, b in zip(drawn(folder, mix=0.0), drawn(folder)):
             assert all(torch.equal(a.buffers[name], b.buffers[name]) for name in MEMBERS)
+
+
+def test_views_of_relit_captures_are_mixed_with_the_same_view_under_other_lights(make_dataset, tmp_path):
+    folder = make_dataset(tmp_path, {"train": 2}, lights=2, views=3)
+    store = ClipStore(folder, "train")
+    assert store.key(1) == "train000-l0-c0001"
+    for one, mixed in zip(drawn(folder, mix=0.0), drawn(folder)):
+        assert not torch.equal(one.buffers[TARGET], mixed.buffers[TARGET])

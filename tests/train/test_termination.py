@@ -64,6 +64,25 @@ def test_sigterm_ends_behind_the_step_with_a_checkpoint_and_nothing_is_lost(
     assert run(tmp_path) == uninterrupted
 
 
+def test_a_request_that_comes_twice_at_once_is_one_and_a_later_one_ends_at_once(run, monkeypatch, tmp_path):
+    """`timeout` tells its command and then the whole group, a launcher tells all and its command again."""
+    train_a_step = RendererModule.training_step
+
+    def signalled(self, batch, index):
+        if (self.stage.name, self.global_step) == ("one", 3):
+            for _ in range(2):
+                os.kill(os.getpid(), signal.SIGTERM)
+        return train_a_step(self, batch, index)
+
+    monkeypatch.setattr(RendererModule, "training_step", signalled)
+    for seconds, step in ((60.0, 4), (0.0, 2)):
+        monkeypatch.setattr("train.termination.SAME_SECONDS", seconds)
+        with pytest.raises(SystemExit) as ended:
+            run(tmp_path / str(step))
+        assert ended.value.code == 128 + signal.SIGTERM
+        assert position(tmp_path / str(step)) == (0, step)
+
+
 def test_sigterm_before_training_ends_at_once_and_binds_nothing(run, monkeypatch, tmp_path):
     opened = TrainingData.open
 

@@ -1,0 +1,110 @@
+"""Commands by which the renderer benchmark makes data and trainings: their settings, and what they read."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from datagen.assets import find_assets
+from datagen.settings import Settings as DatagenSettings
+from eval.cli import Settings as EvalSettings
+from eval.real_models import model_names
+from eval.renderer.benchmark import Renderer
+from eval.renderer.datasets import Datasets
+from eval.stages import Child
+from train.settings import Settings as TrainSettings
+from train.splits import Splits
+from tron.cli.instantiation import make
+from tron.cli.recipes import check, compose_recipe
+
+COMMANDS = {"tron-datagen": ("conf.datagen", DatagenSettings), "tron-train": ("conf.train", TrainSettings)}
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Name of what is made -> settings of its command, which is not run."""
+    found: dict[str, Any] = {}
+
+    def note(children: Sequence[Child]) -> None:
+        for child in children:
+            module, model = COMMANDS[child.script]
+            found[child.label] = check(compose_recipe(module, model, child.arguments), model)
+
+    monkeypatch.setattr("eval.stages.run_together", note)
+    return found
+
+
+def datasets(folder: Path, *overrides: str) -> Datasets:
+    recipe = compose_recipe("conf.eval", EvalSettings, ["benchmark=renderer", *overrides])
+    benchmark = make(check(recipe, EvalSettings).benchmark, "benchmark")
+    assert isinstance(benchmark, Renderer)
+    return Datasets(benchmark, folder)
+
+
+def test_the_commands_accept_every_recipe_and_no_data_share_a_seed(asked: dict[str, Any], tmp_path: Path):
+    for kind in ("assets/a", "hdri"):
+        (tmp_path / "real" / kind).mkdir(parents=True)
+    (tmp_path / "real" / "assets" / "a" / "chess-board.glb").touch()
+    (tmp_path / "real" / "hdri" / "night_1k.hdr").touch()
+    made = datasets(tmp_path / "out", f"benchmark.real_data={tmp_path / 'real'}", "benchmark.max_seconds=9")
+    for size in (128, 256):
+        made.synthetic(size)
+    for make_it in (made.captures, made.shadows, made.seeds, made.kills, made.trained):
+        make_it()
+    made.models(128)
+    assert asked["models_128"].allow_unlicensed == ["chess-board", "night_1k"]
+    assert asked["captures"].captures == tmp_path / "out" / "captures_views" / "captures"
+    assert asked["captures"].captured.split_by_name
+    assert asked["trained_pair"].renderer["config"]["guidance"] == ["pbr", "irradiance"]
+    assert asked["trained_lit"].splits == {"train_b": f"{tmp_path / 'out' / 'training_captures'}#train"}
+    assert asked["trained_lit"].max_seconds == 9
+    views = ("synthetic_128", "models_128", "captures_views", "training_captures_views", "shadows")
+    seeds = [asked[name].seed for name in (*views, "training", "seed_training")]
+    assert len(set(seeds)) == len(seeds)
+
+
+def test_models_of_one_file_name_and_with_spaces_are_called_as_tron_datagen_calls_them(
+    asked: dict[str, Any], tmp_path: Path
+):
+    """Many downloads hold a scene.gltf."""
+    for name in (
+        "assets/cup/scene.gltf",
+        "assets/jar/scene.gltf",
+        "assets/chess board.glb",
+        "hdri/2024.hdr",
+        "hdri/o'clock.exr",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    names = model_names(tmp_path)
+    assert sorted(names) == ["chess board", "cup/scene", "jar/scene"]
+    assert {each.id for each in find_assets(tmp_path / "assets", allow_unlicensed=names)} == set(names)
+    datasets(tmp_path / "out", f"benchmark.real_data={tmp_path}").models(128)
+    assert asked["models_128"].allow_unlicensed == [*names, "2024", "o'clock"]
+
+
+def test_threads_and_seed_of_the_command_are_those_of_the_benchmark(tmp_path: Path):
+    settings = datasets(tmp_path, "threads=3", "seed=5").settings
+    assert (settings.threads, settings.seed) == (3, 5)
+
+
+def test_short_trainings_learn_from_surfels_of_buffers_alone(asked: dict[str, Any], tmp_path: Path):
+    """Reconstructing them would take most of the part's time."""
+    datasets(tmp_path).seeds()
+    assert asked["seed_training"].surfels_from.reconstruction == 0
+
+
+def test_per_pixel_baselines_learn_from_the_split_that_fits_are_made_on(
+    asked: dict[str, Any], dataset: Path, tmp_path: Path
+):
+    """A captures' `train` holds photographs; relit truth, which judges, is in `train_relit`."""
+    for split in ("train", "train_b"):
+        datasets(tmp_path / split).pixel_mlps(dataset, split)
+        for name in ("pixel_mlp", "pixel_mlp_lit"):
+            settings = asked[f"{dataset.name}_{name}"]
+            splits = Splits(settings.dataset, settings.splits)
+            (learnt,) = {split for stage in settings.stages for split in stage.splits()}
+            clips = splits.clips(learnt)
+            assert {clips.meta(number).split for number in range(len(clips))} == {split}
+    assert datasets(tmp_path / "none").pixel_mlps(dataset, "train_relit") == {}
