@@ -21,7 +21,7 @@ from pathlib import Path
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat
 
-from tron.cli.termination import termination_unwinds
+from tron.cli.termination import termination_noted
 from tron.errors import TronError
 from tron.runtime import describe_machine
 from tron.storage import write_atomic
@@ -170,9 +170,9 @@ def run_together(children: Sequence[Child]) -> None:
         StageFailed: the first child, in the order given, that failed by itself.
     """
     paths = [script_path(child.script) for child in children]
-    with termination_unwinds(), ExitStack() as running:
+    with termination_noted() as termination, ExitStack() as running:
         started = [running.enter_context(_running(child, path)) for child, path in zip(children, paths)]
-        while True:
+        while not termination.asked:
             codes = [process.poll() for process, _ in started]
             for child, code, (_, last) in zip(children, codes, started):
                 if code:

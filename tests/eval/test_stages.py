@@ -134,3 +134,35 @@ def test_a_damaged_record_is_one_line(tmp_path: Path):
     (tmp_path / "stages.json").write_text("{]")
     with pytest.raises(TronError, match="not a record of stages"):
         Stages(tmp_path)
+
+
+def test_a_signal_while_the_lock_of_a_child_is_held_ends_the_demo_all_the_same(tmp_path: Path, scripts: Path):
+    script(scripts, "tron-x", "time.sleep(60)")
+    program = f"""
+import os, signal, subprocess
+from pathlib import Path
+from eval import stages
+
+class Signalled:
+    signals = [signal.SIGTERM]
+    def __init__(self, lock): self.lock = lock
+    def __getattr__(self, name): return getattr(self.lock, name)
+    def __enter__(self): return self.lock.__enter__()
+    def __exit__(self, *error): return self.lock.__exit__(*error)
+    def acquire(self, *arguments):
+        taken = self.lock.acquire(*arguments)
+        while self.signals:
+            os.kill(os.getpid(), self.signals.pop())
+        return taken
+
+class Popen(subprocess.Popen):
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        self._waitpid_lock = Signalled(self._waitpid_lock)
+
+stages.subprocess.Popen = Popen
+stages.script_path = lambda name: str(Path({str(scripts)!r}) / name)
+stages.Stages(Path({str(tmp_path)!r})).run("make", [stages.Child("x", "tron-x", [])])
+"""
+    demo = subprocess.run([sys.executable, "-c", program], cwd=ROOT, timeout=60, capture_output=True)
+    assert demo.returncode == 128 + signal.SIGTERM, demo.stderr
