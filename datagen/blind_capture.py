@@ -2,10 +2,11 @@
 
     transforms.json     nerfstudio's: intrinsics, OpenGL camera-to-world matrices
     images/NAME.jpg     8 bits (or .png)
+    masks/NAME.png      8 bits, what is subject; where they are asked for
     sparse.ply          points and their colours, if some are known
 
 No object "tron" (``tron.captures.folder``), so that ``load_capture`` reads the folder as anybody's photos:
-without masks and maps, of an exposure and a tone curve that nothing names.
+without maps, of an exposure and a tone curve that nothing names.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from tron.errors import TronError
 from tron.storage import atomic_folder
 
 IMAGES = "images"
+MASKS = "masks"
 POINTS_NAME = "sparse.ply"
 
 
@@ -34,6 +36,7 @@ def write_blind_capture(
     photos: Mapping[str, bytes],
     suffix: str,
     points: tuple[np.ndarray, np.ndarray] | None = None,
+    masks: Mapping[str, bytes] | None = None,
 ) -> None:
     """Write the folder; it appears whole or not at all, and replaces the one that is there.
 
@@ -43,6 +46,7 @@ def write_blind_capture(
         photos: name -> file.
         suffix: of the files, such as ".jpg".
         points: positions (N, 3), world, and display colours (N, 3).
+        masks: name -> PNG file, if there are any.
 
     Raises:
         TronError: something else lies at ``path``, or the disk says no.
@@ -53,6 +57,10 @@ def write_blind_capture(
         (folder / IMAGES).mkdir()
         for name, data in photos.items():
             (folder / IMAGES / f"{name}{suffix}").write_bytes(data)
+        if masks:
+            (folder / MASKS).mkdir()
+            for name, data in masks.items():
+                (folder / MASKS / f"{name}.png").write_bytes(data)
         if points is not None:
             (folder / POINTS_NAME).write_bytes(encode_points(*points))
         text = json.dumps(_transforms(cameras, suffix, points is not None), indent=1) + "\n"

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from datagen.albedo_scale import at_true_scale
 from datagen.captured_photos import in_order, require_size, resized_view, starts
+from datagen.captured_reconstruction import Found
 from datagen.captured_relit import RelitTruth, find_relit
 from datagen.captured_surfels import CapturedSurfels, LitSurfels
 from datagen.lights import classify, contrast_share
 from datagen.plan import Work
+from datagen.pseudo_captures import TRUTH
 from datagen.settings import Settings
 from datagen.spool import Frame, stored_guidance
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder
 from tron.errors import TronError
+from tron.gaussians.scene import GaussianScene
 from tron.shading.environment import EnvironmentMap
 from tron.shards.schema import TARGET, ClipMeta, color_spaces
 
@@ -27,23 +32,24 @@ MOST_TURNED, MOST_MOVED = 2.0, 0.05
 """Degrees, and share of the photos' distance from their middle, that a named pose may be off the true one."""
 
 
-def relit_clips(
-    item: Work, settings: Settings, surfels: CapturedSurfels
-) -> Iterator[tuple[ClipMeta, Sequence[Frame]]]:
+def relit_clips(item: Work, settings: Settings, found: Found) -> Iterator[tuple[ClipMeta, Sequence[Frame]]]:
     """Clips of a capture under each light of ``captured.relit``, light by light.
 
     Frames hold the schema's members, all linear: guidance under that light, from the true cameras, and as
     rgb what was path-traced, in front of the light itself. The world is the truth's: pseudo-captures name
-    poses with errors that have no common part.
+    poses with errors that have no common part. Where the truth of the capture lies beside (``truth/NAME``),
+    base color is brought to its scale, which photos cannot tell.
 
     Args:
         item: the capture; its split is that of its clips (``train_relit``).
         settings: the recipe.
-        surfels: its reconstruction.
+        found: its reconstruction.
 
     Raises:
         TronError: a folder cannot be read, is not linear or without masks, or its views are too small.
     """
+    scene, factors = _at_true_scale(item, settings, found.scene)
+    surfels = CapturedSurfels(item, settings, replace(found, scene=scene))
     for truth in find_relit(settings, item.capture):
         log.info("%s (%s): relit by %s", item.name, item.capture, truth.folder.name)
         capture = read_capture_folder(truth.folder)
@@ -55,7 +61,24 @@ def relit_clips(
             made = [_frame(view, lit, environment, settings) for view in chosen]
             cameras = [camera for camera, _ in made]
             meta = _meta(item, settings, truth, environment, capture.exposure, number, chosen, cameras)
+            meta.extra["albedo_scale"] = [round(float(factor), 6) for factor in factors]
             yield meta, [frame for _, frame in made]
+
+
+def _at_true_scale(
+    item: Work, settings: Settings, surfels: GaussianScene
+) -> tuple[GaussianScene, np.ndarray]:
+    """The surfels with base color as bright as the truth's, where that is known, and the factors (3,)."""
+    assert settings.captured.relit is not None
+    path = settings.captured.relit.resolve().parent / TRUTH / item.capture
+    if not path.is_dir():
+        return surfels, np.ones(3)
+    views = [view for view in read_capture_folder(path).views if view.has("base_color")]
+    scene, factors = at_true_scale(
+        surfels, ((view.camera, view.read("base_color"), view.read("mask")) for view in views)
+    )
+    log.info("%s (%s): base color scaled by %.2f, %.2f, %.2f", item.name, item.capture, *factors)
+    return scene, factors
 
 
 def require_own_truth(item: Work, settings: Settings, photos: Capture) -> None:

@@ -60,7 +60,7 @@ def make_capture(item: Work, settings: Settings, sources: Sources) -> Record:  #
             made = [_written(item, settings, clips, len(clips))]
         if item.relit:
             relit = replace(item, split=f"{item.split}{RELIT}")
-            made.append(_written(relit, settings, relit_clips(relit, settings, surfels), item.relit))
+            made.append(_written(relit, settings, relit_clips(relit, settings, found), item.relit))
     record = Record(
         name=item.name,
         capture=item.capture,

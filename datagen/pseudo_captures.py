@@ -255,7 +255,8 @@ def _write_photos(
         files = {name: encode_png(photo) for name, photo in photos.items()}
     else:
         files = {name: encode_jpeg(photo, wanted.jpeg_quality) for name, photo in photos.items()}
-    write_blind_capture(path, poses, files, ".png" if wanted.file == "png" else ".jpg", points)
+    masks = {name: encode_png(shots[name][..., 3:]) for name in cameras} if wanted.masks else None
+    write_blind_capture(path, poses, files, ".png" if wanted.file == "png" else ".jpg", points, masks)
 
 
 def median_distance(cameras: Mapping[str, Camera], buffers: Mapping[str, GBufferView]) -> float:

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import logging
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import KDTree
 
+from datagen.albedo_scale import at_true_scale
 from datagen.build import Geometry
 from datagen.capture_export import captured
 from datagen.capture_settings import CaptureSettings
@@ -24,6 +26,7 @@ from datagen.refinement import figures_of
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
 from datagen.view_spool import ViewSpool
+from tron.cameras import Camera
 from tron.captures import Capture
 from tron.captures.folder import read_capture_folder, write_capture
 from tron.gaussians.initialize import surfels_from_gbuffers
@@ -44,6 +47,8 @@ log = logging.getLogger(__name__)
 
 FOLDER = "reconstruction"
 """Folder of a scene that holds its pictures and the checkpoint while it is made."""
+SCALED_BY = 8
+"""Views that tell the scale of the base color."""
 
 
 @stage("reconstruct")
@@ -52,7 +57,8 @@ def reconstruct_surfels(
 ) -> tuple[GaussianScene, Figures]:
     """Surfels reconstructed from pictures of a scene, and how near they are to the truth.
 
-    They are judged by the cameras of the first clip, which are not among the pictures'.
+    Where light and materials are fitted together, base color is brought to the truth's scale. They are judged
+    by the cameras of the first clip, which are not among the pictures'.
 
     Raises:
         TronError: the scene's folder cannot be written, or a reconstruction of other settings lies there.
@@ -72,7 +78,12 @@ def reconstruct_surfels(
     )
     device = torch_device(settings.variant)
     found = reconstruct(capture, prior, recipe, checkpoint=folder / "checkpoint.safetensors", device=device)
-    scene = found.scene if spec.motion is None else _with_objects(found.scene, spec, geometry, settings)
+    scene = found.scene
+    if isinstance(prior, Joint):
+        scene, factors = at_true_scale(scene, _base_colors(spec, geometry, settings))
+        log.info("base color scaled by %.2f, %.2f, %.2f", *factors)
+    if spec.motion is not None:
+        scene = _with_objects(scene, spec, geometry, settings)
     return scene, _judged(scene, spec, geometry, settings)
 
 
@@ -109,6 +120,15 @@ def _pictures(spec: SceneSpec, geometry: Geometry, settings: Settings, folder: P
         folder.mkdir(parents=True)
         write_capture(where, captured(spec, geometry, environment, shots))
     return read_capture_folder(where)
+
+
+def _base_colors(
+    spec: SceneSpec, geometry: Geometry, settings: Settings
+) -> Iterator[tuple[Camera, np.ndarray, np.ndarray]]:
+    """Camera, true base color and mask of some of the views."""
+    cameras = spec.views(max(settings.views, 2), settings.view_width, settings.view_height)
+    for seen in stream_gbuffers(geometry, cameras[:: -(-len(cameras) // SCALED_BY)]):
+        yield seen.camera, seen.base_color, seen.valid
 
 
 def _with_objects(

@@ -90,7 +90,17 @@ def scale_albedo(
     mask: np.ndarray | None = None,
     method: Literal["least_squares", "median_ratio"] = "least_squares",
 ) -> np.ndarray:
-    """Scale a predicted albedo to the truth, one factor a channel: reflectance is known only up to it.
+    """Predicted albedo scaled to the truth by ``albedo_scale``: (..., 3) float32, not clipped."""
+    return (prediction * albedo_scale(prediction, truth, mask, method)).astype(np.float32)
+
+
+def albedo_scale(
+    prediction: np.ndarray,
+    truth: np.ndarray,
+    mask: np.ndarray | None = None,
+    method: Literal["least_squares", "median_ratio"] = "least_squares",
+) -> np.ndarray:
+    """Factors (3,) that bring a predicted albedo to the truth: reflectance is known only up to them.
 
     Papers disagree, and the figures differ: TRON fits by least squares for each view (call once a view),
     TensoIR, GS-IR and IRGS take the median ratio of all views together (call once with the views stacked).
@@ -101,9 +111,6 @@ def scale_albedo(
         method: ``least_squares`` minimises the squared error, ``median_ratio`` is the median of truth /
             prediction where the prediction exceeds 1e-6.
 
-    Returns:
-        The whole prediction, scaled, (..., 3) float32, not clipped.
-
     Raises:
         TronError: the mask selects nothing.
         ValueError: shapes differ.
@@ -113,11 +120,9 @@ def scale_albedo(
     t = _selected(np.asarray(truth, np.float64), mask).reshape(p.shape)
     if method == "least_squares":
         energy = (p * p).sum(axis=0)
-        scale = np.where(energy > 0, (p * t).sum(axis=0) / np.where(energy > 0, energy, 1), 1.0)
-    else:
-        ratios = [tc[pc > 1e-6] / pc[pc > 1e-6] for pc, tc in zip(p.T, t.T)]
-        scale = np.array([np.median(ratio) if ratio.size else 1.0 for ratio in ratios])
-    return (prediction * scale).astype(np.float32)
+        return np.where(energy > 0, (p * t).sum(axis=0) / np.where(energy > 0, energy, 1), 1.0)
+    ratios = [tc[pc > 1e-6] / pc[pc > 1e-6] for pc, tc in zip(p.T, t.T)]
+    return np.array([np.median(ratio) if ratio.size else 1.0 for ratio in ratios])
 
 
 def _same_shape(a: np.ndarray, b: np.ndarray) -> None:

@@ -127,6 +127,32 @@ def test_guidance_is_of_the_surfels_under_that_light(pairs: Path):
     np.testing.assert_allclose(two, 2 * one, rtol=2e-3, atol=1e-3)
 
 
+def test_base_color_is_brought_to_the_scale_of_a_truth_that_lies_beside(
+    pairs: Path, recipe: Recipe, tiny_captures: Path, relit: Path, tmp_path: Path
+):
+    true = read_capture_folder(tiny_captures / NAME)
+    mapped = [view for view in true.views if view.has("base_color")]
+    made = []
+    for factor in (0.5, 0.25):
+        folder = tmp_path / str(factor)
+        shutil.copytree(relit, folder / "relit")
+        darker = tuple(replace(view, base_color=factor * view.read("base_color")) for view in mapped)
+        write_capture(folder / "truth" / NAME, replace(true, views=darker, test=frozenset()))
+        again = [f"captured.relit={folder / 'relit'}", f"captured.reconstructed={pairs}"]
+        assert make(recipe(folder / "pairs", *again)) == 0
+        made.append(folder / "pairs")
+    for plain, bright, dark in zip(*(read_clips(folder, "test_relit") for folder in (pairs, *made))):
+        assert plain.meta.extra["albedo_scale"] == [1, 1, 1]
+        scales = [np.array(clip.meta.extra["albedo_scale"]) for clip in (bright, dark)]
+        np.testing.assert_allclose(scales[0], 2 * scales[1], rtol=1e-2)
+        one, other = bright.frames["pbr"], dark.frames["pbr"]
+        surfels = (one != other).any(-1)  # not the light behind them
+        assert surfels.mean() > 0.1
+        assert other[surfels].mean() < 0.8 * one[surfels].mean()
+    for plain, dark in zip(read_clips(pairs, "test"), read_clips(made[1], "test")):
+        np.testing.assert_array_equal(dark.frames["pbr"], plain.frames["pbr"])
+
+
 def test_a_run_that_ends_before_the_relit_clips_goes_on_to_the_same_bytes(
     pairs: Path, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files_of
 ):

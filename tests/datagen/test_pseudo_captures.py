@@ -21,7 +21,7 @@ from datagen.settings import Settings
 from datagen.validate import validate
 from tron.apps.reconstruct_settings import Settings as ReconstructSettings
 from tron.cameras import Camera
-from tron.captures import load_capture
+from tron.captures import LoadSettings, load_capture
 from tron.captures.folder import read_capture_folder
 from tron.captures.view import MAPS
 from tron.cli.recipes import check, compose_recipe
@@ -120,6 +120,18 @@ def test_the_reader_of_reconstructions_sees_photos_and_no_map(output, tmp_path):
             assert view.space == "display"
         assert capture.points is not None
         assert len(capture.points) == 50
+
+
+def test_masks_are_stored_where_they_are_asked_for_and_read_as_the_subject(tmp_path, variant):
+    settings = tiny(tmp_path, "test.scenes=0", "pseudo_capture.masks=true")
+    assert make_pseudo_captures(settings) == 0
+    folder = tmp_path / "captures/train-000000"
+    capture = load_capture(folder, LoadSettings(masks="subject"))
+    truth = {view.name: view for view in read_capture_folder(tmp_path / "truth/train-000000").views}
+    assert len(list((folder / "masks").iterdir())) == len(capture.views)
+    for view in capture.views:
+        np.testing.assert_allclose(view.read("mask"), truth[view.name].read("mask"), atol=1 / 255)
+    assert 0 < np.mean([view.read("mask").mean() for view in capture.views]) < 1
 
 
 def test_truth_allows_to_judge_and_to_relight(output):
