@@ -9,6 +9,7 @@ from typing import ClassVar
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from eval.benchmark import Benchmark
+from eval.demo.large_frames import large_frames
 from eval.demo.refinement import refinement
 from eval.relighting.benchmark import Relighting
 from eval.report.outcome import Outcome
@@ -21,6 +22,7 @@ from tron.shards.manifest import Manifest
 WORDS = {
     "datagen": "path-trace scenes, make surfels, render pbr, irradiance and lit",
     "train": "train the neural renderer and, at the same time, one of two buffers and the pixel MLP",
+    "large": "larger frames of three held-out scenes",
     "eval": "fit the baselines, score every held-out frame",
 }
 TRAININGS = {
@@ -38,6 +40,9 @@ class Demo(Benchmark):
 
     relighting: Relighting = Field(description="settings of the evaluation; its inputs are filled in")
     datagen: list[str] = Field(default=["experiment=demo"], description="arguments of tron-datagen")
+    large: list[str] = Field(
+        default_factory=list, description="arguments of tron-datagen for larger frames; none: no such pictures"
+    )
     train: list[str] = Field(
         default=["experiment=demo"], description="arguments of tron-train, for all networks"
     )
@@ -70,6 +75,9 @@ class Demo(Benchmark):
         stages, dataset = Stages(folder), folder / "dataset"
         stages.run("datagen", [Child("datagen", "tron-datagen", [*self.datagen, f"output_dir={dataset}"])])
         stages.run("train", [self._training(name, dataset, folder / "train" / name) for name in TRAININGS])
+        if self.large:
+            arguments = [*self.large, f"output_dir={folder / 'large'}"]
+            stages.run("large", [Child("large", "tron-datagen", arguments)])
         weights = {name: folder / "train" / name / "renderer.safetensors" for name in TRAININGS}
         evaluation = self.relighting.model_copy(
             update={
@@ -81,6 +89,7 @@ class Demo(Benchmark):
         stages.restart("eval")  # never stale: it costs a minute and shows the code as it is now
         with stages.timed("eval", [["tron-eval", "benchmark=demo", f"output_dir={output_dir}"]]):
             outcome = evaluation.run(output_dir)
+            larger = large_frames(folder / "large") if self.large else []
         rows, sections = refinement(dataset, self.relighting.seed)
         seconds = {f"{name}_seconds": record.seconds for name, record in stages.records.items()}
         rows += [
@@ -94,7 +103,7 @@ class Demo(Benchmark):
             outcome,
             rows=[*outcome.rows, *rows],
             title="Demo: from path-traced scenes to an evaluated neural renderer",
-            sections=[*outcome.sections, *sections, *stage_section(stages.records, WORDS)],
+            sections=[*outcome.sections, *larger, *sections, *stage_section(stages.records, WORDS)],
             headline={**outcome.headline, "demo.seconds": "The whole demo, after set-up"},
             reproduce=[
                 "make demo",

@@ -55,7 +55,8 @@ def test_the_demo_goes_from_nothing_to_a_report_and_a_second_run_only_evaluates(
     assert run(f"output_dir={out}", *times) == 0
     commands = stand_ins.read_text().splitlines()
     assert commands[0] == f"tron-datagen experiment=demo output_dir={out / 'dataset'}"
-    trained = sorted(command.split()[2:4] for command in commands[1:])
+    assert commands[-1].startswith("tron-datagen experiment=demo train.scenes=0 ")
+    trained = sorted(command.split()[2:4] for command in commands[1:-1])
     assert [words[0] for words in trained] == ["renderer=pixel_mlp", "renderer=tiny", "renderer=tiny"]
     assert sum("renderer.config.guidance=[pbr,irradiance]" in words for words in trained) == 1
     limits = {
@@ -65,7 +66,7 @@ def test_the_demo_goes_from_nothing_to_a_report_and_a_second_run_only_evaluates(
     assert limits == {"tiny": {"max_seconds=7"}, "pixel_mlp": {"max_seconds=3"}}
     results = Results.load(out / "results.json")
     assert results.benchmark == "demo"
-    parts = [results.value(f"demo.{stage}_seconds") for stage in ("datagen", "train", "eval")]
+    parts = [results.value(f"demo.{stage}_seconds") for stage in ("datagen", "train", "large", "eval")]
     assert all(parts)
     assert results.value("demo.seconds") == pytest.approx(sum(parts))  # type: ignore[arg-type]
     for method in ("neural", "neural_lit", "lit", "lit.supersampled", "lit.reflections", "pixel_mlp_lit"):
@@ -83,6 +84,7 @@ def test_the_demo_goes_from_nothing_to_a_report_and_a_second_run_only_evaluates(
     html = (out / "report.html").read_text()
     assert "Where the time went" in html
     assert "the whole demo, after set-up" in html
+    assert "Larger frames, by the renderers that ship" in html
 
     assert run(f"output_dir={out}", *times) == 0
     assert stand_ins.read_text().splitlines() == commands
@@ -90,7 +92,7 @@ def test_the_demo_goes_from_nothing_to_a_report_and_a_second_run_only_evaluates(
     for stage in ("datagen", "train"):
         assert again.value(f"demo.{stage}_seconds") == results.value(f"demo.{stage}_seconds")
     stages = json.loads((out / "stages.json").read_text())["stages"]
-    assert list(stages) == ["datagen", "train", "eval"]
+    assert list(stages) == ["datagen", "train", "large", "eval"]
     assert all(stage["finished"] for stage in stages.values())
 
 
