@@ -41,7 +41,7 @@ class Demo(Benchmark):
     relighting: Relighting = Field(description="settings of the evaluation; its inputs are filled in")
     datagen: list[str] = Field(default=["experiment=demo"], description="arguments of tron-datagen")
     large: list[str] = Field(
-        default_factory=list, description="arguments of tron-datagen for larger frames; none: no such pictures"
+        default_factory=list, description="arguments of tron-datagen for larger frames; none: no pictures"
     )
     train: list[str] = Field(
         default=["experiment=demo"], description="arguments of tron-train, for all networks"

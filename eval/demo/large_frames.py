@@ -36,7 +36,8 @@ def large_frames(dataset: Path) -> list[Section]:
         "(`checkpoint=pair` and `checkpoint=lit`): they were trained on other scenes, at 128 x 128, and not "
         "here. Each number is the PSNR of that very picture's foreground."
     )
-    return [Section("large", "Larger frames, by the renderers that ship", [Text(words), *map(comparison, chosen)])]
+    blocks = [Text(words), *map(comparison, chosen)]
+    return [Section("large", "Larger frames, by the renderers that ship", blocks)]
 
 
 def _shipped() -> Mapping[Kind, Path]:
