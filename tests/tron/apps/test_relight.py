@@ -28,7 +28,7 @@ SIZE = 32
 def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, tmp_path, read_video):
     out = tmp_path / "out"
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=2"]
-    assert relight(*base, "buffers=[normal,depth,mask]") == 0
+    assert relight(*base, "buffers=[normal,depth,mask]", "checkpoint=null") == 0
     frames = sorted(path.name for path in (out / "frames").iterdir())
     buffers = ("depth", "irradiance", "lit", "mask", "normal", "pbr")
     expected = [f"{i:04d}.{name}.exr" for i in range(2) for name in buffers]
@@ -306,8 +306,8 @@ def test_a_file_in_place_of_the_output_folder_is_one_line(relight, scene_path, l
         ({"background": "white"}, "a list is written background=[1,1,1]"),
         ({"background": "[0,0,255]"}, "'background.2' (255)"),
         ({"checkpoint": "absent.safetensors", "buffers": "[relit]"}, "no relit.exr with a checkpoint"),
-        ({"window": "5"}, "window is the neural renderer's: give a checkpoint too"),
-        ({"overlap": "mean"}, "overlap is the neural renderer's"),
+        ({"window": "5", "checkpoint": "null"}, "window is the neural renderer's: give a checkpoint too"),
+        ({"overlap": "mean", "checkpoint": "null"}, "overlap is the neural renderer's"),
         ({"overlap": "oldest", "checkpoint": "a.safetensors"}, "'overlap'"),
         ({"weights": "{pbr: -1}", "checkpoint": "a.safetensors"}, "the weight of 'pbr' is -1"),
         ({"weights": "{pbr: 0}", "checkpoint": "a.safetensors"}, "all weights are 0"),

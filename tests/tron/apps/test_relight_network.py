@@ -91,14 +91,14 @@ def test_the_record_is_of_the_file_that_was_loaded(run, checkpoints, tmp_path, m
 
 
 def test_a_shipped_checkpoint_is_given_by_name(run, checkpoints, tmp_path, monkeypatch, capsys):
-    assert run(tmp_path / "path", f"checkpoint={checkpoints / 'lit.safetensors'}") == 0
+    assert run(tmp_path / "path", f"checkpoint={checkpoints / 'pair.safetensors'}") == 0
     monkeypatch.setattr(shipped, "FOLDER", checkpoints)
-    assert run(tmp_path / "name", "checkpoint=lit") == 0
+    assert run(tmp_path / "name", "checkpoint=pair") == 0
     np.testing.assert_array_equal(pictures(tmp_path / "name"), pictures(tmp_path / "path"))
     monkeypatch.setattr(shipped, "FOLDER", tmp_path)
-    assert run(tmp_path / "absent", "checkpoint=lit") == 2
+    assert run(tmp_path / "absent", "checkpoint=pair") == 2
     error = capsys.readouterr().err.strip()
-    assert "this installation has no checkpoint 'lit'" in error
+    assert "this installation has no checkpoint 'pair'" in error
     assert "\n" not in error
     assert not (tmp_path / "absent").exists()
 
@@ -147,7 +147,8 @@ def test_the_default_checkpoint_draws_where_it_fits(run, checkpoints, tmp_path, 
 
 def test_the_default_is_a_shipped_one_whose_file_is_there():
     assert shipped.DEFAULT is None or shipped.shipped(shipped.DEFAULT).is_file()
-    assert relight_settings.Settings.model_fields["checkpoint"].default in (None, shipped.DEFAULT)
+    default = relight_settings.Settings.model_fields["checkpoint"].default
+    assert (None if default is None else str(default)) == shipped.DEFAULT
 
 
 class _Explosive:
