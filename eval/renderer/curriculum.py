@@ -16,7 +16,9 @@ from eval.results import Row, mean_row
 from tron.errors import TronError
 from tron.report.page import Block, Cell, Section, Table, Text
 
-SYNTHETIC, CAPTURES = "synthetic", "captures"
+SYNTHETIC, CAPTURES, PHOTOS = "synthetic", "captures", "photos"
+PLACES = {SYNTHETIC: "synthetic scenes", CAPTURES: "captures relit", PHOTOS: "captures in their own light"}
+"""Distribution that judges -> its heading."""
 STAGE_FILE = re.compile(r"(\d+)-([\w-]+)\.safetensors")
 
 
@@ -30,8 +32,8 @@ class Curriculum:
     def rows(self, seed: int) -> Iterator[Row]:
         """PSNR of every stage, what stage 2 gains on captures, and what stage 3 loses on single frames.
 
-        Figures without a checkpoint's name are of the first that was given. The loss is the greater of
-        those on the two distributions.
+        Figures without a checkpoint's name are of the first that was given. The loss is the greatest of
+        those on the distributions.
         """
         for (kind, number, place), found in self.psnr.items():
             yield mean_row(f"renderer.{kind}.stage{number}_psnr.{place}", "dB", found, seed)
@@ -40,9 +42,10 @@ class Curriculum:
         for kind in kinds:
             start = "renderer" if kind == first else f"renderer.{kind}"
             yield from self._change(f"{start}.stage2_capture_gain_db", kind, 2, 1, CAPTURES, seed)
+            yield from self._change(f"{start}.stage2_photo_gain_db", kind, 2, 1, PHOTOS, seed)
             losses = [
                 row
-                for place in (SYNTHETIC, CAPTURES)
+                for place in PLACES
                 for row in self._change(
                     f"{start}.stage3_single_frame_loss_db.{place}", kind, 2, 3, place, seed
                 )
@@ -54,9 +57,7 @@ class Curriculum:
 
     def sections(self, pictures: Path) -> list[Section]:  # noqa: ARG002
         """A row for each stage, a column for each distribution."""
-        places = [
-            place for place in (SYNTHETIC, CAPTURES) if any(place == found for _, _, found in self.psnr)
-        ]
+        places = [place for place in PLACES if any(place == found for _, _, found in self.psnr)]
         rows: list[Sequence[Cell | str]] = []
         for (kind, number), name in self.names.items():
             cells = []
@@ -68,7 +69,7 @@ class Curriculum:
         caption = "Foreground PSNR of what each stage ended with, single frames."
         blocks: list[Block] = [
             Text(f"Differences of stages are of the same frames. {interval_note(min(scenes))}"),
-            Table(caption, ["Stage", *(f"{place} scenes" for place in places)], rows),
+            Table(caption, ["Stage", *(PLACES[place] for place in places)], rows),
         ]
         return [Section("curriculum", "Stages of the training", blocks)]
 

@@ -12,7 +12,7 @@ from typing import Protocol
 from eval.relighting.benchmark import load_network
 from eval.relighting.measured import Judged
 from eval.renderer.clips import measure_clips
-from eval.renderer.curriculum import CAPTURES, SYNTHETIC, measure_curriculum
+from eval.renderer.curriculum import CAPTURES, PHOTOS, SYNTHETIC, measure_curriculum
 from eval.renderer.datasets import FIT, FIT_RELIT, TEST, TEST_RELIT, WEIGHTS, Datasets
 from eval.renderer.gains import Gains
 from eval.renderer.judging import Judging
@@ -26,6 +26,7 @@ from eval.renderer.sweep import measure_sweep
 from eval.renderer.throughput import measure_throughput
 from eval.results import Row
 from tron.report.page import Section
+from tron.shards.manifest import Manifest
 
 log = logging.getLogger("tron.eval")
 
@@ -122,8 +123,9 @@ class Parts:
             "captures",
             "capture_",
             "Captures, reconstructed and relit under other lights",
-            "Photographs of scenes whose truth is hidden, reconstructed blind; the reconstruction is lit by "
-            "lights it was not filmed in and judged by path-traced truth.",
+            "Photographs of scenes whose truth is hidden, with masks of what is subject, reconstructed "
+            "blind; the reconstruction is lit by lights it was not filmed in and judged by path-traced "
+            "truth. Of the truth it is told one factor a channel on its base color, which no photo shows.",
             {judged.clips[0].width: judged},
         )
 
@@ -131,10 +133,13 @@ class Parts:
         if not self.trained:
             log.warning("no benchmark.training={pair: DIR}: stages have no rows")
             return
+        captures = self.datasets.captures()
         judges = {
             SYNTHETIC: (self.datasets.synthetic(self._size), TEST),
-            CAPTURES: (self.datasets.captures(), TEST_RELIT),
+            CAPTURES: (captures, TEST_RELIT),
         }
+        if TEST in Manifest.load(captures).splits():
+            judges[PHOTOS] = (captures, TEST)
         yield measure_curriculum(self.trained, judges)
 
     def _clips(self) -> Iterable[Found]:

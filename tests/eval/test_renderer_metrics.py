@@ -10,7 +10,7 @@ from eval.relighting.measured import Judged
 from eval.relighting.scores import Score, Scores
 from eval.renderer.changes import change_sums, correlation, slope, stayed
 from eval.renderer.clips import Clips, ClipScore
-from eval.renderer.curriculum import CAPTURES, SYNTHETIC, Curriculum, stage_files
+from eval.renderer.curriculum import CAPTURES, PHOTOS, SYNTHETIC, Curriculum, stage_files
 from eval.renderer.gains import Gains
 from eval.renderer.judging import fold
 from eval.renderer.kills import Ended, Kills
@@ -200,15 +200,20 @@ def test_stages_are_compared_on_the_same_frames():
 
     psnr = {
         ("pair", number, place): frames(mean)
-        for place, means in ((SYNTHETIC, (30.0, 29.5, 29.4)), (CAPTURES, (20.0, 21.0, 20.5)))
+        for place, means in (
+            (SYNTHETIC, (30.0, 29.5, 29.4)),
+            (CAPTURES, (20.0, 21.0, 20.5)),
+            (PHOTOS, (18.0, 24.0, 23.8)),
+        )
         for number, mean in enumerate(means, 1)
     }
     names = {("pair", number): name for number, name in enumerate(("synthetic", "captures", "clips"), 1)}
     found = Curriculum(psnr, names)  # type: ignore[arg-type]
     rows = values(found.rows(0))
     assert rows["renderer.stage2_capture_gain_db"].value == pytest.approx(1.0)
+    assert rows["renderer.stage2_photo_gain_db"].value == pytest.approx(6.0)
     assert rows["renderer.stage3_single_frame_loss_db.synthetic"].value == pytest.approx(0.1)
-    assert rows["renderer.stage3_single_frame_loss_db"].value == pytest.approx(0.5), "the greater of both"
+    assert rows["renderer.stage3_single_frame_loss_db"].value == pytest.approx(0.5), "the greatest of all"
     assert "stage 3 (clips)" in str(found.sections(Path()))
 
 
