@@ -14,7 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -224,7 +224,9 @@ def end(process: subprocess.Popen) -> None:
             process.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             process.kill()
-            process.wait()
+            # Not for ever: an interrupted `Popen.poll` may have left the process's lock taken.
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(PATIENCE)
 
 
 def _say(label: str, text: str) -> None:

@@ -17,6 +17,8 @@ SAMPLES = 48
 """Places of a path that are looked at."""
 
 TRIES = 40
+LAST_TRIES = 600
+"""Further paths, all of the easiest kind."""
 
 
 class Obstacles:
@@ -64,10 +66,10 @@ def unhindered(
         room, above: least distances from things and from the ground, world units; they shrink to a third.
 
     Raises:
-        TronError: no path in TRIES did.
+        TronError: no path in TRIES and LAST_TRIES did.
     """
-    for attempt in range(TRIES):
-        ease = attempt / (TRIES - 1)
+    for attempt in range(TRIES + LAST_TRIES):
+        ease = min(attempt / (TRIES - 1), 1.0)
         path = draw(rng, ease)
         share = 1.0 - 0.67 * ease
         if obstacles.leave(path, share * room, share * above):

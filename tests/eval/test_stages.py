@@ -11,6 +11,7 @@ import pytest
 
 from eval import stages as stages_module
 from eval.stages import Child, StageFailed, StageFile, Stages
+from tron.cli.termination import termination_noted
 from tron.errors import TronError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -136,22 +137,28 @@ def test_a_damaged_record_is_one_line(tmp_path: Path):
         Stages(tmp_path)
 
 
-def test_a_signal_while_the_lock_of_a_child_is_held_ends_the_demo_all_the_same(tmp_path: Path, scripts: Path):
-    script(scripts, "tron-x", "time.sleep(60)")
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGINT, -signal.SIGINT)]
+)
+def test_a_signal_while_the_lock_of_a_child_is_held_ends_the_demo_all_the_same(
+    tmp_path: Path, scripts: Path, number: signal.Signals, code: int
+):
+    body = f"open({str(tmp_path / 'child')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
+    script(scripts, "tron-x", body)
     program = f"""
 import os, signal, subprocess
 from pathlib import Path
 from eval import stages
 
 class Signalled:
-    signals = [signal.SIGTERM]
+    signals = [{int(number)}]
     def __init__(self, lock): self.lock = lock
     def __getattr__(self, name): return getattr(self.lock, name)
     def __enter__(self): return self.lock.__enter__()
     def __exit__(self, *error): return self.lock.__exit__(*error)
     def acquire(self, *arguments):
         taken = self.lock.acquire(*arguments)
-        while self.signals:
+        while self.signals and Path({str(tmp_path / "child")!r}).exists():
             os.kill(os.getpid(), self.signals.pop())
         return taken
 
@@ -165,4 +172,26 @@ stages.script_path = lambda name: str(Path({str(scripts)!r}) / name)
 stages.Stages(Path({str(tmp_path)!r})).run("make", [stages.Child("x", "tron-x", [])])
 """
     demo = subprocess.run([sys.executable, "-c", program], cwd=ROOT, timeout=60, capture_output=True)
-    assert demo.returncode == 128 + signal.SIGTERM, demo.stderr
+    assert demo.returncode == code, demo.stderr
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "child").read_text()), 0)
+
+
+def test_a_noted_signal_is_not_lost_where_the_block_raises():
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as end, termination_noted() as termination:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert termination.asked
+        raise StageFailed("tron-x", 1, "words")
+    assert end.value.code == 128 + signal.SIGTERM
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_an_ignored_signal_stays_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with termination_noted() as termination:
+            os.kill(os.getpid(), signal.SIGINT)
+        assert not termination.asked
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -31,32 +31,41 @@ def termination_unwinds() -> Iterator[None]:
 
 @dataclass
 class Termination:
-    """Whether SIGTERM has come."""
+    """The signal that asked for the end, if one did."""
 
-    asked: bool = False
+    signum: int | None = None
+
+    @property
+    def asked(self) -> bool:
+        """Whether one has come."""
+        return self.signum is not None
 
 
 @contextmanager
 def termination_noted() -> Iterator[Termination]:
-    """Note SIGTERM while the block runs; if it came, the end of the block raises SystemExit.
+    """Note SIGTERM and SIGINT while the block runs; its end raises SystemExit or KeyboardInterrupt if one came.
 
     For a block that starts and polls processes: an exception out of a signal handler may land within
     `subprocess.Popen` between the taking of its lock and the ``try`` that releases it, and whoever waits for
-    that process then waits for ever. The block must look at ``asked`` by itself.
-    Only the main thread may set handlers; in others nothing is noted.
+    that process then waits for ever. The block must look at ``asked`` by itself. What it raises gives way.
+    Signals that are ignored stay so. Only the main thread may set handlers; in others nothing is noted.
     """
     termination = Termination()
 
-    def note(_signum: int, _frame: object) -> None:
-        termination.asked = True
+    def note(signum: int, _frame: object) -> None:
+        termination.signum = signum
 
     if threading.current_thread() is not threading.main_thread():
         yield termination
         return
-    before = signal.signal(signal.SIGTERM, note)
+    noted = [each for each in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(each) != signal.SIG_IGN]
+    before = {each: signal.signal(each, note) for each in noted}
     try:
         yield termination
     finally:
-        signal.signal(signal.SIGTERM, before)
-    if termination.asked:
-        raise SystemExit(128 + signal.SIGTERM)
+        for each, handler in before.items():
+            signal.signal(each, handler)
+        if termination.signum == signal.SIGINT:
+            raise KeyboardInterrupt
+        if termination.signum is not None:
+            raise SystemExit(128 + termination.signum)
