@@ -1,4 +1,4 @@
-"""Captures as a camera and structure from motion give them: photos, poses, sparse points, nothing else.
+"""Captures as a camera and structure from motion give them: photos, poses, sparse points, perhaps masks.
 
     transforms.json     nerfstudio's: intrinsics, OpenGL camera-to-world matrices
     images/NAME.jpg     8 bits (or .png)

@@ -12,10 +12,12 @@ from glob import escape
 from pathlib import Path
 
 from datagen.settings import Settings
+from tron.captures import View
 from tron.captures.folder import read_capture_folder
 from tron.errors import TronError
 
 ENVIRONMENT_NAME = "environment.exr"
+MEND = "give the folder truth of pseudo-captures"
 _LIGHT = re.compile(r"([1-9][0-9]{0,3})_([a-z][a-z0-9_]{0,30})")
 
 
@@ -66,6 +68,24 @@ def find_relit(settings: Settings, capture: str) -> list[RelitTruth]:
             "captured.names=[...]",
         )
     return sorted(found, key=lambda truth: truth.number)
+
+
+def find_truth(settings: Settings, capture: str) -> list[View]:
+    """True views of a capture that have a map of their base color; none without ``captured.truth``.
+
+    Raises:
+        TronError: no such folder, nothing of this capture in it, or no such map.
+    """
+    if settings.captured.truth is None:
+        return []
+    folder = settings.captured.truth / capture
+    if not folder.is_dir():
+        raise TronError("captured.truth holds nothing of this capture", folder, MEND)
+    views = read_capture_folder(folder).views
+    mapped = [view for view in views if view.has("base_color") and view.has("mask")]
+    if not mapped:
+        raise TronError("no true view has base color and a mask", folder, MEND)
+    return mapped
 
 
 def _views(folder: Path, settings: Settings) -> int:

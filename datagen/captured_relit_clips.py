@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from datagen.albedo_scale import at_true_scale
 from datagen.captured_photos import in_order, require_size, resized_view, starts
 from datagen.captured_reconstruction import Found
-from datagen.captured_relit import RelitTruth, find_relit
+from datagen.captured_relit import RelitTruth, find_relit, find_truth
 from datagen.captured_surfels import CapturedSurfels, LitSurfels
 from datagen.lights import classify, contrast_share
 from datagen.plan import Work
-from datagen.pseudo_captures import TRUTH
 from datagen.settings import Settings
 from datagen.spool import Frame, stored_guidance
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder
 from tron.errors import TronError
-from tron.gaussians.scene import GaussianScene
 from tron.shading.environment import EnvironmentMap
 from tron.shards.schema import TARGET, ClipMeta, color_spaces
 
@@ -37,8 +36,7 @@ def relit_clips(item: Work, settings: Settings, found: Found) -> Iterator[tuple[
 
     Frames hold the schema's members, all linear: guidance under that light, from the true cameras, and as
     rgb what was path-traced, in front of the light itself. The world is the truth's: pseudo-captures name
-    poses with errors that have no common part. Where the truth of the capture lies beside (``truth/NAME``),
-    base color is brought to its scale, which photos cannot tell.
+    poses with errors that have no common part. With ``captured.truth`` base color has the truth's scale.
 
     Args:
         item: the capture; its split is that of its clips (``train_relit``).
@@ -48,7 +46,12 @@ def relit_clips(item: Work, settings: Settings, found: Found) -> Iterator[tuple[
     Raises:
         TronError: a folder cannot be read, is not linear or without masks, or its views are too small.
     """
-    scene, factors = _at_true_scale(item, settings, found.scene)
+    scene, factors = found.scene, None
+    if true := find_truth(settings, item.capture):
+        scene, factors = at_true_scale(
+            scene, ((view.camera, view.read("base_color"), view.read("mask")) for view in true)
+        )
+        log.info("%s (%s): base color scaled by %.2f, %.2f, %.2f", item.name, item.capture, *factors)
     surfels = CapturedSurfels(item, settings, replace(found, scene=scene))
     for truth in find_relit(settings, item.capture):
         log.info("%s (%s): relit by %s", item.name, item.capture, truth.folder.name)
@@ -61,28 +64,13 @@ def relit_clips(item: Work, settings: Settings, found: Found) -> Iterator[tuple[
             made = [_frame(view, lit, environment, settings) for view in chosen]
             cameras = [camera for camera, _ in made]
             meta = _meta(item, settings, truth, environment, capture.exposure, number, chosen, cameras)
-            meta.extra["albedo_scale"] = [round(float(factor), 6) for factor in factors]
+            if factors is not None:
+                meta.extra["albedo_scale"] = [round(float(factor), 6) for factor in factors]
             yield meta, [frame for _, frame in made]
 
 
-def _at_true_scale(
-    item: Work, settings: Settings, surfels: GaussianScene
-) -> tuple[GaussianScene, np.ndarray]:
-    """The surfels with base color as bright as the truth's, where that is known, and the factors (3,)."""
-    assert settings.captured.relit is not None
-    path = settings.captured.relit.resolve().parent / TRUTH / item.capture
-    if not path.is_dir():
-        return surfels, np.ones(3)
-    views = [view for view in read_capture_folder(path).views if view.has("base_color")]
-    scene, factors = at_true_scale(
-        surfels, ((view.camera, view.read("base_color"), view.read("mask")) for view in views)
-    )
-    log.info("%s (%s): base color scaled by %.2f, %.2f, %.2f", item.name, item.capture, *factors)
-    return scene, factors
-
-
 def require_own_truth(item: Work, settings: Settings, photos: Capture) -> None:
-    """Make sure that what ``captured.relit`` shows of a capture is of this very capture, and can be used.
+    """Make sure that what ``captured.relit`` and ``truth`` show is of this very capture, and can be used.
 
     Relit views are named after the photos whose places they are seen from, and a pseudo-capture's poses are
     off by little.
@@ -98,14 +86,23 @@ def require_own_truth(item: Work, settings: Settings, photos: Capture) -> None:
         views = read_capture_folder(truth.folder).views
         _require_truth(views, truth)
         require_size(views, settings.captured.width, settings.captured.height)
-        for view in views:
-            own = cameras.get(view.name)
-            if own is None or not _near(own, view.camera, spread):
-                raise TronError(
-                    f"view {view.name} is not seen from where the photo of that name was taken",
-                    truth.folder,
-                    f"give the relit folder that was made with {settings.captures}",
-                )
+        _require_places(views, cameras, spread, truth.folder, settings)
+    if true := find_truth(settings, item.capture):
+        assert settings.captured.truth is not None
+        _require_places(true, cameras, spread, settings.captured.truth / item.capture, settings)
+
+
+def _require_places(
+    views: Sequence[View], cameras: Mapping[str, Camera], spread: float, folder: Path, settings: Settings
+) -> None:
+    for view in views:
+        own = cameras.get(view.name)
+        if own is None or not _near(own, view.camera, spread):
+            raise TronError(
+                f"view {view.name} is not seen from where the photo of that name was taken",
+                folder,
+                f"give the folder that was made with {settings.captures}",
+            )
 
 
 def _near(one: Camera, other: Camera, spread: float) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from datagen.settings_model import SettingsModel
 from tron.captures.load import CaptureSettings
@@ -45,6 +45,12 @@ class CapturedSettings(SettingsModel):
         description="Folder of path-traced views of the captures under other lights, relit/ of "
         "pseudo-captures: reconstructions are lit by NAME_k_LIGHT/environment.exr as well, in the splits "
         "train_relit, train_b_relit, validation_relit and test_relit.",
+    )
+    truth: Path | None = Field(
+        default=None,
+        description="Folder of the captures' truth, truth/ of pseudo-captures: base color of relit clips is "
+        "brought to the scale of its maps, a factor a channel, which photos cannot tell; null: it stays as "
+        "the photos tell it.",
     )
     relit_frames: int = Field(
         default=1,
@@ -100,6 +106,12 @@ class CapturedSettings(SettingsModel):
         default_factory=lambda: FitSettings(),
         description="Fit of the light where the prior is not joint, likewise.",
     )
+
+    @model_validator(mode="after")
+    def _scales_something(self) -> CapturedSettings:
+        if self.truth is not None and self.relit is None:
+            raise ValueError("captured.truth scales relit clips: give captured.relit too")
+        return self
 
     @field_validator("shares")
     @classmethod

@@ -90,7 +90,7 @@ class PseudoCaptureSettings(ViewSettings):
     lens: LensSettings = Field(default=LensSettings(), description="Blur and vignetting of the photos.")
     masks: bool = Field(
         default=False,
-        description="Also store what is subject in each photo, as a segmenter would tell it: masks/NAME.png, "
-        "white where a surface covers the pixel. Reconstruct with captured.photos.masks=subject.",
+        description="Also store what is subject in each photo: masks/NAME.png, white where a surface covers "
+        "the pixel, exactly and from the true camera. Reconstruct with captured.photos.masks=subject.",
     )
     pose_noise: PoseNoise = Field(default=PoseNoise(), description="Errors of the named poses and points.")

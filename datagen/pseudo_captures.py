@@ -1,6 +1,7 @@
 """Pseudo-captures: scenes as a phone would bring them home, and the truth in a folder that nobody opens.
 
-    captures/NAME    photos, poses a little off, sparse points (``datagen.blind_capture``); nothing else
+    captures/NAME    photos, poses a little off, sparse points, masks where they are asked for
+                     (``datagen.blind_capture``); nothing else
     truth/NAME       the same views as a capture folder: true cameras, linear radiance with coverage as mask,
                      true maps of the held-out views, environment.exr, spec.json, photographs.json
     relit/NAME_K_L   the held-out views under other lights (``datagen.relit``)
@@ -292,7 +293,7 @@ def _finished(item: Work, settings: Settings, manifests: Mapping[Path, CaptureMa
 def _estimate_bytes(item: Work, settings: Settings) -> int:
     wanted, views = settings.pseudo_capture, len(photo_names(item, settings))
     held_out = -(-views // HELD_OUT)
-    pixel = views * (PHOTO_BYTES + TRUE_BYTES)
+    pixel = views * (PHOTO_BYTES + wanted.masks + TRUE_BYTES)
     pixel += held_out * (MAPS_BYTES + len(wanted.relights) * TRUE_BYTES)
     light = settings.environment_height**2 * 2 * 12
     return pixel * wanted.width * wanted.height + views * 10_000 + light * (1 + len(wanted.relights))

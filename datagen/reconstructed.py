@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 FOLDER = "reconstruction"
 """Folder of a scene that holds its pictures and the checkpoint while it is made."""
 SCALED_BY = 8
-"""Views that tell the scale of the base color."""
+"""Views, at most, that tell the scale of the base color."""
 
 
 @stage("reconstruct")

@@ -437,13 +437,15 @@ class Settings(ScaleSettings):
         """Keys that decide a scene's content, plain values: not where it goes, who makes it or how many."""
         if self.source == "captured":
             seeded = {"reconstruction": {"seed", "checkpoint_every"}, "light": {"seed"}}
+            places = dict.fromkeys(("names", "relit", "truth", "reconstructed"), True)
             values = self.model_dump(
                 mode="json",
                 include={"source", "captured", *OF_BOTH_SOURCES},
-                exclude={"captured": {"names": True, "relit": True, "reconstructed": True, **seeded}},
+                exclude={"captured": {**places, **seeded}},
             )
-            if self.captured.relit is not None:  # that there are such clips, not where their truth lies
-                values["captured"]["relit"] = True
+            # That there are such clips, not where their truth lies.
+            given = {"relit": self.captured.relit, "truth": self.captured.truth}
+            values["captured"] |= {name: True for name, folder in given.items() if folder is not None}
             return values
         values = self.model_dump(mode="json", exclude=OUTSIDE | OF_CAPTURES)
         for name in SPLITS:

@@ -78,7 +78,7 @@ class Renderer(RendererSettings):
         ]
         return Outcome(
             rows=rows,
-            title="The neural renderer: better than anything without it, on what it never saw",
+            title="The neural renderer against the best without one, on what it never saw",
             verdict=page.verdict({row.metric: row for row in rows}),
             lead=page.LEAD,
             sections=[

@@ -17,7 +17,11 @@ from tron.errors import TronError
 from tron.report.page import Block, Cell, Section, Table, Text
 
 SYNTHETIC, CAPTURES, PHOTOS = "synthetic", "captures", "photos"
-PLACES = {SYNTHETIC: "synthetic scenes", CAPTURES: "captures relit", PHOTOS: "captures in their own light"}
+PLACES = {
+    SYNTHETIC: "synthetic scenes",
+    CAPTURES: "captures relit",
+    PHOTOS: "photos that captures are made from",
+}
 """Distribution that judges -> its heading."""
 STAGE_FILE = re.compile(r"(\d+)-([\w-]+)\.safetensors")
 

@@ -112,7 +112,10 @@ class Datasets:
         if name in self.settings.data:
             return self.settings.data[name]
         views = self._made(f"{name}_views", recipes.views)
-        given = [f"captures={views / 'captures'}", f"captured.relit={views / 'relit'}"]
+        given = [
+            f"captures={views / 'captures'}",
+            *(f"captured.{name}={views / name}" for name in ("relit", "truth")),
+        ]
         return self._made(name, [*recipes.pairs, *given])
 
     def _made(self, name: str, recipe: Sequence[str]) -> Path:

@@ -123,9 +123,10 @@ class Parts:
             "captures",
             "capture_",
             "Captures, reconstructed and relit under other lights",
-            "Photographs of scenes whose truth is hidden, with masks of what is subject, reconstructed "
-            "blind; the reconstruction is lit by lights it was not filmed in and judged by path-traced "
-            "truth. Of the truth it is told one factor a channel on its base color, which no photo shows.",
+            "Photographs with exact masks of what is subject, reconstructed without any other truth; the "
+            "reconstruction is lit by lights it was not filmed in and judged by path-traced truth. Its base "
+            "color is scaled to the true maps of these views, one factor a channel, which no photo shows and "
+            "no scan of yours will have.",
             {judged.clips[0].width: judged},
         )
 

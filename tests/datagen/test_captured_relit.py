@@ -127,22 +127,21 @@ def test_guidance_is_of_the_surfels_under_that_light(pairs: Path):
     np.testing.assert_allclose(two, 2 * one, rtol=2e-3, atol=1e-3)
 
 
-def test_base_color_is_brought_to_the_scale_of_a_truth_that_lies_beside(
-    pairs: Path, recipe: Recipe, tiny_captures: Path, relit: Path, tmp_path: Path
+def test_base_color_is_brought_to_the_scale_of_the_truth(
+    pairs: Path, recipe: Recipe, tiny_captures: Path, tmp_path: Path
 ):
     true = read_capture_folder(tiny_captures / NAME)
     mapped = [view for view in true.views if view.has("base_color")]
     made = []
     for factor in (0.5, 0.25):
         folder = tmp_path / str(factor)
-        shutil.copytree(relit, folder / "relit")
         darker = tuple(replace(view, base_color=factor * view.read("base_color")) for view in mapped)
         write_capture(folder / "truth" / NAME, replace(true, views=darker, test=frozenset()))
-        again = [f"captured.relit={folder / 'relit'}", f"captured.reconstructed={pairs}"]
+        again = [f"captured.truth={folder / 'truth'}", f"captured.reconstructed={pairs}"]
         assert make(recipe(folder / "pairs", *again)) == 0
         made.append(folder / "pairs")
     for plain, bright, dark in zip(*(read_clips(folder, "test_relit") for folder in (pairs, *made))):
-        assert plain.meta.extra["albedo_scale"] == [1, 1, 1]
+        assert "albedo_scale" not in plain.meta.extra
         scales = [np.array(clip.meta.extra["albedo_scale"]) for clip in (bright, dark)]
         np.testing.assert_allclose(scales[0], 2 * scales[1], rtol=1e-2)
         one, other = bright.frames["pbr"], dark.frames["pbr"]
@@ -151,6 +150,29 @@ def test_base_color_is_brought_to_the_scale_of_a_truth_that_lies_beside(
         assert other[surfels].mean() < 0.8 * one[surfels].mean()
     for plain, dark in zip(read_clips(pairs, "test"), read_clips(made[1], "test")):
         np.testing.assert_array_equal(dark.frames["pbr"], plain.frames["pbr"])
+    with pytest.raises(TronError, match=r"made with captured\.truth=None"):
+        make(recipe(pairs, f"captured.truth={tmp_path / '0.5' / 'truth'}"))
+
+
+def test_another_captures_truth_is_refused_before_the_reconstruction(
+    recipe: Recipe, tiny_captures: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    views = read_capture_folder(tiny_captures / NAME).views
+    turned = tuple(replace(view, camera=other.camera) for view, other in zip(views, views[1:] + views[:1]))
+    write_capture(tmp_path / "turned" / NAME, Capture(turned, up=np.array([0.0, 0.0, 1.0])))
+    bare = tuple(replace(view, base_color=None) for view in views)
+    write_capture(tmp_path / "bare" / NAME, Capture(bare, up=np.array([0.0, 0.0, 1.0])))
+    (tmp_path / "empty").mkdir()
+    for name, words in (
+        ("turned", "is not seen from where the photo of that name was taken"),
+        ("bare", "no true view has base color and a mask"),
+        ("empty", "captured.truth holds nothing of this capture"),
+    ):
+        assert make(recipe(tmp_path / f"{name}_pairs", f"captured.truth={tmp_path / name}")) == 1
+        assert words in caplog.text
+        assert "surfels are learnt" not in caplog.text
+    with pytest.raises(TronError, match=r"give captured\.relit too"):
+        recipe(tmp_path / "x", f"captured.truth={tmp_path}", "captured.relit=null")
 
 
 def test_a_run_that_ends_before_the_relit_clips_goes_on_to_the_same_bytes(

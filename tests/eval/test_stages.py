@@ -179,10 +179,15 @@ stages.Stages(Path({str(tmp_path)!r})).run("make", [stages.Child("x", "tron-x", 
 
 def test_a_noted_signal_is_not_lost_where_the_block_raises():
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(SystemExit) as end, termination_noted() as termination:
-        os.kill(os.getpid(), signal.SIGTERM)
-        assert termination.asked
-        raise StageFailed("tron-x", 1, "words")
+
+    def block():
+        with termination_noted() as termination:
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert termination.asked
+            raise StageFailed("tron-x", 1, "words")
+
+    with pytest.raises(SystemExit) as end:
+        block()
     assert end.value.code == 128 + signal.SIGTERM
     assert signal.getsignal(signal.SIGTERM) is before
 

@@ -43,7 +43,7 @@ class Termination:
 
 @contextmanager
 def termination_noted() -> Iterator[Termination]:
-    """Note SIGTERM and SIGINT while the block runs; its end raises SystemExit or KeyboardInterrupt if one came.
+    """Note SIGTERM and SIGINT while the block runs; if one came its end raises SystemExit, KeyboardInterrupt.
 
     For a block that starts and polls processes: an exception out of a signal handler may land within
     `subprocess.Popen` between the taking of its lock and the ``try`` that releases it, and whoever waits for
