@@ -85,6 +85,7 @@ def test_the_demo_goes_from_nothing_to_a_report_and_a_second_run_only_evaluates(
     assert "Where the time went" in html
     assert "the whole demo, after set-up" in html
     assert "Larger frames, by the renderers that ship" in html
+    assert "network that starts from lit, scene" in html
 
     assert run(f"output_dir={out}", *times) == 0
     assert stand_ins.read_text().splitlines() == commands

@@ -24,8 +24,9 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     """The settings as they will be followed, and the network on its device, or None without one.
 
     A checkpoint that was asked for has to fit. The default one gives way with a line in the log: where the
-    libraries of networks or its file are not installed, where nothing bounces and it is given lit, and where
-    radiance is asked for, which a network does not draw. Where window, overlap or weights are chosen, it has
+    libraries of networks or its file are not installed, where nothing bounces and it is given lit, where
+    radiance is asked for, which a network does not draw, and where lit has sub-pixels or rays for reflections
+    (quality=final): it learnt from single samples, and makes finer pictures worse (docs/experiments.md). Where window, overlap or weights are chosen, it has
     to fit too.
 
     Raises:
@@ -38,6 +39,11 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     try:
         if "relit" in settings.buffers:
             raise TronError("buffers ask for relit.exr, and a network draws display values")
+        if settings.estimation().supersample > 1 or settings.estimation().reflections > 0:
+            raise TronError(
+                "the default one learnt from single samples a pixel, and this lit is better without it",
+                mend="give checkpoint=FILE to have it all the same",
+            )
         return settings, _loaded(settings)
     except TronError as error:
         if settings.tuned:

@@ -15,7 +15,7 @@ SHIPPED = {
     "pair": "of pbr and irradiance, the paper's buffers",
 }
 """Name -> what the network is given."""
-DEFAULT: str | None = None
+DEFAULT: str | None = "lit"
 """The one that tron-relight takes unless told otherwise; None: it draws without a network."""
 
 

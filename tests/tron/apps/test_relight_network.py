@@ -109,6 +109,9 @@ def test_a_shipped_checkpoint_is_given_by_name(run, checkpoints, tmp_path, monke
         (("bounces=0",), "no bounced light with bounces=0"),
         (("fidelity=paper",), "no bounced light with bounces=0"),
         (("buffers=[relit]",), "buffers ask for relit.exr"),
+        (("quality=final",), "learnt from single samples"),
+        (("supersample=2",), "learnt from single samples"),
+        (("reflections=2",), "learnt from single samples"),
         ((), "this installation has no checkpoint 'lit'"),
     ],
 )
@@ -121,7 +124,8 @@ def test_the_default_checkpoint_gives_way_where_it_does_not_fit(
         assert run(tmp_path / "out", "checkpoint=lit", *settings) == 0
     assert words in caplog.text
     report = json.loads((tmp_path / "out" / "relight.json").read_text())
-    assert report["relit"] == ("lit" if settings in ((), ("buffers=[relit]",)) else "shadowed")
+    direct = settings in (("bounces=0",), ("fidelity=paper",))
+    assert report["relit"] == ("shadowed" if direct else "lit")
     assert report["network"] is None
     assert not list((tmp_path / "out" / "frames").glob("*.neural.png"))
 
