@@ -2,10 +2,13 @@
 
 import shutil
 
+import numpy as np
 import pytest
 
 from datagen import reconstructed, run
+from datagen.drawn_scene import draw_and_build
 from datagen.plan import plan, read_record, scene_folder
+from datagen.ready_sources import ready_sources
 from datagen.run import make
 from datagen.surfel_settings import SurfelSources
 from tron.errors import TronError
@@ -85,3 +88,24 @@ def test_a_killed_reconstruction_goes_on_and_ends_with_the_same_bytes(
     assert make(cut) == 0
     assert forgotten == [before], "pictures are not taken again"
     assert files_of(cut.output_dir) == files_of(whole.output_dir)
+
+
+@pytest.mark.long
+def test_base_color_of_a_joint_fit_has_the_scale_of_the_truth(variant, tmp_path, small_settings, monkeypatch):
+    settings = small_settings(tmp_path, *REBUILT, "surfel_reconstruction.prior=joint")
+    found = []
+    scaled = reconstructed.at_true_scale
+
+    def watched(surfels, truth):
+        scene, factors = scaled(surfels, truth)
+        again = reconstructed._base_colors(*drawn, settings)
+        found.append((factors, scaled(scene, again)[1]))
+        return scene, factors
+
+    item = plan(settings)[0]
+    drawn = draw_and_build(item, settings, ready_sources(settings), settings.train.lights)
+    monkeypatch.setattr(reconstructed, "at_true_scale", watched)
+    assert make(settings) == 0
+    ((first, second),) = found
+    assert np.abs(np.log(first)).max() > 0.02, "the fit was at the truth's scale by itself"
+    np.testing.assert_allclose(second, 1, atol=0.03)
