@@ -46,5 +46,5 @@ def large_frames(dataset: Path) -> list[Section]:
 
 def _shipped() -> Mapping[Kind, Path]:
     """The checkpoints that this installation has."""
-    files = {kind: FOLDER / f"{kind}.safetensors" for kind in KINDS}
+    files: dict[Kind, Path] = {kind: FOLDER / f"{kind}.safetensors" for kind in KINDS}
     return {kind: path for kind, path in files.items() if path.is_file()}

@@ -24,10 +24,10 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     """The settings as they will be followed, and the network on its device, or None without one.
 
     A checkpoint that was asked for has to fit. The default one gives way with a line in the log: where the
-    libraries of networks or its file are not installed, where nothing bounces and it is given lit, where
-    radiance is asked for, which a network does not draw, and where lit has sub-pixels or rays for reflections
-    (quality=final): it learnt from single samples, and makes finer pictures worse (docs/experiments.md). Where window, overlap or weights are chosen, it has
-    to fit too.
+    libraries of networks or its file are not installed; where nothing bounces and it is given lit; where
+    radiance is asked for, which a network does not draw; and where lit has sub-pixels or rays for reflections
+    (quality=final), for it learnt from single samples and makes finer pictures worse (docs/experiments.md).
+    Where window, overlap or weights are chosen, it has to fit too.
 
     Raises:
         TronError: the checkpoint is missing, damaged, or does not fit the settings.
