@@ -31,7 +31,7 @@ def at_true_scale(
     """The surfels with their base color scaled to the truth, and the factors (3,).
 
     The factors are the median ratios over the pixels of all views where both show a surface; they are 1 where
-    there is no such pixel. Base color stays in [0, 1].
+    there is no such pixel. Base color stays in [0, 1]. The log says the factors.
 
     Args:
         surfels: of a reconstruction.
@@ -48,5 +48,6 @@ def at_true_scale(
         log.warning("no view shows the surfels where the truth has a surface: base color is left as it is")
         return surfels, np.ones(3)
     factors = albedo_scale(np.concatenate(found), np.concatenate(wanted), method="median_ratio")
+    log.info("base color scaled by %.2f, %.2f, %.2f", *factors)
     scaled = np.clip(surfels.base_color * factors.astype(np.float32), 0, 1)
     return replace(surfels, base_color=scaled), factors

@@ -1,7 +1,8 @@
 """Captures under lights that their photos never saw: where the path-traced truth of each lies.
 
 ``captured.relit=FOLDER`` is the folder ``relit`` of pseudo-captures: a capture folder for each capture and
-light, ``NAME_1_sun``, with linear radiance, masks and the light itself as environment.exr.
+light, ``NAME_1_sun``, with linear radiance, masks and the light itself as environment.exr. ``captured.truth``
+is their folder ``truth``, whose maps of base color tell the scale of the reconstruction's.
 """
 
 from __future__ import annotations

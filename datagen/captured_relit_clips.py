@@ -51,7 +51,6 @@ def relit_clips(item: Work, settings: Settings, found: Found) -> Iterator[tuple[
         scene, factors = at_true_scale(
             scene, ((view.camera, view.read("base_color"), view.read("mask")) for view in true)
         )
-        log.info("%s (%s): base color scaled by %.2f, %.2f, %.2f", item.name, item.capture, *factors)
     surfels = CapturedSurfels(item, settings, replace(found, scene=scene))
     for truth in find_relit(settings, item.capture):
         log.info("%s (%s): relit by %s", item.name, item.capture, truth.folder.name)

@@ -80,8 +80,7 @@ def reconstruct_surfels(
     found = reconstruct(capture, prior, recipe, checkpoint=folder / "checkpoint.safetensors", device=device)
     scene = found.scene
     if isinstance(prior, Joint):
-        scene, factors = at_true_scale(scene, _base_colors(spec, geometry, settings))
-        log.info("base color scaled by %.2f, %.2f, %.2f", *factors)
+        scene, _ = at_true_scale(scene, _base_colors(spec, geometry, settings))
     if spec.motion is not None:
         scene = _with_objects(scene, spec, geometry, settings)
     return scene, _judged(scene, spec, geometry, settings)

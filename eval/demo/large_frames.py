@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 from eval.relighting.baselines import predictions
@@ -10,12 +9,9 @@ from eval.relighting.buffers import MEMBERS
 from eval.relighting.gallery import Example, middle_frame
 from eval.renderer.networks import METHODS, load_networks
 from eval.renderer.pictures import comparison
-from eval.renderer.settings import Kind
-from tron.neural.shipped import FOLDER
+from tron.neural.shipped import installed
 from tron.report.page import Section, Text
 from tron.shards.reader import read_clips
-
-KINDS: tuple[Kind, ...] = ("pair", "lit")
 
 
 def large_frames(dataset: Path) -> list[Section]:
@@ -26,12 +22,14 @@ def large_frames(dataset: Path) -> list[Section]:
     Raises:
         TronError: the dataset has no test split or is damaged.
     """
-    networks = {METHODS[kind]: each.show(1) for kind, each in load_networks(_shipped()).items()}
+    files = installed()
+    networks = load_networks({kind: files[kind] for kind in METHODS if kind in files})
+    shows = {METHODS[kind]: network.show(1) for kind, network in networks.items()}
     if not networks:
         return []
     examples: dict[str, list[Example]] = {}
     for clip in read_clips(dataset, "test", MEMBERS):
-        shown = predictions(clip, networks)["frame"]
+        shown = predictions(clip, shows)["frame"]
         examples.setdefault(clip.meta.scene, []).append(middle_frame(clip, shown, clip.displayed("rgb")))
     chosen = [lights[number % len(lights)] for number, lights in enumerate(examples.values())]
     size = f"{chosen[0].meta.width} x {chosen[0].meta.height}"
@@ -42,9 +40,3 @@ def large_frames(dataset: Path) -> list[Section]:
     )
     blocks = [Text(words), *map(comparison, chosen)]
     return [Section("large", "Larger frames, by the renderers that ship", blocks)]
-
-
-def _shipped() -> Mapping[Kind, Path]:
-    """The checkpoints that this installation has."""
-    files: dict[Kind, Path] = {kind: FOLDER / f"{kind}.safetensors" for kind in KINDS}
-    return {kind: path for kind, path in files.items() if path.is_file()}

@@ -39,7 +39,8 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     try:
         if "relit" in settings.buffers:
             raise TronError("buffers ask for relit.exr, and a network draws display values")
-        if settings.estimation().supersample > 1 or settings.estimation().reflections > 0:
+        estimation = settings.estimation()
+        if estimation.supersample > 1 or estimation.reflections > 0:
             raise TronError(
                 "the default one learnt from single samples a pixel, and this lit is better without it",
                 mend="give checkpoint=FILE to have it all the same",

@@ -19,6 +19,12 @@ DEFAULT: str | None = "lit"
 """The one that tron-relight takes unless told otherwise; None: it draws without a network."""
 
 
+def installed() -> dict[str, Path]:
+    """Name -> file of the shipped checkpoints that this installation came with."""
+    files = {name: FOLDER / f"{name}.safetensors" for name in SHIPPED}
+    return {name: path for name, path in files.items() if path.is_file()}
+
+
 def shipped(name: str) -> Path:
     """The file of a shipped checkpoint.
 
@@ -27,10 +33,10 @@ def shipped(name: str) -> Path:
     """
     if name not in SHIPPED:
         raise TronError(f"no shipped checkpoint is called {name!r}", mend=f"they are {', '.join(SHIPPED)}")
-    path = FOLDER / f"{name}.safetensors"
-    if not path.is_file():
+    path = installed().get(name)
+    if path is None:
         mend = "give the path of a renderer.safetensors that tron-train wrote"
-        raise TronError(f"this installation has no checkpoint '{name}'", path, mend)
+        raise TronError(f"this installation has no checkpoint '{name}'", FOLDER, mend)
     return path
 
 
