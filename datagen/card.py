@@ -239,7 +239,8 @@ def _reconstruction(found: Sequence[Figures]) -> list[str]:
         "pictures, as a capture's are; on views that were not among them base color reaches "
         f"{statistics.median(each.base_color_psnr for each in found):.1f} dB and normals are off by "
         f"{statistics.median(each.normal_mae_deg for each in found):.2f}° (medians). `surfels_from` in a "
-        "clip's metadata says which they are.",
+        "clip's metadata says which they are, `albedo_scale` in scenes/NAME/record.json by how much their "
+        "base color was scaled to the truth's.",
     ]
 
 

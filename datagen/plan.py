@@ -126,6 +126,17 @@ class Figures(BaseModel):
     silhouette_error: float
 
 
+class ReconstructedFigures(Figures):
+    """The same of reconstructed surfels.
+
+    Attributes:
+        albedo_scale: factors a channel that brought base color to the truth's scale; None where light was
+            known, and in records of older versions. See ``datagen.albedo_scale``.
+    """
+
+    albedo_scale: tuple[float, float, float] | None = None
+
+
 class Refinement(BaseModel):
     """Gain of a scene's surfels by a number of optimisation steps."""
 
@@ -154,7 +165,7 @@ class Record(BaseModel):
     shards: list[ShardEntry]
     quarantined: list[Quarantined]
     refinement: Refinement | None = None
-    reconstruction: Figures | None = None
+    reconstruction: ReconstructedFigures | None = None
     clips: list[ClipRow] = Field(default_factory=list)
     variety: Histograms = Field(default_factory=dict)
 

@@ -21,7 +21,7 @@ from datagen.capture_export import captured
 from datagen.capture_settings import CaptureSettings
 from datagen.clock import stage
 from datagen.pathtrace import stream_gbuffers
-from datagen.plan import Figures, scene_folder
+from datagen.plan import ReconstructedFigures, scene_folder
 from datagen.refinement import figures_of
 from datagen.scene import SceneSpec
 from datagen.settings import Settings
@@ -54,7 +54,7 @@ SCALED_BY = 8
 @stage("reconstruct")
 def reconstruct_surfels(
     spec: SceneSpec, geometry: Geometry, settings: Settings
-) -> tuple[GaussianScene, Figures]:
+) -> tuple[GaussianScene, ReconstructedFigures]:
     """Surfels reconstructed from pictures of a scene, and how near they are to the truth.
 
     Where light and materials are fitted together, base color is brought to the truth's scale. They are judged
@@ -78,12 +78,12 @@ def reconstruct_surfels(
     )
     device = torch_device(settings.variant)
     found = reconstruct(capture, prior, recipe, checkpoint=folder / "checkpoint.safetensors", device=device)
-    scene = found.scene
+    scene, factors = found.scene, None
     if isinstance(prior, Joint):
-        scene, _ = at_true_scale(scene, _base_colors(spec, geometry, settings))
+        scene, factors = at_true_scale(scene, _base_colors(spec, geometry, settings))
     if spec.motion is not None:
         scene = _with_objects(scene, spec, geometry, settings)
-    return scene, _judged(scene, spec, geometry, settings)
+    return scene, _judged(scene, factors, spec, geometry, settings)
 
 
 def reconstruction_steps(settings: Settings) -> int:
@@ -140,7 +140,13 @@ def _with_objects(
     return replace(surfels, object_id=truth.object_id[np.asarray(nearest)])
 
 
-def _judged(surfels: GaussianScene, spec: SceneSpec, geometry: Geometry, settings: Settings) -> Figures:
+def _judged(
+    surfels: GaussianScene,
+    factors: np.ndarray | None,
+    spec: SceneSpec,
+    geometry: Geometry,
+    settings: Settings,
+) -> ReconstructedFigures:
     recipe = settings.split(spec.split)
     cameras = spec.clip(0, recipe.frames, recipe.width, recipe.height)
     with ViewSpool(scene_folder(settings.output_dir, spec.name)) as judges:
@@ -151,4 +157,5 @@ def _judged(surfels: GaussianScene, spec: SceneSpec, geometry: Geometry, setting
         "%d surfels reconstructed: base color %.1f dB, normals %.2f degrees",
         len(surfels), figures.base_color_psnr, figures.normal_mae_deg,
     )  # fmt: skip
-    return figures
+    scale = None if factors is None else (float(factors[0]), float(factors[1]), float(factors[2]))
+    return ReconstructedFigures(**figures.model_dump(), albedo_scale=scale)

@@ -157,7 +157,7 @@ class Settings(BaseModel):
     splits: dict[str, str] = Field(
         default={},
         description="Splits, by the names that stages and validation use, that come from another dataset: "
-        "FOLDER, or FOLDER#SPLIT where the split has another name there.",
+        "FOLDER, or FOLDER#SPLIT where the split has another name there; FOLDER#A+B joins two.",
     )
     output_dir: Path = Field(
         description="Folder for renderer.safetensors, checkpoints, metrics.csv, config.yaml."
@@ -228,7 +228,8 @@ class Settings(BaseModel):
     @classmethod
     def _places(cls, splits: dict[str, str]) -> dict[str, str]:
         for name, value in splits.items():
-            _require_training_split(name, SplitPlace.parse(name, value).split)
+            for split in SplitPlace.parse(name, value).names:
+                _require_training_split(name, split)
         return splits
 
     @model_validator(mode="after")

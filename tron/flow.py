@@ -11,6 +11,10 @@ NumPy only. Images are (H, W, ...), indexed by row, then column; cameras are Ope
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
 import numpy as np
 
 from tron.cameras import Camera
@@ -21,6 +25,21 @@ TOLERANCE = 0.01
 
 EDGE = 0.1
 """The same for each of the four pixels around a place: beyond it they lie on another surface."""
+
+REMEMBERED = 32
+"""Depths, and pairs of frames, that a clip's motion keeps: windows that overlap ask for the same."""
+
+
+class Match(NamedTuple):
+    """Places of one view's surfaces in another.
+
+    Attributes:
+        displacement: (H, W, 2) pixels, x then y, as :func:`flow` gives it.
+        seen: (H, W) bool, whether the surface is seen there, as :func:`both_see` tells.
+    """
+
+    displacement: np.ndarray
+    seen: np.ndarray
 
 
 def flow(
@@ -82,6 +101,37 @@ def both_see(
     near = np.abs(around - expected[..., None]) <= EDGE * expected[..., None]
     agrees = np.abs(found - expected) <= TOLERANCE * expected
     return in_front & inside & near.all(-1) & agrees
+
+
+def surface_motion(
+    cameras: Sequence[Camera],
+    depth: Callable[[int], np.ndarray],
+    moves: Callable[[int, int], tuple[np.ndarray, np.ndarray]] | None = None,
+    still_sky: bool = True,
+) -> Callable[[int, int], Match]:
+    """Match of each frame of a clip in each other frame, by their numbers.
+
+    Args:
+        cameras: one a frame.
+        depth: reads a frame's (H, W) or (H, W, 1) distance along the rays, world units, 0 where there is no
+            surface; asked once where frames near each other are asked for.
+        moves: frame and other frame -> pixels and motion, as :func:`flow` has them; None: nothing moves.
+        still_sky: whether what is infinitely far stands still; if not, it is never seen again.
+
+    Returns:
+        What gives the matches; it raises TronError for a depth of another size than its camera's.
+    """
+    read = lru_cache(REMEMBERED)(depth)
+
+    @lru_cache(REMEMBERED)
+    def match(index: int, other: int) -> Match:
+        motion = () if moves is None else moves(index, other)
+        seen = both_see(read(index), cameras[index], read(other), cameras[other], *motion)
+        if not still_sky:
+            seen &= _plane(read(index), cameras[index], "depth") > 0
+        return Match(flow(read(index), cameras[index], cameras[other], *motion), seen)
+
+    return match
 
 
 def warp(image: np.ndarray, displacement: np.ndarray) -> np.ndarray:

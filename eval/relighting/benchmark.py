@@ -227,7 +227,8 @@ def load_network(path: Path, vae: Path | None = None) -> Network:
     guidance = renderer.config.guidance
 
     def show(buffers: Buffers) -> np.ndarray:
-        return render_clip(renderer, {each: buffers.displayed(each) for each in guidance})
+        shown = {each: buffers.displayed(each) for each in guidance}
+        return render_clip(renderer, shown, motion=buffers.motion)
 
     return Network(show, path, "lit" in guidance)
 

@@ -5,29 +5,36 @@ from __future__ import annotations
 import logging
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from eval.confidence import interval, scene_sums
-from eval.relighting.buffers import MEMBERS, Buffers, region_mask
+from eval.relighting.buffers import MEMBERS, SURFELS_DEPTH, Buffers, region_mask
 from eval.renderer.networks import TITLES, Network
-from eval.renderer.settings import Kind, Overlap
+from eval.renderer.settings import Kind
 from eval.renderer.warping import DEPTH, Flicker, flicker, steps
 from eval.report.intervals import interval_note
 from eval.results import Row, mean_row
 from tron import metrics
 from tron.errors import TronError
+from tron.neural.reprojection import Motion, averaged
+from tron.neural.windows import Overlap, windows
 from tron.report.page import Block, Cell, Section, Table, Text
 from tron.report.values import format_value
 from tron.shards.reader import read_clips
 
 log = logging.getLogger("tron.eval")
 
-TRUTH, LIT = "truth", "lit_buffer"
-SINGLE = "k1"
-PLAIN = {TRUTH: "path-traced truth", LIT: "lit, no network"}
+TRUTH, LIT, LIT_AVERAGED = "truth", "lit_buffer", "lit_buffer_averaged"
+SINGLE, UNMOVED = "k1", "unmoved"
+"""Single frames; windows whose frames are not averaged along their motion."""
+PLAIN = {
+    TRUTH: "path-traced truth",
+    LIT: "lit, no network",
+    LIT_AVERAGED: "lit, no network, averaged along its motion alike",
+}
 
 
 @dataclass(frozen=True)
@@ -46,7 +53,8 @@ class Clips:
     Attributes:
         window: frames of a pass of the windowed methods.
         overlap: the way of overlapping that figures without a name are of.
-        scores: method -> a score a clip; methods are TRUTH, LIT and ``KIND.k1``, ``KIND.OVERLAP``.
+        scores: method -> a score a clip; methods are TRUTH, LIT, LIT_AVERAGED and ``KIND.k1``,
+            ``KIND.unmoved``, ``KIND.OVERLAP``.
     """
 
     window: int
@@ -68,6 +76,7 @@ class Clips:
         """Root mean squared flicker of every method; ratios and gains of windows over single frames.
 
         Figures without a checkpoint's name are of that which starts from lit, the default of tron-relight.
+        Its windows are compared with lit that is averaged alike, too.
         """
         for method in self.scores:
             yield self._rms(method)
@@ -80,6 +89,9 @@ class Clips:
                 start = "renderer" if kind == "lit" else "renderer.pair"
                 yield self._ratio(f"{start}.warp_error_ratio", kind, self.overlap, seed)
                 yield self._gain(f"{start}.clip_gain_db", kind, self.overlap, seed)
+        if LIT_AVERAGED in self.scores and self.overlap in self.ways("lit"):
+            of = f"lit.{self.overlap}", LIT_AVERAGED
+            yield self._difference("renderer.lit.clip_gain_over_lit_db", *of, seed)
 
     def sections(self, pictures: Path) -> list[Section]:  # noqa: ARG002
         """Every way of overlapping in a table."""
@@ -99,13 +111,16 @@ class Clips:
             "Warping error: each frame against that before it, warped by the exact flow of true surfaces, "
             "on foreground that both frames see (Lai et al. 2018). Shown as the root of the mean square, in "
             "shares of full brightness; the ratio is of mean squares, as the measure is defined, windows "
-            f"over single frames of the same network. {interval_note(scenes)}"
+            "over single frames of the same network. Windows are averaged along the motion of the surfels' "
+            f"own depth, but for those that are called in place. {interval_note(scenes)}"
         )
         headings = ["Method", "warping error, rms", "ratio to K = 1", "PSNR", "gain over K = 1"]
         blocks: list[Block] = [text, Table("Flicker and PSNR of clips, foreground.", headings, rows)]
         return [Section("clips", f"Clips: windows of {self.window} frames", blocks)]
 
     def _words(self, way: str) -> str:
+        if way == UNMOVED:
+            return f"K = {self.window}, {self.overlap}, in place"
         return "K = 1" if way == SINGLE else f"K = {self.window}, {way}"
 
     def _value(self, kind: str, way: str, what: str) -> float:
@@ -131,9 +146,13 @@ class Clips:
         return row.within(interval(per_scene, ratio, seed))
 
     def _gain(self, metric: str, kind: str, way: str, seed: int) -> Row:
+        return self._difference(metric, f"{kind}.{way}", f"{kind}.{SINGLE}", seed)
+
+    def _difference(self, metric: str, method: str, other: str, seed: int) -> Row:
+        """Mean difference of PSNR of two methods on the same frames."""
         found = [
             (many.scene, a - b)
-            for many, single in zip(self.scores[f"{kind}.{way}"], self.scores[f"{kind}.{SINGLE}"])
+            for many, single in zip(self.scores[method], self.scores[other])
             for a, b in zip(many.psnr, single.psnr)
         ]
         return mean_row(metric, "dB", found, seed)
@@ -157,16 +176,18 @@ def measure_clips(
         TronError: no clip is as long as a window, or clips hold no true depth.
     """
     found = Clips(window, overlap)
-    for clip in read_clips(dataset, split, (*MEMBERS, DEPTH)):
+    for clip in read_clips(dataset, split, (*MEMBERS, DEPTH, SURFELS_DEPTH)):
         if clip.meta.frames < window:
             continue
         moves, truth, inside = steps(clip), clip.displayed("rgb"), region_mask(clip, "foreground")
         if not any(move.judged.any() for move in moves):
             continue
         buffers = Buffers.of(clip)
-        shown = {TRUTH: truth, LIT: buffers.displayed("lit")}
+        lit = buffers.displayed("lit")
+        shown = {TRUTH: truth, LIT: lit, LIT_AVERAGED: _averaged(lit, window, overlap, buffers.motion)}
         for kind, network in networks.items():
             shown[f"{kind}.{SINGLE}"] = network.clip(buffers, 1)
+            shown[f"{kind}.{UNMOVED}"] = network.clip(replace(buffers, motion=None), window, overlap)
             for way in overlaps:
                 shown[f"{kind}.{way}"] = network.clip(buffers, window, way)
         for method, frames in shown.items():
@@ -180,3 +201,15 @@ def measure_clips(
     if not found.scores:
         raise TronError(f"no clip of {window} frames whose surface is seen twice", dataset)
     return found
+
+
+def _averaged(frames: np.ndarray, window: int, overlap: Overlap, motion: Motion | None) -> np.ndarray:
+    """Frames averaged along their motion over the same windows, without a network."""
+    assert motion is not None  # the clip was read with the depth of its surfels
+    sums, counts = np.zeros(frames.shape), np.zeros(len(frames))
+    for each in windows(len(frames), window, 1, overlap):
+        pictures = {index: frames[index] for index in each.frames}
+        for index in each.kept:
+            sums[index] += averaged(pictures, index, motion)
+            counts[index] += 1
+    return (sums / counts[:, None, None, None]).astype(np.float32)

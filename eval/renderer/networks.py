@@ -12,9 +12,10 @@ import numpy as np
 from eval.relighting.baselines import NEURAL, NEURAL_LIT
 from eval.relighting.buffers import Buffers
 from eval.relighting.fits import Show
-from eval.renderer.settings import Kind, Overlap
+from eval.renderer.settings import Kind
 from tron.errors import TronError
 from tron.neural.shipped import SHIPPED, checkpoint_file
+from tron.neural.windows import Overlap
 
 if TYPE_CHECKING:
     from tron.neural.protocols import Renderer
@@ -38,12 +39,12 @@ class Network:
     path: Path
     renderer: Renderer
 
-    def clip(self, buffers: Buffers, window: int, overlap: Overlap = "newest") -> np.ndarray:
-        """Its pictures of a clip, (K, H, W, 3) display float32 in [0, 1]."""
+    def clip(self, buffers: Buffers, window: int, overlap: Overlap = "anchor") -> np.ndarray:
+        """Its pictures of a clip, (K, H, W, 3) display float32 in [0, 1], as `render_clip` gives them."""
         from tron.neural.renderer import render_clip
 
         displayed = {name: buffers.displayed(name) for name in self.renderer.config.guidance}
-        return render_clip(self.renderer, displayed, window, overlap)
+        return render_clip(self.renderer, displayed, window, overlap, motion=buffers.motion)
 
     def show(self, window: int) -> Show:
         """The network as a method that is given ``window`` frames a pass."""

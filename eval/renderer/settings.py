@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt
 
 from eval.benchmark import Benchmark
+from tron.neural.windows import Overlap
 
 Part = Literal[
     "synthetic",
@@ -21,7 +22,6 @@ Part = Literal[
     "kills",
     "cosmos",
 ]
-Overlap = Literal["newest", "mean", "anchor"]
 Kind = Literal["pair", "lit"]
 """Checkpoint: of the paper's two buffers, or with lit."""
 Recipe = list[str]
@@ -132,7 +132,7 @@ class RendererSettings(Benchmark):
 
     window: PositiveInt = Field(default=1, description="frames a pass in everything but clips")
     clip_window: PositiveInt = Field(default=5, description="frames a pass in clips")
-    overlap: Overlap = Field(default="newest", description="how windows overlap where one figure is wanted")
+    overlap: Overlap = Field(default="anchor", description="how windows overlap where one figure is wanted")
     overlaps: list[Overlap] = Field(
         default=["newest", "mean", "anchor"], description="ways that clips compares"
     )

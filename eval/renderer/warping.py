@@ -15,7 +15,7 @@ import numpy as np
 
 from tron.cameras import Camera
 from tron.errors import TronError
-from tron.flow import both_see, flow, warp
+from tron.flow import surface_motion, warp
 from tron.shards.moving import Moving
 from tron.shards.schema import Clip
 
@@ -55,12 +55,10 @@ def steps(clip: Clip) -> list[Step]:
     cameras = [Camera.from_dict(each) for each in clip.meta.cameras]
     depths, moving = clip.frames[DEPTH][..., 0], Moving.of(clip.meta)
     foreground = clip.frames["foreground"][..., 0] > 0.5
+    match = surface_motion(cameras, depths.__getitem__, None if moving is None else moving.between)
     found = []
     for k in range(1, clip.meta.frames):
-        pixels = None if moving is None else moving.pixels[k]
-        motion = None if moving is None else moving.between(k, k - 1)
-        displacement = flow(depths[k], cameras[k], cameras[k - 1], pixels, motion)
-        seen = both_see(depths[k], cameras[k], depths[k - 1], cameras[k - 1], pixels, motion)
+        displacement, seen = match(k, k - 1)
         found.append(Step(displacement, seen & foreground[k]))
     return found
 

@@ -138,11 +138,13 @@ def test_flow_by_the_motion_in_the_metadata_is_where_the_truth_shows_the_object_
             np.testing.assert_array_equal(moving.pixels[i], view.valid & (view.object_id == number))
             seen.append(np.where(view.valid, np.linalg.norm(view.position - camera.position, axis=-1), 0))
         for i, j in ((1, 0), (2, 1)):
-            args = (seen[i], cameras[i], seen[j], cameras[j], moving.pixels[i])
-            both = both_see(*args, moving.between(i, j))
+            pixels, motion = moving.between(i, j)
+            np.testing.assert_array_equal(pixels, moving.pixels[i])
+            args = (seen[i], cameras[i], seen[j], cameras[j], pixels)
+            both = both_see(*args, motion)
             assert both[moving.pixels[i]].mean() > 0.1
             assert both[moving.pixels[i]].mean() > both_see(*args, np.eye(4))[moving.pixels[i]].mean()
-            displacement = flow(seen[i], cameras[i], cameras[j], moving.pixels[i], moving.between(i, j))
+            displacement = flow(seen[i], cameras[i], cameras[j], pixels, motion)
             landed = warp(moving.pixels[j][..., None].astype(float), displacement)[..., 0]
             # where it touches what it rests on, depth tells no edge
             assert (landed[both & moving.pixels[i]] > 0.99).mean() > 0.9

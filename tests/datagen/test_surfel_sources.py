@@ -54,6 +54,7 @@ def test_a_killed_reconstruction_goes_on_and_ends_with_the_same_bytes(
     record = read_record(whole.output_dir, "train-000000")
     assert record is not None
     assert record.reconstruction is not None
+    assert record.reconstruction.albedo_scale is None, "true light leaves no factor open"
     assert record.refinement is None
     assert {clip.meta.extra["surfels_from"] for clip in read_clips(whole.output_dir, "train")} == {
         "reconstruction"
@@ -109,3 +110,7 @@ def test_base_color_of_a_joint_fit_has_the_scale_of_the_truth(variant, tmp_path,
     ((first, second),) = found
     assert np.abs(np.log(first)).max() > 0.02, "the fit was at the truth's scale by itself"
     np.testing.assert_allclose(second, 1, atol=0.03)
+    record = read_record(settings.output_dir, "train-000000")
+    assert record is not None
+    assert record.reconstruction is not None
+    np.testing.assert_allclose(record.reconstruction.albedo_scale, first)

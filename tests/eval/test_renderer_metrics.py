@@ -84,18 +84,18 @@ def test_a_clip_without_true_depth_is_refused(drawn_clip: Callable[..., Clip]):
 
 
 def test_ratios_are_of_mean_squares_and_gains_of_the_same_frames():
-    found = Clips(5, "newest")
+    found = Clips(5, "anchor")
     for scene, single, many in (("a", (8.0, 100), (4.0, 100)), ("b", (2.0, 50), (1.5, 50))):
         found.scores["truth"].append(ClipScore(scene, Flicker(0.5, single[1]), [100.0, 100.0]))
         found.scores["lit.k1"].append(ClipScore(scene, Flicker(*single), [30.0, 31.0]))
-        found.scores["lit.newest"].append(ClipScore(scene, Flicker(*many), [30.5, 31.5]))
+        found.scores["lit.anchor"].append(ClipScore(scene, Flicker(*many), [30.5, 31.5]))
     rows = values(found.rows(0))
     assert rows["renderer.warp_error_ratio"].value == pytest.approx(5.5 / 10)
     assert rows["renderer.warp_error_ratio"].scenes == 2
     assert rows["renderer.clip_gain_db"].value == pytest.approx(0.5)
     assert rows["renderer.warp_rms.truth"].value == pytest.approx(np.sqrt(1 / 150))
     assert "renderer.pair.warp_error_ratio" not in rows
-    assert "K = 5, newest" in str(found.sections(Path()))
+    assert "K = 5, anchor" in str(found.sections(Path()))
 
 
 def test_the_truth_correlates_with_itself_and_a_constant_with_nothing():

@@ -87,12 +87,24 @@ def test_a_moved_dataset_is_the_same_by_its_hash(make_settings, dataset, make_da
         ({"train_b": "#photos"}, "neither FOLDER nor FOLDER#SPLIT"),
         ({"train_b": "folder#"}, "neither FOLDER nor FOLDER#SPLIT"),
         ({"train_b": "folder#test"}, "kept for evaluation"),
+        ({"train_b": "folder#train+test_relit"}, "kept for evaluation"),
+        ({"train_b": "folder#train+"}, "neither FOLDER nor FOLDER#SPLIT"),
         ({"train_c": "folder"}, "which neither a stage nor validation reads"),
     ],
 )
 def test_wrong_splits_are_found_before_anything_is_read(make_settings, dataset, tmp_path, splits, message):
     with pytest.raises(ValidationError, match=message):
         Settings.model_validate(make_settings(dataset, tmp_path, splits=splits))
+
+
+def test_two_splits_of_a_folder_are_one_after_the_other(make_dataset, dataset, tmp_path):
+    captures = make_dataset(tmp_path / "captures", {"photos": 3, "relit": 2})
+    splits = Splits(dataset, {"train_b": f"{captures}#photos+relit", "relit": str(captures)})
+    both, relit = splits.clips("train_b"), splits.clips("relit")
+    assert len(both) == 5
+    assert [both.key(k) for k in (3, 4)] == [relit.key(k) for k in (0, 1)]
+    with pytest.raises(TronError, match=r"no split 'absent' .*it has: photos, relit"):
+        Splits(dataset, {"train_b": f"{captures}#photos+absent"})
 
 
 def test_folders_that_have_not_the_split_are_named(dataset, captures, tmp_path):

@@ -18,6 +18,7 @@ from tron.cameras import Camera
 from tron.cli.progress import track
 from tron.color import to_display
 from tron.estimation import Estimation
+from tron.flow import surface_motion
 from tron.gaussians.scene import GaussianScene
 from tron.images import write_image
 from tron.neural.windows import Overlap
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
     from tron.shading.environment import EnvironmentMap
     from tron.shading.lighting import Lighting
     from tron.tracing import SurfelTracer
+
+DEPTH = "depth"
+"""Buffer that the motion of surfaces is known by."""
 
 
 @dataclass
@@ -87,14 +91,21 @@ class Clip:
         self,
         renderer: Renderer,
         window: int | None = None,
-        overlap: Overlap = "newest",
+        overlap: Overlap = "anchor",
         weights: Mapping[str, float] | None = None,
+        cameras: Sequence[Camera] | None = None,
     ) -> None:
-        """Write the neural renderer's pictures, as `render_frames` gives them."""
+        """Write the neural renderer's pictures, as `render_frames` gives them.
+
+        With cameras, one a frame, and the buffer DEPTH in the folder, the frames of a window are averaged
+        along their motion.
+        """
         from tron.neural.renderer import render_frames
 
         frames = len(self.rotations)
-        drawn = render_frames(renderer, self._displayed, frames, window, overlap, weights)
+        still_sky = len(set(self.rotations)) == 1
+        motion = None if cameras is None else surface_motion(cameras, self._depth, still_sky=still_sky)
+        drawn = render_frames(renderer, self._displayed, frames, window, overlap, weights, motion)
         for index, neural in enumerate(track(drawn, "neural", frames)):
             self.folder.write_picture(index, "neural", neural)
             relit = self.picture.display(self.folder, index, self.exposure, neural)
@@ -102,6 +113,9 @@ class Clip:
 
     def _displayed(self, index: int) -> dict[str, np.ndarray]:
         return {name: to_display(self.folder.read(index, name), self.exposure) for name in self.guidance}
+
+    def _depth(self, index: int) -> np.ndarray:
+        return self.folder.read(index, DEPTH)[..., 0]
 
     def assemble(self, output_dir: Path, fps: float) -> None:
         """Write videos and the contact sheet from the pictures of all frames."""

@@ -17,11 +17,11 @@ import numpy as np
 
 import tron
 from tron.apps.camera_files import read_cameras
-from tron.apps.clip import Clip, trace
+from tron.apps.clip import DEPTH, Clip, trace
 from tron.apps.filmed_space import CAMERAS, filmed_cameras, filmed_orbit
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.framing import plan_cameras, turn_cameras, upright
-from tron.apps.relight_network import chosen_network, describe_network
+from tron.apps.relight_network import averages_frames, chosen_network, describe_network
 from tron.apps.relight_settings import Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
@@ -73,7 +73,8 @@ def main(settings: Settings) -> None:
     # Without a network the relit picture is one of them, and is shown as such; so is lit if nothing bounces.
     guidance = [name for name in GUIDANCE if name != settings.source and (settings.bounces or name != "lit")]
     guidance = guidance if renderer is None else renderer.config.guidance
-    clips = [_clip(*each, len(cameras), guidance) for each in zip(lights, environments)]
+    averaged = averages_frames(settings, renderer)
+    clips = [_clip(*each, len(cameras), guidance, averaged) for each in zip(lights, environments)]
     clock.lap("loading")
 
     pixels = len(clips) * len(cameras) * settings.width * settings.height
@@ -86,7 +87,8 @@ def main(settings: Settings) -> None:
         clock.lap("guidance")
         if renderer is not None:
             for clip in clips:
-                clip.draw(renderer, settings.window, settings.overlap, settings.weights)
+                along = cameras if averaged else None
+                clip.draw(renderer, settings.window, settings.overlap, settings.weights, along)
             clock.lap("neural")
         for light, clip in zip(lights, clips):
             clip.assemble(light.output_dir, settings.fps)
@@ -171,9 +173,12 @@ def _load_scene(settings: Settings) -> GaussianScene:
     return scene
 
 
-def _clip(light: Settings, environment: EnvironmentMap, frames: int, guidance: Sequence[str]) -> Clip:
+def _clip(
+    light: Settings, environment: EnvironmentMap, frames: int, guidance: Sequence[str], averaged: bool
+) -> Clip:
     picture = RelitPicture(light.background, light.source)
-    buffers = [name for name in (*guidance, *picture.buffers, *light.buffers) if name != "relit"]
+    needed = (*guidance, *picture.buffers, *light.buffers, *([DEPTH] if averaged else []))
+    buffers = [name for name in needed if name != "relit"]
     return Clip(
         environment=environment,
         rotations=light.rotations(frames),

@@ -53,6 +53,11 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
         return settings.model_copy(update={"checkpoint": None}), None
 
 
+def averages_frames(settings: Settings, renderer: Renderer | None) -> bool:
+    """Whether frames of a window are averaged along their motion: there are windows, and it is wanted."""
+    return renderer is not None and settings.reproject and (settings.window or renderer.config.window) > 1
+
+
 def describe_network(settings: Settings, renderer: Renderer | None) -> dict[str, Any] | None:
     """Record of the network for relight.json, None without one; weights null: equal ones."""
     if renderer is None or settings.checkpoint is None:
@@ -63,6 +68,7 @@ def describe_network(settings: Settings, renderer: Renderer | None) -> dict[str,
         "guidance": list(renderer.config.guidance),
         "window": settings.window or renderer.config.window,
         "overlap": settings.overlap,
+        "reproject": averages_frames(settings, renderer),
         "weights": settings.weights or getattr(renderer.config, "weights", None),
     }
 

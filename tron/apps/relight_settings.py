@@ -127,9 +127,14 @@ class Settings(BaseModel):
         "trained for",
     )
     overlap: Overlap = Field(
-        "newest",
-        description="which window draws a frame that lies in several: the one that ends with it, the one in "
-        "whose middle it stands (anchor), or the mean of all",
+        "anchor",
+        description="which window draws a frame that lies in several: the one in whose middle it stands "
+        "(anchor), the one that ends with it (newest), or the mean of all",
+    )
+    reproject: bool = Field(
+        True,
+        description="average each neural frame with the others of its window, brought to it along the exact "
+        "motion of surfaces: less flicker and noise; without effect at window=1",
     )
     weights: dict[str, float] | None = Field(
         None,
@@ -199,7 +204,12 @@ class Settings(BaseModel):
     @property
     def tuned(self) -> list[str]:
         """Settings of the neural renderer that were chosen."""
-        chosen = {"window": self.window, "weights": self.weights, "overlap": self.overlap != "newest"}
+        chosen = {
+            "window": self.window,
+            "weights": self.weights,
+            "overlap": self.overlap != "anchor",
+            "reproject": not self.reproject,
+        }
         return [name for name, given in chosen.items() if given]
 
     @property

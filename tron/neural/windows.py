@@ -36,7 +36,7 @@ def check_frames(frames: int, temporal_factor: int = TEMPORAL_FACTOR) -> None:
 
 
 def windows(
-    frames: int, size: int, temporal_factor: int = TEMPORAL_FACTOR, overlap: Overlap = "newest"
+    frames: int, size: int, temporal_factor: int = TEMPORAL_FACTOR, overlap: Overlap = "anchor"
 ) -> list[Window]:
     """Passes over a clip, in order; every frame is kept at least once, and once but for the mean.
 

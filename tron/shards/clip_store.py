@@ -30,7 +30,7 @@ class ClipStore:
 
     Args:
         place: the dataset's folder, or its URL.
-        split: of it.
+        split: of it, or several joined by +, one after another.
         members: that are read, unless a call says others; None: all that a clip holds.
         manifest: of the folder, where it has been loaded already.
 
@@ -47,7 +47,8 @@ class ClipStore:
     ) -> None:
         manifest = Manifest.load(place) if manifest is None else manifest
         self.split, self.members = split, None if members is None else tuple(members)
-        self._entries = [entry for entry in manifest.of_split(split) if entry.keys]
+        entries = [entry for name in split.split("+") for entry in manifest.of_split(name)]
+        self._entries = [entry for entry in entries if entry.keys]
         if not self._entries:
             raise TronError(f"manifest names no clip of the split '{split}'", str(place), DAMAGED)
         self._ends = list(accumulate(len(entry.keys) for entry in self._entries))

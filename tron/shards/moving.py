@@ -84,6 +84,9 @@ class Moving:
         pixels = [base64.b64encode(each).decode() for each in pictures]
         return _Text.model_validate({"poses": rows, "pixels": pixels}).model_dump_json()
 
-    def between(self, frame: int, other: int) -> np.ndarray:
-        """(4, 4) motion of the object's surface from the world at one frame to the world at another."""
-        return self.poses[other] @ np.linalg.inv(self.poses[frame])
+    def between(self, frame: int, other: int) -> tuple[np.ndarray, np.ndarray]:
+        """The object's pixels in a frame, (H, W) bool, and how its surface moves until another.
+
+        That is (4, 4), from the world at the one frame to the world at the other.
+        """
+        return self.pixels[frame], self.poses[other] @ np.linalg.inv(self.poses[frame])

@@ -232,10 +232,12 @@ def test_final_frames_without_bounces_have_no_reflections(tmp_path):
         Estimation(bounces=0, reflections=2)
 
 
-@pytest.mark.parametrize("overlap", ["newest", "anchor"])
-def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap):
+@pytest.mark.parametrize(("overlap", "turning"), [("newest", None), ("anchor", False), ("anchor", True)])
+def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap, turning):
+    """In place (None), and averaged along the motion under a light that stands still or turns."""
     import torch
 
+    from tron.flow import surface_motion
     from tron.neural.configs import BackboneConfig, RendererConfig
     from tron.neural.renderer import NeuralRenderer, render_clip
 
@@ -244,15 +246,23 @@ def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap):
     torch.manual_seed(1)
     for parameter in renderer.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
-    folder = FrameFolder(tmp_path, GUIDANCE)
+    folder = FrameFolder(tmp_path, (*GUIDANCE, "depth"))
     rng = generator(0, "test", "clip")
+    depth = np.where(np.arange(16)[:, None, None] < 6, 0, 5.0).repeat(16, 1)
     for index in range(8):
-        folder.write(index, {name: rng.uniform(0, 2, (16, 16, 3)) for name in GUIDANCE})
+        guidance = {name: rng.uniform(0, 2, (16, 16, 3)) for name in GUIDANCE}
+        folder.write(index, {**guidance, "depth": depth})
+    cameras, motion, rotations = None, None, [0.0] * 8
+    if turning is not None:
+        places = [0.05 * k for k in range(8)]
+        cameras = [Camera.look_at((x, -5, 0), (x, 0, 0), fov_deg=40, width=16, height=16) for x in places]
+        motion = surface_motion(cameras, lambda _: depth, still_sky=not turning)
+        rotations = [float(turning * k) for k in range(8)]
     light, picture = EnvironmentMap.constant(1.0), RelitPicture("environment", "neural")
-    Clip(light, [0.0] * 8, 0.7, picture, folder).draw(renderer, overlap=overlap)
+    Clip(light, rotations, 0.7, picture, folder).draw(renderer, overlap=overlap, cameras=cameras)
     linear = {name: np.stack([folder.read(i, name) for i in range(8)]) for name in GUIDANCE}
     shown = {name: to_display(buffer, 0.7) for name, buffer in linear.items()}
-    whole = render_clip(renderer, shown, overlap=overlap)
+    whole = render_clip(renderer, shown, overlap=overlap, motion=motion)
     for index in range(8):
         np.testing.assert_allclose(folder.row(index, ["neural"]), whole[index], atol=1.01 / 255)
 

@@ -56,6 +56,7 @@ def test_window_overlap_and_weights_change_the_pictures_and_are_on_record(run, c
         "plain": (),
         "single": ("window=1",),
         "mean": ("overlap=mean", "window=2"),
+        "in_place": ("reproject=false",),
         "weighed": ("weights={pbr: 0.3, irradiance: 0.7}",),
         "equal": ("weights={pbr: 0.5, irradiance: 0.5}",),
     }
@@ -67,12 +68,13 @@ def test_window_overlap_and_weights_change_the_pictures_and_are_on_record(run, c
         network = report["network"]
         assert report["frames_rendered"] == (3 if name == "plain" else 0)
         assert network["window"] == {"single": 1, "mean": 2}.get(name, 3)
-        assert network["overlap"] == ("mean" if name == "mean" else "newest")
+        assert network["overlap"] == ("mean" if name == "mean" else "anchor")
+        assert network["reproject"] == (name not in ("single", "in_place"))
         assert network["guidance"] == ["pbr", "irradiance"]
         if name == "weighed":
             assert network["weights"] == {"pbr": 0.3, "irradiance": 0.7}
     np.testing.assert_array_equal(drawn["equal"], drawn["plain"])
-    for name in ("single", "mean", "weighed"):
+    for name in ("single", "mean", "weighed", "in_place"):
         assert np.abs(drawn[name] - drawn["plain"]).max() > 2 / 255
 
 

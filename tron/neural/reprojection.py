@@ -1,0 +1,73 @@
+"""Pictures of neighbouring frames averaged along exact motion: temporal anti-aliasing.
+
+Rays that differ from frame to frame, edges that fall on pixels otherwise each time, what a network makes of
+both: it flickers, and the mean over frames is nearer to the truth than each of them. A neighbour's picture is
+sampled where it shows the surface of each pixel (:mod:`tron.flow`: cameras and depth are known, nothing is
+estimated), by bicubic interpolation, as a bilinear one blurs. Where the neighbour does not see that surface
+it is left out. What moves otherwise than the surface, as reflections, shadows and highlights, is held to the
+colours around the pixel: to their mean and DEVIATIONS standard deviations of 3 x 3 pixels (variance clipping:
+Salvi 2016, "An Excursion in Temporal Supersampling"; the method as a whole: Yang, Liu and Salvi 2020, "A
+Survey of Temporal Antialiasing Techniques"). docs/experiments.md says how the numbers were chosen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+DEVIATIONS = 1.0
+"""Standard deviations of the colours around a pixel that others may be off their mean."""
+OWN_WEIGHT = 2.0
+"""Weight of a frame's own picture where a neighbour's has 1."""
+Motion = Callable[[int, int], tuple[np.ndarray, np.ndarray]]
+"""Frame and other frame of a clip, by number -> where each pixel's surface is in the other frame:
+
+(H, W, 2) displacement in pixels, x then y, and (H, W) bool whether it is seen there
+(`tron.flow.surface_motion`).
+"""
+
+
+def averaged(pictures: Mapping[int, np.ndarray], index: int, motion: Motion) -> np.ndarray:
+    """A frame's picture and those of other frames, brought to its pixels: their mean.
+
+    Args:
+        pictures: by number in the clip, (H, W, 3) display values in [0, 1].
+        index: the frame that is wanted, one of them.
+        motion: of the clip.
+
+    Returns:
+        (H, W, 3) float32 in [0, 1]; the picture itself where no other frame sees the surface.
+    """
+    own = np.asarray(pictures[index], np.float32)
+    least, most = _bounds(own)
+    total = OWN_WEIGHT * own
+    weight = np.full((*own.shape[:2], 1), OWN_WEIGHT, np.float32)
+    for other, picture in pictures.items():
+        if other != index:
+            displacement, seen = motion(index, other)
+            there = np.clip(_sampled(picture, displacement), least, most)
+            total += np.where(seen[..., None], there, 0)
+            weight += seen[..., None]
+    return np.clip(total / weight, 0, 1)
+
+
+def _sampled(picture: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+    """(H, W, 3) float32: bicubic samples of a picture; beyond its border, and at NaN, its nearest pixels."""
+    import cv2
+
+    height, width = displacement.shape[:2]
+    place = np.nan_to_num(displacement, nan=0.0) + np.stack(np.meshgrid(range(width), range(height)), -1)
+    x, y = np.moveaxis(np.clip(place, -1, (picture.shape[1], picture.shape[0])).astype(np.float32), -1, 0)
+    image = np.asarray(picture, np.float32)
+    return cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _bounds(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and most that another frame's colours count as, (H, W, 3) each."""
+    import cv2
+
+    around = {"ksize": (3, 3), "borderType": cv2.BORDER_REPLICATE}
+    mean = cv2.blur(picture, **around)
+    spread = DEVIATIONS * np.sqrt(np.maximum(cv2.blur(picture * picture, **around) - mean * mean, 0))
+    return mean - spread, mean + spread
