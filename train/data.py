@@ -22,7 +22,14 @@ from train.curriculum import CAPTURES, Stage, require_splits
 from train.framing import centred, sized
 from train.held_out import HeldOutClips, Windows, first_windows, network_input, spread
 from train.processes import Processes
-from train.requirements import first_whole, require_clips, require_fit, require_members, require_size
+from train.requirements import (
+    first_whole,
+    firsts_whole,
+    require_clips,
+    require_fit,
+    require_members,
+    require_size,
+)
 from train.settings import DataSettings, ValidationSettings
 from train.sources import CachedSplit, Draw, IndexedSplit, Source
 from train.splits import Splits
@@ -158,7 +165,8 @@ class TrainingData(lightning.LightningDataModule):
         used = list(dict.fromkeys(split for stage in stages for split in stage.splits()))
         for stage in stages:
             for split in stage.splits():
-                require_fit(stage, split, self.first_meta(split))
+                for first in firsts_whole(self.splits.clips(split)):
+                    require_fit(stage, split, first)
             if self.validation_split is not None:
                 require_size(stage, self.validation_split, self.first_meta(self.validation_split))
         for split in used:
@@ -183,8 +191,9 @@ class TrainingData(lightning.LightningDataModule):
         return first_whole(self.splits.clips(split))
 
     def photographs(self, split: str) -> bool:
-        """Whether a split's pictures are display-encoded, as photographs are."""
-        return self.first_meta(split).color_space.get(TARGET) == "display"
+        """Whether a split's pictures are display-encoded, as photographs are; all of them in a joined one."""
+        firsts = firsts_whole(self.splits.clips(split))
+        return all(first.color_space.get(TARGET) == "display" for first in firsts)
 
     def stands_in(self, split: str) -> bool:
         """Whether a split holds path-traced pictures where the curriculum would have photographs."""

@@ -25,9 +25,9 @@ class OtherLights:
 
     def __init__(self, clips: ClipStore, ratio: float, read: Callable[[int, slice], Sample]):
         self.clips, self.ratio, self.read = clips, ratio, read
-        self._places: dict[str, list[int]] = defaultdict(list)
+        self._places: dict[tuple[str, str], list[int]] = defaultdict(list)
         for number in range(len(clips)):
-            self._places[_place(clips.key(number))].append(number)
+            self._places[self._place(number)].append(number)
 
     def mixed(self, sample: Sample, number: int, window: slice, random: np.random.Generator) -> Sample:
         """A clip's frames, in `ratio` of all cases with those under another of its lights in a random share.
@@ -39,7 +39,7 @@ class OtherLights:
         """
         if sample.display or random.random() >= self.ratio:
             return sample
-        others = [each for each in self._places[_place(self.clips.key(number))] if each != number]
+        others = [each for each in self._places[self._place(number)] if each != number]
         if not others:
             return sample
         other, weight = others[int(random.integers(len(others)))], float(random.random())
@@ -55,7 +55,7 @@ class OtherLights:
         }
         return Sample(buffers)
 
-
-def _place(key: str) -> str:
-    """A clip's key without its light."""
-    return re.sub(r"-[^-]+(-c\d+)?$", r"\1", key)
+    def _place(self, number: int) -> tuple[str, str]:
+        """A clip's split, whose clips alone are seen from the same places, and its key without its light."""
+        key = re.sub(r"-[^-]+(-c\d+)?$", r"\1", self.clips.key(number))
+        return self.clips.split_of(number), key

@@ -13,14 +13,21 @@ from tron.shards.clip_store import ClipStore
 from tron.shards.schema import ClipMeta
 
 
-def first_whole(clips: ClipStore, members: Sequence[str] = ()) -> ClipMeta:
-    """Metadata of the first clip of a split that has its metadata, and these members in its first frame.
+def firsts_whole(clips: ClipStore, members: Sequence[str] = ()) -> list[ClipMeta]:
+    """Metadata of the first clip of each of the splits of a store, as :func:`first_whole` finds it."""
+    return [first_whole(clips, members, start) for start in clips.first_of_splits()]
+
+
+def first_whole(clips: ClipStore, members: Sequence[str] = (), start: int = 0) -> ClipMeta:
+    """Metadata of the first clip from a number on that has them, and these members in its first frame.
 
     Raises:
-        TronError: none of the first 64 has; it says what is wrong with the first.
+        TronError: none of 64 has, all of one split; it says what is wrong with the first.
     """
     failure: TronError | None = None
-    for number in range(min(MOST_TRIES, len(clips))):
+    for number in range(start, min(start + MOST_TRIES, len(clips))):
+        if clips.split_of(number) != clips.split_of(start):
+            break
         try:
             meta = clips.meta(number)
             for name in members:
@@ -37,7 +44,7 @@ def require_members(clips: ClipStore, split: str, members: Sequence[str]) -> Non
     """TronError, naming the buffer, unless a split holds the members that samples are to have."""
     for name in members:
         try:
-            first_whole(clips, [name])
+            firsts_whole(clips, [name])
         except TronError as error:
             raise TronError(
                 f"split '{split}' gives no buffer '{name}': {error.what}",

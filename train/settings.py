@@ -228,7 +228,7 @@ class Settings(BaseModel):
     @classmethod
     def _places(cls, splits: dict[str, str]) -> dict[str, str]:
         for name, value in splits.items():
-            for split in SplitPlace.parse(name, value).names:
+            for split in SplitPlace.parse(name, value).splits:
                 _require_training_split(name, split)
         return splits
 

@@ -7,21 +7,21 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class SplitPlace:
-    """A dataset's folder or URL, and the name of one of its splits, or several joined by +."""
+    """A dataset's folder or URL, and the names of those of its splits that are one here."""
 
     folder: str
-    split: str
+    splits: tuple[str, ...]
 
     @classmethod
     def parse(cls, name: str, value: str) -> SplitPlace:
-        """Place of the split that a run calls ``name``: FOLDER or FOLDER#SPLIT+SPLIT..., else ValueError."""
-        folder, mark, split = value.rpartition("#")
-        place = cls(folder, split) if mark else cls(value, name)
-        if not place.folder or not all(place.names):
-            raise ValueError(f"{name}={value!r} is neither FOLDER nor FOLDER#SPLIT")
-        return place
+        """Place of the split that a run calls ``name``: FOLDER or FOLDER#SPLIT or FOLDER#SPLIT+SPLIT.
 
-    @property
-    def names(self) -> list[str]:
-        """The splits one by one."""
-        return self.split.split("+")
+        Raises:
+            ValueError: it is none of these, or names a split twice.
+        """
+        folder, mark, joined = value.rpartition("#")
+        splits = tuple(joined.split("+")) if mark else (name,)
+        place = cls(folder if mark else value, splits)
+        if not place.folder or not all(splits) or len(set(splits)) < len(splits):
+            raise ValueError(f"{name}={value!r} is neither FOLDER nor FOLDER#SPLIT, nor FOLDER#SPLIT+OTHER")
+        return place

@@ -43,9 +43,9 @@ class Splits:
     def clips(self, name: str) -> ClipStore:
         """Clips of a split; TronError, naming those there are, where there is none."""
         if name not in self._stores:
-            place = self._places.get(name, SplitPlace(str(self._dataset), name))
+            place = self._places.get(name, SplitPlace(str(self._dataset), (name,)))
             try:
-                store = ClipStore(place.folder, place.split, manifest=self._manifests[place.folder])
+                store = ClipStore(place.folder, place.splits, manifest=self._manifests[place.folder])
             except TronError as error:
                 raise TronError(error.what, place.folder, error.mend) from error
             self._stores[name] = store
@@ -60,4 +60,4 @@ def manifest_hash(folder: Place) -> str:
 def split_hashes(elsewhere: Mapping[str, str]) -> dict[str, str]:
     """Of each split that is read elsewhere, its dataset's `manifest_hash` and its name there."""
     places = {name: SplitPlace.parse(name, value) for name, value in elsewhere.items()}
-    return {name: f"{manifest_hash(place.folder)}#{place.split}" for name, place in places.items()}
+    return {name: f"{manifest_hash(place.folder)}#{'+'.join(place.splits)}" for name, place in places.items()}

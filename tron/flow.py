@@ -27,7 +27,7 @@ EDGE = 0.1
 """The same for each of the four pixels around a place: beyond it they lie on another surface."""
 
 REMEMBERED = 32
-"""Depths, and pairs of frames, that a clip's motion keeps: windows that overlap ask for the same."""
+"""Depths that a clip's motion keeps: windows that overlap ask for the same."""
 
 
 class Match(NamedTuple):
@@ -93,14 +93,27 @@ def both_see(
     Raises:
         TronError: sizes differ from the cameras'.
     """
+    return match(depth, camera, other_depth, other, moving, motion).seen
+
+
+def match(
+    depth: np.ndarray,
+    camera: Camera,
+    other_depth: np.ndarray,
+    other: Camera,
+    moving: np.ndarray | None = None,
+    motion: np.ndarray | None = None,
+) -> Match:
+    """:func:`flow` and :func:`both_see` at once, of the same arguments."""
     place, in_front, expected = _seen_from(depth, camera, other, moving, motion)
+    displacement = np.where(in_front[..., None], place - _centres(camera), np.nan)
     taps, weights, inside = _taps(place, other.width, other.height)
     inverse = _inverse_z(_plane(other_depth, other, "the other depth"), other)
     around = inverse.reshape(-1)[taps]
     found = (around * weights).sum(-1)
     near = np.abs(around - expected[..., None]) <= EDGE * expected[..., None]
     agrees = np.abs(found - expected) <= TOLERANCE * expected
-    return in_front & inside & near.all(-1) & agrees
+    return Match(displacement, in_front & inside & near.all(-1) & agrees)
 
 
 def surface_motion(
@@ -123,15 +136,14 @@ def surface_motion(
     """
     read = lru_cache(REMEMBERED)(depth)
 
-    @lru_cache(REMEMBERED)
-    def match(index: int, other: int) -> Match:
+    def between(index: int, other: int) -> Match:
         motion = () if moves is None else moves(index, other)
-        seen = both_see(read(index), cameras[index], read(other), cameras[other], *motion)
+        found = match(read(index), cameras[index], read(other), cameras[other], *motion)
         if not still_sky:
-            seen &= _plane(read(index), cameras[index], "depth") > 0
-        return Match(flow(read(index), cameras[index], cameras[other], *motion), seen)
+            found.seen[_plane(read(index), cameras[index], "depth") <= 0] = False
+        return found
 
-    return match
+    return between
 
 
 def warp(image: np.ndarray, displacement: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +13,7 @@ from tron.cameras import Camera
 from tron.color import to_display
 from tron.flow import surface_motion
 from tron.neural.reprojection import Motion
-from tron.shards.moving import Moving
+from tron.shards.moving import KEY, Moving
 from tron.shards.schema import TARGET, Clip, light_members
 
 Region = Literal["foreground", "frame"]
@@ -22,6 +22,8 @@ MEMBERS = (*light_members(), TARGET, "mask", "foreground")
 """Members of a clip that predictions and their scores need."""
 SURFELS_DEPTH = "depth"
 """Member that motion is known by where a clip is rendered: the surfels', not the truth's."""
+PAIRS = 64
+"""Pairs of frames whose match is remembered."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,9 @@ class Buffers:
     Attributes:
         images: (..., C) float32 each, linear.
         exposure: the clip's factor before the tone curve.
-        motion: of the surfaces of a whole clip as those know it who render it; None where the depth of the
-            surfels was not read.
+        motion: of the surfaces of a whole clip, from cameras and the depth of the surfels, which whoever
+            renders it has, and of the object that moves; None where that depth was not read, or an older
+            program did not say how the object moves.
     """
 
     images: Mapping[str, np.ndarray]
@@ -43,7 +46,8 @@ class Buffers:
     @classmethod
     def of(cls, clip: Clip) -> Buffers:
         """All pixels of a clip: (K, H, W, C)."""
-        motion = _motion(clip) if SURFELS_DEPTH in clip.frames else None
+        unsaid = clip.meta.extra.get("moving_object") and KEY not in clip.meta.extra
+        motion = _motion(clip) if SURFELS_DEPTH in clip.frames and not unsaid else None
         return cls(clip.frames, clip.meta.exposure, motion)
 
     def at(self, pixels: Any) -> Buffers:
@@ -75,7 +79,8 @@ def _motion(clip: Clip) -> Motion:
             still_sky=not clip.meta.extra.get("turn_deg"),
         )
 
-    return lambda index, other: known()(index, other)
+    # Several methods and ways of overlapping ask for the same.
+    return lru_cache(PAIRS)(lambda index, other: known()(index, other))
 
 
 def region_mask(clip: Clip, region: Region) -> np.ndarray:

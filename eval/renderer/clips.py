@@ -13,6 +13,7 @@ import numpy as np
 from eval.confidence import interval, scene_sums
 from eval.relighting.buffers import MEMBERS, SURFELS_DEPTH, Buffers, region_mask
 from eval.renderer.networks import TITLES, Network
+from eval.renderer.pictures import LEAST_WIDTH, enlarge
 from eval.renderer.settings import Kind
 from eval.renderer.warping import DEPTH, Flicker, flicker, steps
 from eval.report.intervals import interval_note
@@ -21,9 +22,10 @@ from tron import metrics
 from tron.errors import TronError
 from tron.neural.reprojection import Motion, averaged
 from tron.neural.windows import Overlap, windows
-from tron.report.page import Block, Cell, Section, Table, Text
+from tron.report.page import Block, Cell, Film, Films, Section, Table, Text
 from tron.report.values import format_value
 from tron.shards.reader import read_clips
+from tron.video import VideoWriter
 
 log = logging.getLogger("tron.eval")
 
@@ -35,6 +37,7 @@ PLAIN = {
     LIT: "lit, no network",
     LIT_AVERAGED: "lit, no network, averaged along its motion alike",
 }
+FILM_FPS = 10.0
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,14 @@ class ClipScore:
     psnr: Sequence[float]
 
 
+@dataclass(frozen=True)
+class Example:
+    """Clip to look at: its name, and method -> (K, H, W, 3) display values."""
+
+    title: str
+    frames: Mapping[str, np.ndarray]
+
+
 @dataclass
 class Clips:
     """Findings.
@@ -53,12 +64,14 @@ class Clips:
     Attributes:
         window: frames of a pass of the windowed methods.
         overlap: the way of overlapping that figures without a name are of.
+        example: frames of the clip that flickers most by single frames, by method; None before it was seen.
         scores: method -> a score a clip; methods are TRUTH, LIT, LIT_AVERAGED and ``KIND.k1``,
             ``KIND.unmoved``, ``KIND.OVERLAP``.
     """
 
     window: int
     overlap: Overlap
+    example: Example | None = None
     scores: defaultdict[str, list[ClipScore]] = field(default_factory=lambda: defaultdict(list))
 
     @property
@@ -93,8 +106,8 @@ class Clips:
             of = f"lit.{self.overlap}", LIT_AVERAGED
             yield self._difference("renderer.lit.clip_gain_over_lit_db", *of, seed)
 
-    def sections(self, pictures: Path) -> list[Section]:  # noqa: ARG002
-        """Every way of overlapping in a table."""
+    def sections(self, pictures: Path) -> list[Section]:
+        """Every way of overlapping in a table, and films of a clip, which are written to ``pictures``."""
         rows: list[Sequence[Cell | str]] = []
         for method, scores in self.scores.items():
             kind, _, way = method.partition(".")
@@ -116,7 +129,27 @@ class Clips:
         )
         headings = ["Method", "warping error, rms", "ratio to K = 1", "PSNR", "gain over K = 1"]
         blocks: list[Block] = [text, Table("Flicker and PSNR of clips, foreground.", headings, rows)]
+        if self.example is not None:
+            blocks.append(self._films(self.example, pictures))
         return [Section("clips", f"Clips: windows of {self.window} frames", blocks)]
+
+    def _films(self, example: Example, pictures: Path) -> Films:
+        films = []
+        shown = [LIT, f"{self.kinds[0]}.{SINGLE}", f"{self.kinds[0]}.{self.overlap}", TRUTH]
+        for method in [each for each in shown if each in example.frames]:
+            kind, _, way = method.partition(".")
+            title = PLAIN.get(method) or f"{_title(kind)}, {self._words(way)}"
+            frames = example.frames[method]
+            scale = -(-LEAST_WIDTH // frames.shape[2])
+            film = [enlarge(frame, scale) for frame in [*frames, *frames[-2:0:-1]]]  # there and back again
+            size = film[0].shape[1], film[0].shape[0]
+            path = pictures / f"renderer-clips-{method.replace('.', '-')}.mp4"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with VideoWriter(path, FILM_FPS, size) as video:
+                for frame in film:
+                    video.write(frame)
+            films.append(Film(path.read_bytes(), size, title, f"{example.title}: {title}"))
+        return Films(example.title, films, columns=2)
 
     def _words(self, way: str) -> str:
         if way == UNMOVED:
@@ -197,6 +230,9 @@ def measure_clips(
                 if mask.any()
             ]
             found.scores[method].append(ClipScore(clip.meta.scene, flicker(frames, moves), psnr))
+        scores = found.scores[f"{next(iter(networks))}.{SINGLE}"] if networks else []
+        if scores and scores[-1].flicker.mean == max(score.flicker.mean for score in scores):
+            found.example = Example(f"Scene {clip.meta.scene}, light {clip.meta.light}", shown)
         log.info("clip %s by windows of %d frames", clip.meta.key, window)
     if not found.scores:
         raise TronError(f"no clip of {window} frames whose surface is seen twice", dataset)

@@ -41,6 +41,11 @@ class Flicker(NamedTuple):
     squared: float
     pixels: int
 
+    @property
+    def mean(self) -> float:
+        """Mean square, 0 where no pixel was judged."""
+        return self.squared / self.pixels if self.pixels else 0.0
+
 
 def steps(clip: Clip) -> list[Step]:
     """The K - 1 steps of a clip with true depth.

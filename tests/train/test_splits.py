@@ -1,5 +1,6 @@
 """Splits that come from another dataset, through the command."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ from train.cli import main
 from train.settings import Settings
 from train.splits import Splits, manifest_hash
 from tron.errors import TronError
+from tron.shards.manifest import Manifest
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +91,7 @@ def test_a_moved_dataset_is_the_same_by_its_hash(make_settings, dataset, make_da
         ({"train_b": "folder#test"}, "kept for evaluation"),
         ({"train_b": "folder#train+test_relit"}, "kept for evaluation"),
         ({"train_b": "folder#train+"}, "neither FOLDER nor FOLDER#SPLIT"),
+        ({"train_b": "folder#train+train"}, "neither FOLDER nor FOLDER#SPLIT"),
         ({"train_c": "folder"}, "which neither a stage nor validation reads"),
     ],
 )
@@ -103,8 +106,31 @@ def test_two_splits_of_a_folder_are_one_after_the_other(make_dataset, dataset, t
     both, relit = splits.clips("train_b"), splits.clips("relit")
     assert len(both) == 5
     assert [both.key(k) for k in (3, 4)] == [relit.key(k) for k in (0, 1)]
+    assert both.first_of_splits() == [0, 3]
+    assert [both.split_of(k) for k in (2, 3)] == ["photos", "relit"]
     with pytest.raises(TronError, match=r"no split 'absent' .*it has: photos, relit"):
         Splits(dataset, {"train_b": f"{captures}#photos+absent"})
+
+
+def test_every_joined_split_is_checked_before_the_first_step(make_settings, dataset, make_dataset, tmp_path):
+    captures = make_dataset(tmp_path / "captures", {"long": 2}, frames=5)
+    make_dataset(tmp_path / "more", {"short": 2}, frames=1)
+    manifest = Manifest.load(captures)
+    for path in (tmp_path / "more").glob("short-*"):
+        shutil.copy(path, captures)
+    shards = [*manifest.shards, *Manifest.load(tmp_path / "more").shards]
+    (captures / "manifest.json").write_text(manifest.model_copy(update={"shards": shards}).model_dump_json())
+    stage = {"name": "one", "split": "train_b", "frames": 5, "steps": 2, "batch_size": 2, "crop": 16}
+    changes = {"stages": [stage], "validation": {"split": None}}
+    joined = {"splits": {"train_b": f"{captures}#long+short"}}
+    with pytest.raises(TronError, match="needs clips of 5 frames, split 'train_b' has 1"):
+        main(Settings.model_validate(make_settings(dataset, tmp_path / "run", **changes, **joined)))
+
+
+def test_names_of_stages_and_validation_are_not_joined(make_settings, dataset, tmp_path):
+    settings = make_settings(dataset, tmp_path / "run", validation={"split": "train+test"})
+    with pytest.raises(TronError, match=r"no split 'train\+test'"):
+        main(Settings.model_validate(settings))
 
 
 def test_folders_that_have_not_the_split_are_named(dataset, captures, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from tron.shading.environment import EnvironmentMap
     from tron.shading.lighting import Lighting
     from tron.tracing import SurfelTracer
+
+log = logging.getLogger(__name__)
 
 DEPTH = "depth"
 """Buffer that the motion of surfaces is known by."""
@@ -115,7 +118,7 @@ class Clip:
         return {name: to_display(self.folder.read(index, name), self.exposure) for name in self.guidance}
 
     def _depth(self, index: int) -> np.ndarray:
-        return self.folder.read(index, DEPTH)[..., 0]
+        return self.folder.read(index, DEPTH)[..., 0].copy()  # a view would keep all three channels
 
     def assemble(self, output_dir: Path, fps: float) -> None:
         """Write videos and the contact sheet from the pictures of all frames."""
@@ -150,6 +153,9 @@ def trace(
     from tron.apps.lit_scene import LitScene
 
     lit = LitScene(scene, cameras[0], estimation, seeds.integer(seed, "relight", "bounces"))
+    for clip in clips:
+        if lacking := clip.folder.lacking(len(cameras)):
+            log.info("frames that have no %s yet are traced again", ", ".join(lacking))
     if not all(clip.folder.finished(index) for clip in clips for index in range(len(cameras))):
         lit.prepare()
     for index, camera in enumerate(track(cameras, "guidance")):

@@ -65,6 +65,14 @@ class FrameFolder:
         """Whether every buffer of the frame is there, and hence whole."""
         return all(self.path(index, name, "exr").exists() for name in self.buffers)
 
+    def lacking(self, frames: int) -> list[str]:
+        """Names of buffers that are missing in frames which have others of them."""
+        missing = set()
+        for index in range(frames):
+            there = {name for name in self.buffers if self.path(index, name, "exr").exists()}
+            missing |= set(self.buffers) - there if there else set()
+        return sorted(missing)
+
     def write(self, index: int, images: Mapping[str, np.ndarray]) -> None:
         """Write a frame's buffers. Raises TronError, and writes nothing, if one of them is not finite."""
         for name in self.buffers:

@@ -60,7 +60,6 @@ def main(settings: Settings) -> None:
     given = None if settings.cameras is None else read_cameras(settings.cameras, *size)
     environments = [EnvironmentMap.load(light.light) for light in lights]
     settings, renderer = chosen_network(settings)
-    network = describe_network(settings, renderer)
     lights = settings.by_light()
     scene = _load_scene(settings)
     turn = upright(scene.up)  # to +z, which is up in environment maps
@@ -73,7 +72,8 @@ def main(settings: Settings) -> None:
     # Without a network the relit picture is one of them, and is shown as such; so is lit if nothing bounces.
     guidance = [name for name in GUIDANCE if name != settings.source and (settings.bounces or name != "lit")]
     guidance = guidance if renderer is None else renderer.config.guidance
-    averaged = averages_frames(settings, renderer)
+    averaged = averages_frames(settings, renderer, len(cameras))
+    network = describe_network(settings, renderer, len(cameras))
     clips = [_clip(*each, len(cameras), guidance, averaged) for each in zip(lights, environments)]
     clock.lap("loading")
 
@@ -245,7 +245,7 @@ cli = command(
         "tron-relight scene=surfels.ply environment=a.hdr trajectory=still rotation=[0,360] output_dir=out",
         "tron-relight scene=surfels.ply environment=a.hdr background=transparent output_dir=out",
         "tron-relight scene=surfels.ply environment=a.hdr checkpoint=renderer.safetensors output_dir=out",
-        "tron-relight scene=surfels.ply environment=a.hdr checkpoint=pair overlap=anchor "
+        "tron-relight scene=surfels.ply environment=a.hdr checkpoint=pair overlap=newest "
         "'weights={pbr: 0.3, irradiance: 0.7}' output_dir=out",
     ),
 )

@@ -10,7 +10,7 @@ from tron.apps.relight_settings import Settings
 from tron.cli.installation import require_extra
 from tron.errors import TronError
 from tron.neural.shipped import checkpoint_file
-from tron.neural.windows import check_frames
+from tron.neural.windows import check_frames, windows
 from tron.runtime import set_torch_threads, torch_device
 from tron.storage import sha256
 
@@ -27,7 +27,7 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     libraries of networks or its file are not installed; where nothing bounces and it is given lit; where
     radiance is asked for, which a network does not draw; and where lit has sub-pixels or rays for reflections
     (quality=final), for it learnt from single samples and makes finer pictures worse (docs/experiments.md).
-    Where window, overlap or weights are chosen, it has to fit too.
+    Where window, overlap, reproject or weights are chosen, it has to fit too.
 
     Raises:
         TronError: the checkpoint is missing, damaged, or does not fit the settings.
@@ -53,12 +53,15 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
         return settings.model_copy(update={"checkpoint": None}), None
 
 
-def averages_frames(settings: Settings, renderer: Renderer | None) -> bool:
-    """Whether frames of a window are averaged along their motion: there are windows, and it is wanted."""
-    return renderer is not None and settings.reproject and (settings.window or renderer.config.window) > 1
+def averages_frames(settings: Settings, renderer: Renderer | None, frames: int) -> bool:
+    """Whether frames of a clip are averaged along their motion: it is wanted, and windows hold several."""
+    if renderer is None or not settings.reproject:
+        return False
+    passes = windows(frames, settings.window or renderer.config.window, renderer.temporal_factor)
+    return len(passes[0].frames) > 1
 
 
-def describe_network(settings: Settings, renderer: Renderer | None) -> dict[str, Any] | None:
+def describe_network(settings: Settings, renderer: Renderer | None, frames: int) -> dict[str, Any] | None:
     """Record of the network for relight.json, None without one; weights null: equal ones."""
     if renderer is None or settings.checkpoint is None:
         return None
@@ -68,7 +71,7 @@ def describe_network(settings: Settings, renderer: Renderer | None) -> dict[str,
         "guidance": list(renderer.config.guidance),
         "window": settings.window or renderer.config.window,
         "overlap": settings.overlap,
-        "reproject": averages_frames(settings, renderer),
+        "reproject": averages_frames(settings, renderer, frames),
         "weights": settings.weights or getattr(renderer.config, "weights", None),
     }
 

@@ -17,10 +17,10 @@ from tron.neural.shipped import DEFAULT, SHIPPED
 from tron.neural.windows import Overlap
 from tron.shards.schema import light_members
 
-DEFAULT_BUFFERS = (*light_members(), "indirect", "foreground", "mask", "share")
+DEFAULT_BUFFERS = (*light_members(), "indirect", "foreground", "mask", "share", "depth")
 BUFFERS = (
     *DEFAULT_BUFFERS,
-    *("base_color", "normal", "depth", "position", "roughness", "metallic", "rgb"),  # of the G-buffer
+    *("base_color", "normal", "position", "roughness", "metallic", "rgb"),  # of the G-buffer
     "relit",
 )
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ class ClipStore:
 
     Args:
         place: the dataset's folder, or its URL.
-        split: of it, or several joined by +, one after another.
+        split: of it, or several, one after another.
         members: that are read, unless a call says others; None: all that a clip holds.
         manifest: of the folder, where it has been loaded already.
 
@@ -41,13 +41,14 @@ class ClipStore:
     def __init__(
         self,
         place: Place,
-        split: str,
+        split: str | Sequence[str],
         members: Iterable[str] | None = None,
         manifest: Manifest | None = None,
     ) -> None:
         manifest = Manifest.load(place) if manifest is None else manifest
-        self.split, self.members = split, None if members is None else tuple(members)
-        entries = [entry for name in split.split("+") for entry in manifest.of_split(name)]
+        splits = [split] if isinstance(split, str) else split
+        self.split, self.members = "+".join(splits), None if members is None else tuple(members)
+        entries = [entry for name in splits for entry in manifest.of_split(name)]
         self._entries = [entry for entry in entries if entry.keys]
         if not self._entries:
             raise TronError(f"manifest names no clip of the split '{split}'", str(place), DAMAGED)
@@ -64,6 +65,19 @@ class ClipStore:
         """Key of a clip; IndexError where there is no such number."""
         entry, place = self._find(number)
         return entry.keys[place]
+
+    def split_of(self, number: int) -> str:
+        """Split of a clip; IndexError where there is no such number."""
+        return self._find(number)[0].split
+
+    def first_of_splits(self) -> list[int]:
+        """Number of the first clip of each of the splits."""
+        starts = [0, *self._ends[:-1]]
+        return [
+            start
+            for k, (start, entry) in enumerate(zip(starts, self._entries))
+            if k == 0 or entry.split != self._entries[k - 1].split
+        ]
 
     def meta(self, number: int) -> ClipMeta:
         """Metadata of a clip; TronError where they are missing, damaged or of another clip."""
