@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from train.light_mixing import OtherLights
 from train.sources import CachedSplit, Draw, IndexedSplit
 from tron import seeds
 from tron.shards import ClipStore
@@ -71,6 +72,29 @@ def test_scenes_with_one_light_and_photographs_stay_as_they_are(make_dataset, da
     for folder in (dataset, photos):
         for a, b in zip(drawn(folder, mix=0.0), drawn(folder)):
             assert all(torch.equal(a.buffers[name], b.buffers[name]) for name in MEMBERS)
+
+
+def test_joined_splits_mix_lights_within_their_own():
+    """Photos and relit views of a capture have the same keys but for their lights, and other cameras."""
+    keys = [
+        ("photos", "a-l0-c0000"),
+        ("photos", "a-l0-c0001"),
+        ("relit", "a-l1-c0000"),
+        ("relit", "a-l2-c0000"),
+    ]
+
+    class Clips:
+        def __len__(self):
+            return len(keys)
+
+        def key(self, number: int) -> str:
+            return keys[number][1]
+
+        def split_of(self, number: int) -> str:
+            return keys[number][0]
+
+    lights = OtherLights(Clips(), 1.0, lambda *_: None)  # type: ignore[arg-type]
+    assert sorted(map(sorted, lights._places.values())) == [[0], [1], [2, 3]]
 
 
 def test_views_of_relit_captures_are_mixed_with_the_same_view_under_other_lights(make_dataset, tmp_path):

@@ -41,9 +41,8 @@ def test_depths_are_read_once_for_frames_near_each_other():
         return wall(CAMERAS[k])
 
     motion = surface_motion(CAMERAS, depth)
-    first = motion(1, 2)
+    motion(1, 2)
     motion(2, 1)
-    assert motion(1, 2) is first
     assert sorted(read) == [1, 2]
 
 

@@ -14,6 +14,7 @@ from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
 from tron.color import to_display
 from tron.estimation import Estimation
+from tron.flow import surface_motion
 from tron.gaussians.ply import MATERIAL_PROPERTIES
 from tron.images import read_image
 from tron.seeds import generator
@@ -237,7 +238,6 @@ def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap, turning):
     """In place (None), and averaged along the motion under a light that stands still or turns."""
     import torch
 
-    from tron.flow import surface_motion
     from tron.neural.configs import BackboneConfig, RendererConfig
     from tron.neural.renderer import NeuralRenderer, render_clip
 
@@ -248,15 +248,16 @@ def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap, turning):
         torch.nn.init.normal_(parameter, std=0.1)
     folder = FrameFolder(tmp_path, (*GUIDANCE, "depth"))
     rng = generator(0, "test", "clip")
-    depth = np.where(np.arange(16)[:, None, None] < 6, 0, 5.0).repeat(16, 1)
+    ground = np.where(np.arange(16)[:, None, None] < 6, 0, 5.0).repeat(16, 1)
+    depths = [ground * (1 + 0.003 * index) for index in range(8)]
     for index in range(8):
         guidance = {name: rng.uniform(0, 2, (16, 16, 3)) for name in GUIDANCE}
-        folder.write(index, {**guidance, "depth": depth})
+        folder.write(index, {**guidance, "depth": depths[index]})
     cameras, motion, rotations = None, None, [0.0] * 8
     if turning is not None:
         places = [0.05 * k for k in range(8)]
         cameras = [Camera.look_at((x, -5, 0), (x, 0, 0), fov_deg=40, width=16, height=16) for x in places]
-        motion = surface_motion(cameras, lambda _: depth, still_sky=not turning)
+        motion = surface_motion(cameras, depths.__getitem__, still_sky=not turning)
         rotations = [float(turning * k) for k in range(8)]
     light, picture = EnvironmentMap.constant(1.0), RelitPicture("environment", "neural")
     Clip(light, rotations, 0.7, picture, folder).draw(renderer, overlap=overlap, cameras=cameras)
@@ -265,6 +266,23 @@ def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap, turning):
     whole = render_clip(renderer, shown, overlap=overlap, motion=motion)
     for index in range(8):
         np.testing.assert_allclose(folder.row(index, ["neural"]), whole[index], atol=1.01 / 255)
+
+
+def test_motion_by_the_traced_depth_is_where_the_traced_position_is_seen(
+    relight, scene_path, light_path, tmp_path
+):
+    base = [f"scene={scene_path}", f"environment={light_path}", "up=[0,0,1]", "frames=12"]
+    assert relight(*base, f"output_dir={tmp_path}", "buffers=[depth,position]", "checkpoint=null") == 0
+    folder = FrameFolder(tmp_path / "frames", ("depth", "position"))
+    report = json.loads((tmp_path / "relight.json").read_text())
+    cameras = [Camera.from_dict(each) for each in report["cameras"][:2]]
+    motion = surface_motion(cameras, lambda k: folder.read(k, "depth")[..., 0])(0, 1)
+    solid = folder.read(0, "depth")[..., 0] > 0
+    there, _ = cameras[1].project(folder.read(0, "position")[solid])
+    rows, columns = np.nonzero(solid)
+    expected = there - np.stack([columns, rows], -1) - 0.5
+    assert motion.seen[solid].mean() > 0.3
+    np.testing.assert_allclose(motion.displacement[solid], expected, atol=1e-2)
 
 
 def test_cameras_of_a_report_repeat_its_frames(relight, scene_path, light_path, tmp_path):

@@ -78,6 +78,25 @@ def test_window_overlap_and_weights_change_the_pictures_and_are_on_record(run, c
         assert np.abs(drawn[name] - drawn["plain"]).max() > 2 / 255
 
 
+def test_frames_of_an_older_run_that_lack_a_buffer_are_traced_again_with_a_line(
+    run, checkpoints, tmp_path, caplog
+):
+    path = checkpoints / "pair.safetensors"
+    assert run(tmp_path, f"checkpoint={path}") == 0
+    for old in (tmp_path / "frames").glob("*.depth.exr"):
+        old.unlink()
+    caplog.clear()
+    assert run(tmp_path, f"checkpoint={path}") == 0
+    assert "frames that have no depth yet are traced again" in caplog.text
+    assert json.loads((tmp_path / "relight.json").read_text())["frames_rendered"] == 3
+
+
+def test_one_frame_is_not_said_to_be_averaged(relight, scene_path, light_path, checkpoints, tmp_path):
+    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={tmp_path}", "frames=1"]
+    assert relight(*base, f"checkpoint={checkpoints / 'pair.safetensors'}", "width=16", "height=16") == 0
+    assert json.loads((tmp_path / "relight.json").read_text())["network"]["reproject"] is False
+
+
 def test_the_record_is_of_the_file_that_was_loaded(run, checkpoints, tmp_path, monkeypatch):
     """A training may write the next checkpoint in its place while frames are drawn."""
     path, draw = Path(shutil.copy(checkpoints / "pair.safetensors", tmp_path)), Clip.draw

@@ -43,6 +43,14 @@ def test_a_still_texture_is_left_as_it_is_and_noise_falls():
     assert left[INNER].std() == pytest.approx(expected, rel=0.15)
 
 
+def test_a_fine_texture_stays_sharp():
+    """Bilinear samples of these waves, seven pixels each, leave 0.97 of their contrast."""
+    fine = {k: painted(camera, waves=8) for k, camera in enumerate(CAMERAS)}
+    found = averaged(fine, 2, motion_of_the_wall())[INNER]
+    kept = (found - found.mean()).std() / (fine[2][INNER] - fine[2][INNER].mean()).std()
+    assert kept == pytest.approx(1, abs=0.005)
+
+
 def test_without_motion_known_the_same_frames_would_smear():
     """The test above can fail: averaged in place, the texture is off many times as much."""
     clean = {k: painted(camera) for k, camera in enumerate(CAMERAS)}
@@ -68,6 +76,10 @@ def test_colours_that_are_nowhere_around_are_held_to_what_is():
     lit = grey + 0.5
     found = averaged({0: grey, 1: lit}, 0, lambda *_: Match(np.zeros((9, 9, 2)), np.ones((9, 9), bool)))
     assert np.abs(found - grey).max() < 0.03
+    # Exactly: each pixel counts OWN_WEIGHT times, and once the most that the nine around it allow.
+    around = grey[3:6, 3:6].reshape(9, 3).astype(np.float64)
+    expected = (OWN_WEIGHT * grey[4, 4] + around.mean(0) + around.std(0)) / (OWN_WEIGHT + 1)
+    np.testing.assert_allclose(found[4, 4], expected, atol=2e-5)
 
 
 def test_displacements_that_lead_nowhere_are_no_numbers_and_do_no_harm():
