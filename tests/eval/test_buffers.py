@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 
 from eval.relighting.buffers import Buffers
 from tron.cameras import Camera
@@ -30,14 +31,15 @@ def test_there_is_none_without_depth_or_without_word_of_what_moves(drawn_clip: C
     assert Buffers.of(clip).motion is None
 
 
-def test_under_a_light_that_turns_the_sky_is_not_seen_again(drawn_clip: Callable[..., Clip]):
+@pytest.mark.parametrize(("turn", "seen"), [(0.0, True), (20.0, False)])
+def test_under_a_light_that_turns_the_sky_is_not_seen_again(
+    drawn_clip: Callable[..., Clip], turn: float, seen: bool
+):
     clip = drawn_clip(frames=2)
     clip.frames["depth"][:] = 0
     clip.meta.cameras[1] = clip.meta.cameras[0]
-    still = Buffers.of(clip).motion
-    clip.meta.extra["turn_deg"] = 20.0
-    turning = Buffers.of(clip).motion
-    assert still is not None
-    assert turning is not None
-    assert still(1, 0)[1].any()
-    assert not turning(1, 0)[1].any()
+    clip.meta.extra["turn_deg"] = turn
+    motion = Buffers.of(clip).motion
+    assert motion is not None
+    assert motion(1, 0)[1][1:-1, 1:-1].all() == seen
+    assert motion(1, 0)[1].any() == seen
