@@ -20,8 +20,8 @@ from eval.report.intervals import interval_note
 from eval.results import Row, mean_row
 from tron import metrics
 from tron.errors import TronError
-from tron.neural.reprojection import Motion, averaged
-from tron.neural.windows import Overlap, windows
+from tron.neural.reprojection import averaged_frames
+from tron.neural.windows import Overlap
 from tron.report.page import Block, Cell, Film, Films, Section, Table, Text
 from tron.report.values import format_value
 from tron.shards.reader import read_clips
@@ -30,8 +30,8 @@ from tron.video import VideoWriter
 log = logging.getLogger("tron.eval")
 
 TRUTH, LIT, LIT_AVERAGED = "truth", "lit_buffer", "lit_buffer_averaged"
-SINGLE, UNMOVED = "k1", "unmoved"
-"""Single frames; windows whose frames are not averaged along their motion."""
+SINGLE, UNMOVED, AVERAGED = "k1", "unmoved", "averaged"
+"""Single frames; windows whose frames are not averaged along their motion; single frames that are."""
 PLAIN = {
     TRUTH: "path-traced truth",
     LIT: "lit, no network",
@@ -66,7 +66,7 @@ class Clips:
         overlap: the way of overlapping that figures without a name are of.
         example: frames of the clip that flickers most by single frames, by method; None before it was seen.
         scores: method -> a score a clip; methods are TRUTH, LIT, LIT_AVERAGED and ``KIND.k1``,
-            ``KIND.unmoved``, ``KIND.OVERLAP``.
+            ``KIND.unmoved``, ``KIND.averaged``, ``KIND.OVERLAP``.
     """
 
     window: int
@@ -154,6 +154,8 @@ class Clips:
     def _words(self, way: str) -> str:
         if way == UNMOVED:
             return f"K = {self.window}, {self.overlap}, in place"
+        if way == AVERAGED:
+            return f"K = 1, {self.window} frames averaged"
         return "K = 1" if way == SINGLE else f"K = {self.window}, {way}"
 
     def _value(self, kind: str, way: str, what: str) -> float:
@@ -217,9 +219,11 @@ def measure_clips(
             continue
         buffers = Buffers.of(clip)
         lit = buffers.displayed("lit")
-        shown = {TRUTH: truth, LIT: lit, LIT_AVERAGED: _averaged(lit, window, overlap, buffers.motion)}
+        shown = {TRUTH: truth, LIT: lit, LIT_AVERAGED: _averaged(lit, window, overlap, buffers)}
         for kind, network in networks.items():
-            shown[f"{kind}.{SINGLE}"] = network.clip(buffers, 1)
+            single = network.clip(buffers, 1)
+            shown[f"{kind}.{SINGLE}"] = single
+            shown[f"{kind}.{AVERAGED}"] = _averaged(single, window, overlap, buffers)
             shown[f"{kind}.{UNMOVED}"] = network.clip(replace(buffers, motion=None), window, overlap)
             for way in overlaps:
                 shown[f"{kind}.{way}"] = network.clip(buffers, window, way)
@@ -239,13 +243,7 @@ def measure_clips(
     return found
 
 
-def _averaged(frames: np.ndarray, window: int, overlap: Overlap, motion: Motion | None) -> np.ndarray:
-    """Frames averaged along their motion over the same windows, without a network."""
-    assert motion is not None  # the clip was read with the depth of its surfels
-    sums, counts = np.zeros(frames.shape), np.zeros(len(frames))
-    for each in windows(len(frames), window, 1, overlap):
-        pictures = {index: frames[index] for index in each.frames}
-        for index in each.kept:
-            sums[index] += averaged(pictures, index, motion)
-            counts[index] += 1
-    return (sums / counts[:, None, None, None]).astype(np.float32)
+def _averaged(frames: np.ndarray, window: int, overlap: Overlap, buffers: Buffers) -> np.ndarray:
+    """Pictures averaged along the motion of their clip, as tron-relight does."""
+    assert buffers.motion is not None  # the clip was read with the depth of its surfels
+    return np.stack(list(averaged_frames(frames, len(frames), window, buffers.motion, overlap)))

@@ -22,6 +22,7 @@ from tron.estimation import Estimation
 from tron.flow import surface_motion
 from tron.gaussians.scene import GaussianScene
 from tron.images import write_image
+from tron.neural.reprojection import averaged_frames
 from tron.neural.windows import Overlap
 from tron.shards.schema import GUIDANCE
 
@@ -97,18 +98,21 @@ class Clip:
         overlap: Overlap = "anchor",
         weights: Mapping[str, float] | None = None,
         cameras: Sequence[Camera] | None = None,
+        reproject: int = 1,
     ) -> None:
         """Write the neural renderer's pictures, as `render_frames` gives them.
 
-        With cameras, one a frame, and the buffer DEPTH in the folder, the frames of a window are averaged
+        With cameras, one a frame, and the buffer DEPTH in the folder, ``reproject`` frames each are averaged
         along their motion.
         """
         from tron.neural.renderer import render_frames
 
         frames = len(self.rotations)
-        still_sky = len(set(self.rotations)) == 1
-        motion = None if cameras is None else surface_motion(cameras, self._depth, still_sky=still_sky)
-        drawn = render_frames(renderer, self._displayed, frames, window, overlap, weights, motion)
+        drawn = render_frames(renderer, self._displayed, frames, window, overlap, weights)
+        if cameras is not None and reproject > 1:
+            still_sky = len(set(self.rotations)) == 1
+            motion = surface_motion(cameras, self._depth, still_sky=still_sky)
+            drawn = averaged_frames(drawn, frames, reproject, motion, overlap)
         for index, neural in enumerate(track(drawn, "neural", frames)):
             self.folder.write_picture(index, "neural", neural)
             relit = self.picture.display(self.folder, index, self.exposure, neural)

@@ -10,7 +10,7 @@ from tron.apps.relight_settings import Settings
 from tron.cli.installation import require_extra
 from tron.errors import TronError
 from tron.neural.shipped import checkpoint_file
-from tron.neural.windows import check_frames, windows
+from tron.neural.windows import check_frames
 from tron.runtime import set_torch_threads, torch_device
 from tron.storage import sha256
 
@@ -53,14 +53,6 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
         return settings.model_copy(update={"checkpoint": None}), None
 
 
-def averages_frames(settings: Settings, renderer: Renderer | None, frames: int) -> bool:
-    """Whether frames of a clip are averaged along their motion: it is wanted, and windows hold several."""
-    if renderer is None or not settings.reproject:
-        return False
-    passes = windows(frames, settings.window or renderer.config.window, renderer.temporal_factor)
-    return len(passes[0].frames) > 1
-
-
 def describe_network(settings: Settings, renderer: Renderer | None, frames: int) -> dict[str, Any] | None:
     """Record of the network for relight.json, None without one; weights null: equal ones."""
     if renderer is None or settings.checkpoint is None:
@@ -71,7 +63,7 @@ def describe_network(settings: Settings, renderer: Renderer | None, frames: int)
         "guidance": list(renderer.config.guidance),
         "window": settings.window or renderer.config.window,
         "overlap": settings.overlap,
-        "reproject": averages_frames(settings, renderer, frames),
+        "reproject": min(settings.reproject, frames),
         "weights": settings.weights or getattr(renderer.config, "weights", None),
     }
 

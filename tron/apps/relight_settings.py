@@ -131,10 +131,12 @@ class Settings(BaseModel):
         description="which window draws a frame that lies in several: the one in whose middle it stands "
         "(anchor), the one that ends with it (newest), or the mean of all",
     )
-    reproject: bool = Field(
-        True,
-        description="average each neural frame with the others of its window, brought to it along the exact "
-        "motion of surfaces: less flicker and noise; without effect at window=1",
+    reproject: int = Field(
+        5,
+        ge=1,
+        le=33,
+        description="neural frames that each one is the mean of: those around it (before it with "
+        "overlap=newest), brought to it along the exact motion of surfaces, against flicker; 1: itself",
     )
     weights: dict[str, float] | None = Field(
         None,
@@ -208,7 +210,7 @@ class Settings(BaseModel):
             "window": self.window,
             "weights": self.weights,
             "overlap": self.overlap != "anchor",
-            "reproject": not self.reproject,
+            "reproject": self.reproject != 5,
         }
         return [name for name, given in chosen.items() if given]
 

@@ -14,7 +14,7 @@ from tron.neural.backbone import Backbone
 from tron.neural.codecs import CODECS
 from tron.neural.configs import MEAN, RendererConfig, UNetConfig, check_weights
 from tron.neural.protocols import Codec, Renderer
-from tron.neural.reprojection import Motion, averaged
+from tron.neural.reprojection import Motion, averaged_frames
 from tron.neural.unet import UNet
 from tron.neural.windows import Overlap, check_frames, windows
 
@@ -131,8 +131,8 @@ def render_clip(
         window: frames a pass, 1 + temporal_factor * n (default: the renderer's own).
         overlap: which of the windows that hold a frame draws it, see `tron.neural.windows`.
         weights: of the latents by name, instead of the renderer's own.
-        motion: of the clip's surfaces, as `surface_motion` tells it: each frame is then averaged with the
-            others of its window, brought to it (`tron.neural.reprojection`). None: windows alone.
+        motion: of the clip's surfaces, as `surface_motion` tells it: each frame is then averaged with as many
+            others as a window has, brought to it (`tron.neural.reprojection`). None: windows alone.
 
     Returns:
         Display values (K, H, W, 3) in [0, 1], float32.
@@ -149,7 +149,11 @@ def render_clip(
         return {name: buffer[index] for name, buffer in displayed.items()}
 
     frames = next(iter(shapes))[0]
-    return np.stack(list(render_frames(renderer, read, frames, window, overlap, weights, motion)))
+    drawn = render_frames(renderer, read, frames, window, overlap, weights)
+    size = window or renderer.config.window
+    if motion is not None and size > 1:
+        drawn = averaged_frames(drawn, frames, size, motion, overlap)
+    return np.stack(list(drawn))
 
 
 def render_frames(
@@ -159,7 +163,6 @@ def render_frames(
     window: int | None = None,
     overlap: Overlap = "anchor",
     weights: Mapping[str, float] | None = None,
-    motion: Motion | None = None,
 ) -> Iterator[np.ndarray]:
     """Render a clip frame after frame, in the memory of one window however long it is.
 
@@ -171,7 +174,6 @@ def render_frames(
         window: as render_clip has it.
         overlap: likewise.
         weights: likewise.
-        motion: likewise.
 
     Yields:
         Display values (H, W, 3) in [0, 1], float32, in order.
@@ -199,11 +201,9 @@ def render_frames(
                 given[index] = {name: to_tensor(shown[name][None]).to(device) for name in wanted}
             with torch.no_grad():
                 drawn = renderer(_joined([given[index] for index in this.frames]), weights)
-            pictures = dict(zip(this.frames, to_display_array(drawn)))
+            display = to_display_array(drawn)
             for index in this.kept:
-                frame = pictures[index]
-                if motion is not None and len(pictures) > 1:
-                    frame = averaged(pictures, index, motion)
+                frame = display[index - this.frames.start]
                 sums[index] = sums[index] + frame if index in sums else frame
                 counts[index] = counts.get(index, 0) + 1
             # A frame is finished where no later window keeps it.

@@ -12,9 +12,11 @@ Survey of Temporal Antialiasing Techniques"). docs/experiments.md says how the n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import numpy as np
+
+from tron.neural.windows import Overlap, windows
 
 DEVIATIONS = 1.0
 """Standard deviations of the colours around a pixel that others may be off their mean."""
@@ -26,6 +28,31 @@ Motion = Callable[[int, int], tuple[np.ndarray, np.ndarray]]
 (H, W, 2) displacement in pixels, x then y, and (H, W) bool whether it is seen there
 (`tron.flow.surface_motion`).
 """
+
+
+def averaged_frames(
+    pictures: Iterable[np.ndarray], frames: int, size: int, motion: Motion, overlap: Overlap = "anchor"
+) -> Iterator[np.ndarray]:
+    """Frames of a clip, each averaged with others near it, in the memory of ``size`` frames.
+
+    Args:
+        pictures: of the clip, in order, (H, W, 3) display values in [0, 1].
+        frames: how many they are.
+        size: frames that one is made of, itself among them.
+        motion: of the clip.
+        overlap: newest: those before it (and, of the first ones, behind it); else those around it.
+
+    Yields:
+        (H, W, 3) float32 in [0, 1], in order, each as soon as the frames that it is made of are there.
+    """
+    source, held = iter(enumerate(pictures)), dict[int, np.ndarray]()
+    for this in windows(frames, size, 1, "newest" if overlap == "newest" else "anchor"):
+        held = {index: picture for index, picture in held.items() if index >= this.frames.start}
+        while this.frames[-1] not in held:
+            index, picture = next(source)
+            held[index] = picture
+        for index in this.kept:
+            yield averaged(held, index, motion)
 
 
 def averaged(pictures: Mapping[int, np.ndarray], index: int, motion: Motion) -> np.ndarray:

@@ -188,7 +188,7 @@ def test_a_new_renderer_is_given_lit_and_shows_it(relight, scene_path, light_pat
     checkpoint, out = tmp_path / "renderer.safetensors", tmp_path / "out"
     save_renderer(checkpoint, PixelMLP(PixelMLPConfig(width=4)))
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=2"]
-    assert relight(*base, f"checkpoint={checkpoint}") == 0
+    assert relight(*base, f"checkpoint={checkpoint}", "reproject=1") == 0
     for index in range(2):
         neural, lit, pbr = (
             read_image(out / "frames" / f"{index:04d}.{name}.png") for name in ("neural", "lit", "pbr")
@@ -260,7 +260,7 @@ def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap, turning):
         motion = surface_motion(cameras, depths.__getitem__, still_sky=not turning)
         rotations = [float(turning * k) for k in range(8)]
     light, picture = EnvironmentMap.constant(1.0), RelitPicture("environment", "neural")
-    Clip(light, rotations, 0.7, picture, folder).draw(renderer, overlap=overlap, cameras=cameras)
+    Clip(light, rotations, 0.7, picture, folder).draw(renderer, overlap=overlap, cameras=cameras, reproject=5)
     linear = {name: np.stack([folder.read(i, name) for i in range(8)]) for name in GUIDANCE}
     shown = {name: to_display(buffer, 0.7) for name, buffer in linear.items()}
     whole = render_clip(renderer, shown, overlap=overlap, motion=motion)

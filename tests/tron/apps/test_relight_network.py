@@ -56,7 +56,7 @@ def test_window_overlap_and_weights_change_the_pictures_and_are_on_record(run, c
         "plain": (),
         "single": ("window=1",),
         "mean": ("overlap=mean", "window=2"),
-        "in_place": ("reproject=false",),
+        "in_place": ("reproject=1",),
         "weighed": ("weights={pbr: 0.3, irradiance: 0.7}",),
         "equal": ("weights={pbr: 0.5, irradiance: 0.5}",),
     }
@@ -69,7 +69,7 @@ def test_window_overlap_and_weights_change_the_pictures_and_are_on_record(run, c
         assert report["frames_rendered"] == (3 if name == "plain" else 0)
         assert network["window"] == {"single": 1, "mean": 2}.get(name, 3)
         assert network["overlap"] == ("mean" if name == "mean" else "anchor")
-        assert network["reproject"] == (name not in ("single", "in_place"))
+        assert network["reproject"] == (1 if name == "in_place" else 3), "of three frames"
         assert network["guidance"] == ["pbr", "irradiance"]
         if name == "weighed":
             assert network["weights"] == {"pbr": 0.3, "irradiance": 0.7}
@@ -94,7 +94,7 @@ def test_frames_of_an_older_run_that_lack_a_buffer_are_traced_again_with_a_line(
 def test_one_frame_is_not_said_to_be_averaged(relight, scene_path, light_path, checkpoints, tmp_path):
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={tmp_path}", "frames=1"]
     assert relight(*base, f"checkpoint={checkpoints / 'pair.safetensors'}", "width=16", "height=16") == 0
-    assert json.loads((tmp_path / "relight.json").read_text())["network"]["reproject"] is False
+    assert json.loads((tmp_path / "relight.json").read_text())["network"]["reproject"] == 1
 
 
 def test_the_record_is_of_the_file_that_was_loaded(run, checkpoints, tmp_path, monkeypatch):
