@@ -21,7 +21,7 @@ from tron.apps.clip import DEPTH, Clip, trace
 from tron.apps.filmed_space import CAMERAS, filmed_cameras, filmed_orbit
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.framing import plan_cameras, turn_cameras, upright
-from tron.apps.relight_network import chosen_network, describe_network
+from tron.apps.relight_network import averaged_frames_of, chosen_network, describe_network
 from tron.apps.relight_settings import Settings
 from tron.apps.relit import RelitPicture
 from tron.cameras import Camera
@@ -72,7 +72,7 @@ def main(settings: Settings) -> None:
     # Without a network the relit picture is one of them, and is shown as such; so is lit if nothing bounces.
     guidance = [name for name in GUIDANCE if name != settings.source and (settings.bounces or name != "lit")]
     guidance = guidance if renderer is None else renderer.config.guidance
-    averaged = renderer is not None and min(settings.reproject, len(cameras)) > 1
+    averaged = averaged_frames_of(settings, len(cameras)) > 1
     network = describe_network(settings, renderer, len(cameras))
     clips = [_clip(*each, len(cameras), guidance, averaged) for each in zip(lights, environments)]
     clock.lap("loading")

@@ -53,6 +53,12 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
         return settings.model_copy(update={"checkpoint": None}), None
 
 
+def averaged_frames_of(settings: Settings, frames: int) -> int:
+    """Frames that each one is the mean of along its motion: 1 where the light turns, or nothing is drawn."""
+    turns = len(set(settings.rotations(frames))) > 1
+    return 1 if settings.checkpoint is None or turns else min(settings.reproject, frames)
+
+
 def describe_network(settings: Settings, renderer: Renderer | None, frames: int) -> dict[str, Any] | None:
     """Record of the network for relight.json, None without one; weights null: equal ones."""
     if renderer is None or settings.checkpoint is None:
@@ -63,7 +69,7 @@ def describe_network(settings: Settings, renderer: Renderer | None, frames: int)
         "guidance": list(renderer.config.guidance),
         "window": settings.window or renderer.config.window,
         "overlap": settings.overlap,
-        "reproject": min(settings.reproject, frames),
+        "reproject": averaged_frames_of(settings, frames),
         "weights": settings.weights or getattr(renderer.config, "weights", None),
     }
 

@@ -136,7 +136,8 @@ class Settings(BaseModel):
         ge=1,
         le=33,
         description="neural frames that each one is the mean of: those around it (before it with "
-        "overlap=newest), brought to it along the exact motion of surfaces, against flicker; 1: itself",
+        "overlap=newest), brought to it along the exact motion of surfaces, against flicker, unless the "
+        "light turns; 1: itself",
     )
     weights: dict[str, float] | None = Field(
         None,

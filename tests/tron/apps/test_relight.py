@@ -235,7 +235,7 @@ def test_final_frames_without_bounces_have_no_reflections(tmp_path):
 
 @pytest.mark.parametrize(("overlap", "turning"), [("newest", None), ("anchor", False), ("anchor", True)])
 def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap, turning):
-    """In place (None), and averaged along the motion under a light that stands still or turns."""
+    """In place (None), and averaged along the motion unless the light turns."""
     import torch
 
     from tron.neural.configs import BackboneConfig, RendererConfig
@@ -257,7 +257,7 @@ def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap, turning):
     if turning is not None:
         places = [0.05 * k for k in range(8)]
         cameras = [Camera.look_at((x, -5, 0), (x, 0, 0), fov_deg=40, width=16, height=16) for x in places]
-        motion = surface_motion(cameras, depths.__getitem__, still_sky=not turning)
+        motion = None if turning else surface_motion(cameras, depths.__getitem__)
         rotations = [float(turning * k) for k in range(8)]
     light, picture = EnvironmentMap.constant(1.0), RelitPicture("environment", "neural")
     Clip(light, rotations, 0.7, picture, folder).draw(renderer, overlap=overlap, cameras=cameras, reproject=5)

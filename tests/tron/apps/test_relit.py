@@ -243,7 +243,7 @@ def test_a_turning_light_on_a_still_view_is_each_angle_alone(relight, scene_path
     assert relight(*base, f"output_dir={tmp_path / 'turning'}", "rotation=[0,360]") == 0
     assert counted == {"trace": 1, "bake": 3}
     assert json.loads((tmp_path / "turning" / "relight.json").read_text())["rotations"] == [0, 120, 240]
-    assert relight(*base, f"output_dir={tmp_path / 'at'}", "rotation=120") == 0
+    assert relight(*base, f"output_dir={tmp_path / 'at'}", "rotation=120", "reproject=1") == 0
     turning, alone = (frame_files(tmp_path / name, index=1) for name in ("turning", "at"))
     assert turning == alone
     report = json.loads((tmp_path / "turning" / "relight.json").read_text())
