@@ -255,6 +255,9 @@ def _parse(text: str) -> Override:
     except HydraException as error:
         key, equals, value = text.partition("=")
         mend = f"""quote the value: '{key}="{value}"'""" if equals else "write key=value"
+        if value[:1] in ("{", "["):  # the quotes belong around the texts in it
+            shown = '{name: "text"}' if value[0] == "{" else '["text"]'
+            mend = f"quote the texts in it, as in '{key}={shown}'"
         raise TronError(f"cannot read '{text}'", mend=mend) from error
     if override.is_sweep_override():
         key, _, value = text.partition("=")

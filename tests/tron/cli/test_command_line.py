@@ -190,6 +190,20 @@ def test_a_quoted_value_may_hold_anything(run: Run):
     assert run.seen[0].output_dir == Path("a(1), =b.ply")  # type: ignore[attr-defined]
 
 
+@pytest.mark.parametrize(
+    ("typed", "mend"),
+    [
+        ("note=a#b c=d", """quote the value: 'note="a#b c=d"'"""),
+        ("stages={a: ../b#c}", """quote the texts in it, as in 'stages={name: "text"}'"""),
+        ("stages=[../b#c]", """quote the texts in it, as in 'stages=["text"]'"""),
+    ],
+)
+def test_what_cannot_be_read_is_mended_by_quotes_where_they_belong(run: Run, typed: str, mend: str):
+    code, _, said = run("output_dir=o", typed)
+    assert code == 2
+    assert mend in said
+
+
 def test_own_recipes_come_from_a_config_dir(run: Run, tmp_path: Path):
     (tmp_path / "my recipes" / "experiment").mkdir(parents=True)
     (tmp_path / "my recipes" / "experiment" / "mine.yaml").write_text("# @package _global_\nframes: 9\n")
