@@ -68,7 +68,7 @@ def flow(
             given without the other.
     """
     place, in_front, _ = _seen_from(depth, camera, other, moving, motion)
-    return np.where(in_front[..., None], place - _centres(camera), np.nan)
+    return _displacement(place, in_front, camera)
 
 
 def both_see(
@@ -106,14 +106,13 @@ def match(
 ) -> Match:
     """:func:`flow` and :func:`both_see` at once, of the same arguments."""
     place, in_front, expected = _seen_from(depth, camera, other, moving, motion)
-    displacement = np.where(in_front[..., None], place - _centres(camera), np.nan)
     taps, weights, inside = _taps(place, other.width, other.height)
     inverse = _inverse_z(_plane(other_depth, other, "the other depth"), other)
     around = inverse.reshape(-1)[taps]
     found = (around * weights).sum(-1)
     near = np.abs(around - expected[..., None]) <= EDGE * expected[..., None]
     agrees = np.abs(found - expected) <= TOLERANCE * expected
-    return Match(displacement, in_front & inside & near.all(-1) & agrees)
+    return Match(_displacement(place, in_front, camera), in_front & inside & near.all(-1) & agrees)
 
 
 def surface_motion(
@@ -191,6 +190,11 @@ def _seen_from(
     place, z = pixels.reshape(*surface.shape, 2), z.reshape(surface.shape)
     in_front = z > 0
     return place, in_front, np.divide(1.0, z, out=np.zeros_like(z), where=in_front & surface)
+
+
+def _displacement(place: np.ndarray, in_front: np.ndarray, camera: Camera) -> np.ndarray:
+    """(H, W, 2) from the centres of pixels to places; NaN where they are not in front."""
+    return np.where(in_front[..., None], place - _centres(camera), np.nan)
 
 
 def _plane(image: np.ndarray, camera: Camera, what: str) -> np.ndarray:

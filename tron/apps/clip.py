@@ -103,13 +103,13 @@ class Clip:
         """Write the neural renderer's pictures, as `render_frames` gives them.
 
         With cameras, one a frame, and the buffer DEPTH in the folder, ``reproject`` frames each are averaged
-        along their motion, unless the light turns: then each frame has one of its own.
+        along their motion (`tron.apps.relight_network.averaged_frames_of` says how many).
         """
         from tron.neural.renderer import render_frames
 
         frames = len(self.rotations)
         drawn = render_frames(renderer, self._displayed, frames, window, overlap, weights)
-        if cameras is not None and reproject > 1 and len(set(self.rotations)) == 1:
+        if cameras is not None and reproject > 1:
             motion = surface_motion(cameras, self._depth)
             drawn = averaged_frames(drawn, frames, reproject, motion, overlap)
         for index, neural in enumerate(track(drawn, "neural", frames)):

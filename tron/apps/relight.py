@@ -72,9 +72,9 @@ def main(settings: Settings) -> None:
     # Without a network the relit picture is one of them, and is shown as such; so is lit if nothing bounces.
     guidance = [name for name in GUIDANCE if name != settings.source and (settings.bounces or name != "lit")]
     guidance = guidance if renderer is None else renderer.config.guidance
-    averaged = averaged_frames_of(settings, len(cameras)) > 1
+    averaged = averaged_frames_of(settings, len(cameras))
     network = describe_network(settings, renderer, len(cameras))
-    clips = [_clip(*each, len(cameras), guidance, averaged) for each in zip(lights, environments)]
+    clips = [_clip(*each, len(cameras), guidance, averaged > 1) for each in zip(lights, environments)]
     clock.lap("loading")
 
     pixels = len(clips) * len(cameras) * settings.width * settings.height
@@ -88,7 +88,7 @@ def main(settings: Settings) -> None:
         if renderer is not None:
             for clip in clips:
                 tuned = settings.window, settings.overlap, settings.weights
-                clip.draw(renderer, *tuned, cameras, settings.reproject)
+                clip.draw(renderer, *tuned, cameras, averaged)
             clock.lap("neural")
         for light, clip in zip(lights, clips):
             clip.assemble(light.output_dir, settings.fps)

@@ -233,9 +233,9 @@ def test_final_frames_without_bounces_have_no_reflections(tmp_path):
         Estimation(bounces=0, reflections=2)
 
 
-@pytest.mark.parametrize(("overlap", "turning"), [("newest", None), ("anchor", False), ("anchor", True)])
-def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap, turning):
-    """In place (None), and averaged along the motion unless the light turns."""
+@pytest.mark.parametrize(("overlap", "reproject"), [("newest", 1), ("anchor", 5), ("newest", 5)])
+def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap, reproject):
+    """In place, and averaged along the motion."""
     import torch
 
     from tron.neural.configs import BackboneConfig, RendererConfig
@@ -253,14 +253,12 @@ def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap, turning):
     for index in range(8):
         guidance = {name: rng.uniform(0, 2, (16, 16, 3)) for name in GUIDANCE}
         folder.write(index, {**guidance, "depth": depths[index]})
-    cameras, motion, rotations = None, None, [0.0] * 8
-    if turning is not None:
-        places = [0.05 * k for k in range(8)]
-        cameras = [Camera.look_at((x, -5, 0), (x, 0, 0), fov_deg=40, width=16, height=16) for x in places]
-        motion = None if turning else surface_motion(cameras, depths.__getitem__)
-        rotations = [float(turning * k) for k in range(8)]
+    places = [0.05 * k for k in range(8)]
+    cameras = [Camera.look_at((x, -5, 0), (x, 0, 0), fov_deg=40, width=16, height=16) for x in places]
+    motion = surface_motion(cameras, depths.__getitem__) if reproject > 1 else None
     light, picture = EnvironmentMap.constant(1.0), RelitPicture("environment", "neural")
-    Clip(light, rotations, 0.7, picture, folder).draw(renderer, overlap=overlap, cameras=cameras, reproject=5)
+    clip = Clip(light, [0.0] * 8, 0.7, picture, folder)
+    clip.draw(renderer, overlap=overlap, cameras=cameras, reproject=reproject)
     linear = {name: np.stack([folder.read(i, name) for i in range(8)]) for name in GUIDANCE}
     shown = {name: to_display(buffer, 0.7) for name, buffer in linear.items()}
     whole = render_clip(renderer, shown, overlap=overlap, motion=motion)
