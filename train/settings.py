@@ -52,6 +52,12 @@ class LossSettings(BaseModel):
     l2: float = Field(
         default=1.0, ge=0, description="Weight of the squared error of display values in [-1, 1]."
     )
+    psnr: float = Field(
+        default=0.0,
+        ge=0,
+        description="Weight of the negative PSNR in dB, frame by frame: a good frame's errors count as much as a "
+        "bad one's, in proportion (the loss of NAFNet).",
+    )
     lpips: float = Field(default=1.0, ge=0, description="Weight of LPIPS (VGG); needs vgg_weights.")
     vgg_weights: Path | None = Field(
         default=None, description="Local vgg16-397923af.pth; without it LPIPS is absent and the log says so."

@@ -13,6 +13,9 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 - ``affine_ratio``: the same with D(B E / E0) as a third input.
 - ``lit``: D(L), L being shadowed and the light that bounced between the surfels.
 - ``affine_lit``: affine_ratio with D(L) as a fourth input.
+- ``lit_filtered``: D(L) filtered by a Gaussian, whose deviation is fitted: L is sampled once in a pixel, the
+  truth is a mean over it.
+- ``affine_ratio_filtered``, ``affine_lit_filtered``: the blends of images so filtered.
 - ``pixel_mlp``, ``pixel_mlp_lit``: 1x1 convolutions on D(B) and D(E), or on these and D(L).
 
 Baselines whose name says lit use bounced light, the others light that comes straight from the environment.
@@ -36,7 +39,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from eval.relighting.buffers import Buffers, Region, region_mask
-from eval.relighting.fits import AffineFit, Fit, Fitted, ProductFit, Show
+from eval.relighting.fits import (
+    AffineFit,
+    FilteredAffineFit,
+    Fit,
+    Fitted,
+    GaussianFit,
+    ProductFit,
+    Show,
+)
 from tron.color import to_display
 from tron.errors import TronError
 from tron.seeds import generator
@@ -169,6 +180,15 @@ BASELINES = (
         groups=(DIRECT,),
     ),
     Baseline(
+        "affine_ratio_filtered",
+        "filtered affine blend with shadow ratio",
+        "the same of images that one fitted Gaussian filters",
+        fit=lambda: FilteredAffineFit(show_pbr, show_irradiance, show_shadow_ratio),
+        surfaces=True,
+        groups=(DIRECT,),
+        pictured=False,
+    ),
+    Baseline(
         "pixel_mlp",
         "per-pixel network of two buffers",
         "a network that sees pbr and irradiance of one pixel at a time",
@@ -184,10 +204,26 @@ BASELINES = (
         show_lit,
     ),
     Baseline(
+        "lit_filtered",
+        "lit, filtered",
+        "lit filtered by one Gaussian, whose deviation is fitted",
+        fit=lambda: GaussianFit(show_lit),
+        groups=(ON_LIT,),
+    ),
+    Baseline(
         "affine_lit",
         "affine blend with lit",
         "fitted blend of pbr, irradiance, shadow ratio, lit and a constant",
         fit=lambda: AffineFit(show_pbr, show_irradiance, show_shadow_ratio, show_lit),
+        surfaces=True,
+        groups=(ON_LIT,),
+        pictured=False,
+    ),
+    Baseline(
+        "affine_lit_filtered",
+        "filtered affine blend with lit",
+        "the same of images that one fitted Gaussian filters",
+        fit=lambda: FilteredAffineFit(show_pbr, show_irradiance, show_shadow_ratio, show_lit),
         surfaces=True,
         groups=(ON_LIT,),
         pictured=False,
@@ -233,15 +269,15 @@ def fit_baselines(clips: Iterable[Clip], seed: int) -> dict[str, Fitted]:
     fits = {baseline.name: baseline.fit() for baseline in BASELINES if baseline.fit}
     fitted_on = 0
     for clip in clips:
-        inside = region_mask(clip, "foreground")
-        buffers, truth = Buffers.of(clip).at(inside), clip.displayed("rgb")[inside]
+        inside = np.nonzero(region_mask(clip, "foreground"))
+        buffers, truth = Buffers.of(clip), clip.displayed("rgb")
         rng = generator(seed, "eval", "scale", clip.meta.key)
-        count = min(SAMPLED_PIXELS * clip.meta.frames, len(truth))
-        some = np.sort(rng.choice(len(truth), count, replace=False)) if count else []
-        sample = buffers.at(some), truth[some]
+        pixels = len(inside[0])
+        count = min(SAMPLED_PIXELS * clip.meta.frames, pixels)
+        some = np.sort(rng.choice(pixels, count, replace=False)) if count else np.zeros(0, int)
         for fit in fits.values():
-            fit.add(*(sample if fit.sampled else (buffers, truth)))
-        fitted_on += len(truth)
+            fit.add(buffers, truth, tuple(axis[some] for axis in inside) if fit.sampled else inside)
+        fitted_on += pixels
     if not fitted_on:
         raise TronError(
             "no training clips with a foreground to fit the baselines on",

@@ -7,16 +7,19 @@ dB off.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
+import scipy.ndimage
 import scipy.optimize
 
 from eval.relighting.buffers import Buffers
 from tron.color import agx
 
 Show = Callable[[Buffers], np.ndarray]
-"""Buffers of any pixels -> display values in [0, 1], (..., 3) float32."""
+"""Buffers of any pixels, of whole frames where neighbours count -> display values in [0, 1], (..., 3) float32."""
+DEVIATIONS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.3)
+"""Of the Gaussians that fits choose from, in pixels."""
 
 
 class Fitted(NamedTuple):
@@ -37,8 +40,8 @@ class Fit(Protocol):
     sampled: ClassVar[bool]
     """Whether some of the foreground's pixels are enough, chosen at random; otherwise it is given all."""
 
-    def add(self, buffers: Buffers, truth: np.ndarray) -> None:
-        """Take n pixels with their displayed truth (n, 3)."""
+    def add(self, buffers: Buffers, truth: np.ndarray, inside: Any = ...) -> None:
+        """Take pixels of a clip: buffers and displayed truth, (..., 3), of which ``inside`` indexes n."""
 
     def solve(self) -> Fitted:
         """The method with the least squared error on the pixels that were added."""
@@ -66,9 +69,9 @@ class ProductFit:
     def __init__(self):
         self._pixels: list[np.ndarray] = []
 
-    def add(self, buffers: Buffers, truth: np.ndarray) -> None:
-        """Keep these pixels with their displayed truth (n, 3)."""
-        self._pixels.append(np.stack([*product_terms(buffers), truth]).astype(np.float64))
+    def add(self, buffers: Buffers, truth: np.ndarray, inside: Any = ...) -> None:
+        """As Fit.add; the pixels are kept."""
+        self._pixels.append(np.stack([*product_terms(buffers.at(inside)), truth[inside]]).astype(np.float64))
 
     def solve(self) -> Fitted:
         """The scale, (1,), with the least displayed squared error."""
@@ -101,19 +104,22 @@ class AffineFit:
         self.inputs = inputs
         self._gram = np.zeros((3, len(inputs) + 1, len(inputs) + 1))
         self._moment = np.zeros((3, len(inputs) + 1))
+        self._square = np.zeros(3)
 
-    def add(self, buffers: Buffers, truth: np.ndarray) -> None:
-        """Add n pixels with their displayed truth (n, 3)."""
-        columns = np.stack([*self._images(buffers), np.ones(truth.shape)], axis=-1)
+    def add(self, buffers: Buffers, truth: np.ndarray, inside: Any = ...) -> None:
+        """As Fit.add; sums over the pixels are kept."""
+        target = np.asarray(truth[inside], np.float64)
+        columns = np.stack(
+            [*(image[inside] for image in self._images(buffers)), np.ones(target.shape)], axis=-1
+        )
         by_channel = columns.transpose(1, 2, 0)  # (3, inputs + 1, n)
         self._gram += by_channel @ columns.transpose(1, 0, 2)
-        self._moment += (by_channel @ np.asarray(truth, np.float64).T[:, :, None])[..., 0]
+        self._moment += (by_channel @ target.T[:, :, None])[..., 0]
+        self._square += (target**2).sum(0)
 
     def solve(self) -> Fitted:
         """The least-squares weights, (3 output channels, inputs + 1); the last column is the constant."""
-        diagonal = np.einsum("cii->ci", self._gram)
-        ridge = np.eye(self._gram.shape[-1]) * (self.RIDGE * diagonal)[:, None, :]
-        weights = np.linalg.solve(self._gram + ridge, self._moment[..., None])[..., 0]
+        weights = self._weights()
 
         def show(buffers: Buffers) -> np.ndarray:
             blend = weights[:, -1] + sum(w * image for w, image in zip(weights.T, self._images(buffers)))
@@ -121,5 +127,71 @@ class AffineFit:
 
         return Fitted(show, weights)
 
+    def error(self) -> float:
+        """Sum of the squared errors of the solution, before it is clipped."""
+        weights = self._weights()
+        explained = 2 * (weights * self._moment).sum(1) - np.einsum(
+            "ci,cij,cj->c", weights, self._gram, weights
+        )
+        return float((self._square - explained).sum())
+
+    def _weights(self) -> np.ndarray:
+        diagonal = np.einsum("cii->ci", self._gram)
+        ridge = np.eye(self._gram.shape[-1]) * (self.RIDGE * diagonal)[:, None, :]
+        return np.linalg.solve(self._gram + ridge, self._moment[..., None])[..., 0]
+
     def _images(self, buffers: Buffers) -> list[np.ndarray]:
         return [np.asarray(show(buffers), np.float64) for show in self.inputs]
+
+
+def filtered(show: Show, deviation: float) -> Show:
+    """A method whose pictures (K, H, W, 3) a Gaussian then filters, frame by frame; the edge goes on beyond."""
+
+    def shown(buffers: Buffers) -> np.ndarray:
+        return scipy.ndimage.gaussian_filter(
+            show(buffers), (0, deviation, deviation, 0), mode="nearest", truncate=4
+        )
+
+    return shown
+
+
+class GaussianFit:
+    """A method filtered by that Gaussian of DEVIATIONS which has the least squared error; needs whole clips."""
+
+    sampled: ClassVar[bool] = False
+
+    def __init__(self, show: Show):
+        self._shown = {deviation: filtered(show, deviation) for deviation in DEVIATIONS}
+        self._errors = dict.fromkeys(DEVIATIONS, 0.0)
+
+    def add(self, buffers: Buffers, truth: np.ndarray, inside: Any = ...) -> None:
+        """As Fit.add; sums of squared errors are kept."""
+        for deviation, show in self._shown.items():
+            self._errors[deviation] += float(
+                np.square((show(buffers) - truth)[inside], dtype=np.float64).sum()
+            )
+
+    def solve(self) -> Fitted:
+        """The deviation in pixels, (1,)."""
+        best = min(DEVIATIONS, key=self._errors.__getitem__)
+        return Fitted(self._shown[best], np.array([best]))
+
+
+class FilteredAffineFit:
+    """An AffineFit of inputs that the best Gaussian of DEVIATIONS filtered first; needs whole clips."""
+
+    sampled: ClassVar[bool] = True
+
+    def __init__(self, *inputs: Show):
+        self._fits = {
+            deviation: AffineFit(*(filtered(show, deviation) for show in inputs)) for deviation in DEVIATIONS
+        }
+
+    def add(self, buffers: Buffers, truth: np.ndarray, inside: Any = ...) -> None:
+        """As Fit.add, by each of the fits."""
+        for fit in self._fits.values():
+            fit.add(buffers, truth, inside)
+
+    def solve(self) -> Fitted:
+        """The weights of AffineFit for the Gaussian with which its error is least."""
+        return min(self._fits.values(), key=AffineFit.error).solve()

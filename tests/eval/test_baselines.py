@@ -6,7 +6,16 @@ import pytest
 from eval.relighting import baselines
 from eval.relighting.baselines import RATIO_FLOOR
 from eval.relighting.buffers import Buffers
-from eval.relighting.fits import AffineFit, ProductFit, Show, show_product
+from eval.relighting.fits import (
+    DEVIATIONS,
+    AffineFit,
+    FilteredAffineFit,
+    GaussianFit,
+    ProductFit,
+    Show,
+    filtered,
+    show_product,
+)
 from tron.color import agx
 from tron.seeds import generator
 
@@ -131,3 +140,55 @@ def test_a_third_input_never_hurts_on_the_data_it_was_fitted_on():
         fit.add(buffers, truth)
         errors.append(np.mean((fit.solve().show(buffers) - truth) ** 2))
     assert errors[0] <= errors[1]
+
+
+def pictures(*names: str) -> Buffers:
+    """Buffers of a clip of three frames."""
+    shape = (3, 20, 24, 3)
+    made = {
+        name: generator(1, "pictures", name).uniform(0.2, 0.8, shape).astype(np.float32) for name in names
+    }
+    return Buffers(made, 1.0)
+
+
+@pytest.mark.parametrize("deviation", [DEVIATIONS[0], DEVIATIONS[3], DEVIATIONS[-1]])
+def test_the_gaussian_that_made_the_truth_is_found_from_some_of_the_pixels(deviation: float):
+    buffers = pictures("pbr")
+    truth = filtered(FIRST, deviation)(buffers)
+    fit = GaussianFit(FIRST)
+    inside = np.nonzero(generator(1, "inside").random(truth.shape[:3]) < 0.4)
+    broken = truth.copy()
+    broken[np.setdiff1d(np.arange(3), inside[0])] = 9
+    fit.add(buffers, broken, inside)
+    fitted = fit.solve()
+    assert fitted.weights == deviation
+    np.testing.assert_array_equal(fitted.show(buffers), truth)
+
+
+def test_a_gaussian_does_not_mix_frames_or_colours():
+    buffers = pictures("pbr")
+    image = filtered(FIRST, 1.0)(buffers)
+    for frame, channel in ((0, 0), (2, 1)):
+        alone = Buffers({"pbr": np.zeros_like(buffers["pbr"])}, 1.0)
+        alone["pbr"][frame, ..., channel] = buffers["pbr"][frame, ..., channel]
+        np.testing.assert_array_equal(
+            filtered(FIRST, 1.0)(alone)[frame, ..., channel], image[frame, ..., channel]
+        )
+
+
+def test_a_filtered_blend_finds_weights_and_deviation():
+    buffers = pictures("pbr", "irradiance")
+    truth = 0.3 * filtered(FIRST, 0.7)(buffers) + 0.6 * filtered(SECOND, 0.7)(buffers) + 0.05
+    fit = FilteredAffineFit(FIRST, SECOND)
+    fit.add(buffers, truth, np.nonzero(np.ones(truth.shape[:3])))
+    fitted = fit.solve()
+    np.testing.assert_allclose(fitted.weights, [[0.3, 0.6, 0.05]] * 3, atol=1e-5)
+    np.testing.assert_allclose(fitted.show(buffers), truth, atol=1e-5)
+
+
+def test_the_error_of_a_blend_is_that_of_its_picture():
+    first, second, truth = images("first", "second", "truth", high=0.5)
+    fit = AffineFit(FIRST, SECOND)
+    buffers = guided(first, second)
+    fit.add(buffers, truth)
+    assert fit.error() == pytest.approx(np.sum((fit.solve().show(buffers) - truth) ** 2), rel=1e-4)

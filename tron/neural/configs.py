@@ -189,6 +189,18 @@ class RendererConfig(GuidedConfig):
         description="concat gives the transformer all latents; average their mean, which keeps the input "
         "width that published weights expect (the paper's choice, 3 dB worse for the tiny model).",
     )
+    skip_blur: float = Field(
+        default=0.0,
+        ge=0,
+        le=2,
+        description="Deviation in pixels of a Gaussian that the start is filtered by first: guidance is sampled "
+        "once a pixel, a photograph is a mean over it. 0: none.",
+    )
+    skip_kernel: Literal[0, 3, 5, 7] = Field(
+        default=0,
+        description="Side in pixels of kernels that the network predicts, one for each pixel, to filter the start "
+        "by; they begin as the Gaussian of skip_blur. For codec=pixels. 0: that Gaussian.",
+    )
     sigma: float | None = Field(
         default=None,
         gt=0,
@@ -211,6 +223,14 @@ class RendererConfig(GuidedConfig):
         if weights is not None and "guidance" in info.data:
             check_weights(weights, info.data["guidance"])
         return weights
+
+    @model_validator(mode="after")
+    def _filter(self) -> RendererConfig:
+        if self.skip_blur and self.skip == MEAN:
+            raise ValueError("skip_blur filters one buffer: skip=mean has none, name one of guidance")
+        if self.skip_kernel and (self.codec != "pixels" or not self.skip_blur):
+            raise ValueError("skip_kernel goes with codec=pixels and a skip_blur above 0, which it begins as")
+        return self
 
 
 COSMOS_0_6B = BackboneConfig(

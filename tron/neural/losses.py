@@ -1,4 +1,4 @@
-"""The loss of training: squared error of display values, and LPIPS if its weights are given."""
+"""The loss of training: squared error of display values, PSNR, and LPIPS if its weights are given."""
 
 from __future__ import annotations
 
@@ -12,26 +12,41 @@ from tron.metrics import LPIPS
 
 log = logging.getLogger(__name__)
 
+PSNR_FLOOR = 1e-5
+"""Mean square that is added for the loss's PSNR: 50 dB, beyond which nothing is gained."""
+
 
 class RendererLoss:
-    """l2 * mean squared error + lpips * LPIPS (VGG), frame by frame, on values in [-1, 1] (paper: 1 and 1).
+    """l2 * mean squared error + lpips * LPIPS (VGG) - psnr * PSNR, on values in [-1, 1] (paper: 1, 1, 0).
+
+    PSNR is in dB, of each frame by itself (Chen et al., "Simple Baselines for Image Restoration", 2022): what it
+    says of a frame that is nearly right counts as much as of one that is far off, where the mean squared error
+    hears the latter alone.
 
     Without `vgg_weights` (torchvision's vgg16-397923af.pth) the LPIPS term is absent, and the log says so:
     a random VGG is never used silently. LPIPS is no module here, so that its frozen weights stay out of
     checkpoints and EMA. Raises TronError where the weights file is missing or is not VGG-16.
     """
 
-    def __init__(self, l2: float = 1.0, lpips: float = 1.0, vgg_weights: str | Path | None = None):
-        self.l2, self.lpips = l2, lpips
+    def __init__(
+        self, l2: float = 1.0, lpips: float = 1.0, vgg_weights: str | Path | None = None, psnr: float = 0.0
+    ):
+        self.l2, self.lpips, self.psnr = l2, lpips, psnr
         self.perceptual = LPIPS.load(vgg_weights) if vgg_weights is not None and lpips > 0 else None
         if self.perceptual is None:
-            log.info("Loss: L2 alone. LPIPS is absent: loss.vgg_weights names no VGG-16 file.")
+            log.info("Loss: %s. LPIPS is absent: loss.vgg_weights names no VGG-16 file.", self._terms())
         else:
-            log.info("Loss: %g L2 + %g LPIPS (VGG)", l2, lpips)
+            log.info("Loss: %s + %g LPIPS (VGG)", self._terms(), lpips)
+
+    def _terms(self) -> str:
+        return f"{self.l2:g} L2" + (f" - {self.psnr:g} PSNR" if self.psnr else "")
 
     def __call__(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Loss (scalar) of (B, 3, K, H, W) in [-1, 1]; the prediction is not clamped."""
-        loss = self.l2 * (predicted - target).square().mean()
+        squares = (predicted - target).square()
+        loss = self.l2 * squares.mean()
+        if self.psnr:
+            loss = loss + self.psnr * torch.log10(squares.mean((1, 3, 4)) / 4 + PSNR_FLOOR).mean() * 10
         if self.perceptual is not None:
             frames = (video.transpose(1, 2).flatten(0, 1) for video in (predicted, target))
             loss = loss + self.lpips * self.perceptual(*frames).mean()

@@ -13,12 +13,15 @@ from tron.errors import TronError
 from tron.neural.backbone import Backbone
 from tron.neural.codecs import CODECS
 from tron.neural.configs import MEAN, RendererConfig, UNetConfig, check_weights
+from tron.neural.filtering import filtered, gaussian_logits
 from tron.neural.protocols import Codec, Renderer
 from tron.neural.reprojection import Motion, averaged_frames
 from tron.neural.unet import UNet
 from tron.neural.windows import Overlap, check_frames, windows
 
 PLAIN_TIMESTEP = 0.2  # what the tiny transformer is told; any constant will do
+BLUR_SIDE = 5
+"""Pixels of the square that skip_blur gathers from; skip_kernel has its own."""
 
 
 class NeuralRenderer(Renderer):
@@ -39,7 +42,10 @@ class NeuralRenderer(Renderer):
         latents = len(self.config.guidance) if self.config.fusion == "concat" else 1
         shape = self.config.backbone
         kind = UNet if isinstance(shape, UNetConfig) else Backbone
-        self.backbone: Backbone | UNet = kind(shape, latents * channels, channels)  # type: ignore[arg-type]
+        predicted = channels + self.config.skip_kernel**2
+        self.backbone: Backbone | UNet = kind(shape, latents * channels, predicted)  # type: ignore[arg-type]
+        # None of the weights: the configuration says all of it.
+        self.register_buffer("_blur", self._blur_logits(), persistent=False)
 
     def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:
         """As Renderer.forward, with 1 + temporal_factor * n frames of any H and W.
@@ -48,17 +54,28 @@ class NeuralRenderer(Renderer):
         are taken here, where everything before lets none through: the backbone is then given zeros. Raises
         TronError for another number of frames.
         """
-        videos = self.stacked(buffers)
+        videos = [self._padded(video) for video in self.stacked(buffers)]
+        height, width = next(iter(buffers.values())).shape[-2:]
         check_frames(videos[0].shape[2], self.temporal_factor)
         scales = self._scales(weights)
-        height, width = videos[0].shape[-2:]
-        latents = [self.codec.encode(self._padded(video)) for video in videos]
+        latents = [self.codec.encode(video) for video in videos]
         weighed = [z if scale == 1 else scale * z for scale, z in zip(scales, latents)]
         mean = torch.stack(weighed).mean(0)
         fused = torch.cat(weighed, 1) if self.config.fusion == "concat" else mean
-        skip = self.config.skip
-        start = mean if skip == MEAN else latents[self.config.guidance.index(skip)]
-        return self.codec.decode(self._denoise(fused, start))[..., :height, :width]
+        t = None if self.config.sigma is None else self.config.sigma / (1 + self.config.sigma)
+        if t is None:
+            change = self.backbone(fused, PLAIN_TIMESTEP)
+        else:
+            change = -t * self.backbone((1 - t) * fused, t).float()
+        change, kernels = change.split([mean.shape[1], self.config.skip_kernel**2], 1)
+        if self.config.skip == MEAN:
+            start = mean
+        else:
+            index = self.config.guidance.index(self.config.skip)
+            start = self._filtered(videos[index], kernels) if self.config.skip_blur else latents[index]
+        # The difference of two nearly equal numbers in bf16 would lose the picture: float32 where there is a t.
+        drawn = start + change if t is None else (1 - t) * start.float() + change
+        return self.codec.decode(drawn)[..., :height, :width]
 
     def check_weights(self, weights: Mapping[str, float] | None) -> None:
         """As Renderer.check_weights: one number >= 0 for each buffer of the guidance, not all of them 0."""
@@ -90,12 +107,17 @@ class NeuralRenderer(Renderer):
             self.check_weights(weights)
         return [len(guidance) * weights[name] for name in guidance]
 
-    def _denoise(self, fused: Tensor, start: Tensor) -> Tensor:
-        if self.config.sigma is None:
-            return start + self.backbone(fused, PLAIN_TIMESTEP)
-        t = self.config.sigma / (1 + self.config.sigma)
-        # The difference of two nearly equal numbers in bf16 would lose the picture: float32 here.
-        return (1 - t) * start.float() - t * self.backbone((1 - t) * fused, t).float()
+    def _blur_logits(self) -> Tensor | None:
+        if not self.config.skip_blur:
+            return None
+        return gaussian_logits(self.config.skip_blur, self.config.skip_kernel or BLUR_SIDE)
+
+    def _filtered(self, video: Tensor, kernels: Tensor) -> Tensor:
+        """Latents of the start, filtered by the Gaussian, or by kernels that the backbone changes it to."""
+        if self.config.skip_kernel:
+            logits = self._blur[:, None, None, None] + kernels
+            return filtered(video, logits.softmax(1))
+        return self.codec.encode(filtered(video, self._blur.softmax(0)))
 
     def _padded(self, video: Tensor) -> Tensor:
         block = self.codec.space_block

@@ -51,24 +51,25 @@ def test_equal_weights_are_none_bit_by_bit(kind, fusion, skip, names):
     assert torch.equal(told(given), told(given, weights=None))
 
 
-@pytest.mark.parametrize("codec", ["pixels", "block_dct"])
-def test_an_average_is_the_weighted_sum_of_the_latents(codec, monkeypatch):
-    """Seen by the backbone, and by the start where that is the mean."""
-    made, given = renderer(codec=codec, fusion="average", skip="mean"), buffers()
+def backbone_input(made: NeuralRenderer, monkeypatch, **kwargs) -> tuple[torch.Tensor, torch.Tensor]:
+    """What the backbone is given, and the start: the latent that is decoded where the backbone adds nothing."""
     seen = []
-    monkeypatch.setattr(made, "_denoise", lambda fused, start: seen.append((fused, start)) or start)
-    made(given, weights={"pbr": 0.3, "irradiance": 0.9})
-    expected = 0.3 * made.codec.encode(given["pbr"]) + 0.9 * made.codec.encode(given["irradiance"])
-    for each in seen[0]:
+    monkeypatch.setattr(made.backbone, "forward", lambda x, _t: seen.append(x) or torch.zeros_like(x[:, :3]))
+    drawn = made(buffers(), **kwargs)
+    return seen[0], drawn
+
+
+def test_an_average_is_the_weighted_sum_of_the_latents(monkeypatch):
+    """Seen by the backbone, and by the start where that is the mean."""
+    made, given = renderer(codec="pixels", fusion="average", skip="mean"), buffers()
+    expected = 0.3 * given["pbr"] + 0.9 * given["irradiance"]
+    for each in backbone_input(made, monkeypatch, weights={"pbr": 0.3, "irradiance": 0.9}):
         torch.testing.assert_close(each, expected, atol=1e-6, rtol=1e-6)
 
 
 def test_of_a_concatenation_each_latent_is_scaled_and_the_start_is_not(monkeypatch):
     made, given = renderer(codec="pixels"), buffers()
-    seen = []
-    monkeypatch.setattr(made, "_denoise", lambda fused, start: seen.append((fused, start)) or start)
-    made(given, weights={"pbr": 0.25, "irradiance": 1.0})
-    fused, start = seen[0]
+    fused, start = backbone_input(made, monkeypatch, weights={"pbr": 0.25, "irradiance": 1.0})
     torch.testing.assert_close(fused, torch.cat([0.5 * given["pbr"], 2.0 * given["irradiance"]], 1))
     assert torch.equal(start, given["pbr"])
 

@@ -8,7 +8,7 @@ import torch
 
 from tron import metrics
 from tron.errors import TronError
-from tron.neural.losses import RendererLoss, psnr_per_frame
+from tron.neural.losses import PSNR_FLOOR, RendererLoss, psnr_per_frame
 
 
 def pair(frames: int = 2, size: int = 16):
@@ -22,6 +22,24 @@ def test_without_vgg_the_loss_is_the_squared_error_and_the_log_says_so(caplog):
         loss = RendererLoss(l2=2.0, lpips=1.0)
     assert "LPIPS is absent" in caplog.text
     np.testing.assert_allclose(loss(a, b).item(), 2 * np.mean((a.numpy() - b.numpy()) ** 2), rtol=1e-6)
+
+
+def test_psnr_is_the_mean_over_frames_and_the_better_frame_counts_as_much(caplog):
+    a, b = pair()
+    b = torch.stack([b[0], a[1] + 0.02 * (b[1] - a[1])])  # the second sample is nearly right
+    with caplog.at_level(logging.INFO):
+        loss = RendererLoss(l2=0.0, psnr=0.5)
+    assert "0.5 PSNR" in caplog.text
+    a.requires_grad_()
+    value = loss(a, b)
+    unclamped = [
+        -10 * np.log10(np.mean(((x - y) / 2) ** 2) + PSNR_FLOOR)
+        for x, y in zip(a.detach().movedim(2, 1).flatten(0, 1).numpy(), b.movedim(2, 1).flatten(0, 1).numpy())
+    ]
+    np.testing.assert_allclose(value.item(), -0.5 * np.mean(unclamped), rtol=1e-5)
+    value.backward()
+    far, near = a.grad.flatten(1).norm(dim=1)
+    assert near > 5 * far
 
 
 def test_lpips_is_the_mean_over_frames_of_the_metric(tmp_path):
