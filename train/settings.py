@@ -55,8 +55,8 @@ class LossSettings(BaseModel):
     psnr: float = Field(
         default=0.0,
         ge=0,
-        description="Weight of the negative PSNR in dB, frame by frame: a good frame's errors count as much as a "
-        "bad one's, in proportion (the loss of NAFNet).",
+        description="Weight of the negative PSNR in dB, frame by frame: a good frame's errors count as "
+        "much as a bad one's, in proportion (the loss of NAFNet).",
     )
     lpips: float = Field(default=1.0, ge=0, description="Weight of LPIPS (VGG); needs vgg_weights.")
     vgg_weights: Path | None = Field(

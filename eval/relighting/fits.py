@@ -17,7 +17,7 @@ from eval.relighting.buffers import Buffers
 from tron.color import agx
 
 Show = Callable[[Buffers], np.ndarray]
-"""Buffers of any pixels, of whole frames where neighbours count -> display values in [0, 1], (..., 3) float32."""
+"""Buffers of any pixels (whole frames where neighbours count) -> display in [0, 1], (..., 3) float32."""
 DEVIATIONS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.3)
 """Of the Gaussians that fits choose from, in pixels."""
 
@@ -145,7 +145,7 @@ class AffineFit:
 
 
 def filtered(show: Show, deviation: float) -> Show:
-    """A method whose pictures (K, H, W, 3) a Gaussian then filters, frame by frame; the edge goes on beyond."""
+    """A method whose pictures (K, H, W, 3) a Gaussian filters, frame by frame; the edge goes on beyond."""
 
     def shown(buffers: Buffers) -> np.ndarray:
         return scipy.ndimage.gaussian_filter(
@@ -156,7 +156,7 @@ def filtered(show: Show, deviation: float) -> Show:
 
 
 class GaussianFit:
-    """A method filtered by that Gaussian of DEVIATIONS which has the least squared error; needs whole clips."""
+    """A method filtered by that Gaussian of DEVIATIONS that has the least squared error; needs whole clips."""
 
     sampled: ClassVar[bool] = False
 

@@ -193,13 +193,13 @@ class RendererConfig(GuidedConfig):
         default=0.0,
         ge=0,
         le=2,
-        description="Deviation in pixels of a Gaussian that the start is filtered by first: guidance is sampled "
-        "once a pixel, a photograph is a mean over it. 0: none.",
+        description="Deviation in pixels of a Gaussian that the start is filtered by first: guidance is "
+        "sampled once a pixel, a photograph is a mean over it. 0: none.",
     )
     skip_kernel: Literal[0, 3, 5, 7] = Field(
         default=0,
-        description="Side in pixels of kernels that the network predicts, one for each pixel, to filter the start "
-        "by; they begin as the Gaussian of skip_blur. For codec=pixels. 0: that Gaussian.",
+        description="Side in pixels of kernels that the network predicts, one for each pixel, to filter the "
+        "start by; they begin as the Gaussian of skip_blur. For codec=pixels. 0: that Gaussian.",
     )
     sigma: float | None = Field(
         default=None,

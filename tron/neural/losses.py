@@ -19,9 +19,9 @@ PSNR_FLOOR = 1e-5
 class RendererLoss:
     """l2 * mean squared error + lpips * LPIPS (VGG) - psnr * PSNR, on values in [-1, 1] (paper: 1, 1, 0).
 
-    PSNR is in dB, of each frame by itself (Chen et al., "Simple Baselines for Image Restoration", 2022): what it
-    says of a frame that is nearly right counts as much as of one that is far off, where the mean squared error
-    hears the latter alone.
+    PSNR is in dB, of each frame by itself (Chen et al., "Simple Baselines for Image Restoration", 2022): a
+    frame that is nearly right counts as much as one that is far off, where the mean squared error hears the
+    latter alone.
 
     Without `vgg_weights` (torchvision's vgg16-397923af.pth) the LPIPS term is absent, and the log says so:
     a random VGG is never used silently. LPIPS is no module here, so that its frozen weights stay out of

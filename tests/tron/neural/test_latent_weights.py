@@ -52,7 +52,7 @@ def test_equal_weights_are_none_bit_by_bit(kind, fusion, skip, names):
 
 
 def backbone_input(made: NeuralRenderer, monkeypatch, **kwargs) -> tuple[torch.Tensor, torch.Tensor]:
-    """What the backbone is given, and the start: the latent that is decoded where the backbone adds nothing."""
+    """What the backbone is given, and the start: what is drawn where the backbone adds nothing."""
     seen = []
     monkeypatch.setattr(made.backbone, "forward", lambda x, _t: seen.append(x) or torch.zeros_like(x[:, :3]))
     drawn = made(buffers(), **kwargs)
