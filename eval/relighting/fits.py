@@ -156,7 +156,7 @@ def filtered(show: Show, deviation: float) -> Show:
 
 
 class GaussianFit:
-    """A method filtered by that Gaussian of DEVIATIONS that has the least squared error; needs whole clips."""
+    """A method filtered by the Gaussian of DEVIATIONS with the least squared error; needs whole clips."""
 
     sampled: ClassVar[bool] = False
 

@@ -31,7 +31,7 @@ from tron.errors import TronError
 from tron.gaussians.foreign_files import refuse_foreign
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
-from tron.neural.shipped import checkpoint_file
+from tron.neural.shipped import SHIPPED, checkpoint_file
 from tron.runtime import activate, describe_machine
 from tron.shards.schema import GUIDANCE
 from tron.storage import locked, require_free_space, sha256, write_atomic
@@ -147,7 +147,8 @@ def _check_paths(settings: Settings, lights: Sequence[Settings]) -> None:
         if path is not None and not path.is_file():
             if path.is_dir():
                 raise TronError("cannot read: is a folder", path, "give one file of it")
-            raise TronError("file not found", path)
+            names = f"checkpoints of the package are {', '.join(SHIPPED)}" if path == checkpoint else ""
+            raise TronError("file not found", path, names)
     if settings.output_dir.exists() and not settings.output_dir.is_dir():
         raise TronError("output_dir is a file", settings.output_dir, "give a folder, which need not exist")
     refuse_foreign(settings.scene)

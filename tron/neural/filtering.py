@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 
 
 def gaussian_logits(deviation: float, side: int) -> Tensor:
-    """Logarithms of a Gaussian's weights at the centres of ``side`` x ``side`` pixels: (side^2,), no sum of 1.
+    """Logarithms of a Gaussian's weights at the centres of ``side`` x ``side`` pixels: (side^2,).
 
     Args:
         deviation: in pixels, above 0.

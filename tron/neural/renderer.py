@@ -73,7 +73,7 @@ class NeuralRenderer(Renderer):
         else:
             index = self.config.guidance.index(self.config.skip)
             start = self._filtered(videos[index], kernels) if self.config.skip_blur else latents[index]
-        # The difference of two nearly equal numbers in bf16 would lose the picture: float32 with a noise level.
+        # The difference of two nearly equal numbers in bf16 would lose the picture: in float32 there.
         drawn = start + change if t is None else (1 - t) * start.float() + change
         return self.codec.decode(drawn)[..., :height, :width]
 

@@ -319,6 +319,7 @@ def test_a_file_in_place_of_the_output_folder_is_one_line(relight, scene_path, l
         ({"environment": "absent.hdr"}, "absent.hdr"),
         ({"environment": "[a.hdr,b/a.hdr]"}, "a.hdr, b/a.hdr"),
         ({"vae": "absent.pth"}, "file not found (absent.pth)"),
+        ({"checkpoint": "litt"}, "file not found (litt): checkpoints of the package are lit, pair"),
         ({"checkpoint": "absent.safetensors"}, "absent.safetensors"),
         ({"cameras": "absent.json"}, "absent.json"),
         ({"quality": "best"}, "'quality'"),
