@@ -10,6 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
+from train.muon import Muon
 from train.settings import OptimizerSettings
 from tron.neural.protocols import Renderer
 
@@ -18,7 +19,7 @@ def make_optimizer(renderer: Renderer, settings: OptimizerSettings) -> torch.opt
     """Optimise what is not frozen, at the settings' rates.
 
     With muon_learning_rate, the matrices that the renderer names as `hidden_matrices` follow Muon
-    (orthogonalised momentum, K. Jordan 2024, as in torch.optim.Muon) and everything else AdamW.
+    (orthogonalised momentum, K. Jordan 2024) and everything else AdamW.
     """
     trained = [parameter for parameter in renderer.parameters() if parameter.requires_grad]
     if settings.muon_learning_rate is None:
@@ -27,7 +28,7 @@ def make_optimizer(renderer: Renderer, settings: OptimizerSettings) -> torch.opt
     if not hidden:
         return _adamw(trained, settings)
     chosen = {id(matrix) for matrix in hidden}
-    muon = torch.optim.Muon(
+    muon = Muon(
         hidden,
         lr=settings.muon_learning_rate,
         weight_decay=settings.weight_decay,
