@@ -33,26 +33,27 @@ class Muon(torch.optim.Muon):
             by_shape = defaultdict(list)
             for matrix in group["params"]:
                 if matrix.grad is not None:
-                    by_shape[matrix.shape].append(matrix)
+                    by_shape[matrix.shape].append((matrix, matrix.grad))
             for matrices in by_shape.values():
                 self._change(matrices, group)
         return loss
 
-    def _change(self, matrices: list[Tensor], group: dict[str, Any]) -> None:
+    def _change(self, matrices: list[tuple[Tensor, Tensor]], group: dict[str, Any]) -> None:
+        """Change matrices of one shape, each given with its gradient."""
         rate, momentum = group["lr"], group["momentum"]
         updates = []
-        for matrix in matrices:
+        for matrix, gradient in matrices:
             state = self.state[matrix]
             if "momentum_buffer" not in state:
                 state["momentum_buffer"] = torch.zeros_like(matrix)
-            mean = state["momentum_buffer"].lerp_(matrix.grad, 1 - momentum)
-            updates.append(matrix.grad.lerp(mean, momentum) if group["nesterov"] else mean)
+            mean = state["momentum_buffer"].lerp_(gradient, 1 - momentum)
+            updates.append(gradient.lerp(mean, momentum) if group["nesterov"] else mean)
         turned = orthogonalised(
             torch.stack(updates), group["ns_coefficients"], group["ns_steps"], group["eps"]
         )
-        rows, columns = matrices[0].shape
+        rows, columns = turned.shape[1:]
         scale = max(1.0, rows / columns) ** 0.5
-        for matrix, update in zip(matrices, turned.unbind()):
+        for (matrix, _), update in zip(matrices, turned.unbind()):
             matrix.mul_(1 - rate * group["weight_decay"]).add_(update, alpha=-rate * scale)
 
 

@@ -44,8 +44,6 @@ class NeuralRenderer(Renderer):
         kind = UNet if isinstance(shape, UNetConfig) else Backbone
         predicted = channels + self.config.skip_kernel**2
         self.backbone: Backbone | UNet = kind(shape, latents * channels, predicted)  # type: ignore[arg-type]
-        # None of the weights: the configuration says all of it.
-        self.register_buffer("_blur", self._blur_logits(), persistent=False)
 
     def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:
         """As Renderer.forward, with 1 + temporal_factor * n frames of any H and W.
@@ -107,17 +105,13 @@ class NeuralRenderer(Renderer):
             self.check_weights(weights)
         return [len(guidance) * weights[name] for name in guidance]
 
-    def _blur_logits(self) -> Tensor | None:
-        if not self.config.skip_blur:
-            return None
-        return gaussian_logits(self.config.skip_blur, self.config.skip_kernel or BLUR_SIDE)
-
     def _filtered(self, video: Tensor, kernels: Tensor) -> Tensor:
         """Latents of the start, filtered by the Gaussian, or by kernels that the backbone changes it to."""
-        if self.config.skip_kernel:
-            logits = self._blur[:, None, None, None] + kernels
-            return filtered(video, logits.softmax(1))
-        return self.codec.encode(filtered(video, self._blur.softmax(0)))
+        side = self.config.skip_kernel
+        blur = gaussian_logits(self.config.skip_blur, side or BLUR_SIDE).to(video)
+        if side:
+            return filtered(video, (blur[:, None, None, None] + kernels).softmax(1))
+        return self.codec.encode(filtered(video, blur.softmax(0)))
 
     def _padded(self, video: Tensor) -> Tensor:
         block = self.codec.space_block
