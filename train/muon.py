@@ -13,7 +13,7 @@ from torch import Tensor
 class Muon(torch.optim.Muon):
     """torch.optim.Muon (K. Jordan 2024), as fast on a processor without bf16 arithmetic as on one with it.
 
-    torch's orthogonalises in bf16, which such a processor emulates: 7 to 12 times the time of float32,
+    torch's orthogonalises in bf16, which such a processor emulates: 2 to 12 times the time of float32,
     three quarters of a training step (docs/experiments.md). Here the same iteration runs in float32, on all
     matrices of one shape at once. On a GPU torch's own is taken. Options and state are torch's; the rate is
     adjusted to a shape as "original" does it.

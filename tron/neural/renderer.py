@@ -25,7 +25,7 @@ BLUR_SIDE = 5
 
 
 class NeuralRenderer(Renderer):
-    """Codec, backbone, codec. A new one with sigma None returns the buffer that `skip` names."""
+    """Codec, backbone, codec. A new one with sigma None returns the buffer that `skip` names, filtered."""
 
     config: RendererConfig
 
