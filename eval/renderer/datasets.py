@@ -70,8 +70,12 @@ class Datasets:
         """Train both checkpoints, side by side; folder of each one's training."""
         recipes = self.settings.training_recipes
         data = self._made("training", recipes.data)
-        captures = self._captured("training_captures", recipes.captures)
-        splits = ",".join(f'{name}: "{captures}#{split}"' for name, split in recipes.splits.items())
+        others = {
+            "captures": self._captured("training_captures", recipes.captures),
+            "clips": self._made("training_clips", recipes.clips),
+        }
+        placed = {name: place.split("#") for name, place in recipes.splits.items()}
+        splits = ",".join(f'{name}: "{others[kind]}#{split}"' for name, (kind, split) in placed.items())
         common = [*recipes.recipe, f"dataset={data}"]
         common += [f"splits={{{splits}}}"] if splits else []
         if self.settings.max_seconds is not None:
@@ -130,7 +134,7 @@ def require_data(settings: RendererSettings) -> None:
     """TronError unless every folder that was given holds a data set, and is given for one that is made."""
     known = [f"synthetic_{size}" for size in settings.synthetic]
     known += [f"models_{size}" for size in settings.models]
-    known += ["captures", "shadows", "training", "training_captures", "seed_training", "kills"]
+    known += ["captures", "shadows", "training", "training_captures", "training_clips", "seed_training", "kills"]
     for name, folder in settings.data.items():
         if name not in known:
             raise TronError(

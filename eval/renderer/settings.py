@@ -44,9 +44,10 @@ class TrainingRecipes(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     data: Recipe = Field(description="arguments of tron-datagen: synthetic scenes")
+    clips: Recipe = Field(description="arguments of tron-datagen: synthetic clips of neighbouring frames")
     captures: CaptureRecipes = Field(description="captures that later stages learn from")
     splits: dict[str, str] = Field(
-        description="split, as the recipe of training names it -> split of the captures"
+        description="split, as the recipe of training names it -> captures#SPLIT or clips#SPLIT"
     )
     recipe: Recipe = Field(description="arguments of tron-train, for both")
     own: dict[Kind, Recipe] = Field(description="further ones of each checkpoint")

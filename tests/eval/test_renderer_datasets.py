@@ -58,7 +58,9 @@ def test_the_commands_accept_every_recipe_and_no_data_share_a_seed(asked: dict[s
     assert asked["captures"].captured.split_by_name
     assert asked["trained_pair"].renderer["config"]["guidance"] == ["pbr", "irradiance"]
     assert asked["trained_lit"].splits == {
-        "train_b": f"{tmp_path / 'out' / 'training_captures'}#train+train_relit"
+        "train_b": f"{tmp_path / 'out' / 'training_captures'}#train+train_relit",
+        "near": f"{tmp_path / 'out' / 'training_clips'}#train",
+        "validation": f"{tmp_path / 'out' / 'training_clips'}#validation",
     }
     assert asked["trained_lit"].max_seconds == 9
     views = ("synthetic_128", "models_128", "captures_views", "training_captures_views", "shadows")
