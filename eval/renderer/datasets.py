@@ -134,7 +134,15 @@ def require_data(settings: RendererSettings) -> None:
     """TronError unless every folder that was given holds a data set, and is given for one that is made."""
     known = [f"synthetic_{size}" for size in settings.synthetic]
     known += [f"models_{size}" for size in settings.models]
-    known += ["captures", "shadows", "training", "training_captures", "training_clips", "seed_training", "kills"]
+    known += [
+        "captures",
+        "shadows",
+        "training",
+        "training_captures",
+        "training_clips",
+        "seed_training",
+        "kills",
+    ]
     for name, folder in settings.data.items():
         if name not in known:
             raise TronError(

@@ -118,7 +118,8 @@ class RendererSettings(Benchmark):
     data: dict[str, Path] = Field(
         default={},
         description="data sets that are there already, by the names that this benchmark gives its own: "
-        "synthetic_128, models_128, captures, shadows, training, training_captures, seed_training, kills",
+        "synthetic_128, models_128, captures, shadows, training, training_clips, training_captures, "
+        "seed_training, kills",
     )
     synthetic: Sizes = Field(description="width of a frame -> recipe of held-out scenes and lights")
     real_data: Path | None = Field(description="folder with assets and hdri; null: no models")

@@ -85,6 +85,7 @@ class Clip:
         for name in self.guidance:
             self.folder.write_picture(index, name, to_display(self.folder.read(index, name), self.exposure))
         if not self.picture.neural:
+            self.folder.path(index, "neural", "png").unlink(missing_ok=True)  # of an earlier run
             self.folder.write_picture(index, "relit", self.picture.display(self.folder, index, self.exposure))
         if self.keeps_linear:
             write_image(self.folder.path(index, "relit", "exr"), self.picture.linear(self.folder, index))
@@ -133,6 +134,8 @@ class Clip:
         }.items():
             if pictures:
                 self.folder.write_video(output_dir / f"{name}.mp4", frames, pictures, fps)
+            else:
+                (output_dir / f"{name}.mp4").unlink(missing_ok=True)  # of an earlier run
         self.folder.write_sheet(output_dir / "contact_sheet.png", frames, ["relit", *self.guidance, *drawn])
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from tron.apps.labelled_sheet import thumbnail
+from tron.apps.labelled_sheet import labelled_sheet
 from tron.claim import first_difference, read_recipe, require_same
 from tron.errors import TronError
 from tron.images import read_image, write_image
@@ -102,13 +102,11 @@ class FrameFolder:
                 video.write(self.row(index, names))
 
     def write_sheet(self, path: Path, frames: int, names: Sequence[str]) -> None:
-        """Write a contact sheet: a column for each of a few frames evenly spread, a row for each picture."""
+        """Write a contact sheet: a column for each of a few frames evenly spread, a row a picture."""
         columns = np.linspace(0, frames, min(frames, _SHEET_COLUMNS), endpoint=False).astype(int)
         width = min(read_image(self.path(0, names[0], "png")).shape[1], _SHEET_WIDTH)
-        rows = [
-            [np.asarray(thumbnail(self.row(index, [name]), width)) for index in columns] for name in names
-        ]
-        sheet = np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0)
+        rows = {name: [self.row(index, [name]) for index in columns] for name in names}
+        sheet = labelled_sheet(rows, [f"frame {index}" for index in columns], width)
         write_image(path, sheet.astype(np.float32) / 255)
 
 

@@ -123,8 +123,8 @@ class Settings(BaseModel):
     window: int | None = Field(
         None,
         ge=1,
-        description="frames that the neural renderer sees at once, sliding by one; null: as many as it was "
-        "trained for",
+        description="frames that the neural renderer sees at once, sliding by one; null: as the checkpoint "
+        "says, which is 1 for those of the package",
     )
     overlap: Overlap = Field(
         "anchor",

@@ -85,9 +85,10 @@ def test_rows_videos_and_sheets_show_every_picture_in_its_place(folder, tmp_path
     assert abs(video[:, :, 10:].mean() / 255 - 0.8) < 0.03
     folder.write_sheet(tmp_path / "sheet.png", 3, list(shades))
     sheet = read_image(tmp_path / "sheet.png")
-    assert sheet.shape == (12, 24, 3)
-    np.testing.assert_allclose(sheet[:6], 0.2, atol=0.003)
-    np.testing.assert_allclose(sheet[6:], 0.8, atol=0.003)
+    for top, shade in ((18, 0.2), (26, 0.8)):  # below the headings, beside the labels, gaps of two pixels
+        for left in (110, 120, 130):
+            np.testing.assert_allclose(sheet[top : top + 6, left : left + 8], shade, atol=0.003)
+    assert sheet[:, :110].min() < 0.5  # the labels' ink
 
 
 def test_the_sheet_of_many_large_frames_is_small(folder, tmp_path):
@@ -95,5 +96,5 @@ def test_the_sheet_of_many_large_frames_is_small(folder, tmp_path):
         folder.write_picture(index, "pbr", np.full((300, 640, 3), index / 20))
     folder.write_sheet(tmp_path / "sheet.png", 20, ["pbr"])
     sheet = read_image(tmp_path / "sheet.png")
-    assert sheet.shape == (150, 6 * 320, 3)
-    assert (np.diff(sheet[75, 160::320, 0]) > 0).all()
+    assert sheet.shape == (18 + 152, 110 + 6 * 322, 3)
+    assert (np.diff(sheet[90, 270::322, 0]) > 0).all()

@@ -37,7 +37,7 @@ def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, 
     assert frames == sorted([*expected, "settings.json"])
     assert read_video(out / "guidance.mp4").shape == (2, SIZE, 2 * SIZE, 3)
     assert read_video(out / "relit.mp4").shape == (2, SIZE, SIZE, 3)
-    assert read_image(out / "contact_sheet.png").shape == (3 * SIZE, 2 * SIZE, 3)
+    assert read_image(out / "contact_sheet.png").shape == (18 + 3 * (SIZE + 2), 110 + 2 * (SIZE + 2), 3)
     assert not (out / "neural.mp4").exists()
     report = json.loads((out / "relight.json").read_text())
     assert report["frames"] == report["frames_rendered"] == 2

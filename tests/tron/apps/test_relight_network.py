@@ -91,6 +91,16 @@ def test_frames_of_an_older_run_that_lack_a_buffer_are_traced_again_with_a_line(
     assert json.loads((tmp_path / "relight.json").read_text())["frames_rendered"] == 3
 
 
+def test_a_run_without_the_network_leaves_no_pictures_of_one_before(run, checkpoints, tmp_path):
+    assert run(tmp_path, f"checkpoint={checkpoints / 'pair.safetensors'}") == 0
+    neural = [tmp_path / "neural.mp4", *(tmp_path / "frames").glob("*.neural.png")]
+    assert len(neural) == 4
+    assert all(path.exists() for path in neural)
+    assert run(tmp_path, "checkpoint=null") == 0
+    assert not any(path.exists() for path in neural)
+    assert (tmp_path / "relit.mp4").exists()
+
+
 def test_one_frame_is_not_said_to_be_averaged(relight, scene_path, light_path, checkpoints, tmp_path):
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={tmp_path}", "frames=1"]
     assert relight(*base, f"checkpoint={checkpoints / 'pair.safetensors'}", "width=16", "height=16") == 0
