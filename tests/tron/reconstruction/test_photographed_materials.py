@@ -310,7 +310,7 @@ def test_photos_alone_tell_light_and_materials(
         scene, base_color=np.full((len(scene), 3), 0.5), roughness=np.full(len(scene), 0.5),
         metallic=np.zeros(len(scene)),
     )  # fmt: skip
-    # Of 714 surfels, the lamp explains 0.4 % or 1.0 % by the processor's roundings; it is as wide as 17 degrees.
+    # The lamp, 17 degrees wide, explains 0.4 or 1.0 % of these 714 surfels, by the processor's roundings.
     prior = Joint(light=LightSettings(points=1500), sun=0.002)
     found = explain(replace(capture, exposure=4.0), blank, prior, 0)
     directions, solid = cube_texels(32)
