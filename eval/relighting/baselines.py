@@ -15,7 +15,7 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 - ``affine_lit``: affine_ratio with D(L) as a fourth input.
 - ``lit_filtered``: D(L) filtered by a Gaussian, whose deviation is fitted: L is sampled once in a pixel, the
   truth is a mean over it.
-- ``affine_ratio_filtered``, ``affine_lit_filtered``: the blends of images so filtered.
+- ``affine_filtered``, ``affine_ratio_filtered``, ``affine_lit_filtered``: the blends of images so filtered.
 - ``pixel_mlp``, ``pixel_mlp_lit``: 1x1 convolutions on D(B) and D(E), or on these and D(L).
 
 Baselines whose name says lit use bounced light, the others light that comes straight from the environment.
@@ -169,6 +169,15 @@ BASELINES = (
         fit=lambda: AffineFit(show_pbr, show_irradiance),
         surfaces=True,
         groups=(SIMPLE, DIRECT),
+        pictured=False,
+    ),
+    Baseline(
+        "affine_filtered",
+        "filtered affine blend",
+        "the same of images that one fitted Gaussian filters",
+        fit=lambda: FilteredAffineFit(show_pbr, show_irradiance),
+        surfaces=True,
+        groups=(DIRECT,),
         pictured=False,
     ),
     Baseline(

@@ -25,14 +25,20 @@ from eval.report.strips import write_strips
 from eval.results import Row
 from tron.report.page import Block, Cell, Section, Table, Text
 
-TWO_BUFFERS = ["pbr", "pbr_x_irradiance", "affine", "pixel_mlp"]
+TWO_BUFFERS = ["pbr", "pbr_x_irradiance", "affine", "affine_filtered", "pixel_mlp"]
 """Baselines that see pbr and irradiance, and nothing else."""
+PIXELWISE = ["lit", "affine_lit", "pixel_mlp_lit"]
+"""Of the rivals of the network that starts from lit, those that see one pixel at a time."""
 PAIR_RIVALS: dict[str, list[str]] = {
     "gain_db": GROUPS[DIRECT],
     "gain_over_two_buffers_db": TWO_BUFFERS,
     "gain_over_pbr_db": ["pbr"],
 }
-LIT_RIVALS: dict[str, list[str]] = {"gain_db": ["lit", *GROUPS[ON_LIT]], "gain_over_lit_db": ["lit"]}
+LIT_RIVALS: dict[str, list[str]] = {
+    "gain_db": ["lit", *GROUPS[ON_LIT]],
+    "gain_over_pixelwise_db": PIXELWISE,
+    "gain_over_lit_db": ["lit"],
+}
 RIVALS = {NEURAL.name: ("renderer", PAIR_RIVALS), NEURAL_LIT.name: ("renderer.lit", LIT_RIVALS)}
 """Method -> beginning of its rows, and what its gains are over by the end of their names."""
 TITLES = {method.name: method.title for method in BASELINES} | {
@@ -43,6 +49,10 @@ GAIN_WORDS = {
     (NEURAL.name, "gain_over_two_buffers_db"): "pair: gain over the best of pbr and irradiance alone",
     (NEURAL.name, "gain_over_pbr_db"): "pair: gain over pbr",
     (NEURAL_LIT.name, "gain_db"): "lit's network: gain over lit and all fits on it",
+    (
+        NEURAL_LIT.name,
+        "gain_over_pixelwise_db",
+    ): "lit's network: gain over what sees single pixels",
     (NEURAL_LIT.name, "gain_over_lit_db"): "lit's network: gain over lit",
 }
 
