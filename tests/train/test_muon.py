@@ -13,7 +13,7 @@ def weights() -> list[torch.nn.Parameter]:
     return [torch.nn.Parameter(torch.randn(shape, generator=generator)) for shape in SHAPES]
 
 
-def trained(kind: type[torch.optim.Optimizer], steps: int, **options) -> list[torch.nn.Parameter]:
+def trained(kind: type[Muon] | type[torch.optim.Muon], steps: int, **options) -> list[torch.nn.Parameter]:
     made, generator = weights(), torch.Generator().manual_seed(1)
     optimizer = kind(made, lr=0.02, weight_decay=0.1, adjust_lr_fn="original", **options)
     for _ in range(steps):

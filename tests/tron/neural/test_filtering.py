@@ -64,7 +64,7 @@ def test_kernels_are_learnt_and_travel_with_the_weights(tmp_path):
     """A truth that is the start moved by a pixel: no sum of colours, a kernel is told at once."""
     made, given = renderer(skip_blur=0.6, skip_kernel=3), buffers()
     truth = filtered(given["lit"], torch.eye(9)[3])
-    optimizer = torch.optim.Adam([made.backbone.out.bias], 0.2)
+    optimizer = torch.optim.Adam([made.backbone.get_parameter("out.bias")], 0.2)
     for _ in range(120):
         optimizer.zero_grad()
         (made(given) - truth).square().mean().backward()
@@ -78,7 +78,7 @@ def test_kernels_are_learnt_and_travel_with_the_weights(tmp_path):
 
 def test_kernels_do_not_see_other_frames():
     made, given = renderer(skip_blur=0.6, skip_kernel=3), buffers(2)
-    torch.nn.init.normal_(made.backbone.out.weight, std=0.1)
+    torch.nn.init.normal_(made.backbone.get_parameter("out.weight"), std=0.1)
     alone = {name: each[:, :, 1:] for name, each in given.items()}
     torch.testing.assert_close(made(given)[:, :, 1:], made(alone), atol=1e-6, rtol=1e-5)
 

@@ -38,6 +38,7 @@ def test_psnr_is_the_mean_over_frames_and_the_better_frame_counts_as_much(caplog
     ]
     np.testing.assert_allclose(value.item(), -0.5 * np.mean(unclamped), rtol=1e-5)
     value.backward()
+    assert a.grad is not None
     far, near = a.grad.flatten(1).norm(dim=1)
     assert near > 5 * far
 
