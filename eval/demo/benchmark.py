@@ -25,9 +25,17 @@ WORDS = {
     "large": "larger frames of three held-out scenes",
     "eval": "fit the baselines, score every held-out frame",
 }
+UNET = [
+    "renderer=unet",
+    "renderer.config.skip_blur=0.6",
+    "renderer.config.skip_kernel=5",
+    "loss.l2=0",
+    "loss.psnr=1",
+]
+"""Network and loss of the shipped checkpoints: it begins as a Gaussian of ``lit``."""
 TRAININGS = {
-    "tiny": ["renderer=tiny"],
-    "tiny_of_two": ["renderer=tiny", "renderer.config.guidance=[pbr,irradiance]"],
+    "unet": UNET,
+    "unet_of_two": [*UNET, "renderer.config.guidance=[pbr,irradiance]"],
     "pixel_mlp": ["renderer=pixel_mlp"],
 }
 """Networks that train side by side: own arguments of tron-train."""
@@ -82,7 +90,7 @@ class Demo(Benchmark):
         evaluation = self.relighting.model_copy(
             update={
                 "dataset": dataset,
-                "renderer": (weights["tiny"], weights["tiny_of_two"]),
+                "renderer": (weights["unet"], weights["unet_of_two"]),
                 "pixel_mlp": weights["pixel_mlp"],
             }
         )

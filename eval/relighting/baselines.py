@@ -134,7 +134,7 @@ class Baseline(Method):
     needs: str | None = None
 
 
-NEURAL_LIT = Method("neural_lit", "neural renderer", "a small transformer that adds to lit what is missing")
+NEURAL_LIT = Method("neural_lit", "neural renderer", "filters lit and adds what is missing")
 NEURAL = Method("neural", "neural renderer of two buffers", "the same of pbr and irradiance alone")
 NETWORKS = (NEURAL_LIT, NEURAL)
 BASELINES = (

@@ -21,7 +21,7 @@ with open({log!r}, "a") as log:
 MAKE = "shutil.copytree({dataset!r}, out)\nprint('12 clips')"
 TRAIN = """
 out.mkdir(parents=True)
-kind = given["renderer"] + ("_of_two" if "renderer.config.guidance" in given else "")
+kind = given["renderer"].replace("unet", "tiny") + ("_of_two" if "renderer.config.guidance" in given else "")
 shutil.copy(pathlib.Path({weights!r}) / (kind + ".safetensors"), out / "renderer.safetensors")
 """
 
@@ -56,14 +56,14 @@ def test_the_demo_goes_from_nothing_to_a_report_and_a_second_run_only_evaluates(
     commands = stand_ins.read_text().splitlines()
     assert commands[0] == f"tron-datagen experiment=demo output_dir={out / 'dataset'}"
     assert commands[-1].startswith("tron-datagen experiment=demo train.scenes=0 ")
-    trained = sorted(command.split()[2:4] for command in commands[1:-1])
-    assert [words[0] for words in trained] == ["renderer=pixel_mlp", "renderer=tiny", "renderer=tiny"]
+    trained = sorted(command.split()[2:] for command in commands[1:-1])
+    assert [words[0] for words in trained] == ["renderer=pixel_mlp", "renderer=unet", "renderer=unet"]
     assert sum("renderer.config.guidance=[pbr,irradiance]" in words for words in trained) == 1
     limits = {
         name: {command.split()[-1] for command in commands if f"renderer={name} " in command}
-        for name in ("tiny", "pixel_mlp")
+        for name in ("unet", "pixel_mlp")
     }
-    assert limits == {"tiny": {"max_seconds=7"}, "pixel_mlp": {"max_seconds=3"}}
+    assert limits == {"unet": {"max_seconds=7"}, "pixel_mlp": {"max_seconds=3"}}
     results = Results.load(out / "results.json")
     assert results.benchmark == "demo"
     parts = [results.value(f"demo.{stage}_seconds") for stage in ("datagen", "train", "large", "eval")]
