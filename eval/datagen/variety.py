@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -252,16 +253,21 @@ def _make_judges(
 
 
 def _make_together(stages: Stages, children: Sequence[Child], found: Variety) -> None:
-    """Make some datasets at once; if one fails each by itself, and what fails then is left out."""
-    try:
-        stages.run(" ".join(child.label for child in children), children)
-    except StageFailed:
-        for child in children:
-            try:
-                stages.run(child.label, [child])
-            except StageFailed as failure:
-                log.error("%s is left out: %s", child.label, failure)
-                found.left_out[child.label] = str(failure).rpartition(f"{child.script}: ")[2]
+    """Make some datasets at once; if one fails each by itself, and what fails then is left out.
+
+    Once they were begun one by one they go on so: together, the one that fails would end the others while
+    they write over a dataset that is finished.
+    """
+    if not any(child.label in stages.records for child in children):
+        with suppress(StageFailed):
+            stages.run(" ".join(child.label for child in children), children)
+            return
+    for child in children:
+        try:
+            stages.run(child.label, [child])
+        except StageFailed as failure:
+            log.error("%s is left out: %s", child.label, failure)
+            found.left_out[child.label] = str(failure).rpartition(f"{child.script}: ")[2]
 
 
 def _score(
