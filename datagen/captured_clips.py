@@ -13,7 +13,7 @@ from datagen.captured_surfels import CapturedSurfels
 from datagen.lights import classify, contrast_share
 from datagen.plan import Work, scene_folder
 from datagen.settings import Settings
-from datagen.spool import Frame, Spool, stored_guidance
+from datagen.spool import Frame, Spool
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.color import luminance
@@ -103,7 +103,7 @@ def _film(
         if wanted.linear:
             rgb = decoded(rgb, capture.tone_curve) / np.float32(capture.exposure)
         truth = {TARGET: rgb, "foreground": seen.astype(np.float32)}
-        spool.add(0, stored_guidance(guidance) | truth)
+        spool.add(0, lit.frame(guidance, photo.camera) | truth)
         ratios.append(light_ratio(photo, guidance.lit * capture.exposure, seen & (guidance.mask > OPAQUE)))
         cameras.append(photo.camera)
     measured = np.concatenate(ratios)

@@ -17,7 +17,7 @@ from datagen.captured_surfels import CapturedSurfels, LitSurfels
 from datagen.lights import classify, contrast_share
 from datagen.plan import Work
 from datagen.settings import Settings
-from datagen.spool import Frame, stored_guidance
+from datagen.spool import Frame
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder
@@ -131,7 +131,7 @@ def _frame(
     camera, (shown, covered) = resized_view(
         view.camera, (view.read() * mask + behind * (1 - mask), mask[..., 0]), wanted.width, wanted.height
     )
-    frame = stored_guidance(lit.view(camera, view.name))
+    frame = lit.frame(lit.view(camera, view.name), camera)
     return camera, frame | {
         TARGET: np.maximum(shown, 0.0),
         "foreground": (covered > 0.5).astype(np.float32),

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from datagen.captured_reconstruction import Found
 from datagen.plan import Work
 from datagen.settings import Settings
+from datagen.spool import Frame, stored_guidance
 from tron.cameras import Camera
 from tron.estimation import Estimation
 from tron.seeds import integer
 from tron.shading.bounce import BouncedLight, BounceTransport
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
+from tron.shading.surface_maps import surface_maps
 from tron.tracing import SurfelTracer
 
 
@@ -39,6 +41,10 @@ class LitSurfels:
         return render_guidance(
             self.tracer, camera, self.lighting, self.estimation, seed, background, self.bounce
         )
+
+    def frame(self, guidance: Guidance, camera: Camera) -> Frame:
+        """Members of one view that surfels give, with the guidance that :meth:`view` gave of it."""
+        return stored_guidance(guidance) | surface_maps(self.tracer, camera)
 
 
 class CapturedSurfels:

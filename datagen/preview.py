@@ -53,7 +53,7 @@ def displayable(member: str, image: np.ndarray) -> np.ndarray:
 
     Base color goes through the square root (near enough to sRGB to look at), normals through (n + 1) / 2.
     """
-    if member.startswith("base_color"):
+    if member.startswith("base_color") or MEMBERS[member].color_space == "reflectance":
         image = np.sqrt(np.clip(image, 0.0, 1.0))
     elif member.startswith("normal"):
         image = np.where(np.abs(image).sum(-1, keepdims=True) > 0, 0.5 * image + 0.5, 0.0)

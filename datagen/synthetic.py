@@ -41,6 +41,7 @@ from tron.seeds import integer
 from tron.shading.bounce import BouncedLight, BounceTransport
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance, trace_views
+from tron.shading.surface_maps import surface_maps
 from tron.shards.moving import KEY as MOTION
 from tron.shards.moving import Moving
 from tron.shards.schema import ClipMeta, color_spaces
@@ -233,6 +234,7 @@ def _film(
         else:
             rgb = render_lights(now.scenes[0], now.stacked, camera, spp, seed)
         views = trace_views(now.tracer, camera, estimation, bounces)
+        surfaces = surface_maps(now.tracer, camera)
         fine = trace_views(now.tracer, camera, finer, bounces) if recipe.reference_buffers else []
         for k, light in enumerate(now.lights):
             if spec.metered and i == 0:
@@ -242,7 +244,7 @@ def _film(
                 render_guidance, now.tracer, camera, light.lighting, seed=seed, bounce=light.bounce
             )
             guidance = view(estimation, gbuffer=views[k])
-            frame = stored_guidance(guidance)
+            frame = stored_guidance(guidance) | surfaces
             frame |= {"rgb": rgb[k], "foreground": truth.valid.astype(np.float32)}
             if recipe.reference_buffers:
                 seed = light.seeds["reference"][i]

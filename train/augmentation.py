@@ -11,9 +11,9 @@ from torch import Tensor
 from train.framing import random_start
 from train.samples import Sample
 from train.settings import DataSettings
-from tron.color import agx, luminance
+from tron.color import luminance
 from tron.errors import TronError
-from tron.shards.schema import TARGET
+from tron.shards.schema import MEMBERS, TARGET, encoded
 
 
 def augmented(
@@ -25,7 +25,8 @@ def augmented(
     permuted and scaled buffers: transport is linear and no channel knows another. A tint keeps the
     luminance of white, so that the exposure rule still holds; a random exposure, a gain on all channels,
     leaves that rule on purpose. Samples with display members keep their colours. A turned picture is what a
-    rolled camera sees: buffers are colours, and none holds a direction that would have to turn with it.
+    rolled camera sees: no buffer holds a direction that would have to turn with it. Reflectance has its
+    colours exchanged, and no light to scale; what is no colour stays.
     """
     height, width = sample.buffers[TARGET].shape[-2:]
     rows, columns = slice(None), slice(None)
@@ -48,7 +49,9 @@ def augmented(
         video = video[..., rows, columns]
         video = video.flip(-1) if mirrored else video
         video = torch.rot90(video, turns, (-2, -1)) if turns else video
-        buffers[name] = video if sample.display else video[order.tolist()] * gains
+        space = None if sample.display else MEMBERS[name].color_space
+        video = video if space is None else video[order.tolist()]
+        buffers[name] = video * gains if space == "linear" else video
     return Sample(buffers, sample.display)
 
 
@@ -59,11 +62,12 @@ def _quarter_turns(random: np.random.Generator, probability: float, size: tuple[
 
 
 def display_encoded(samples: Sequence[Sample], name: str) -> Tensor:
-    """One buffer of a batch as the network sees it: AgX where it is linear, then [-1, 1], (B, 3, K, h, w)."""
+    """One buffer of a batch as the network sees it: encoded, then in [-1, 1], (B, 3, K, h, w)."""
     batch = torch.stack([sample.buffers[name] for sample in samples])
-    linear = torch.tensor([name not in sample.display for sample in samples])
-    if linear.all():
-        batch = agx(batch, axis=1)
-    elif linear.any():
-        batch[linear] = agx(batch[linear], axis=1)
+    space = MEMBERS[name].color_space
+    plain = torch.tensor([name not in sample.display for sample in samples])
+    if plain.all():
+        batch = encoded(batch, space, axis=1)
+    elif plain.any():
+        batch[plain] = encoded(batch[plain], space, axis=1)
     return batch * 2 - 1

@@ -10,15 +10,14 @@ from typing import Any, Literal
 import numpy as np
 
 from tron.cameras import Camera
-from tron.color import to_display
 from tron.flow import surface_motion
 from tron.neural.reprojection import Motion
 from tron.shards.moving import KEY, Moving
-from tron.shards.schema import TARGET, Clip, light_members
+from tron.shards.schema import TARGET, Clip, displayed, guidance_members
 
 Region = Literal["foreground", "frame"]
 REGIONS: tuple[Region, Region] = ("foreground", "frame")
-MEMBERS = (*light_members(), TARGET, "mask", "foreground")
+MEMBERS = (*guidance_members(), TARGET, "mask", "foreground")
 """Members of a clip that predictions and their scores need."""
 SURFELS_DEPTH = "depth"
 """Member that motion is known by where a clip is rendered: the surfels', not the truth's."""
@@ -31,7 +30,7 @@ class Buffers:
     """Members of any pixels of a clip, by name.
 
     Attributes:
-        images: (..., C) float32 each, linear.
+        images: (..., C) float32 each, linear, as stored.
         exposure: the clip's factor before the tone curve.
         motion: of the surfaces of a whole clip, from cameras and the depth of the surfels, which whoever
             renders it has, and of the object that moves; None where that depth was not read, or an older
@@ -61,7 +60,7 @@ class Buffers:
     def displayed(self, name: str) -> np.ndarray:
         """One of the members as displayed: (..., 3) in [0, 1], computed once."""
         if name not in self._displayed:
-            self._displayed[name] = to_display(self[name], self.exposure)
+            self._displayed[name] = displayed(name, self[name], self.exposure)
         return self._displayed[name]
 
 

@@ -10,7 +10,7 @@ import yaml
 
 from tron import seeds
 from tron.shards.manifest import Manifest
-from tron.shards.schema import TARGET, ClipMeta, light_members
+from tron.shards.schema import TARGET, ClipMeta, guidance_members, light_members
 from tron.shards.writer import ShardWriter
 
 pytestmark = pytest.mark.long
@@ -37,7 +37,7 @@ def dataset(tmp_path_factory) -> Path:
             )
             noise = seeds.generator(0, "dataset", number).random((16, 16, 3), np.float32)
             one = np.ones((16, 16, 1), np.float32)
-            colours = dict.fromkeys((*light_members(), TARGET), noise)
+            colours = dict.fromkeys((*guidance_members(), TARGET), noise)
             writer.write(meta, [{**colours, "mask": one, "foreground": one}])
     Manifest(config_sha256="0" * 64, shards=writer.entries).save(folder)
     return folder

@@ -11,7 +11,7 @@ import pytest
 
 from tron import seeds
 from tron.shards.manifest import Manifest
-from tron.shards.schema import GUIDANCE, TARGET, ClipMeta, ColorSpace, light_members
+from tron.shards.schema import GUIDANCE, TARGET, ClipMeta, ColorSpace, guidance_members
 from tron.shards.writer import ShardWriter
 
 
@@ -63,7 +63,7 @@ def _frame(random: np.random.Generator, height: int, width: int) -> dict[str, np
     pbr = 0.1 + random.random(3) * down[:, None, None] + np.zeros((height, width, 3))
     irradiance = 0.2 + random.random(3) * right[None, :, None] + np.zeros((height, width, 3))
     one = np.ones((height, width, 1))
-    images = dict.fromkeys(light_members(), pbr) | {"irradiance": irradiance, "unshadowed": irradiance}
+    images = dict.fromkeys(guidance_members(), pbr) | {"irradiance": irradiance, "unshadowed": irradiance}
     return images | {"rgb": pbr * irradiance, "mask": one, "foreground": one}
 
 

@@ -214,6 +214,30 @@ def test_turns_are_alike_in_all_buffers_and_keep_the_size(height, width, turns):
     assert 0.1 < seen.count(0) / 60 < 0.4
 
 
+def test_reflectance_exchanges_its_colours_with_the_light_and_nothing_scales_it():
+    """lit = albedo x light stays so under any augmentation; what is no colour is left alone."""
+    random = seeds.generator(0, "reflectance")
+    albedo, light = (torch.from_numpy(random.random((3, 1, 8, 8), np.float32)) for _ in range(2))
+    sample = Sample({"albedo": albedo, "surface": albedo, "irradiance": light, "rgb": albedo * light})
+    settings = DataSettings(permute_colors=1.0, tint=0.4, exposure=1.0, rotate=1.0)
+    exchanged = set()
+    for number in range(20):
+        out = augmented(sample, seeds.generator(0, "reflectance", number), None, settings).buffers
+        torch.testing.assert_close(out["rgb"], out["albedo"] * out["irradiance"])
+        torch.testing.assert_close(out["albedo"].sum(0).sum(), albedo.sum(0).sum())
+        torch.testing.assert_close(out["surface"].sum((1, 2, 3)), albedo.sum((1, 2, 3)))
+        exchanged.add(tuple(out["albedo"].sum((1, 2, 3)).tolist()))
+    assert len(exchanged) > 1
+
+
+def test_reflectance_is_encoded_by_the_srgb_curve_and_what_is_no_colour_stays():
+    sample = Sample({name: torch.full((3, 1, 2, 2), 0.18) for name in ("albedo", "surface", "lit")})
+    shown = {name: float(display_encoded([sample], name)[0, 0, 0, 0, 0] + 1) / 2 for name in sample.buffers}
+    assert shown["albedo"] == pytest.approx(1.055 * 0.18 ** (1 / 2.4) - 0.055)
+    assert shown["surface"] == pytest.approx(0.18)
+    assert shown["lit"] == pytest.approx(float(to_display(np.full((1, 3), 0.18), 1.0)[0, 0]), abs=1e-5)
+
+
 def test_other_augmentations_keep_their_numbers_where_new_ones_are_off():
     """So that a run of an earlier version goes on as it began."""
     video = torch.rand(3, 1, 16, 16)

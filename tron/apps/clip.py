@@ -17,14 +17,13 @@ from tron.apps.frame_folder import FrameFolder
 from tron.apps.relit import RelitPicture, surfels_alone
 from tron.cameras import Camera
 from tron.cli.progress import track
-from tron.color import to_display
 from tron.estimation import Estimation
 from tron.flow import surface_motion
 from tron.gaussians.scene import GaussianScene
 from tron.images import write_image
 from tron.neural.reprojection import averaged_frames
 from tron.neural.windows import Overlap
-from tron.shards.schema import GUIDANCE
+from tron.shards.schema import GUIDANCE, displayed
 
 if TYPE_CHECKING:
     from tron.apps.lit_scene import Bounced, LitScene
@@ -83,7 +82,7 @@ class Clip:
     def write_pictures(self, index: int) -> None:
         """Write the pictures of a frame whose buffers are there, those that need no network."""
         for name in self.guidance:
-            self.folder.write_picture(index, name, to_display(self.folder.read(index, name), self.exposure))
+            self.folder.write_picture(index, name, self._shown(index, name))
         if not self.picture.neural:
             self.folder.path(index, "neural", "png").unlink(missing_ok=True)  # of an earlier run
             self.folder.write_picture(index, "relit", self.picture.display(self.folder, index, self.exposure))
@@ -119,7 +118,10 @@ class Clip:
             self.folder.write_picture(index, "relit", relit)
 
     def _displayed(self, index: int) -> dict[str, np.ndarray]:
-        return {name: to_display(self.folder.read(index, name), self.exposure) for name in self.guidance}
+        return {name: self._shown(index, name) for name in self.guidance}
+
+    def _shown(self, index: int, name: str) -> np.ndarray:
+        return displayed(name, self.folder.read(index, name), self.exposure)
 
     def _depth(self, index: int) -> np.ndarray:
         return self.folder.read(index, DEPTH)[..., 0].copy()  # a view would keep all three channels
@@ -197,6 +199,7 @@ def _shade(
     from tron.shading.background import background_share
     from tron.shading.guidance import arriving_light, shade, trace_view
     from tron.shading.supersampling import averaged
+    from tron.shading.surface_maps import surface_maps
 
     view = trace_view(tracer, camera, estimation, bounce)
     arriving = arriving_light(tracer, view, lighting, estimation, seed, bounce)
@@ -205,6 +208,8 @@ def _shade(
     transmittance = 1 - view.images({"opacity": view.opacity})["opacity"]
     share = averaged(background_share(transmittance), estimation.supersample)
     made = guidance.gbuffer | vars(guidance) | {"share": share.astype(np.float32)}
+    if not {"albedo", "surface"}.isdisjoint(names):
+        made |= surface_maps(tracer, camera)
     if "foreground" in names:
         over_black = shade(view, arriving, lighting, (0, 0, 0), estimation).lit
         made["foreground"] = surfels_alone(over_black, made["share"])

@@ -15,11 +15,11 @@ from tron.estimation import FINAL, FINEST, PREVIEW, Estimation, Estimator, requi
 from tron.neural.configs import check_sizes
 from tron.neural.shipped import DEFAULT, SHIPPED
 from tron.neural.windows import Overlap
-from tron.shards.schema import light_members
+from tron.shards.schema import guidance_members, light_members
 
 DEFAULT_BUFFERS = (*light_members(), "indirect", "foreground", "mask", "share", "depth")
 BUFFERS = (
-    *DEFAULT_BUFFERS,
+    *dict.fromkeys((*DEFAULT_BUFFERS, *guidance_members())),
     *("base_color", "normal", "position", "roughness", "metallic", "rgb"),  # of the G-buffer
     "relit",
 )

@@ -20,7 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from tron.shards.schema import GUIDANCE, light_members
+from tron.shards.schema import GUIDANCE, guidance_members
 
 PAPER_GUIDANCE = ("pbr", "irradiance")
 """Guidance of the paper's network: direct light alone."""
@@ -70,7 +70,7 @@ class GuidedConfig(BaseModel):
     @field_validator("guidance")
     @classmethod
     def _colours(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        there = light_members()
+        there = guidance_members()
         if not names or len(set(names)) < len(names) or not set(names) <= set(there):
             raise ValueError(f"guidance is one or more of {', '.join(there)}")
         return names
@@ -201,6 +201,11 @@ class RendererConfig(GuidedConfig):
         description="Side in pixels of kernels that the network predicts, one for each pixel, to filter the "
         "start by; they begin as the Gaussian of skip_blur. For codec=pixels. 0: that Gaussian.",
     )
+    skip_detail: str | None = Field(
+        default=None,
+        description="Member of guidance, such as albedo, whose detail is given back to the start: what those "
+        "kernels take from it, each pixel and channel in a share that the network predicts, 0 at first.",
+    )
     sigma: float | None = Field(
         default=None,
         gt=0,
@@ -230,6 +235,10 @@ class RendererConfig(GuidedConfig):
             raise ValueError("skip_blur filters one buffer: skip=mean has none, name one of guidance")
         if self.skip_kernel and (self.codec != "pixels" or not self.skip_blur):
             raise ValueError("skip_kernel goes with codec=pixels and a skip_blur above 0, which it begins as")
+        if self.skip_detail is not None and not self.skip_kernel:
+            raise ValueError("skip_detail is what kernels take from a buffer: it goes with a skip_kernel")
+        if self.skip_detail is not None and self.skip_detail not in self.guidance:
+            raise ValueError(f"skip_detail is one of guidance: {', '.join(self.guidance)}")
         return self
 
 

@@ -15,12 +15,13 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from tron.color import agx
+from tron.color import agx, linear_to_srgb
 from tron.errors import TronError
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 
-ColorSpace = Literal["linear", "display"]
+ColorSpace = Literal["linear", "display", "reflectance"]
+"""linear light; display values in [0, 1]; linear base color in [0, 1], which is under no light."""
 
 GUIDANCE = ("pbr", "irradiance", "lit")
 """Members that the neural renderer is conditioned on, unless its configuration names others.
@@ -75,6 +76,12 @@ MEMBERS: dict[str, Member] = {
     "unshadowed": _light("irradiance / pi at the surfels, without visibility"),
     "shadowed": _light("direct light: diffuse with shadows, plus the split sum's specular part"),
     "lit": _light("shadowed, and light that bounced between the surfels: the picture without a network"),
+    "albedo": Member(
+        "exr", 3, 2, "reflectance", "all", "base color of the surfels times opacity, mean of 2 x 2 sub-pixels"
+    ),
+    "surface": Member(
+        "exr", 3, 2, None, "all", "cosine of normal and view, roughness, metallic of the surfels, likewise"
+    ),
     "mask": _scalar("opacity of the surfels in [0, 1]", "all"),
     "foreground": Member("png", 1, 1, None, "all", "1 where the pixel-centre ray meets true geometry"),
     "lit_supersampled": _light("lit, on 2 x 2 sub-pixels", "reference"),
@@ -101,9 +108,14 @@ def clip_members(reference: bool) -> tuple[str, ...]:
 
 
 def light_members() -> tuple[str, ...]:
-    """Names of the guidance in colour, which tron-relight writes and networks may be given."""
+    """Names of the guidance that is light."""
+    return tuple(name for name in guidance_members() if MEMBERS[name].color_space == "linear")
+
+
+def guidance_members() -> tuple[str, ...]:
+    """Names of the guidance, which networks may be given: light, and what surfaces are under any light."""
     return tuple(
-        name for name in clip_members(reference=False) if MEMBERS[name].color_space and name != TARGET
+        name for name in clip_members(reference=False) if MEMBERS[name].channels == 3 and name != TARGET
     )
 
 
@@ -203,14 +215,35 @@ class Clip:
         """Whether a member is display-encoded already, as photographs are."""
         return self.meta.color_space.get(member, MEMBERS[member].color_space) == "display"
 
+    def space(self, member: str) -> ColorSpace | None:
+        """Colour space of a member: what the metadata say, else what the schema says."""
+        own = self.meta.color_space.get(member)
+        return MEMBERS[member].color_space if own is None else own
+
     def exposed(self, member: str) -> np.ndarray:
-        """(K, H, W, 3) linear under the clip's exposure, ready for AgX; display values as they are."""
+        """(K, H, W, C), light under the clip's exposure, ready for :func:`encoded`; the rest as it is."""
         image = self.frames[member]
-        return image if self.is_display(member) else image * np.float32(self.meta.exposure)
+        return image * np.float32(self.meta.exposure) if self.space(member) == "linear" else image
 
     def displayed(self, member: str) -> np.ndarray:
-        """(K, H, W, 3) in [0, 1] as a screen shows it: exposure, then AgX, unless it is display-encoded."""
-        return self.exposed(member) if self.is_display(member) else agx(self.exposed(member))
+        """(K, H, W, 3) in [0, 1] as a screen and a network see it: exposure, then :func:`encoded`."""
+        return encoded(self.exposed(member), self.space(member))
+
+
+def encoded(image: Any, space: ColorSpace | None, axis: int = -1) -> Any:
+    """Exposed values -> what a screen and a network see, in [0, 1], arrays and tensors alike.
+
+    Light by AgX, reflectance by the sRGB curve, the rest as it is.
+    """
+    if space == "linear":
+        return agx(image, axis=axis)
+    return linear_to_srgb(image.clip(0, 1)) if space == "reflectance" else image
+
+
+def displayed(member: str, image: np.ndarray, exposure: float) -> np.ndarray:
+    """A member of guidance as a screen and a network see it, (..., 3) in [0, 1]."""
+    space = MEMBERS[member].color_space
+    return encoded(exposure * image if space == "linear" else image, space)
 
 
 def require_schema(version: int, where: str | Path) -> None:

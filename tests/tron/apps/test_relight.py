@@ -20,7 +20,7 @@ from tron.images import read_image
 from tron.seeds import generator
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance
-from tron.shards.schema import GUIDANCE
+from tron.shards.schema import GUIDANCE, guidance_members
 from tron.tracing.surface import Surface
 
 SIZE = 32
@@ -53,7 +53,7 @@ def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, 
 
 
 def test_every_buffer_of_the_help_is_made_and_all_guidance_is_written_by_default():
-    shaded = {"foreground", "share", "relit"}
+    shaded = {"foreground", "share", "relit", *guidance_members()}
     assert set(BUFFERS) <= {field.name for field in fields(Surface)} | set(Guidance.BUFFERS) | shaded
     assert set(Guidance.BUFFERS) <= set(DEFAULT_BUFFERS)
     assert all(name in (Settings.model_fields["buffers"].description or "") for name in BUFFERS)

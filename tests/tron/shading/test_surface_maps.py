@@ -1,0 +1,32 @@
+"""Maps of what surfaces are, on a sphere above a plane that is traced in closed form."""
+
+import numpy as np
+
+from tron.shading.surface_maps import surface_maps
+
+
+def test_maps_are_materials_and_slope_inside_surfaces_and_nothing_outside(
+    variant: str, sphere_over_plane, camera
+) -> None:
+    maps = surface_maps(sphere_over_plane(base_color=0.6, metallic=0.25), camera)
+    assert {name: image.shape for name, image in maps.items()} == dict.fromkeys(maps, (48, 48, 3))
+    covered = maps["albedo"][..., 0] / 0.6
+    inside, outside = covered > 0.999, covered == 0
+    assert inside.sum() > 500
+    assert outside.sum() > 100
+    np.testing.assert_allclose(maps["surface"][inside][:, 1:], [[0.5, 0.25]] * inside.sum(), atol=1e-5)
+    assert not maps["surface"][outside].any()
+
+
+def test_slope_is_the_cosine_of_normal_and_view(variant: str, sphere_over_plane, camera) -> None:
+    """On the plane z = 0 it is -z of the ray, averaged over the four sub-pixels."""
+    slope = surface_maps(sphere_over_plane(sphere=False), camera)["surface"][..., 0]
+    rays = camera.resized(96, 96).rays()[..., 2].reshape(48, 2, 48, 2).mean((1, 3))
+    inside = surface_maps(sphere_over_plane(sphere=False), camera)["albedo"][..., 0] > 0.999
+    np.testing.assert_allclose(slope[inside], -rays[inside], atol=1e-5)
+
+
+def test_a_pixel_at_an_edge_has_the_share_that_is_covered(variant: str, sphere_over_plane, camera) -> None:
+    covered = surface_maps(sphere_over_plane(), camera)["albedo"][..., 0]
+    shares = np.unique(covered.round(4))
+    assert set(shares) == {0.0, 0.25, 0.5, 0.75, 1.0}
