@@ -42,8 +42,9 @@ class NeuralRenderer(Renderer):
         latents = len(self.config.guidance) if self.config.fusion == "concat" else 1
         shape = self.config.backbone
         kind = UNet if isinstance(shape, UNetConfig) else Backbone
-        predicted = channels + self.config.skip_kernel**2
-        self.backbone: Backbone | UNet = kind(shape, latents * channels, predicted)  # type: ignore[arg-type]
+        detail = 0 if self.config.skip_detail is None else channels
+        self._predicted = [channels, self.config.skip_kernel**2, detail]
+        self.backbone: Backbone | UNet = kind(shape, latents * channels, sum(self._predicted))  # type: ignore[arg-type]
 
     def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:
         """As Renderer.forward, with 1 + temporal_factor * n frames of any H and W.
@@ -65,12 +66,14 @@ class NeuralRenderer(Renderer):
             change = self.backbone(fused, PLAIN_TIMESTEP)
         else:
             change = -t * self.backbone((1 - t) * fused, t).float()
-        change, kernels = change.split([mean.shape[1], self.config.skip_kernel**2], 1)
+        change, kernels, shares = change.split(self._predicted, 1)
         if self.config.skip == MEAN:
             start = mean
+        elif self.config.skip_kernel:
+            start = self._refiltered(videos, kernels, shares)
         else:
             index = self.config.guidance.index(self.config.skip)
-            start = self._filtered(videos[index], kernels) if self.config.skip_blur else latents[index]
+            start = self._blurred(videos[index]) if self.config.skip_blur else latents[index]
         # The difference of two nearly equal numbers in bf16 would lose the picture: in float32 there.
         drawn = start + change if t is None else (1 - t) * start.float() + change
         return self.codec.decode(drawn)[..., :height, :width]
@@ -105,13 +108,22 @@ class NeuralRenderer(Renderer):
             self.check_weights(weights)
         return [len(guidance) * weights[name] for name in guidance]
 
-    def _filtered(self, video: Tensor, kernels: Tensor) -> Tensor:
-        """Latents of the start, filtered by the Gaussian, or by kernels that the backbone changes it to."""
-        side = self.config.skip_kernel
-        blur = gaussian_logits(self.config.skip_blur, side or BLUR_SIDE).to(video)
-        if side:
-            return filtered(video, (blur[:, None, None, None] + kernels).softmax(1))
+    def _blurred(self, video: Tensor) -> Tensor:
+        """Latents of the start, filtered by the Gaussian."""
+        blur = gaussian_logits(self.config.skip_blur, BLUR_SIDE).to(video)
         return self.codec.encode(filtered(video, blur.softmax(0)))
+
+    def _refiltered(self, videos: list[Tensor], kernels: Tensor, shares: Tensor) -> Tensor:
+        """The start, filtered by kernels that the backbone changes the Gaussian to, and detail given back."""
+        names, config = self.config.guidance, self.config
+        start = videos[names.index(config.skip)]
+        blur = gaussian_logits(config.skip_blur, config.skip_kernel).to(start)
+        weights = (blur[:, None, None, None] + kernels).softmax(1)
+        if config.skip_detail is None:
+            return filtered(start, weights)
+        sharp = videos[names.index(config.skip_detail)]
+        smooth, blunt = filtered(torch.cat([start, sharp], 1), weights).chunk(2, 1)
+        return smooth + shares * (sharp - blunt)
 
     def _padded(self, video: Tensor) -> Tensor:
         block = self.codec.space_block

@@ -31,6 +31,7 @@ from tron.neural.pixel_mlp import PixelMLP
 from tron.neural.protocols import Codec, Renderer
 from tron.neural.published_files import existing, folder_state, load_strictly, safetensors_state, torch_state
 from tron.neural.renderer import NeuralRenderer
+from tron.neural.widening import widened
 from tron.storage import write_atomic
 
 log = logging.getLogger(__name__)
@@ -81,16 +82,32 @@ def load_renderer(path: str | Path, vae: str | Path | None = None) -> Renderer:
 def restore_renderer(path: str | Path, renderer: Renderer) -> None:
     """Put the weights that `save_renderer` wrote into a renderer of the same configuration.
 
-    A renderer with paths between frames also takes the weights of one without them: a warm start, from what
-    that one draws. TronError names the first weight that is missing, unknown or of another shape.
+    A renderer with paths between frames also takes the weights of one without them, a U-Net those of one that
+    is given fewer buffers: a warm start, from what that one draws. TronError names the first weight that is
+    missing, unknown or of another shape.
     """
     path = Path(path)
-    state = _read(path)[0]
+    state, metadata = _read(path)
+    if isinstance(renderer, NeuralRenderer) and (given := _config(metadata)) is not None:
+        wider = widened(state, given, renderer)
+        if wider is not state:
+            new = [name for name in renderer.config.guidance if name not in given.guidance]
+            log.info("%s was not given %s: their weights start from zero", path, ", ".join(new))
+        state = wider
     temporal = renderer.temporal_weights()
     if temporal and not set(temporal) & set(state):
         log.info("%s was trained on single frames: the paths between frames start from zero", path)
         state |= {name: parameter.detach() for name, parameter in temporal.items()}
     load_strictly(renderer, state, path)
+
+
+def _config(metadata: Mapping[str, str]) -> RendererConfig | None:
+    """Configuration of a NeuralRenderer's file; None where it says none, or another's."""
+    try:
+        header = json.loads(metadata.get(METADATA_KEY, "{}"))
+        return RendererConfig.model_validate(header["config"]) if header["kind"] == "neural" else None
+    except (ValueError, KeyError, TypeError):
+        return None
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -76,6 +76,16 @@ def test_kernels_are_learnt_and_travel_with_the_weights(tmp_path):
     assert torch.equal(loaded(given), made(given))
 
 
+def test_detail_of_a_buffer_is_given_back_in_the_share_that_the_network_predicts():
+    """Shares of one everywhere: the filtered start, and all that the filter took from the buffer."""
+    made, given = renderer(skip_blur=0.6, skip_kernel=5, skip_detail="pbr"), buffers()
+    blur = gaussian_logits(0.6, 5).softmax(0)
+    torch.testing.assert_close(made(given), filtered(given["lit"], blur), msg="none at first")
+    made.backbone.get_parameter("out.bias").data.view(4, 31)[:, 28:] = 1.0  # four sub-pixels of a patch
+    detail = given["pbr"] - filtered(given["pbr"], blur)
+    torch.testing.assert_close(made(given), filtered(given["lit"], blur) + detail)
+
+
 def test_kernels_do_not_see_other_frames():
     made, given = renderer(skip_blur=0.6, skip_kernel=3), buffers(2)
     torch.nn.init.normal_(made.backbone.get_parameter("out.weight"), std=0.1)
@@ -91,6 +101,8 @@ def test_kernels_do_not_see_other_frames():
         ({"skip_kernel": 3, "skip_blur": 0.6, "codec": "block_dct"}, "codec=pixels"),
         ({"skip_kernel": 4, "skip_blur": 0.6, "codec": "pixels"}, "skip_kernel"),
         ({"skip_blur": -1.0}, "skip_blur"),
+        ({"skip_detail": "pbr"}, "skip_kernel"),
+        ({"skip_kernel": 3, "skip_blur": 0.6, "codec": "pixels", "skip_detail": "albedo"}, "one of guidance"),
     ],
 )
 def test_filters_that_make_no_sense_are_refused(config: dict, said: str):

@@ -11,6 +11,7 @@ from tron.neural.configs import RendererConfig, UNetConfig, UNetRendererConfig
 from tron.neural.renderer import NeuralRenderer
 from tron.neural.unet import UNet, _gathered, _spread
 from tron.neural.weights import load_renderer, restore_renderer, save_renderer
+from tron.neural.widening import FIRST, LAST
 from tron.shards.schema import GUIDANCE, TARGET
 
 SMALL = UNetConfig(widths=(8, 12, 16), blocks=(1, 1, 1), blocks_up=(1, 1))
@@ -173,6 +174,24 @@ def test_a_window_starts_from_the_weights_of_single_frames(tmp_path, caplog):
     assert "start from zero" in caplog.text
     given = buffers(5)
     torch.testing.assert_close(renderer(given), saved(given), atol=1e-6, rtol=0)
+
+
+def test_more_buffers_start_from_the_weights_of_fewer(tmp_path, caplog):
+    """The picture is that of the network that was given fewer, until it learns what new ones are worth."""
+    filtering = {"codec": "pixels", "backbone": SMALL, "skip_blur": 0.6, "skip_kernel": 3}
+    saved = shaken(NeuralRenderer(RendererConfig(guidance=("irradiance", "lit"), **filtering)))
+    save_renderer(tmp_path / "fewer.safetensors", saved)
+    names = ("lit", "albedo", "irradiance", "surface")
+    config = UNetRendererConfig(guidance=names, skip_detail="albedo", **filtering)
+    renderer = shaken(NeuralRenderer(config))
+    with caplog.at_level(logging.INFO):
+        restore_renderer(tmp_path / "fewer.safetensors", renderer)
+    assert "not given albedo, surface" in caplog.text
+    random = torch.Generator().manual_seed(3)
+    given = {name: torch.rand(2, 3, 1, 16, 16, generator=random) * 2 - 1 for name in names}
+    torch.testing.assert_close(renderer(given), saved(given), atol=1e-5, rtol=0)
+    renderer(given).square().mean().backward()
+    assert all((renderer.get_parameter(name).grad != 0).any() for name in (FIRST, *LAST))
 
 
 def test_the_rest_of_a_warm_start_is_strict(tmp_path):
