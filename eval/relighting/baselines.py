@@ -15,6 +15,9 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 - ``affine_lit``: affine_ratio with D(L) as a fourth input.
 - ``lit_filtered``: D(L) filtered by a Gaussian, whose deviation is fitted: L is sampled once in a pixel, the
   truth is a mean over it.
+- ``lit_remodulated``: D(A G(L / A)), G a Gaussian whose deviation is fitted, A the surfels' base color as
+  a mean over sub-pixels: ``albedo``.
+- ``lit_detailed``: an affine blend of G(D(L)), G(S(A)) and S(A), S being the sRGB curve.
 - ``affine_filtered``, ``affine_ratio_filtered``, ``affine_lit_filtered``: the blends of images so filtered.
 - ``pixel_mlp``, ``pixel_mlp_lit``: 1x1 convolutions on D(B) and D(E), or on these and D(L).
 
@@ -35,6 +38,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -47,6 +51,8 @@ from eval.relighting.fits import (
     GaussianFit,
     ProductFit,
     Show,
+    filtered,
+    remodulated,
 )
 from tron.color import to_display
 from tron.errors import TronError
@@ -85,6 +91,11 @@ def show_irradiance(buffers: Buffers) -> np.ndarray:
 def show_lit(buffers: Buffers) -> np.ndarray:
     """D(L)."""
     return buffers.displayed("lit")
+
+
+def show_albedo(buffers: Buffers) -> np.ndarray:
+    """Base color of the surfels by the sRGB curve."""
+    return buffers.displayed("albedo")
 
 
 def show_shadow_ratio(buffers: Buffers) -> np.ndarray:
@@ -216,8 +227,25 @@ BASELINES = (
         "lit_filtered",
         "lit, filtered",
         "lit filtered by one Gaussian, whose deviation is fitted",
-        fit=lambda: GaussianFit(show_lit),
+        fit=lambda: GaussianFit(partial(filtered, show_lit)),
         groups=(ON_LIT,),
+    ),
+    Baseline(
+        "lit_remodulated",
+        "lit, filtered without its texture",
+        "lit over base color, filtered by one fitted Gaussian, times base color",
+        fit=lambda: GaussianFit(remodulated),
+        groups=(ON_LIT,),
+        pictured=False,
+    ),
+    Baseline(
+        "lit_detailed",
+        "lit, filtered, with the detail of albedo",
+        "fitted blend of lit and albedo, both filtered by one fitted Gaussian, and of albedo as it is",
+        fit=lambda: FilteredAffineFit(show_lit, sharp=[show_albedo]),
+        surfaces=True,
+        groups=(ON_LIT,),
+        pictured=False,
     ),
     Baseline(
         "affine_lit",

@@ -6,7 +6,7 @@ dB off.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -14,12 +14,14 @@ import scipy.ndimage
 import scipy.optimize
 
 from eval.relighting.buffers import Buffers
-from tron.color import agx
+from tron.color import agx, to_display
 
 Show = Callable[[Buffers], np.ndarray]
 """Buffers of any pixels (whole frames where neighbours count) -> display in [0, 1], (..., 3) float32."""
 DEVIATIONS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.3)
 """Of the Gaussians that fits choose from, in pixels."""
+FAINTEST = 0.02
+"""Base color that light is divided by at least: no common material reflects less."""
 
 
 class Fitted(NamedTuple):
@@ -155,13 +157,31 @@ def filtered(show: Show, deviation: float) -> Show:
     return shown
 
 
+def remodulated(deviation: float) -> Show:
+    """Lit without its base color, filtered by a Gaussian in linear light, and with base color again.
+
+    What a denoiser does with the buffers that it is given: the texture of ``albedo`` stays sharp. Base colors
+    below FAINTEST count as that.
+    """
+
+    def shown(buffers: Buffers) -> np.ndarray:
+        base = np.maximum(buffers["albedo"], FAINTEST)
+        light = scipy.ndimage.gaussian_filter(
+            buffers["lit"] / base, (0, deviation, deviation, 0), mode="nearest", truncate=4
+        )
+        return to_display(light * base, buffers.exposure)
+
+    return shown
+
+
 class GaussianFit:
     """A method filtered by the Gaussian of DEVIATIONS with the least squared error; needs whole clips."""
 
     sampled: ClassVar[bool] = False
 
-    def __init__(self, show: Show):
-        self._shown = {deviation: filtered(show, deviation) for deviation in DEVIATIONS}
+    def __init__(self, filtered_by: Callable[[float], Show]):
+        """filtered_by: deviation -> the method filtered by it."""
+        self._shown = {deviation: filtered_by(deviation) for deviation in DEVIATIONS}
         self._errors = dict.fromkeys(DEVIATIONS, 0.0)
 
     def add(self, buffers: Buffers, truth: np.ndarray, inside: Any = ...) -> None:
@@ -178,13 +198,17 @@ class GaussianFit:
 
 
 class FilteredAffineFit:
-    """An AffineFit of inputs that the best Gaussian of DEVIATIONS filtered first; needs whole clips."""
+    """An AffineFit of inputs that the best Gaussian of DEVIATIONS filtered first; needs whole clips.
+
+    ``sharp`` inputs are taken as they are besides: less what the Gaussian leaves of them they are detail.
+    """
 
     sampled: ClassVar[bool] = True
 
-    def __init__(self, *inputs: Show):
+    def __init__(self, *inputs: Show, sharp: Sequence[Show] = ()):
         self._fits = {
-            deviation: AffineFit(*(filtered(show, deviation) for show in inputs)) for deviation in DEVIATIONS
+            deviation: AffineFit(*(filtered(show, deviation) for show in (*inputs, *sharp)), *sharp)
+            for deviation in DEVIATIONS
         }
 
     def add(self, buffers: Buffers, truth: np.ndarray, inside: Any = ...) -> None:

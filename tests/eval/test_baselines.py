@@ -1,5 +1,7 @@
 """Each baseline's law, on images whose answer is known."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -14,9 +16,10 @@ from eval.relighting.fits import (
     ProductFit,
     Show,
     filtered,
+    remodulated,
     show_product,
 )
-from tron.color import agx
+from tron.color import agx, to_display
 from tron.seeds import generator
 
 
@@ -155,7 +158,7 @@ def pictures(*names: str) -> Buffers:
 def test_the_gaussian_that_made_the_truth_is_found_from_some_of_the_pixels(deviation: float):
     buffers = pictures("pbr")
     truth = filtered(FIRST, deviation)(buffers)
-    fit = GaussianFit(FIRST)
+    fit = GaussianFit(partial(filtered, FIRST))
     inside = np.nonzero(generator(1, "inside").random(truth.shape[:3]) < 0.4)
     broken = truth.copy()
     broken[np.setdiff1d(np.arange(3), inside[0])] = 9
@@ -192,3 +195,30 @@ def test_the_error_of_a_blend_is_that_of_its_picture():
     buffers = guided(first, second)
     fit.add(buffers, truth)
     assert fit.error() == pytest.approx(np.sum((fit.solve().show(buffers) - truth) ** 2), rel=1e-4)
+
+
+def test_light_on_a_texture_is_filtered_and_the_texture_stays():
+    """Noise of the light goes, a checkerboard does not; a plain Gaussian has to choose."""
+    buffers = pictures("lit", "albedo")
+    texture = np.where(np.indices((20, 24)).sum(0) % 2, 0.9, 0.1)[..., None] * np.ones(3)
+    buffers["albedo"][:] = texture
+    buffers["lit"][:] = texture * (1 + 0.5 * (buffers["lit"] - 0.5))
+    truth = to_display(np.broadcast_to(texture, buffers["lit"].shape), 1.0)
+    errors = {}
+    for name, fit in (
+        ("plain", GaussianFit(partial(filtered, lambda given: given.displayed("lit")))),
+        ("remodulated", GaussianFit(remodulated)),
+    ):
+        fit.add(buffers, truth)
+        errors[name] = np.mean((fit.solve().show(buffers) - truth) ** 2)
+    assert errors["remodulated"] < 0.1 * errors["plain"]
+    assert GaussianFit(remodulated).solve().weights == DEVIATIONS[0], "nothing added: the first"
+
+
+def test_a_filtered_blend_takes_detail_from_a_sharp_input():
+    buffers = pictures("pbr", "irradiance")
+    smooth = filtered(FIRST, 0.7)(buffers)
+    truth = 0.8 * smooth + 0.4 * (SECOND(buffers) - filtered(SECOND, 0.7)(buffers)) + 0.1
+    fit = FilteredAffineFit(FIRST, sharp=[SECOND])
+    fit.add(buffers, truth, np.nonzero(np.ones(truth.shape[:3])))
+    np.testing.assert_allclose(fit.solve().weights, [[0.8, -0.4, 0.4, 0.1]] * 3, atol=1e-5)
