@@ -11,7 +11,7 @@ from tron.errors import TronError
 
 FOLDER = Path(__file__).with_name("shipped")
 SHIPPED = {
-    "lit": "of pbr, irradiance and lit",
+    "lit": "of pbr, irradiance, lit, albedo and surface",
     "pair": "of pbr and irradiance, the paper's buffers",
 }
 """Name -> what the network is given."""

@@ -14,7 +14,7 @@ def test_a_shipped_checkpoint_is_given_what_its_name_says_and_has_a_card(name: s
     assert set(load_renderer(path).config.guidance) == {
         "pbr",
         "irradiance",
-        *(["lit"] if name == "lit" else []),
+        *(["lit", "albedo", "surface"] if name == "lit" else []),
     }
     assert path.stat().st_size < 8_000_000
     _, _, card = (shipped.FOLDER / "README.md").read_text().partition(f"## `{name}`")
