@@ -78,9 +78,8 @@ class Datasets:
         splits = ",".join(f'{name}: "{others[kind]}#{split}"' for name, (kind, split) in placed.items())
         common = [*recipes.recipe, f"dataset={data}"]
         common += [f"splits={{{splits}}}"] if splits else []
-        if self.settings.max_seconds is not None:
-            common.append(f"max_seconds={self.settings.max_seconds:g}")
-        arguments = {f"trained_{kind}": [*common, *own] for kind, own in recipes.own.items()}
+        limit = [] if self.settings.max_seconds is None else [f"max_seconds={self.settings.max_seconds:g}"]
+        arguments = {f"trained_{kind}": [*common, *own, *limit] for kind, own in recipes.own.items()}
         made = self.train("training", arguments, len(arguments))
         return {kind: made[f"trained_{kind}"] for kind in recipes.own}
 
