@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -167,6 +167,7 @@ def trace(
     if not all(clip.folder.finished(index) for clip in clips for index in range(len(cameras))):
         lit.prepare()
     for index, camera in enumerate(track(cameras, "guidance")):
+        surfaces = cache(partial(_surface_maps, lit, camera))  # alike under all lights
         for clip in clips:
             if not clip.folder.finished(index):
                 started = time.perf_counter()
@@ -178,6 +179,7 @@ def trace(
                     lighting,
                     bounced(camera),
                     clip.folder.buffers,
+                    surfaces,
                     estimation,
                     ray_seed,
                 )
@@ -186,20 +188,26 @@ def trace(
             clip.write_pictures(index)
 
 
+def _surface_maps(scene: LitScene, camera: Camera) -> dict[str, np.ndarray]:
+    from tron.shading.surface_maps import surface_maps
+
+    return surface_maps(scene.tracer(camera), camera)
+
+
 def _shade(
     tracer: SurfelTracer,
     camera: Camera,
     lighting: Lighting,
     bounce: BouncedLight | None,
     names: Sequence[str],
+    surfaces: Callable[[], dict[str, np.ndarray]],
     estimation: Estimation,
     seed: int,
 ) -> dict[str, np.ndarray]:
-    """The buffers ``names`` of one frame."""
+    """The buffers ``names`` of one frame; ``surfaces`` gives those that no light shines on."""
     from tron.shading.background import background_share
     from tron.shading.guidance import arriving_light, shade, trace_view
     from tron.shading.supersampling import averaged
-    from tron.shading.surface_maps import surface_maps
 
     view = trace_view(tracer, camera, estimation, bounce)
     arriving = arriving_light(tracer, view, lighting, estimation, seed, bounce)
@@ -209,7 +217,7 @@ def _shade(
     share = averaged(background_share(transmittance), estimation.supersample)
     made = guidance.gbuffer | vars(guidance) | {"share": share.astype(np.float32)}
     if not {"albedo", "surface"}.isdisjoint(names):
-        made |= surface_maps(tracer, camera)
+        made |= surfaces()
     if "foreground" in names:
         over_black = shade(view, arriving, lighting, (0, 0, 0), estimation).lit
         made["foreground"] = surfels_alone(over_black, made["share"])

@@ -31,13 +31,16 @@ def widened(state: dict[str, Tensor], narrow: RendererConfig, wide: NeuralRender
     ):
         return state
     channels, area = wide.codec.latent_channels, shape.patch**2
+    columns, rows = area * len(narrow.guidance) * channels, wide.state_dict()
+    whole = {FIRST, *LAST} <= state.keys() and state[FIRST].shape == (rows[FIRST].shape[0], columns)
+    if not whole or any(state[name].shape[0] % area for name in LAST):
+        return state  # damaged: whoever loads it says where
     # Columns and rows of each pixel of a patch lie together: of a column block for each buffer, in order.
     old = state[FIRST].unflatten(1, (area, len(narrow.guidance), channels))
     new = old.new_zeros(*old.shape[:2], len(config.guidance), channels)
     for place, name in enumerate(narrow.guidance):
         new[:, :, config.guidance.index(name)] = old[:, :, place]
     grown = {FIRST: new.flatten(1)}
-    rows = wide.state_dict()
     for name in LAST:
         old = state[name].unflatten(0, (area, -1))
         new = old.new_zeros(area, rows[name].shape[0] // area, *old.shape[2:])

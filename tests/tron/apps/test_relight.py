@@ -20,7 +20,7 @@ from tron.images import read_image
 from tron.seeds import generator
 from tron.shading.environment import EnvironmentMap
 from tron.shading.guidance import Guidance
-from tron.shards.schema import GUIDANCE, guidance_members
+from tron.shards.schema import GUIDANCE
 from tron.tracing.surface import Surface
 
 SIZE = 32
@@ -53,10 +53,23 @@ def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, 
 
 
 def test_every_buffer_of_the_help_is_made_and_all_guidance_is_written_by_default():
-    shaded = {"foreground", "share", "relit", *guidance_members()}
+    shaded = {"foreground", "share", "relit", "albedo", "surface"}
     assert set(BUFFERS) <= {field.name for field in fields(Surface)} | set(Guidance.BUFFERS) | shaded
     assert set(Guidance.BUFFERS) <= set(DEFAULT_BUFFERS)
     assert all(name in (Settings.model_fields["buffers"].description or "") for name in BUFFERS)
+
+
+def test_maps_of_surfaces_are_written_where_they_are_asked_for(relight, scene_path, light_path, tmp_path):
+    """In the middle of the ball they are the G-buffer's; where no surfel is, nothing."""
+    names = ("albedo", "surface", "base_color", "roughness")
+    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={tmp_path / 'out'}"]
+    assert relight(*base, "frames=1", "checkpoint=null", f"buffers=[{','.join(names)}]") == 0
+    maps = {name: read_image(tmp_path / "out" / "frames" / f"0000.{name}.exr") for name in names}
+    middle = {name: image[SIZE // 2, SIZE // 2] for name, image in maps.items()}
+    np.testing.assert_allclose(middle["albedo"], middle["base_color"], atol=0.03)
+    assert middle["surface"][0] > 0.8
+    assert middle["surface"][1] == pytest.approx(middle["roughness"][0], abs=0.03)
+    assert not maps["albedo"][0, 0].any()
 
 
 def test_the_papers_fidelity_gives_other_frames(relight, scene_path, light_path, tmp_path):
