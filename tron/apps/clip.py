@@ -23,7 +23,7 @@ from tron.gaussians.scene import GaussianScene
 from tron.images import write_image
 from tron.neural.reprojection import averaged_frames
 from tron.neural.windows import Overlap
-from tron.shards.schema import GUIDANCE, displayed
+from tron.shards.schema import GUIDANCE, displayed, surface_members
 
 if TYPE_CHECKING:
     from tron.apps.lit_scene import Bounced, LitScene
@@ -216,7 +216,7 @@ def _shade(
     transmittance = 1 - view.images({"opacity": view.opacity})["opacity"]
     share = averaged(background_share(transmittance), estimation.supersample)
     made = guidance.gbuffer | vars(guidance) | {"share": share.astype(np.float32)}
-    if not {"albedo", "surface"}.isdisjoint(names):
+    if not set(names).isdisjoint(surface_members()):
         made |= surfaces()
     if "foreground" in names:
         over_black = shade(view, arriving, lighting, (0, 0, 0), estimation).lit

@@ -112,6 +112,11 @@ def light_members() -> tuple[str, ...]:
     return tuple(name for name in guidance_members() if MEMBERS[name].color_space == "linear")
 
 
+def surface_members() -> tuple[str, ...]:
+    """Names of the guidance that is under no light (:func:`tron.shading.surface_maps.surface_maps`)."""
+    return tuple(name for name in guidance_members() if MEMBERS[name].color_space != "linear")
+
+
 def guidance_members() -> tuple[str, ...]:
     """Names of the guidance, which networks may be given: light, and what surfaces are under any light."""
     return tuple(

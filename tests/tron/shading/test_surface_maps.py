@@ -3,13 +3,16 @@
 import numpy as np
 
 from tron.shading.surface_maps import surface_maps
+from tron.shards.schema import surface_members
 
 
 def test_maps_are_materials_and_slope_inside_surfaces_and_nothing_outside(
     variant: str, sphere_over_plane, camera
 ) -> None:
     maps = surface_maps(sphere_over_plane(base_color=0.6, metallic=0.25), camera)
-    assert {name: image.shape for name, image in maps.items()} == dict.fromkeys(maps, (48, 48, 3))
+    assert {name: image.shape for name, image in maps.items()} == dict.fromkeys(
+        surface_members(), (48, 48, 3)
+    )
     covered = maps["albedo"][..., 0] / 0.6
     inside, outside = covered > 0.999, covered == 0
     assert inside.sum() > 500
