@@ -1,5 +1,7 @@
 """Maps of what surfaces are, on a sphere above a plane that is traced in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from tron.shading.surface_maps import surface_maps
@@ -33,3 +35,14 @@ def test_a_pixel_at_an_edge_has_the_share_that_is_covered(variant: str, sphere_o
     covered = surface_maps(sphere_over_plane(), camera)["albedo"][..., 0]
     shares = np.unique(covered.round(4))
     assert set(shares) == {0.0, 0.25, 0.5, 0.75, 1.0}
+
+
+def test_surfels_count_by_their_opacity(variant: str, sphere_over_plane, camera) -> None:
+    class Thin(sphere_over_plane):
+        def gbuffer(self, camera):
+            seen = super().gbuffer(camera)
+            return replace(seen, opacity=0.25 * seen.opacity)
+
+    thin, solid = (surface_maps(each(), camera) for each in (Thin, sphere_over_plane))
+    for name in solid:
+        np.testing.assert_allclose(thin[name], 0.25 * solid[name], atol=1e-6)
