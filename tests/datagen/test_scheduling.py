@@ -50,27 +50,31 @@ def test_workers_are_replaced_one_by_one_and_a_scene_that_hangs_or_kills_is_name
         if kind == "kills" or (kind == "stumbles" and not marker.exists()):
             marker.touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        time.sleep(7.0 if kind == "slow" else 0.1)
         if kind == "fails":
             raise ValueError("no such shape")
+        if kind == "quick":
+            marker.touch()
+        # More than one worker makes before it is replaced; how long a new one takes to start is the machine's affair.
+        while kind == "slow" and len(list(settings.output_dir.glob("quick-*"))) < 3:
+            time.sleep(0.05)
         return os.getpid(), begun, time.time()
 
     others = ["hangs-0", "fails-0", "kills-0", "stumbles-0", "quick-6"]
     names = ["slow-0", *(f"quick-{i}" for i in range(6)), *others]
-    settings = settings_of(tmp_path, "workers=2", "recycle_after=2", "scene_timeout=20")
+    settings = settings_of(tmp_path, "workers=2", "recycle_after=2", "scene_timeout=30")
     found = {item.name: each for item, each in attempts(task, works(*names), settings, Sources())}
     assert sorted(found) == sorted(names)
 
     failed = {name: each.outcome for name, each in found.items() if isinstance(each.outcome, Failure)}
     assert sorted(failed) == ["fails-0", "hangs-0", "kills-0"]
     assert failed["fails-0"].reason == "ValueError: no such shape"
-    assert failed["hangs-0"].reason.startswith("took longer than scene_timeout=20 s on tcp://")
+    assert failed["hangs-0"].reason.startswith("took longer than scene_timeout=30 s on tcp://")
     assert "in task" in failed["hangs-0"].traceback, "where it hung"
     assert failed["kills-0"].reason == "worker lost: 3 workers ended while they made it"
 
     made = {name: each.outcome for name, each in found.items() if not isinstance(each.outcome, Failure)}
     slow, quick = made.pop("slow-0"), [made[f"quick-{i}"] for i in range(6)]
-    meanwhile = {pid for pid, _, ended in quick if ended < slow[2]}
+    meanwhile = {pid for pid, begun, _ in quick if begun < slow[2]}
     assert slow[0] not in meanwhile
     assert len(meanwhile) >= 2, "while one worker is slow another goes on, and is even replaced"
     for process in {pid for pid, _, _ in made.values()}:
