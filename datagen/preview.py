@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tron.color import to_display
+from tron.color import linear_to_srgb, to_display
 from tron.images import write_image
 from tron.shards.schema import MEMBERS, ClipMeta
 
@@ -51,10 +51,10 @@ def shown_as_is(meta: ClipMeta, member: str) -> bool:
 def displayable(member: str, image: np.ndarray) -> np.ndarray:
     """Display values of a member that is no light, (H, W, C) in [0, 1]: no exposure applies to it.
 
-    Base color goes through the square root (near enough to sRGB to look at), normals through (n + 1) / 2.
+    Reflectance goes through the sRGB curve, normals through (n + 1) / 2.
     """
     if member.startswith("base_color") or MEMBERS[member].color_space == "reflectance":
-        image = np.sqrt(np.clip(image, 0.0, 1.0))
+        image = np.asarray(linear_to_srgb(np.clip(image, 0.0, 1.0)), np.float32)
     elif member.startswith("normal"):
         image = np.where(np.abs(image).sum(-1, keepdims=True) > 0, 0.5 * image + 0.5, 0.0)
     return np.clip(image, 0.0, 1.0)

@@ -54,7 +54,7 @@ def test_workers_are_replaced_one_by_one_and_a_scene_that_hangs_or_kills_is_name
             raise ValueError("no such shape")
         if kind == "quick":
             marker.touch()
-        # More than one worker makes before it is replaced; how long a new one takes to start is the machine's affair.
+        # More than one worker makes before it is replaced, however long the next one takes to start.
         while kind == "slow" and len(list(settings.output_dir.glob("quick-*"))) < 3:
             time.sleep(0.05)
         return os.getpid(), begun, time.time()
