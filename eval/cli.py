@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 from tron.cli.command_line import command
 from tron.cli.instantiation import make
 from tron.dataset_folder import DatasetPlace
+from tron.errors import TronError
 from tron.storage import locked
 
 
@@ -50,6 +51,10 @@ def main(settings: Settings) -> int:
     from tron.runtime import describe_machine
 
     benchmark = make(settings.benchmark, "benchmark")
+    for name in ("dataset", "renderer", "pixel_mlp"):
+        if getattr(settings, name) is not None and name not in type(benchmark).model_fields:
+            mend = f"leave it out; tron-eval benchmark={benchmark.name} --help lists what it takes"
+            raise TronError(f"benchmark={benchmark.name} takes no {name}", mend=mend)
     benchmark.check()
     with locked(settings.output_dir):
         try:

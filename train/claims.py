@@ -11,6 +11,7 @@ from train.settings import Settings
 from train.splits import manifest_hash, split_hashes
 from tron.claim import read_recipe, require_same
 from tron.cli.recipes import model_defaults
+from tron.neural.shipped import checkpoint_file
 from tron.storage import sha256, write_atomic
 
 NAME = "config.yaml"
@@ -27,7 +28,9 @@ def described_settings(settings: Settings, processes: int) -> dict[str, Any]:
     described = yaml.safe_load(yaml.safe_dump(settings.model_dump(mode="json")))
     described["dataset_sha256"] = manifest_hash(settings.dataset)
     described["splits_sha256"] = split_hashes(settings.splits)
-    described["start_from_sha256"] = sha256(settings.start_from) if settings.start_from else None
+    described["start_from_sha256"] = (
+        sha256(checkpoint_file(settings.start_from)) if settings.start_from else None
+    )
     described["processes"] = processes
     return described
 

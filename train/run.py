@@ -37,6 +37,7 @@ from tron.cli.instantiation import make
 from tron.errors import TronError
 from tron.neural.losses import RendererLoss
 from tron.neural.protocols import Renderer
+from tron.neural.shipped import checkpoint_file
 from tron.neural.weights import restore_renderer, save_renderer
 from tron.runtime import set_torch_threads
 from tron.storage import locked
@@ -116,7 +117,7 @@ def _make_module(
     for stage in stages:
         require_renderer(stage, renderer)
     if position == Position(0) and settings.start_from is not None:
-        restore_renderer(settings.start_from, renderer)
+        restore_renderer(checkpoint_file(settings.start_from), renderer)
     apply_options(renderer, settings)
     module = RendererModule(renderer, RendererLoss(**settings.loss.model_dump()), settings.optimizer)
     data.open(stages, renderer.config.guidance)

@@ -11,6 +11,7 @@ from train.curriculum import Stage
 from train.memory_settings import MemorySettings
 from train.split_place import SplitPlace
 from tron.dataset_folder import DatasetPlace
+from tron.neural.shipped import SHIPPED
 
 LoggerName = Literal["csv", "tensorboard", "wandb"]
 
@@ -173,8 +174,9 @@ class Settings(BaseModel):
     )
     start_from: Path | None = Field(
         default=None,
-        description="The renderer.safetensors of another run, of the same shape, to begin with; null begins "
-        "with random or published weights.",
+        description="The renderer.safetensors of another run, of the same shape, to begin with, or the "
+        f"name of a shipped checkpoint ({', '.join(SHIPPED)}); null begins with random or published weights.",
+        examples=["lit"],
     )
     stages: list[Stage] = Field(default=THREE_STAGES, min_length=1, description="The curriculum, in order.")
     optimizer: OptimizerSettings = OptimizerSettings()

@@ -24,6 +24,7 @@ from eval.report.charts import training_curves
 from eval.report.outcome import Outcome
 from tron.dataset_folder import DatasetFolder, DatasetPlace, Place
 from tron.errors import TronError
+from tron.neural.shipped import SHIPPED, checkpoint_file
 from tron.runtime import set_torch_threads
 from tron.shards.manifest import Manifest
 from tron.shards.reader import read_clips
@@ -43,7 +44,8 @@ class Relighting(Benchmark):
     dataset: DatasetPlace | None = Field(description="folder that tron-datagen wrote, or its URL")
     renderer: Weights | None = Field(
         default=None,
-        description="weights of the neural renderer, .safetensors; of two, [a,b], one sees lit, one does not",
+        description="weights of the neural renderer, .safetensors, or the name of a shipped checkpoint "
+        f"({', '.join(SHIPPED)}); of two, [a,b], one sees lit, one does not",
     )
     pixel_mlp: Weights | None = Field(default=None, description="weights of the pixel MLP baseline, likewise")
     ood: DatasetPlace | None = Field(
@@ -82,16 +84,21 @@ class Relighting(Benchmark):
             Manifest.load(self.ood).of_split(self.test_split)
         for path in (*(path for _, path in self._weights()), self.vae):
             if path is not None and not path.exists():
-                raise TronError("weights not found", path, "give what tron-train wrote")
+                mend = f"give what tron-train wrote, or one of {', '.join(SHIPPED)}"
+                raise TronError("weights not found", path, mend)
 
     def run(self, output_dir: Path) -> Outcome:
         """Fit on the training splits, score the test split, choose and make the pictures."""
         self.check()
         dataset = self._dataset()
         set_torch_threads(self.threads)
-        for setting in ("renderer", "pixel_mlp"):
-            if getattr(self, setting) is None:
-                log.warning("no %s given: its rows will be absent", setting)
+        if self.renderer is None:
+            log.warning("no renderer given: its rows will be absent")
+        if self.pixel_mlp is None:
+            log.warning(
+                "no pixel_mlp given: its rows will be absent, and so will gains over the best baseline, "
+                "which it may be; tron-train renderer=pixel_mlp makes one"
+            )
         networks = self._networks()
         log.info("fitting the baselines on %s", ", ".join(self.train_splits))
         fitted = fit_baselines(self._training_clips(), self.seed)
@@ -167,7 +174,7 @@ class Relighting(Benchmark):
         """Kind of network and file of all weights that were given."""
         for kind, given in (("neural", self.renderer), ("pixel_mlp", self.pixel_mlp)):
             for path in [given] if isinstance(given, Path) else given or ():
-                yield kind, path
+                yield kind, checkpoint_file(path)
 
     def _networks(self) -> dict[str, Network]:
         """Method -> the network; TronError where two are the same method."""

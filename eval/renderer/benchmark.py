@@ -7,9 +7,9 @@ from pathlib import Path
 
 from eval.renderer import page
 from eval.renderer.datasets import require_data
-from eval.renderer.networks import find_weights
+from eval.renderer.networks import find_weights, load_networks
 from eval.renderer.parts import Found, Parts, worst_family
-from eval.renderer.settings import Part, RendererSettings
+from eval.renderer.settings import Kind, Part, RendererSettings
 from eval.report.outcome import Outcome
 from eval.report.stage_table import stage_section
 from eval.results import Row
@@ -28,7 +28,7 @@ class Renderer(RendererSettings):
     """Parts of the benchmark; data sets and trainings that are finished are not made again."""
 
     def check(self) -> None:
-        """Find the commands, the checkpoints and the data sets that were given."""
+        """Find the commands and the data sets, and read the checkpoints that were given."""
         require_own_packages("datagen", "train")
         for name in ("tron-datagen", "tron-train"):
             script_path(name)
@@ -42,9 +42,11 @@ class Renderer(RendererSettings):
             raise TronError(
                 "no checkpoint to judge", mend="give benchmark.pair or benchmark.lit, or train=true"
             )
-        for given in (self.pair, self.lit):
-            if given is not None:
-                find_weights(given)
+        if self.parts == ["stages"] and not self.training:
+            mend = "give benchmark.training={lit: DIR}, the output_dir of tron-train, or train=true"
+            raise TronError("part stages has no training to judge", mend=mend)
+        given: dict[Kind, str | None] = {"pair": self.pair, "lit": self.lit}
+        load_networks({kind: find_weights(each) for kind, each in given.items() if each is not None})
 
     def run(self, output_dir: Path) -> Outcome:
         """Measure part after part; one line on stderr for each figure.
@@ -62,7 +64,7 @@ class Renderer(RendererSettings):
         for part in self.parts:
             stages = parts.datasets.stages
             stages.restart(f"part {part}")  # a figure of this run, never of one before
-            with stages.timed(f"part {part}", [_typed([part], folder)]):
+            with stages.timed(f"part {part}", [self._typed([part], folder)]):
                 found[part] = parts.measure(part)
                 fresh = [row for each in found[part] for row in each.rows(self.seed)]
             for row in fresh:
@@ -88,7 +90,7 @@ class Renderer(RendererSettings):
                 *stage_section(parts.datasets.stages.records),
             ],
             headline=page.HEADLINE,
-            reproduce=[" ".join(_typed(self.parts, output_dir))],
+            reproduce=[" ".join(self._typed(self.parts, output_dir))],
             inputs=self._inputs(parts),
         )
 
@@ -100,7 +102,22 @@ class Renderer(RendererSettings):
             "settings": self.model_dump(mode="json", exclude={"targets", "what"}),
         }
 
+    def _typed(self, parts: list[Part], output_dir: Path) -> list[str]:
+        """The command that measures parts with what was given: checkpoints, trainings and data sets."""
+        inner = {
+            name: ", ".join(f"{key}: {path}" for key, path in getattr(self, name).items())
+            for name in ("training", "data")
+        }
+        defaults = type(self).model_fields
+        changed = [name for name in ("pair", "lit", "train") if getattr(self, name) != defaults[name].default]
+        given = [
+            *(f"benchmark.{name}={_plain(getattr(self, name))}" for name in changed),
+            *(f"'benchmark.{name}={{{listed}}}'" for name, listed in inner.items() if listed),
+        ]
+        chosen = f"'benchmark.parts=[{','.join(parts)}]'"
+        return ["tron-eval", "benchmark=renderer", chosen, *given, f"output_dir={output_dir}"]
 
-def _typed(parts: list[Part], output_dir: Path) -> list[str]:
-    given = ("benchmark=renderer", f"benchmark.parts=[{','.join(parts)}]", f"output_dir={output_dir}")
-    return ["tron-eval", *given]
+
+def _plain(value: object) -> str:
+    """A value as Hydra reads it."""
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)

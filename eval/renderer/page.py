@@ -15,11 +15,14 @@ LEAD = (
     "A neural renderer makes the final picture of them: one checkpoint of the paper's two buffers, pbr and "
     "irradiance, and one that starts from lit, which is tron-relight's default.",
     "This page judges both on scenes, lights and models that neither was trained on, by a path tracer's "
-    "truth, and holds them against the best picture that the same buffers give without a network: blends and "
-    "factors fitted, by least squares, on the very distribution that judges.",
+    "truth, and holds them against the best picture without a network: filters, blends and factors fitted on "
+    "the very distribution that judges. Rivals of lit may use base color too, as its network does; rivals of "
+    "the pair are given light without shadows besides its two buffers, over which alone there are tiles of "
+    "their own.",
 )
 HEADLINE = {
     "renderer.gain_db": "Pair: gain, held-out scenes",
+    "renderer.gain_over_two_buffers_db": "Pair: gain over its two buffers",
     "renderer.lit.gain_db": "With lit: gain, held-out scenes",
     "renderer.ood_gain_db": "Pair: gain, real models",
     "renderer.lit.ood_gain_db": "With lit: gain, real models",

@@ -12,6 +12,7 @@ from train.cli import main
 from train.module import RendererModule
 from train.settings import Settings
 from tron.errors import TronError
+from tron.neural import shipped
 from tron.neural.pixel_mlp import PixelMLP
 
 PIXELS = {"_target_": "tron.neural.pixel_mlp.PixelMLP"}
@@ -64,6 +65,17 @@ def test_what_a_run_began_with_is_part_of_it(train, first, tmp_path):
         train(tmp_path / "out", stages=STAGES[1:], start_from=tmp_path / "other" / "renderer.safetensors")
     with pytest.raises(TronError, match="a run made with start_from_sha256="):
         train(tmp_path / "out", stages=STAGES[1:])
+
+
+def test_a_checkpoint_of_the_package_is_begun_with_by_its_name(train, first, tmp_path, monkeypatch):
+    (tmp_path / "lit.safetensors").write_bytes(first.read_bytes())
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path)
+    by_path = train(tmp_path / "path", stages=STAGES[1:], start_from=first)
+    by_name = train(tmp_path / "name", stages=STAGES[1:], start_from=Path("lit"))
+    assert all(torch.equal(by_name[name], value) for name, value in by_path.items())
+    (tmp_path / "lit.safetensors").unlink()
+    with pytest.raises(TronError, match="this installation has no checkpoint 'lit'"):
+        train(tmp_path / "absent", stages=STAGES[1:], start_from=Path("lit"))
 
 
 class Malice:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from tron.apps.relight_settings import Settings
 from tron.cli.installation import require_extra
 from tron.errors import TronError
-from tron.neural.shipped import checkpoint_file
+from tron.neural.shipped import DEFAULT, checkpoint_file
 from tron.neural.windows import check_frames
 from tron.runtime import set_torch_threads, torch_device
 from tron.storage import sha256
@@ -23,11 +23,11 @@ log = logging.getLogger(__name__)
 def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     """The settings as they will be followed, and the network on its device, or None without one.
 
-    A checkpoint that was asked for has to fit. The default one gives way with a line in the log: where the
-    libraries of networks or its file are not installed; where nothing bounces and it is given lit; where
-    radiance is asked for, which a network does not draw; and where lit has sub-pixels or rays for reflections
-    (quality=final), for it learnt from single samples and makes finer pictures worse (docs/experiments.md).
-    Where window, overlap, reproject or weights are chosen, it has to fit too.
+    A checkpoint that was asked for has to fit. That of checkpoint=auto gives way with a line in the log:
+    where the libraries of networks or its file are not installed; where nothing bounces and it is given lit;
+    where radiance is asked for, which a network does not draw; and where lit has sub-pixels or rays for
+    reflections (quality=final), for it learnt from single samples and makes finer pictures worse
+    (docs/experiments.md). Where window, overlap, reproject or weights are chosen, it has to fit too.
 
     Raises:
         TronError: the checkpoint is missing, damaged, or does not fit the settings.
@@ -42,9 +42,10 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
         estimation = settings.estimation()
         if estimation.supersample > 1 or estimation.reflections > 0:
             raise TronError(
-                "the default one learnt from single samples a pixel, and this lit is better without it",
-                mend="give checkpoint=FILE to have it all the same",
+                f"{DEFAULT} learnt from single samples a pixel, and this picture is better without it",
+                mend=f"give checkpoint={DEFAULT} to have it all the same",
             )
+        settings = settings.model_copy(update={"checkpoint": Path(DEFAULT)})
         return settings, _loaded(settings)
     except TronError as error:
         if settings.tuned:
@@ -87,6 +88,7 @@ def _loaded(settings: Settings) -> Renderer:
         what = "the network is given lit, which has no bounced light with bounces=0 (fidelity=paper sets it)"
         raise TronError(what, path, "give bounces=4, or take a checkpoint of pbr and irradiance")
     _check_drawing(settings, renderer, path)
+    log.info("Network: checkpoint %s, of %s", settings.checkpoint, ", ".join(renderer.config.guidance))
     return renderer.to(torch_device(settings.variant))
 
 

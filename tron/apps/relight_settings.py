@@ -13,7 +13,7 @@ from tron.apps.relit import Background
 from tron.errors import TronError
 from tron.estimation import FINAL, FINEST, PREVIEW, Estimation, Estimator, require_bounces
 from tron.neural.configs import check_sizes
-from tron.neural.shipped import DEFAULT, SHIPPED
+from tron.neural.shipped import AUTO, DEFAULT, SHIPPED
 from tron.neural.windows import Overlap
 from tron.shards.schema import guidance_members, light_members
 
@@ -115,9 +115,10 @@ class Settings(BaseModel):
         examples=["[0,0,1]"],
     )
     checkpoint: Path | None = Field(
-        None if DEFAULT is None else Path(DEFAULT),
+        Path(AUTO),
         description="renderer.safetensors, or the name of a checkpoint that comes with the package "
-        f"({', '.join(SHIPPED)}): the relit picture is then the neural renderer's; null: no network",
+        f"({', '.join(SHIPPED)}): the relit picture is then the neural renderer's; auto: {DEFAULT} where it "
+        "makes the picture better, which the log says, otherwise none; null: no network",
         examples=["pair"],
     )
     window: int | None = Field(
@@ -217,8 +218,8 @@ class Settings(BaseModel):
 
     @property
     def takes_default(self) -> bool:
-        """Whether the checkpoint is the one that nobody has to ask for."""
-        return self.checkpoint is not None and str(self.checkpoint) == DEFAULT
+        """Whether the checkpoint is the one that nobody asked for, which may give way."""
+        return self.checkpoint is not None and str(self.checkpoint) == AUTO
 
     @property
     def source(self) -> Literal["neural", "lit", "shadowed"]:

@@ -15,8 +15,10 @@ SHIPPED = {
     "pair": "of pbr and irradiance, the paper's buffers",
 }
 """Name -> what the network is given."""
-DEFAULT: str | None = "lit"
-"""The one that tron-relight takes unless told otherwise; None: it draws without a network."""
+DEFAULT = "lit"
+"""The one that ``auto`` means."""
+AUTO = "auto"
+"""What tron-relight is told unless it is told otherwise: :data:`DEFAULT` where that fits, otherwise none."""
 
 
 def installed() -> dict[str, Path]:
@@ -41,7 +43,7 @@ def shipped(name: str) -> Path:
 
 
 def checkpoint_file(checkpoint: str | Path) -> Path:
-    """The file that a setting `checkpoint` means: that of a shipped name, or the path itself.
+    """The file that a setting such as `checkpoint` means: that of a shipped name, or the path itself.
 
     A name wins over a file that is called like it. Raises TronError where a name's file did not come with
     this installation.

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from tron.apps import relight_settings
 from tron.apps.clip import Clip
+from tron.apps.relight_settings import Settings
 from tron.images import read_image
 from tron.neural import shipped
 from tron.neural.configs import PAPER_GUIDANCE, RendererConfig, UNetConfig
@@ -149,10 +149,9 @@ def test_a_shipped_checkpoint_is_given_by_name(run, checkpoints, tmp_path, monke
 def test_the_default_checkpoint_gives_way_where_it_does_not_fit(
     run, checkpoints, tmp_path, monkeypatch, caplog, settings, words
 ):
-    monkeypatch.setattr(relight_settings, "DEFAULT", "lit")
     monkeypatch.setattr(shipped, "FOLDER", checkpoints if settings else tmp_path)
     with caplog.at_level("INFO"):
-        assert run(tmp_path / "out", "checkpoint=lit", *settings) == 0
+        assert run(tmp_path / "out", "checkpoint=auto", *settings) == 0
     assert words in caplog.text
     report = json.loads((tmp_path / "out" / "relight.json").read_text())
     direct = settings in (("bounces=0",), ("fidelity=paper",))
@@ -165,25 +164,42 @@ def test_the_default_checkpoint_does_not_give_way_where_something_is_asked_of_it
     run, checkpoints, tmp_path, monkeypatch, capsys
 ):
     """Pictures without a network are no answer to a choice of its weights."""
-    monkeypatch.setattr(relight_settings, "DEFAULT", "lit")
     monkeypatch.setattr(shipped, "FOLDER", checkpoints)
-    assert run(tmp_path / "out", "checkpoint=lit", "weights={pbr: 1, irradiance: 1}") == 2
+    assert run(tmp_path / "out", "checkpoint=auto", "weights={pbr: 1, irradiance: 1}") == 2
     assert "weights lack 'lit'" in capsys.readouterr().err
-    assert run(tmp_path / "out", "checkpoint=lit", "window=5", "buffers=[relit]") == 2
+    assert run(tmp_path / "out", "checkpoint=auto", "window=5", "buffers=[relit]") == 2
     assert not (tmp_path / "out").exists()
 
 
 def test_the_default_checkpoint_draws_where_it_fits(run, checkpoints, tmp_path, monkeypatch):
-    monkeypatch.setattr(relight_settings, "DEFAULT", "lit")
     monkeypatch.setattr(shipped, "FOLDER", checkpoints)
-    assert run(tmp_path, "checkpoint=lit") == 0
-    assert json.loads((tmp_path / "relight.json").read_text())["relit"] == "neural"
+    assert run(tmp_path, "checkpoint=auto") == 0
+    report = json.loads((tmp_path / "relight.json").read_text())
+    assert report["relit"] == "neural"
+    assert report["network"]["checkpoint"] == "lit"
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (("bounces=0",), "no bounced light with bounces=0"),
+        (("buffers=[relit]",), "no relit.exr with a checkpoint"),
+    ],
+)
+def test_a_shipped_checkpoint_that_was_asked_for_is_taken_or_refused(
+    run, checkpoints, tmp_path, monkeypatch, capsys, settings, words
+):
+    monkeypatch.setattr(shipped, "FOLDER", checkpoints)
+    assert run(tmp_path / "final", "checkpoint=lit", "quality=final", "bounces=1") == 0
+    assert json.loads((tmp_path / "final" / "relight.json").read_text())["relit"] == "neural"
+    assert run(tmp_path / "out", "checkpoint=lit", *settings) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_default_is_a_shipped_one_whose_file_is_there():
-    assert shipped.DEFAULT is None or shipped.shipped(shipped.DEFAULT).is_file()
-    default = relight_settings.Settings.model_fields["checkpoint"].default
-    assert (None if default is None else str(default)) == shipped.DEFAULT
+    assert Settings.model_fields["checkpoint"].default == Path(shipped.AUTO)
+    assert shipped.shipped(shipped.DEFAULT).is_file()
 
 
 class _Explosive:
