@@ -28,12 +28,14 @@ class Sweep:
     Attributes:
         images: (5, 5, H, W, 3) displays, the weight of pbr down and that of irradiance across.
         values: the weights.
-        key: of the clip.
+        given: the network's buffers and the truth, by what they are called: (H, W, 3) displays.
+        clip: of which scene under which light.
     """
 
     images: np.ndarray
     values: tuple[float, ...]
-    key: str
+    given: dict[str, np.ndarray]
+    clip: str
 
     def rows(self, seed: int) -> Iterator[Row]:  # noqa: ARG002
         """None: it is looked at."""
@@ -47,16 +49,28 @@ class Sweep:
             Picture(
                 enlarge(self.images[i, j], scale),
                 f"w_pbr {self.values[i]:g}, w_irr {self.values[j]:g}",
-                f"latents weighted {self.values[i]:g} and {self.values[j]:g}, clip {self.key}",
+                f"latents weighted {self.values[i]:g} and {self.values[j]:g}, {self.clip}",
                 strong=self.values[i] == self.values[j] == 0.5,
             )
             for i in range(count)
             for j in range(count)
         ]
-        note = "Framed: the weights of the paper and of the training. At 0, 0 the network sees nothing."
+        note = (
+            "Framed: the weights of the paper and of the training. At 0, 0 the network sees nothing; its picture "
+            "is added to filtered pbr, whatever the weights."
+        )
+        beside = Pictures(
+            "What it is given, and the truth",
+            [
+                Picture(enlarge(image, scale), name, f"{name}, {self.clip}")
+                for name, image in self.given.items()
+            ],
+            f"A colour over all is the light's: {self.clip}.",
+            columns=count,
+        )
         group = Pictures("Weights of the two latents", shown, note, columns=count)
         write_strips([group], ["renderer-sweep"], pictures)
-        return [Section("sweep", "Trading pbr against irradiance", [group])]
+        return [Section("sweep", "Trading pbr against irradiance", [beside, group])]
 
 
 def measure_sweep(dataset: Path, split: str, pair: Network) -> Sweep:
@@ -73,4 +87,8 @@ def measure_sweep(dataset: Path, split: str, pair: Network) -> Sweep:
     clip = next(iter(read_clips(dataset, split, MEMBERS)))
     buffers = Buffers.of(clip)
     displayed = {name: buffers.displayed(name)[:1] for name in pair.renderer.config.guidance}
-    return Sweep(weight_sweep(pair.renderer, displayed), SWEEP, clip.meta.key)
+    given = {name: buffers.displayed(name)[0] for name in displayed} | {
+        "path tracer": clip.displayed("rgb")[0]
+    }
+    described = f"scene {clip.meta.scene}, {clip.meta.light_family} light"
+    return Sweep(weight_sweep(pair.renderer, displayed), SWEEP, given, described)
