@@ -56,8 +56,8 @@ class Sweep:
             for j in range(count)
         ]
         note = (
-            "Framed: the weights of the paper and of the training. At 0, 0 the network sees nothing; its picture "
-            "is added to filtered pbr, whatever the weights."
+            "Framed: the weights of the paper and of the training. At 0, 0 the network sees nothing; what it "
+            "draws is added to filtered pbr, whatever the weights."
         )
         beside = Pictures(
             "What it is given, and the truth",
