@@ -55,7 +55,9 @@ class StageRecord(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     commands: list[list[str]] = Field(description="as typed")
-    seconds: NonNegativeFloat = Field(default=0.0, description="wall time of all attempts")
+    seconds: NonNegativeFloat = Field(
+        default=0.0, description="wall time of all attempts, less that of stages within"
+    )
     attempts: int = Field(default=0, ge=0)
     finished: bool = False
     commit: str = Field(default="", description="checkout() of the code that finished it")
@@ -97,6 +99,7 @@ class Stages:
     def __init__(self, folder: Path):
         self.path = folder / "stages.json"
         self.file = StageFile()
+        self._counted = 0.0
         if self.path.is_file():
             try:
                 self.file = StageFile.model_validate_json(self.path.read_bytes())
@@ -135,15 +138,20 @@ class Stages:
 
     @contextmanager
     def timed(self, name: str, commands: list[list[str]]) -> Iterator[StageRecord]:
-        """Add the seconds of the block to the stage's record, and mark it finished if the block succeeds."""
+        """Add the seconds of the block to the stage's record, and mark it finished if the block succeeds.
+
+        Those of stages within the block are theirs alone, so that all records add up to the time that passed.
+        """
         record = self.records.setdefault(name, StageRecord(commands=commands))
         record.attempts += 1
-        start = time.perf_counter()
+        start, before = time.perf_counter(), self._counted
         try:
             yield record
             record.finished, record.commit = True, checkout()
         finally:
-            record.seconds += time.perf_counter() - start
+            spent = time.perf_counter() - start
+            record.seconds += spent - (self._counted - before)
+            self._counted = before + spent
             write_atomic(self.path, self.file.model_dump_json(indent=2) + "\n")
 
     def restart(self, name: str) -> None:

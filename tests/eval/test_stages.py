@@ -96,6 +96,21 @@ def test_the_seconds_of_failed_attempts_count(tmp_path: Path, scripts: Path):
     assert Stages(tmp_path).run("make", [Child("x", "tron-x", [])]) >= 0.6
 
 
+def test_the_seconds_of_a_stage_within_another_count_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    clock = iter([0.0, 2.0, 7.0, 8.0, 11.0, 12.0])
+    monkeypatch.setattr(stages_module.time, "perf_counter", lambda: next(clock))
+    stages = Stages(tmp_path)
+    with stages.timed("part", [["outer"]]):
+        for name in ("first", "second"):
+            with stages.timed(name, [["inner"]]):
+                pass
+    assert {name: each.seconds for name, each in stages.records.items()} == {
+        "part": 4,
+        "first": 5,
+        "second": 3,
+    }
+
+
 def test_a_child_killed_by_a_signal_fails_too(tmp_path: Path, scripts: Path):
     script(scripts, "tron-x", "print('about to go', flush=True); os.kill(os.getpid(), 9)")
     with pytest.raises(StageFailed, match="about to go") as failure:
