@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -98,7 +99,7 @@ def test_the_seconds_of_failed_attempts_count(tmp_path: Path, scripts: Path):
 
 def test_the_seconds_of_a_stage_within_another_count_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     clock = iter([0.0, 2.0, 7.0, 8.0, 11.0, 12.0])
-    monkeypatch.setattr(stages_module.time, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(stages_module, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
     stages = Stages(tmp_path)
     with stages.timed("part", [["outer"]]):
         for name in ("first", "second"):
