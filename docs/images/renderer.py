@@ -2,7 +2,7 @@
 
     cd docs/images; python renderer.py DATA renderer.jpg clips.jpg
 
-DATA holds what `tron-eval benchmark=renderer` judges by, as it names it: synthetic_256, synthetic_128, captures.
+DATA holds what `tron-eval benchmark=renderer` judges by: its synthetic_256, synthetic_128 and captures.
 """
 
 import sys
