@@ -23,6 +23,7 @@ from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
 from tron.priors import Prior, Track, apply_prior, untracked
 from tron.reconstruction.checkpoint import Checkpoint, save_checkpoint
+from tron.reconstruction.enclosure import enclosed
 from tron.reconstruction.explanation import Explanation, explain
 from tron.reconstruction.initial import Beginning, beginning, extent_of, place_of, source_of
 from tron.reconstruction.joint import Joint
@@ -110,6 +111,8 @@ def reconstruct(
     plan = radiance_plan(radiance, extent, settings.seed, normals_given=given, tone_curve=capture.tone_curve)
     surfels = run.stage(plan, taught.train_views, first)
     scene = surfels.scene(settings.initial.kernel_degree, capture.up)
+    if settings.indoors and not run.past(plan.name):
+        scene = enclosed(scene, views, settings.seed, track)
     if isinstance(prior, Joint):
         try:
             found = explain(capture, scene, prior, settings.seed, device, track)
@@ -176,11 +179,15 @@ class _Run:
         """Spent on the run, interrupted parts included."""
         return self.before + time.perf_counter() - self.started
 
+    def past(self, stage: str) -> bool:
+        """Whether the checkpoint that the run goes on from lies behind a stage."""
+        return self.found is not None and _ORDER.index(self.found.stage) > _ORDER.index(stage)
+
     def stage(self, plan: Plan, views: Sequence[View], begin: Callable[[], GaussianScene]) -> LearntSurfels:
         """Run a stage to its end, from the checkpoint if that lies in it or behind it."""
         degree, seed = self.settings.initial.kernel_degree, self.settings.seed
         found = self.found
-        if found is not None and _ORDER.index(found.stage) > _ORDER.index(plan.name):
+        if found is not None and self.past(plan.name):
             # A later stage is under way: this one's surfels are those of the checkpoint.
             return found.surfels(plan.rates, self.device)
         if found is not None and found.stage == plan.name:

@@ -257,6 +257,11 @@ class ReconstructionSettings(Settings):
     )
     radiance: RadianceSettings = Field(default_factory=lambda: RadianceSettings(), description="Stage 1.")
     materials: MaterialSettings = Field(default_factory=lambda: MaterialSettings(), description="Stage 2.")
+    indoors: bool = Field(
+        default=False,
+        description="Photos taken in a room: where none shows what bounds it, such as a ceiling, surfels of "
+        "the colour near by close it, so that no light comes in.",
+    )
     steps_scaler: float = Field(
         default=0.1,
         gt=0,

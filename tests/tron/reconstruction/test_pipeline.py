@@ -179,6 +179,22 @@ def whole(painted_capture: Capture) -> Reconstruction:
     return found
 
 
+def test_surfels_that_close_a_room_outlive_an_interruption(
+    painted_capture, one_thread, tmp_path: Path, whole: Reconstruction
+) -> None:
+    closed = reconstruct(painted_capture, Classical(), settings(indoors=True))
+    assert len(closed.scene) > len(whole.scene)
+    assert np.array_equal(closed.scene.means[: len(whole.scene)], whole.scene.means)
+    for cut in (("radiance", 13), ("materials", 5)):
+        path = tmp_path / f"{cut[0]}.safetensors"
+        with pytest.raises(Cut):
+            reconstruct(
+                painted_capture, Classical(), settings(indoors=True), checkpoint=path, watch=CutAt(*cut)
+            )
+        again = reconstruct(painted_capture, Classical(), settings(indoors=True), checkpoint=path)
+        assert same(again.scene, closed.scene)
+
+
 def test_a_finished_run_is_not_trained_again(painted_capture, tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
     first = reconstruct(painted_capture, GroundTruth(), settings(), checkpoint=path)
