@@ -1,4 +1,4 @@
-"""What bounds a room where no photo looked: by a ceiling that nobody filmed a new light would shine in.
+"""Bounds of a room where no photo looked: by a ceiling that nobody filmed a new light would shine in.
 
 The surfels' convex hull is sampled. A point of it that a camera's position sees through no surfel, and that
 no photo has in its picture, is part of a wall that was not photographed; one that a photo does have in its
