@@ -21,6 +21,7 @@ from tron.captures import View
 from tron.gaussians.harmonics import SH_COUNT
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.priors import Track, untracked
+from tron.reconstruction.even_directions import even_directions
 from tron.reconstruction.seen_space import pixels_of
 from tron.seeds import generator
 from tron.tracing import SurfelTracer
@@ -34,20 +35,23 @@ _WITHIN = 0.995  # share of the surfels in each of them that the hull is of: tho
 _SOLID = 0.5  # opacity of surfels that count
 _OPEN = 0.3  # transmittance from here on: no surface was found
 _MOST = 0.5  # share of the hull that is closed in silence
-_RADIUS = 1.4  # standard deviation of a new surfel, distances between samples: they overlap
+_RADIUS = 0.8  # standard deviation of a new surfel, distances between samples: larger ones cover windows
 _NEAR = 32  # surfels that tell the colour
-_OPACITY_LOGIT = 6.0
-_ROUGHNESS = 0.7
+_OPACITY_LOGIT = 6.0  # opacity 0.998
+_ROUGHNESS = 0.7  # of plaster and paint, nearly diffuse
 
 
 def enclosed(
     scene: GaussianScene, views: Sequence[View], seed: int, track: Track = untracked
 ) -> GaussianScene:
-    """The scene with surfels where it is bounded and no view looks.
+    """The scene (world frame and units) with surfels where it is bounded and no view looks.
+
+    The new ones face inwards, are opaque and nearly diffuse; base color (linear) and the constant harmonic
+    (display) are means of what is near.
 
     Args:
         scene: surfels of a room; those that are there stay, and come first.
-        views: taken inside it.
+        views: taken inside it; cameras are looked at, not images.
         seed: root of the random numbers.
         track: wraps the loop over the views.
     """
@@ -94,7 +98,7 @@ def _hull(means: np.ndarray, cameras: np.ndarray, seed: int) -> tuple[np.ndarray
     """Points (N, 3) even over the hull of surfels and cameras, unit normals (N, 3) inwards, spacing."""
     middle = cameras.mean(0)
     kept = np.ones(len(means), bool)
-    for direction in _directions(_DIRECTIONS):
+    for direction in even_directions(_DIRECTIONS):
         along = means @ direction
         kept &= along <= np.quantile(along, _WITHIN)
     hull = ConvexHull(np.concatenate([means[kept], cameras]) - middle, qhull_options="QJ")
@@ -105,14 +109,6 @@ def _hull(means: np.ndarray, cameras: np.ndarray, seed: int) -> tuple[np.ndarray
     share = rng.dirichlet((1.0, 1.0, 1.0), POINTS)
     points = middle + np.einsum("nk,nki->ni", share, corners[facet])
     return points, -hull.equations[facet, :3], float(np.sqrt(area.sum() / POINTS))
-
-
-def _directions(count: int) -> np.ndarray:
-    """(count, 3) unit vectors, nearly even over the sphere (Fibonacci's spiral)."""
-    i = np.arange(count) + 0.5
-    z, angle = 1 - 2 * i / count, i * np.pi * (3 - np.sqrt(5))
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], -1)
 
 
 def _transmittance(tracer: SurfelTracer, origin: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
+from tron.reconstruction.even_directions import even_directions
 from tron.reconstruction.joint_light import Light, Points
 from tron.reconstruction.sky_visibility import visibility_towards
 from tron.seeds import generator
@@ -107,7 +108,7 @@ class SunSearch:
     def find(self) -> tuple[np.ndarray, float]:
         """Direction (3,) of the best sun, and its strength over the mean rest."""
         up = self.tracer.scene.up
-        best = self._of_few()._best(_above(_sphere(_DIRECTIONS), up))
+        best = self._of_few()._best(_above(even_directions(_DIRECTIONS), up))
         for ring in _RINGS:
             best = self._best(_above(_around(best[0], ring), up))
         return best[0], best[1]
@@ -161,14 +162,6 @@ def lobe_transport(
     cosine = np.maximum(normal @ along.T, 0)
     facing = float((along @ direction).mean())
     return (visibility_towards(tracer, position, normal, along) * cosine).mean(1) / np.float32(facing)
-
-
-def _sphere(count: int) -> np.ndarray:
-    """(count, 3) directions spread evenly, on Fibonacci's spiral."""
-    i = np.arange(count) + 0.5
-    z, angle = 1 - 2 * i / count, i * np.pi * (3 - np.sqrt(5))
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), z], -1)
 
 
 def _above(directions: np.ndarray, up: np.ndarray) -> np.ndarray:
