@@ -1,7 +1,7 @@
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-long lint format clean
+.PHONY: help setup demo test test-long docs lint format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -9,15 +9,18 @@ help:  ## list the targets
 setup:  ## make .venv, install the pinned dependencies, check LLVM
 	@.ci/setup
 
-demo: setup  ## from a procedural scene to an evaluated neural renderer (13 to 19 minutes on two cores)
+demo: setup  ## from a procedural scene to an evaluated neural renderer (some 20 minutes on two cores)
 	$(BIN)/tron-eval benchmark=demo output_dir=outputs/demo
 	@echo "report: $(CURDIR)/outputs/demo/report.html"
 
-test: setup  ## the fast tests, in two processes: nine minutes on two cores
+test: setup  ## the fast tests, in two processes
 	$(BIN)/python -m pytest -m "not long" -n 2 --dist loadfile
 
-test-long: setup  ## the tests marked long
-	$(BIN)/python -m pytest -m long || [ $$? -eq 5 ]  # 5: pytest collected none
+test-long: setup  ## the tests marked long, in two processes
+	$(BIN)/python -m pytest -m long -n 2 --dist loadfile --no-loadscope-reorder || [ $$? -eq 5 ]  # 5: pytest collected none
+
+docs: setup  ## these pages and the reference as a site in outputs/site, links checked
+	$(BIN)/python -m mkdocs build --strict
 
 lint: setup  ## style, formatting, who may import whom, types
 	$(BIN)/ruff check
@@ -25,10 +28,9 @@ lint: setup  ## style, formatting, who may import whom, types
 	$(BIN)/lint-imports
 	$(BIN)/pyright
 
-format: setup  ## let ruff mend and format the code, and bring README's file tree up to date
+format: setup  ## let ruff mend and format the code
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
-	$(BIN)/python .ci/file_tree.py --write
 
 clean:  ## remove caches, build results and .venv; outputs/ stays
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from datagen.capture_export import make_captures
 from datagen.equal_error import measure_equal_error
-from datagen.merge import merge
-from datagen.projection import project
-from datagen.pseudo_captures import make_pseudo_captures
-from datagen.run import make
-from datagen.settings import Settings
-from datagen.sharing import measure_sharing
-from datagen.validate import validate
+from datagen.run.captures import CAMERAS, make_captures
+from datagen.run.cost import project
+from datagen.run.dataset import make
+from datagen.run.merge import merge
+from datagen.run.validate import validate
+from datagen.settings.command import Settings
 from tron.cli.command_line import command
 
 
@@ -18,15 +16,14 @@ def main(settings: Settings) -> int:
     """Make a dataset for the neural renderer, plan or validate one, or make captures to reconstruct.
 
     Scenes are drawn from seeds, path-traced by Mitsuba, turned into surfels and rendered again by TRON's
-    tracer; the pairs land in tar shards with a manifest. With mode=plan nothing is made: a small scene is
-    timed, and what is missing is printed with its bytes, memory and hours. With shard=i/n one part of a
+    tracer; the pairs land in tar shards with a manifest. With mode=plan nothing is made:
+    what is missing is printed with its bytes, memory and hours. With shard=i/n one part of a
     dataset is made; mode=merge joins them. With mode=captures scenes are path-traced from all sides
     instead, with true maps, as folders that tron-reconstruct and nerfstudio read; with
     mode=pseudo_captures they are photographed as by a phone, and the truth is kept apart. With
     source=captured each folder of photos in captures=DIR is reconstructed and lit, and its photos are the
     pairs' truth. With mode=equal_error guidance of a dataset's test scenes is held against the path tracer:
-    equal_error.json; with mode=sharing frames under many lights at once against frames one by one:
-    sharing.json. An interrupted run resumes. The exit code is 1 if a scene could not be made
+    equal_error.json. An interrupted run resumes. The exit code is 1 if a scene could not be made
     (failures.jsonl says why, that of captures lies among them) or if validation found a problem.
     """
     if settings.mode == "validate":
@@ -36,15 +33,10 @@ def main(settings: Settings) -> int:
         return 0
     if settings.mode == "merge":
         return 1 if merge(settings) else 0
-    if settings.mode == "captures":
+    if settings.mode in CAMERAS:
         return 1 if make_captures(settings) else 0
-    if settings.mode == "pseudo_captures":
-        return 1 if make_pseudo_captures(settings) else 0
     if settings.mode == "equal_error":
         measure_equal_error(settings)
-        return 0
-    if settings.mode == "sharing":
-        measure_sharing(settings)
         return 0
     return 1 if make(settings) else 0
 

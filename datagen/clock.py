@@ -21,23 +21,14 @@ class Clock:
 
     def __init__(self) -> None:
         self.seconds: defaultdict[str, float] = defaultdict(float)
-        self._stages = [REST]
-        self._since = time.perf_counter()
+        self._stage, self._since = REST, time.perf_counter()
 
-    def enter(self, stage: str) -> None:
-        """Begin a stage inside the one that runs."""
-        self._settle()
-        self._stages.append(stage)
-
-    def leave(self) -> None:
-        """End the innermost stage: the one around it goes on."""
-        self._settle()
-        self._stages.pop()
-
-    def _settle(self) -> None:
+    def enter(self, stage: str) -> str:
+        """Go over to a stage; returns the one that ran until now."""
         now = time.perf_counter()
-        self.seconds[self._stages[-1]] += now - self._since
-        self._since = now
+        self.seconds[self._stage] += now - self._since
+        before, self._stage, self._since = self._stage, stage, now
+        return before
 
 
 _running: ContextVar[Clock | None] = ContextVar("clock", default=None)
@@ -52,7 +43,7 @@ def clocked() -> Iterator[dict[str, float]]:
         yield seconds
     finally:
         _running.reset(token)
-        clock.leave()
+        clock.enter(REST)
         seconds.update(clock.seconds)
 
 
@@ -63,8 +54,8 @@ def stage(name: str) -> Iterator[None]:
     if clock is None:
         yield
         return
-    clock.enter(name)
+    before = clock.enter(name)
     try:
         yield
     finally:
-        clock.leave()
+        clock.enter(before)

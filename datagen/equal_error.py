@@ -16,32 +16,32 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping
+from copy import copy
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from datagen.build import Geometry
-from datagen.lights import HdriSpec
-from datagen.pathtrace import gbuffers, render_frames
-from datagen.plan import Work, chosen, plan, scene_folder
-from datagen.ready_sources import ready_sources
-from datagen.scene import SceneSpec
-from datagen.scene_geometry import scene_geometry
-from datagen.settings import EqualErrorSettings, Settings
+from datagen.dataset.records import Work, scene_folder
+from datagen.files.sources import ready_sources
+from datagen.run.plan import chosen, plan
+from datagen.settings.command import EqualErrorSettings, Settings
+from datagen.truth.build import Geometry, scene_geometry
+from datagen.truth.pathtrace import gbuffers, render_frames
+from datagen.world.lights import HdriSpec
+from datagen.world.scene import SceneSpec
 from tron.cameras import Camera
 from tron.color import to_display
 from tron.errors import TronError
 from tron.estimation import FINAL, FINEST, PREVIEW, Estimation
 from tron.gaussians.scene import GaussianScene
-from tron.images import write_image
+from tron.io.images import write_image
+from tron.relighting import EnvironmentMap, Relighter
 from tron.runtime import activate, describe_machine
 from tron.seeds import integer
-from tron.shading.bounce import BouncedLight, BounceTransport
-from tron.shading.environment import EnvironmentMap
-from tron.shading.guidance import Lighting, render_guidance
+from tron.shading.bounces.bounce import BouncedLight
+from tron.shading.lighting import Lighting
 from tron.storage import write_atomic
-from tron.tracing import SurfelTracer
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ def measure_equal_error(settings: Settings) -> None:
     if missing or not scenes:
         name = missing[0] if missing else "test"
         raise TronError(f"scene {name} is not there", settings.output_dir, "make it by mode=make first")
-    activate(settings.variant, settings.equal_error.threads)
+    activate(settings.variant)
     sources = ready_sources(settings)
     cases: list[dict[str, Any]] = []
     for item in scenes:
@@ -94,9 +94,9 @@ def _judge_scene(
 ) -> list[dict[str, Any]]:
     """A case for each light of the scene."""
     recipe, wanted = settings.split(spec.split), settings.equal_error
-    tracer = SurfelTracer(scene)
-    BounceTransport.trace(tracer)  # compiles it
-    transport, seconds = timed(lambda: BounceTransport.trace(tracer))
+    relighter = Relighter(scene)
+    copy(relighter).prepare()  # compiles it
+    _, seconds = timed(lambda: relighter.transport.rays.met)
     cases = []
     for number, light in enumerate(spec.lights):
         environment = light.bake(settings.environment_height, settings.environments)
@@ -108,7 +108,7 @@ def _judge_scene(
             "pixels": camera.width * camera.height,
             "surfels": len(scene),
             "transport_seconds": seconds,
-            **frame.judge(tracer, transport, settings.output_dir / "equal_error" / f"{spec.name}-l{number}"),
+            **frame.judge(relighter, settings.output_dir / "equal_error" / f"{spec.name}-l{number}"),
         }
         for name, way in case["ways"].items():
             said = spec.name, case["light"], name, way["error"], way["seconds"], way["paths"], way["ratio"]
@@ -148,21 +148,19 @@ class _Frame:
         off = (self._shown(image) - self._shown(self._truth))[self._inside].astype(np.float64)
         return math.sqrt(max((off**2).mean() - self._noise, 1e-12))
 
-    def judge(self, tracer: SurfelTracer, transport: BounceTransport, pictures: Path) -> dict[str, Any]:
+    def judge(self, relighter: Relighter, pictures: Path) -> dict[str, Any]:
         """Times and errors of our frames, and of the path tracer's as far as they are wanted."""
         lighting = Lighting(self._environment)
 
-        def bake() -> BouncedLight:
-            return transport.bake(lighting)
+        def bake() -> BouncedLight | None:
+            return relighter.under(lighting).bounced(self._camera)
 
-        bounce = bake()
+        light = relighter.under(lighting)
 
         def ours(estimation: Estimation) -> Callable[[], np.ndarray]:
-            def render() -> np.ndarray:
-                found = render_guidance(tracer, self._camera, lighting, estimation, self._seed, bounce=bounce)
-                return found.lit
-
-            return render
+            of_frame = {"rays", "filtered", "reflections", "supersample"}
+            framed = light.framed(**estimation.model_dump(include=of_frame))
+            return lambda: framed.render(self._camera, self._seed).lit
 
         frames = {name: ours(estimation) for name, estimation in WAYS.items()}
         images = {name: render() for name, render in frames.items()}

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 from tron.cli.command_line import command
 from tron.cli.instantiation import make
-from tron.dataset_folder import DatasetPlace
 from tron.errors import TronError
+from tron.shards.dataset_folder import DatasetPlace
 from tron.storage import locked
+
+if TYPE_CHECKING:
+    from eval.benchmark import Benchmark
 
 
 class Settings(BaseModel):
@@ -23,6 +27,10 @@ class Settings(BaseModel):
     benchmark: dict[str, Any] = Field(description="settings of the benchmark; benchmark=NAME chooses it")
     output_dir: Path = Field(
         default=Path("outputs/eval"), description="folder for results.json, report.html and the pictures"
+    )
+    report: Path | None = Field(
+        default=None,
+        description="folder with results.json: write its report.html anew, and measure nothing",
     )
     dataset: DatasetPlace | None = Field(
         default=None, description="data set to evaluate on, made by tron-datagen: its folder or URL"
@@ -43,13 +51,15 @@ def main(settings: Settings) -> int:
 
     Exits with 0 whether or not the targets are reached: the report says so, and by how much.
     """
-    from eval.report.assemble import assemble
-    from eval.report.terminal import print_results
+    from eval.page import write_page
+    from eval.report.figures import print_results
     from eval.results import Results
     from eval.stages import StageFailed
-    from tron.report.render import write_report
     from tron.runtime import describe_machine
 
+    if settings.report is not None:
+        print(f"report: {write_page(settings.report).absolute()}", flush=True)
+        return 0
     benchmark = make(settings.benchmark, "benchmark")
     for name in ("dataset", "renderer", "pixel_mlp"):
         if getattr(settings, name) is not None and name not in type(benchmark).model_fields:
@@ -62,14 +72,31 @@ def main(settings: Settings) -> int:
         except StageFailed as failure:
             print(f"tron-eval: {failure}", file=sys.stderr)
             return failure.exit_code
-        environment = {**describe_machine(), "inputs": outcome.inputs}
-        results = Results(benchmark=benchmark.name, environment=environment, rows=list(outcome.rows))
-        results = results.held_to(benchmark.bounds())
+        results = Results(
+            benchmark=benchmark.name,
+            environment={
+                **describe_machine(),
+                "inputs": {"settings": settings_of(benchmark), **outcome.inputs},
+            },
+            rows=outcome.rows,
+            reproduce=outcome.reproduce or typed(),
+            series=outcome.series,
+            pictures=outcome.pictures,
+        ).held_to(benchmark.bounds())
         results.save(settings.output_dir / "results.json")
-        report = settings.output_dir / "report.html"
-        write_report(assemble(outcome, results, benchmark.bounds()), report)
-        print_results(results, benchmark.bounds(), report)
+        print_results(results, write_page(settings.output_dir))
     return 0
+
+
+def settings_of(benchmark: Benchmark) -> dict[str, Any]:
+    """What a benchmark was told, as JSON has it; targets stand beside it in results.json."""
+    return benchmark.model_dump(mode="json", exclude={"targets"})
+
+
+def typed() -> list[str]:
+    """The command that runs, as it was typed; none where Python called it."""
+    name, *arguments = sys.argv
+    return [shlex.join(["tron-eval", *arguments])] if Path(name).name == "tron-eval" else []
 
 
 cli = command(
@@ -79,6 +106,7 @@ cli = command(
     main,
     examples=(
         "tron-eval benchmark=demo output_dir=outputs/demo",
+        "tron-eval report=docs/benchmarks/tracing",
         "tron-eval benchmark=relighting dataset=outputs/data renderer=outputs/train/renderer.safetensors "
         "output_dir=outputs/relighting",
         "tron-eval benchmark=tracing output_dir=outputs/tracing",

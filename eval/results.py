@@ -2,10 +2,12 @@
 
 The file is ``{"benchmark", "environment", "rows": [{"metric", "value", "unit", "reference", "ratio",
 "n"}]}``. Metric names are unique; a figure that was not measured has no row, and a row never holds NaN or
-infinity (JSON has no way to write them).
+infinity (JSON has no way to write them). Beside the rows stands what else the page is made of: ``targets``
+that the rows are held to, ``reproduce`` (commands), ``series`` (curves) and ``pictures`` (files beside it).
 
 A row that is a mean over scenes also has ``"scenes"``, their number, and where that is two or more ``"low"``
-and ``"high"``, the ends of its confidence interval (:mod:`eval.confidence`); other rows lack these keys.
+and ``"high"``, the ends of its confidence interval (:mod:`eval.confidence`). A gain has ``"without_one"``
+too, its least and greatest value where one scene is left out. Other rows lack these keys.
 """
 
 from __future__ import annotations
@@ -23,6 +25,8 @@ from eval.confidence import Interval, mean_interval
 from tron.errors import TronError
 from tron.storage import write_atomic
 
+KEYS = ("benchmark", "environment", "rows")
+"""What every results.json has; the rest where there is some."""
 METRIC_PATTERN = r"^[a-z][a-z0-9_]*(\.[a-z0-9][a-z0-9_]*)+$"
 
 
@@ -40,6 +44,9 @@ class Row(BaseModel):
     low: FiniteFloat | None = Field(default=None, description="lower end of the interval over scenes")
     high: FiniteFloat | None = Field(default=None, description="upper end")
     scenes: PositiveInt | None = Field(default=None, description="independent scenes behind the n")
+    without_one: tuple[FiniteFloat, FiniteFloat] | None = Field(
+        default=None, description="least and greatest figure where one scene is left out"
+    )
 
     @pydantic.model_validator(mode="after")
     def _interval(self) -> Row:
@@ -58,7 +65,7 @@ class Row(BaseModel):
 
     @pydantic.model_serializer(mode="wrap")
     def _without_absent(self, plain: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        absent = {name for name in ("low", "high", "scenes") if getattr(self, name) is None}
+        absent = {name for name in ("low", "high", "scenes", "without_one") if getattr(self, name) is None}
         return {name: value for name, value in plain(self).items() if name not in absent}
 
 
@@ -91,6 +98,36 @@ class Target(BaseModel):
         return self.margin(measured) >= 0
 
 
+class Caption(BaseModel):
+    """Words of one picture or film (:class:`tron.report.page.Picture`); ``size``: height, width."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    title: str
+    alt: str
+    figure: str = ""
+    strong: bool = False
+    size: tuple[PositiveInt, PositiveInt]
+
+
+class Group(BaseModel):
+    """Pictures or films side by side on the page.
+
+    Pictures are one file, ``pictures/FILE.png``: rows of ``columns`` cells as large as the largest of them,
+    each picture in the upper left corner of its cell. Films are a file each, ``pictures/FILE-NUMBER.mp4``.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    section: str = Field(description="of the page that shows them")
+    file: str
+    title: str
+    note: str = ""
+    columns: PositiveInt
+    films: bool = False
+    captions: list[Caption]
+
+
 class Results(BaseModel):
     """Everything in results.json; validated when read and when written."""
 
@@ -99,6 +136,12 @@ class Results(BaseModel):
     benchmark: str = Field(min_length=1)
     environment: dict[str, Any]
     rows: list[Row]
+    targets: list[Target] = Field(default_factory=list)
+    reproduce: list[str] = Field(default_factory=list, description="command lines that measure it again")
+    series: dict[str, dict[str, list[tuple[FiniteFloat, FiniteFloat]]]] = Field(
+        default_factory=dict, description="name of a chart -> label of a line -> (x, y) of its points"
+    )
+    pictures: list[Group] = Field(default_factory=list)
 
     @pydantic.model_validator(mode="after")
     def _unique(self) -> Results:
@@ -119,7 +162,8 @@ class Results(BaseModel):
         return None if row is None else row.value
 
     def held_to(self, targets: Iterable[Target]) -> Results:
-        """A copy whose rows name their target as ``reference``, with ``ratio`` = value / target."""
+        """A copy with the targets; rows name theirs as ``reference``, with ``ratio`` = value / target."""
+        targets = list(targets)
         by_metric = {target.metric: target for target in targets}
 
         def annotated(row: Row) -> Row:
@@ -130,7 +174,8 @@ class Results(BaseModel):
             reference = f"target: {target.bound} {target.value:g} {row.unit}"
             return row.model_copy(update={"reference": reference, "ratio": ratio})
 
-        return self.model_copy(update={"rows": [annotated(row) for row in self.rows]})
+        rows = [annotated(row) for row in self.rows]
+        return self.model_copy(update={"rows": rows, "targets": targets})
 
     def save(self, path: str | Path) -> None:
         """Write the file whole or not at all; TronError if the folder cannot be written.
@@ -138,8 +183,9 @@ class Results(BaseModel):
         Raises:
             ValueError: two rows share a name, or a value is not finite (a defect of the benchmark).
         """
-        checked = Results.model_validate(self.model_dump())
-        write_atomic(path, json.dumps(checked.model_dump(), indent=2, allow_nan=False) + "\n")
+        checked = Results.model_validate(self.model_dump()).model_dump()
+        written = {key: value for key, value in checked.items() if value or key in KEYS}
+        write_atomic(path, json.dumps(written, indent=2, allow_nan=False) + "\n")
 
     @staticmethod
     def load(path: str | Path) -> Results:

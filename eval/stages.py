@@ -21,10 +21,10 @@ from pathlib import Path
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat
 
-from tron.cli.termination import termination_noted
 from tron.errors import TronError
+from tron.run_folder import CHOOSE_ANOTHER, RunFolder
 from tron.runtime import describe_machine
-from tron.storage import write_atomic
+from tron.termination import termination_noted
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """Environment of a command that computes on one thread."""
@@ -97,14 +97,12 @@ class Stages:
     """Runs stages and remembers them in ``folder/stages.json``."""
 
     def __init__(self, folder: Path):
-        self.path = folder / "stages.json"
-        self.file = StageFile()
+        self.folder = RunFolder(folder, "a stage", "stages.json")
         self._counted = 0.0
-        if self.path.is_file():
-            try:
-                self.file = StageFile.model_validate_json(self.path.read_bytes())
-            except pydantic.ValidationError as error:
-                raise TronError("not a record of stages", self.path, "delete it to start afresh") from error
+        try:
+            self.file = StageFile.model_validate(self.folder.recipe() or {})
+        except pydantic.ValidationError as error:
+            raise TronError("not a record of stages", self.folder.record, CHOOSE_ANOTHER) from error
 
     @property
     def records(self) -> dict[str, StageRecord]:
@@ -120,12 +118,7 @@ class Stages:
         """
         commands = [child.typed for child in children]
         record = self.records.setdefault(name, StageRecord(commands=commands))
-        if record.commands != commands:
-            raise TronError(
-                f"stage '{name}' was begun with other settings",
-                self.path.parent,
-                "choose another output_dir, or delete this one to start afresh",
-            )
+        self.folder.require({name: _settings(commands)}, {name: _settings(record.commands)})
         if not record.finished:
             with self.timed(name, commands):
                 run_together(children)
@@ -133,7 +126,7 @@ class Stages:
         _say(name, f"done before, {record.seconds:.0f} s")
         if record.commit != checkout():
             made_by = record.commit or "unknown"
-            _say(name, f"made by another commit ({made_by}): delete {self.path.parent} to redo it")
+            _say(name, f"made by another commit ({made_by}): delete {self.folder.folder} to redo it")
         return record.seconds
 
     @contextmanager
@@ -152,11 +145,22 @@ class Stages:
             spent = time.perf_counter() - start
             record.seconds += spent - (self._counted - before)
             self._counted = before + spent
-            write_atomic(self.path, self.file.model_dump_json(indent=2) + "\n")
+            self.folder.keep(self.file.model_dump(mode="json"))
 
     def restart(self, name: str) -> None:
         """Forget a stage: one that is cheap, and is measured anew every time."""
         self.records.pop(name, None)
+
+
+def _settings(commands: list[list[str]]) -> dict[str, dict[str, str]]:
+    """Commands as plain values: the number of each, its script, and its settings by their keys."""
+    return {
+        str(number): {
+            "command": script,
+            **{key: value for key, _, value in (each.partition("=") for each in rest)},
+        }
+        for number, (script, *rest) in enumerate(commands)
+    }
 
 
 def script_path(name: str) -> str:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tron.apps.framing import plan_cameras, upright
+from tron.apps.framing import plan_cameras
 from tron.cameras import Camera
 from tron.gaussians import GaussianScene
 from tron.gaussians.harmonics import rgb_to_dc
 from tron.gaussians.scene import quats_from_normals
+from tron.relighting import EnvironmentMap
 from tron.runtime import activate
-from tron.shading import EnvironmentMap
 
 FLOOR, BALL, RING = 1, 2, 3
 OUTPUTS = Path("outputs/examples")
@@ -23,8 +23,8 @@ OUTPUTS = Path("outputs/examples")
 INPUTS = {
     "scene": "your PLY; default: a ball and a ring, made here",
     "environment": "your HDRI (.hdr, .exr); default: a low sun",
-    "dataset": "made by 6_make_a_dataset.py or tron-datagen; default: %(default)s",
-    "renderer": "trained by 7_train.py or tron-train; default: %(default)s",
+    "dataset": "made by examples.make_dataset or tron-datagen; default: %(default)s",
+    "renderer": "trained by examples.train or tron-train; default: %(default)s",
 }
 
 
@@ -51,7 +51,7 @@ def load_scene(chosen: argparse.Namespace) -> GaussianScene:
     if chosen.scene is None:
         return make_scene(0.08 if chosen.small else 0.02)
     scene = GaussianScene.load(chosen.scene)
-    return scene.rotated(upright(scene.up))
+    return scene.upright()
 
 
 def load_light(chosen: argparse.Namespace) -> EnvironmentMap:

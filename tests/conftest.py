@@ -3,6 +3,7 @@
 import ctypes
 import json
 import os
+import signal
 import struct
 import sys
 from collections.abc import Callable, Sequence
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filelock import FileLock
 
 # Read by torch when it is first imported: sums depend on the thread count, tests must not.
 os.environ["OMP_NUM_THREADS"] = "1"
@@ -51,6 +53,16 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(autouse=True)
+def interruptible() -> None:
+    """Give Ctrl-C Python's own handler before each test, whatever the last one or the shell has set.
+
+    A console script ends by ignoring it, as do the children of a shell's background jobs; processes that a
+    test starts would inherit that.
+    """
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
 def drjit_threads() -> None:
     """Give Dr.Jit two threads or more before each test, whatever the last one set.
 
@@ -70,6 +82,7 @@ def tiny_scenes() -> list[str]:
     """Overrides of `tron-datagen` for two scenes of one small frame each, made in seconds."""
     train = [
         "scenes=2",
+        "style=object",
         "lights=[overcast]",
         "frames=1",
         "width=16",
@@ -144,21 +157,45 @@ def write_glb() -> Callable[[Path, dict[str, Any], Sequence[Any]], Path]:
 
 
 @pytest.fixture(scope="session")
-def tiny_captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], None]], Path]:
+    """`made_once(name, make)`: a folder that the first process of a session fills by `make`, for all of them.
+
+    Processes of pytest-xdist have folders of their own beside each other. Nobody may write into what is made.
+    """
+    own = tmp_path_factory.getbasetemp()
+    shared = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+
+    def made(name: str, make: Callable[[Path], None]) -> Path:
+        folder, done = shared / f"once-{name}", shared / f"once-{name}.done"
+        with FileLock(shared / f"once-{name}.lock"):
+            if not done.exists():
+                folder.mkdir()
+                make(folder)
+                done.touch()
+        return folder
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def tiny_captures(made_once) -> Path:
     """Folder of three captures, path-traced, with true maps: 9 views of 24 x 24, two of them held out."""
-    from datagen.capture_export import make_captures
-    from datagen.settings import Settings
+    from datagen.run.captures import make_captures
+    from datagen.settings.command import Settings
     from tron.cli.recipes import check, compose_recipe
 
-    output = tmp_path_factory.mktemp("tiny_captures")
     wanted = [
-        *("mode=captures", f"output_dir={output}", "cluster=none", "seed=77", "test.style=A"),
+        *("mode=captures", "cluster=none", "seed=77", "test.style=object"),
         *("capture.scenes=3", "capture.views=9", "capture.width=24", "capture.height=24"),
         *("capture.path_spp=9", "capture.reference_spp=2", "mesh_edge=0.2", "environment_height=16"),
         *("texels_per_unit=16", "objects=[2,2]"),
     ]
-    assert make_captures(check(compose_recipe("conf.datagen", Settings, wanted), Settings)) == 0
-    return output / "captures"
+
+    def make(output: Path) -> None:
+        recipe = compose_recipe("conf.datagen", Settings, [*wanted, f"output_dir={output}"])
+        assert make_captures(check(recipe, Settings)) == 0
+
+    return made_once("tiny_captures", make) / "captures"
 
 
 @pytest.fixture(scope="session")
@@ -178,3 +215,45 @@ def quick_reconstruction() -> list[str]:
         *(f"captured.reconstruction.{value}" for value in surfels),
         *(f"captured.light.{value}" for value in light),
     ]
+
+
+@pytest.fixture(scope="session")
+def live_memory() -> Any:
+    """Class of a context that counts bytes of tensors alive at once, the same on every machine.
+
+    ``live_memory()`` has ``live`` and ``peak``. What was there before is not counted, nor are an
+    allocator's rounding and an operation's own scratch space. Inside torch's FakeTensorMode it counts a
+    pass without doing it.
+    """
+    import weakref
+
+    from torch import Tensor
+    from torch.utils._python_dispatch import TorchDispatchMode
+    from torch.utils._pytree import tree_leaves
+
+    def storages(tensors: Any) -> list[Any]:
+        return [leaf.untyped_storage() for leaf in tree_leaves(tensors) if isinstance(leaf, Tensor)]
+
+    class LiveMemory(TorchDispatchMode):
+        def __init__(self) -> None:
+            super().__init__()
+            self.live = self.peak = 0
+            self.seen: set[int] = set()
+
+        def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            given = {storage._cdata for storage in storages((args, kwargs))}
+            outputs = func(*args, **(kwargs or {}))
+            for storage in storages(outputs):
+                if storage._cdata not in given | self.seen:  # neither a view nor an update in place
+                    size = storage.nbytes()
+                    self.seen.add(storage._cdata)
+                    self.live += size
+                    self.peak = max(self.peak, self.live)
+                    weakref.finalize(storage, self.forget, storage._cdata, size)
+            return outputs
+
+        def forget(self, key: int, size: int) -> None:
+            self.seen.discard(key)
+            self.live -= size
+
+    return LiveMemory

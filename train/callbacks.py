@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import lightning
-from lightning.pytorch.callbacks import Callback
+import torch
+from lightning.pytorch.callbacks import Callback, WeightAveraging
+from torch import Tensor
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from train.curriculum import Stage, StageClock
-from train.damage import DamageCount
+from train.examples.data import DAMAGED
 from tron.cli.progress import Progress
+from tron.errors import TronError
 from tron.storage import write_atomic
+from tron.termination import Termination, termination_noted
 
 SMOOTHING = 0.98
 
@@ -188,3 +196,134 @@ def earlier_rows(path: Path, stage: str, first_step: int) -> list[dict[str, Any]
                 break
             kept.append(row)
     return kept
+
+
+FEWEST = 1000
+"""Samples that a share is taken of at least: of the first few, one damaged sample would be too many."""
+
+
+class DamageCount(Callback):
+    """Number of a stage's samples, in all processes, that stand in for damaged ones; part of checkpoints.
+
+    Args:
+        stage: that is trained.
+        limit: share of its samples beyond which TronError ends the run, in all processes at once.
+        checkpoint_every: steps between checkpoints, which have the number up to their step.
+    """
+
+    def __init__(self, stage: Stage, limit: float, checkpoint_every: int):
+        self.stage, self.limit, self.checkpoint_every = stage, limit, checkpoint_every
+        self.total = 0
+        self._new: Tensor | None = None
+
+    def on_train_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        outputs: Any,
+        batch: dict[str, Tensor],
+        batch_idx: int,
+    ) -> None:
+        """Count a batch's."""
+        del pl_module, outputs, batch_idx
+        new = batch[DAMAGED]
+        self._new = new if self._new is None else self._new + new
+        step = trainer.global_step
+        # Reading a number from a GPU waits for it.
+        if new.device.type == "cpu" or step % 10 == 0 or step % self.checkpoint_every == 0:
+            self._collect(trainer)
+
+    def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Count the last ones."""
+        del pl_module
+        if self._new is not None:
+            self._collect(trainer)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The number goes into checkpoints."""
+        return {"total": self.total}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """The number goes on from a checkpoint."""
+        self.total = state_dict["total"]
+
+    def _collect(self, trainer: lightning.Trainer) -> None:
+        assert self._new is not None
+        self.total += int(trainer.strategy.reduce(self._new.to(torch.float32), reduce_op="sum").item())
+        self._new = None
+        samples = trainer.global_step * self.stage.batch_size * trainer.world_size
+        if self.total > self.limit * max(samples, FEWEST):
+            raise TronError(
+                f"stage {self.stage.name}: {self.total} of {samples} samples were damaged, more than "
+                f"data.damaged_limit={self.limit:g} of them",
+                mend="make the damaged clips, which the log names, again; or raise the limit",
+            )
+
+
+log = logging.getLogger(__name__)
+
+LINE = "stopping behind the step in hand, with a checkpoint; once more after five seconds stops at once"
+
+
+class Stopped(SystemExit):
+    """End of training behind a step and its checkpoint, since SIGTERM or SIGINT has reached a process."""
+
+    def __init__(self, signum: int) -> None:
+        super().__init__(128 + signum)
+        self.signum = signum
+
+
+class CheckpointOnTermination(Callback):
+    """Ends all processes of a run behind one step and a checkpoint, once a signal has reached one of them.
+
+    Before the first step a signal ends the process at once. Lightning's own handlers talk to the other
+    processes from within the signal, amid whatever they are saying to each other, and end a step that Ctrl-C
+    interrupts without a checkpoint; so they are replaced from the first step until the stage's end is kept.
+
+    Args:
+        path: of the checkpoint after a step.
+        until: closed once the stage's end is kept; a signal that came late then takes effect.
+    """
+
+    def __init__(self, path: Callable[[int], Path], until: ExitStack):
+        self.path, self.until = path, until
+        self._termination = Termination()
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Take over the signals."""
+        del pl_module
+        line = LINE if trainer.is_global_zero else ""
+        self._termination = self.until.enter_context(termination_noted(line))
+
+    def on_train_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """Stop here where any process was asked to."""
+        del outputs, batch, batch_idx
+        step = trainer.global_step
+        if pl_module.device.type != "cpu" and step % 10:  # asking the others waits for the GPU
+            return
+        asked = torch.tensor(float(self._termination.signum or 0), device=pl_module.device)
+        signum = int(trainer.strategy.reduce(asked, reduce_op="max").item())
+        if signum:
+            trainer.save_checkpoint(self.path(step))
+            log.info("stopped: step %d is kept", step)
+            raise Stopped(signum)
+
+
+class AveragedWeights(WeightAveraging):
+    """Average a of the weights w, after every step a + (1 - d) (w - a) with decay d.
+
+    Validation sees the averages, and a stage ends with them: its file holds them and the next stage starts
+    from them. A checkpoint holds both. Buffers, such as a codec's normalisation, are constants and are not
+    averaged. Frozen weights stay as they are, which Lightning's own d a + (1 - d) w does not grant: rounding
+    moves them.
+    """
+
+    def __init__(self, decay: float):
+        super().__init__(use_buffers=False, multi_avg_fn=get_ema_multi_avg_fn(decay))

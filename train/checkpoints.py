@@ -6,7 +6,8 @@ leaves `checkpoints/2-adapt.safetensors`, the renderer at its end, and its `.ckp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,12 +36,18 @@ class AtomicCheckpoints(TorchCheckpointIO):
     ) -> dict[str, Any]:
         """Read a checkpoint; always with weights_only, so that nothing in the file is executed."""
         del weights_only
-        try:
+        with damage_told(path):
             return torch.load(path, map_location=map_location, weights_only=True)
-        except Exception as error:  # torch raises a dozen types for damaged files
-            raise TronError(
-                "checkpoint is damaged", str(path), "remove it to start from the one before"
-            ) from error
+
+
+@contextmanager
+def damage_told(path: Any) -> Iterator[None]:
+    """Raise TronError for whatever reading a damaged checkpoint raises: torch has a dozen types for it."""
+    try:
+        yield
+    except Exception as error:
+        mend = "remove it to start from the one before"
+        raise TronError("checkpoint is damaged", str(path), mend) from error
 
 
 def periodic_checkpoint(folder: Path, number: int, stage: Stage, every: int) -> ModelCheckpoint:

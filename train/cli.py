@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from train.settings import Settings
 from tron.cli.command_line import command
+from tron.cli.installation import loading
 
 
 def main(settings: Settings) -> None:
@@ -12,7 +13,8 @@ def main(settings: Settings) -> None:
     Ends with output_dir/renderer.safetensors. An interrupted run resumes from its last checkpoint when the
     same command is given again; a finished one is left as it is.
     """
-    from train.run import run  # torch, Lightning and diffusers: not for --help or a mistyped key
+    with loading("tron-train"):
+        from train.run import run  # not for --help or a mistyped key
 
     run(settings)
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from tron.errors import TronError
-from tron.neural.windows import TEMPORAL_FACTOR
+from tron.neural.clips import TEMPORAL_FACTOR
 
 FrameSide = Annotated[int, Field(ge=8, le=16_384)]
 CAPTURES = "train_b"

@@ -27,16 +27,15 @@ from torch import distributed
 from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException, start_processes
 
 from train.settings import Settings
-from train.termination import TERMINATED, Terminated
 from tron.cli.command_line import INTERRUPTED, USER_ERROR
 from tron.cli.log import configure_logging
-from tron.cli.termination import termination_unwinds
 from tron.errors import TronError
+from tron.termination import TERMINATED, termination_unwinds
 
 GRACE_SECONDS = 15.0
 """Seconds that processes have to end by themselves after one of them has failed or was interrupted."""
 CHECKPOINT_SECONDS = 120.0
-"""Seconds that processes have to finish their step and write a checkpoint after SIGTERM."""
+"""Seconds that processes have to finish their step and write a checkpoint after SIGTERM or Ctrl-C."""
 
 Result = TypeVar("Result")
 
@@ -190,15 +189,10 @@ def _joined(settings: Settings, devices: int) -> Iterator[Processes]:
 
 def _spawn(work: Callable[[Processes, Settings], None], settings: Settings, devices: int) -> None:
     """Start this machine's processes, wait for them, and end them all as the first to fail has ended."""
-    shared = {"WORLD_SIZE": str(devices * settings.nodes)}
-    if settings.nodes == 1:
-        port = str(find_free_network_port())
-        shared |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "NODE_RANK": "0"}
-    elif not {"MASTER_ADDR", "MASTER_PORT", "NODE_RANK"} <= os.environ.keys():
-        raise TronError(
-            f"nodes={settings.nodes} without a launcher",
-            mend="start it by torchrun or srun, or set MASTER_ADDR, MASTER_PORT and NODE_RANK on each",
-        )
+    if settings.nodes > 1:
+        raise TronError(f"nodes={settings.nodes} without a launcher", mend="start it by torchrun or srun")
+    port = str(find_free_network_port())
+    shared = {"WORLD_SIZE": str(devices), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "NODE_RANK": "0"}
     errors = torch.multiprocessing.get_context("spawn").SimpleQueue()
     context = start_processes(
         _spawned, (work, settings, devices, shared, errors), nprocs=devices, join=False, start_method="spawn"
@@ -215,14 +209,17 @@ def _spawn(work: Callable[[Processes, Settings], None], settings: Settings, devi
         if error.exit_code == INTERRUPTED:
             raise KeyboardInterrupt from error
         if error.exit_code == TERMINATED:
-            raise Terminated from error
+            raise SystemExit(TERMINATED) from error
         raise TronError(
             f"training {error}",
             mend="if that was for want of memory, make batch_size or data.cache_gb smaller",
         ) from error
-    except SystemExit:  # SIGTERM: they finish their step, write a checkpoint, and judge what comes after it
-        signal.signal(signal.SIGTERM, lambda *_: _tell(context.processes, signal.SIGTERM))
-        _end(context.processes, signal.SIGTERM, CHECKPOINT_SECONDS)
+    except (SystemExit, KeyboardInterrupt) as asked:
+        # They finish their step, write a checkpoint, and judge what comes after it.
+        number = signal.SIGINT if isinstance(asked, KeyboardInterrupt) else signal.SIGTERM
+        before = signal.signal(number, lambda *_: _tell(context.processes, number))
+        _end(context.processes, number, CHECKPOINT_SECONDS)
+        signal.signal(number, before)
         raise
     finally:
         _end(context.processes, signal.SIGINT, GRACE_SECONDS)

@@ -4,47 +4,65 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import signal
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import lightning
 import torch
 import yaml
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.strategies import DDPStrategy, Strategy
 
+from train.callbacks import (
+    AveragedWeights,
+    CheckpointOnTermination,
+    DamageCount,
+    Stopped,
+    TrainingLog,
+    earlier_rows,
+    steps_before,
+)
 from train.checkpoints import (
     AtomicCheckpoints,
     Position,
+    checkpoint_path,
     find_position,
+    periodic_checkpoint,
     remove_checkpoints,
     stage_end,
 )
-from train.claims import described_settings, keep_settings, require_own
 from train.curriculum import Stage, StageClock
-from train.data import TrainingData
+from train.examples.data import TrainingData
+from train.examples.requirements import require_renderer
+from train.examples.splits import manifest_hash, split_hashes
 from train.loggers import RunLoggers
 from train.module import RendererModule
 from train.optimizers import learning
 from train.processes import Processes, launch
-from train.requirements import require_renderer
 from train.settings import Settings
-from train.sharding import ShardedModule, require_shardable
-from train.termination import Terminated
-from train.trainer import make_trainer
+from train.sharding import ShardedModule, ShardedStrategy, require_shardable
+from train.strips import ValidationStrips
 from train.transformer_options import apply_options, require_compiler
 from tron import seeds
 from tron.cli.instantiation import make
+from tron.cli.recipes import model_defaults
 from tron.errors import TronError
 from tron.neural.losses import RendererLoss
 from tron.neural.protocols import Renderer
 from tron.neural.shipped import checkpoint_file
 from tron.neural.weights import restore_renderer, save_renderer
+from tron.run_folder import RunFolder
 from tron.runtime import set_torch_threads
-from tron.storage import locked
+from tron.storage import locked, sha256
 
 log = logging.getLogger(__name__)
 
 RENDERER_NAME = "renderer.safetensors"
+MAY_CHANGE = ("output_dir", "dataset", "splits", "start_from", "devices", "nodes", "logger")
+"""A run may move, and be watched in other ways; data and first weights are known by their hash."""
 
 
 def run(settings: Settings) -> None:
@@ -70,7 +88,7 @@ def train(processes: Processes, settings: Settings) -> None:
     )
     with ExitStack() as held:
         folder = settings.output_dir / "checkpoints"
-        described = processes.from_first(lambda: described_settings(settings, processes.count))
+        described = processes.from_first(lambda: _described(settings, processes.count))
         loggers = processes.together(partial(_loggers, settings, described))
         held.callback(loggers.close)
         position = processes.from_first(lambda: _claim(held, settings, described, stages))
@@ -78,16 +96,33 @@ def train(processes: Processes, settings: Settings) -> None:
             return
         module = processes.together(lambda: _make_module(settings, stages, position, data))
         # Only now: what is wrong with a first attempt's settings must not bind the second.
-        processes.from_first(lambda: keep_settings(settings.output_dir, described))
+        processes.from_first(lambda: _keep_settings(settings, described))
         if position == Position(0) and settings.start_from is None:
             _calibrate(module.renderer, data, stages, processes)
         for index in range(position.stage, len(stages)):
             here = position if index == position.stage else Position(index)
-            _run_stage(settings, stages, here, module, data, processes, loggers)
-            processes.from_first(partial(_end_stage, folder, index + 1, stages[index], module))
+            with ExitStack() as kept:  # signals wait for its end once the first step has begun
+                _run_stage(settings, stages, here, module, data, processes, loggers, kept)
+                processes.from_first(partial(_end_stage, folder, index + 1, stages[index], module))
         path = settings.output_dir / RENDERER_NAME
         processes.from_first(lambda: save_renderer(path, module.renderer))
         log.info("Renderer: %s", path)
+
+
+def _described(settings: Settings, processes: int) -> dict[str, Any]:
+    """Settings as plain values, with the hashes of what they name.
+
+    Batches are as many as there are processes: the run remembers their number, not how they were spread.
+    TronError where the dataset or `start_from` cannot be read.
+    """
+    described = yaml.safe_load(yaml.safe_dump(settings.model_dump(mode="json")))
+    described["dataset_sha256"] = manifest_hash(settings.dataset)
+    described["splits_sha256"] = split_hashes(settings.splits)
+    described["start_from_sha256"] = (
+        sha256(checkpoint_file(settings.start_from)) if settings.start_from else None
+    )
+    described["processes"] = processes
+    return described
 
 
 def _loggers(settings: Settings, described: dict[str, Any]) -> RunLoggers:
@@ -100,12 +135,25 @@ def _claim(
 ) -> Position | None:
     """Hold the output folder, which must be this run's, and find where it stands; None if it is finished."""
     held.enter_context(locked(settings.output_dir))
-    require_own(settings.output_dir, described)
+    kept = [key for key in described if key not in MAY_CHANGE]
+    earlier = _run_folder(settings).recipe() or described
+    before, now = ({key: each[key] for key in kept if key in each} for each in (earlier, described))
+    _run_folder(settings).require(now, before)
     position = find_position(settings.output_dir / "checkpoints", stages)
     if position.stage == len(stages) and (settings.output_dir / RENDERER_NAME).is_file():
         log.info("%s is trained already", settings.output_dir / RENDERER_NAME)
         return None
     return position
+
+
+def _run_folder(settings: Settings) -> RunFolder:
+    defaults = {**model_defaults(Settings), "processes": 1, "splits_sha256": {}, "start_from_sha256": None}
+    return RunFolder(settings.output_dir, defaults=defaults)
+
+
+def _keep_settings(settings: Settings, described: dict[str, Any]) -> None:
+    if _run_folder(settings).recipe() is None:
+        _run_folder(settings).keep(described)
 
 
 def _make_module(
@@ -154,6 +202,7 @@ def _run_stage(
     data: TrainingData,
     processes: Processes,
     loggers: RunLoggers,
+    kept: ExitStack,
 ) -> None:
     number, stage = position.stage + 1, stages[position.stage]
     share = stage.steps / sum(each.steps for each in stages)
@@ -169,11 +218,13 @@ def _run_stage(
     trained = ShardedModule(module, settings) if settings.strategy == "fsdp" else module
     trained.begin(stage, clock)
     data.begin(stage, position.step)
-    trainer = make_trainer(settings, position, clock, data, processes, loggers)
+    trainer = make_trainer(settings, position, clock, data, processes, loggers, kept)
     try:
         with learning(trained.renderer, stage.train_only):
             trainer.fit(trained, datamodule=data, ckpt_path=position.checkpoint, weights_only=True)
-    except Terminated:
+    except Stopped as stopped:
+        if stopped.signum == signal.SIGINT:
+            raise KeyboardInterrupt from stopped
         raise
     except SystemExit as error:  # Lightning turns an interrupt into exit(1)
         raise KeyboardInterrupt from error
@@ -214,3 +265,73 @@ def _kind(data: TrainingData, split: str) -> str:
     if data.stands_in(split):
         return " (path-traced, it stands in for photographs)"
     return " (photographs)" if data.photographs(split) else ""
+
+
+def make_trainer(
+    settings: Settings,
+    position: Position,
+    clock: StageClock,
+    data: TrainingData,
+    processes: Processes,
+    loggers: RunLoggers,
+    kept: ExitStack,
+) -> lightning.Trainer:
+    """Trainer of the stage that `data` has begun, from a position on; signals wait until `kept` is closed."""
+    stage = data.stage
+    assert stage is not None
+    earlier = steps_before(earlier_rows(_metrics(settings), stage.name, position.step), stage.name)
+    return lightning.Trainer(
+        max_steps=stage.steps if clock.seconds_limit is None else -1,
+        max_epochs=-1,
+        accelerator=settings.accelerator,
+        devices=settings.devices if processes.count == 1 else processes.count // settings.nodes,
+        num_nodes=settings.nodes,
+        strategy=_strategy(settings, processes),
+        use_distributed_sampler=False,
+        precision=settings.precision,  # type: ignore[arg-type]
+        gradient_clip_val=settings.optimizer.gradient_clip,
+        val_check_interval=min(settings.validation.every, stage.steps),
+        check_val_every_n_epoch=None,
+        num_sanity_val_steps=0,
+        limit_val_batches=0 if data.validation_split is None else 1.0,
+        callbacks=_callbacks(settings, position, stage, clock, data, earlier, kept),
+        plugins=[AtomicCheckpoints()],
+        logger=loggers.of_stage(earlier + position.step) if processes.first else False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=settings.output_dir,
+    )
+
+
+def _strategy(settings: Settings, processes: Processes) -> Literal["auto"] | Strategy:
+    if settings.strategy == "fsdp":
+        return ShardedStrategy(processes)
+    # Buffers are constants here; broadcasting them would also tie together how often ranks validate.
+    return "auto" if processes.count == 1 else DDPStrategy(broadcast_buffers=False)
+
+
+def _metrics(settings: Settings) -> Path:
+    return settings.output_dir / "metrics.csv"
+
+
+def _callbacks(
+    settings: Settings,
+    position: Position,
+    stage: Stage,
+    clock: StageClock,
+    data: TrainingData,
+    earlier: int,
+    kept: ExitStack,
+) -> list[Callback]:
+    """In this order: averages are formed and shown before anything else looks at the weights."""
+    folder, number = settings.output_dir / "checkpoints", position.stage + 1
+    decay = settings.optimizer.ema_decay
+    damage = DamageCount(stage, settings.data.damaged_limit, settings.checkpoint_every)
+    return [
+        *([] if decay is None else [AveragedWeights(decay)]),
+        damage,
+        TrainingLog(_metrics(settings), stage, clock, damage, first_step=position.step),
+        ValidationStrips(settings.output_dir, stage, data, earlier),
+        CheckpointOnTermination(lambda step: checkpoint_path(folder, number, stage, step), kept),
+        periodic_checkpoint(folder, number, stage, settings.checkpoint_every),
+    ]

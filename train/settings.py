@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from train.curriculum import Stage
-from train.memory_settings import MemorySettings
-from train.split_place import SplitPlace
-from tron.dataset_folder import DatasetPlace
 from tron.neural.shipped import SHIPPED
+from tron.shards.dataset_folder import DatasetPlace
 
 LoggerName = Literal["csv", "tensorboard", "wandb"]
 
@@ -111,9 +110,6 @@ class DataSettings(BaseModel):
         description="Largest share of a stage's samples, counted over at least 1000, that may stand in for "
         "damaged ones; beyond it the run ends.",
     )
-    crop_alignment: int = Field(
-        default=4, ge=1, description="Crops start at multiples of this; 4 keeps the codec's blocks."
-    )
 
 
 class ValidationSettings(BaseModel):
@@ -155,12 +151,27 @@ It shows that the curriculum works, not what real data would add.
 """
 
 
+class MemorySettings(BaseModel):
+    """Memory of the backward pass."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    checkpoint_activations: bool = Field(
+        default=False,
+        description="Keep only what goes into each block of a transformer, and do the block again in the "
+        "backward pass: a third more time for a small part of the memory.",
+    )
+
+
 class Settings(BaseModel):
     """Settings of tron-train."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    dataset: DatasetPlace = Field(description="Dataset folder that tron-datagen wrote, or its URL.")
+    dataset: DatasetPlace = Field(
+        description="Dataset folder that tron-datagen wrote, or its URL; or shards by name, read from their "
+        "beginning to their end: 'pipe:ssh host cat data/train-{00000..00003}.tar'."
+    )
     splits: dict[str, str] = Field(
         default={},
         description="Splits, by the names that stages and validation use, that come from another dataset: "
@@ -212,7 +223,7 @@ class Settings(BaseModel):
     nodes: int = Field(
         default=1,
         ge=1,
-        description="Machines, with a command on each: by torchrun or srun, or see docs/training.md.",
+        description="Machines, with a command on each: by torchrun or srun.",
     )
     precision: str = Field(default="32-true", description="Lightning precision, e.g. 32-true or bf16-mixed.")
     strategy: Literal["auto", "ddp", "fsdp"] = Field(
@@ -268,3 +279,25 @@ def _require_training_split(name: str, split: str | None) -> None:
         raise ValueError(
             f"{name} asks for the split '{split}', which is kept for evaluation: training never reads it"
         )
+
+
+@dataclass(frozen=True)
+class SplitPlace:
+    """A dataset's folder or URL, and the names of those of its splits that are one here."""
+
+    folder: str
+    splits: tuple[str, ...]
+
+    @classmethod
+    def parse(cls, name: str, value: str) -> SplitPlace:
+        """Place of the split that a run calls ``name``: FOLDER or FOLDER#SPLIT or FOLDER#SPLIT+SPLIT.
+
+        Raises:
+            ValueError: it is none of these, or names a split twice.
+        """
+        folder, mark, joined = value.rpartition("#")
+        splits = tuple(joined.split("+")) if mark else (name,)
+        place = cls(folder if mark else value, splits)
+        if not place.folder or not all(splits) or len(set(splits)) < len(splits):
+            raise ValueError(f"{name}={value!r} is neither FOLDER nor FOLDER#SPLIT, nor FOLDER#SPLIT+OTHER")
+        return place

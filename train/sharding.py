@@ -2,30 +2,20 @@
 
 torch's FSDP2 shards every tensor along its first axis, block by block, on GPUs and, by gloo, on the CPU. A
 stage trains a sharded copy of the renderer; the whole one stays on the CPU of each process and takes the
-weights over at the stage's end. Validation gathers all weights for as long as it lasts. Checkpoints are the
-same whole files as DDP's, which one process reads.
+weights over at the stage's end. Validation gathers all weights for as long as it lasts.
 """
 
 from __future__ import annotations
 
 import copy
-from pathlib import Path
 from typing import Any
 
-import torch
-from lightning.pytorch.core.optimizer import LightningOptimizer
 from lightning.pytorch.strategies import ModelParallelStrategy
 from torch import nn
-from torch.distributed.checkpoint.state_dict import (
-    StateDictOptions,
-    get_model_state_dict,
-    get_optimizer_state_dict,
-    set_model_state_dict,
-    set_optimizer_state_dict,
-)
+from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
 from torch.distributed.fsdp import FSDPModule, fully_shard
 
-from train.checkpoints import AtomicCheckpoints
+from train.checkpoints import damage_told
 from train.module import RendererModule
 from train.processes import Processes
 from train.settings import Settings
@@ -34,8 +24,6 @@ from tron.errors import TronError
 from tron.neural.protocols import Renderer
 
 WHOLE = StateDictOptions(full_state_dict=True)
-ON_FIRST = StateDictOptions(full_state_dict=True, cpu_offload=True)
-"""Whole tensors, in the first process alone."""
 
 
 def require_shardable(settings: Settings, processes: Processes) -> None:
@@ -104,53 +92,15 @@ def _copied(renderer: Renderer) -> Renderer:
 
 
 class ShardedStrategy(ModelParallelStrategy):
-    """Lightning's strategy for FSDP2, with checkpoints in the form of every other strategy's."""
+    """Lightning's strategy for FSDP2, with whole checkpoints, read without unpickling."""
 
     def __init__(self, processes: Processes):
         super().__init__(
             data_parallel_size=processes.count, tensor_parallel_size=1, save_distributed_checkpoint=False
         )
 
-    def optimizer_state(self, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
-        """The optimiser's whole state in the first process, by the number of each weight; empty in others.
-
-        Lightning's own numbers count frozen weights too, which no optimiser elsewhere does.
-        """
-        if isinstance(optimizer, LightningOptimizer):
-            optimizer = optimizer._optimizer
-        assert self.model is not None
-        state: dict[str, Any] = get_optimizer_state_dict(self.model, optimizer, options=ON_FIRST)
-        if not state:
-            return {}
-        names = [name for group in state["param_groups"] for name in group["params"]]
-        numbers = {name: number for number, name in enumerate(names)}
-        return {
-            "state": {numbers[name]: value for name, value in state["state"].items()},
-            "param_groups": [
-                group | {"params": [numbers[name] for name in group["params"]]}
-                for group in state["param_groups"]
-            ],
-        }
-
     def load_checkpoint(self, checkpoint_path: Any, weights_only: bool | None = None) -> dict[str, Any]:
         """Each process reads the whole file and keeps its shard; the rest of the checkpoint is returned."""
         del weights_only
-        assert self.model is not None
-        checkpoint = AtomicCheckpoints().load_checkpoint(Path(checkpoint_path))
-        set_model_state_dict(self.model, checkpoint.pop("state_dict"), options=WHOLE)
-        for optimizer, state in zip(self.optimizers, checkpoint["optimizer_states"], strict=True):
-            named = self._by_name(optimizer, state)
-            set_optimizer_state_dict(self.model, optimizer, optim_state_dict=named, options=WHOLE)
-        return checkpoint
-
-    def _by_name(self, optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> dict[str, Any]:
-        assert self.model is not None
-        names = {id(parameter): name for name, parameter in self.model.named_parameters()}
-        order = [names[id(p)] for group in optimizer.param_groups for p in group["params"]]
-        return {
-            "state": {order[number]: value for number, value in state["state"].items()},
-            "param_groups": [
-                group | {"params": [order[number] for number in group["params"]]}
-                for group in state["param_groups"]
-            ],
-        }
+        with damage_told(checkpoint_path):
+            return super().load_checkpoint(checkpoint_path, weights_only=True)

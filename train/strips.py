@@ -14,11 +14,11 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from train.curriculum import Stage
-from train.data import TrainingData
-from train.framing import area_resized
+from train.examples.data import TrainingData
+from train.examples.framing import area_resized
 from train.loggers import log_picture
 from train.module import RendererModule
-from tron.images import encode_png
+from tron.io.images import encode_png
 from tron.neural.renderer import to_display_array
 from tron.shards.schema import TARGET
 from tron.storage import write_atomic

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from tron.errors import TronError
+from tron.framing import Surfels, find_subject, framed, outward
 
 _FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV <-> OpenGL
 _FLIP_XY = np.diag([-1.0, -1.0, 1.0, 1.0])  # OpenCV <-> Mitsuba
@@ -99,6 +100,44 @@ class Camera:
         matrix[:3, 3] = -rotation @ origin
         focal = 0.5 * width / math.tan(0.5 * math.radians(fov_deg))
         return cls(focal, focal, width / 2, height / 2, width, height, matrix)
+
+    @classmethod
+    def around(
+        cls,
+        scene: Surfels,
+        *,
+        azimuth_deg: float = 0.0,
+        elevation_deg: float = 25.0,
+        distance: float = 1.0,
+        fov_deg: float = 40.0,
+        width: int = 512,
+        height: int = 512,
+    ) -> Camera:
+        """Place a camera from which a scene's subject fills the image, ``scene.up`` pointing up.
+
+        What to look at and from how far is found as by ``tron-relight trajectory=still``.
+
+        Args:
+            scene: a :class:`tron.gaussians.GaussianScene`, upright or not.
+            azimuth_deg: counter-clockwise about up seen from its tip, from the world's x axis.
+            elevation_deg: above the level plane, within (-90, 90).
+            distance: factor on the distance that is found.
+            fov_deg: horizontal field of view in degrees.
+            width, height: image size in pixels.
+
+        Raises:
+            TronError: fov_deg is outside (0, 180), or the camera looks along up.
+        """
+        if not 0 < fov_deg < 180:
+            raise TronError(f"horizontal field of view must lie between 0 and 180 degrees, not {fov_deg}")
+        subject = find_subject(scene)
+        (away,) = outward(np.array([azimuth_deg]), np.array([elevation_deg]), scene.up)
+        image = {"fov_deg": fov_deg, "width": width, "height": height}
+
+        def at(radius: float) -> list[Camera]:
+            return [cls.look_at(subject.centre + radius * away, subject.centre, up=scene.up, **image)]
+
+        return framed(subject, at, **image, distance=distance)[0]
 
     @cached_property
     def camera_to_world(self) -> np.ndarray:
@@ -290,3 +329,33 @@ def mitsuba_sensor(camera: Camera, spp: int = 16, **film: Any) -> dict[str, Any]
             **film,
         },
     }
+
+
+def rigid_pose(matrix: object) -> np.ndarray:
+    """(4, 4) float64 rigid transform from a (4, 4) or (3, 4) matrix as files have it.
+
+    A uniform scale of the axes is divided out, the position kept; rounding is removed by taking the nearest
+    rotation.
+
+    Raises:
+        TronError: another shape, NaN, a mirrored, sheared or unevenly scaled matrix.
+    """
+    try:
+        pose = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TronError("pose is not a matrix of numbers") from error
+    if pose.shape not in ((4, 4), (3, 4)):
+        raise TronError(f"pose has shape {pose.shape}, not (4, 4)")
+    if not np.isfinite(pose).all():
+        raise TronError("pose holds NaN or infinity")
+    if pose.shape == (4, 4) and not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-6):
+        raise TronError("last row of the pose is not 0 0 0 1")
+    u, scales, vt = np.linalg.svd(pose[:3, :3])
+    if scales[0] < 1e-9 or scales[0] - scales[2] > 0.01 * scales[0]:
+        raise TronError("pose is no rotation: its axes are not at right angles and of one length")
+    if np.linalg.det(pose[:3, :3]) < 0:
+        raise TronError("pose is mirrored: its axes are left-handed")
+    rigid = np.eye(4)
+    rigid[:3, :3] = u @ vt
+    rigid[:3, 3] = pose[:3, 3]
+    return rigid

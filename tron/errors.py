@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
 
 
 class TronError(Exception):
@@ -29,3 +33,18 @@ class TronError(Exception):
         if self.mend:
             text += f": {self.mend}"
         return " ".join(text.split())
+
+
+@contextmanager
+def located(where: str | os.PathLike[str] | None) -> Iterator[None]:
+    """Errors of the block that do not say where were found in ``where``."""
+    try:
+        yield
+    except TronError as error:
+        raise TronError(error.what, error.where or where, error.mend) from error
+
+
+@lru_cache(maxsize=4096)
+def say_once(logger: str, line: str, level: int = logging.INFO) -> None:
+    """Log a line under this logger's name, the first time that it is asked for."""
+    logging.getLogger(logger).log(level, "%s", line)

@@ -20,7 +20,7 @@ def require_bounces(bounces: int, reflections: int) -> None:
 
 
 class Estimation(BaseModel):
-    """Choices in estimating light (docs/conventions.md, 10); by default those of final frames.
+    """Choices in estimating light (conventions.md, 10); by default those of final frames.
 
     The paper's are ``Estimation(estimator="plain", two_sided=False, bounces=0, diffuse="lambert")``. What
     each costs, on 10,000 to 20,000 surfels of scenes that no benchmark uses:
@@ -60,7 +60,8 @@ class Estimation(BaseModel):
     reflections: int = Field(
         default=0,
         ge=0,
-        description="rays per pixel that find what glossy surfaces mirror; 0: the bounced light around them",
+        description="rays per pixel that find what glossy surfaces mirror; 0: the bounced light around them, "
+        "and one ray for metals where filtered",
     )
     supersample: Literal[1, 2] = Field(
         default=1, description="2: 2 x 2 sub-pixels with a quarter of the rays each, averaged"

@@ -16,6 +16,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tron.errors import TronError
 
 MINIMUM_LLVM = 17
@@ -36,6 +38,8 @@ _LLVM_FOLDERS = (
     "/opt/homebrew/opt/llvm*/lib",
     "/usr/local/opt/llvm*/lib",
 )
+ALIGNMENT = 64
+"""Bytes of the widest packet: 16 numbers of 32 bits."""
 
 
 def find_llvm() -> Path:
@@ -163,9 +167,10 @@ def set_torch_threads(n: int) -> None:
     torch.set_num_threads(n)
 
 
-def torch_device(variant: str) -> str:
-    """The torch device that a Mitsuba variant shares its arrays with: "cuda" or "cpu"."""
-    return "cuda" if variant.startswith("cuda") else "cpu"
+def torch_device() -> str:
+    """The torch device that the active Mitsuba variant shares its arrays with: "cuda" or "cpu"."""
+    mitsuba = sys.modules.get("mitsuba")
+    return "cuda" if mitsuba and (mitsuba.variant() or "").startswith("cuda") else "cpu"
 
 
 def describe_machine() -> dict[str, Any]:
@@ -235,3 +240,21 @@ def _output(command: list[str]) -> str | None:
         return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
+
+
+def aligned(array: np.ndarray) -> np.ndarray:
+    """The array, contiguous, at a multiple of ``ALIGNMENT`` bytes; itself where it is that already.
+
+    Dr.Jit borrows the memory of a NumPy array and writes its alignment into the kernels that read it: loads
+    of whole packets where it begins at a multiple of 64 bytes, else loads byte by byte, and gathers of four
+    numbers one by one. NumPy's memory begins at any multiple of 16, by chance, so the same call would now and
+    then compile another and slower kernel.
+    """
+    array = np.ascontiguousarray(array)
+    if array.ctypes.data % ALIGNMENT == 0:
+        return array
+    memory = np.empty(array.nbytes + ALIGNMENT, np.uint8)
+    first = -memory.ctypes.data % ALIGNMENT
+    copy = memory[first : first + array.nbytes].view(array.dtype).reshape(array.shape)
+    copy[...] = array
+    return copy

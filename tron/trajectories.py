@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tron.cameras import Camera
 from tron.errors import TronError
+from tron.framing import outward
 
 Vector = Sequence[float] | np.ndarray
 Z_UP = (0.0, 0.0, 1.0)
@@ -167,24 +168,11 @@ def _fractions(n: int) -> np.ndarray:
 
 def _around(azimuth_deg: np.ndarray, elevation_deg: np.ndarray, **view: Unpack[View]) -> list[Camera]:
     target, radius = np.asarray(view["target"], dtype=np.float64), view["radius"]
-    east, north, zenith = _frame(np.asarray(view.get("up", Z_UP), dtype=np.float64))
-    image = {"fov_deg": view["fov_deg"], "width": view["width"], "height": view["height"]}
+    up = np.asarray(view.get("up", Z_UP), dtype=np.float64)
+    image = {"up": up, "fov_deg": view["fov_deg"], "width": view["width"], "height": view["height"]}
     if np.abs(elevation_deg).max() >= 90:
         raise TronError("elevations of a camera path must stay between -90 and 90 degrees")
     if not radius > 0:
         raise TronError(f"radius of a camera path must be positive, not {radius}")
-    azimuth, elevation = np.radians(azimuth_deg)[:, None], np.radians(elevation_deg)[:, None]
-    level = np.cos(azimuth) * east + np.sin(azimuth) * north
-    outward = np.cos(elevation) * level + np.sin(elevation) * zenith
-    return [Camera.look_at(position, target, up=zenith, **image) for position in target + radius * outward]
-
-
-def _frame(up: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Right-handed east, north, zenith; east is the world's x axis made orthogonal to up if it can be."""
-    if not np.linalg.norm(up) > 0:
-        raise TronError("up direction must not be zero")
-    zenith = up / np.linalg.norm(up)
-    axis = np.array([1.0, 0.0, 0.0]) if abs(zenith[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    east = axis - zenith * (axis @ zenith)
-    east /= np.linalg.norm(east)
-    return east, np.cross(zenith, east), zenith
+    positions = target + radius * outward(azimuth_deg, elevation_deg, up)
+    return [Camera.look_at(position, target, **image) for position in positions]

@@ -1,4 +1,4 @@
-"""Benchmark `reconstruction`: how good surfels from photos are, how long they take, and what a step costs."""
+"""Benchmark `reconstruction`: how good surfels from photos are, and how long they take."""
 
 from __future__ import annotations
 
@@ -6,23 +6,35 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
-from eval.peers.timing import write_times
-from eval.reconstruction import page
-from eval.reconstruction.measured import Measured, ReconstructionSettings
-from eval.reconstruction.relit import FoxRun, chosen_views, collect_fox, write_cameras
-from eval.reconstruction.runs import Run, collect_run
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
+
+from eval.benchmark import Benchmark
+from eval.reconstruction.fox import FoxRun, chosen_views, collect_fox, write_cameras
+from eval.reconstruction.runs import Run, collect_run, light_rows, mean_curve, rows_of
 from eval.report.outcome import Outcome
 from eval.stages import Child, Stages, script_path
 from tron.errors import TronError
 
+if TYPE_CHECKING:
+    from eval.reconstruction.scans import Scan
+
 log = logging.getLogger("tron.eval")
 
+DEFAULT_VARIANT = "llvm_ad_rgb"
 PHOTOGRAPHS = "photographs"
 """Folder of the captures that are photographs, and of the truth of relighting."""
-DEGREE2 = "degree2"
-"""Folder of the scene of the steps with the peer's own kernel, beside those of the ways."""
+WAYS = {
+    "random": "random points, true prior",
+    "depth_init": "depth maps, true prior",
+    "photos": "photographs, no prior",
+}
+RELIT_ENLARGED = 2
+"""Pixels of a relit fox per pixel of its photo, along a side."""
+SCANS = {"raw": "the file as it is", "splats": "the file as a capture"}
+Part = Literal["scenes", "photos", "splats", "fox"]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 
 
 class Made(NamedTuple):
@@ -45,11 +57,40 @@ def relit_truths(dataset: Path, scene: str) -> list[Path]:
     return sorted(path.parent for path in (dataset / "relit").glob(f"{scene}_*/transforms.json"))
 
 
-class Reconstruction(ReconstructionSettings):
-    """Parts of the benchmark, and the arguments of the commands.
+class SplatSettings(BaseModel):
+    """A scan of the first scene as other programs leave it, and what tron-reconstruct makes of that."""
 
-    Beside the page, times.json keeps the steps' rounds.
-    """
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    scan: list[str] = Field(description="arguments of tron-reconstruct for what becomes the scan")
+    reconstruct: list[str] = Field(description="arguments of tron-reconstruct for the scan as a capture")
+
+
+class Reconstruction(Benchmark):
+    """Parts of the benchmark, and the arguments of the commands."""
+
+    name: ClassVar[str] = "reconstruction"
+
+    variant: str = Field(default=DEFAULT_VARIANT, description="Mitsuba variant; cuda_ad_rgb on a GPU")
+    seed: int = 0
+    parts: list[Part] = Field(description="what is measured", min_length=1)
+    datagen: list[str] = Field(description="arguments of tron-datagen, which makes the captures")
+    reconstruct: list[str] = Field(description="arguments of tron-reconstruct for every scene and way")
+    ways: dict[Name, list[str]] = Field(description="further ones of each way; the first is the main one")
+    photographs: list[str] = Field(
+        description="arguments of tron-datagen, which makes the same scenes as photographs, and relights them"
+    )
+    photos: dict[Name, list[str]] = Field(
+        description="further arguments of each way to reconstruct the photographs, none of which is a way's"
+    )
+    relit: list[Name] = Field(description="ways whose surfels are relit, beside those of photographs")
+    splats: SplatSettings = Field(description="scans of plain splats, made and taken as captures")
+    real_data: Path | None = Field(description="folder with captures/fox and hdri; null: no fox")
+    fox_downscale: PositiveFloat = Field(default=8, description="factor by which the photos are reduced")
+    fox: list[str] = Field(description="further arguments of tron-reconstruct for the fox")
+    hdris: list[str] = Field(description="files of hdri under which the fox is relit")
+    relight: list[str] = Field(description="arguments of tron-relight")
+    relit_views: PositiveInt = Field(default=3, description="held-out views of the fox that are shown")
 
     def check(self) -> None:
         """Find the commands that the parts call."""
@@ -69,28 +110,30 @@ class Reconstruction(ReconstructionSettings):
         """
         self.check()
         folder = output_dir.absolute()
-        measured = Measured(self, Stages(folder))
+        stages, found = Stages(folder), Outcome(folder)
         # Commands first: what comes after them is done in this process, anew each time.
-        runs = self._reconstruct_scenes(measured.stages, folder) if "scenes" in self.parts else []
+        runs = self._reconstruct_scenes(stages, folder) if "scenes" in self.parts else []
         if "photos" in self.parts:
-            runs += self._reconstruct_photos(measured.stages, folder)
-        scans = self._reconstruct_splats(measured.stages, folder) if "splats" in self.parts else []
-        if "steps" in self.parts:
-            self._reconstruct_for_steps(measured.stages, folder)
-        fox = self._reconstruct_fox(measured, folder) if "fox" in self.parts else None
+            runs += self._reconstruct_photos(stages, folder)
+        scans = self._reconstruct_splats(stages, folder) if "splats" in self.parts else []
+        fox = self._reconstruct_fox(stages, folder) if "fox" in self.parts else None
         from tron.runtime import activate, set_torch_threads
 
         activate(self.variant)
         set_torch_threads(1)  # as tron-reconstruct does: Dr.Jit has the cores
-        self._collect_scenes(runs, folder, measured)
-        self._collect_scans(scans, folder, measured)
+        self._collect_scenes(runs, found)
+        self._collect_scans(scans, found)
         if fox is not None:
-            measured.fox = collect_fox(fox)
-        if "steps" in self.parts:
-            self._measure_steps(folder, measured)
-            self._measure_growth(measured)
-            write_times(folder / "times.json", [*measured.steps, *measured.growth])
-        return page.outcome(measured, output_dir)
+            self._collect_fox(fox, found)
+        return found
+
+    def _variant(self) -> list[str]:
+        """The variant as an argument of a command, if it is not the default."""
+        return [] if self.variant == DEFAULT_VARIANT else [f"variant={self.variant}"]
+
+    def _prefix(self, way: str) -> str:
+        """Beginning of the metrics of a way: the first one's name no way."""
+        return "reconstruction" if way == next(iter(self.ways)) else f"reconstruction.{way}"
 
     def _reconstruct_scenes(self, stages: Stages, folder: Path) -> list[Made]:
         """Every scene in every way."""
@@ -129,13 +172,13 @@ class Reconstruction(ReconstructionSettings):
         return Made(scene, way, capture, out, seconds)
 
     def _reconstruct_splats(self, stages: Stages, folder: Path) -> list[Made]:
-        """Scans of some scenes, raw and reconstructed."""
+        """A scan of the first scene, raw and reconstructed."""
         from eval.reconstruction.scans import write_scan
         from tron.gaussians.scene import GaussianScene
 
         dataset, made = self._dataset(stages, folder), []
         self._photographs(stages, folder)
-        for scene in scene_names(dataset)[: self.splats.scenes]:
+        for scene in scene_names(dataset)[:1]:
             scanned = self._reconstruct_scene(stages, folder, dataset, scene, "scan", self.splats.scan)
             raw = folder / "scans" / scene / "scene.ply"
             if not raw.is_file():
@@ -150,50 +193,65 @@ class Reconstruction(ReconstructionSettings):
         self, stages: Stages, label: str, capture: Path, arguments: list[str], output_dir: Path
     ) -> float:
         """Reconstruct one capture; its wall seconds."""
-        typed = [f"capture={capture}", *arguments, *self.override()]
+        typed = [f"capture={capture}", *arguments, *self._variant()]
         typed += [f"seed={self.seed}", f"output_dir={output_dir}"]
         return stages.run(label, [Child(label, "tron-reconstruct", typed)])
 
-    def _reconstruct_for_steps(self, stages: Stages, folder: Path) -> None:
-        """The scene of the steps once more, with the peer's own kernel."""
-        from eval.reconstruction.subjects import first_trained
+    def _collect_scenes(self, made: Sequence[Made], found: Outcome) -> None:
+        from eval.reconstruction.pictures import compare_scene
+        from eval.reconstruction.relighting import relight, relit_pictures
 
-        way, arguments = next(iter(self.ways.items()))
-        scene, dataset = first_trained(folder, way), folder / "dataset"
-        self._reconstruct_scene(stages, folder, dataset, scene, DEGREE2, [*arguments, *self.step_degree2])
-
-    def _collect_scenes(self, made: Sequence[Made], folder: Path, measured: Measured) -> None:
-        from eval.reconstruction.pictures import compare_scene, write_sheet
-        from eval.reconstruction.relighting import relight
-
-        scenes: dict[str, dict[str, Run]] = {}
+        ways: dict[str, list[Run]] = {}
         for each in made:
             run = collect_run(each.scene, each.folder, each.capture, each.seconds)
-            truths = relit_truths(folder / PHOTOGRAPHS, each.scene)
+            truths = relit_truths(found.folder / PHOTOGRAPHS, each.scene)
             if truths and (each.way in self.photos or each.way in self.relit):
-                relit = relight(each.folder / "scene.ply", truths)
-                log.info("%s %s: relit %.2f dB", each.scene, each.way, relit.psnr)
-                run = replace(run, relit=relit)
-            measured.runs.setdefault(each.way, []).append(run)
-            scenes.setdefault(each.scene, {})[each.way] = run
-        measured.compared += [compare_scene(ways) for ways in scenes.values()]
-        for compared in measured.compared:
-            write_sheet(folder / "pictures", compared)
+                run = replace(run, relit=relight(each.folder / "scene.ply", truths))
+            ways.setdefault(each.way, []).append(run)
+        for way, runs in ways.items():
+            found.add(rows_of(self._prefix(way), runs, self.seed))
+            found.add(light_rows(self._prefix(way), runs, self.seed))
+            if curve := mean_curve(runs):
+                found.series.setdefault("scenes", {})[WAYS.get(way, way)] = curve
+        for scene in dict.fromkeys(run.name for runs in ways.values() for run in runs):
+            of_scene = {way: run for way, runs in ways.items() for run in runs if run.name == scene}
+            found.show("views", scene, compare_scene(of_scene, WAYS))
+            relit = {WAYS.get(way, way): run.relit for way, run in of_scene.items() if run.relit is not None}
+            if relit:
+                found.show("relit", f"{scene}-relit", relit_pictures(f"Scene {scene}", relit))
 
-    def _collect_scans(self, made: Sequence[Made], folder: Path, measured: Measured) -> None:
-        from eval.reconstruction.scans import collect_scan
+    def _collect_scans(self, made: Sequence[Made], found: Outcome) -> None:
+        from eval.reconstruction.relighting import relit_pictures
+        from eval.reconstruction.scans import collect_scan, normal_pictures, scan_rows
 
+        ways: dict[str, list[Scan]] = {}
         for each in made:
-            truths = relit_truths(folder / PHOTOGRAPHS, each.scene)
+            truths = relit_truths(found.folder / PHOTOGRAPHS, each.scene)
             scan = collect_scan(each.scene, each.folder / "scene.ply", each.capture, truths, each.seconds)
-            measured.scans.setdefault(each.way, []).append(scan)
+            ways.setdefault(each.way, []).append(scan)
+        for way, scans in ways.items():
+            found.add(scan_rows(way, scans, self.seed))
+        for scans in zip(*ways.values()):
+            titled = dict(zip((SCANS[way] for way in ways), scans))
+            name = scans[0].name
+            found.show("splats", f"{name}-splats", normal_pictures(titled))
+            relit = {title: scan.relit for title, scan in titled.items()}
+            title = f"Scene {name} under other lights"
+            found.show("splats", f"{name}-splats-relit", relit_pictures(title, relit))
 
-    def _reconstruct_fox(self, measured: Measured, folder: Path) -> FoxRun | None:
-        """Reconstruct and relight the fox; None, with the reason in ``measured``, if that cannot be."""
-        data, stages = self.real_data, measured.stages
+    def _collect_fox(self, made: FoxRun, found: Outcome) -> None:
+        fox = collect_fox(made)
+        found.add(fox.rows())
+        if curve := mean_curve([fox.run]):
+            found.series["fox"] = {"fox": curve}
+        for name, group in fox.pictures():
+            found.show("fox", name, group)
+
+    def _reconstruct_fox(self, stages: Stages, folder: Path) -> FoxRun | None:
+        """Reconstruct and relight the fox; None, with a warning, if it is not there."""
+        data = self.real_data
         if data is None or not (data / "captures" / "fox").is_dir():
-            measured.no_fox = "benchmark.real_data is null" if data is None else f"no captures/fox in {data}"
-            log.warning("the fox is left out: %s", measured.no_fox)
+            log.warning("the fox is left out: no captures/fox in benchmark.real_data=%s", data)
             return None
         capture, out, cameras = data / "captures" / "fox", folder / "fox", folder / "fox_cameras.json"
         arguments = [f"downscale={self.fox_downscale:g}", *self.fox]
@@ -211,41 +269,12 @@ class Reconstruction(ReconstructionSettings):
                 f"scene={out / 'scene.ply'}",
                 f"environment={environment}",
                 f"cameras={cameras}",
-                f"width={camera.width * self.relit_enlarged}",
-                f"height={camera.height * self.relit_enlarged}",
+                f"width={camera.width * RELIT_ENLARGED}",
+                f"height={camera.height * RELIT_ENLARGED}",
                 *self.relight,
-                *self.override(),
+                *self._variant(),
                 f"output_dir={frames}",
             ]
             made.relit_seconds += stages.run(label, [Child(label, "tron-relight", typed)])
             made.lights[environment.stem] = environment, frames
         return made
-
-    def _measure_steps(self, folder: Path, measured: Measured) -> None:
-        from eval.reconstruction.step import measure_steps
-        from eval.reconstruction.subjects import trained
-
-        for way in (DEGREE2, next(iter(self.ways))):
-            for size in self.step_pixels:
-                found = measure_steps(*trained(folder, way, size), self.seed, self.rounds)
-                measured.steps.append(found)
-                seconds = ", ".join(f"{name} {times.median:.3f} s" for name, times in found.times.items())
-                log.info(
-                    "a step of %d surfels, %s: %.1f times volprim (%s)",
-                    found.count,
-                    found.case,
-                    found.ratio(),
-                    seconds,
-                )
-
-    def _measure_growth(self, measured: Measured) -> None:
-        from eval.reconstruction.step import measure_growth
-        from eval.reconstruction.subjects import drawn
-
-        surfels, pixels = self.growth_at
-        cases = [(count, pixels) for count in self.growth_surfels]
-        cases += [(surfels, size) for size in self.growth_pixels]
-        for count, size in dict.fromkeys(cases):
-            found = measure_growth(*drawn(count, size, self.seed), self.seed, self.repetitions)
-            measured.growth.append(found)
-            log.info("a step of %d surfels at %d: %.3f s", count, size, found.seconds)

@@ -13,7 +13,7 @@ import numpy as np
 
 from tron.color import luminance
 from tron.seeds import generator
-from tron.shading.environment import EnvironmentMap
+from tron.shading.environments.environment import EnvironmentMap
 
 NORMALS = 500
 SPOT_DEG = 10.0

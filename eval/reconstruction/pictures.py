@@ -2,55 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from eval.reconstruction.light import read_light
-from eval.reconstruction.measured import CHANNELS, Compared
 from eval.reconstruction.runs import Run
-from tron.apps.labelled_sheet import labelled_sheet
 from tron.captures import View
 from tron.captures.folder import read_capture_folder
 from tron.color import linear_to_srgb, to_display
 from tron.gaussians.scene import GaussianScene
-from tron.images import write_image
 from tron.metrics import scale_albedo
-from tron.reconstruction.evaluation import picture, wanted_picture
-from tron.shading.environment import EnvironmentMap
+from tron.reconstruction.scores import picture, wanted_picture
+from tron.report.page import Picture, Pictures
+from tron.shading.environments.environment import EnvironmentMap
 from tron.tracing import SurfelTracer
 
 LIGHT_HEIGHT = 64
 
 
-def compare_scene(runs: Mapping[str, Run]) -> Compared:
-    """The middle held-out view of a scene, as every way reconstructed it; ``runs`` maps a way to its run."""
+def compare_scene(runs: Mapping[str, Run], titles: Mapping[str, str]) -> Pictures:
+    """The middle held-out view of a scene: the truth, and a row for each way that reconstructed it.
+
+    Args:
+        runs: way -> its run. titles: way -> what it is.
+    """
     run = next(iter(runs.values()))
-    view = middle_view(read_capture_folder(run.capture).test_views)
+    views = read_capture_folder(run.capture).test_views
+    view = views[len(views) // 2]
     everywhere = np.ones((view.camera.height, view.camera.width), bool)
     mask = view.read("mask") > 0.5 if view.has("mask") else everywhere
     truth = {"radiance": wanted_picture(view)}
     if view.has("normal"):
-        truth["normal"] = _normal_picture(view.read("normal"), mask)
+        truth["normal"] = normal_picture(view.read("normal"), mask)
     if view.has("base_color"):
         truth["base color"] = _color_picture(view.read("base_color"), mask)
     light, exposure = read_light(run.capture), 1.0
     if light is not None:
         exposure = light.exposure()
         truth["light"] = light_picture(light, exposure)
-    ways = {}
+    pictures = [
+        Picture(
+            image, f"true {channel}" if channel != "radiance" else "photo", f"{channel}, {run.name}, truth"
+        )
+        for channel, image in truth.items()
+    ]
     for way, each in runs.items():
-        ways[way] = show_view(each.folder, view, mask)
+        shown, figures = show_view(each.folder, view, mask), _figures(each, view.name)
         if (found := read_light(each.folder)) is not None:
-            ways[way]["light"] = light_picture(found, exposure)
-    figures = {way: _figures(each, view.name) for way, each in runs.items()}
-    return Compared(run.name, run.family, view.name, truth, ways, figures)
-
-
-def middle_view(views: Sequence[View]) -> View:
-    """The middle one of some views."""
-    return views[len(views) // 2]
+            shown["light"] = light_picture(found, exposure)
+        for channel in truth:
+            image = shown.get(channel, np.zeros_like(truth[channel]))
+            alt = f"{channel} of scene {run.name}, {titles.get(way, way)}"
+            pictures.append(Picture(image, f"{way}: {channel}", alt, figures.get(channel, "")))
+    words = "; ".join(f"{way}: {titles.get(way, way)}" for way in runs)
+    light_words = f" · {run.family}" if run.family else ""
+    return Pictures(f"Scene {run.name}{light_words}", pictures, f"View {view.name}. {words}.", len(truth))
 
 
 def show_view(folder: Path, view: View, mask: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -65,7 +73,7 @@ def show_view(folder: Path, view: View, mask: np.ndarray | None = None) -> dict[
         color = scale_albedo(color, view.read("base_color"), mask)
     return {
         "radiance": picture(buffers),
-        "normal": _normal_picture(buffers["normal"], solid),
+        "normal": normal_picture(buffers["normal"], solid),
         "base color": _color_picture(color, solid),
     }
 
@@ -75,14 +83,8 @@ def light_picture(light: EnvironmentMap, exposure: float | None = None) -> np.nd
     return to_display(light.baked().resized(LIGHT_HEIGHT).image, exposure or light.exposure())
 
 
-def write_sheet(folder: Path, compared: Compared) -> None:
-    """Write all of it as one labelled picture, ``folder/SCENE.png``."""
-    columns, blank = {"truth": compared.truth, **compared.ways}, np.zeros((8, 8))
-    rows = {name: [images.get(name, blank) for images in columns.values()] for name in CHANNELS}
-    write_image(folder / f"{compared.scene}.png", labelled_sheet(rows, list(columns)))
-
-
-def _normal_picture(normal: np.ndarray, where: np.ndarray) -> np.ndarray:
+def normal_picture(normal: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """World normals (H, W, 3) as colours, black outside of ``where`` (H, W)."""
     return np.where(where[..., None], np.clip(0.5 * normal + 0.5, 0, 1), 0)
 
 

@@ -8,24 +8,24 @@ nearest.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import fminbound
 
-from tron.apps.lit_scene import LitScene
-from tron.apps.relight_settings import QUALITY
+from tron.apps.relight.settings import QUALITY
 from tron.captures import Capture
 from tron.captures.folder import read_capture_folder
 from tron.color import to_display
 from tron.estimation import Estimation
 from tron.gaussians.scene import GaussianScene
 from tron.metrics import capped_psnr
+from tron.relighting import Illumination, Relighter
+from tron.report.page import Picture, Pictures
 from tron.seeds import integer
-from tron.shading.environment import EnvironmentMap
-from tron.shading.guidance import Lighting, render_guidance
+from tron.shading.environments.environment import EnvironmentMap
 
 COVERED = 0.999
 """Coverage from which a pixel shows nothing but surfaces."""
@@ -76,10 +76,9 @@ def relight(scene: Path, truths: Sequence[Path], estimation: Estimation = QUALIT
     """
     surfels = GaussianScene.load(scene)
     captures = {path.name.rpartition("_")[2]: (path, read_capture_folder(path)) for path in truths}
-    first = next(iter(captures.values()))[1].views[0].camera
-    lit = LitScene(surfels, first, estimation, integer(0, "reconstruction", "relit bounces"))
+    relighter = Relighter(surfels, estimation, integer(0, "reconstruction", "relit bounces"))
     pictures = {
-        name: _lit_views(lit, capture, EnvironmentMap.load(path / "environment.exr"), estimation)
+        name: _lit_views(relighter.under(EnvironmentMap.load(path / "environment.exr")), capture)
         for name, (path, capture) in captures.items()
     }
     views = {name: _display(capture) for name, (_, capture) in captures.items()}
@@ -117,19 +116,29 @@ def fitted_factor(lights: Sequence[tuple[np.ndarray, float, np.ndarray, np.ndarr
     return float(np.exp2(fminbound(error, floor - step, floor + step)))
 
 
-def _lit_views(lit: LitScene, capture: Capture, light: EnvironmentMap, estimation: Estimation) -> np.ndarray:
+def _lit_views(light: Illumination, capture: Capture) -> np.ndarray:
     """(K, H, W, 3) linear radiance of the surfels from the capture's views."""
-    lighting = Lighting(light)
-    bounced = lit.bake(lighting)
-    frames = []
-    for number, view in enumerate(capture.views):
-        tracer, seed = lit.tracer(view.camera), integer(0, "reconstruction", "relit", number)
-        bounce = bounced(view.camera)
-        frames.append(render_guidance(tracer, view.camera, lighting, estimation, seed, bounce=bounce).lit)
-    return np.stack(frames)
+    seeds = [integer(0, "reconstruction", "relit", number) for number in range(len(capture.views))]
+    return np.stack(
+        [light.render(view.camera, seed).lit for view, seed in zip(capture.views, seeds, strict=True)]
+    )
 
 
 def _display(capture: Capture) -> tuple[np.ndarray, np.ndarray]:
     """True display values (K, H, W, 3), and where nothing but surfaces is seen (K, H, W) bool."""
     truth = np.stack([to_display(view.read(), capture.exposure) for view in capture.views])
     return truth, np.stack([view.read("mask") > COVERED for view in capture.views])
+
+
+def relit_pictures(title: str, relit: Mapping[str, Relit]) -> Pictures:
+    """A row of pictures for each light: the truth, then every way; ``relit``: title -> what it gave."""
+    pictures = []
+    for light, under in next(iter(relit.values())).lights.items():
+        pictures.append(
+            Picture(under.truth, f"{light}: path-traced", f"{title}, {light}, path-traced", strong=True)
+        )
+        for name, each in relit.items():
+            found = each.lights[light]
+            pictures.append(Picture(found.shown, name, f"{title}, {light}, {name}", f"{found.psnr:.1f} dB"))
+    note = "The middle held-out view; figures are of all held-out views under that light."
+    return Pictures(title, pictures, note, columns=len(relit) + 1)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
@@ -95,10 +96,6 @@ class Run:
     family: str = ""
     relit: Relit | None = None
 
-    def curve(self) -> list[tuple[float, float]]:
-        """(seconds of training, dB) of held-out views."""
-        return [(point.seconds, point.test_psnr) for point in self.report.curve]
-
 
 def read_report(folder: Path) -> Report:
     """metrics.json of a finished run; TronError if it is missing, or is none."""
@@ -176,16 +173,14 @@ def light_rows(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]
         yield mean_row(f"{prefix}.sun_direction_deg", "deg", values, seed)
 
 
-def gain_rows(prefix: str, runs: Sequence[Run], over: Sequence[Run], seed: int = 0) -> Iterator[Row]:
-    """Gain of relit pictures over another way's, scene by scene, dB; none where either was not relit."""
-    before = {run.name: run.relit.psnr for run in over if run.relit is not None}
-    gains = [
-        (run.name, run.relit.psnr - before[run.name])
-        for run in runs
-        if run.relit is not None and run.name in before
-    ]
-    if gains:
-        yield mean_row(f"{prefix}.relight_gain", "dB", gains, seed)
+def mean_curve(runs: Sequence[Run]) -> list[tuple[float, float]]:
+    """Mean (seconds, dB of held-out views) over the scenes at the steps that all of them scored."""
+    by_step = [{point.step: point for point in run.report.curve} for run in runs]
+    steps = sorted(set.intersection(*(set(points) for points in by_step)))
+    if len(steps) < 2:
+        return []
+    means = [np.mean([(p[step].seconds, p[step].test_psnr) for p in by_step], axis=0) for step in steps]
+    return [(float(seconds), float(psnr)) for seconds, psnr in means]
 
 
 def _figures(runs: Sequence[Run]) -> Iterator[tuple[str, str, dict[str, float]]]:

@@ -7,22 +7,23 @@ over by the order of our arrays, axes are exchanged and turned over at random.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import plyfile
 
+from eval.reconstruction.pictures import normal_picture
 from eval.reconstruction.relighting import Relit, relight
 from eval.results import Row, mean_row
-from tron.apps.lit_scene import LitScene
-from tron.apps.relight_settings import QUALITY
 from tron.captures.folder import read_capture_folder
 from tron.gaussians.fields import FIELDS
 from tron.gaussians.ply import NORMAL, REST
 from tron.gaussians.scene import GaussianScene, quats_from_matrices
 from tron.metrics import angular_errors_deg
+from tron.relighting import Relighter
+from tron.report.page import Picture, Pictures
 from tron.seeds import generator
 from tron.storage import atomic_path
 
@@ -90,15 +91,19 @@ def collect_scan(name: str, scene: Path, capture: Path, truths: Sequence[Path], 
         seconds: that making it took.
     """
     surfels, views = GaussianScene.load(scene), read_capture_folder(capture).test_views
-    lit = LitScene(surfels, views[0].camera, QUALITY["final"], 0)
+    relighter = Relighter(surfels)
     means, medians, pictures = [], [], []
     for view in views:
-        normal, truth = lit.tracer(view.camera).gbuffer(view.camera).numpy()["normal"], view.read("normal")
+        normal, truth = (
+            relighter.tracer(view.camera).gbuffer(view.camera).numpy()["normal"],
+            view.read("normal"),
+        )
         known = np.asarray(truth.any(axis=-1) & (view.read("mask") > 0.5))
         angles = angular_errors_deg(normal, truth, known)
         means.append(angles.mean())
         medians.append(np.median(angles))
-        pictures.append((_shown(truth, known), _shown(normal, np.asarray(normal.any(axis=-1)))))
+        shown = (truth, known), (normal, np.asarray(normal.any(axis=-1)))
+        pictures.append(tuple(normal_picture(*each) for each in shown))
     normals = {"normal_mae_deg": float(np.mean(means)), "normal_median_deg": float(np.mean(medians))}
     relit = relight(scene, truths)
     return Scan(name, normals, len(surfels), seconds, relit, pictures[len(pictures) // 2])
@@ -116,5 +121,11 @@ def scan_rows(way: str, scans: Sequence[Scan], seed: int = 0) -> Iterator[Row]:
     yield Row(metric=f"{prefix}.seconds", value=max(s.seconds for s in scans), unit="s", n=len(scans))
 
 
-def _shown(normal: np.ndarray, where: np.ndarray) -> np.ndarray:
-    return np.where(where[..., None], np.clip(0.5 * normal + 0.5, 0, 1), 0)
+def normal_pictures(scans: Mapping[str, Scan]) -> Pictures:
+    """True normals of a scene, and those of its scans by their titles."""
+    first = next(iter(scans.values()))
+    pictures = [Picture(first.views[0], "true normals", f"true normals of scene {first.name}", strong=True)]
+    for title, scan in scans.items():
+        figure = f"{scan.normals['normal_mae_deg']:.1f}°"
+        pictures.append(Picture(scan.views[1], title, f"normals of scene {scan.name}, {title}", figure))
+    return Pictures(f"Normals of scene {first.name}", pictures, columns=len(pictures))

@@ -1,6 +1,6 @@
 """Baselines that a neural renderer must beat: products in linear light, and least-squares blends.
 
-Definitions (docs/conventions.md, 12). With B = pbr, E = irradiance, E0 = unshadowed irradiance (all linear, E
+Definitions (conventions.md, 12). With B = pbr, E = irradiance, E0 = unshadowed irradiance (all linear, E
 over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the displayed image:
 
 - ``pbr``: D(B).
@@ -18,6 +18,10 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 - ``lit_remodulated``: D(A G(L / A)), G a Gaussian whose deviation is fitted, A the surfels' base color as
   a mean over sub-pixels: ``albedo``.
 - ``lit_detailed``: an affine blend of G(D(L)), G(S(A)) and S(A), S being the sRGB curve.
+- ``lit_bilateral``: D(L) by a cross-bilateral filter (:mod:`eval.relighting.bilateral`).
+- ``lit_blended``: an affine blend of G(D(L)), G(D(B)), G(D(E)), G(S(A)) and S(A), weights and deviation by
+  the mean PSNR of training frames (`PsnrAffineFit`).
+- ``lit_oidn``: D of L through Open Image Denoise, where pyoidn is installed.
 - ``affine_filtered``, ``affine_ratio_filtered``, ``affine_lit_filtered``: the blends of images so filtered.
 - ``pixel_mlp``, ``pixel_mlp_lit``: 1x1 convolutions on D(B) and D(E), or on these and D(L).
 
@@ -36,12 +40,14 @@ A new baseline is one more entry of BASELINES: scores, tables and pictures itera
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
+from eval.relighting.bilateral import BilateralFit
 from eval.relighting.buffers import Buffers, Region, region_mask
 from eval.relighting.fits import (
     AffineFit,
@@ -50,6 +56,7 @@ from eval.relighting.fits import (
     Fitted,
     GaussianFit,
     ProductFit,
+    PsnrAffineFit,
     Show,
     filtered,
     remodulated,
@@ -103,6 +110,27 @@ def show_shadow_ratio(buffers: Buffers) -> np.ndarray:
     return to_display(shadow_ratio(buffers), buffers.exposure)
 
 
+def show_oidn(buffers: Buffers) -> np.ndarray:
+    """Displayed ``lit`` of whole clips (K, H, W, 3), denoised frame by frame by Intel's Open Image Denoise.
+
+    A network that nobody here trained. The filter is that of path tracers' linear pictures; it is given
+    ``lit``, exposed, and base color, a mean over sub-pixels, as its clean albedo
+    (https://www.openimagedenoise.org/documentation.html).
+    """
+    from pyoidn import denoise  # pyright: ignore
+
+    frames = [
+        denoise(
+            np.ascontiguousarray(lit * buffers.exposure, np.float32),
+            np.ascontiguousarray(np.clip(albedo, 0, 1), np.float32),
+            hdr=True,
+            clean_aux=True,
+        )
+        for lit, albedo in zip(buffers["lit"], buffers["albedo"])
+    ]
+    return to_display(np.stack(frames), 1.0)
+
+
 @dataclass(frozen=True)
 class Method:
     """A way to make the picture from the guidance.
@@ -148,6 +176,15 @@ class Baseline(Method):
 NEURAL_LIT = Method("neural_lit", "neural renderer", "filters lit and adds what is missing")
 NEURAL = Method("neural", "neural renderer of two buffers", "the same of pbr and irradiance alone")
 NETWORKS = (NEURAL_LIT, NEURAL)
+OIDN = Baseline(
+    "lit_oidn",
+    "lit, Open Image Denoise",
+    "Intel's denoiser on linear lit with base color",
+    show_oidn,
+    groups=(ON_LIT,),
+    pictured=False,
+)
+"""Among the baselines where pyoidn is installed."""
 BASELINES = (
     Baseline("pbr", "pbr", "split-sum shading of the surfels, no shadows", show_pbr, groups=(SIMPLE, DIRECT)),
     Baseline(
@@ -247,6 +284,24 @@ BASELINES = (
         groups=(ON_LIT,),
         pictured=False,
     ),
+    Baseline(
+        "lit_bilateral",
+        "lit, cross-bilateral filter",
+        "lit filtered among pixels alike in base color, surface and filtered lit; two numbers fitted by PSNR",
+        fit=BilateralFit,
+        groups=(ON_LIT,),
+        pictured=False,
+    ),
+    Baseline(
+        "lit_blended",
+        "lit, filtered, with the detail of albedo, fitted by PSNR",
+        "lit_detailed with pbr and irradiance besides, by the mean PSNR of frames instead of squared error",
+        fit=lambda: PsnrAffineFit(show_lit, show_pbr, show_irradiance, sharp=[show_albedo]),
+        surfaces=True,
+        groups=(ON_LIT,),
+        pictured=False,
+    ),
+    *((OIDN,) if importlib.util.find_spec("pyoidn") else ()),
     Baseline(
         "affine_lit",
         "affine blend with lit",

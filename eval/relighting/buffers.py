@@ -11,7 +11,7 @@ import numpy as np
 
 from tron.cameras import Camera
 from tron.flow import surface_motion
-from tron.neural.reprojection import Motion
+from tron.neural.clips import Motion
 from tron.shards.moving import KEY, Moving
 from tron.shards.schema import TARGET, Clip, displayed, guidance_members
 

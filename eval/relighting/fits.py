@@ -121,23 +121,37 @@ class AffineFit:
 
     def solve(self) -> Fitted:
         """The least-squares weights, (3 output channels, inputs + 1); the last column is the constant."""
-        weights = self._weights()
+        weights = self.weights()
+        return Fitted(self.shown_by(weights), weights)
+
+    def shown_by(self, weights: np.ndarray) -> Show:
+        """The blend of the inputs by weights (3, inputs + 1)."""
 
         def show(buffers: Buffers) -> np.ndarray:
             blend = weights[:, -1] + sum(w * image for w, image in zip(weights.T, self._images(buffers)))
             return np.clip(blend, 0, 1).astype(np.float32)
 
-        return Fitted(show, weights)
+        return show
+
+    def join(self, other: AffineFit, share: float) -> None:
+        """Add the pixels of another fit of the same inputs, ``share`` times each."""
+        self._gram += share * other._gram
+        self._moment += share * other._moment
+        self._square += share * other._square
 
     def error(self) -> float:
         """Sum of the squared errors of the solution, before it is clipped."""
-        weights = self._weights()
+        return self.error_of(self.weights())
+
+    def error_of(self, weights: np.ndarray) -> float:
+        """The same of any weights (3, inputs + 1)."""
         explained = 2 * (weights * self._moment).sum(1) - np.einsum(
             "ci,cij,cj->c", weights, self._gram, weights
         )
         return float((self._square - explained).sum())
 
-    def _weights(self) -> np.ndarray:
+    def weights(self) -> np.ndarray:
+        """The least-squares weights."""
         diagonal = np.einsum("cii->ci", self._gram)
         ridge = np.eye(self._gram.shape[-1]) * (self.RIDGE * diagonal)[:, None, :]
         return np.linalg.solve(self._gram + ridge, self._moment[..., None])[..., 0]
@@ -219,3 +233,66 @@ class FilteredAffineFit:
     def solve(self) -> Fitted:
         """The weights of AffineFit for the Gaussian with which its error is least."""
         return min(self._fits.values(), key=AffineFit.error).solve()
+
+
+STEPS = 30
+LEAST_ERROR = 1e-6
+"""Mean squared error under which a frame counts no more: 60 dB."""
+
+
+class PsnrAffineFit:
+    """FilteredAffineFit by mean PSNR: weights and Gaussian with the highest mean over training frames.
+
+    Squared errors of all pixels together are mostly those of the worst frames; the mean of their logarithms
+    counts a factor of an error alike in each. It is minimised by least squares that are weighted anew (Lange
+    2016, *MM Optimization Algorithms*, majorising the concave logarithm by its tangent): a frame has the
+    weight of one over its squared error by the last solution. ``sharp`` inputs are taken as they are
+    besides. Needs whole clips.
+    """
+
+    sampled: ClassVar[bool] = True
+
+    def __init__(self, *inputs: Show, sharp: Sequence[Show] = ()):
+        self._inputs = {
+            deviation: (*(filtered(show, deviation) for show in (*inputs, *sharp)), *sharp)
+            for deviation in DEVIATIONS
+        }
+        self._frames: dict[float, list[AffineFit]] = {deviation: [] for deviation in DEVIATIONS}
+        self._pixels: list[int] = []
+
+    def add(self, buffers: Buffers, truth: np.ndarray, inside: Any = ...) -> None:
+        """As Fit.add; sums of each frame are kept."""
+        frames = np.unique(inside[0])
+        for frame in frames:
+            self._pixels.append(int((inside[0] == frame).sum()))
+        for deviation, inputs in self._inputs.items():
+            images = [show(buffers) for show in inputs]
+            for frame in frames:
+                some = tuple(axis[inside[0] == frame] for axis in inside)
+                fit = AffineFit(*((lambda _, image=image: image) for image in images))
+                fit.add(buffers, truth, some)
+                self._frames[deviation].append(fit)
+
+    def solve(self) -> Fitted:
+        """The weights, (3 output channels, inputs + 1)."""
+        counts = np.array(self._pixels, float)
+        found = {each: fitted_by_psnr(frames, counts) for each, frames in self._frames.items()}
+        best = max(found, key=lambda deviation: found[deviation][1])
+        whole = AffineFit(*self._inputs[best])
+        return Fitted(whole.shown_by(found[best][0]), found[best][0])
+
+
+def fitted_by_psnr(frames: Sequence[AffineFit], counts: np.ndarray) -> tuple[np.ndarray, float]:
+    """Weights of highest mean PSNR of frames, and that mean, dB."""
+    share = np.ones(len(frames))
+    weights = np.zeros(0)
+    errors = np.ones(len(frames))
+    for _ in range(STEPS):
+        whole = AffineFit(*frames[0].inputs)
+        for fit, each in zip(frames, share):
+            whole.join(fit, each)
+        weights = whole.weights()
+        errors = np.array([fit.error_of(weights) for fit in frames]) / (3 * counts)
+        errors = np.maximum(errors, LEAST_ERROR)
+        share = 1 / (counts * errors)
+    return weights, float(np.mean(-10 * np.log10(errors)))

@@ -135,6 +135,15 @@ def comparison(example: Example) -> Pictures:
     return Pictures(example.title, [*pictures, truth, error(judged)])
 
 
+def opening(example: Example) -> Pictures:
+    """Beginning of a page: lit, the network and the truth of one frame; pbr where there is no network."""
+    whole = comparison(example).pictures
+    network = next((method for method in NETWORKS if method.name in example.methods), None)
+    titles = [LIT.title if network else "pbr", network.title if network else LIT.title, "path-traced truth"]
+    shown = [picture for title in titles for picture in whole if picture.title == title]
+    return Pictures(example.title, shown, columns=len(shown))
+
+
 def guidance(example: Example) -> Pictures:
     """Irradiance, its reference and errors; base color and normals of the surfels beside the true ones."""
     where = f"scene {example.meta.scene} under light {example.meta.light}"

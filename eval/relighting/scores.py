@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.confidence import Interval, interval, scene_sums
+from eval.confidence import interval, scene_sums, without_one
 from eval.relighting.baselines import (
     BASELINES,
     DIRECT,
@@ -65,11 +65,15 @@ METRICS = (
     ),
     Metric("ssim", "SSIM ↑", "1", metrics.ssim, "SSIM compares structure; 1 is identical."),
 )
+BEST_OF_ALL = "best_of_all"
+"""Group of everything but the networks that are judged, dearer forms of lit included: the best is of those
+that were scored, whatever was not given."""
 GROUPS = {
     **{
         group: [each.name for each in BASELINES if group in each.groups] for group in (SIMPLE, DIRECT, ON_LIT)
     },
     "best_baseline": [baseline.name for baseline in BASELINES],
+    BEST_OF_ALL: [each.name for each in (*BASELINES, *FINER)],
 }
 OPTIONAL = {baseline.name for baseline in BASELINES if baseline.optional}
 RIVALS = {each.name: [each.name] for each in (*BASELINES, *FINER)} | GROUPS
@@ -96,9 +100,9 @@ class Where(NamedTuple):
         return self.tail_after("")
 
     def tail_after(self, size: str) -> str:
-        """The same with something between the region and the kind; in lower case, which style A is not."""
+        """The same with something between the region and the kind."""
         kind = self.family or self.style
-        return ("_full" if self.region == "frame" else "") + size + (f".{kind.lower()}" if kind else "")
+        return ("_full" if self.region == "frame" else "") + size + (f".{kind}" if kind else "")
 
 
 ALL = Where()
@@ -190,10 +194,13 @@ class Scores:
         return next((method for method in self.methods if method in NETWORKS), None)
 
     def best(self, methods: Sequence[str], where: Where = ALL) -> str | None:
-        """The method with the highest mean PSNR; None unless all were scored that are not OPTIONAL."""
+        """The method with the highest mean PSNR; None unless all were scored that are not OPTIONAL.
+
+        Of all methods (BEST_OF_ALL) it is the best of those that were scored.
+        """
         means = {method: self.psnr(method, where) for method in methods}
         known = {method: mean for method, mean in means.items() if mean is not None}
-        missing = means.keys() - known.keys() - OPTIONAL
+        missing = set() if methods == GROUPS[BEST_OF_ALL] else means.keys() - known.keys() - OPTIONAL
         return max(known, key=known.__getitem__) if known and not missing else None
 
     def gain(self, method: str, over: Sequence[str], where: Where = ALL) -> float | None:
@@ -230,15 +237,18 @@ class Scores:
         if gain is None:
             return None
         row = Row(metric=metric, value=gain, unit="dB", n=len(self.of(method, where)))
-        return row.within(self._gain_interval(method, over, where, seed))
+        return self._with_ranges(row, method, over, where, seed)
 
     def psnr_row(self, metric: str, method: str, where: Where = ALL, seed: int = 0) -> Row | None:
         """Mean PSNR of a method as a row of that name; None where nothing was scored."""
         found = [(score.scene, score.figures["psnr"]) for score in self.of(method, where)]
         return mean_row(metric, "dB", found, seed) if found else None
 
-    def _gain_interval(self, method: str, over: Sequence[str], where: Where, seed: int) -> Interval:
-        """The interval of a gain: in each resample over the one of the others that is the best there."""
+    def _with_ranges(self, row: Row, method: str, over: Sequence[str], where: Where, seed: int) -> Row:
+        """The gain with its interval, in each resample over the one of the others that is the best there.
+
+        Likewise where one scene is left out.
+        """
         by_method = [scores for name in (method, *over) if (scores := self.of(name, where))]
         psnr = [[score.figures["psnr"] for score in scores] for scores in by_method]
         scenes = [score.scene for score in by_method[0]]
@@ -248,4 +258,5 @@ class Scores:
             ours, others, frames = sums[..., 0], sums[..., 1:-1], sums[..., -1]
             return (ours - others.max(-1)) / frames
 
-        return interval(per_scene, gain, seed)
+        ranges = {"without_one": without_one(per_scene, gain)}
+        return row.within(interval(per_scene, gain, seed)).model_copy(update=ranges)

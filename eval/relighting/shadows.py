@@ -1,6 +1,6 @@
 """Errors of the surfels' shadows: light that leaks into shadow, and lit surfaces that are darkened.
 
-The definitions are those of docs/conventions.md, 10. What is in shadow and what is lit is the path tracer's
+The definitions are those of conventions.md, 10. What is in shadow and what is lit is the path tracer's
 to say: its irradiance with shadows over its own without, so that an error of the surfels' normals moves no
 pixel from one class to another. Pixels are judged where surfels and truth show the same surface. A surfel
 that overhangs a silhouette by a pixel shows another surface, with that one's light; the error is counted

@@ -2,51 +2,63 @@
 
 from __future__ import annotations
 
-import logging
+import copy
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
 from pathlib import Path
 
-from eval.renderer import page
-from eval.renderer.datasets import require_data
-from eval.renderer.networks import find_weights, load_networks
-from eval.renderer.parts import Found, Parts, worst_family
-from eval.renderer.settings import Kind, Part, RendererSettings
+import numpy as np
+
+from eval.relighting.baselines import fit_baselines
+from eval.relighting.buffers import MEMBERS
+from eval.relighting.fits import Show
+from eval.relighting.judging import Judged, judge
+from eval.relighting.networks import Network, load_networks
+from eval.relighting.scores import Scores
+from eval.renderer.clips import measure_clips
+from eval.renderer.datasets import (
+    FIT,
+    FIT_RELIT,
+    TEST,
+    TEST_RELIT,
+    Datasets,
+    RendererSettings,
+    require_data,
+)
+from eval.renderer.gains import gain_rows, over_lit
+from eval.renderer.pictures import comparison, sweep_pictures
+from eval.renderer.shadows import measure_shadows
 from eval.report.outcome import Outcome
-from eval.report.stage_table import stage_section
 from eval.results import Row
 from eval.stages import script_path
 from tron.cli.installation import require_own_packages
 from tron.errors import TronError
 from tron.runtime import set_torch_threads
+from tron.seeds import generator
+from tron.shards.manifest import Manifest
+from tron.shards.reader import read_clips
 from tron.storage import sha256
 
-log = logging.getLogger("tron.eval")
-
-WITHOUT_WEIGHTS: tuple[Part, ...] = ("kills", "cosmos")
+KINDS = {"neural_lit": "lit", "neural": "pair"}
+"""Method -> what its rows call it."""
+FOLDS = 4
+"""Groups of scenes, each judged by fits on the others: a quarter of the scenes is left out of a fit."""
+WARM_UP = 1
+"""Rounds of throughput that do not count."""
 
 
 class Renderer(RendererSettings):
     """Parts of the benchmark; data sets and trainings that are finished are not made again."""
 
     def check(self) -> None:
-        """Find the commands and the data sets, and read the checkpoints that were given."""
+        """Find the commands and the data sets, and read the checkpoints."""
         require_own_packages("datagen", "train")
         for name in ("tron-datagen", "tron-train"):
             script_path(name)
         require_data(self)
-        for kind, folder in self.training.items():
-            if not folder.is_dir():
-                raise TronError(f"no training of {kind}", folder, "give the output_dir of tron-train")
-        if self.train or set(self.parts) <= set(WITHOUT_WEIGHTS):
-            return
-        if self.pair is None and self.lit is None:
-            raise TronError(
-                "no checkpoint to judge", mend="give benchmark.pair or benchmark.lit, or train=true"
-            )
-        if self.parts == ["stages"] and not self.training:
-            mend = "give benchmark.training={lit: DIR}, the output_dir of tron-train, or train=true"
-            raise TronError("part stages has no training to judge", mend=mend)
-        given: dict[Kind, str | None] = {"pair": self.pair, "lit": self.lit}
-        load_networks({kind: find_weights(each) for kind, each in given.items() if each is not None})
+        load_networks("neural", self.weights())
 
     def run(self, output_dir: Path) -> Outcome:
         """Measure part after part; one line on stderr for each figure.
@@ -57,67 +69,170 @@ class Renderer(RendererSettings):
         """
         self.check()
         set_torch_threads(self.threads)
-        folder = output_dir.absolute()
-        parts = Parts(self, folder)
-        found: dict[Part, list[Found]] = {}
-        rows: list[Row] = []
+        run = Run(self, output_dir.absolute())
         for part in self.parts:
-            stages = parts.datasets.stages
-            stages.restart(f"part {part}")  # a figure of this run, never of one before
-            with stages.timed(f"part {part}", [self._typed([part], folder)]):
-                found[part] = parts.measure(part)
-                fresh = [row for each in found[part] for row in each.rows(self.seed)]
-            for row in fresh:
-                log.info("%s: %.4g %s", row.metric, row.value, row.unit)
-            rows += fresh
-        families = worst_family(found, self.seed)
-        if families:
-            worst = min(families.values(), key=lambda row: row.value)
-            rows.append(worst.model_copy(update={"metric": "renderer.lit.worst_family_gain_db"}))
-        pictures = folder / "pictures"
-        sections = [
-            section for part in found.values() for each in part for section in each.sections(pictures)
+            run.datasets.stages.restart(f"part {part}")  # a figure of this run, never of one before
+            with run.datasets.stages.timed(f"part {part}", [["tron-eval", f"benchmark.parts=[{part}]"]]):
+                getattr(run, part)()
+        if run.gains:
+            worst = min(run.gains, key=lambda row: row.value)
+            run.outcome.add([worst.model_copy(update={"metric": "renderer.lit.worst_family_gain_db"})])
+        run.outcome.inputs |= {
+            f"{KINDS[name]}_sha256": sha256(each.path) for name, each in run.networks.items()
+        }
+        return run.outcome
+
+
+class Run:
+    """Parts by name. Data sets are made when a part first needs them, and kept.
+
+    A part whose data are not there is left out, and the log says what is missing.
+    """
+
+    def __init__(self, settings: Renderer, folder: Path):
+        self.settings, self.outcome = settings, Outcome(folder)
+        self.datasets = Datasets(settings, folder)
+        self.gains: list[Row] = []
+        """Of lit's network over lit, of all families, styles and distributions."""
+
+    @cached_property
+    def networks(self) -> dict[str, Network]:
+        """The checkpoints by their names among the methods."""
+        return load_networks("neural", self.settings.weights())
+
+    def synthetic(self) -> None:
+        """Gains on held-out scenes and lights, and the weights of the pair's latents."""
+        sizes = {size: self.datasets.synthetic(size) for size in self.settings.synthetic}
+        self._judge("synthetic", "", sizes, TEST, FIT)
+        if pair := self.networks.get("neural"):
+            clip = next(iter(read_clips(next(iter(sizes.values())), TEST, MEMBERS)))
+            for name, group in sweep_pictures(clip, pair):
+                self.outcome.show("sweep", name, group)
+
+    def models(self) -> None:
+        """Gains on real models."""
+        sizes = {size: self.datasets.models(size) for size in self.settings.models}
+        self._judge("models", "ood_", {size: each for size, each in sizes.items() if each}, TEST, FIT)
+
+    def captures(self) -> None:
+        """Gains on captures, reconstructed and relit."""
+        dataset = self.datasets.captures()
+        width = next(iter(read_clips(dataset, TEST_RELIT, ()))).meta.width
+        self._judge("captures", "capture_", {width: dataset}, TEST_RELIT, FIT_RELIT)
+
+    def clips(self) -> None:
+        """Flicker of windows of frames over single ones."""
+        dataset = self.datasets.synthetic(next(iter(self.settings.synthetic)))
+        measure_clips(dataset, TEST, self._by_kind(), self.settings.seed, self.outcome)
+
+    def shadows(self) -> None:
+        """Whether shadows move as the truth's do."""
+        dataset = self.datasets.shadows()
+        measure_shadows(dataset, TEST, self._by_kind(), self.settings.seed, self.outcome)
+
+    def throughput(self) -> None:
+        """Frames a second of every checkpoint at every size, rendering and in training, by medians."""
+        for size in self.settings.sizes:
+            runs = {
+                (kind, way): work
+                for kind, network in self._by_kind().items()
+                for way, work in passes(network, size, self.settings.seed).items()
+            }
+            seconds: dict[tuple[str, str], list[float]] = {each: [] for each in runs}
+            for number in range(self.settings.rounds + WARM_UP):
+                for each, work in runs.items():
+                    begun = time.perf_counter()
+                    work()
+                    if number >= WARM_UP:
+                        seconds[each].append(time.perf_counter() - begun)
+            for (kind, way), rounds in seconds.items():
+                metric = f"{'renderer' if kind == 'lit' else f'renderer.{kind}'}.{way}.{size}"
+                value = 1 / statistics.median(rounds)
+                self.outcome.add([Row(metric=metric, value=value, unit="frames/s", n=len(rounds))])
+
+    def _by_kind(self) -> dict[str, Network]:
+        return {kind: self.networks[name] for name, kind in KINDS.items() if name in self.networks}
+
+    def _judge(self, name: str, prefix: str, sizes: Mapping[int, Path], split: str, fit_split: str) -> None:
+        """Gains on one distribution; figures without a size are of the first, pictures of the largest."""
+        judged = {size: self._judged(dataset, split, fit_split) for size, dataset in sizes.items()}
+        scores = {size: each.scores for size, each in judged.items()}
+        self.outcome.add(gain_rows(prefix, scores, self.settings.seed))
+        if judged:
+            self.gains += over_lit(next(iter(scores.values())), self.settings.seed)
+            for example in judged[max(judged)].examples:
+                file = f"renderer-{name}-{max(judged)}-{example.meta.key}"
+                self.outcome.show(name, file, comparison(example))
+
+    def _judged(self, dataset: Path, split: str, fit_split: str) -> Judged:
+        trained = [
+            load_networks("pixel_mlp", [path]) for path in self.datasets.pixel_mlps(dataset, fit_split)
         ]
-        return Outcome(
-            rows=rows,
-            title="The neural renderer against the best without one, on what it never saw",
-            verdict=page.verdict({row.metric: row for row in rows}),
-            lead=page.LEAD,
-            sections=[
-                *page.parts_section({part: self.what.get(part, "") for part in self.parts}),
-                *page.families_section(families),
-                *sections,
-                *stage_section(parts.datasets.stages.records),
-            ],
-            headline=page.HEADLINE,
-            reproduce=[" ".join(self._typed(self.parts, output_dir))],
-            inputs=self._inputs(parts),
+        shown = {name: net.show for nets in (*trained, self.networks) for name, net in nets.items()}
+        fits = fitted(dataset, split, fit_split, self.settings.seed)
+        pictures = self.settings.pictures
+        return judge(dataset, split, lambda scene: {**fits[scene], **shown}, pictures, Scores(), MEMBERS)
+
+
+def fitted(dataset: Path, split: str, fit_split: str, seed: int) -> dict[str, dict[str, Show]]:
+    """Scene of a split -> baseline -> the method as fitted for it, on the very distribution that judges.
+
+    Where the data set has a training split the fits are made on it. Otherwise the scenes are divided into
+    groups, and each group is judged by fits on the others, so that no baseline has seen the scene that it is
+    judged by.
+
+    Raises:
+        TronError: the data set lacks the split, or has neither a training split nor two scenes.
+    """
+    manifest = Manifest.load(dataset)
+    manifest.of_split(split)
+    scenes = sorted({clip.meta.scene for clip in read_clips(dataset, split, ())})
+    groups = [scenes] if fit_split in manifest.splits() else fold(scenes, FOLDS, seed)
+    if fit_split not in manifest.splits() and len(scenes) < 2:
+        raise TronError(
+            f"no split '{fit_split}' and one scene: nothing is left to fit baselines on",
+            dataset,
+            "make two scenes or more",
         )
-
-    def _inputs(self, parts: Parts) -> dict[str, object]:
-        """Hashes of the checkpoints, and the settings."""
-        judged = {} if set(self.parts) <= set(WITHOUT_WEIGHTS) else parts.weights
-        return {
-            **{f"{kind}_sha256": sha256(path) for kind, path in judged.items()},
-            "settings": self.model_dump(mode="json", exclude={"targets", "what"}),
-        }
-
-    def _typed(self, parts: list[Part], output_dir: Path) -> list[str]:
-        """The command that measures parts with what was given: checkpoints, trainings and data sets."""
-        inner = {
-            name: ", ".join(f"{key}: {path}" for key, path in getattr(self, name).items())
-            for name in ("training", "data")
-        }
-        defaults = type(self).model_fields
-        changed = [name for name in ("pair", "lit", "train") if getattr(self, name) != defaults[name].default]
-        given = [
-            *(f"benchmark.{name}={_plain(getattr(self, name))}" for name in changed),
-            *(f"'benchmark.{name}={{{listed}}}'" for name, listed in inner.items() if listed),
-        ]
-        chosen = f"'benchmark.parts=[{','.join(parts)}]'"
-        return ["tron-eval", "benchmark=renderer", chosen, *given, f"output_dir={output_dir}"]
+    found: dict[str, dict[str, Show]] = {}
+    for group in groups:
+        if fit_split in manifest.splits():
+            clips = read_clips(dataset, fit_split, MEMBERS)
+        else:
+            clips = (clip for clip in read_clips(dataset, split, MEMBERS) if clip.meta.scene not in group)
+        methods = {name: each.show for name, each in fit_baselines(clips, seed).items()}
+        found |= dict.fromkeys(group, methods)
+    return found
 
 
-def _plain(value: object) -> str:
-    """A value as Hydra reads it."""
-    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+def fold(scenes: list[str], folds: int, seed: int) -> list[list[str]]:
+    """Scenes in random groups of nearly one size, as many as asked for or as there are scenes."""
+    order = generator(seed, "eval", "folds").permutation(len(scenes))
+    count = min(folds, len(scenes))
+    return [[scenes[k] for k in np.sort(order[start::count])] for start in range(count)]
+
+
+def passes(network: Network, size: int, seed: int) -> dict[str, Callable[[], None]]:
+    """Name in rows -> one frame of random buffers through a network, and a training step on a copy of it."""
+    import torch
+
+    def drawn() -> Iterator[torch.Tensor]:
+        rng = generator(seed, "eval", "throughput", size)
+        while True:
+            yield torch.from_numpy(rng.uniform(-1, 1, (1, 3, 1, size, size)).astype(np.float32))
+
+    buffers = dict(zip((*network.renderer.config.guidance, "rgb"), drawn()))
+    truth = buffers.pop("rgb")
+    learner = copy.deepcopy(network.renderer).train().requires_grad_(True)
+    optimizer = torch.optim.AdamW(learner.parameters(), lr=1e-6)
+
+    def inference() -> None:
+        with torch.no_grad():
+            network.renderer(buffers)
+
+    def training() -> None:
+        optimizer.zero_grad()
+        torch.nn.functional.mse_loss(learner(buffers), truth).backward()
+        optimizer.step()
+
+    return {"frames_per_second": inference, "training_frames_per_second": training}

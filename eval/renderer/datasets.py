@@ -1,15 +1,23 @@
-"""Data sets, checkpoints and baselines that the benchmark makes by the other commands, each once."""
+"""Settings of the benchmark, and the data sets and baselines that it makes by other commands, each once."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import logging
+import re
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated, ClassVar, Literal
 
-from eval.real_models import has_models, model_arguments
-from eval.renderer.settings import CaptureRecipes, Kind, RendererSettings
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveInt
+
+from eval.benchmark import Benchmark
+from eval.relighting.networks import find_weights
 from eval.stages import ONE_THREAD, Child, Stages
 from tron.errors import TronError
 from tron.shards.manifest import Manifest
+
+log = logging.getLogger("tron.eval")
 
 WEIGHTS = "renderer.safetensors"
 TEST, TEST_RELIT = "test", "test_relit"
@@ -19,6 +27,63 @@ BASELINE_BUFFERS = {
     "pixel_mlp_lit": ("pbr", "irradiance", "lit"),
 }
 """Per-pixel baseline -> what it sees."""
+
+
+Recipe = list[str]
+"""Arguments of tron-datagen or tron-train, but for what it reads and where it writes."""
+Sizes = Annotated[dict[PositiveInt, Recipe], Field(min_length=1)]
+Part = Literal["synthetic", "models", "captures", "clips", "shadows", "throughput"]
+
+
+class CaptureRecipes(BaseModel):
+    """Captures whose truth is hidden, and their reconstructions under other lights."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    views: Recipe = Field(description="arguments of tron-datagen: photographs, and the truth relit beside")
+    pairs: Recipe = Field(description="those that reconstruct the photographs and relight what comes of it")
+
+
+class RendererSettings(Benchmark):
+    """Checkpoints, recipes and sizes of the parts; recipes are arguments of the other commands."""
+
+    name: ClassVar[str] = "renderer"
+
+    parts: list[Part] = Field(description="what is measured", min_length=1)
+    seed: int = Field(default=0, description="seed of the fits and the intervals")
+    threads: PositiveInt = Field(default=1, description="threads that the networks use")
+    renderer: Path | list[Path] | None = Field(
+        default=None,
+        description="checkpoint that is judged: a file or a shipped name; [a,b]: one with lit, one of the "
+        "paper's two buffers; null: both that are shipped",
+    )
+    data: dict[str, Path] = Field(
+        default={},
+        description="data sets that are there already, by the names that this benchmark gives its own: "
+        "synthetic_128, models_128, captures, shadows",
+    )
+    synthetic: Sizes = Field(description="width of a frame -> recipe of held-out scenes and lights")
+    real_data: Path | None = Field(description="folder with assets and hdri; null: no models")
+    models: Sizes = Field(description="width of a frame -> recipe of scenes of those models")
+    captures: CaptureRecipes = Field(description="held-out captures")
+    shadows: Recipe = Field(description="clips in which an occluder moves")
+    pixel_mlp: Recipe | None = Field(
+        default=None,
+        description="arguments of tron-train for the per-pixel baselines, trained on the training split of "
+        "each test distribution that has one; null: without them",
+    )
+    sizes: list[PositiveInt] = Field(
+        default=[64, 128, 256, 512], description="frames that are counted, width"
+    )
+    rounds: PositiveInt = Field(
+        default=5, description="of throughput, in which all take turns; medians count"
+    )
+    pictures: NonNegativeInt = Field(default=3, description="scenes of each distribution that are shown")
+
+    def weights(self) -> list[Path]:
+        """Files of the checkpoints."""
+        given = [self.renderer] if isinstance(self.renderer, Path) else self.renderer
+        return [find_weights(each) for each in given or ("paper", "surfaces")]
 
 
 class Datasets:
@@ -44,82 +109,40 @@ class Datasets:
         name, data = f"models_{size}", self.settings.real_data
         if name in self.settings.data:
             return self.settings.data[name]
-        if data is None or not has_models(data):
+        if data is None or not all((data / kind).is_dir() for kind in ("assets", "hdri")):
+            log.warning("no assets and hdri in %s: no models", data)
             return None
         return self._made(name, [*self.settings.models[size], *model_arguments(data)])
 
     def captures(self) -> Path:
         """Held-out captures, reconstructed and relit."""
-        return self._captured("captures", self.settings.captures)
+        if "captures" in self.settings.data:
+            return self.settings.data["captures"]
+        recipes = self.settings.captures
+        views = self._made("captures_views", recipes.views)
+        given = [f"captures={views / 'captures'}", *(f"captured.{n}={views / n}" for n in ("relit", "truth"))]
+        return self._made("captures", [*recipes.pairs, *given])
 
     def shadows(self) -> Path:
         """Clips in which an occluder moves."""
         return self._made("shadows", self.settings.shadows)
 
-    def seeds(self) -> Path:
-        """Data of short trainings: the checkpoints' own training data where they are at hand."""
-        if self.settings.train or "training" in self.settings.data:
-            return self._made("training", self.settings.training_recipes.data)
-        return self._made("seed_training", self.settings.seeds.data)
-
-    def kills(self) -> Path:
-        """The tiny data set of trainings that are killed."""
-        return self._made("kills", self.settings.kills.data)
-
-    def trained(self) -> dict[Kind, Path]:
-        """Train both checkpoints, side by side; folder of each one's training."""
-        recipes = self.settings.training_recipes
-        data = self._made("training", recipes.data)
-        others = {
-            "captures": self._captured("training_captures", recipes.captures),
-            "clips": self._made("training_clips", recipes.clips),
-        }
-        placed = {name: place.split("#") for name, place in recipes.splits.items()}
-        splits = ",".join(f'{name}: "{others[kind]}#{split}"' for name, (kind, split) in placed.items())
-        common = [*recipes.recipe, f"dataset={data}"]
-        common += [f"splits={{{splits}}}"] if splits else []
-        limit = [] if self.settings.max_seconds is None else [f"max_seconds={self.settings.max_seconds:g}"]
-        arguments = {f"trained_{kind}": [*common, *own, *limit] for kind, own in recipes.own.items()}
-        made = self.train("training", arguments, len(arguments))
-        return {kind: made[f"trained_{kind}"] for kind in recipes.own}
-
-    def train(self, stage: str, runs: Mapping[str, Sequence[str]], side_by_side: int) -> dict[str, Path]:
-        """Run trainings, folder -> arguments; their folders by the same names."""
-        names = list(runs)
-        for first in range(0, len(names), side_by_side):
-            children = [
-                Child(name, "tron-train", [*runs[name], f"output_dir={self.folder / name}"], ONE_THREAD)
-                for name in names[first : first + side_by_side]
-            ]
-            self.stages.run(f"{stage}: {' '.join(child.label for child in children)}", children)
-        return {name: self.folder / name for name in names}
-
-    def pixel_mlps(self, dataset: Path, split: str) -> dict[str, Path]:
-        """Per-pixel baselines trained on a split: name -> weights; none where they are not asked for."""
+    def pixel_mlps(self, dataset: Path, split: str) -> list[Path]:
+        """Weights of per-pixel baselines trained on a split; none where they are not asked for."""
         recipe = self.settings.pixel_mlp
         if recipe is None or split not in Manifest.load(dataset).splits():
-            return {}
+            return []
         # The recipe's stages name FIT, which may be there beside the split and hold other pictures.
         place = [] if split == FIT else [f'splits={{{FIT}: "{dataset}#{split}"}}']
-        runs = {
-            f"{dataset.name}_{name}": [
-                *("renderer=pixel_mlp", f"renderer.config.guidance=[{','.join(buffers)}]"),
-                *(*recipe, f"dataset={dataset}", *place),
-            ]
-            for name, buffers in BASELINE_BUFFERS.items()
-        }
-        made = self.train("per-pixel baselines", runs, len(runs))
-        return {name: made[f"{dataset.name}_{name}"] / WEIGHTS for name in BASELINE_BUFFERS}
-
-    def _captured(self, name: str, recipes: CaptureRecipes) -> Path:
-        if name in self.settings.data:
-            return self.settings.data[name]
-        views = self._made(f"{name}_views", recipes.views)
-        given = [
-            f"captures={views / 'captures'}",
-            *(f"captured.{name}={views / name}" for name in ("relit", "truth")),
-        ]
-        return self._made(name, [*recipes.pairs, *given])
+        children = []
+        for name, buffers in BASELINE_BUFFERS.items():
+            label = f"{dataset.name}_{name}"
+            arguments = ["renderer=pixel_mlp", f"renderer.config.guidance=[{','.join(buffers)}]", *recipe]
+            arguments += [f"dataset={dataset}", *place, f"output_dir={self.folder / label}"]
+            children.append(Child(label, "tron-train", arguments, ONE_THREAD))
+        labels = [child.label for child in children]
+        self.stages.run(f"per-pixel baselines: {' '.join(labels)}", children)
+        return [self.folder / label / WEIGHTS for label in labels]
 
     def _made(self, name: str, recipe: Sequence[str]) -> Path:
         if name in self.settings.data:
@@ -133,15 +156,7 @@ def require_data(settings: RendererSettings) -> None:
     """TronError unless every folder that was given holds a data set, and is given for one that is made."""
     known = [f"synthetic_{size}" for size in settings.synthetic]
     known += [f"models_{size}" for size in settings.models]
-    known += [
-        "captures",
-        "shadows",
-        "training",
-        "training_captures",
-        "training_clips",
-        "seed_training",
-        "kills",
-    ]
+    known += ["captures", "shadows"]
     for name, folder in settings.data.items():
         if name not in known:
             raise TronError(
@@ -152,3 +167,45 @@ def require_data(settings: RendererSettings) -> None:
                 f"no data set {name}", folder, f"leave out benchmark.data.{name}: it is made then"
             )
         Manifest.load(folder)
+
+
+MODEL_FILES = (".gltf", ".glb", ".obj")
+MAP_FILES = (".hdr", ".exr")
+PLAIN = re.compile(r"[A-Za-z][\w./-]*")
+"""Names that need no quotation marks on a command line."""
+
+
+def model_names(data: Path) -> list[str]:
+    """Names of its models, sorted."""
+    return _names(data / "assets", MODEL_FILES)
+
+
+def model_arguments(data: Path) -> list[str]:
+    """Arguments that give a run the models and maps, licensed or not: what is judged is not handed on."""
+    data = data.absolute()
+    names = [*model_names(data), *_names(data / "hdri", MAP_FILES)]
+    return [
+        f"assets={data / 'assets'}",
+        f"environments={data / 'hdri'}",
+        f"allow_unlicensed={typed_list(names)}",
+    ]
+
+
+def typed_list(names: Sequence[str]) -> str:
+    """Names as one types them in a list; in quotation marks where they have spaces, or could be numbers."""
+    return f"[{','.join(name if PLAIN.fullmatch(name) else _quoted(name) for name in names)}]"
+
+
+def _quoted(name: str) -> str:
+    escaped = name.replace("'", "\\'")
+    return f"'{escaped}'"
+
+
+def _names(folder: Path, suffixes: Sequence[str]) -> list[str]:
+    """Names of a folder's files as tron-datagen calls them, with its subfolders, suffixes in any case.
+
+    A file is called by its stem, or where several have that, by its path without the suffix.
+    """
+    paths = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in suffixes]
+    stems = Counter(path.stem for path in paths)
+    return sorted(path.stem if stems[path.stem] == 1 else path.with_suffix("").as_posix() for path in paths)

@@ -1,127 +1,60 @@
-"""Shadows that move: whether the network's picture changes where the truth's does, and by as much."""
+"""Shadows that move: whether the network's picture changes where the truth's does, and by as much.
+
+An occluder moves between two frames, camera and light stand still. Where the surface stayed, what changes
+is the light that arrives. x is the truth's change of a displayed value, y that of a method. Correlation is
+Pearson's; the slope is that of the least-squares line of y over x, cov(x, y) / var(x). Both follow from
+sums over pixels.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from eval.confidence import Statistic, interval, scene_sums
 from eval.relighting.buffers import MEMBERS, Buffers
-from eval.renderer.changes import SURFACE, change_sums, correlation, slope, slope_error, stayed
-from eval.renderer.networks import TITLES, Network
-from eval.renderer.pictures import LEAST_WIDTH, enlarge
-from eval.renderer.settings import Kind
-from eval.report.charts import density_chart
-from eval.report.figures import row_cell
-from eval.report.intervals import interval_note
-from eval.report.strips import write_strips
+from eval.relighting.networks import Network
+from eval.renderer.pictures import KIND_TITLES, LEAST_WIDTH, enlarge
+from eval.report.outcome import Outcome
 from eval.results import Row
 from tron.errors import TronError
-from tron.report.page import Block, Picture, Pictures, Section, Table, Text
-from tron.seeds import generator
+from tron.report.page import Picture, Pictures
 from tron.shards.reader import read_clips
+from tron.shards.schema import Clip
 
 log = logging.getLogger("tron.eval")
 
 LIT, PBR = "lit_buffer", "pbr_buffer"
-PLAIN = {LIT: "lit, no network", PBR: "pbr, no network"}
-POINTS = 2000
-"""Values of a clip that the chart shows, drawn at random."""
+SURFACE = ("depth_ref", "normal_ref", "base_color_ref")
+"""Members that say whether a pixel's surface stayed."""
+SAME_DEPTH = 1e-3
+"""Largest relative difference of distances of a surface that stayed."""
+SAME_NORMAL = 1e-3
+"""Largest 1 - cosine of its normals."""
+SAME_COLOR = 5e-3
+"""Largest difference of its base color, linear; half floats round by 5e-4 at most."""
 CHANGE_GAIN = 3
 """Factor on changes in pictures, around middle grey."""
 
 
-@dataclass(frozen=True)
-class Moved:
-    """The clip whose truth changes most: (H, W, 3) displays of two frames of a method, and where judged."""
-
-    title: str
-    frames: Mapping[str, tuple[np.ndarray, np.ndarray]]
-    judged: np.ndarray
-
-
-@dataclass
-class Shadows:
-    """Findings.
-
-    Attributes:
-        scenes: of each pair of frames.
-        sums: method -> sums (6,) of each pair of frames; methods are LIT, PBR and kinds of checkpoint.
-        points: method -> (n, 2) changes of the truth and of the method, for the chart.
-        example: a pair of frames that is shown.
-    """
-
-    scenes: list[str] = field(default_factory=list)
-    sums: defaultdict[str, list[np.ndarray]] = field(default_factory=lambda: defaultdict(list))
-    points: defaultdict[str, list[np.ndarray]] = field(default_factory=lambda: defaultdict(list))
-    example: Moved | None = None
-
-    def rows(self, seed: int) -> Iterator[Row]:
-        """Correlation and slope of every method.
-
-        Figures without a name are of the checkpoint that starts from lit, the default of tron-relight.
-        """
-        for method in self.sums:
-            for what, measure in (("correlation", correlation), ("slope", slope)):
-                yield self._row(f"renderer.{method}.shadow_{what}", method, measure, seed)
-        if "lit" in self.sums:
-            yield self._row("renderer.shadow_correlation", "lit", correlation, seed)
-            yield self._row("renderer.shadow_slope", "lit", slope, seed)
-            yield self._row("renderer.shadow_slope_error", "lit", slope_error, seed)
-
-    def sections(self, pictures: Path) -> list[Section]:
-        """A table, a chart for each method, and the clip that changes most."""
-        rows = [
-            [
-                _title(method),
-                row_cell(self._row("a.b", method, correlation, 0), "strong"),
-                row_cell(self._row("a.b", method, slope, 0)),
-            ]
-            for method in self.sums
-        ]
-        text = Text(
-            "An occluder moves between two frames; camera and light stand still. Over foreground pixels "
-            "whose true depth, normal and base color are unchanged, the change of displayed values is held "
-            "against the truth's: 1 and 1 is perfect, 0 a picture that does not react. The truth's own "
-            f"noise keeps correlation below 1. {interval_note(len(set(self.scenes)))}"
-        )
-        caption = f"Change of the picture against the truth's, {len(self.scenes)} pairs of frames."
-        blocks: list[Block] = [text, Table(caption, ["Method", "correlation", "slope"], rows)]
-        shown = {_title(name): np.concatenate(self.points[name]) for name in self.sums if name != PBR}
-        blocks.append(
-            density_chart(
-                shown,
-                "change of the truth, display values",
-                "change of the picture",
-                "Each cell's shade: how many values lie there, logarithmic. Dotted: both change alike.",
-            )
-        )
-        if self.example is not None:
-            group = _moved(self.example)
-            write_strips([group], ["renderer-shadows"], pictures)
-            blocks.append(group)
-        return [Section("shadows", "Shadows that move", blocks)]
-
-    def _row(self, metric: str, method: str, measure: Statistic, seed: int) -> Row:
-        sums = np.stack(self.sums[method])
-        row = Row(metric=metric, value=float(measure(sums.sum(0))), unit="1", n=len(sums))
-        return row.within(interval(scene_sums(self.scenes, sums), measure, seed))
-
-
 def measure_shadows(
-    dataset: Path, split: str, networks: Mapping[Kind, Network], window: int, seed: int
-) -> Shadows:
-    """Compare consecutive frames of every clip.
+    dataset: Path, split: str, networks: Mapping[str, Network], seed: int, outcome: Outcome
+) -> None:
+    """Compare consecutive frames of every clip: correlation and slope of every method.
+
+    Figures without a name are of the checkpoint that starts from lit, the default of tron-relight. The pair
+    of frames that changes most is shown.
 
     Raises:
         TronError: clips hold no references, or no surface stays where the truth changes.
     """
-    found, largest = Shadows(), 0.0
+    scenes, sums, largest = list[str](), defaultdict[str, list[np.ndarray]](list), 0.0
+    pictures = None
     for clip in read_clips(dataset, split, (*MEMBERS, *SURFACE)):
         if missing := [name for name in SURFACE if name not in clip.frames]:
             raise TronError(
@@ -129,45 +62,98 @@ def measure_shadows(
             )
         buffers, truth = Buffers.of(clip), clip.displayed("rgb")
         shown = {PBR: buffers.displayed("pbr"), LIT: buffers.displayed("lit")}
-        shown |= {kind: network.clip(buffers, window) for kind, network in networks.items()}
+        shown |= {kind: network.show(buffers) for kind, network in networks.items()}
         for now in range(1, clip.meta.frames):
             judged = stayed(clip, now - 1, now)
             if not judged.any():
                 continue
             change = (truth[now] - truth[now - 1])[judged]
-            rng = generator(seed, "eval", "shadows", clip.meta.key, now)
-            some = rng.choice(change.size, min(POINTS, change.size), replace=False)
-            found.scenes.append(clip.meta.scene)
+            scenes.append(clip.meta.scene)
             for method, frames in shown.items():
                 ours = (frames[now] - frames[now - 1])[judged]
-                found.sums[method].append(change_sums(change, ours))
-                found.points[method].append(np.stack([change.ravel()[some], ours.ravel()[some]], 1))
+                sums[method].append(change_sums(change, ours))
             if (strength := float((change**2).sum())) > largest:
                 largest = strength
-                pair = {name: (frames[now - 1], frames[now]) for name, frames in shown.items()}
-                pair["truth"] = (truth[now - 1], truth[now])
-                found.example = Moved(f"Scene {clip.meta.scene}, light {clip.meta.light}", pair, judged)
+                pairs = {name: (each[now - 1], each[now]) for name, each in shown.items() if name != PBR}
+                pairs["truth"] = truth[now - 1], truth[now]
+                pictures = _pictures(f"Scene {clip.meta.scene}, light {clip.meta.light}", pairs, judged)
         log.info("changes of clip %s", clip.meta.key)
-    if not found.scenes:
+    if not scenes:
         raise TronError("no clip with two frames in which a surface stays", dataset)
-    return found
+
+    def row(metric: str, method: str, measure: Statistic) -> Row:
+        found = np.stack(sums[method])
+        plain = Row(metric=metric, value=float(measure(found.sum(0))), unit="1", n=len(found))
+        return plain.within(interval(scene_sums(scenes, found), measure, seed))
+
+    measures = {"correlation": correlation, "slope": slope}
+    for method in sums:
+        outcome.add(row(f"renderer.{method}.shadow_{name}", method, each) for name, each in measures.items())
+    if "lit" in sums:
+        measures["slope_error"] = slope_error
+        outcome.add(row(f"renderer.shadow_{name}", "lit", each) for name, each in measures.items())
+    if pictures is not None:
+        outcome.show("shadows", "renderer-shadows", pictures)
 
 
-def _title(method: str) -> str:
-    titles: dict[str, str] = {**PLAIN, **TITLES, "truth": "path-traced truth"}
-    return titles[method]
-
-
-def _moved(example: Moved) -> Pictures:
-    """Two frames and their change, by every method but pbr; three columns, a method a row."""
-    pictures = []
-    scale = -(-LEAST_WIDTH // example.judged.shape[1])
-    order: Sequence[str] = [name for name in example.frames if name != PBR]
-    for name in order:
-        before, now = example.frames[name]
+def _pictures(title: str, pairs: Mapping[str, tuple[np.ndarray, np.ndarray]], judged: np.ndarray) -> Pictures:
+    """Two frames and their change where ``judged`` (H, W), a method a row."""
+    pictures, scale = [], -(-LEAST_WIDTH // judged.shape[1])
+    titles = {LIT: "lit, no network", **KIND_TITLES, "truth": "path-traced truth"}
+    for name, (before, now) in pairs.items():
         change = np.clip(0.5 + CHANGE_GAIN * (now - before) / 2, 0, 1)
-        change = np.where(example.judged[..., None], change, 0.5)
+        change = np.where(judged[..., None], change, 0.5)
         for image, what in ((before, "before"), (now, "after"), (change, "change, surface that stayed")):
-            title = f"{_title(name)}: {what}"
-            pictures.append(Picture(enlarge(image, scale), title, title))
-    return Pictures(example.title, pictures, columns=3)
+            words = f"{titles[name]}: {what}"
+            pictures.append(Picture(enlarge(image, scale), words, words))
+    return Pictures(title, pictures, columns=3)
+
+
+def stayed(clip: Clip, before: int, now: int) -> np.ndarray:
+    """(H, W) bool: foreground in two frames whose true depth, normal and base color are unchanged.
+
+    The eight pixels around have not changed either: a pixel's picture gathers light from half a pixel beyond
+    its centre and more, so that beside a silhouette that moves it shows the occluder, not its shadow.
+    """
+    frames = {name: clip.frames[name] for name in (*SURFACE, "foreground")}
+    (depth, other), (normal, turned), (color, dyed), (solid, there) = (
+        (images[now], images[before]) for images in frames.values()
+    )
+    same = np.abs(depth - other)[..., 0] <= SAME_DEPTH * np.maximum(other[..., 0], 1e-6)
+    same &= (normal * turned).sum(-1) >= 1 - SAME_NORMAL
+    same &= np.abs(color - dyed).max(-1) <= SAME_COLOR
+    now_solid, then_solid = solid[..., 0] > 0.5, there[..., 0] > 0.5
+    same |= ~now_solid & ~then_solid  # sky has no normal
+    changed = np.asarray(binary_dilation(~same, np.ones((3, 3), bool)), bool)
+    return ~changed & now_solid & then_solid
+
+
+def change_sums(truth: np.ndarray, ours: np.ndarray) -> np.ndarray:
+    """(6,) float64: n and sums of x, y, xx, xy, yy over values of any shape."""
+    x, y = (np.asarray(each, np.float64).ravel() for each in (truth, ours))
+    return np.array([x.size, x.sum(), y.sum(), x @ x, x @ y, y @ y])
+
+
+def correlation(sums: np.ndarray) -> np.ndarray:
+    """Correlation from sums (..., 6); 0 where one side never varies."""
+    _, var_x, var_y, cov = _moments(sums)
+    spread = np.sqrt(np.maximum(var_x * var_y, 0))
+    return np.divide(cov, spread, out=np.zeros_like(cov), where=spread > 1e-15)
+
+
+def slope(sums: np.ndarray) -> np.ndarray:
+    """Slope from sums (..., 6); 0 where the truth never varies."""
+    _, var_x, _, cov = _moments(sums)
+    return np.divide(cov, var_x, out=np.zeros_like(cov), where=var_x > 1e-15)
+
+
+def slope_error(sums: np.ndarray) -> np.ndarray:
+    """Distance of the slope from 1."""
+    return np.abs(slope(sums) - 1)
+
+
+def _moments(sums: np.ndarray) -> tuple[np.ndarray, ...]:
+    count = np.maximum(sums[..., 0], 1)
+    mean_x, mean_y = sums[..., 1] / count, sums[..., 2] / count
+    var_x, var_y = sums[..., 3] / count - mean_x**2, sums[..., 5] / count - mean_y**2
+    return count, np.asarray(var_x), np.asarray(var_y), np.asarray(sums[..., 4] / count - mean_x * mean_y)

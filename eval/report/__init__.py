@@ -1,1 +1,1 @@
-"""One self-contained HTML page for a benchmark: blocks of content, and the template that sets them."""
+"""results.json and its pictures -> one HTML page: sentences in templates, figures from rows."""

@@ -9,17 +9,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from eval.peers.contenders import Contenders
-from eval.peers.scene import camera
 from eval.results import Row
-from eval.tracing.shadow_rays import random_rays
-from tron import seeds
+from eval.tracing import peers
+from eval.tracing.peers import Contenders, RestartedShadows
+from eval.tracing.scene import camera
+from eval.tracing.speed import random_rays
+from tron import metrics, seeds
+from tron.report.page import Picture, Pictures
 from tron.tracing import reference
 
 MARGIN = 1e-5
 GAP = 1e-6
 """World units; at the distances of the benchmark's view, two steps of a float32."""
 OFF = 1e-4
+ERROR_GAIN = 4
 
 
 def camera_errors(contenders: Contenders, size: int, rays: int, seed: int) -> list[Row]:
@@ -56,8 +59,6 @@ def camera_errors(contenders: Contenders, size: int, rays: int, seed: int) -> li
 
 def shadow_errors(contenders: Contenders, size: int, rays: int, seed: int) -> list[Row]:
     """Largest error of transmittance over ``rays`` random shadow rays, and of the restarting peer."""
-    from eval.peers.embree import RestartedShadows
-
     scene = contenders.scene
     gbuffer = contenders.tracer.gbuffer(camera(size))
     origin, direction = random_rays(gbuffer, scene.spacing, rays, seed)
@@ -89,3 +90,25 @@ def _excluded(kind: str, steady: np.ndarray, difference: np.ndarray) -> list[Row
         Row(metric=f"{kind}.{name}", value=float(which.mean()), unit="fraction", n=len(steady))
         for name, which in shares.items()
     ]
+
+
+def compare_images(contenders: Contenders, size: int) -> Pictures:
+    """Our image, the peer's along the same rays with the same stop, and their difference."""
+    view, integrator = camera(size), peers.load_integrator(peers.OUR_STOP)
+    ours = np.clip(contenders.tracer.gbuffer(view).numpy()["rgb"], 0, 1)
+    peer = np.clip(peers.through_centres(contenders.primitives, integrator, view), 0, 1)
+    words, psnr = "the same scene by Mitsuba's integrator", f"{metrics.psnr(ours, peer):.1f} dB"
+    pictures = [
+        Picture(ours, "TRON", "the benchmark's scene by TRON", strong=True),
+        Picture(peer, "Mitsuba's volprim", words, psnr),
+        Picture(
+            np.clip(ERROR_GAIN * np.abs(ours - peer), 0, 1),
+            f"difference ×{ERROR_GAIN}",
+            "absolute difference of the two, enlarged",
+        ),
+    ]
+    note = (
+        "Radiance along the same rays, at the smallest scene's large surfels: differences show best. "
+        "They lie at silhouettes, where the peer also composites surfels seen from behind."
+    )
+    return Pictures("The same picture", pictures, note, columns=3)

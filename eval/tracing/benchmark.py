@@ -1,172 +1,127 @@
-"""Benchmark `tracing`: the tracer's speed, exactness and noise, beside what a user would pick instead."""
+"""Benchmark `tracing`: the tracer's speed and exactness beside others', and guidance where it is hard."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Collection, Iterable
-from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar, Literal
 
-from eval.peers.contenders import SHIPPED, Contenders
-from eval.peers.scene import FROM_GBUFFERS, GROUND, ROOM, STUDY, Recipe
-from eval.peers.timing import fastest, write_times
+import numpy as np
+from pydantic import Field, PositiveInt
+
+from eval.benchmark import Benchmark
 from eval.report.outcome import Outcome
-from eval.results import Row
-from eval.tracing import page
-from eval.tracing.accuracy import camera_errors, shadow_errors
-from eval.tracing.agreement import compare_images, hits_a_ray
-from eval.tracing.bounce import measure_bounce, measure_equal_error
-from eval.tracing.camera_rays import measure_camera_rays, time_shapes
-from eval.tracing.few_rays import measure_few_rays
-from eval.tracing.gradients import measure_gradient
-from eval.tracing.irradiance import measure_direct, measure_noise
-from eval.tracing.lights import LIGHTS
-from eval.tracing.measured import CameraRays, Measured, TracingSettings, few_rays_rows
-from eval.tracing.memory import measure_memory
-from eval.tracing.shadow_rays import measure_shadow_rays
+from eval.tracing.accuracy import camera_errors, compare_images, shadow_errors
+from eval.tracing.hard_cases import measure_hard_cases
+from eval.tracing.peers import SHAPES, Contenders
+from eval.tracing.scene import LIGHTS
+from eval.tracing.speed import (
+    Found,
+    measure_bounce,
+    measure_camera,
+    measure_direct,
+    measure_gradient,
+    measure_shadow,
+    measure_shapes,
+)
+from eval.tracing.timing import Timed, write_times
+from tron.color import to_display
+from tron.errors import TronError
+from tron.report.page import Picture, Pictures
 from tron.runtime import activate
 
-log = logging.getLogger("tron.eval")
+Part = Literal["camera", "shadow", "gradient", "irradiance", "guidance", "error", "bounce"]
+Case = tuple[PositiveInt, PositiveInt]
 
 
-class Tracing(TracingSettings):
-    """Parts of the benchmark; beside the page, times.json keeps every round's seconds."""
+class Tracing(Benchmark):
+    """Parts of the benchmark and their sizes; beside results.json, times.json keeps every round's seconds."""
+
+    name: ClassVar[str] = "tracing"
+
+    variant: str = Field(default="llvm_ad_rgb", description="Mitsuba variant; cuda_ad_rgb on a GPU")
+    seed: int = 0
+    rounds: PositiveInt = Field(
+        default=5, description="of timing in turns; three of what takes over a second"
+    )
+    parts: list[Part] = Field(description="what is measured", min_length=1)
+    surfels: list[PositiveInt] = Field(description="sizes of the scene", min_length=1)
+    pixels: list[PositiveInt] = Field(description="widths of the image, multiples of 4", min_length=1)
+    shadow_rays: PositiveInt = Field(default=200_000, description="random shadow rays")
+    shadow_spp: PositiveInt = Field(default=64, description="rays per pixel of the traced irradiance pass")
+    gradient: list[Case] = Field(description="(surfels, pixels) of the gradient steps")
+    irradiance: Case = Field(description="(surfels, pixels) of the comparison with Mitsuba's direct")
+    error_rays: PositiveInt = Field(default=2000, description="rays held against float64")
+    bounce: list[Case] = Field(description="(surfels, pixels) of transport, bake and frames with bounces")
+
+    def check(self) -> None:
+        """Refuse sizes that the tile order of the rays cannot take."""
+        odd = [size for size in self.pixels if size % 4]
+        if odd:
+            raise TronError(f"images of {odd[0]} pixels", "benchmark.pixels", "give multiples of 4")
 
     def run(self, output_dir: Path) -> Outcome:
-        """Measure part after part; one line on stderr for each case."""
+        """Measure part after part; one line on stderr for each figure."""
         self.check()
         activate(self.variant)
-        measured = Measured(self)
+        outcome, timed, shape = Outcome(output_dir), list[Timed](), SHAPES[0]
+        if {"camera", "gradient"} & set(self.parts):
+            shape = measure_shapes(Contenders.of(self.surfels[0], self.seed), self.pixels[0], 3)
+
+        def keep(found: Found) -> None:
+            timed.append(found[0])
+            outcome.add(found[1])
+
         for part in self.parts:
-            if part == "equal_error":
-                measured.equal_error = measure_equal_error(self.equal_error, output_dir)
-                _say(measured.equal_error.rows(self.seed))
-            else:
-                getattr(self, f"_measure_{part}")(measured)
-        write_times(output_dir / "times.json", measured.timed())
-        return page.outcome(measured, output_dir)
+            match part:
+                case "camera":
+                    for count in self.surfels:
+                        contenders = Contenders.of(count, self.seed, shape)
+                        for size in self.pixels:
+                            keep(measure_camera(contenders, size, self.rounds))
+                    smallest = Contenders.of(self.surfels[0], self.seed, shape)
+                    outcome.show("camera", "camera", compare_images(smallest, max(self.pixels)))
+                case "shadow":
+                    sizes = self.pixels[0], self.shadow_rays, self.shadow_spp
+                    for count in self.surfels:
+                        contenders = Contenders.of(count, self.seed)
+                        keep(measure_shadow(contenders, *sizes, self.seed, self.rounds))
+                case "gradient":
+                    for count, size in self.gradient:
+                        keep(measure_gradient(Contenders.of(count, self.seed, shape), size, self.rounds))
+                case "irradiance":
+                    timed += self._measure_irradiance(outcome)
+                case "guidance":
+                    outcome.add(measure_hard_cases(self.rounds))
+                case "error":
+                    contenders = Contenders.of(self.surfels[0], self.seed)
+                    for errors in (camera_errors, shadow_errors):
+                        outcome.add(errors(contenders, self.pixels[0], self.error_rays, self.seed))
+                case "bounce":
+                    for count, size in self.bounce:
+                        keep(measure_bounce(Contenders.of(count, self.seed), size, self.rounds))
+        write_times(output_dir / "times.json", timed)
+        return outcome
 
-    @property
-    def _recipe(self) -> Recipe:
-        return replace(STUDY, sh_degree=self.sh_degree)
-
-    def _contenders(self, count: int, shapes: Measured | None = None) -> Contenders:
-        """The usual scene; primitives are of the shape that was ``measured`` to be faster, if it was."""
-        contenders = Contenders.of(count, self.seed, self._recipe)
-        if shapes and shapes.shapes:
-            contenders.shape = fastest(shapes.shapes)
-        return contenders
-
-    def _measure_camera(self, measured: Measured) -> None:
-        for k, count in enumerate(self.surfels):
-            contenders = self._contenders(count, measured)
-            if k == 0:
-                measured.shapes = time_shapes(contenders, self.pixels[0])
-                contenders.shape = fastest(measured.shapes)
-                measured.hits = hits_a_ray(contenders.scene, self.pixels[0], self.seed)
-            for size in self.pixels:
-                self._add_frame(measured, contenders, size)
-            if k == 0:
-                measured.same_picture = compare_images(contenders, max(self.pixels))
-        count, size = self.middle
-        for recipe, without in (
-            (replace(STUDY, name="sh3", sh_degree=3), [SHIPPED]),
-            (FROM_GBUFFERS, ["volprim", SHIPPED]),
-        ):
-            contenders = Contenders.of(count, self.seed, recipe)
-            contenders.shape = fastest(measured.shapes)
-            measured.variants.append(self._frame(contenders, size, without))
-
-    def _measure_inside(self, measured: Measured) -> None:
-        for place, (count, size) in ((ROOM, self.room), (GROUND, self.ground)):
-            contenders = Contenders.of(count, self.seed, self._recipe, place)
-            contenders.shape = fastest(time_shapes(contenders, self.pixels[0]))
-            usual = self._contenders(count) if place is ROOM else None
-            measured.inside.append(self._frame(contenders, size, usual=usual))
-            picture = contenders.tracer.gbuffer(place.camera(size)).numpy()["rgb"]
-            measured.inside_pictures[place.name] = picture.clip(0, 1)
-
-    def _measure_growth(self, measured: Measured) -> None:
-        cases = [(count, self.pixels[0]) for count in self.growth_surfels]
-        cases += [(self.middle[0], size) for size in self.growth_pixels]
-        for count in dict.fromkeys(count for count, _ in cases):
-            contenders = self._contenders(count, measured)
-            for size in dict.fromkeys(size for other, size in cases if other == count):
-                self._add_frame(measured, contenders, size, [SHIPPED])
-
-    def _add_frame(
-        self, measured: Measured, contenders: Contenders, size: int, without: Collection[str] = ()
-    ) -> None:
-        """Time a frame of the usual scene, unless its case was timed before."""
-        known = {(frame.count, frame.size) for frame in measured.camera}
-        if (len(contenders.scene), size) not in known:
-            measured.camera.append(self._frame(contenders, size, without))
-
-    def _frame(
-        self,
-        contenders: Contenders,
-        size: int,
-        without: Collection[str] = (),
-        usual: Contenders | None = None,
-    ) -> CameraRays:
-        frame = measure_camera_rays(contenders, size, self.rounds, without, usual)
-        _say(frame.rows())
-        return frame
-
-    def _measure_shadow(self, measured: Measured) -> None:
-        sizes = self.pixels[0], self.shadow_rays, self.shadow_spp
-        for count in self.surfels:
-            found = measure_shadow_rays(self._contenders(count), *sizes, self.seed, self.rounds)
-            measured.shadow.append(found)
-            _say(found.rows())
-
-    def _measure_gradient(self, measured: Measured) -> None:
-        for count, size in self.gradient:
-            step = measure_gradient(self._contenders(count, measured), size, self.rounds)
-            measured.gradient.append(step)
-            _say(step.rows())
-
-    def _measure_irradiance(self, measured: Measured) -> None:
+    def _measure_irradiance(self, outcome: Outcome) -> list[Timed]:
+        """Ratio under every light, the worst of them, and the seconds of the pass."""
         count, size = self.irradiance
-        contenders = self._contenders(count)
+        contenders, found = Contenders.of(count, self.seed), []
         for light in LIGHTS:
-            found = measure_direct(contenders, size, light, self.seed, self.rounds)
-            measured.direct.append(found)
-            log.info("irradiance under %s: %.2f times Mitsuba's direct", light, found.ratio)
-
-    def _measure_noise(self, measured: Measured) -> None:
-        count, size = self.noise
-        contenders = self._contenders(count)
-        for light in LIGHTS:
-            found = measure_noise(contenders, size, light, self.reference_spp, self.seed)
-            measured.noise.append(found)
-            for name, value in {**found.rmse, **found.blocks}.items():
-                log.info("irradiance under %s: %s %.5f", light, name, value)
-
-    def _measure_few_rays(self, measured: Measured) -> None:
-        count, size = self.few_rays
-        contenders = self._contenders(count)
-        for light in LIGHTS:
-            measured.few_rays.append(measure_few_rays(contenders, size, light, self.reference_spp, self.seed))
-        _say(few_rays_rows(measured.few_rays))
-
-    def _measure_error(self, measured: Measured) -> None:
-        contenders, size = self._contenders(self.surfels[0]), self.pixels[0]
-        measured.error += camera_errors(contenders, size, self.error_rays, self.seed)
-        measured.error += shadow_errors(contenders, size, self.error_rays, self.seed)
-        _say(measured.error)
-
-    def _measure_bounce(self, measured: Measured) -> None:
-        for count, size in self.bounce:
-            found = measure_bounce(self._contenders(count), size, self.rounds)
-            measured.bounce.append(found)
-            _say(found.rows())
-
-    def _measure_memory(self, measured: Measured) -> None:
-        measured.memory = measure_memory(self.memory_surfels, self.pixels[-1], self.variant, self.seed)
-        log.info("memory of %d surfels: %s", self.memory_surfels, measured.memory)
-
-
-def _say(rows: Iterable[Row]) -> None:
-    for row in rows:
-        log.info("%s: %.4g %s", row.metric, row.value, row.unit)
+            timed, ratio, images, exposure = measure_direct(contenders, size, light, self.seed, self.rounds)
+            pictures = [
+                Picture(to_display(image, exposure), title, f"irradiance under {light}: {title}")
+                for title, image in images.items()
+            ]
+            outcome.show("irradiance", f"direct-{light}", Pictures(f"Light: {light}", pictures, columns=2))
+            found.append((timed, ratio, light))
+        name = "irradiance.seconds_ratio_to_mitsuba_direct"
+        outcome.add(timed.row(f"{name}_{light}", ratio, "x") for timed, ratio, light in found)
+        worst = found[int(np.argmax([ratio for _, ratio, _ in found]))]
+        seconds = max(timed.times["tron"].median for timed, *_ in found)
+        outcome.add(
+            [
+                worst[0].row(name, worst[1], "x"),
+                worst[0].row("irradiance.seconds_64spp", seconds, "s"),
+            ]
+        )
+        return [timed for timed, *_ in found]

@@ -1,20 +1,35 @@
 """The recipes named after the paper make what the paper made: its sizes, numbers of scenes and schedules."""
 
+import json
+import math
 from collections import Counter
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from torch import nn
 
-from datagen.settings import Settings as DatagenSettings
-from eval.datagen.paper_smoke import write_tiny_weights
+from datagen.settings.command import Settings as DatagenSettings
+from eval.stages import Child, Stages
 from train.curriculum import learning_rate_factor
 from train.optimizers import make_optimizer
 from train.run import build_renderer
 from train.settings import Settings as TrainSettings
-from tron.apps.relight_settings import QUALITY
+from tron.apps.relight.settings import QUALITY
 from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
+from tron.metrics import LPIPS
 from tron.neural.losses import RendererLoss
+from tron.neural.weights import load_cosmos
+from tron.shards.manifest import Manifest
+from tron.shards.reader import read_clips
+
+SMOKE = "experiment=paper_smoke"
+WAN: dict[str, Any] = {"base_dim": 8, "num_res_blocks": 1}
+"""Shape of the tiny autoencoder; its latents are the published one's."""
+VGG = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
+"""Channels of VGG-16's convolutions, M between them where it pools."""
 
 
 @pytest.fixture(scope="module")
@@ -169,3 +184,77 @@ def test_adamw_trains_the_transformer_alone_without_its_text_branch(tmp_path) ->
     assert names | text == {name for name, _ in renderer.named_parameters()}
     losses = RendererLoss(**smoke.loss.model_dump())
     assert losses.perceptual is not None
+
+
+def write_tiny_weights(folder: Path) -> None:
+    """Random weights of paper_smoke's shapes: ``transformer`` and ``vae`` (diffusers), ``vgg16.pth``."""
+    from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
+
+    from tron.neural.configs import BackboneConfig
+    from tron.neural.networks.backbone import transformer
+
+    torch.manual_seed(0)
+    vae = AutoencoderKLWan(**WAN).eval()
+    vae.save_pretrained(folder / "vae")
+    channels = vae.config["z_dim"]
+    shape = BackboneConfig.model_validate(composed_training("paper_smoke").renderer["config"]["backbone"])
+    transformer(shape, channels, channels).save_pretrained(folder / "transformer")
+    state = {f"features.{name}": value for name, value in _vgg16_features().state_dict().items()}
+    torch.save(state, folder / "vgg16.pth")
+
+
+def _vgg16_features() -> nn.Sequential:
+    """Convolutions of VGG-16 at torchvision's places, random."""
+    layers: list[nn.Module] = []
+    channels = 3
+    for each in VGG:
+        if isinstance(each, str):
+            layers.append(nn.MaxPool2d(2))
+            continue
+        layers += [nn.Conv2d(channels, each, 3, padding=1), nn.ReLU()]
+        channels = each
+    return nn.Sequential(*layers)
+
+
+def test_tiny_weights_are_read_by_the_loaders_of_the_published_files(tmp_path):
+    write_tiny_weights(tmp_path)
+    backbone = {"heads": 2, "head_dim": 12, "layers": 2, "text_embed_dim": 16, "adaln_lora_dim": 8}
+    backbone |= {"patch": (1, 2, 2), "max_size": (8, 32, 32), "rope_scale": (1.0, 4.0, 4.0)}
+    backbone |= {"padding_channel": True, "cross_attention": "frozen"}
+    renderer = load_cosmos(tmp_path / "transformer", tmp_path / "vae", {"backbone": backbone})
+    assert renderer.config.fusion == "average"
+    LPIPS.load(tmp_path / "vgg16.pth")
+
+
+@pytest.mark.long
+def test_the_papers_recipes_run_from_data_to_figures(tmp_path):
+    """Data from reconstructions, three stages with LPIPS, evaluation of the network that came of it."""
+    weights, dataset, trained, judged = (tmp_path / name for name in ("weights", "dataset", "train", "eval"))
+    write_tiny_weights(weights)
+    training = [
+        *(SMOKE, f"dataset={dataset}", f"loss.vgg_weights={weights / 'vgg16.pth'}"),
+        *(f"renderer.transformer_path={weights / 'transformer'}", f"renderer.vae_path={weights / 'vae'}"),
+    ]
+    judging = [
+        f"dataset={dataset}",
+        f"renderer={trained / 'renderer.safetensors'}",
+        f"+benchmark.vae={weights / 'vae'}",
+    ]
+    stages = Stages(tmp_path)
+    for script, arguments, output in (
+        ("tron-datagen", [SMOKE, "cluster=none"], dataset),
+        ("tron-train", training, trained),
+        ("tron-eval", judging, judged),
+    ):
+        stages.run(script, [Child(script, script, [*arguments, f"output_dir={output}"])])
+    manifest = Manifest.load(dataset)
+    clips = {split: sum(e.samples for e in manifest.of_split(split)) for split in manifest.splits()}
+    assert clips == {"train": 4, "train_b": 1, "validation": 1, "test": 2}
+    rows = {row["metric"]: row["value"] for row in json.loads((judged / "results.json").read_text())["rows"]}
+    assert math.isfinite(rows["neural.psnr"])
+    made = {
+        clip.meta.extra["surfels_from"] for split in clips for clip in read_clips(dataset, split, ["pbr"])
+    }
+    assert made == {"reconstruction"}
+    steps = (trained / "metrics.csv").read_text()
+    assert all(stage in steps for stage in ("synthetic", "adapt", "video"))

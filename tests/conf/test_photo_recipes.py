@@ -7,9 +7,9 @@ from typing import Any, cast
 import pytest
 from omegaconf import OmegaConf
 
-from tron.apps.reconstruct_settings import Settings
+from tron.apps.reconstruct.settings import Settings
 from tron.cli.recipes import check, compose_recipe
-from tron.nested import leaves
+from tron.run_folder import leaves
 
 FOX = (1080, 1920)
 

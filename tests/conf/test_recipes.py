@@ -24,7 +24,7 @@ from tron.cli.recipes import (
     nested_model,
     resolve,
 )
-from tron.nested import leaves, nested_items
+from tron.run_folder import leaves, nested_items
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
@@ -47,48 +47,31 @@ def load_command(folder: str) -> Command:
     return get_object(COMMANDS[folder].replace(":", ".")).load()
 
 
-def with_required_values(command: Command, overrides: list[str]) -> list[str]:
-    """The overrides and a stand-in for every key that only the user can know: all names or paths."""
-    recipe = complete(compose_recipe(command.config_module, command.settings, overrides))
-    required = [key for key, value in nested_items(OmegaConf.to_container(recipe)) if value == "???"]
-    return [*overrides, *(f"{key}=stand-in" for key in required)]
-
-
 def test_every_command_has_a_folder_of_recipes_and_no_folder_is_without_a_command():
     folders = {path.parent.name for path in (ROOT / "conf").glob("*/config.yaml")}
     assert folders == set(COMMANDS)
 
 
 @pytest.mark.parametrize(("folder", "overrides"), shipped_recipes())
-def test_a_shipped_recipe_is_valid(folder: str, overrides: list[str]):
+def test_a_shipped_recipe_is_valid_its_classes_exist_and_its_seeds_are_those_of_the_run(
+    folder: str, overrides: list[str]
+):
+    """What only the user can know, names and paths, has a stand-in. No class that takes a seed is without."""
     command = load_command(folder)
-    recipe = compose_recipe(command.config_module, command.settings, with_required_values(command, overrides))
+    recipe = compose_recipe(command.config_module, command.settings, [*overrides, "seed=7"])
+    for key, value in nested_items(OmegaConf.to_container(complete(recipe))):
+        if value == "???":
+            OmegaConf.update(recipe, key, "stand-in", force_add=True)
     check(recipe, command.settings)
-
-
-@pytest.mark.parametrize(("folder", "overrides"), shipped_recipes())
-def test_a_class_that_a_recipe_names_exists(folder: str, overrides: list[str]):
-    command = load_command(folder)
-    values = resolve(
-        compose_recipe(command.config_module, command.settings, with_required_values(command, overrides))
-    )
-    for key, value in nested_items(values):
-        if key.rpartition(".")[2] == "_target_":
-            assert callable(get_object(value)), f"{key}={value}"
-
-
-@pytest.mark.parametrize(("folder", "overrides"), shipped_recipes())
-def test_every_seed_follows_the_seed_of_the_run(folder: str, overrides: list[str]):
-    """Seeds of parts are the run's unless they are set, and no class that takes one is left without."""
-    command = load_command(folder)
-    overrides = [*with_required_values(command, overrides), "seed=7"]
-    recipe = complete(compose_recipe(command.config_module, command.settings, overrides))
-    values = dict(nested_items(resolve(recipe)))
+    values = dict(nested_items(resolve(complete(recipe))))
     seeds = {key: value for key, value in values.items() if key.rpartition(".")[2] == "seed"}
     for key, value in values.items():
-        if key.rpartition(".")[2] == "_target_" and "seed" in inspect.signature(get_object(value)).parameters:
-            parent = key.removesuffix("_target_")
-            seeds[f"{parent}seed"] = values.get(f"{parent}seed")
+        if key.rpartition(".")[2] == "_target_":
+            made = get_object(value)
+            assert callable(made), f"{key}={value}"
+            if "seed" in inspect.signature(made).parameters:
+                parent = key.removesuffix("_target_")
+                seeds[f"{parent}seed"] = values.get(f"{parent}seed")
     assert seeds == dict.fromkeys(seeds, 7)
 
 
@@ -200,11 +183,3 @@ def test_the_line_that_help_shows_is_a_whole_sentence(path: Path):
 def test_every_group_option_says_what_it_is_for(folder: str):
     options = group_options(load_command(folder).config_module)
     assert [f"{group}={name}" for group in options for name, said in options[group].items() if not said] == []
-
-
-def test_the_seeds_of_trainings_are_compared_on_surfels_of_g_buffers():
-    """A mapping on the command line is merged into the recipe's, and would leave its other shares."""
-    benchmark = yaml.safe_load((ROOT / "conf/eval/benchmark/renderer.yaml").read_text())
-    datagen = load_command("datagen")
-    values = compose_recipe("conf.datagen", datagen.settings, [*benchmark["seeds"]["data"], "output_dir=out"])
-    assert check(values, datagen.settings).surfels_from.model_dump() == {"gbuffers": 1, "reconstruction": 0}

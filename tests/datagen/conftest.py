@@ -6,19 +6,22 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from datagen.run import make
-from datagen.settings import Settings
+from datagen.run.dataset import make
+from datagen.settings.command import Settings
 from tron.cli.recipes import check, compose_recipe
 
 SMALL = [
     *("train.scenes=2", "train_b.scenes=1", "validation.scenes=0", "test.scenes=1", "seed=5"),
-    *("views=6", "view_width=32", "view_height=32", "surfels=1500", "refine_steps=0", "mesh_edge=0.2"),
+    *("views=6", "view_width=32", "view_height=32", "surfels=1500", "refine_steps=3", "mesh_edge=0.2"),
     *("environment_height=16", "path_frames=8", "cluster=none"),
     *("train.lights=[sun,overcast]", "train_b.lights=[studio]", "test.lights=[sun,studio]"),
     *(
         f"{split}.{value}"
         for split in ("train", "train_b", "test")
-        for value in ("frames=3", "width=32", "height=24", "path_spp=4", "guidance_spp=4", "reference_spp=4")
+        for value in (
+            *("style=object", "frames=3", "width=32", "height=24"),
+            *("path_spp=4", "guidance_spp=4", "reference_spp=4"),
+        )
     ),
 ]
 
@@ -36,11 +39,21 @@ def small_settings():
 
 
 @pytest.fixture(scope="session")
-def small_dataset(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_dataset(variant: str, made_once) -> Path:
     """Four scenes, seven clips of three frames, 32 x 24; nobody writes into it."""
-    output = tmp_path_factory.mktemp("small") / "dataset"
-    assert make(small(output)) == 0
-    return output
+
+    def fill(output: Path) -> None:
+        assert make(small(output)) == 0
+
+    return made_once(f"small_dataset_{variant}", fill)
+
+
+CLIENT = {
+    "AWS_ACCESS_KEY_ID": "tron-test-key",
+    "AWS_SECRET_ACCESS_KEY": "tron-test-secret",
+    "AWS_DEFAULT_REGION": "us-east-1",
+    "AWS_MAX_ATTEMPTS": "1",
+}
 
 
 class S3Server:
@@ -106,10 +119,8 @@ def running_s3():
     pytest.importorskip("moto.server", reason="no S3 server: pip install 'moto[server]'")
     pytest.importorskip("s3fs", reason="no S3 client: pip install s3fs")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("AWS_ACCESS_KEY_ID", "tron-test-key")
-        patch.setenv("AWS_SECRET_ACCESS_KEY", "tron-test-secret")
-        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-        patch.setenv("AWS_MAX_ATTEMPTS", "1")
+        for name, value in CLIENT.items():
+            patch.setenv(name, value)
         server = S3Server()
         yield server
         server.stop()
@@ -120,12 +131,7 @@ def s3_server(running_s3, monkeypatch: pytest.MonkeyPatch):
     """The server, running, with the environment of a client that finds it."""
     running_s3.stop()
     running_s3.start()
-    for name, value in (
-        ("AWS_ACCESS_KEY_ID", "tron-test-key"),
-        ("AWS_SECRET_ACCESS_KEY", "tron-test-secret"),
-        ("AWS_DEFAULT_REGION", "us-east-1"),
-        ("AWS_MAX_ATTEMPTS", "1"),
-    ):
+    for name, value in CLIENT.items():
         monkeypatch.setenv(name, value)
     running_s3.point_to(running_s3.address, monkeypatch)
     return running_s3

@@ -8,7 +8,7 @@ import pytest
 
 from datagen.cli import cli
 from datagen.equal_error import WAYS, equal
-from tron.images import read_image
+from tron.io.images import read_image
 
 CONVERGING = {spp: (0.4 / spp**0.5, 0.1 + 0.01 * spp) for spp in (1, 4, 16, 64)}
 

@@ -153,7 +153,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory, write_dataset: Callable[..
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Untrained weights: tiny and pixel_mlp, which return lit, and those of two buffers, which return pbr."""
     from tron.neural.configs import PAPER_GUIDANCE, PixelMLPConfig, RendererConfig
-    from tron.neural.pixel_mlp import PixelMLP
+    from tron.neural.networks.pixel_mlp import PixelMLP
     from tron.neural.renderer import NeuralRenderer
     from tron.neural.weights import save_renderer
 

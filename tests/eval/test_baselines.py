@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from eval.relighting import baselines
-from eval.relighting.baselines import RATIO_FLOOR
+from eval.relighting.baselines import RATIO_FLOOR, show_oidn
+from eval.relighting.bilateral import BilateralFit, bilateral
 from eval.relighting.buffers import Buffers
 from eval.relighting.fits import (
     DEVIATIONS,
@@ -14,8 +15,10 @@ from eval.relighting.fits import (
     FilteredAffineFit,
     GaussianFit,
     ProductFit,
+    PsnrAffineFit,
     Show,
     filtered,
+    fitted_by_psnr,
     remodulated,
     show_product,
 )
@@ -222,3 +225,80 @@ def test_a_filtered_blend_takes_detail_from_a_sharp_input():
     fit = FilteredAffineFit(FIRST, sharp=[SECOND])
     fit.add(buffers, truth, np.nonzero(np.ones(truth.shape[:3])))
     np.testing.assert_allclose(fit.solve().weights, [[0.8, -0.4, 0.4, 0.1]] * 3, atol=1e-5)
+
+
+def clip_of(lit: np.ndarray, **others: np.ndarray) -> Buffers:
+    """Whole frames (K, H, W, 3) of lit, and other buffers beside it; exposure 1."""
+    plain = {name: np.full_like(lit, 0.5) for name in ("albedo", "surface", "pbr", "irradiance")}
+    return Buffers({"lit": lit, **plain, **others}, 1.0)
+
+
+def everywhere(images: np.ndarray) -> tuple[np.ndarray, ...]:
+    return np.nonzero(np.ones(images.shape[:3], bool))
+
+
+def test_the_bilateral_filter_is_a_gaussian_where_nothing_leads_it():
+    lit = generator(0, "bilateral").uniform(0.1, 1, (1, 12, 14, 3)).astype(np.float32)
+    (shown,) = bilateral(clip_of(lit), np.array([[1.0, 1e9]]))
+    show = filtered(lambda buffers: buffers.displayed("lit"), 1.0)
+    inner = np.s_[:, 4:-4, 4:-4]
+    np.testing.assert_allclose(
+        shown[inner], show(clip_of(lit))[inner], atol=2e-3
+    )  # cut at 3 pixels, not at 4
+
+
+def test_the_bilateral_filter_takes_noise_away_and_keeps_an_edge_of_albedo():
+    rng = generator(1, "bilateral")
+    truth = np.where(np.arange(24)[None, None, :, None] < 12, 0.2, 0.8) * np.ones((2, 24, 24, 3))
+    albedo = truth.astype(np.float32)
+    lit = np.clip(truth + 0.05 * rng.normal(size=truth.shape), 0.01, None).astype(np.float32)
+    buffers = clip_of(lit, albedo=albedo)
+    shown_truth = to_display(truth.astype(np.float32), 1.0)
+    fit = BilateralFit()
+    fit.add(buffers, shown_truth, everywhere(shown_truth))
+    led = fit.solve()
+
+    def psnr(image: np.ndarray) -> float:
+        return float(-10 * np.log10(np.mean((image - shown_truth) ** 2)))
+
+    gaussian = max(psnr(filtered(baselines.show_lit, s)(buffers)) for s in DEVIATIONS)
+    assert psnr(led.show(buffers)) > gaussian + 3
+    assert psnr(led.show(buffers)) > psnr(buffers.displayed("lit")) + 6
+
+
+def test_a_blend_by_psnr_is_the_best_that_gradients_find():
+    """Frames of unlike error: the fit beats squared error's by PSNR, and no weights beside it are better."""
+    rng = generator(2, "psnr")
+    lit = rng.uniform(0.1, 0.9, (4, 10, 10, 3)).astype(np.float32)
+    noise = np.array([0.2, 0.02, 0.005, 0.002])[:, None, None, None]
+    shift = np.array([0.3, 0.0, 0.02, -0.01])[:, None, None, None]
+    inputs = (lambda buffers: buffers["lit"], lambda buffers: buffers["albedo"])
+    buffers = clip_of(lit, albedo=rng.uniform(0, 1, lit.shape).astype(np.float32))
+    truth = 0.6 * lit + 0.3 * buffers["albedo"] + shift + noise * rng.normal(size=lit.shape)
+    by_error = AffineFit(*inputs)
+
+    def mean_psnr(weights: np.ndarray) -> float:
+        images = [show(buffers).astype(float) for show in inputs]
+        blend = weights[:, -1] + sum(w * image for w, image in zip(weights.T, images))
+        return float(np.mean(-10 * np.log10(np.square(blend - truth).mean((1, 2, 3)))))
+
+    by_error.add(buffers, truth, everywhere(truth))
+    frames = [AffineFit(*inputs) for _ in truth]
+    for number, fit in enumerate(frames):
+        fit.add(buffers, truth, tuple(axis[everywhere(truth)[0] == number] for axis in everywhere(truth)))
+    weights, reached = fitted_by_psnr(frames, np.full(4, 100.0))
+    assert reached == pytest.approx(mean_psnr(weights), abs=1e-6)
+    assert reached > mean_psnr(by_error.weights()) + 1
+    for _ in range(50):
+        assert mean_psnr(weights + 1e-3 * rng.normal(size=weights.shape)) <= reached + 1e-6
+    whole = PsnrAffineFit(*inputs, sharp=inputs)
+    whole.add(buffers, truth, everywhere(truth))
+    assert whole.solve().show(buffers).shape == truth.shape
+
+
+def test_open_image_denoise_takes_noise_away_where_it_is_installed():
+    pytest.importorskip("pyoidn")
+    lit = generator(3, "oidn").uniform(0.2, 0.6, (1, 32, 32, 3)).astype(np.float32)
+    shown = show_oidn(clip_of(lit))
+    assert shown.shape == lit.shape
+    assert shown.std() < 0.5 * to_display(lit, 1.0).std()

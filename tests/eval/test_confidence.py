@@ -9,11 +9,10 @@ import pytest
 import scipy.stats
 
 from eval.confidence import Interval, interval, mean_interval, quotient, scene_sums
-from eval.demo.refinement import refinement
+from eval.demo import refinement
 from eval.relighting.guidance import GuidanceScores, shadow_rows
 from eval.relighting.scores import GROUPS, METRICS, Score, Scores
-from eval.report.figures import with_interval
-from eval.report.intervals import interval_note
+from eval.report.figures import interval_note, left_out, with_interval
 from eval.results import Results, Row
 from tron.seeds import generator
 from tron.shards.schema import Clip
@@ -108,6 +107,19 @@ def scored(**psnr: list[list[float]]) -> Scores:
     return scores
 
 
+def test_a_gain_says_how_far_it_rests_on_a_single_scene():
+    pbr = [[20.0], [20.0], [20.0], [20.0], [20.0], [20.0]]
+    neural = [[21.0], [21.0], [21.0], [21.0], [21.0], [26.0]]
+    rows = {row.metric: row for row in scored(neural=neural, pbr=pbr).rows()}
+    gain = rows["neural.gain_over_pbr"]
+    assert gain.without_one == pytest.approx((1.0, 2.0))
+    assert left_out(gain) == "+1.00 dB to +2.00 dB without any one scene"
+    assert rows["pbr.psnr"].without_one is None
+    few = {row.metric: row for row in scored(neural=neural[:2], pbr=pbr[:2]).rows()}
+    assert few["neural.gain_over_pbr"].without_one is None
+    assert left_out(few["neural.gain_over_pbr"]) == ""
+
+
 def test_a_gain_is_of_differences_on_the_same_frames():
     rng = generator(0, "gains")
     pbr = rng.uniform(20, 40, (8, 5))
@@ -173,11 +185,9 @@ def test_refinement_is_drawn_by_scene(tmp_path: Path):
         folder = tmp_path / "scenes" / f"s{number}"
         folder.mkdir(parents=True)
         (folder / "record.json").write_text(json.dumps(record))
-    rows, sections = refinement(tmp_path, seed=0)
+    rows = refinement(tmp_path, seed=0)
     after = next(row for row in rows if row.metric == "refinement.base_color_psnr.after")
     assert (after.value, after.low, after.high, after.scenes) == (32.75, 30.0, 36.0, 4)
-    table = sections[0].blocks[0]
-    assert "32.75 dB [30.00, 36.00]" in [cell.text for cell in table.cells[0]]  # type: ignore[union-attr]
 
 
 def test_results_keep_an_interval_and_lack_its_keys_without_one(tmp_path: Path):
@@ -200,7 +210,7 @@ def test_half_an_interval_is_refused(ends: dict[str, float]):
 
 def test_intervals_are_written_in_the_unit_of_their_figure():
     def row(value: float, unit: str, low: float, high: float) -> Row:
-        return Row(metric="a.b", value=value, unit=unit, n=8).within(Interval(4, low, high))
+        return Row(metric="a.b", value=value, unit=unit, n=8).within(Interval(5, low, high))
 
     assert with_interval(row(34.1, "dB", 32.9, 35.2)) == "34.10 dB [32.90, 35.20]"
     assert with_interval(row(0.005, "fraction", 0.001, 0.009)) == "0.50% [0.10, 0.90]"
@@ -209,9 +219,16 @@ def test_intervals_are_written_in_the_unit_of_their_figure():
     assert with_interval(row(1.5, "deg", 1, 2)) == "1.50° [1.00, 2.00]"
 
 
+@pytest.mark.parametrize("scenes, said", [(2, "34.10 dB"), (4, "34.10 dB"), (5, "34.10 dB [32.90, 35.20]")])
+def test_an_interval_over_fewer_than_five_scenes_is_not_printed(scenes: int, said: str):
+    row = Row(metric="a.b", value=34.1, unit="dB", n=99, low=32.9, high=35.2, scenes=scenes)
+    assert with_interval(row) == said
+    assert ("no interval is given" in interval_note(scenes)) == ("[" not in said)
+
+
 def test_the_note_says_how_many_scenes_and_that_few_are_few():
-    few, many = interval_note(4, "60 frames"), interval_note(30, "900 frames")
-    assert "60 frames are 4 independent scenes" in few
+    few, many = interval_note(5, "60 frames"), interval_note(30, "900 frames")
+    assert "60 frames are 5 independent scenes" in few
     assert "There are 4 scenes" in interval_note(4)
     assert "wide" in few
     assert "900 frames are 30 independent scenes" in many

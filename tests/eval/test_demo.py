@@ -3,12 +3,15 @@
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from eval import stages as stages_module
 from eval.cli import cli
-from eval.results import Results
+from eval.demo import Demo
+from eval.relighting.benchmark import Relighting
+from eval.results import Results, Target
 
 STAND_IN = """#!{python}
 import pathlib, shutil, sys
@@ -117,4 +120,18 @@ def test_other_settings_do_not_mix_with_a_finished_data_set(
     out = tmp_path / "demo"
     assert run(f"output_dir={out}") == 1  # the data set is finished, the training is not
     assert run(f"output_dir={out}", 'benchmark.datagen=["experiment=paper"]') == 2
-    assert "begun with other settings" in capfd.readouterr().err
+    assert "output_dir holds a stage made with" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "given, judged",
+    [
+        ({}, True),
+        ({"datagen": ["experiment=mine"]}, False),
+        ({"train": ["experiment=tiny"]}, False),
+    ],
+)
+def test_the_demos_targets_judge_the_demos_own_recipe_alone(given: dict[str, Any], judged: bool):
+    target = Target(metric="lit.psnr", bound="at least", value=35.5)
+    demo = Demo(relighting=Relighting(dataset=None), targets=[target], **given)
+    assert demo.bounds() == ([target] if judged else [])

@@ -1,4 +1,4 @@
-"""The reconstruction benchmark: lights against closed forms, steps against the peer's, orchestration."""
+"""The reconstruction benchmark: lights against closed forms, orchestration."""
 
 import json
 import sys
@@ -7,28 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from eval import stages as stages_module
 from eval.cli import cli
-from eval.peers import volprim
-from eval.peers.timing import Rounds
-from eval.reconstruction import step
 from eval.reconstruction.light import brightest_direction, irradiance, light_errors, sun_error_deg, texels
-from eval.reconstruction.relighting import Relit, RelitLight
-from eval.reconstruction.runs import Report, Run, gain_rows, light_rows, read_report, rows_of
-from eval.reconstruction.subjects import drawn
+from eval.reconstruction.runs import Report, Run, light_rows, read_report, rows_of
 from eval.results import Results
+from eval.tracing.scene import surfels
 from tron.captures import Capture, View
 from tron.captures.folder import write_capture
 from tron.errors import TronError
-from tron.images import encode_exr, write_image
-from tron.reconstruction.losses import photometric_loss
-from tron.reconstruction.surfels import LearntSurfels
+from tron.io.images import encode_exr, write_image
 from tron.seeds import generator
 from tron.shading import EnvironmentMap
 from tron.tracing import SurfelTracer
-from tron.tracing.torch_bridge import render
 from tron.trajectories import spiral
 
 SCENE = "test-000000"
@@ -75,7 +67,7 @@ def test_light_errors_know_scale_from_direction(variant: str):
 
 def test_the_brightest_spot_is_found_finer_than_a_texel(variant: str):
     directions, _ = texels(EnvironmentMap.constant(0.3, 96))
-    for towards in unit(5):
+    for towards in unit(2):
         near = (directions @ towards > np.cos(np.radians(4.0))).reshape(96, 192, 1)
         sun = replace(EnvironmentMap.constant(0.3, 96), image=np.float32(0.3 + 300 * near) * np.ones(3, "f4"))
         assert np.degrees(np.arccos(brightest_direction(sun) @ towards)) < 0.8
@@ -84,20 +76,6 @@ def test_the_brightest_spot_is_found_finer_than_a_texel(variant: str):
     # A turn about z moves a direction by less than its angle, the less the higher it stands.
     chord = 2 * np.sqrt(1 - straight_up**2) * np.sin(np.radians(20))
     assert turned == pytest.approx(np.degrees(2 * np.arcsin(chord / 2)), abs=0.8)
-
-
-def test_the_gain_is_scene_by_scene_where_both_were_relit():
-    here = Path()
-
-    def relit(name: str, psnr: float | None) -> Run:
-        light = None if psnr is None else Relit({"sun": RelitLight(psnr, np.zeros(1), np.zeros(1))}, 1.0)
-        return Run(name, here, here, report(), 1.0, relit=light)
-
-    runs = [relit("a-1", 25.0), relit("b-2", 24.0), relit("c-3", None), relit("d-4", 30.0)]
-    before = [relit("b-2", 22.0), relit("a-1", 20.0), relit("c-3", 10.0), relit("d-4", None)]
-    (row,) = gain_rows("reconstruction.photos", runs, before)
-    assert (row.metric, row.value, row.n) == ("reconstruction.photos.relight_gain", 3.5, 2)
-    assert not list(gain_rows("reconstruction.photos", runs, []))
 
 
 def test_light_rows_keep_suns_apart():
@@ -166,64 +144,6 @@ def test_metrics_that_are_none_are_refused(tmp_path: Path):
         read_report(tmp_path)
 
 
-def test_the_peer_is_given_the_same_surfels(variant: str):
-    """Against the NumPy conversion that the tracing benchmark uses."""
-    import mitsuba as mi
-
-    scene, _, extent = drawn(50, 16, seed=0)
-    surfels = LearntSurfels.of_scene(scene, step.step_plan(extent, 0).rates)
-    wanted = mi.traverse(volprim.primitives(scene, 3))
-    names = ("surfels.data", "surfels.opacities", "surfels.sh_coeffs")
-    for name, tensor in zip(names, step.ellipsoids(surfels), strict=True):
-        np.testing.assert_allclose(tensor.detach().numpy().ravel(), np.array(wanted[name]), atol=2e-6)
-
-
-def test_both_sides_differentiate_the_same_loss_and_learn(variant: str):
-    scene, view, extent = drawn(300, 32, seed=0)
-    plan = step.step_plan(extent, 0)
-    ours, peer = (LearntSurfels.of_scene(scene, plan.rates) for _ in range(2))
-    target = torch.from_numpy(view.read())
-    integrator = volprim.load_integrator(volprim.OUR_STOP)
-    draw = step.peer_picture(volprim.primitives(scene, 3), view, integrator)
-    photometric_loss(render(ours.rendered(), view.camera)["rgb"], target).backward()
-    photometric_loss(draw(peer), target).backward()
-    assert set(plan.rates) == {"means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest"}
-    for name in plan.rates:
-        a, b = (side[name].grad for side in (ours, peer))
-        assert a is not None
-        assert b is not None
-        assert a.any()
-        assert b.any()
-        if name in ("sh_dc", "opacity_logits"):
-            assert torch.cosine_similarity(a.ravel(), b.ravel(), dim=0) > 0.8
-
-    before = float(photometric_loss(draw(peer), target).detach())
-    peer.step()
-    for _ in range(4):
-        loss = photometric_loss(draw(peer), target)
-        peer.clear_gradients()
-        loss.backward()
-        peer.step()
-    assert float(photometric_loss(draw(peer), target).detach()) < before
-
-
-def test_a_step_changes_what_it_learns_and_is_timed(variant: str):
-    scene, view, extent = drawn(200, 16, seed=0)
-    found = step.measure_steps(scene, view, extent, 0, Rounds(2, 1), shape="ellipsoids")
-    assert (found.count, found.size, found.shape) == (200, 16, "ellipsoids")
-    assert found.case == "degree2_16"
-    assert set(found.times) == {step.TRON, step.VOLPRIM, step.SHIPPED}
-    other = step.measure_steps(
-        replace(scene, kernel_degree=4), view, extent, 0, Rounds(1, 1), shape="ellipsoids"
-    )
-    assert other.case == "degree4_16"
-    assert set(other.times) == {step.TRON, step.VOLPRIM}
-    assert len(found.times[step.TRON].seconds) == 2
-    assert found.ratio() > 0
-    assert found.agreement > 15
-    assert step.measure_growth(scene, view, extent, 0, 2).seconds > 0
-
-
 # Stand-ins for the commands: they copy what those would make.
 STAND_IN = """#!{python}
 import pathlib, shutil, sys
@@ -236,7 +156,7 @@ shutil.copytree({made!r}, given["output_dir"], dirs_exist_ok=True)
 
 def small_capture() -> Capture:
     """Nine views of drawn surfels with their true maps."""
-    scene, _, _ = drawn(300, 32, seed=0)
+    scene = surfels(300, seed=0)
     tracer, views = SurfelTracer(scene), []
     cameras = spiral(9, target=(0, 0, 0.4), radius=5, width=24, height=32, fov_deg=35)
     for number, camera in enumerate(cameras):
@@ -266,7 +186,7 @@ def stand_ins(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
     folder = made["tron-reconstruct"]
     folder.mkdir(parents=True)
-    drawn(300, 32, seed=0)[0].save(folder / "scene.ply")
+    surfels(300, seed=0).save(folder / "scene.ply")
     light.save(folder / "environment.exr")
     figures = {"psnr": 33.0, "ssim": 0.9, "normal_mae_deg": 4.0, "base_color_psnr": 31.0}
     metrics = {
@@ -320,19 +240,18 @@ def test_every_scene_in_every_way_and_the_fox_are_run_once(stand_ins: Path, tmp_
     out = tmp_path / "out"
     commands = stand_ins.read_text().splitlines()
     assert commands[0] == f"tron-datagen experiment=captures output_dir={out / 'dataset'}"
-    assert [command.split()[0] for command in commands[1:]] == [*["tron-reconstruct"] * 4, "tron-relight"]
-    folders = [command.rpartition("output_dir=")[2] for command in commands[1:4]]
-    ways = ("random", "depth_init", "classical")
+    assert [command.split()[0] for command in commands[1:]] == [*["tron-reconstruct"] * 3, "tron-relight"]
+    folders = [command.rpartition("output_dir=")[2] for command in commands[1:3]]
+    ways = ("random", "depth_init")
     assert folders == [str(out / "scenes" / SCENE / way) for way in ways]
-    assert all(f"capture={out / 'dataset' / 'captures' / SCENE}" in command for command in commands[1:4])
-    assert ["prior=classical" in command for command in commands[1:4]] == [False, False, True]
+    assert all(f"capture={out / 'dataset' / 'captures' / SCENE}" in command for command in commands[1:3])
     cameras = json.loads((out / "fox_cameras.json").read_text())
     assert [camera["width"] for camera in cameras] == [24, 24]
     assert f"scene={out / 'fox' / 'scene.ply'}" in commands[-1]
     assert "width=48 height=64" in commands[-1]
 
     results = Results.load(out / "results.json")
-    prefixes = ("reconstruction", "reconstruction.depth_init", "reconstruction.classical")
+    prefixes = ("reconstruction", "reconstruction.depth_init")
     for prefix in prefixes:
         for name in SCENE_FIGURES:
             assert results.find(f"{prefix}.{name}") is not None
@@ -342,16 +261,14 @@ def test_every_scene_in_every_way_and_the_fox_are_run_once(stand_ins: Path, tmp_
     assert results.value("reconstruction.seconds") == stages[f"{SCENE} random"]["seconds"]
     for name, value in (("test_psnr", 33.0), ("ssim", 0.9), ("surfels", 300.0), ("views", 9.0)):
         assert results.value(f"fox.{name}") == value
-    assert not [row.metric for row in results.rows if row.metric.startswith("step.")]
     assert results.find("fox.test_psnr").reference == "target: at least 25 dB"  # type: ignore[union-attr]
 
     page = (out / "report.html").read_text()
-    for anchor in ("targets", "scenes", "views", "light", "fox", "limits", "stages"):
+    for anchor in ("targets", "scenes", "light", "fox", "stages"):
         assert f'id="{anchor}"' in page
     assert "no interval is given" in page
     assert "Under noon" in page
-    assert "name and that are absent: 1." in page
-    assert page.count("<svg") == 3
+    assert page.count("<svg") == 2
     assert (out / "pictures" / f"{SCENE}.png").is_file()
 
     assert run(tmp_path, "benchmark.parts=[scenes,fox]") == 0
@@ -379,10 +296,9 @@ def test_photographs_and_scans_are_relit_and_have_rows(stand_ins: Path, tmp_path
     assert b"base_color" not in header
 
     results = Results.load(out / "results.json")
-    for prefix in ("reconstruction", "reconstruction.classical", "reconstruction.photos"):
+    for prefix in ("reconstruction", "reconstruction.photos"):
         for name in ("relight_psnr", "relight_psnr_sun", "relight_psnr_studio", "irradiance_error"):
             assert results.find(f"{prefix}.{name}") is not None
-    assert results.value("reconstruction.photos.relight_gain") == pytest.approx(0, abs=1e-9)  # one stand-in
     for prefix in ("splats", "splats.raw"):
         for name in ("normal_mae_deg", "normal_median_deg", "relight_psnr", "surfels", "seconds"):
             assert results.find(f"{prefix}.{name}") is not None
@@ -395,25 +311,18 @@ def test_photographs_and_scans_are_relit_and_have_rows(stand_ins: Path, tmp_path
 
 
 def test_a_way_is_of_scenes_or_of_photos(stand_ins: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]):
-    assert run(tmp_path, '+benchmark.photos.classical=["prior=classical"]') == 2
-    assert "way classical is of photos and of scenes" in capfd.readouterr().err
+    assert run(tmp_path, '+benchmark.photos.random=["prior=joint"]') == 2
+    assert "way random is of photos and of scenes" in capfd.readouterr().err
 
 
-def test_without_real_data_the_fox_has_no_rows_and_the_page_says_so(stand_ins: Path, tmp_path: Path):
+def test_without_real_data_the_fox_has_no_rows_and_no_section(stand_ins: Path, tmp_path: Path):
     assert run(tmp_path, "benchmark.parts=[fox]", f"benchmark.real_data={tmp_path / 'nowhere'}") == 0
     results = Results.load(tmp_path / "out" / "results.json")
     assert results.rows == []
     assert not stand_ins.exists()
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "The real capture was not reconstructed" in page
+    assert 'id="fox"' not in page
     assert "not measured" in page
-
-
-def test_steps_without_a_scene_are_one_line(
-    stand_ins: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-):
-    assert run(tmp_path, "benchmark.parts=[steps]") == 2
-    assert "no reconstructed scene to take steps on" in capfd.readouterr().err
 
 
 QUICK = (
@@ -442,7 +351,6 @@ def test_the_whole_benchmark_with_the_real_commands(shared_data: Path, tmp_path:
                 f"benchmark.datagen=[{CAPTURES}]",
                 f"benchmark.reconstruct=[{QUICK}]",
                 "~benchmark.ways.depth_init",
-                "~benchmark.ways.classical",
                 f"benchmark.photographs=[{CAPTURES.replace('captures', 'photographs', 1)},{RELIT}]",
                 f"benchmark.photos.photos=[{QUICK}]",
                 f'benchmark.splats.scan=[{QUICK},"initial.kernel_degree=2","light=null"]',
@@ -452,13 +360,6 @@ def test_the_whole_benchmark_with_the_real_commands(shared_data: Path, tmp_path:
                 'benchmark.relight=["quality=preview"]',
                 "benchmark.hdris=[studio_small_03_1k.hdr]",
                 "benchmark.relit_views=2",
-                "benchmark.step_pixels=[16,32]",
-                'benchmark.step_degree2=["initial.kernel_degree=2"]',
-                "benchmark.growth_surfels=[200,400]",
-                "benchmark.growth_pixels=[32,64]",
-                "benchmark.growth_at=[200,32]",
-                "benchmark.repetitions=1",
-                "benchmark.slow_repetitions=1",
             ]
         )
     assert end.value.code == 0
@@ -468,29 +369,7 @@ def test_the_whole_benchmark_with_the_real_commands(shared_data: Path, tmp_path:
     assert {f"reconstruction.photos.{name}" for name in (*SCENE_FIGURES, "relight_psnr")} <= found
     assert {f"splats.{name}" for name in ("normal_mae_deg", "relight_psnr", "raw.relight_psnr")} <= found
     assert {"fox.test_psnr", "fox.seconds", "fox.ssim", "fox.surfels", "fox.relight_seconds"} <= found
-    for degree in ("degree2", "degree4"):
-        assert {f"step.ratio_to_volprim.{degree}", f"step.ratio_to_volprim.{degree}_32"} <= found
-        assert {f"step.tron_ms.{degree}_32", f"step.volprim_ms.{degree}_16"} <= found
-        assert results.value(f"step.ratio_to_volprim.{degree}") == results.value(
-            f"step.ratio_to_volprim.{degree}_16"
-        )
-        agreement = results.value(f"step.psnr_to_volprim.{degree}_32")
-        assert agreement is not None
-        assert agreement > 20
-    assert {"step.seconds.200_32", "step.seconds.400_32", "step.seconds.200_64"} <= found
     assert results.value("fox.views") == 50
     page = (tmp_path / "report.html").read_text()
-    for anchor in (
-        "targets",
-        "scenes",
-        "views",
-        "light",
-        "relit",
-        "splats",
-        "fox",
-        "steps",
-        "limits",
-        "stages",
-    ):
+    for anchor in ("targets", "scenes", "light", "relit", "splats", "fox", "stages"):
         assert f'id="{anchor}"' in page
-    assert len(json.loads((tmp_path / "times.json").read_text())["step degree4_32"]["tron"]) == 1

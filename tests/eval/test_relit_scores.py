@@ -6,18 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eval.peers.scene import surfels
 from eval.reconstruction.relighting import fitted_factor, relight
 from eval.reconstruction.scans import THICKNESS, collect_scan, write_scan
+from eval.tracing.scene import surfels
 from tron.captures import Capture, View
 from tron.captures.folder import write_capture
 from tron.color import to_display
 from tron.estimation import Estimation
 from tron.gaussians.scene import GaussianScene
-from tron.images import encode_exr
+from tron.io.images import encode_exr
 from tron.seeds import generator
-from tron.shading.bounce import BounceTransport
-from tron.shading.environment import EnvironmentMap
+from tron.shading.bounces.bounce import BounceTransport
+from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Lighting, render_guidance
 from tron.tracing import SurfelTracer
 from tron.trajectories import spiral

@@ -6,15 +6,14 @@ from typing import Any
 
 import pytest
 
-from datagen.assets import find_assets
-from datagen.settings import Settings as DatagenSettings
+from datagen.files.assets import find_assets
+from datagen.settings.command import Settings as DatagenSettings
 from eval.cli import Settings as EvalSettings
-from eval.real_models import model_names
 from eval.renderer.benchmark import Renderer
-from eval.renderer.datasets import Datasets
+from eval.renderer.datasets import Datasets, model_names
 from eval.stages import Child
+from train.examples.splits import Splits
 from train.settings import Settings as TrainSettings
-from train.splits import Splits
 from tron.cli.instantiation import make
 from tron.cli.recipes import check, compose_recipe
 
@@ -47,24 +46,20 @@ def test_the_commands_accept_every_recipe_and_no_data_share_a_seed(asked: dict[s
         (tmp_path / "real" / kind).mkdir(parents=True)
     (tmp_path / "real" / "assets" / "a" / "chess-board.glb").touch()
     (tmp_path / "real" / "hdri" / "night_1k.hdr").touch()
-    made = datasets(tmp_path / "out", f"benchmark.real_data={tmp_path / 'real'}", "benchmark.max_seconds=9")
+    made = datasets(tmp_path / "out", f"benchmark.real_data={tmp_path / 'real'}")
     for size in (128, 256):
         made.synthetic(size)
-    for make_it in (made.captures, made.shadows, made.seeds, made.kills, made.trained):
+    for make_it in (made.captures, made.shadows):
         make_it()
     made.models(128)
     assert asked["models_128"].allow_unlicensed == ["chess-board", "night_1k"]
     assert asked["captures"].captures == tmp_path / "out" / "captures_views" / "captures"
     assert asked["captures"].captured.split_by_name
-    assert asked["trained_pair"].renderer["config"]["guidance"] == ["pbr", "irradiance"]
-    assert asked["trained_lit"].splits == {
-        "train_b": f"{tmp_path / 'out' / 'training_captures'}#train+train_relit",
-        "near": f"{tmp_path / 'out' / 'training_clips'}#train",
-        "validation": f"{tmp_path / 'out' / 'training_clips'}#validation",
-    }
-    assert asked["trained_lit"].max_seconds == 9
-    views = ("synthetic_128", "models_128", "captures_views", "training_captures_views", "shadows")
-    seeds = [asked[name].seed for name in (*views, "training", "seed_training")]
+    seeds = [asked[name].seed for name in ("synthetic_128", "models_128", "captures_views", "shadows")]
+    for learnt_from in ("renderer_train", "pseudo_captures"):
+        typed = [f"experiment={learnt_from}", f"output_dir={tmp_path}"]
+        composed = compose_recipe("conf.datagen", DatagenSettings, typed)
+        seeds.append(check(composed, DatagenSettings).seed)
     assert len(set(seeds)) == len(seeds)
 
 
@@ -93,12 +88,6 @@ def test_threads_and_seed_of_the_command_are_those_of_the_benchmark(tmp_path: Pa
     assert (settings.threads, settings.seed) == (3, 5)
 
 
-def test_short_trainings_learn_from_surfels_of_buffers_alone(asked: dict[str, Any], tmp_path: Path):
-    """Reconstructing them would take most of the part's time."""
-    datasets(tmp_path).seeds()
-    assert asked["seed_training"].surfels_from.reconstruction == 0
-
-
 def test_per_pixel_baselines_learn_from_the_split_that_fits_are_made_on(
     asked: dict[str, Any], dataset: Path, tmp_path: Path
 ):
@@ -111,4 +100,4 @@ def test_per_pixel_baselines_learn_from_the_split_that_fits_are_made_on(
             (learnt,) = {split for stage in settings.stages for split in stage.splits()}
             clips = splits.clips(learnt)
             assert {clips.meta(number).split for number in range(len(clips))} == {split}
-    assert datasets(tmp_path / "none").pixel_mlps(dataset, "train_relit") == {}
+    assert datasets(tmp_path / "none").pixel_mlps(dataset, "train_relit") == []

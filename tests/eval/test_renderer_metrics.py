@@ -1,23 +1,16 @@
 """Laws of the renderer benchmark's figures: flicker, moving shadows, folds, insets, paired differences."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from eval.relighting.measured import Judged
 from eval.relighting.scores import Score, Scores
-from eval.renderer.changes import change_sums, correlation, slope, stayed
-from eval.renderer.clips import Clips, ClipScore
-from eval.renderer.curriculum import CAPTURES, PHOTOS, SYNTHETIC, Curriculum, stage_files
-from eval.renderer.gains import Gains
-from eval.renderer.judging import fold
-from eval.renderer.kills import Ended, Kills
+from eval.renderer.benchmark import fold
+from eval.renderer.clips import ClipScore, Flicker, clip_rows, flicker, steps
+from eval.renderer.gains import gain_rows, over_lit
 from eval.renderer.pictures import busiest_square, with_inset
-from eval.renderer.repeats import Repeats
-from eval.renderer.throughput import INFERENCE, TRAINING, Throughput
-from eval.renderer.warping import Flicker, flicker, steps
+from eval.renderer.shadows import change_sums, correlation, slope, stayed
 from eval.results import Row
 from tron.cameras import Camera
 from tron.errors import TronError
@@ -84,18 +77,19 @@ def test_a_clip_without_true_depth_is_refused(drawn_clip: Callable[..., Clip]):
 
 
 def test_ratios_are_of_mean_squares_and_gains_of_the_same_frames():
-    found = Clips(5, "anchor")
+    psnr = {"lit_buffer_averaged": 30.0, "lit.k1": 30.0, "lit.averaged": 30.0, "lit.anchor": 30.5}
+    scores: dict[str, list[ClipScore]] = {name: [] for name in ("truth", *psnr)}
     for scene, single, many in (("a", (8.0, 100), (4.0, 100)), ("b", (2.0, 50), (1.5, 50))):
-        found.scores["truth"].append(ClipScore(scene, Flicker(0.5, single[1]), [100.0, 100.0]))
-        found.scores["lit.k1"].append(ClipScore(scene, Flicker(*single), [30.0, 31.0]))
-        found.scores["lit.anchor"].append(ClipScore(scene, Flicker(*many), [30.5, 31.5]))
-    rows = values(found.rows(0))
+        scores["truth"].append(ClipScore(scene, Flicker(0.5, single[1]), [100.0, 100.0]))
+        for name, first in psnr.items():
+            of = Flicker(*(many if name == "lit.anchor" else single))
+            scores[name].append(ClipScore(scene, of, [first, first + 1]))
+    rows = values(clip_rows(scores, ["lit"], 0))
     assert rows["renderer.warp_error_ratio"].value == pytest.approx(5.5 / 10)
     assert rows["renderer.warp_error_ratio"].scenes == 2
     assert rows["renderer.clip_gain_db"].value == pytest.approx(0.5)
     assert rows["renderer.warp_rms.truth"].value == pytest.approx(np.sqrt(1 / 150))
     assert "renderer.pair.warp_error_ratio" not in rows
-    assert "K = 5, anchor" in str(found.sections(Path()))
 
 
 def test_the_truth_correlates_with_itself_and_a_constant_with_nothing():
@@ -155,7 +149,7 @@ def test_the_inset_shows_the_square_in_which_two_pictures_differ_most():
     assert (shown[260:] == 1).all(), "all of the square is white"
 
 
-def judged(**psnr: float) -> Judged:
+def scored(**psnr: float) -> Scores:
     """Scores of two scenes under two kinds of light, of methods whose PSNR is constant."""
     scores = Scores()
     for method, mean in psnr.items():
@@ -165,14 +159,14 @@ def judged(**psnr: float) -> Judged:
                 figures = {"psnr": mean + off - harder, "ssim": 0.9}
                 for region in ("foreground", "frame"):
                     scores.kept[method, region].append(Score(family, scene, f"{scene}-{family}", figures))
-    return Judged(scores, [], [])
+    return scores
 
 
 def test_gains_are_over_the_best_of_the_group_and_paired_by_scene():
     fits = {"pbr": 20.0, "pbr_x_irradiance": 21.0, "affine": 22.0, "shadow_ratio": 23.0}
     fits |= {"shadowed": 23.5, "affine_ratio": 25.0, "lit": 30.0, "affine_lit": 29.0}
-    found = Gains("models", "ood_", "Models", "", {128: judged(**fits, neural=27.0, neural_lit=31.0)})
-    rows = values(found.rows(0))
+    found = scored(**fits, neural=27.0, neural_lit=31.0)
+    rows = values(gain_rows("ood_", {128: found}, 0))
     assert rows["renderer.ood_gain_db"].value == pytest.approx(2.0)
     assert rows["renderer.ood_gain_db"].low == pytest.approx(2.0), "scenes differ, their gains do not"
     assert rows["renderer.ood_gain_over_two_buffers_db"].value == pytest.approx(5.0)
@@ -180,72 +174,14 @@ def test_gains_are_over_the_best_of_the_group_and_paired_by_scene():
     assert rows["renderer.lit.ood_gain_db"].value == pytest.approx(0.75)
     assert rows["renderer.lit.ood_gain_db.sun"].value == pytest.approx(0.5)
     assert rows["renderer.ood_psnr.lit_full.studio"].value == pytest.approx(30.0)
-    worst = found.worst_over_lit(0)
-    assert {name: row.value for name, row in worst.items()} == {
-        "Models: sun": pytest.approx(0.5),
-        "Models: studio": pytest.approx(1.0),
-    }
+    assert [row.value for row in over_lit(found, 0)] == [
+        pytest.approx(1.0),
+        pytest.approx(0.5),
+    ]  # studio, sun
 
 
 def test_sizes_after_the_first_stand_in_the_names_of_their_rows():
-    scores = judged(pbr=20.0, lit=30.0, affine_lit=30.5, neural_lit=31.0)
-    rows = values(Gains("synthetic", "", "S", "", {128: scores, 256: scores}).rows(0))
+    scores = scored(pbr=20.0, lit=30.0, affine_lit=30.5, neural_lit=31.0)
+    rows = values(gain_rows("", {128: scores, 256: scores}, 0))
     assert {f"renderer.lit.gain_db{end}" for end in ("", ".256", "_full.256.sun")} <= set(rows)
     assert "renderer.gain_db" not in rows, "there was no pair"
-
-
-def test_stages_are_compared_on_the_same_frames():
-    def frames(mean: float) -> list[tuple[str, float]]:
-        return [("s0", mean - 3), ("s0", mean - 1), ("s1", mean + 4)]
-
-    psnr = {
-        ("pair", number, place): frames(mean)
-        for place, means in (
-            (SYNTHETIC, (30.0, 29.5, 29.4)),
-            (CAPTURES, (20.0, 21.0, 20.5)),
-            (PHOTOS, (18.0, 24.0, 23.8)),
-        )
-        for number, mean in enumerate(means, 1)
-    }
-    names = {("pair", number): name for number, name in enumerate(("synthetic", "captures", "clips"), 1)}
-    found = Curriculum(psnr, names)  # type: ignore[arg-type]
-    rows = values(found.rows(0))
-    assert rows["renderer.stage2_capture_gain_db"].value == pytest.approx(1.0)
-    assert rows["renderer.stage2_photo_gain_db"].value == pytest.approx(6.0)
-    assert rows["renderer.stage3_single_frame_loss_db.synthetic"].value == pytest.approx(0.1)
-    assert rows["renderer.stage3_single_frame_loss_db"].value == pytest.approx(0.5), "the greatest of all"
-    assert "stage 3 (clips)" in str(found.sections(Path()))
-
-
-def test_stages_are_found_by_their_number(tmp_path: Path):
-    with pytest.raises(TronError, match="no stages of a training"):
-        stage_files(tmp_path)
-    (tmp_path / "checkpoints").mkdir()
-    for name in ("2-adapt.safetensors", "1-synthetic.safetensors", "3-video-00000100.ckpt"):
-        (tmp_path / "checkpoints" / name).touch()
-    assert {number: name for number, (name, _) in stage_files(tmp_path).items()} == {
-        1: "synthetic",
-        2: "adapt",
-    }
-
-
-def test_a_training_that_differs_takes_all_its_signals_with_it():
-    ended = Ended("SIGKILL", 1.0, 40)
-    rows = values(Kills([([ended] * 4, True), ([ended], False)]).rows(0))
-    assert (rows["renderer.kill_identical"].value, rows["renderer.kill_identical"].n) == (4, 5)
-    assert rows["renderer.kill_identical_share"].value == pytest.approx(0.8)
-
-
-def test_frames_a_second_are_of_medians():
-    seconds = {("lit", INFERENCE, 64): [0.5, 0.25, 9.0], ("pair", TRAINING, 64): [2.0, 2.0, 4.0]}
-    rows = values(Throughput(seconds, 1).rows(0))  # type: ignore[arg-type]
-    assert rows["renderer.frames_per_second.64"].value == 2.0
-    assert rows["renderer.pair.training_frames_per_second.64"].value == 0.5
-
-
-def test_the_worst_difference_between_seeds_is_reported_and_so_is_the_spread_of_trainings():
-    trained = {seed: [("s0", 30.0 + seed), ("s1", 32.0 + seed)] for seed in range(3)}
-    rows = values(Repeats({"pair": 0.0, "lit": 0.125}, 4, 2, trained).rows(0))
-    assert rows["renderer.seed_max_difference"].value == 0.125
-    assert rows["renderer.training_seed_spread_db"].value == pytest.approx(1.0)
-    assert rows["renderer.training_seed_range_db"].value == pytest.approx(2.0)

@@ -112,6 +112,17 @@ def test_gains_are_over_the_best_of_their_group_and_absent_without_all_of_it(dra
     assert rows["neural_lit.gain_over_best_fit_on_lit"][0] == pytest.approx(20 * np.log10(1.25), abs=1e-2)
 
 
+def test_the_best_of_all_is_the_best_of_all_that_was_scored(drawn_clip: MakeClip):
+    clip = drawn_clip()
+    truth = np.full_like(clip.displayed("rgb"), 0.5)
+    given = {"pbr": 0.1, "lit": 0.02, "lit.reflections": 0.005, "neural_lit": 0.01}
+    scores = Scores()
+    scores.add(clip, both({name: truth + np.float32(error) for name, error in given.items()}), truth)
+    assert scores.best(GROUPS["best_of_all"]) == "lit.reflections"
+    gain = rows_of(scores)["neural_lit.gain_over_best_of_all"][0]
+    assert gain == pytest.approx(-20 * np.log10(2), abs=1e-2)
+
+
 def test_what_was_not_given_has_no_row(drawn_clip: MakeClip):
     clip = drawn_clip()
     scores = Scores()
@@ -208,17 +219,15 @@ def test_a_captured_photo_is_shown_as_it_is(drawn_clip: MakeClip):
     np.testing.assert_array_equal(clip.displayed("rgb"), clip.frames["rgb"])
 
 
-@pytest.mark.parametrize("styles", [("object", "table"), ("A", "object")])
-def test_styles_of_scenes_have_rows_of_their_own_where_there_are_several(drawn_clip, styles):
-    """In lower case, as names of rows are."""
-    scores = Scores()
+def test_styles_of_scenes_have_rows_of_their_own_where_there_are_several(drawn_clip):
+    scores, styles = Scores(), ["object", "table"]
     for number, style in enumerate(styles):
         clip = drawn_clip(seed=number)
         clip = replace(clip, meta=clip.meta.model_copy(update={"extra": {"style": style}}))
         truth = clip.displayed("rgb")
         scores.add(clip, {"foreground": {"pbr": np.clip(truth + 0.1 * (number + 1), 0, 1)}}, truth)
-        assert scores.styles == ([] if number == 0 else list(styles))
+        assert scores.styles == ([] if number == 0 else styles)
     rows = {row.metric: row for row in scores.rows()}
-    both = [rows[f"pbr.psnr.{style.lower()}"] for style in styles]
+    both = [rows[f"pbr.psnr.{style}"] for style in styles]
     assert both[0].value > both[1].value
     assert rows["pbr.psnr"].value == pytest.approx(np.mean([row.value for row in both]))

@@ -1,58 +1,81 @@
 """Every example runs at small size, and shows what its first line claims."""
 
+import contextlib
+import io
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tron.gaussians import GaussianScene
-from tron.images import read_image
+from tron.io.images import read_image
 from tron.neural.renderer import render_clip
 from tron.neural.weights import load_renderer
+from tron.runtime import activate
 from tron.shading import EnvironmentMap
 from tron.shards.reader import read_clips
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-SCRIPTS = sorted(EXAMPLES.glob("[0-9]_*.py"))
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = ROOT / "examples"
+SCRIPTS = sorted(EXAMPLES.glob("*/main.py"))
 HEIGHT, WIDTH = 64, 96
 
 
-def run(name: str, output: Path, *arguments: str | Path) -> str:
+def started(name: str, output: Path, *arguments: str | Path) -> str:
     """Start an example as a user does, at small size; gives what it printed."""
-    command = [sys.executable, EXAMPLES / f"{name}.py", "--small", "--output", output, *arguments]
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(filter(None, [str(EXAMPLES.parent), *sys.path]))
-    }
+    command = [sys.executable, "-m", f"examples.{name}.main", "--small", "--output", output, *arguments]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), *sys.path]))}
     done = subprocess.run(command, capture_output=True, text=True, cwd=output.parent, env=environment)
     assert done.returncode == 0, done.stderr
     assert str(output.parent) in done.stdout, "it says where it wrote"
     return done.stdout
 
 
-def test_there_are_eight_of_at_most_forty_lines_with_a_picture_and_a_line_each():
-    assert [script.name[0] for script in SCRIPTS] == list("12345678")
+@pytest.fixture(scope="module")
+def run(variant: str) -> Callable[..., str]:
+    """Runs an example in this process, which has imported what it needs; otherwise as `started`."""
+
+    def run(name: str, output: Path, *arguments: str | Path) -> str:
+        said = io.StringIO()
+        words = [f"examples.{name}.main", "--small", "--output", str(output), *map(str, arguments)]
+        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
+            patch.setattr(sys, "argv", words)
+            patch.syspath_prepend(str(ROOT))
+            patch.chdir(output.parent)
+            runpy.run_module(words[0], run_name="__main__")
+        activate(variant)
+        assert str(output.parent) in said.getvalue(), "it says where it wrote"
+        return said.getvalue()
+
+    return run
+
+
+def test_there_are_eight_of_at_most_forty_lines_with_a_picture_and_a_page_each():
+    assert len(SCRIPTS) == 8
     page = (EXAMPLES / "README.md").read_text()
     for script in SCRIPTS:
-        assert len(script.read_text().splitlines()) <= 40, script.name
-        picture = EXAMPLES / "images" / f"{script.stem}.jpg"
+        assert len(script.read_text().splitlines()) <= 40, script
+        picture, own = script.with_name("picture.jpg"), script.with_name("README.md").read_text()
         assert picture.stat().st_size <= 150_000
         assert read_image(picture).shape[1] >= 512
-        assert f"]({script.name})" in page
-        assert f"(images/{picture.name})" in page
+        assert f"examples.{script.parent.name}.main" in own
+        assert f"(./{script.parent.name}/README.md)" in page
 
 
-def test_1_relight_shows_the_users_scene_in_the_users_light(tmp_path: Path):
-    run("1_relight", tmp_path / "own.jpg")
+def test_relight_shows_the_users_scene_in_the_users_light(run, tmp_path: Path):
+    started("relight", tmp_path / "own.jpg")
     scene, light = load_stage()
     scene.save(tmp_path / "scan.ply")
     EnvironmentMap(light.image[..., ::-1].copy()).save(tmp_path / "studio.hdr")
     given = ["--scene", tmp_path / "scan.ply", "--environment", tmp_path / "studio.hdr"]
-    run("1_relight", tmp_path / "given.jpg", *given)
+    run("relight", tmp_path / "given.jpg", *given)
     ours, given = (read_image(tmp_path / name) for name in ("own.jpg", "given.jpg"))
     assert ours.shape == (HEIGHT, WIDTH, 3)
     warmth = [picture[:8, :, 0].mean() - picture[:8, :, 2].mean() for picture in (ours, given)]
@@ -61,24 +84,22 @@ def test_1_relight_shows_the_users_scene_in_the_users_light(tmp_path: Path):
 
 
 def load_stage() -> tuple[GaussianScene, EnvironmentMap]:
-    sys.path.insert(0, str(EXAMPLES))
-    try:
-        from stage import make_light, make_scene  # pyright: ignore[reportMissingImports]
-    finally:
-        sys.path.remove(str(EXAMPLES))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT))
+        from examples.stage import make_light, make_scene
     return make_scene(0.08), make_light()
 
 
-def test_2_orbit_films_every_frame_and_they_differ(tmp_path: Path, read_video):
-    run("2_orbit", tmp_path / "orbit.jpg")
+def test_orbit_films_every_frame_and_they_differ(run, tmp_path: Path, read_video):
+    run("orbit", tmp_path / "orbit.jpg")
     film = read_video(tmp_path / "orbit.mp4").astype(float)
     assert film.shape == (6, HEIGHT, WIDTH, 3)
     assert np.abs(np.diff(film, axis=0)).mean(axis=(1, 2, 3)).min() > 2
     assert read_image(tmp_path / "orbit.jpg").shape == (HEIGHT, 3 * WIDTH // 2, 3)
 
 
-def test_3_material_edit_makes_the_ring_blue_and_leaves_the_floor(tmp_path: Path):
-    run("3_material_edit", tmp_path / "edit.png")
+def test_material_edit_makes_the_ring_blue_and_leaves_the_floor(run, tmp_path: Path):
+    run("edit_materials", tmp_path / "edit.png")
     before, after = np.split(read_image(tmp_path / "edit.png"), 2, axis=1)
     bluer = (after - before) @ np.array([-0.5, -0.5, 1.0])
     assert (bluer > 0.1).mean() > 0.01
@@ -86,16 +107,16 @@ def test_3_material_edit_makes_the_ring_blue_and_leaves_the_floor(tmp_path: Path
     assert floor.max() < 0.02, "what was not edited stays"
 
 
-def test_4_gradient_leads_back_to_where_the_ball_was(tmp_path: Path):
-    said = run("4_gradient", tmp_path / "gradient.png")
+def test_gradient_leads_back_to_where_the_ball_was(run, tmp_path: Path):
+    said = run("gradient", tmp_path / "gradient.png")
     first, last = map(float, re.findall(r"([\d.]+) m", said.splitlines()[-1]))
     assert last < 0.25 * first
     start, found, wanted = np.split(read_image(tmp_path / "gradient.png"), 3, axis=1)
     assert np.abs(found - wanted).mean() < 0.3 * np.abs(start - wanted).mean()
 
 
-def test_5_fit_light_finds_the_sun(tmp_path: Path):
-    run("5_fit_light", tmp_path / "light.png")
+def test_fit_light_finds_the_sun(run, tmp_path: Path):
+    run("fit_light", tmp_path / "light.png")
     found, true = np.split(read_image(tmp_path / "light.png"), 2, axis=1)
     sun = np.unravel_index(true.sum(axis=2).argmax(), true.shape[:2])
     brightest = np.unravel_index(found.sum(axis=2).argmax(), found.shape[:2])
@@ -105,23 +126,23 @@ def test_5_fit_light_finds_the_sun(tmp_path: Path):
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what 6_make_a_dataset.py and 7_train.py leave."""
+def trained(run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what make_dataset and train leave."""
     folder = tmp_path_factory.mktemp("trained")
-    run("6_make_a_dataset", folder / "dataset")
-    said = run("7_train", folder / "renderer", "--dataset", folder / "dataset")
+    run("make_dataset", folder / "dataset")
+    said = run("train", folder / "renderer", "--dataset", folder / "dataset")
     assert re.search(r"given [\d.]+ dB, drawn [\d.]+ dB", said)
     return folder
 
 
 @pytest.mark.long
-def test_6_a_dataset_has_clips_under_three_lights(trained: Path):
+def test_a_dataset_has_clips_under_three_lights(trained: Path):
     assert (trained / "dataset" / "manifest.json").exists()
     assert read_image(trained / "dataset" / "dataset.jpg").shape == (3 * 3 * 24, 3 * 3 * 24, 3)
 
 
 @pytest.mark.long
-def test_7_training_brings_the_drawing_of_what_it_learnt_from_near_the_truth(trained: Path):
+def test_training_brings_the_drawing_of_what_it_learnt_from_near_the_truth(trained: Path):
     """Untrained, it draws lit. One tiny scene teaches nothing of others, which are not judged."""
     renderer = load_renderer(trained / "renderer" / "renderer.safetensors")
     before, after = [], []
@@ -134,10 +155,10 @@ def test_7_training_brings_the_drawing_of_what_it_learnt_from_near_the_truth(tra
 
 
 @pytest.mark.long
-def test_8_evaluation_scores_the_renderer_beside_the_baselines(trained: Path, tmp_path: Path):
+def test_evaluation_scores_the_renderer_beside_the_baselines(run, trained: Path, tmp_path: Path):
     weights = trained / "renderer" / "renderer.safetensors"
     out = tmp_path / "out"
-    run("8_evaluate", out, "--dataset", trained / "dataset", "--renderer", weights)
+    run("evaluate", out, "--dataset", trained / "dataset", "--renderer", weights)
     metrics = {row["metric"] for row in json.loads((out / "results.json").read_text())["rows"]}
     assert {"neural_lit.psnr", "lit.psnr", "pbr.psnr", "affine.psnr"} <= metrics
     assert (out / "report.html").stat().st_size > 10_000

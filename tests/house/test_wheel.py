@@ -17,8 +17,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from tron.gaussians.scene import GaussianScene, quats_from_normals
-from tron.images import read_image
-from tron.shading.environment import EnvironmentMap
+from tron.io.images import read_image
+from tron.shading.environments.environment import EnvironmentMap
 
 pytestmark = pytest.mark.long
 
@@ -111,14 +111,18 @@ def test_a_command_imports_ours_beside_decoys(installed: Path, tmp_path: Path, c
     shown = start(installed, command, "--help", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
     assert f"usage: {command}" in shown.stdout
-    where = _run(
-        installed / "bin" / "python", "-P", "-c", "import train.cli as m; print(m.__file__)", cwd=tmp_path
-    )
-    assert Path(where.strip()).is_relative_to(installed)
+    said = start(installed, "python", "-P", "-c", "import train.cli as m; print(m.__file__)", cwd=tmp_path)
+    assert Path(said.stdout.strip()).is_relative_to(installed)
 
 
-@pytest.mark.parametrize("command", sorted(COMMANDS))
-@pytest.mark.parametrize("decoy", ["train.py", "eval.py", "datagen.py", "conf.py", "conf/__init__.py"])
+HIDDEN = [
+    *((command, "conf.py") for command in sorted(COMMANDS)),
+    *((f"tron-{name}", f"{name}.py") for name in ("train", "eval", "datagen")),
+    ("tron-relight", "conf/__init__.py"),
+]
+
+
+@pytest.mark.parametrize(("command", "decoy"), [*HIDDEN, ("tron-relight", "train.py")])
 def test_a_foreign_file_of_one_of_our_names_is_one_clear_line(
     installed: Path, tmp_path: Path, command: str, decoy: str
 ):
@@ -126,10 +130,10 @@ def test_a_foreign_file_of_one_of_our_names_is_one_clear_line(
     (tmp_path / decoy).write_text("raise SystemExit('a decoy was imported')\n")
     (tmp_path / "data").mkdir()  # a folder without __init__.py hides nothing
     refused = start(installed, command, "--help", cwd=tmp_path, PYTHONPATH=str(tmp_path))
-    hidden = decoy.partition("/")[0]
-    if hidden.removesuffix(".py") not in ("conf", command.removeprefix("tron-")):  # nothing imports it
+    if (command, decoy) not in HIDDEN:  # nothing imports it
         assert refused.returncode == 0, refused.stderr
         return
+    hidden = decoy.partition("/")[0]
     assert refused.returncode == 2
     assert refused.stdout == ""
     (line,) = refused.stderr.splitlines()
@@ -141,7 +145,7 @@ def test_a_foreign_file_of_one_of_our_names_is_one_clear_line(
 def test_a_module_run_beside_a_foreign_conf_says_so_too(installed: Path, tmp_path: Path):
     """`python -m` puts the current folder first on the path."""
     (tmp_path / "conf.py").touch()
-    refused = start(installed, "python", "-m", "tron.apps.relight", "--help", cwd=tmp_path)
+    refused = start(installed, "python", "-m", "tron.apps.relight.command", "--help", cwd=tmp_path)
     assert refused.returncode == 2
     (line,) = refused.stderr.splitlines()
     assert line.startswith("tron-relight: this file hides TRON's own package 'conf'")
@@ -149,10 +153,8 @@ def test_a_module_run_beside_a_foreign_conf_says_so_too(installed: Path, tmp_pat
 
 def test_a_scene_is_relit_without_torch_and_lightning(smallest: Path, tmp_path: Path):
     absent = ("torch", "lightning", "dask", "webdataset", "diffusers", "transformers", "pycolmap", "trimesh")
-    found = _run(
-        smallest / "bin" / "python", "-P", "-c",
-        f"from importlib.util import find_spec; print([n for n in {absent} if find_spec(n)])", cwd=tmp_path
-    )  # fmt: skip
+    program = f"from importlib.util import find_spec; print([n for n in {absent} if find_spec(n)])"
+    found = start(smallest, "python", "-P", "-c", program, cwd=tmp_path).stdout
     assert found.strip() == "[]"
     make_ball().save(tmp_path / "ball.ply")
     EnvironmentMap.constant(1.0).save(tmp_path / "white.hdr")
@@ -169,14 +171,14 @@ def test_a_scene_is_relit_without_torch_and_lightning(smallest: Path, tmp_path: 
 @pytest.mark.parametrize(
     ("command", "arguments", "words"),
     [
-        ("tron-train", ["--help"], ["lightning", "torch", "pip install 'tron-relight[train]'"]),
+        ("tron-train", [], ["lightning", "torch", "pip install 'tron-relight[train]'"]),
         ("tron-datagen", [], ["trimesh", "dask", "pip install 'tron-relight[datagen]'"]),
         ("tron-reconstruct", [], ["pycolmap", "pip install 'tron-relight[reconstruct]'"]),
         ("tron-eval", [], ["matplotlib", "pip install 'tron-relight[eval]'"]),
         (
             "tron-relight",
             ["scene=ball.ply", "environment=white.hdr", "checkpoint=ball.ply", "output_dir=out"],
-            ["checkpoint needs", "torch", "pip install 'tron-relight[train]'"],
+            ["checkpoint needs", "torch", "pip install 'tron-relight[network]'"],
         ),
     ],
 )
@@ -188,6 +190,17 @@ def test_a_command_whose_extra_is_missing_says_so(smallest: Path, tmp_path: Path
     (line,) = [each for each in refused.stderr.splitlines() if each.startswith(f"{command}: ")]
     assert [word for word in words if word not in line] == []
     assert "Traceback" not in refused.stderr
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_help_lists_every_key_without_the_extra_and_names_it(smallest: Path, tmp_path: Path, command: str):
+    shown = start(smallest, command, "--help", cwd=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    extra = f"tron-relight[{command.removeprefix('tron-')}]"
+    installed = command == "tron-relight"  # the one whose libraries this environment has
+    first = f"of {extra}, which is installed" if installed else f"needs pip install '{extra}'"
+    assert shown.stdout.startswith(first)
+    assert "\n  output_dir=" in shown.stdout
 
 
 def make_ball() -> GaussianScene:
@@ -222,7 +235,6 @@ def start(environment: Path, command: str, *arguments: str, cwd: Path, **variabl
     )
 
 
-def _run(*command: str | Path, cwd: Path | None = None) -> str:
-    done = subprocess.run([str(each) for each in command], cwd=cwd, capture_output=True, text=True)
+def _run(*command: str | Path) -> None:
+    done = subprocess.run([str(each) for each in command], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout

@@ -15,7 +15,7 @@ import trimesh
 from hydra.utils import get_object
 from PIL import Image
 
-from datagen.models import load_model
+from datagen.files.assets import load_model
 
 POSITIONS = np.array([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], np.float32)
 UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
@@ -108,14 +108,14 @@ GLB = {
     ),
     "an accessor past its view": (
         lambda: (tree(accessors=[accessor(5), accessor(6, "SCALAR"), accessor(4, "VEC2")]), CARD),
-        "ends after its buffer view",
+        "does not lie in its buffer view",
     ),
     "a negative offset": (
         lambda: (
             tree(accessors=[accessor(4, byteOffset=-64), accessor(6, "SCALAR"), accessor(4, "VEC2")]),
             CARD,
         ),
-        "no sensible layout",
+        "does not lie in its buffer view",
     ),
     "a view past its buffer": (
         lambda: (tree(bufferViews=[{"buffer": 0, "byteLength": 2**40}] * 4), CARD),
@@ -145,7 +145,7 @@ GLB = {
     ),
     "ktx2 of no size": (
         lambda: (tree(), [*CARD, b"\xabKTX 20\xbb\r\n\x1a\n" + struct.pack("<17I", 0, 1, *[2**31] * 15)]),
-        "pixels is too large|needs opengl_basisu",
+        "pixels is too large",
     ),
     "a file above": (lambda: uri("../../../../etc/passwd"), "outside its folder"),
     "a file above, escaped": (lambda: uri("%2e%2e/%2e%2e/etc/passwd"), "outside its folder"),
@@ -204,7 +204,7 @@ def spoil(kind, path):
 MEASURE = """
 import json, pathlib, sys, time
 from tron.errors import TronError
-from datagen.models import load_model
+from datagen.files.assets import load_model
 
 def peak():
     text = pathlib.Path("/proc/self/status").read_text()

@@ -1,4 +1,4 @@
-"""The ten promises of the data engine (docs/data.md), each held to both sources: scenes and captures."""
+"""Ten promises of the data engine (docs/guides/datasets.md), each held to both sources."""
 
 from __future__ import annotations
 
@@ -12,23 +12,27 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
+import psutil
 import pytest
 
-import datagen.run
-import datagen.scene_files
-from datagen.run import make
-from datagen.settings import Settings
-from datagen.validate import validate
+import datagen.dataset.spool
+import datagen.run.dataset
+import datagen.sources.captured
+import datagen.sources.synthetic
+from datagen.run.dataset import make
+from datagen.run.validate import validate
+from datagen.settings.command import Settings
 from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
-from tron.images import read_image
+from tron.io.images import read_image
 from tron.shards.manifest import Manifest
-from tron.shards.reader import read_clips
-from tron.shards.verify import verify
+from tron.shards.reader import read_clips, verify
 from tron.storage import locked
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -42,13 +46,13 @@ class Source:
 
     Attributes:
         words: overrides of tron-datagen for two scenes or captures, in this process.
-        maker: name in datagen.run of what makes one.
+        maker: module and name of what makes one.
         outside: a word that is refused, and what the line must name.
     """
 
     name: str
     words: Sequence[str]
-    maker: str
+    maker: tuple[ModuleType, str]
     outside: tuple[str, str]
 
     def settings(self, output: Path, *more: str) -> Settings:
@@ -60,11 +64,13 @@ class Source:
 @pytest.fixture(scope="module", params=["synthetic", "captured"])
 def source(request: pytest.FixtureRequest, tiny_scenes: list[str]) -> Source:
     if request.param == "synthetic":
-        return Source("synthetic", tiny_scenes, "make_scene", ("train.frames=94", "train.frames"))
+        maker = datagen.sources.synthetic, "make_scene"
+        return Source("synthetic", tiny_scenes, maker, ("train.frames=94", "train.frames"))
     captures = request.getfixturevalue("tiny_captures")
     words = ["source=captured", f"captures={captures}", "prior=ground_truth"]
     words += request.getfixturevalue("quick_reconstruction")
-    return Source("captured", words, "make_capture", ("captured.frames=0", "captured.frames"))
+    maker = datagen.sources.captured, "make_capture"
+    return Source("captured", words, maker, ("captured.frames=0", "captured.frames"))
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +127,7 @@ def test_2_resumable_what_is_missing_is_made_again_and_nothing_else(
     def never(*_: object) -> None:
         raise AssertionError("nothing is left to make")
 
-    monkeypatch.setattr(datagen.run, source.maker, never)
+    monkeypatch.setattr(*source.maker, never)
     before = {path: os.stat(dataset / path).st_mtime_ns for path in files_of(dataset)}
     assert make(source.settings(dataset)) == 0
     assert {path: os.stat(dataset / path).st_mtime_ns for path in files_of(dataset)} == before
@@ -180,7 +186,7 @@ def test_3_atomic_a_full_disk_leaves_nothing_half_written(
     size = sum(len(data) for data in files_of(dataset).values())
     full = small_disk(size // 3)
     # What the check beforehand cannot know: others fill the disk while the scenes are made.
-    monkeypatch.setattr(datagen.run, "require_free_space", lambda *_: None)
+    monkeypatch.setattr(datagen.run.dataset, "require_free_space", lambda *_: None)
     assert ended(source.settings(full / "dataset")) != "finished"
     whole = files_of(dataset)
     for path, data in files_of(full / "dataset").items():
@@ -198,7 +204,7 @@ def test_3_atomic_too_small_a_disk_and_a_read_only_one_are_told_before_the_first
     def never(*_: object) -> None:
         raise AssertionError("a scene is made")
 
-    monkeypatch.setattr(datagen.run, source.maker, never)
+    monkeypatch.setattr(*source.maker, never)
     disk = small_disk(100_000)
     with pytest.raises(TronError, match="not enough disk space"):
         make(source.settings(disk / "dataset"))
@@ -232,23 +238,32 @@ def test_4_accounted_for_validation_finds_what_is_damaged(
 
 
 def test_5_failures_are_data_with_a_command_that_tries_again(
-    source: Source, dataset: Path, tmp_path: Path, files_of: Callable, monkeypatch: pytest.MonkeyPatch
+    source: Source,
+    dataset: Path,
+    tmp_path: Path,
+    files_of: Callable,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     first, output = names(dataset)[0], tmp_path / "out"
-    real = getattr(datagen.run, source.maker)
+    real = getattr(*source.maker)
 
     def fails(item, *rest):
         if item.name == first:
             raise RuntimeError("no memory\nfor this")
         return real(item, *rest)
 
-    monkeypatch.setattr(datagen.run, source.maker, fails)
+    monkeypatch.setattr(*source.maker, fails)
     assert make(source.settings(output)) == 1
     failure = json.loads((output / "failures.jsonl").read_text())
     assert (failure["scene"], failure["reason"]) == (first, "RuntimeError: no memory for this")
     assert (output / failure["traceback"]).read_text().endswith("no memory\nfor this\n")
+    assert f"listed in {output / 'failures.jsonl'}, tracebacks in {output / 'failures'}" in caplog.text
     assert names(output) == names(dataset)[1:], "the others are made"
     assert verify(output) == []
+    assert Manifest.load(output).failures == 1
+    assert make(source.settings(output, f"only=[{names(output)[0]}]")) == 1, "what is not tried stays listed"
+    assert (output / failure["traceback"]).is_file()
     monkeypatch.undo()
     words = shlex.split(failure["command"])
     assert make(check(compose_recipe("conf.datagen", Settings, words[1:]), Settings)) == 0
@@ -260,18 +275,20 @@ def test_6_finite_a_clip_with_nan_is_set_aside_and_never_in_a_shard(
 ) -> None:
     split = Manifest.load(dataset).shards[0].split
     key = Manifest.load(dataset).shards[0].keys[0]
-    real = datagen.scene_files.first_bad_value
+    real = datagen.dataset.spool.first_bad_value
 
     def spoilt(frames):
         frames = [dict(frame) for frame in frames]
         frames[0]["pbr"] = np.full_like(frames[0]["pbr"], np.nan)
         return real(frames)
 
-    monkeypatch.setattr(datagen.scene_files, "first_bad_value", spoilt)
+    monkeypatch.setattr(datagen.dataset.spool, "first_bad_value", spoilt)
     assert make(source.settings(tmp_path)) >= 1
     assert "pbr has" in json.loads((tmp_path / "failures.jsonl").read_text().splitlines()[0])["reason"]
     assert key not in {clip for entry in Manifest.load(tmp_path).shards for clip in entry.keys}
-    assert (tmp_path / "quarantine" / f"{key}.npz").is_file()
+    with np.load(tmp_path / "quarantine" / f"{key}.npz") as aside:
+        assert aside["pbr"].shape[-1] == 3, "its frames are kept for who looks into it"
+    assert make(source.settings(tmp_path)) >= 1, "made again it would be the same; it stays accounted for"
     monkeypatch.undo()
     for clip in read_clips(dataset, split):
         assert all(np.isfinite(member).all() for member in clip.frames.values())
@@ -284,12 +301,28 @@ def test_7_bounded_two_runs_of_one_folder_do_not_mix(source: Source, tmp_path: P
 
 @pytest.mark.long
 def test_7_bounded_memory_stays_flat_over_many_scenes(tiny_scenes: list[str], tmp_path: Path) -> None:
-    """Workers are replaced: the benchmark's soak watches 500 scenes, this one 60 and three lives."""
-    from eval.datagen.soak import measure_soak
-
+    """60 scenes, three lives of each worker; the last fifth of the run beside the second."""
+    output, count = tmp_path / "soak", 60
     words = [each for each in tiny_scenes if not each.startswith("train.scenes")]
-    soak = measure_soak([*words, "recycle_after=10"], 60, tmp_path)
-    assert soak.peak(4) - soak.peak(1) < 150
+    words += ["recycle_after=10", f"train.scenes={count}", "workers=2", f"output_dir={output}"]
+    times, samples = output / "logs" / "times.jsonl", []
+    with (tmp_path / "log").open("wb") as log:
+        process = subprocess.Popen([SCRIPT, *words], stdout=log, stderr=log)
+        watched = psutil.Process(process.pid)
+        while process.poll() is None:
+            done = times.read_bytes().count(b"\n") if times.is_file() else 0
+            resident = 0
+            for each in (watched, *watched.children(recursive=True)):
+                with suppress(psutil.NoSuchProcess):
+                    resident += each.memory_info().rss
+            samples.append((done, resident / 1e6))
+            time.sleep(1)
+    assert process.returncode == 0, (tmp_path / "log").read_text()
+
+    def peak(part: int) -> float:
+        return max(mb for done, mb in samples if count * part / 5 <= done < count * (part + 1) / 5)
+
+    assert peak(4) - peak(1) < 150
 
 
 # 8, hostile input, is tests/robustness/test_hostile_files.py.
@@ -320,10 +353,6 @@ def test_10_visible_sheets_page_card_and_a_bar(
         assert sheet in page
     assert "tron-datagen" in card
     assert "mitsuba" in card
-    done = subprocess.run(
-        [SCRIPT, *source.words, "cluster=none", f"only=[{names(dataset)[0]}]", f"output_dir={tmp_path}"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert re.search(r"scenes: \d+ of \d+ .*", done.stderr)
+    with caplog.at_level("INFO"):
+        assert make(source.settings(tmp_path, f"only=[{names(dataset)[0]}]")) == 0
+    assert re.search(r"scenes: \d+ of \d+ .*", caplog.text)

@@ -13,9 +13,9 @@ from torch.utils.data import DataLoader
 
 from train.cli import main
 from train.curriculum import Stage
-from train.data import DAMAGED, Batches, TrainingData
+from train.examples.data import DAMAGED, Batches, TrainingData
+from train.examples.sources import CachedSplit, IndexedSplit, Passes
 from train.settings import DataSettings, Settings, ValidationSettings
-from train.sources import CachedSplit, IndexedSplit, Passes
 from tron.errors import TronError
 from tron.shards import GUIDANCE, ClipStore
 from tron.shards.schema import TARGET

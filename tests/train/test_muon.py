@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from train.muon import Muon, orthogonalised
+from train.optimizers import Muon, orthogonalised
 
 SHAPES = ((24, 24), (24, 48), (48, 24), (24, 48), (8, 3))
 

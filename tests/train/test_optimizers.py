@@ -8,7 +8,7 @@ import torch
 from train.optimizers import CombinedOptimizer, make_optimizer
 from train.settings import OptimizerSettings
 from tron.neural.configs import BackboneConfig, PixelMLPConfig, RendererConfig
-from tron.neural.pixel_mlp import PixelMLP
+from tron.neural.networks.pixel_mlp import PixelMLP
 from tron.neural.renderer import NeuralRenderer
 
 RENDERERS = [

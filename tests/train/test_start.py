@@ -7,15 +7,15 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from train.averaging import AveragedWeights
+from train.callbacks import AveragedWeights
 from train.cli import main
 from train.module import RendererModule
 from train.settings import Settings
 from tron.errors import TronError
 from tron.neural import shipped
-from tron.neural.pixel_mlp import PixelMLP
+from tron.neural.networks.pixel_mlp import PixelMLP
 
-PIXELS = {"_target_": "tron.neural.pixel_mlp.PixelMLP"}
+PIXELS = {"_target_": "tron.neural.networks.pixel_mlp.PixelMLP"}
 STAGES = [
     {"name": "one", "split": "train", "steps": 3, "batch_size": 2, "crop": 16},
     {"name": "two", "split": "train_b", "frames": 5, "steps": 3, "batch_size": 1, "crop": 16},
@@ -61,21 +61,21 @@ def test_what_a_run_began_with_is_part_of_it(train, first, tmp_path):
     moved.write_bytes(first.read_bytes())
     train(tmp_path / "out", stages=STAGES[1:], start_from=moved)
     train(tmp_path / "other", stages=STAGES[1:], seed=1)
-    with pytest.raises(TronError, match="a run made with start_from_sha256="):
+    with pytest.raises(TronError, match="a run made with another start_from "):
         train(tmp_path / "out", stages=STAGES[1:], start_from=tmp_path / "other" / "renderer.safetensors")
-    with pytest.raises(TronError, match="a run made with start_from_sha256="):
+    with pytest.raises(TronError, match="a run made with another start_from "):
         train(tmp_path / "out", stages=STAGES[1:])
 
 
 def test_a_checkpoint_of_the_package_is_begun_with_by_its_name(train, first, tmp_path, monkeypatch):
-    (tmp_path / "lit.safetensors").write_bytes(first.read_bytes())
+    (tmp_path / "surfaces.safetensors").write_bytes(first.read_bytes())
     monkeypatch.setattr(shipped, "FOLDER", tmp_path)
     by_path = train(tmp_path / "path", stages=STAGES[1:], start_from=first)
-    by_name = train(tmp_path / "name", stages=STAGES[1:], start_from=Path("lit"))
+    by_name = train(tmp_path / "name", stages=STAGES[1:], start_from=Path("surfaces"))
     assert all(torch.equal(by_name[name], value) for name, value in by_path.items())
-    (tmp_path / "lit.safetensors").unlink()
-    with pytest.raises(TronError, match="this installation has no checkpoint 'lit'"):
-        train(tmp_path / "absent", stages=STAGES[1:], start_from=Path("lit"))
+    (tmp_path / "surfaces.safetensors").unlink()
+    with pytest.raises(TronError, match="this installation has no checkpoint 'surfaces'"):
+        train(tmp_path / "absent", stages=STAGES[1:], start_from=Path("surfaces"))
 
 
 class Malice:
@@ -83,33 +83,19 @@ class Malice:
         return (Path.touch, (Path("executed"),))
 
 
-@pytest.mark.parametrize(
-    ("kind", "message"),
-    [
-        ("missing", "cannot read: No such file"),
-        ("pickle", "not a readable safetensors file"),
-        ("torch", "not a readable safetensors file"),
-        ("truncated", "not a readable safetensors file"),
-        ("shape", "weights do not fit the model"),
-    ],
-)
-def test_a_wrong_file_to_start_from_is_one_line_before_the_first_step(
-    train, first, tmp_path, monkeypatch, kind, message
-):
+def test_a_wrong_file_to_start_from_is_one_line_before_the_first_step(train, first, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    path = tmp_path / "start.safetensors"
-    if kind == "pickle":
-        path.write_bytes(pickle.dumps(Malice()))
-    elif kind == "torch":
-        torch.save({"a": Malice()}, path)
-    elif kind == "truncated":
-        path.write_bytes(first.read_bytes()[:-100])
-    elif kind == "shape":
-        path = first
-    output = tmp_path / "out"
-    with pytest.raises(TronError, match=message) as said:
-        train(output, start_from=path, **({"renderer": PIXELS} if kind == "shape" else {}))
-    assert "\n" not in str(said.value)
+    path, output = tmp_path / "start.safetensors", tmp_path / "out"
+    with pytest.raises(TronError, match="cannot read: No such file"):
+        train(output, start_from=path)
+    with pytest.raises(TronError, match="weights do not fit the model"):
+        train(output, start_from=first, renderer=PIXELS)
+    torch.save({"a": Malice()}, tmp_path / "torch")
+    for content in (pickle.dumps(Malice()), (tmp_path / "torch").read_bytes(), first.read_bytes()[:-100]):
+        path.write_bytes(content)
+        with pytest.raises(TronError, match="not a readable safetensors file") as said:
+            train(output, start_from=path)
+        assert "\n" not in str(said.value)
     assert not Path("executed").exists()
     assert not (output / "config.yaml").exists(), "the mended command may use the folder"
     train(output, stages=STAGES[:1])

@@ -2,7 +2,10 @@
 
 import csv
 import os
+import shutil
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +16,13 @@ from pydantic import ValidationError
 from safetensors.torch import load_file
 from torch._inductor import config as inductor_config
 
-from eval.renderer.live_memory import LiveMemory
 from train.cli import main
 from train.settings import Settings
 from train.transformer_options import apply_options, transformer_blocks
 from tron.errors import TronError
-from tron.neural.backbone import transformer
 from tron.neural.configs import COSMOS_0_6B, BackboneConfig
-from tron.neural.pixel_mlp import PixelMLP
+from tron.neural.networks.backbone import transformer
+from tron.neural.networks.pixel_mlp import PixelMLP
 from tron.neural.weights import load_cosmos
 
 two_cores = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="two processes need two cores")
@@ -105,7 +107,7 @@ def test_recomputed_blocks_train_the_same_weights_and_the_text_branch_stays(trai
         assert torch.equal(before[name], after[name]) == (name in text), name
 
 
-def test_recomputed_blocks_keep_a_small_part_of_the_activations(make_settings, clips, published):
+def test_recomputed_blocks_keep_a_small_part_of_the_activations(make_settings, clips, live_memory):
     def peak(layers: int, checkpointed: bool) -> int:
         torch.manual_seed(0)
         model = transformer(BACKBONE.model_copy(update={"layers": layers}), 16, 16)
@@ -113,7 +115,7 @@ def test_recomputed_blocks_keep_a_small_part_of_the_activations(make_settings, c
         apply_options(model, Settings.model_validate(make_settings(clips, "out", memory=memory)))
         model.requires_grad_(False)  # gradients of weights are as large either way
         latent = torch.randn(1, 17, 2, 16, 16, requires_grad=True)
-        with LiveMemory() as live:
+        with live_memory() as live:
             shown = model(latent, torch.tensor([0.2]), torch.zeros(1, 1, 16), return_dict=False)[0]
             shown.square().mean().backward()
         return live.peak
@@ -171,16 +173,35 @@ def test_shards_train_the_weights_of_ddp(train):
     assert losses(fsdp) == pytest.approx(losses(ddp), rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({}, "strategy=fsdp shares the weights out among processes, and this run has one"),
-        ({"devices": 1, "nodes": 1}, "give devices=2 or more"),
-    ],
-)
-def test_one_process_has_nothing_to_shard(train, tmp_path, changes, message):
-    with pytest.raises(TronError, match=message):
-        train("out", strategy="fsdp", **changes)
+@two_cores
+@pytest.mark.long
+def test_shards_go_on_from_a_checkpoint(train, tmp_path):
+    """The checkpoint of step 2 is put aside while it is there."""
+    aside = tmp_path / "again" / "checkpoints"
+    aside.mkdir(parents=True)
+
+    def put_aside() -> None:
+        checkpoint = tmp_path / "whole" / "checkpoints" / "1-one-00000002.ckpt"
+        while not (found.is_set() or (tmp_path / "whole" / "renderer.safetensors").exists()):
+            with suppress(FileNotFoundError):
+                shutil.copyfile(checkpoint, aside / checkpoint.name)
+                found.set()
+
+    found = threading.Event()
+    watcher = threading.Thread(target=put_aside)
+    watcher.start()
+    how = {"devices": 2, "strategy": "fsdp", "checkpoint_every": 2}
+    whole = train("whole", **how)
+    watcher.join()
+    assert found.is_set()
+    shutil.copyfile(whole / "config.yaml", aside.parent / "config.yaml")
+    again = train("again", **how)
+    assert largest_difference(whole, again) == 0.0
+
+
+def test_one_process_has_nothing_to_shard(train, tmp_path):
+    with pytest.raises(TronError, match="and this run has one: give devices=2 or more"):
+        train("out", strategy="fsdp")
     assert not (tmp_path / "out").exists()
 
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from train.cli import main
-from train.held_out import network_input
+from train.examples.held_out import network_input
 from train.settings import Settings
 from train.strips import HEADER
-from tron.images import read_image
+from tron.io.images import read_image
 from tron.neural.renderer import to_display_array
 from tron.neural.weights import load_renderer
 from tron.shards import ClipStore

@@ -6,19 +6,18 @@ What the frames were made with stands beside them; frames of other settings are 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tron.apps.labelled_sheet import labelled_sheet
-from tron.claim import first_difference, read_recipe, require_same
 from tron.errors import TronError
-from tron.images import read_image, write_image
-from tron.storage import write_atomic
-from tron.video import VideoWriter
+from tron.io.images import read_image, write_image
+from tron.io.video import VideoWriter
+from tron.report.contact_sheet import labelled_sheet
+from tron.run_folder import RunFolder
+from tron.shards.schema import MEMBERS
 
 SETTINGS_NAME = "settings.json"
 # Lengths need more digits than half floats have.
@@ -47,15 +46,13 @@ class FrameFolder:
         A setting that the record of older frames lacks had its value in `defaults`. Raises TronError if the
         folder holds frames made with others, unless `overwrite` deletes them.
         """
-        record = self.folder / SETTINGS_NAME
-        before = read_recipe(record)
-        if before is not None and not overwrite:
-            mend = "choose another output_dir, or replace them with overwrite=true"
-            require_same(before, made_with, self.folder, "frames", mend, defaults)
-        elif before is not None and first_difference(before, made_with, defaults) is not None:
-            for path in (*self.folder.glob("*.exr"), *self.folder.glob("*.png")):
-                path.unlink()
-        write_atomic(record, json.dumps(made_with, indent=1) + "\n")
+        mend = "choose another output_dir, or replace them with overwrite=true"
+        run = RunFolder(self.folder, "frames", SETTINGS_NAME, mend, defaults)
+        if overwrite and run.difference(made_with) is not None:
+            run.clear("*.exr", "*.png")
+        else:
+            run.require(made_with)
+        run.keep(made_with)
 
     def path(self, index: int, name: str, suffix: str) -> Path:
         """File of frame `index`'s buffer or picture `name`; suffix "exr" or "png"."""
@@ -80,7 +77,8 @@ class FrameFolder:
                 raise TronError(f"buffer {name} of frame {index} is not finite", self.folder)
         for name in self.buffers:
             path = self.path(index, name, "exr")
-            write_image(path, images[name], half=name not in _FULL_PRECISION)
+            color = name not in MEMBERS or MEMBERS[name].color_space is not None
+            write_image(path, images[name], half=name not in _FULL_PRECISION, color=color)
 
     def read(self, index: int, name: str) -> np.ndarray:
         """A frame's buffer as (H, W, 3) float32."""

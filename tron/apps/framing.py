@@ -1,89 +1,21 @@
-"""Cameras for a scene that nobody has framed: what to look at, and from how far.
-
-The subject is what stands on the floor, where there is one: a floor often holds most of the surfels, and a
-view that shows all of it shows little else. Strays are left out by quantiles.
-"""
+"""Camera paths around a scene that nobody has framed (:mod:`tron.framing`)."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 
 from tron import trajectories
 from tron.cameras import Camera
-from tron.gaussians.scene import GaussianScene
+from tron.framing import Surfels, find_subject, framed
 
 TrajectoryName = Literal["orbit", "spiral", "oscillating", "still"]
 
-# Fraction of the subject's surfels that may lie outside the frame.
-STRAYS = 0.01
-# Empty border around the subject, as a fraction of the image's sides.
-BORDER = 0.06
-# A floor is flat: its surfels look up within this cosine and lie within this many spacings of one height.
-_LEVEL_COSINE = 0.95
-_FLOOR_SPACINGS = 3.0
-_FLOOR_SHARE = 0.2
-_SUBJECT_SHARE = 0.005
-# Enough points and cameras to find a distance by; a camera comes no nearer than this many radii.
-_PROBES = 2000
-_PROBE_CAMERAS = 24
-_NEAREST = 1.2
-
-
-@dataclass(frozen=True)
-class Subject:
-    """Part of a scene that is worth looking at.
-
-    Attributes:
-        points: (N, 3) surfel centres, world.
-        centre: (3,) of their sphere, world.
-        radius: of that sphere, world units.
-    """
-
-    points: np.ndarray
-    centre: np.ndarray
-    radius: float
-
-
-def find_subject(scene: GaussianScene) -> Subject:
-    """The surfels that matter, strays apart: those off the floor if the scene has a floor, else all."""
-    shown = scene.means[_off_floor(scene)].astype(np.float64)
-    low, high = np.quantile(shown, [STRAYS, 1 - STRAYS], axis=0)
-    centre = (low + high) / 2
-    from_centre = np.linalg.norm(shown - centre, axis=1)
-    radius = float(np.quantile(from_centre, 1 - STRAYS))
-    return Subject(shown[from_centre <= radius], centre, max(radius, scene.spacing))
-
-
-def has_floor(scene: GaussianScene) -> bool:
-    """Whether part of the scene is a floor that the rest stands on."""
-    return not _off_floor(scene).all()
-
-
-def _off_floor(scene: GaussianScene) -> np.ndarray:
-    """(M,) bool: surfels that stand on or above the floor; all of them where no floor is found."""
-    everything = np.ones(len(scene), dtype=bool)
-    height = scene.means @ scene.up
-    level = np.abs(scene.normals() @ scene.up) > _LEVEL_COSINE
-    if level.sum() < _FLOOR_SHARE * len(scene):
-        return everything
-    # The floor is the fullest of thin slabs of level surfels; slabs overlap by half so that none is cut in
-    # two.
-    slab = _FLOOR_SPACINGS * scene.spacing
-    heights = np.sort(height[level])
-    held = np.searchsorted(heights, heights + slab, side="right") - np.arange(len(heights))
-    floor = heights[held.argmax()]
-    above = height > floor + slab
-    if held.max() < _FLOOR_SHARE * len(scene) or above.sum() < _SUBJECT_SHARE * len(scene):
-        return everything
-    return above
-
 
 def plan_cameras(
-    scene: GaussianScene,
+    scene: Surfels,
     trajectory: TrajectoryName,
     frames: int,
     *,
@@ -110,25 +42,7 @@ def plan_cameras(
     def at(radius: float) -> list[Camera]:
         return getattr(trajectories, trajectory)(frames, radius=radius, **view, **path)
 
-    probes = subject.points[:: max(1, len(subject.points) // _PROBES)]
-    # From the far end a sphere around the subject fits into any frame; bisection of the logarithm from there.
-    half = math.atan(math.tan(math.radians(fov_deg) / 2) * min(1.0, height / width) * (1 - 2 * BORDER))
-    near, far = _NEAREST * subject.radius, max(_NEAREST, 1.1 / math.sin(half)) * subject.radius
-    for _ in range(12):
-        middle = math.sqrt(near * far)
-        near, far = (near, middle) if _hold(at(middle), probes) else (middle, far)
-    return at(distance * far)
-
-
-def _hold(cameras: list[Camera], points: np.ndarray) -> bool:
-    """Whether the images hold all but the strays of the points (N, 3), world, with a border to spare."""
-    for camera in cameras[:: max(1, len(cameras) // _PROBE_CAMERAS)]:
-        pixels, depth = camera.project(points)
-        place = pixels / (camera.width, camera.height)
-        inside = (depth > 0) & (np.abs(place - 0.5) < 0.5 - BORDER).all(axis=1)
-        if inside.mean() < 1 - STRAYS:
-            return False
-    return True
+    return framed(subject, at, width=width, height=height, fov_deg=fov_deg, distance=distance)
 
 
 def turn_cameras(cameras: list[Camera], rotation: np.ndarray) -> list[Camera]:
@@ -136,13 +50,3 @@ def turn_cameras(cameras: list[Camera], rotation: np.ndarray) -> list[Camera]:
     turn = np.eye(4)
     turn[:3, :3] = rotation.T
     return [replace(camera, world_to_camera=camera.world_to_camera @ turn) for camera in cameras]
-
-
-def upright(up: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation, the shortest, that takes the unit direction `up` to +z, up in environment maps."""
-    x, y, z = up
-    if z < -1 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])
-    # Rodrigues' formula about up x z, with cos = z: R = I + [v]x + [v]x^2 / (1 + cos).
-    cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
-    return np.eye(3) + cross + cross @ cross / (1 + z)

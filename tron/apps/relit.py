@@ -8,7 +8,7 @@ between the surfels), or `shadowed` where nothing is to bounce. What stands behi
     [r, g, b]    one colour, in display values as a picture on the screen has them (sRGB, 0 to 1)
 
 A colour is composited after AgX, so that an empty pixel shows it exactly; it has the background's share of
-tron.shading.background, which is none behind opaque surfels. The buffer `share` holds it: the mean over a
+tron.shading.composition, which is none behind opaque surfels. The buffer `share` holds it: the mean over a
 pixel's sub-pixels, not the share of their mean opacity. A network draws surfels and sky as one: at the rim of
 the surfels its colours hold some of the light's, whatever stands behind.
 """

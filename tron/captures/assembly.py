@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from tron.cameras import Camera
 from tron.captures.capture import Capture
-from tron.captures.image_folder import view_names
-from tron.captures.orientation import estimate_up
-from tron.captures.photo_files import LINEAR_SUFFIXES, exposure_of, require_decoders
-from tron.captures.photo_views import PhotoViews
-from tron.captures.photographs import PhotoCache
-from tron.captures.posed_photos import PosedPhotos
+from tron.captures.photos.image_folder import view_names
+from tron.captures.photos.photo_files import LINEAR_SUFFIXES, exposure_of, require_decoders
+from tron.captures.photos.photo_views import PhotoViews
+from tron.captures.photos.photographs import PhotoCache, PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.captures.view import View
 from tron.errors import TronError
+from tron.io.local_frame import local_origin, said
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +37,7 @@ def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> C
     """
     if not posed.photos:
         raise TronError("the file names no photos", posed.source)
+    posed, offset = about_local_origin(posed)
     require_decoders(photo.path for photo in posed.photos)
     cache = PhotoCache(cache_bytes)
     skipped = dict(posed.skipped)
@@ -71,6 +73,7 @@ def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> C
         up=up / np.linalg.norm(up),
         transform=posed.transform,
         skipped=skipped,
+        offset=offset,
     )
 
 
@@ -113,11 +116,13 @@ def _report(posed: PosedPhotos, skipped: Mapping[str, str], usable: int, lost_ma
 
 
 def _log_kinds(source: Path, made: PhotoViews, linear: int, settings: PhotoSettings) -> None:
-    """Say how masks are taken and how linear photos are shown: neither is seen in the files' names."""
+    """Say how masks are taken, what colours are in and how linear photos are shown: no name tells."""
     if made.masked:
         meaning = {"ignore": "is not learnt from", "subject": "is empty background"}[str(settings.masks)]
         log.info("%s: what is black in the masks of %d photos %s (masks=ignore, subject or null)",
                  source, made.masked, meaning)  # fmt: skip
+    for note, count in made.notes.items():
+        log.info("%s: of %d photos %s", source, count, note)
     if linear:
         log.info("%s: %d EXR photos are shown with exposure %.4g (exr_exposure) and the sRGB curve",
                  source, linear, made.exposure)  # fmt: skip
@@ -134,3 +139,114 @@ def _log_reduced(
         "%s: max_side=%d reduces %d of %d photos, %d x %d to %d x %d; max_side=null keeps their size",
         source, settings.max_side, len(reduced), count, width, height, small_width, small_height,
     )  # fmt: skip
+
+
+log = logging.getLogger(__name__)
+
+
+def about_local_origin(posed: PosedPhotos) -> tuple[PosedPhotos, np.ndarray]:
+    """The photos and points without the middle of large coordinates, and the (3,) float64 offset taken away.
+
+    Poses and points are float64 until here. Cameras and points decide together; what is no pose is left to
+    those who read it. Captures whose coordinates float32 resolves are given back as they are.
+    """
+    positions = [_position(photo.camera_to_world) for photo in posed.photos if photo.refused is None]
+    places = np.array([each for each in positions if each is not None]).reshape(-1, 3)
+    if posed.points is not None:
+        places = np.concatenate([places, np.asarray(posed.points, np.float64)])
+    offset = local_origin(places[np.isfinite(places).all(1)])
+    if not offset.any():
+        return posed, offset
+    log.info("%s: large coordinates: %s is taken away from them and kept", posed.source, said(offset))
+    back = np.eye(4)
+    back[:3, 3] = -offset
+    photos = [
+        replace(photo, camera_to_world=_shifted(photo.camera_to_world, offset)) for photo in posed.photos
+    ]
+    points = None if posed.points is None else np.asarray(posed.points, np.float64) - offset
+    return replace(posed, photos=photos, points=points, transform=back @ posed.transform), offset
+
+
+def _position(camera_to_world: object) -> np.ndarray | None:
+    """(3,) position of a pose as files have it; None where it is no matrix of numbers."""
+    try:
+        matrix = np.asarray(camera_to_world, np.float64)
+    except (TypeError, ValueError):
+        return None
+    return matrix[:3, 3] if matrix.shape in ((3, 4), (4, 4)) else None
+
+
+def _shifted(camera_to_world: object, offset: np.ndarray) -> object:
+    if _position(camera_to_world) is None:
+        return camera_to_world
+    matrix = np.array(camera_to_world, np.float64)
+    matrix[:3, 3] -= offset
+    return matrix
+
+
+_STEPS = 20
+_ROLL = 0.003
+_SIDEWAYS = 0.9
+_FLAT = 0.1
+
+
+def estimate_up(cameras: Sequence[Camera]) -> np.ndarray:
+    """Estimate the world's up direction, (3,) float64 unit, from cameras that a person held.
+
+    People turn and tilt a camera but seldom roll it: its x axis stays level, and its y axis points up on
+    average. Three cases:
+
+    - Cameras' up axes agree on the whole. Up is where the robust (L1) mean of these axes and the level x axes
+      meet: it minimises ``sum_i w_i (x_i . u)^2 + r |u - m|^2`` over directions u, with m the mean, r =
+      0.003 and weights w that spare rolled cameras. Cameras that all look down on one side of a table pull
+      m over, but not x. Where x axes say nothing, since all are parallel, m decides.
+    - Up axes cancel while x axes agree: the photos lie on their side, as a phone held upright stores them.
+      The x axis is then vertical, with the sign that has the cameras look down on average.
+    - Neither: seen from a drone, or rolled at will. If the cameras' positions lie in a plane, up is its
+      normal, on the side of the mean up axis or, where that vanishes, against the view; else the mean up
+      axis.
+    """
+    rights = np.stack([camera.camera_to_world[:3, 0] for camera in cameras])
+    ups = np.stack([camera.up for camera in cameras])
+    backward = -np.mean([camera.forward for camera in cameras], axis=0)
+    mean_up, mean_right = _robust_mean(ups), _robust_mean(rights)
+    agreement = np.linalg.norm(ups.mean(0))
+    if agreement < 0.3 and np.linalg.norm(rights.mean(0)) > _SIDEWAYS:
+        return _level(mean_right * _sign(mean_right @ backward), ups)
+    if agreement >= 0.3:
+        return _level(mean_up, rights)
+    positions = np.stack([camera.position for camera in cameras])
+    _, spread, axes = np.linalg.svd(positions - positions.mean(0), full_matrices=False)
+    if len(spread) == 3 and spread[2] < _FLAT * spread[1]:
+        reference = mean_up @ axes[2] if agreement > 0.1 else backward @ axes[2]
+        return axes[2] * _sign(reference)
+    return mean_up
+
+
+def _robust_mean(axes: np.ndarray) -> np.ndarray:
+    """Unit direction with the least sum of distances to unit axes (N, 3), by reweighting (Weiszfeld)."""
+    mean = _unit(axes.mean(0))
+    for _ in range(_STEPS):
+        weights = 1 / np.maximum(np.linalg.norm(axes - mean, axis=1), 1e-3)
+        mean = _unit(weights @ axes)
+    return mean
+
+
+def _level(mean: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Refine an up direction by axes (N, 3) that ought to be level, sparing those that are not."""
+    up = mean
+    for _ in range(_STEPS):
+        weights = 1 / np.maximum(np.abs(level @ up), 0.02)
+        weights /= weights.sum()
+        scatter = (level * weights[:, None]).T @ level
+        up = _unit(np.linalg.solve(scatter + _ROLL * np.eye(3), _ROLL * mean))
+    return up
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vector)
+    return vector / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
+
+
+def _sign(value: float) -> float:
+    return -1.0 if value < 0 else 1.0

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
-from tron.captures.content import content_hash
-from tron.captures.view import ToneCurve, View
+from tron.captures.view import MAPS, ToneCurve, View
 from tron.errors import TronError
 
 
@@ -25,6 +25,8 @@ class Capture:
         point_colors: (N, 3) float32 of the points, display space.
         up: (3,) float64 unit up direction, world.
         transform: (4, 4) float64 from the world of the files that the capture was read from to its world.
+        offset: (3,) float64 what was taken away from large coordinates, such as those of UTM, to be added
+            again (:mod:`tron.io.local_frame`); zero in most captures.
         exposure: what linear radiance is multiplied by before AgX to look like the images; one number for
             all, because all show one light. Radiance of unknown scale has 1.
         skipped: what the files name and the capture lacks: name -> why, such as "image not found".
@@ -44,12 +46,14 @@ class Capture:
     transform: np.ndarray = field(default_factory=lambda: np.eye(4))
     skipped: Mapping[str, str] = field(default_factory=dict)
     tone_curve: ToneCurve = "srgb"
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "views", tuple(self.views))
         object.__setattr__(self, "test", frozenset(self.test))
         object.__setattr__(self, "up", np.asarray(self.up, np.float64))
         object.__setattr__(self, "transform", np.asarray(self.transform, np.float64))
+        object.__setattr__(self, "offset", np.asarray(self.offset, np.float64))
         self._check_names()
         if self.transform.shape != (4, 4) or not np.isfinite(self.transform).all():
             raise TronError("transform of a capture is not a finite 4 x 4 matrix")
@@ -97,3 +101,22 @@ class Capture:
     def test_views(self) -> Sequence[View]:
         """The held-out views, in order."""
         return [view for view in self.views if view.name in self.test]
+
+
+def content_hash(views: Iterable[View]) -> str:
+    """SHA-256 of the views' names, cameras, images and maps, as 64 hexadecimal digits.
+
+    Values are hashed as they are read, so that whatever changes them counts: a file that was replaced, its
+    size, the exposure of an EXR, the way that masks are taken.
+
+    Raises:
+        TronError: an image or map that cannot be read.
+    """
+    digest = hashlib.sha256()
+    for view in views:
+        digest.update(repr((view.name, view.camera.to_dict(), view.space)).encode())
+        for name in MAPS:
+            if view.has(name):
+                digest.update(name.encode())
+                digest.update(view.read(name).tobytes())
+    return digest.hexdigest()

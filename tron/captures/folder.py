@@ -13,26 +13,26 @@ Reading trusts nothing in the file: paths that leave the folder are refused, by 
 
 from __future__ import annotations
 
+import io
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
+from plyfile import PlyData, PlyElement, PlyParseError
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from tron.cameras import Camera, opencv_to_opengl, opengl_to_opencv
 from tron.captures.capture import Capture
-from tron.captures.points import encode_points, read_points
 from tron.captures.settings import PhotoSettings
-from tron.captures.transforms import read_json
 from tron.captures.view import MAPS, ColorSpace, View
-from tron.errors import TronError
-from tron.images import MAX_SIDE, encode_exr, encode_png, read_image
+from tron.errors import TronError, located
+from tron.io.images import MAX_SIDE, encode_exr, encode_png, read_image
+from tron.io.transforms_json import read_json
 from tron.storage import atomic_folder
 
 TRANSFORMS_NAME = "transforms.json"
@@ -41,12 +41,14 @@ FORMAT_VERSION = 1
 LARGEST_JSON = 2**28
 
 MapName = Literal["normal", "base_color", "roughness", "metallic", "irradiance", "depth", "sky_mask", "valid"]
-
-
 _MAPS: tuple[MapName, ...] = get_args(MapName)
+_COLORS = ("base_color", "irradiance")
 _IN_8_BITS = ("sky_mask", "valid")
 _IN_FLOAT32 = ("depth",)  # half a millimetre at a metre is too coarse for surfaces
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+_Row = tuple[float, float, float, float]
+Matrix = tuple[_Row, _Row, _Row, _Row]
+_CHANNELS = ("red", "green", "blue")
 
 
 def _inside(path: str) -> str:
@@ -57,8 +59,6 @@ def _inside(path: str) -> str:
 
 
 InnerPath = Annotated[str, AfterValidator(_inside)]
-_Row = tuple[float, float, float, float]
-Matrix = tuple[_Row, _Row, _Row, _Row]
 
 
 class _Intrinsics(BaseModel):
@@ -182,7 +182,7 @@ def read_capture_folder(path: str | os.PathLike[str]) -> Capture:
     path = Path(path)
     folder = path.parent if path.name == TRANSFORMS_NAME else path
     transforms = _parse(folder / TRANSFORMS_NAME)
-    with _located(folder / TRANSFORMS_NAME):
+    with located(folder / TRANSFORMS_NAME):
         tron = transforms.tron
         views = []
         for frame in transforms.frames:
@@ -271,7 +271,10 @@ def _write_view(folder: Path, view: View, stem: str) -> tuple[str, _ViewEntry]:
             continue
         pixels, in_8_bits = view.read(name), name in _IN_8_BITS
         maps[name] = f"{name}/{stem}{'.png' if in_8_bits else '.exr'}"
-        data = encode_png(pixels) if in_8_bits else encode_exr(pixels, half=name not in _IN_FLOAT32)
+        if in_8_bits:
+            data = encode_png(pixels)
+        else:
+            data = encode_exr(pixels, half=name not in _IN_FLOAT32, color=name in _COLORS)
         _write(folder / maps[name], data)
     return file_path, _ViewEntry(name=view.name, alpha=alpha, maps=maps)
 
@@ -350,19 +353,10 @@ def _parse(path: Path) -> _Transforms:
         raise TronError(f"{TRANSFORMS_NAME} is damaged{at}: {first['msg'][:200]}", path) from error
 
 
-@contextmanager
-def _located(path: Path) -> Iterator[None]:
-    """Errors that do not know their file were found in ``path``."""
-    try:
-        yield
-    except TronError as error:
-        raise TronError(error.what, error.where or path, error.mend) from error
-
-
 def _view(folder: Path, transforms: _Transforms, frame: _Frame, entry: _ViewEntry) -> View:
     image = _existing(folder, frame.file_path)
     maps = {
-        name: partial(read_image, _existing(folder, inner), MAPS[name].channels)
+        name: partial(read_image, _existing(folder, inner), MAPS[name].channels, name in _COLORS)
         for name, inner in entry.maps.items()
     }
     return View(
@@ -421,3 +415,36 @@ def _camera(transforms: _Transforms, frame: _Frame, name: str) -> Camera:
         raise TronError("camera matrix cannot be inverted", f"view {name}") from error
     except TronError as error:
         raise TronError(error.what, f"view {name}", error.mend) from error
+
+
+def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points (N, 3) float64 and display colours (N, 3) float32, if there are any, of a PLY's vertices.
+
+    Raises:
+        TronError: no PLY, or one that is damaged or has no vertices with x, y, z.
+    """
+    try:
+        vertex = PlyData.read(str(path))["vertex"]
+        points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
+        if not {each.name for each in vertex.properties}.issuperset(_CHANNELS):
+            return points, None
+        stored = np.stack([vertex[channel] for channel in _CHANNELS], axis=1)
+    except (OSError, TypeError, ValueError, KeyError, PlyParseError, MemoryError) as error:
+        raise TronError(f"cannot read points: {error}", path) from error
+    colors = stored.astype(np.float32) / (255 if np.issubdtype(stored.dtype, np.integer) else 1)
+    return points, colors.clip(0, 1)
+
+
+def encode_points(points: np.ndarray, colors: np.ndarray | None) -> bytes:
+    """PLY of points (N, 3) in float32 and display colours (N, 3) in 8 bits."""
+    columns = [(axis, "<f4") for axis in "xyz"]
+    if colors is not None:
+        columns += [(channel, "u1") for channel in _CHANNELS]
+    rows = np.empty(len(points), columns)
+    for axis, values in zip("xyz", points.T):
+        rows[axis] = values
+    for channel, values in zip(_CHANNELS, () if colors is None else colors.T):
+        rows[channel] = np.round(np.clip(values, 0, 1) * 255)
+    stream = io.BytesIO()
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(stream)
+    return stream.getvalue()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,17 +13,25 @@ from pydantic import ConfigDict, Field
 
 from tron.captures.assembly import assemble
 from tron.captures.capture import Capture
-from tron.captures.colmap import model_folder, read_colmap
 from tron.captures.folder import is_capture_folder, load_traced
-from tron.captures.not_a_capture import refusal
-from tron.captures.posed_photos import PosedPhotos
+from tron.captures.formats.colmap import model_folder, read_colmap
+from tron.captures.formats.not_a_capture import refusal
+from tron.captures.formats.tensoir import TensoirSettings, is_tensoir, read_tensoir
+from tron.captures.formats.transforms import has_transforms, read_transforms
+from tron.captures.photos.photographs import PosedPhotos
+from tron.captures.posing.structure_from_motion import (
+    MatchingSettings,
+    PosingSettings,
+    has_photos,
+    pose_photos,
+)
+from tron.captures.posing.video import FrameSettings, is_video, read_video
 from tron.captures.settings import PhotoSettings
-from tron.captures.structure_from_motion import MatchingSettings, PosingSettings, has_photos, pose_photos
-from tron.captures.tensoir import TensoirSettings, is_tensoir, read_tensoir
-from tron.captures.transforms import has_transforms, read_transforms
-from tron.captures.video import FrameSettings, is_video, read_video
 from tron.errors import TronError
 from tron.gaussians.foreign_files import VIDEOS
+from tron.io.recognised import foreign_poses, refuse_by_sight
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -102,16 +111,36 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
     if not path.exists():
         raise TronError("capture not found", path)
     if not any(each.takes(path) for each in FORMATS.values()):
-        raise refusal(path, HOLDS)
+        raise refusal(path, HOLDS, _holds_capture)
+    if path.is_file():
+        refuse_by_sight(path, "a capture is a folder or a transforms.json")
     name = _detected(path) if settings.format == "auto" else settings.format
     if not FORMATS[name].takes(path):
         raise TronError(f"a capture of format {name} is a folder", path)
+    if name == "photos" and settings.format == "auto":
+        _log_poses(path)
     found = FORMATS[name].read(path, settings)
     return found if isinstance(found, Capture) else assemble(found, settings, settings.cache_bytes)
 
 
 def _detected(path: Path) -> str:
-    for name, each in FORMATS.items():
-        if each.takes(path) and each.detect(path):
-            return name
-    raise refusal(path, HOLDS)
+    name = _format_of(path)
+    if name is None:
+        raise refusal(path, HOLDS, _holds_capture)
+    return name
+
+
+def _format_of(path: Path) -> str | None:
+    return next((name for name, each in FORMATS.items() if each.takes(path) and each.detect(path)), None)
+
+
+def _holds_capture(path: Path) -> bool:
+    return _format_of(path) is not None
+
+
+def _log_poses(path: Path) -> None:
+    """Say that poses of another program lie beside photos that are about to be posed anew."""
+    found = foreign_poses(path)
+    if found is not None:
+        log.warning("%s is %s, which is not read: the photos are posed anew (format=photos says that this is "
+                    "meant); %s", found[0], found[1].what, found[1].mend)  # fmt: skip

@@ -12,7 +12,7 @@ import yaml
 from pydantic.fields import FieldInfo
 
 from tron.cli.recipes import nested_model
-from tron.nested import leaves
+from tron.run_folder import leaves
 
 OPTIONS = {
     "-h, --help": "print this page",
@@ -33,8 +33,6 @@ TYPE_NAMES = {
     bool: "true | false",
     type(None): "null",
 }
-
-
 NO_DEFAULT = object()  # of a field of a list's items: each item has its own value
 
 

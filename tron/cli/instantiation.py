@@ -37,5 +37,8 @@ def make(recipe: Mapping[str, Any], key: str, where: str | None = None) -> Any:
             parts = (key, *(inner.groups() if inner else ()), *first["loc"])
             wrong = ".".join(str(part) for part in parts)
             raise TronError(f"wrong value for '{wrong}'", repr(first["input"])[:80], first["msg"]) from error
-        reason = str(cause).splitlines()[0]
-        raise TronError(f"{key} cannot be made: {reason}", where, f"see {key}=NAME in --help") from error
+        reason = str(cause).splitlines()[0].rstrip(":")
+        mend = f"see {key}=NAME in --help"
+        if "No module named" in str(cause):
+            mend = "a module of yours must be on Python's path: PYTHONPATH=FOLDER"
+        raise TronError(f"{key} cannot be made: {reason}", where, mend) from error

@@ -6,17 +6,18 @@ that can be wrong with it is found here, before any long work starts, and raised
 
 import difflib
 import inspect
+import os
+import re
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import pydantic
 import yaml
 from hydra import compose, initialize_config_module
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -28,7 +29,7 @@ from omegaconf.errors import OmegaConfBaseException
 from pydantic_core import to_jsonable_python
 
 from tron.errors import TronError
-from tron.nested import nested_items
+from tron.run_folder import nested_items
 
 Settings = TypeVar("Settings", bound=pydantic.BaseModel)
 
@@ -57,7 +58,6 @@ def compose_recipe(
     Raises:
         TronError: an override cannot be parsed, or names a key, group or option that does not exist.
     """
-    parsed = [_parse(override) for override in overrides]
     if config_dir is not None and not config_dir.is_dir():
         raise TronError("folder not found", where=config_dir, mend="--config-dir names a folder of recipes")
     search = [] if config_dir is None else [f'hydra.searchpath=["file://{config_dir.resolve()}"]']
@@ -66,10 +66,11 @@ def compose_recipe(
         shared = _shared_options(config_module)
         if shared:
             groups[SHARED_GROUP] = list(shared)
-        for index, each in enumerate(parsed):
-            if each.key_or_group in groups and each.value() is None and not each.is_delete():
-                parsed[index] = _parse(f"{each.key_or_group}=none")  # null says the same of a single key
-        selections = [each for each in parsed if each.key_or_group in groups]
+        chosen = [text for text in overrides if _key(text) in groups]
+        selections = [_parse(text) for text in chosen]
+        for index, each in enumerate(selections):
+            if each.value() is None and not each.is_delete():
+                selections[index] = _parse(f"{each.key_or_group}=none")  # null says the same of a single key
         for each in selections:
             _require_option(each, groups[each.key_or_group])
         try:
@@ -80,14 +81,14 @@ def compose_recipe(
                 if each.key_or_group == SHARED_GROUP:
                     values = _merged(values, shared[str(each.value())][0])
             recipe = DictConfig(values)
-            keys = [each for each in parsed if each.key_or_group not in groups]
+            keys = [_setting(text, settings, values) for text in overrides if text not in chosen]
             changed = {each.key_or_group for each in keys if not each.is_add() and not each.is_force_add()}
             if not changed <= _keys(recipe):
                 recipe = complete(recipe)
             for key in sorted(changed - _keys(recipe)):
                 raise unknown_key(key, [*_keys(recipe), *groups])
-            # The part of `compose` that changes keys: the model's are not in the files that it reads.
-            ConfigLoaderImpl._apply_overrides_to_config(keys, recipe)
+            for each in keys:
+                _change(recipe, each)
             return recipe
         except (HydraException, OmegaConfBaseException) as error:
             raise TronError(_first_line(error), where=config_module) from error
@@ -190,15 +191,20 @@ def resolve(recipe: DictConfig) -> Any:
         raise TronError(_first_line(error)) from error
 
 
-def group_options(config_module: str) -> dict[str, dict[str, str]]:
-    """Groups of a configuration folder, their options, and what is said of each: its first comment line."""
+def group_options(config_module: str, config_dir: Path | None = None) -> dict[str, dict[str, str]]:
+    """Groups of a configuration folder, their options, and what is said of each: its first comment line.
+
+    Options of the user's own folder come behind the package's.
+    """
     root = resources.files(config_module)
     with _loader(config_module) as loader:
-        options = {group: loader.get_group_options(group) for group in _groups(loader)}
+        options = {group: _options(loader, group, config_dir) for group in _groups(loader)}
         chosen = compose("config", return_hydra_config=True).hydra.runtime.choices
 
     def describe(group: str, name: str) -> str:
-        comment = _comment(root.joinpath(group, f"{name}.yaml").read_text("utf-8"))
+        path = root.joinpath(group, f"{name}.yaml")
+        own = path if path.is_file() or config_dir is None else config_dir / group / f"{name}.yaml"
+        comment = _comment(own.read_text("utf-8"))
         return f"{comment} (default)".strip() if chosen.get(group) == name else comment
 
     described = {group: {name: describe(group, name) for name in names} for group, names in options.items()}
@@ -249,11 +255,49 @@ def _options(loader: ConfigLoader, group: str, config_dir: Path | None) -> list[
     return [*loader.get_group_options(group), *own]
 
 
-def _parse(text: str) -> Override:
+def _key(text: str) -> str:
+    """The key or group of an override, as it is typed before the equals sign."""
+    return text.partition("=")[0].lstrip("+~").partition("@")[0].strip()
+
+
+def _setting(text: str, settings: type[pydantic.BaseModel], values: Mapping[str, Any]) -> Override:
+    """Override of a key: a path as it is typed, anything else in Hydra's grammar."""
+    typed, equals, value = text.partition("=")
+    is_path, several = takes_paths(settings, values, _key(text)) if equals else (False, False)
+    path = path_value(value, several) if is_path else None
+    if path is None:
+        return _parse(text, several)
+    quoted = f"[{','.join(map(_quoted, path))}]" if isinstance(path, list) else _quoted(path)
+    return _parse(f"{typed}={quoted}")
+
+
+def _quoted(path: str) -> str:
+    """A path as a text in Hydra's grammar, where a backslash before a quote counts, and no other does."""
+    return "'" + re.sub(r"(\\*)(?='|$)", r"\1\1", path).replace("'", r"\'") + "'"
+
+
+def _change(recipe: DictConfig, override: Override) -> None:
+    """Change a key of the recipe in place; compose cannot, since the model's keys are in no file it reads."""
+    key = override.key_or_group
+    if override.is_delete():
+        parent, _, leaf = key.rpartition(".")
+        node = OmegaConf.select(recipe, parent) if parent else recipe
+        if not OmegaConf.is_dict(node) or leaf not in node:
+            raise TronError(f"cannot delete '{key}'", mend="there is no such key")
+        del node[leaf]
+    else:
+        added = override.is_add() or override.is_force_add()
+        OmegaConf.update(recipe, key, override.value(), merge=True, force_add=added)
+
+
+def _parse(text: str, several: bool = False) -> Override:
+    """Parse in Hydra's grammar; of a setting that takes several values a comma without brackets is told."""
     try:
         override = OverridesParser.create().parse_override(text)
     except HydraException as error:
         key, equals, value = text.partition("=")
+        if several and "," in value:
+            raise _one_value(key, value) from error
         mend = f"""quote the value: '{key}="{value}"'""" if equals else "write key=value"
         if value[:1] in ("{", "["):  # the quotes belong around the texts in it
             shown = '{name: "text"}' if value[0] == "{" else '["text"]'
@@ -261,8 +305,12 @@ def _parse(text: str) -> Override:
         raise TronError(f"cannot read '{text}'", mend=mend) from error
     if override.is_sweep_override():
         key, _, value = text.partition("=")
-        raise TronError(f"'{key}' takes one value", where=value, mend=f"for a list write '{key}=[{value}]'")
+        raise _one_value(key, value)
     return override
+
+
+def _one_value(key: str, value: str) -> TronError:
+    return TronError(f"'{key}' takes one value", where=value, mend=f"for a list write '{key}=[{value}]'")
 
 
 def _require_option(override: Override, options: Sequence[str]) -> None:
@@ -366,3 +414,83 @@ def _comment(text: str) -> str:
 
 def _first_line(error: Exception) -> str:
     return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+
+
+_QUOTED = re.compile(r"""(["']).*\1""", re.DOTALL)
+_QUOTED_ITEM = re.compile(r"""(^|,)\s*["']""")
+
+
+def path_value(value: str, several: bool) -> str | list[str] | None:
+    """The path or paths that a typed value names, ``~`` expanded; None where Hydra's grammar holds.
+
+    Args:
+        value: right of the equals sign.
+        several: whether the setting takes a list of paths. ``a,b`` without brackets is then no path, unless
+            there is a file of this name.
+    """
+    if value.strip() in ("", "null") or "${" in value or _QUOTED.fullmatch(value.strip()):
+        return None
+    if several and not Path(value).exists():
+        inner = value.strip()[1:-1]
+        if value.strip() == f"[{inner}]":
+            return None if not inner or _QUOTED_ITEM.search(inner) else list(map(_expanded, inner.split(",")))
+        if "," in value:
+            return None
+    return _expanded(value)
+
+
+def takes_paths(settings: type[pydantic.BaseModel], recipe: Mapping[str, Any], key: str) -> tuple[bool, bool]:
+    """Whether a setting is a path, and whether it may be several.
+
+    Args:
+        settings: model of the whole recipe.
+        recipe: composed values, whose ``_target_`` say what the model leaves open.
+        key: dotted, as it is typed.
+    """
+    annotation: Any = settings
+    node: Any = recipe
+    for part in key.split("."):
+        annotation = _member(annotation, node, part)
+        node = node.get(part) if isinstance(node, Mapping) else None
+    kinds = _alternatives(annotation)
+    several = any(Path in _alternatives(inner) for kind in kinds for inner in _items(kind))
+    return Path in kinds or several, several
+
+
+def _expanded(value: str) -> str:
+    """The value: as it is where there is such a file, else without outer blanks and with a home for ``~``."""
+    return value if Path(value).exists() else os.path.expanduser(value.strip())  # a URL keeps its slashes
+
+
+def _member(annotation: Any, node: Any, part: str) -> Any:
+    """Annotation of one part of what has this annotation and this value; None where nothing says it."""
+    for kind in _alternatives(annotation):
+        if isinstance(kind, type) and issubclass(kind, pydantic.BaseModel):
+            return kind.model_fields[part].annotation if part in kind.model_fields else None
+        if get_origin(kind) is dict and get_args(kind)[1] is not Any:
+            return get_args(kind)[1]
+        if get_origin(kind) in (list, tuple) and part.isdecimal():
+            return get_args(kind)[0]
+    target = node.get("_target_") if isinstance(node, Mapping) else None
+    return None if target is None else _parameter(str(target), part)
+
+
+def _parameter(target: str, name: str) -> Any:
+    """Annotation of a field or parameter of what ``_target_`` names; None where it has none."""
+    try:
+        return get_type_hints(get_object(target)).get(name)
+    except Exception:  # whatever importing it raises: it is told when the object is made
+        return None
+
+
+def _alternatives(annotation: Any) -> tuple[Any, ...]:
+    """Members of a union, without what ``Annotated`` adds; the annotation alone if it is none."""
+    if get_origin(annotation) is Annotated:
+        return _alternatives(get_args(annotation)[0])
+    if get_origin(annotation) is not None and get_origin(annotation) not in (list, tuple, dict):
+        return tuple(each for inner in get_args(annotation) for each in _alternatives(inner))
+    return (annotation,)
+
+
+def _items(kind: Any) -> tuple[Any, ...]:
+    return get_args(kind)[:1] if get_origin(kind) in (list, tuple) else ()

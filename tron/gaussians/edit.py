@@ -1,4 +1,4 @@
-"""Editing a scene: moving some of its surfels as a rigid body."""
+"""Editing a scene: a part of its surfels, and some of them moved as a rigid body."""
 
 from __future__ import annotations
 
@@ -7,10 +7,22 @@ from dataclasses import replace
 import numpy as np
 
 from tron.errors import TronError
+from tron.gaussians.fields import FIELDS
 from tron.gaussians.harmonics import rotate_sh
-from tron.gaussians.scene import GaussianScene, quats_from_matrices
+from tron.gaussians.scene import GaussianScene, measure_spacing, quats_from_matrices
 
 _TOLERANCE = 1e-4
+
+
+def subset(scene: GaussianScene, which: np.ndarray) -> GaussianScene:
+    """The surfels ``which``, (M,) bool or indices, alone; their spacing is measured anew.
+
+    Raises:
+        TronError: nothing is selected, or what there is not.
+    """
+    selected = _selection(which, len(scene))
+    arrays = {name: getattr(scene, name)[selected] for name in FIELDS}
+    return replace(scene, **arrays, spacing=measure_spacing(arrays["means"]))
 
 
 def moved(
@@ -71,7 +83,7 @@ def _selection(which: np.ndarray, count: int) -> np.ndarray:
         selected = np.zeros(count, bool)
         selected[which.astype(np.int64)] = True
     if not selected.any():
-        raise TronError("no surfel is selected", mend="give a mask or indices of the surfels to move")
+        raise TronError("no surfel is selected", mend="give a mask or indices of surfels")
     return selected
 
 

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from tron.gaussians.harmonics import SH_COUNT
 
+LOG_SCALE_LIMIT = 40.0
+"""Scales beyond e^+-40 overflow float32 once they are squared."""
+
 
 @dataclass(frozen=True)
 class Field:

@@ -13,6 +13,7 @@ cannot ask for terabytes.
 
 from __future__ import annotations
 
+import io
 import logging
 import math
 import os
@@ -22,12 +23,27 @@ from typing import Any
 
 import numpy as np
 import plyfile
+from scipy.special import expit
 
 from tron.color import srgb_to_linear
 from tron.errors import TronError
 from tron.gaussians.fields import FIELDS, MATERIALS
-from tron.gaussians.foreign_files import packed_splats, refuse_foreign
+from tron.gaussians.foreign_files import (
+    beginning,
+    flattened,
+    foreign_kernels,
+    is_gzipped,
+    largest,
+    packed_splats,
+    refuse_foreign,
+    round_ones,
+    smoothed,
+    stated_up,
+    usable_splats,
+    whole,
+)
 from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
+from tron.io.local_frame import local_origin, said
 from tron.storage import atomic_path
 
 log = logging.getLogger(__name__)
@@ -35,6 +51,7 @@ log = logging.getLogger(__name__)
 NORMAL = ("nx", "ny", "nz")
 REST = tuple(f"f_rest_{i}" for i in range(3 * (SH_COUNT - 1)))
 THIRD_SCALE = "scale_2"
+FILTER = "filter_3D"
 MATERIAL_PROPERTIES = tuple(name for material in MATERIALS for name in FIELDS[material].properties)
 REQUIRED = tuple(
     name
@@ -49,10 +66,12 @@ GUESSED_ROUGHNESS = 0.6
 GUESSED_METALLIC = 0.0
 # Up in a file that does not say: 3DGS keeps COLMAP's world, whose y axis points down where photos are level.
 GUESSED_UP = (0.0, -1.0, 0.0)
-# What an opacity of exactly 1, whose logit is infinite, is stored as: 3e-7 below 1.
-OPAQUE_LOGIT = 15.0
 
 _HEADER_LIMIT = 1 << 16
+_VISIBLE = 1 / 255
+"""Opacity below which a splat is not drawn (conventions.md, 6)."""
+_COARSE = 0.25
+"""Steps of stored positions, in widths of splats, from which they are seen."""
 _TYPE_BYTES = {
     **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
     **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
@@ -95,30 +114,35 @@ def read_ply(path: str | Path) -> dict[str, Any]:
     """Attributes of the GaussianScene in a TRON, 2DGS or 3DGS PLY; ``spacing`` only if the file says it.
 
     Of three scales the smallest is dropped and the rotation permuted, so that the surfel's normal is the axis
-    along which the Gaussian was thinnest; quaternions are normalised. f_rest of degree 0 to 3 is accepted. A
-    file without materials gets guessed ones (base colour from the mean colour, rough, not metallic) and says
-    so in `materials_guessed`; a file that is not TRON's has unoriented normals (`oriented` is False) and
-    kernel degree 2. Up is what a comment says, TRON's or nerfstudio's ("Vertical Axis: z"); where none does
-    it is -y, and `up_guessed` is True. An opacity logit of +infinity means opaque; surfels whose logit is
-    -infinity or NaN are left out, with one line in the log that counts both.
+    along which the Gaussian was thinnest; ``round_ones`` (M,) bool tells where there is no such axis.
+    Quaternions are normalised. f_rest of degree 0 to 3 is accepted. A file without materials gets guessed
+    ones (base colour from the mean colour, rough, not metallic) and says so in `materials_guessed`; a file
+    that is not TRON's has unoriented normals (`oriented` is False) and kernel degree 2. Up is what a comment
+    says, TRON's or another's (:mod:`tron.gaussians.foreign_files`); where none does it is -y, and
+    `up_guessed` is True. Mip-Splatting's ``filter_3D`` is folded in. An opacity logit of +infinity means
+    opaque; splats that are broken are left out (:mod:`tron.gaussians.foreign_files`). The middle of large
+    coordinates is taken away in float64, and is in `offset` (:mod:`tron.io.local_frame`). Each of these says
+    so in one line.
+
+    The file may be compressed by gzip.
 
     Raises:
         TronError: files that are missing, are no PLY or a packed one, lack properties (named), declare more
-            than they hold, or hold NaN, infinities or zero quaternions elsewhere.
+            than they hold, expand without limit, or hold no splat.
     """
     path = Path(path)
     check_header(path)
-    try:
-        data = plyfile.PlyData.read(str(path))
-    except OSError as error:
-        raise TronError(f"cannot read: {error.strerror or error}", path) from error
-    except (plyfile.PlyParseError, ValueError) as error:  # ValueError: text that is no number
-        raise TronError(f"not a readable PLY: {error}", path) from error
+    data = _parsed(path)
     constants = _read_constants(data.comments, path)
     columns = {p.name: data["vertex"][p.name] for p in data["vertex"].properties}
-    _check_properties(columns, path)
-    columns = _with_finite_opacity(columns, path)
-    up, up_guessed = _up(constants, data.comments)
+    _check_properties(columns, data.comments, path)
+    scales = [name for name in (*FIELDS["log_scales"].properties, THIRD_SCALE) if name in columns]
+    # Before they are smoothed: a filter much wider than a splat hides its axes, not where it faces.
+    columns["round_ones"] = round_ones(np.stack([columns[name] for name in scales], axis=-1))
+    if FILTER in columns:
+        columns = _filtered(columns, scales, path)
+    colors = [name for name in (*FIELDS["sh"].properties, *REST) if name in columns]
+    columns = usable_splats(columns, scales, colors, path)
 
     def stack(names: Sequence[str]) -> np.ndarray:
         return np.stack([np.asarray(columns[name], dtype=np.float32) for name in names], axis=-1)
@@ -127,29 +151,32 @@ def read_ply(path: str | Path) -> dict[str, Any]:
         values = stack(FIELDS[name].properties)
         return values if FIELDS[name].shape else values[:, 0]
 
-    means = field("means")
-    if not len(means):
+    if not len(columns["x"]):
         raise TronError("the scene has no surfels", path)
-    if not np.isfinite(means).all():
-        raise TronError("a position is not finite", path)
-    scales = [name for name in (*FIELDS["log_scales"].properties, THIRD_SCALE) if name in columns]
-    quats, log_scales = _flatten(field("quats"), stack(scales), path)
+    offset = constants.get("offset", [0.0, 0.0, 0.0])
+    means = field("means")
+    if not constants:  # where a file of TRON's stands was decided when it was written
+        means, offset = _about_local_origin(columns, path)
+    quats, log_scales = flattened(field("quats"), stack(scales))
     sh = _harmonics(columns, stack, path)
     guessed = MATERIAL_PROPERTIES[0] not in columns
+    stated = constants["up"] if "up" in constants else stated_up(data.comments)
     return {
         "means": means,
         "quats": quats,
         "log_scales": log_scales,
+        "round_ones": columns["round_ones"],
         "opacity_logits": field("opacity_logits"),
         "sh": sh,
         **(_guess(sh) if guessed else {name: field(name) for name in MATERIALS}),
         "object_id": _object_id(columns, len(means), path),
         "kernel_degree": int(constants.get("kernel_degree", [2])[0]),
         **({"spacing": constants["spacing"][0]} if "spacing" in constants else {}),
-        "up": np.array(up),
-        "up_guessed": up_guessed,
+        "up": np.array(GUESSED_UP if stated is None else stated),
+        "up_guessed": stated is None or bool(constants.get("up_guessed", [0])[0]),
         "materials_guessed": guessed or bool(constants.get("materials_guessed", [0])[0]),
         "oriented": bool(constants.get("oriented", [0])[0]),
+        "offset": np.array(offset),
     }
 
 
@@ -161,14 +188,60 @@ def check_header(path: Path) -> None:
             the header says.
     """
     try:
-        with open(path, "rb") as stream:
-            head, size = stream.read(_HEADER_LIMIT), os.fstat(stream.fileno()).st_size
+        if is_gzipped(path):
+            head, size = beginning(path, _HEADER_LIMIT), largest(path)
+        else:
+            with open(path, "rb") as stream:
+                head, size = stream.read(_HEADER_LIMIT), os.fstat(stream.fileno()).st_size
     except OSError as error:
         raise TronError(f"cannot read: {error.strerror or error}", path) from error
     if not head.startswith(b"ply"):
         refuse_foreign(path)
         raise TronError("not a PLY file", path, _EXPORT)
     _check_sizes(head, size, path)
+
+
+def _parsed(path: Path) -> plyfile.PlyData:
+    try:
+        if not is_gzipped(path):
+            return plyfile.PlyData.read(str(path))
+        content = whole(path)
+        _check_sizes(content[:_HEADER_LIMIT], len(content), path)
+        return plyfile.PlyData.read(io.BytesIO(content))
+    except OSError as error:
+        raise TronError(f"cannot read: {error.strerror or error}", path) from error
+    except (plyfile.PlyParseError, ValueError) as error:  # ValueError: text that is no number
+        raise TronError(f"not a readable PLY: {error}", path) from error
+
+
+def _filtered(columns: dict[str, np.ndarray], scales: Sequence[str], path: Path) -> dict[str, np.ndarray]:
+    """The columns with the 3D smoothing filter in scales and opacity."""
+    log_scales = np.stack([columns[name] for name in scales], axis=-1)
+    widened, logits = smoothed(log_scales, columns["opacity"], columns[FILTER])
+    before, after = (float(np.nanmedian(expit(each))) for each in (columns["opacity"], logits))
+    log.log(
+        logging.INFO if after >= _VISIBLE else logging.WARNING,
+        "%s: %s of Mip-Splatting is taken into scales and opacities, whose median goes from %.2g to %.2g%s",
+        path, FILTER, before, after, "" if after >= _VISIBLE else ": most splats cannot be seen",
+    )  # fmt: skip
+    return columns | dict(zip(scales, widened.T)) | {"opacity": logits}
+
+
+def _about_local_origin(columns: Mapping[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """(M, 3) float32 positions about a local origin, and the (3,) float64 offset that was taken away."""
+    stored = [columns[axis] for axis in FIELDS["means"].properties]
+    positions = np.stack(stored, axis=-1).astype(np.float64)
+    wide = float(np.median(np.exp(np.asarray(columns["scale_0"], np.float64))))
+    offset = local_origin(positions, _COARSE * wide)
+    if offset.any():
+        log.info("%s: large coordinates: %s is taken away from them and kept", path, said(offset))
+        step = max(float(np.spacing(np.abs(each).max())) for each in stored)
+        if step > _COARSE * wide:
+            log.warning(
+                "%s: its positions are stored in steps of %.2g, its splats are %.2g wide: surfaces fall into "
+                "slices; export it with positions in doubles or about a local origin", path, step, wide,
+            )  # fmt: skip
+    return (positions - offset).astype(np.float32), offset
 
 
 def _constants(scene: Mapping[str, Any]) -> list[str]:
@@ -179,6 +252,7 @@ def _constants(scene: Mapping[str, Any]) -> list[str]:
         f"tron up {' '.join(repr(float(v)) for v in scene['up'])}",
         f"tron oriented {int(scene['oriented'])}",
         f"tron materials_guessed {int(scene['materials_guessed'])}",
+        *([f"tron offset {' '.join(map(repr, scene['offset'].tolist()))}"] if scene["offset"].any() else []),
     ]
 
 
@@ -195,19 +269,10 @@ def _read_constants(comments: list[str], path: Path) -> dict[str, list[float]]:
             values = [math.nan]
         if not all(map(math.isfinite, values)):
             raise TronError(f"comment '{comment[:60]}' does not hold finite numbers", path)
+        if words[1] in ("up", "offset") and len(values) != 3:
+            raise TronError(f"comment '{comment[:60]}' does not hold three numbers", path)
         constants[words[1]] = values
     return constants
-
-
-def _up(constants: dict[str, list[float]], comments: list[str]) -> tuple[Sequence[float], bool]:
-    """Up direction of a file, and whether it was guessed."""
-    if "up" in constants:
-        return constants["up"], bool(constants.get("up_guessed", [0])[0])
-    for comment in comments:
-        words = comment.lower().split()
-        if words[:2] == ["vertical", "axis:"] and words[2:] in (["x"], ["y"], ["z"]):
-            return [float(axis == words[2]) for axis in "xyz"], False
-    return GUESSED_UP, True
 
 
 def _check_sizes(head: bytes, size: int, path: Path) -> None:
@@ -249,37 +314,22 @@ def _check_sizes(head: bytes, size: int, path: Path) -> None:
         )
 
 
-def _check_properties(columns: dict[str, np.ndarray], path: Path) -> None:
+def _check_properties(columns: dict[str, np.ndarray], comments: Sequence[str], path: Path) -> None:
+    foreign = ", ".join(foreign_kernels(columns, comments))
     missing = [name for name in REQUIRED if name not in columns]
     if missing:
-        raise TronError(f"the PLY lacks {', '.join(missing)}", path, _EXPORT)
+        made = f"made for {foreign}: export it as plain 3DGS" if foreign else _EXPORT
+        raise TronError(f"the PLY lacks {', '.join(missing)}", path, made)
+    read = (*REQUIRED, *REST, *MATERIAL_PROPERTIES, THIRD_SCALE, FILTER, "object_id")
     for name, values in columns.items():
-        if values.dtype == object and name in (
-            *REQUIRED,
-            *REST,
-            *MATERIAL_PROPERTIES,
-            THIRD_SCALE,
-            "object_id",
-        ):
+        if values.dtype == object and name in read:
             raise TronError(f"property {name} is a list", path, _EXPORT)
+    if foreign:
+        log.warning("%s: not read, so that it may look different here: %s", path, foreign)
     present = [name for name in MATERIAL_PROPERTIES if name in columns]
     if present and len(present) < len(MATERIAL_PROPERTIES):
         absent = ", ".join(name for name in MATERIAL_PROPERTIES if name not in columns)
         raise TronError(f"the PLY has {present[0]} but lacks {absent}", path, "write all materials or none")
-
-
-def _with_finite_opacity(columns: dict[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:
-    """The rows whose opacity is that of a surfel, infinite logits clipped; the log counts the others."""
-    logits = np.asarray(columns["opacity"], dtype=np.float32)
-    opaque, absent = np.isposinf(logits), np.isnan(logits) | np.isneginf(logits)
-    if not (opaque.any() or absent.any()):
-        return columns
-    log.warning(
-        "%s: %d infinite opacities taken as opaque, %d surfels left out (opacity 0 or NaN)",
-        path, opaque.sum(), absent.sum(),
-    )  # fmt: skip
-    columns = columns | {"opacity": np.where(opaque, np.float32(OPAQUE_LOGIT), logits)}
-    return {name: values[~absent] for name, values in columns.items()}
 
 
 def _guess(sh: np.ndarray) -> dict[str, np.ndarray]:
@@ -315,25 +365,3 @@ def _object_id(columns: dict[str, np.ndarray], count: int, path: Path) -> np.nda
     if not whole.all():
         raise TronError(f"object_id of surfel {int((~whole).argmax())} is no 32-bit number", path)
     return values.astype(np.int32)
-
-
-def _flatten(quats: np.ndarray, log_scales: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Drop the smallest of three scales: (M, 4), (M, 2 or 3) -> unit quats, thin axis last, (M, 2)."""
-    if not (np.isfinite(quats).all() and np.isfinite(log_scales).all()):
-        raise TronError("a rotation or scale is not finite", path)
-    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
-    if (lengths < 1e-6).any():
-        raise TronError(f"rotation of surfel {int(lengths.argmin())} is a zero quaternion", path)
-    # Unit quaternions are left alone to the last bit: a scene written and read is the same scene.
-    quats = np.where(np.abs(lengths - 1) > 1e-6, quats / lengths, quats)
-    if log_scales.shape[1] == 2:
-        return quats, log_scales
-    thin = log_scales.argmin(axis=1)
-    # A third turn about (1, 1, 1) cycles the axes (u, v, n) -> (v, n, u), two of them -> (n, u, v): the thin
-    # axis becomes the third column and the frame stays right-handed.
-    w, x, y, z = quats.T
-    cycled = np.stack([w - x - y - z, w + x + y - z, w - x + y + z, w + x - y + z], axis=-1) / 2
-    twice = np.stack([w + x + y + z, -w + x - y + z, -w + x + y - z, -w - x + y + z], axis=-1) / 2
-    kept = np.array([[1, 2], [2, 0], [0, 1]])[thin]
-    quats = np.choose(thin[:, None], [cycled, twice, quats])
-    return quats.astype(np.float32), np.take_along_axis(log_scales, kept, axis=1)

@@ -7,6 +7,7 @@ is NumPy at rest, in the world frame; trainable copies and device arrays are mad
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,19 +16,24 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
-from tron.errors import TronError
-from tron.gaussians.fields import FIELDS, MATERIALS
+from tron.errors import TronError, located
+from tron.framing import upright
+from tron.gaussians.fields import FIELDS, LOG_SCALE_LIMIT, MATERIALS
 from tron.gaussians.harmonics import rotate_sh
 from tron.gaussians.ply import read_ply, write_ply
+
+log = logging.getLogger(__name__)
 
 KERNEL_DEGREES = (2, 4)
 # Densities are measured on at most this many surfels: the median does not move, a million queries take
 # seconds.
 SPACING_QUERIES = 50_000
+# Fewer centres have no plane through them.
+FEWEST_NEIGHBOURS = 4
+# Share of round Gaussians from which they are a scan's kind: 3 to 4 % are in those of 3DGS, all in SplaTAM's.
+ROUND_SHARE = 0.2
 
 _TOLERANCE = 1e-3
-# Scales beyond e^+-40 overflow float32 once they are squared.
-_LOG_SCALE_LIMIT = 40.0
 
 
 @dataclass(eq=False)
@@ -53,6 +59,8 @@ class GaussianScene:
         materials_guessed: True where the materials were derived from colours, not measured.
         oriented: False where the sign of the normals means nothing, as in files of 3DGS: camera rays skip
             back faces, so such scenes are turned towards each camera first (:meth:`facing`).
+        offset: (3,) float64 what was taken away from large coordinates, such as those of UTM: the file's are
+            means + offset (:mod:`tron.io.local_frame`). Zero in most scenes.
     """
 
     means: np.ndarray
@@ -70,12 +78,14 @@ class GaussianScene:
     up_guessed: bool = False
     materials_guessed: bool = False
     oriented: bool = True
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         for name, described in FIELDS.items():
             dtype = np.float32 if described.trained else np.int32
             setattr(self, name, np.ascontiguousarray(getattr(self, name), dtype=dtype))
         self.up = np.asarray(self.up, dtype=np.float64)
+        self.offset = np.asarray(self.offset, dtype=np.float64)
         self.kernel_degree = int(self.kernel_degree)
         self.spacing = float(self.spacing)
 
@@ -138,17 +148,21 @@ class GaussianScene:
             quats=quats_from_matrices(rotation @ self.rotations()),
             sh=rotate_sh(self.sh, rotation),
             up=rotation @ self.up,
+            offset=rotation @ self.offset,
         )
+
+    def upright(self) -> GaussianScene:
+        """The scene turned about the origin the shortest way so that ``up`` is +z, as in environment maps."""
+        turn = upright(self.up)
+        return self if np.allclose(turn, np.eye(3)) else self.rotated(turn)
 
     def validate(self, where: str | Path | None = None) -> GaussianScene:
         """Return the scene itself if it is whole; raise TronError naming the first field that is not.
 
         `where`, the file the scene comes from, is added to the message.
         """
-        try:
+        with located(where):
             self._check()
-        except TronError as error:
-            raise TronError(error.what, where, error.mend) from None
         return self
 
     def _check(self) -> None:
@@ -169,7 +183,7 @@ class GaussianScene:
             bad = ((values < -_TOLERANCE) | (values > 1 + _TOLERANCE)).any(axis=1)
             if bad.any():
                 raise TronError(f"{name} of {bad.sum()} surfels is outside [0, 1] (first: {bad.argmax()})")
-        bad = (np.abs(self.log_scales) > _LOG_SCALE_LIMIT).any(axis=1)
+        bad = (np.abs(self.log_scales) > LOG_SCALE_LIMIT).any(axis=1)
         if bad.any():
             raise TronError(f"log_scales of {bad.sum()} surfels are absurd (first: surfel {bad.argmax()})")
         lengths = np.linalg.norm(self.quats, axis=1)
@@ -187,6 +201,8 @@ class GaussianScene:
             )
         if self.up.shape != (3,) or not abs(np.linalg.norm(self.up) - 1) < _TOLERANCE:
             raise TronError(f"up is {self.up.tolist()}", mend="give a unit vector of three numbers")
+        if self.offset.shape != (3,) or not np.isfinite(self.offset).all():
+            raise TronError(f"offset is {self.offset.tolist()}", mend="give three finite numbers")
 
     def save(self, path: str | Path) -> None:
         """Write a PLY that 3DGS readers open too (:mod:`tron.gaussians.ply`), atomically.
@@ -200,14 +216,22 @@ class GaussianScene:
     def load(cls, path: str | Path) -> GaussianScene:
         """Read a TRON, 2DGS or 3DGS PLY; what files leave out: :func:`tron.gaussians.ply.read_ply`.
 
-        A file that says no spacing has it measured.
+        A file that says no spacing has it measured. Where a scan is made of round Gaussians, as those of
+        SplaTAM and MonoGS, which have no axis for a normal, they get that of their neighbourhood.
 
         Raises:
             TronError: no such file, or no scene in it.
         """
         values = read_ply(path)
+        means, round_ones = values["means"], values.pop("round_ones")
+        if round_ones.mean() > ROUND_SHARE and len(means) >= FEWEST_NEIGHBOURS:
+            log.warning(
+                "%s: %d of %d splats are as thick as wide, without a normal: it is taken from the places of "
+                "their neighbours", path, round_ones.sum(), len(means),
+            )  # fmt: skip
+            values["quats"][round_ones] = quats_from_normals(neighbour_normals(means, round_ones))
         if "spacing" not in values:
-            values["spacing"] = measure_spacing(values["means"])
+            values["spacing"] = measure_spacing(means)
         return cls(**values).validate(path)
 
 
@@ -257,7 +281,7 @@ def neighbour_distances(
 def measure_spacing(means: np.ndarray) -> float:
     """The scene's surfel spacing nn: median of neighbour_distances, world units, never zero.
 
-    Shadow rays start and count back faces in units of it (docs/conventions.md, 8). Large scenes are measured
+    Shadow rays start and count back faces in units of it (conventions.md, 8). Large scenes are measured
     on an evenly strided part of their surfels, against all of them.
     """
     stride = -(-len(means) // SPACING_QUERIES)
@@ -267,3 +291,28 @@ def measure_spacing(means: np.ndarray) -> float:
         return float(np.median(apart))
     extent = float(np.ptp(means, axis=0).max()) if len(means) else 0.0
     return extent or 1.0
+
+
+NEIGHBOURS = 16
+_CHUNK = 100_000
+
+
+def neighbour_normals(means: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """Unit normals (K, 3) float64, of either sign, of the chosen points: axes of least spread.
+
+    The eigenvector of the least eigenvalue of the covariance of the sixteen nearest points, the point itself
+    included (Hoppe et al. 1992, "Surface Reconstruction from Unorganized Points", section 3.2).
+
+    Args:
+        means: (M, 3) all points, three or more, world.
+        which: (M,) bool, K of them true.
+    """
+    points = np.asarray(means, np.float64)
+    tree, asked = KDTree(points), np.flatnonzero(which)
+    normals = np.empty((len(asked), 3))
+    for start in range(0, len(asked), _CHUNK):
+        chunk = slice(start, start + _CHUNK)
+        near = tree.query(points[asked[chunk]], k=min(NEIGHBOURS, len(points)), workers=-1)[1]
+        around = points[near] - points[near].mean(axis=1, keepdims=True)
+        normals[chunk] = np.linalg.eigh(around.transpose(0, 2, 1) @ around)[1][:, :, 0]
+    return normals

@@ -27,7 +27,7 @@ path-traced under many environments at once.
 Mitsuba wraps what a plugin raises in a RuntimeError of its own; the last line of its message is TRON's.
 """
 
-from tron.integrators.surfels import embed
+from tron.integrators.plugin import embed
 
 __all__ = ["embed", "register"]
 

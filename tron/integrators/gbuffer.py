@@ -26,8 +26,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from tron.integrators.plugin import Shown
-from tron.integrators.surfels import Surfels
+from tron.integrators.plugin import Shown, Surfels
 from tron.tracing import Surface
 
 CHANNELS = {

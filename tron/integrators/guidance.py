@@ -28,23 +28,32 @@ through the light that bounces; what shadow and reflection rays find is a consta
 
 from __future__ import annotations
 
+import math
 from typing import Any, get_args
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from tron.errors import TronError
 from tron.estimation import FINAL, Diffuse, Estimation, Estimator
-from tron.integrators.bounces import Bounces
-from tron.integrators.environment import environment_of, light_state
-from tron.integrators.plugin import Shown
-from tron.integrators.surfels import Surfels, unwrap
-from tron.shading.environment import EnvironmentMap
-from tron.shading.guidance import Guidance, Lighting, arriving_light, shade_surface
-from tron.shading.split_sum import CUBEMAP_RESOLUTION
+from tron.gaussians.fields import MATERIALS, PARAMETERS
+from tron.integrators.plugin import Held, Shown, Surfels, unwrap
+from tron.shading.bounces.bounce import BouncedLight, BounceTransport, at_surfels
+from tron.shading.environments.environment import EnvironmentMap
+from tron.shading.guidance import Guidance, arriving_light, shade_surface
+from tron.shading.lighting import CUBEMAP_RESOLUTION, Lighting
 from tron.tracing import GBuffer
 
 BUFFERS = tuple(name for name in Guidance.BUFFERS if name != "mask")
+CHOICES = {"estimator": Estimator, "diffuse": Diffuse}
+NUMBERS = {"bounces": (0, 16), "reflections": (0, 1024)}
+"""Least and greatest."""
+GEOMETRY = tuple(name for name in PARAMETERS if name not in (*MATERIALS, "sh"))
+SAMPLED_HEIGHT = 512
+"""Rows of the map of an emitter that is not taken texel by texel."""
+OVERSAMPLING = 3
+"""Rows that are asked for, for each row of such a map."""
 
 
 class GuidanceAppearance:
@@ -88,11 +97,6 @@ class GuidanceAppearance:
         return self._prepared[1]
 
 
-CHOICES = {"estimator": Estimator, "diffuse": Diffuse}
-NUMBERS = {"bounces": (0, 16), "reflections": (0, 1024)}
-"""Least and greatest."""
-
-
 def _estimation(properties: mi.Properties) -> Estimation:
     rays = int(properties.get("shadow_rays", FINAL.rays))
     if rays < 2 or rays % 2:
@@ -116,3 +120,92 @@ def _given_environment(properties: mi.Properties) -> EnvironmentMap | None:
     if isinstance(properties["environment"], str):
         return EnvironmentMap.load(properties["environment"])
     return unwrap(properties, "environment", EnvironmentMap, "tron_guidance")
+
+
+class Bounces:
+    """Bakes of a plugin's surfels: transport is kept until they move, direct light until they or it change.
+
+    Where gradients are wanted the bounces themselves are gathered anew at each render, attached to the
+    materials: light that has met a surfel carries the gradient of its base color.
+
+    Args:
+        surfels: the plugin's.
+        estimation: of its frames.
+    """
+
+    def __init__(self, surfels: Surfels, estimation: Estimation) -> None:
+        self.surfels, self.estimation = surfels, estimation
+        self._transport: tuple[Any, BounceTransport] | None = None
+        self._direct: tuple[Any, list[mi.Color3f]] | None = None
+
+    def bake(self, lighting: Lighting) -> BouncedLight:
+        """The light of ``lighting`` at each surfel, attached to materials whose gradients are wanted.
+
+        Its rays are those of seed 0, whatever the sensor's.
+        """
+        geometry = self.surfels.state(*GEOMETRY)
+        with dr.suspend_grad():
+            if self._transport is None or self._transport[0] != geometry:
+                self._transport = (
+                    geometry,
+                    BounceTransport.trace(self.surfels.tracer.sided(self.estimation.two_sided)),
+                )
+                self._direct = None
+            transport = self._transport[1]
+            if self._direct is None or self._direct[0] is not lighting:
+                self._direct = lighting, transport.direct_of_faces(lighting, at_surfels(self.estimation))
+        return transport.bounced(self._direct[1], self.estimation)
+
+
+def environment_of(scene: mi.Scene) -> EnvironmentMap:
+    """The light of ``scene`` from infinity, as the scene has it now.
+
+    Raises:
+        TronError: the scene has no environment emitter.
+    """
+    emitter = scene.environment()
+    if emitter is None:
+        raise TronError(
+            "the scene has no environment to light the surfels",
+            mend="add an emitter such as `envmap` or `constant` to it, or give the integrator `environment`",
+        )
+    if emitter.class_name() != "EnvironmentMapEmitter":
+        return _sampled(emitter)
+    parameters: Any = mi.traverse(emitter)
+    image = np.array(parameters["data"])[:, 1:-1, :3]  # Mitsuba repeats a column at either side
+    rotation = _turn_about_z(np.array(parameters["to_world"].matrix)[..., 0])
+    if rotation is None or image.shape[1] != 2 * image.shape[0]:
+        return _sampled(emitter)
+    return EnvironmentMap(image * float(parameters["scale"][0]), rotation)
+
+
+def light_state(scene: mi.Scene) -> list[Any]:
+    """Equal for equal states of the scene's environment; changes when a parameter of it does."""
+    emitter = scene.environment()
+    if emitter is None:
+        return []
+    return [emitter.ptr, *(Held(value) for _, value in mi.traverse(emitter))]
+
+
+def _turn_about_z(to_world: np.ndarray) -> float | None:
+    """Degrees by which an upright map is turned about +z; None if it does not stand upright."""
+    upright = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # rotate([1, 0, 0], 90)
+    turn = to_world[:3, :3] @ upright.T
+    angle = math.atan2(turn[1, 0], turn[0, 0])
+    cos, sin = math.cos(angle), math.sin(angle)
+    if np.abs(turn - [[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]).max() > 1e-5:
+        return None
+    return math.degrees(angle)
+
+
+def _sampled(emitter: mi.Emitter) -> EnvironmentMap:
+    """The emitter's radiance by directions; rows stand on the poles, columns on half texels."""
+    rows = OVERSAMPLING * SAMPLED_HEIGHT
+    texel = dr.arange(mi.UInt32, 2 * rows * rows)
+    polar = mi.Float(texel // (2 * rows)) * (math.pi / (rows - 1))
+    across, along = dr.sincos((mi.Float(texel % (2 * rows)) + 0.5) * (math.pi / rows))
+    sin, cos = dr.sincos(dr.clip(polar, 1e-4, math.pi - 1e-4))  # at a pole an azimuth is anybody's guess
+    si = dr.zeros(mi.SurfaceInteraction3f, 2 * rows * rows)
+    si.wi = -mi.Vector3f(sin * across, sin * along, cos)
+    radiance = mi.Color3f(emitter.eval(si)) + dr.zeros(mi.Color3f, 2 * rows * rows)
+    return EnvironmentMap(np.array(radiance).T.reshape(rows, 2 * rows, 3)).resized(SAMPLED_HEIGHT)

@@ -183,7 +183,9 @@ class RendererConfig(GuidedConfig):
 
     OTHER_STARTS: ClassVar[tuple[str, ...]] = (MEAN,)
 
-    codec: str = Field(default="block_dct", description="Video to latents, a name of tron.neural.codecs.")
+    codec: str = Field(
+        default="block_dct", description="Video to latents, a name of tron.neural.codecs.registry."
+    )
     fusion: Literal["concat", "average"] = Field(
         default="concat",
         description="concat gives the transformer all latents; average their mean, which keeps the input "

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -10,18 +13,28 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from tron.errors import TronError
-from tron.neural.backbone import Backbone
-from tron.neural.codecs import CODECS
-from tron.neural.configs import MEAN, RendererConfig, UNetConfig, check_weights
-from tron.neural.filtering import filtered, gaussian_logits
+from tron.neural.clips import Motion, Overlap, averaged_frames, check_frames, windows
+from tron.neural.codecs.registry import CODECS
+from tron.neural.configs import MEAN, BackboneConfig, RendererConfig, UNetConfig, check_weights
+from tron.neural.networks.unet import UNet
 from tron.neural.protocols import Codec, Renderer
-from tron.neural.reprojection import Motion, averaged_frames
-from tron.neural.unet import UNet
-from tron.neural.windows import Overlap, check_frames, windows
+
+if TYPE_CHECKING:
+    from tron.neural.networks.backbone import Backbone
+
+log = logging.getLogger(__name__)
 
 PLAIN_TIMESTEP = 0.2  # what the tiny transformer is told; any constant will do
 BLUR_SIDE = 5
 """Pixels of the square that skip_blur gathers from; skip_kernel has its own."""
+
+
+def _backbone(shape: UNetConfig | BackboneConfig, given: int, predicted: int) -> Backbone | UNet:
+    if isinstance(shape, UNetConfig):
+        return UNet(shape, given, predicted)
+    from tron.neural.networks.backbone import Backbone  # diffusers, which the shipped networks do without
+
+    return Backbone(shape, given, predicted)
 
 
 class NeuralRenderer(Renderer):
@@ -41,10 +54,9 @@ class NeuralRenderer(Renderer):
         channels = self.codec.latent_channels
         latents = len(self.config.guidance) if self.config.fusion == "concat" else 1
         shape = self.config.backbone
-        kind = UNet if isinstance(shape, UNetConfig) else Backbone
         detail = 0 if self.config.skip_detail is None else channels
         self._predicted = [channels, self.config.skip_kernel**2, detail]
-        self.backbone: Backbone | UNet = kind(shape, latents * channels, sum(self._predicted))  # type: ignore[arg-type]
+        self.backbone: Backbone | UNet = _backbone(shape, latents * channels, sum(self._predicted))
 
     def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:
         """As Renderer.forward, with 1 + temporal_factor * n frames of any H and W.
@@ -132,8 +144,13 @@ class NeuralRenderer(Renderer):
 
 
 def to_tensor(display: np.ndarray) -> Tensor:
-    """Display values (K, H, W, 3) in [0, 1] -> network input (1, 3, K, H, W) in [-1, 1]."""
-    video = torch.from_numpy(np.ascontiguousarray(display, np.float32))
+    """Display values (K, H, W, 3) in [0, 1] -> network input (1, 3, K, H, W) in [-1, 1].
+
+    NaN becomes 0 and infinity the end of the range: one such value would blacken all that the network's
+    reach covers.
+    """
+    finite = np.nan_to_num(np.asarray(display, np.float32), nan=0.0, posinf=1.0, neginf=0.0)
+    video = torch.from_numpy(np.ascontiguousarray(finite))
     return video.permute(3, 0, 1, 2)[None] * 2 - 1
 
 
@@ -157,10 +174,10 @@ def render_clip(
         renderer: what renders.
         displayed: its guidance by name, (K, H, W, 3) display values in [0, 1], as `Clip.displayed` gives.
         window: frames a pass, 1 + temporal_factor * n (default: the renderer's own).
-        overlap: which of the windows that hold a frame draws it, see `tron.neural.windows`.
+        overlap: which of the windows that hold a frame draws it, see `tron.neural.clips`.
         weights: of the latents by name, instead of the renderer's own.
         motion: of the clip's surfaces, as `surface_motion` tells it: each frame is then averaged with as many
-            others as a window has, brought to it (`tron.neural.reprojection`). None: windows alone.
+            others as a window has, brought to it (`tron.neural.clips`). None: windows alone.
 
     Returns:
         Display values (K, H, W, 3) in [0, 1], float32.
@@ -215,6 +232,7 @@ def render_frames(
     passes = windows(frames, size, renderer.temporal_factor, overlap)
     device = next(renderer.parameters()).device
     given: dict[int, dict[str, Tensor]] = {}
+    unknown: Counter[str] = Counter()
     sums: dict[int, np.ndarray] = {}
     counts: dict[int, int] = {}
     was_training = renderer.training
@@ -226,6 +244,7 @@ def render_frames(
             for index in [index for index in this.frames if index not in given]:
                 shown = read(index)
                 wanted = [name for name in renderer.config.guidance if name in shown]
+                unknown.update({name: int((~np.isfinite(shown[name])).sum()) for name in wanted})
                 given[index] = {name: to_tensor(shown[name][None]).to(device) for name in wanted}
             with torch.no_grad():
                 drawn = renderer(_joined([given[index] for index in this.frames]), weights)
@@ -239,8 +258,53 @@ def render_frames(
                 yield sums.pop(index) / np.float32(counts.pop(index))
     finally:
         renderer.train(was_training)
+        for name, count in (+unknown).items():
+            log.warning(
+                "%d values of %s are NaN or infinite: the network is given 0 for NaN, 0 or 1 for infinity",
+                count, name,
+            )  # fmt: skip
 
 
 def _joined(frames: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     """Frames (1, 3, 1, H, W) by name, one after another: (1, 3, K, H, W)."""
     return {name: torch.cat([frame[name] for frame in frames], 2) for name in frames[0]}
+
+
+# Guidance is sampled once in a pixel, a photograph is a mean over it: whatever starts from a buffer of
+# guidance does well to filter it first. Kernels that a network predicts are those of Bako et al.,
+# "Kernel-Predicting Convolutional Networks for Denoising Monte Carlo Renderings" (2017), sec. 4.1: a
+# softmax over the neighbours.
+
+
+def gaussian_logits(deviation: float, side: int) -> Tensor:
+    """Logarithms of a Gaussian's weights at the centres of ``side`` x ``side`` pixels: (side^2,).
+
+    Args:
+        deviation: in pixels, above 0.
+        side: odd; rows first.
+    """
+    steps = torch.arange(side) - side // 2
+    squares = steps[:, None] ** 2 + steps**2
+    return (-squares / (2 * deviation**2)).flatten()
+
+
+def filtered(video: Tensor, weights: Tensor) -> Tensor:
+    """Weighted sum of each pixel's neighbours; beyond the border the edge goes on.
+
+    Args:
+        video: (B, C, K, H, W).
+        weights: of the neighbours, rows first: (side^2,), or (B, side^2, K, H, W) for kernels of their own.
+
+    Returns:
+        (B, C, K, H, W).
+    """
+    count = weights.shape[0] if weights.ndim == 1 else weights.shape[1]
+    side = round(count**0.5)
+    reach, (height, width) = side // 2, video.shape[-2:]
+    wide = pad(video, (reach, reach, reach, reach, 0, 0), mode="replicate")
+    result = torch.zeros_like(video)
+    for k in range(count):
+        y, x = divmod(k, side)
+        weight = weights[k] if weights.ndim == 1 else weights[:, k : k + 1]
+        result = result + weight * wide[..., y : y + height, x : x + width]
+    return result

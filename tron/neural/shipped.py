@@ -5,17 +5,23 @@ Their files lie in the folder `shipped` beside this one as NAME.safetensors; its
 
 from __future__ import annotations
 
+import logging
+from functools import cache
 from pathlib import Path
 
 from tron.errors import TronError
 
+log = logging.getLogger(__name__)
+
 FOLDER = Path(__file__).with_name("shipped")
 SHIPPED = {
-    "lit": "of pbr, irradiance, lit, albedo and surface",
-    "pair": "of pbr and irradiance, the paper's buffers",
+    "surfaces": "of pbr, irradiance, lit, albedo and surface",
+    "paper": "of pbr and irradiance, the paper's buffers",
 }
 """Name -> what the network is given."""
-DEFAULT = "lit"
+FORMER_NAMES = {"lit": "surfaces", "pair": "paper"}
+"""Name that a checkpoint had in version 0.1 -> its name; these go with the next release."""
+DEFAULT = "surfaces"
 """The one that ``auto`` means."""
 AUTO = "auto"
 """What tron-relight is told unless it is told otherwise: :data:`DEFAULT` where that fits, otherwise none."""
@@ -48,4 +54,17 @@ def checkpoint_file(checkpoint: str | Path) -> Path:
     A name wins over a file that is called like it. Raises TronError where a name's file did not come with
     this installation.
     """
-    return shipped(str(checkpoint)) if str(checkpoint) in SHIPPED else Path(checkpoint)
+    name = str(checkpoint)
+    if name in FORMER_NAMES:
+        _say_renamed(name)
+    name = FORMER_NAMES.get(name, name)
+    return shipped(name) if name in SHIPPED else Path(checkpoint)
+
+
+@cache
+def _say_renamed(name: str) -> None:
+    log.warning(
+        "checkpoint '%s' is called '%s' now; the old name goes with the next release",
+        name,
+        FORMER_NAMES[name],
+    )

@@ -12,26 +12,30 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from diffusers.loaders.single_file_utils import convert_cosmos_transformer_checkpoint_to_diffusers
 from pydantic import ValidationError
 from safetensors.torch import save as serialize
 from torch import Tensor
 
 from tron.errors import TronError
-from tron.neural.backbone import Backbone, transformer
-from tron.neural.codecs import CODECS
+from tron.neural.codecs.published_files import (
+    existing,
+    folder_state,
+    load_strictly,
+    safetensors_state,
+    torch_state,
+)
+from tron.neural.codecs.registry import CODECS
 from tron.neural.configs import (
     PAPER_GUIDANCE,
     BackboneConfig,
     CosmosConfig,
     PixelMLPConfig,
     RendererConfig,
+    UNetConfig,
 )
-from tron.neural.pixel_mlp import PixelMLP
+from tron.neural.networks.pixel_mlp import PixelMLP
 from tron.neural.protocols import Codec, Renderer
-from tron.neural.published_files import existing, folder_state, load_strictly, safetensors_state, torch_state
 from tron.neural.renderer import NeuralRenderer
-from tron.neural.widening import widened
 from tron.storage import write_atomic
 
 log = logging.getLogger(__name__)
@@ -143,6 +147,8 @@ def load_cosmos(
     Raises:
         TronError: a path is missing (it names the file to download), unreadable, or of another shape.
     """
+    from tron.neural.networks.backbone import Backbone
+
     if not isinstance(config, RendererConfig):
         config = CosmosConfig.model_validate(config or {})
     shape = config.backbone
@@ -166,6 +172,10 @@ def load_cosmos(
 
 def load_cosmos_state(path: Path, config: BackboneConfig, channels: int) -> dict[str, Tensor]:
     """The transformer's weights in diffusers' names, float32, checked key by key against the config."""
+    from diffusers.loaders.single_file_utils import convert_cosmos_transformer_checkpoint_to_diffusers
+
+    from tron.neural.networks.backbone import transformer
+
     if path.is_dir():
         state = folder_state(path)
     else:
@@ -190,3 +200,44 @@ def _widened(weight: Tensor, latents: int, config: BackboneConfig, codec: Codec)
     split = codec.latent_channels * per_channel
     zeros = [torch.zeros_like(weight[:, :split])] * (latents - 1)
     return torch.cat([weight[:, :split], *zeros, weight[:, split:]], 1)
+
+
+# What is added begins at zero: columns of the first layer for the new buffers, and rows of the last for
+# shares of detail. So the wider network draws exactly what the other did, and learns from there what the
+# new buffers are worth.
+
+FIRST, LAST = "backbone.embed.weight", ("backbone.out.weight", "backbone.out.bias")
+
+
+def widened(state: dict[str, Tensor], narrow: RendererConfig, wide: NeuralRenderer) -> dict[str, Tensor]:
+    """The state of a U-Net of configuration ``narrow`` as one of ``wide``.
+
+    The same state where the two do not differ in their guidance alone, or in a ``skip_detail`` that is new.
+    """
+    config, shape = wide.config, wide.config.backbone
+    added = {"guidance": narrow.guidance, "skip_detail": narrow.skip_detail, "window": narrow.window}
+    if (
+        not isinstance(shape, UNetConfig)
+        or config.fusion != "concat"
+        or config.model_copy(update=added).model_dump() != narrow.model_dump()
+        or not set(narrow.guidance) < set(config.guidance)
+        or narrow.skip_detail not in (None, config.skip_detail)
+    ):
+        return state
+    channels, area = wide.codec.latent_channels, shape.patch**2
+    columns, rows = area * len(narrow.guidance) * channels, wide.state_dict()
+    whole = {FIRST, *LAST} <= state.keys() and state[FIRST].shape == (rows[FIRST].shape[0], columns)
+    if not whole or any(state[name].shape[0] % area for name in LAST):
+        return state  # damaged: whoever loads it says where
+    # Columns and rows of each pixel of a patch lie together: of a column block for each buffer, in order.
+    old = state[FIRST].unflatten(1, (area, len(narrow.guidance), channels))
+    new = old.new_zeros(*old.shape[:2], len(config.guidance), channels)
+    for place, name in enumerate(narrow.guidance):
+        new[:, :, config.guidance.index(name)] = old[:, :, place]
+    grown = {FIRST: new.flatten(1)}
+    for name in LAST:
+        old = state[name].unflatten(0, (area, -1))
+        new = old.new_zeros(area, rows[name].shape[0] // area, *old.shape[2:])
+        new[:, : old.shape[1]] = old
+        grown[name] = new.flatten(0, 1)
+    return state | grown

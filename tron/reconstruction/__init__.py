@@ -1,19 +1,21 @@
-"""From captures to relightable scenes: surfels with materials (stages 1 and 2) and their light (stage 3)."""
+"""From captures to relightable scenes: surfels (stage 1), materials (stage 2) and light (stage 3)."""
 
-from tron.reconstruction.environment import EnvironmentFit, fit_environment
-from tron.reconstruction.explanation import Explanation, explain
-from tron.reconstruction.joint import Joint
+from tron.reconstruction.light.fit_environment import EnvironmentFit, fit_environment
 from tron.reconstruction.pipeline import Reconstruction, reconstruct
+from tron.reconstruction.priors import GroundTruth, Joint, MapPrior, Precomputed, Prior, RgbX
 from tron.reconstruction.settings import FitSettings, ReconstructionSettings
 
 __all__ = [
     "EnvironmentFit",
-    "Explanation",
     "FitSettings",
+    "GroundTruth",
     "Joint",
+    "MapPrior",
+    "Precomputed",
+    "Prior",
     "Reconstruction",
     "ReconstructionSettings",
-    "explain",
+    "RgbX",
     "fit_environment",
     "reconstruct",
 ]

@@ -1,84 +1,108 @@
-"""Capture -> GaussianScene, the paper's Algorithm 1: radiance and geometry, then materials from priors.
+"""The one door from a capture to a relightable scene, whatever the prior (the paper's Algorithms 1 and 2).
 
 The run is a chain of stages with one checkpoint behind it: whoever calls again with the same capture,
-settings and checkpoint goes on where the last call was cut off.
+settings and checkpoint goes on where the last call was cut off. With a checkpoint, SIGTERM and Ctrl-C amid a
+stage finish the step in hand and keep it; before and between stages they end the call at once. A checkpoint
+is one safetensors file of everything that the next step depends on: numbers, and nothing that could run. It
+replaces the one before it, whole or not at all.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
 
 from tron.captures import Capture, View
 from tron.color import srgb_to_linear
 from tron.errors import TronError
-from tron.gaussians.fields import MATERIALS
 from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
-from tron.priors import Prior, Track, apply_prior, untracked
-from tron.reconstruction.checkpoint import Checkpoint, save_checkpoint
-from tron.reconstruction.enclosure import enclosed
-from tron.reconstruction.explanation import Explanation, explain
-from tron.reconstruction.initial import Beginning, beginning, extent_of, place_of, source_of
-from tron.reconstruction.joint import Joint
-from tron.reconstruction.joint_light import TooFewSeen
-from tron.reconstruction.settings import ReconstructionSettings
-from tron.reconstruction.surfels import LearntSurfels
-from tron.reconstruction.training import Plan, Stage, StepSummary, Watch, materials_plan, radiance_plan
+from tron.metrics import LPIPS
+from tron.reconstruction.geometry.initial import Beginning, beginning, extent_of, place_of, source_of
+from tron.reconstruction.geometry.seen_space import enclosed
+from tron.reconstruction.geometry.surfels import LearntSurfels
+from tron.reconstruction.geometry.training import (
+    Plan,
+    Stage,
+    StepSummary,
+    Watch,
+    materials_plan,
+    radiance_plan,
+)
+from tron.reconstruction.priors.prior import FIELDS, Light, Prior, Surfels
+from tron.reconstruction.progress import Track, untracked
+from tron.reconstruction.scores import ViewScore, score_views
+from tron.reconstruction.settings import FitSettings, ReconstructionSettings
+from tron.run_folder import RunFolder
+from tron.storage import write_atomic
+from tron.termination import Termination, termination_noted
 from tron.tracing import SurfelTracer
 
 log = logging.getLogger(__name__)
 
+TRAIN_VIEWS_SCORED = 8
 
-@dataclass(frozen=True)
+_LINE = "stopping behind the step in hand, with a checkpoint; once more after five seconds stops at once"
+_ORDER = ("radiance", "materials")
+_FORMAT = "tron-reconstruction 2"
+
+
+@dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """Result of stages 1 and 2.
+    """A relightable scene, its light, and how good they are.
 
     Attributes:
         scene: surfels with radiance and materials.
-        capture: the capture; its training views carry the prior's maps, if it gives any.
-        seconds: of the stages, those before an interruption included.
-        learnt: the materials that were learnt; the others are what surfels begin with.
+        light: None where none was asked for or none could be found, which the log says.
+        scores: figures of each held-out view ("test") and of at most TRAIN_VIEWS_SCORED others ("train").
+        learnt: the materials that were found; the others are what surfels begin with.
+        gains: (V, 3) linear exposure and white balance of the training photos, where the prior finds them.
         source: of the first surfels.
         confident: share of the subject's pixels whose depth stereo found and other photos confirm; None where
             stereo was not asked.
-        explanation: light and materials together, where the prior is :class:`Joint`.
+        seconds: of surfels with materials, those before an interruption included, and of the light.
     """
 
     scene: GaussianScene
-    capture: Capture
-    seconds: float
+    light: Light | None
+    scores: dict[str, list[ViewScore]]
     learnt: tuple[str, ...]
+    gains: np.ndarray | None
     source: str
     confident: float | None
-    explanation: Explanation | None = None
+    seconds: dict[str, float]
 
 
 def reconstruct(
     capture: Capture,
-    prior: Prior | Joint,
+    prior: Prior,
     settings: ReconstructionSettings,
     *,
+    light: FitSettings | None = None,
     checkpoint: Path | None = None,
-    device: str = "cpu",
+    lpips: LPIPS | None = None,
     watch: Watch | None = None,
     track: Track = untracked,
 ) -> Reconstruction:
-    """Find the surfels of a capture, whose images are display values.
+    """Find surfels, materials and light of a capture, whose images are display values.
 
     Args:
-        capture: training views are learnt from, the others never looked at.
-        prior: gives normals to stage 1 and materials to stage 2, as far as it can; ``Joint`` finds materials
-            and light together after stage 1.
+        capture: training views are learnt from, the others only scored.
+        prior: gives normals to stage 1, and finds materials and light on its surfels.
         settings: schedules, rates, seed.
+        light: settings of the light's fit; None finds no light.
         checkpoint: file to keep the state in and to go on from; None keeps none.
-        device: torch's, that of the active Mitsuba variant.
+        lpips: scores LPIPS as well.
         watch: called after each step.
         track: wraps long loops.
 
@@ -98,53 +122,61 @@ def reconstruct(
             f"view {linear[0]}",
             "encode it for display",
         )
-    run = _Run(settings, made_with(capture, prior, settings), checkpoint, device, watch)
+    prior.check(capture)
+    run = _Run(settings, made_with(capture, prior, settings), checkpoint, watch)
     extent = extent_of(views)
     source_of(capture, settings.initial)  # a lacking one is told before a prior works for hours
-    taught, given = capture, False
-    if settings.radiance.normal > 0 and not isinstance(prior, Joint):
-        taught = apply_prior(capture, prior, fields=["normal"], track=track)
-        given = any(view.has("normal") for view in taught.train_views)
+    fields = [name for name in FIELDS if name != "normal" or settings.radiance.normal > 0]
+    taught = prior.teach(capture, fields, track)
+    given = taught is not capture and any(view.has("normal") for view in taught.train_views)
     most = settings.radiance.density.most
-    first = run.begin(lambda: beginning(taught, settings.initial, settings.seed, most, device, track))
+    first = run.begin(lambda: beginning(taught, settings.initial, settings.seed, most, track))
     radiance = settings.radiance.scaled(settings.steps_scaler, place_of(run.begun["source"]))
+    given &= settings.radiance.normal > 0
     plan = radiance_plan(radiance, extent, settings.seed, normals_given=given, tone_curve=capture.tone_curve)
     surfels = run.stage(plan, taught.train_views, first)
-    scene = surfels.scene(settings.initial.kernel_degree, capture.up)
+    degree = settings.initial.kernel_degree
+    scene = replace(surfels.scene(degree, capture.up), offset=capture.offset)
     if settings.indoors and not run.past(plan.name):
         scene = enclosed(scene, views, settings.seed, track)
-    if isinstance(prior, Joint):
-        try:
-            found = explain(capture, scene, prior, settings.seed, device, track)
-        except TooFewSeen as error:  # surfaces were not found: that is no reason to lose what was
-            log.warning("%s: base color is what the photos show, and there is no environment.exr", error)
-            return Reconstruction(
-                _with_baked_color(scene).validate(), capture, run.seconds(), (), **run.begun
-            )
-        return Reconstruction(
-            found.scene.validate(), capture, run.seconds(), MATERIALS, explanation=found, **run.begun
-        )
-
-    tracer = SurfelTracer(scene)
-    taught = apply_prior(
-        capture, prior, gbuffers=lambda view: tracer.gbuffer(view.camera).numpy(), track=track
-    )
-    fields = tuple(name for name in MATERIALS if any(view.has(name) for view in taught.train_views))
-    plan = materials_plan(settings.materials.scaled(settings.steps_scaler))
-    plan = plan.learning(fields)
     scene = _with_baked_color(scene)
-    if fields:
-        learners = [view for view in taught.train_views if any(view.has(name) for name in fields)]
-        scene = run.stage(plan, learners, lambda: scene).scene(settings.initial.kernel_degree, capture.up)
-    for name in (name for name in MATERIALS if name not in fields):
-        log.warning("no prior for %s: it stays what surfels begin with", name)
-    return Reconstruction(scene.validate(), taught, run.seconds(), fields, **run.begun)
+
+    def learn(names: Collection[str]) -> GaussianScene:
+        plan = materials_plan(settings.materials.scaled(settings.steps_scaler)).learning(names)
+        learners = [view for view in taught.train_views if any(view.has(name) for name in names)]
+        learnt = run.stage(plan, learners, lambda: scene).scene(degree, capture.up)
+        return replace(learnt, offset=capture.offset)
+
+    frozen = Surfels(taught, scene, learn, settings.seed, track)
+    found = prior.find_materials(frozen)
+    tracer = SurfelTracer(found.scene.validate())
+    seconds, started = {"surfels": run.seconds()}, time.perf_counter()
+    lit = None
+    if light is not None:
+        lit = found.light or prior.find_light(frozen, tracer, light)
+    seconds["light"] = time.perf_counter() - started
+    judged = {"test": capture.test_views, "train": views[:: max(1, len(views) // TRAIN_VIEWS_SCORED)]}
+    background = settings.radiance.background
+    scores = {which: score_views(tracer, some, background, lpips, track) for which, some in judged.items()}
+    return Reconstruction(found.scene, lit, scores, found.learnt, found.gains, seconds=seconds, **run.begun)
 
 
-def made_with(capture: Capture, prior: Prior | Joint, settings: ReconstructionSettings) -> dict[str, Any]:
-    """All that a reconstruction is a function of, as plain values: a checkpoint of others is refused."""
+def made_with(capture: Capture, prior: Prior, settings: ReconstructionSettings) -> dict[str, Any]:
+    """All that surfels are a function of, as plain values: a checkpoint of others is refused."""
     values = settings.model_dump(mode="json", exclude={"checkpoint_every"})
     return {"capture": capture.content, "prior": repr(prior), **values}
+
+
+def require_same_run(
+    checkpoint: Path, capture: Capture, prior: Prior, settings: ReconstructionSettings
+) -> None:
+    """Raise TronError where a checkpoint is damaged or of another run; nothing where there is none."""
+    if checkpoint.exists():
+        Checkpoint(checkpoint).require(made_with(capture, prior, settings))
+
+
+class _Stopped(Exception):
+    """End of a stage that was asked to end; what asked for it is raised in its place."""
 
 
 class _Run:
@@ -155,14 +187,14 @@ class _Run:
         settings: ReconstructionSettings,
         values: Mapping[str, Any],
         path: Path | None,
-        device: str,
         watch: Watch | None,
     ) -> None:
-        self.settings, self.values, self.path, self.device, self.watch = settings, values, path, device, watch
+        self.settings, self.values, self.path, self.watch = settings, values, path, watch
         self.found = Checkpoint(path) if path is not None and path.exists() else None
         self.before = self.found.seconds if self.found else 0.0
         self.begun: dict[str, Any] = self.found.begun if self.found else {}
         self.started = time.perf_counter()
+        self._termination = Termination()
         if self.found is not None:
             self.found.require(self.values)
             log.info("resuming from step %d of stage %s", self.found.step, self.found.stage)
@@ -184,17 +216,27 @@ class _Run:
         return self.found is not None and _ORDER.index(self.found.stage) > _ORDER.index(stage)
 
     def stage(self, plan: Plan, views: Sequence[View], begin: Callable[[], GaussianScene]) -> LearntSurfels:
-        """Run a stage to its end, from the checkpoint if that lies in it or behind it."""
+        """Run a stage to its end, from the checkpoint if that lies in it or behind it.
+
+        Raises:
+            KeyboardInterrupt, SystemExit: SIGINT or SIGTERM came; the step that was in hand is kept.
+        """
+        if self.path is None:
+            return self._stage(plan, views, begin)
+        with termination_noted(_LINE) as self._termination:
+            return self._stage(plan, views, begin)
+
+    def _stage(self, plan: Plan, views: Sequence[View], begin: Callable[[], GaussianScene]) -> LearntSurfels:
         degree, seed = self.settings.initial.kernel_degree, self.settings.seed
         found = self.found
         if found is not None and self.past(plan.name):
             # A later stage is under way: this one's surfels are those of the checkpoint.
-            return found.surfels(plan.rates, self.device)
+            return found.surfels(plan.rates)
         if found is not None and found.stage == plan.name:
-            stage = Stage(plan, views, found.surfels(plan.rates, self.device), degree, seed)
+            stage = Stage(plan, views, found.surfels(plan.rates), degree, seed)
             found.resume(stage)
         else:
-            surfels = LearntSurfels.of_scene(begin(), plan.rates, self.device)
+            surfels = LearntSurfels.of_scene(begin(), plan.rates)
             stage = Stage(plan, views, surfels, degree, seed)
         stage.run(self._after)
         self._save(stage)
@@ -205,16 +247,101 @@ class _Run:
             self._save(stage)
         if self.watch is not None:
             self.watch(progress, stage)
+        if self._termination.asked:
+            self._save(stage)
+            log.info("stopped: step %d of stage %s is kept", progress.step, progress.stage)
+            raise _Stopped
 
     def _save(self, stage: Stage) -> None:
         if self.path is not None:
             save_checkpoint(self.path, stage, self.values, self.seconds(), self.begun)
 
 
-_ORDER = ("radiance", "materials")
-
-
 def _with_baked_color(scene: GaussianScene) -> GaussianScene:
     """Base color begins as the radiance of all directions, decoded from sRGB."""
     baked = srgb_to_linear(np.clip(SH_C0 * scene.sh[:, 0] + 0.5, 0, 1))
     return replace(scene, base_color=baked.astype(np.float32))
+
+
+def save_checkpoint(
+    path: Path,
+    stage: Stage,
+    made_with: Mapping[str, Any],
+    seconds: float,
+    begun: Mapping[str, Any] | None = None,
+) -> None:
+    """Write where a stage stands.
+
+    Args:
+        path: the file.
+        stage: under way, between two steps.
+        made_with: plain values that a run must share to go on from here.
+        seconds: spent on the run so far.
+        begun: plain values that tell how the first surfels were found.
+    """
+    tensors = stage.surfels.state()
+    if stage.plan.density is not None:
+        tensors |= stage.plan.density.state()
+    for part in (stage.exposures, stage.fused):
+        tensors |= part.state() if part is not None else {}
+    about = {
+        **{"stage": stage.plan.name, "step": stage.step, "psnr": stage.psnr, "seconds": seconds},
+        "begun": dict(begun or {}),
+    }
+    metadata = {
+        "format": _FORMAT,
+        "about": json.dumps(about),
+        "made_with": json.dumps(made_with, sort_keys=True),
+    }
+    on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    write_atomic(path, save(on_cpu, metadata))
+
+
+class Checkpoint:
+    """A checkpoint that was read.
+
+    Raises:
+        TronError: the file is unreadable or no such checkpoint.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                if metadata.get("format") != _FORMAT:
+                    raise TronError("not a checkpoint of a reconstruction", path, "remove it to begin anew")
+                about = json.loads(metadata["about"])
+                self.made_with: dict[str, Any] = json.loads(metadata["made_with"])
+                self.tensors: dict[str, Tensor] = {n: file.get_tensor(n) for n in file.keys()}  # noqa: SIM118 (no mapping)
+        except (SafetensorError, OSError, KeyError, ValueError) as error:
+            raise TronError(
+                f"cannot read the checkpoint: {error}", path, "remove it to begin anew"
+            ) from error
+        self.stage: str = about["stage"]
+        self.step: int = about["step"]
+        self.psnr: float = about["psnr"]
+        self.seconds: float = about["seconds"]
+        self.begun: dict[str, Any] = about["begun"]
+
+    def require(self, values: Mapping[str, Any]) -> None:
+        """Raise TronError, naming the first key that differs, unless the checkpoint was made with these."""
+        mend = "give the same settings, another output_dir, or overwrite=true"
+        RunFolder(self.path, "a checkpoint", mend=mend).require(values, self.made_with)
+
+    def surfels(self, rates: Mapping[str, float]) -> LearntSurfels:
+        """The surfels as they were, moments of Adam included."""
+        try:
+            return LearntSurfels.of_state(self.tensors, rates)
+        except KeyError as error:
+            raise TronError(f"the checkpoint lacks {error}", self.path, "remove it to begin anew") from error
+
+    def resume(self, stage: Stage) -> None:
+        """Bring a stage that holds :meth:`surfels` to the checkpoint's step."""
+        stage.step, stage.psnr = self.step, self.psnr
+        if stage.plan.density is not None:
+            stage.plan.density.restore(self.tensors, stage.surfels.device)
+        if stage.exposures is not None:
+            stage.exposures.restore(self.tensors)
+        if stage.fused is not None:
+            stage.fused.restore(self.tensors, stage.surfels.device)

@@ -1,13 +1,13 @@
 """Settings of a reconstruction: its beginning, and stages 1 (radiance), 2 (materials) and 3 (light).
 
-The schedule is that of 3DGRT, which the paper inherits (docs/reconstruction.md): 30,000 steps, then 7,000.
+The schedule is 3DGRT's, which the paper inherits (docs/concepts/reconstruction.md): 30,000 steps, then 7,000.
 A machine without a GPU takes fewer of them: ``scaled`` shortens every schedule at once, as gsplat's
 ``steps_scaler`` does, and lets surfels move and turn faster, since otherwise they would not arrive.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, ClassVar, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -28,7 +28,6 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-Truncation = Annotated[float, Field(gt=0, description="Voxels at which fused distances are cut off.")]
 Smoothing = Annotated[float, Field(ge=0, description="Gaussian that smooths the fused field, voxels.")]
 MostVoxels = Annotated[
     int, Field(ge=8, le=1024, description="Maximum number of voxels along the scene's longest side.")
@@ -38,7 +37,7 @@ MostVoxels = Annotated[
 class FusionSettings(Settings):
     """Fusion of the views' depths, and what they agree on; smoothed little, as rendered depths need."""
 
-    truncation: Truncation = 4.0
+    truncation: ClassVar[float] = 4.0  # voxels at which fused distances are cut off
     sigma: Smoothing = 1.0
     most_voxels: MostVoxels = 160
 
@@ -57,13 +56,11 @@ class StereoSettings(FusionSettings):
         default=4, ge=1, description="Neighbours that count, those that agree best: others are hidden."
     )
     radius: int = Field(default=2, ge=1, description="Radius of the compared windows, pixels.")
-    smooth_small: float = Field(
-        default=0.02,
-        ge=0,
-        description="Semi-global matching: price of one plane's difference to a pixel beside.",
-    )
     smooth_large: float = Field(
-        default=0.2, ge=0, description="The same of a larger difference; 0 decides each pixel by itself."
+        default=0.2,
+        ge=0,
+        description="Semi-global matching: price of a difference of several planes to a pixel beside; 0 "
+        "decides each pixel by itself.",
     )
     confident: float = Field(
         default=0.55, ge=0, le=1, description="Least likeness, 1 - cost, of a depth that is fused."
@@ -78,14 +75,8 @@ class StereoSettings(FusionSettings):
         description="Weight in the fusion of depths that no other photo confirms, where a mask tells of a "
         "surface.",
     )
-    truncation: Truncation = 6.0
+    truncation: ClassVar[float] = 6.0  # depths by stereo are noisier than rendered ones
     sigma: Smoothing = 1.5
-    fewest: float = Field(
-        default=0.05,
-        ge=0,
-        le=1,
-        description="Share of pixels with a confirmed depth, below which stereo has found nothing.",
-    )
 
 
 class InitialSettings(Settings):
@@ -97,9 +88,7 @@ class InitialSettings(Settings):
         "comparing the photos, or random points in the cameras' box; auto: points that are dense, else depth "
         "where there is any, else stereo, and where it finds nothing points or random ones.",
     )
-    stereo: StereoSettings = Field(
-        default_factory=lambda: StereoSettings(), description="Depth by comparing photos."
-    )
+    stereo: StereoSettings = Field(default=StereoSettings(), description="Depth by comparing photos.")
     count: int = Field(
         default=5000, ge=4, description="Approximate number of surfels made from depth maps or random points."
     )
@@ -149,16 +138,6 @@ class ConsistencySettings(FusionSettings):
     )
     every: int = Field(default=7500, ge=1, description="Steps between two fusions of all views' depths.")
     sigma: Smoothing = 3.0
-    refine: float = Field(
-        default=0.0,
-        ge=0,
-        description="Widths of a pixel by which depths may move to where photos agree best before they are "
-        "fused; 0 leaves them.",
-    )
-    refine_steps: int = Field(default=4, ge=1, description="Depths that are tried to either side.")
-    photos: StereoSettings = Field(
-        default_factory=lambda: StereoSettings(), description="How photos are compared for that."
-    )
 
 
 class RadianceSettings(Settings):
@@ -192,17 +171,9 @@ class RadianceSettings(Settings):
         default=True,
         description="Find the exposure and white balance of each photo; false takes all as exposed alike.",
     )
-    bystanders: float = Field(
-        default=0.0,
-        ge=0,
-        description="Leave out patches of a photo whose error is so many times the usual one (3 is a good "
-        "number), as passers-by have; 0 leaves out none.",
-    )
-    density: DensitySettings = Field(
-        default_factory=lambda: DensitySettings(), description="Surfels added and removed."
-    )
+    density: DensitySettings = Field(default=DensitySettings(), description="Surfels added and removed.")
     consistency: ConsistencySettings = Field(
-        default_factory=lambda: ConsistencySettings(),
+        default=ConsistencySettings(),
         description="Normals pulled to those that all views' depths agree on, where no prior gives any.",
     )
 
@@ -252,11 +223,9 @@ class MaterialSettings(Settings):
 class ReconstructionSettings(Settings):
     """Reconstruction of surfels: the paper's, a tenth as long, with what so short a schedule needs."""
 
-    initial: InitialSettings = Field(
-        default_factory=lambda: InitialSettings(), description="Source of the first surfels."
-    )
-    radiance: RadianceSettings = Field(default_factory=lambda: RadianceSettings(), description="Stage 1.")
-    materials: MaterialSettings = Field(default_factory=lambda: MaterialSettings(), description="Stage 2.")
+    initial: InitialSettings = Field(default=InitialSettings(), description="Source of the first surfels.")
+    radiance: RadianceSettings = Field(default=RadianceSettings(), description="Stage 1.")
+    materials: MaterialSettings = Field(default=MaterialSettings(), description="Stage 2.")
     indoors: bool = Field(
         default=False,
         description="Photos taken in a room: where none shows what bounds it, such as a ceiling, surfels of "
@@ -303,11 +272,7 @@ class FitSettings(Settings):
         description="Texels along a face edge of the coarsest level that log radiance is a sum of; "
         "resolution or more fits each texel by itself, which gives the same irradiance and a noisy map.",
     )
-    points_per_view: int = Field(
-        default=1 << 16, ge=1, description="Maximum number of surface points of a view."
-    )
     scale_steps: int = Field(default=200, ge=0, description="Updates of the scale; 0 leaves it at 1.")
-    scale_learning_rate: float = Field(default=0.1, gt=0, description="Initial learning rate, in log sigma.")
     scale_views: int = Field(
         default=8, ge=1, description="Maximum number of photos that the scale is fitted to."
     )

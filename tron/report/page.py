@@ -1,22 +1,27 @@
-"""Blocks that a report is made of: whoever reports fills them in without a word of HTML."""
+"""Blocks that a report is made of, filled in without a word of HTML, and numbers with their units as text."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
 
 Tone = Literal["plain", "good", "bad", "strong", "faint"]
-
-
-@dataclass(frozen=True)
-class Text:
-    """A paragraph of plain text."""
-
-    kind: ClassVar[str] = "text"
-    text: str
+MINUS = "\N{MINUS SIGN}"
+_STYLES = {
+    "fraction": (100, 2, "%"),
+    "s": (1, 0, " s"),
+    "deg": (1, 2, "°"),
+    "1": (1, 3, ""),
+    "x": (1, 2, "×"),
+    "surfels": (1, 0, " surfels"),
+    "views": (1, 0, " views"),
+    "kills": (1, 0, " kills"),
+    "frames/h": (1, 0, " frames/h"),
+}
+"""Unit -> factor, decimals, what is written behind the number."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +100,7 @@ class Film:
     """A short silent film that plays on and on.
 
     Attributes:
-        video: bytes of an MP4 (:mod:`tron.video`).
+        video: bytes of an MP4 (:mod:`tron.io.video`).
         size: width and height, pixels.
         title: words under it.
         alt: words in its place.
@@ -120,7 +125,7 @@ class Films:
 
 @dataclass(frozen=True)
 class Chart:
-    """Inline SVG (such as :mod:`eval.report.charts` makes) with a caption and a text in its place."""
+    """Inline SVG (such as :mod:`tron.report.charts` makes) with a caption and a text in its place."""
 
     kind: ClassVar[str] = "chart"
     svg: str
@@ -128,16 +133,7 @@ class Chart:
     alt: str
 
 
-Block = Text | Code | Table | Pictures | Films | Chart
-
-
-@dataclass(frozen=True)
-class Section:
-    """A part of the page with an entry in its table of contents; ``name`` is its anchor."""
-
-    name: str
-    title: str
-    blocks: Sequence[Block]
+Block = Code | Table | Pictures | Films | Chart
 
 
 @dataclass(frozen=True)
@@ -151,14 +147,24 @@ class Tile:
     tone: Tone = "plain"
 
 
-@dataclass(frozen=True)
-class Page:
-    """A whole report; ``brand`` says behind the project's name what kind it is."""
+def format_value(value: float, unit: str, signed: bool = False) -> str:
+    """A figure with its unit: fractions as percent, seconds as minutes too or with decimals.
 
-    title: str
-    verdict: str
-    lead: Sequence[str]
-    tiles: Sequence[Tile]
-    sections: Sequence[Section] = field(default_factory=list)
-    footer: str = ""
-    brand: str = "benchmark report"
+    >>> format_value(0.0123, "fraction"), format_value(31.456, "dB"), format_value(754, "s")
+    ('1.23%', '31.46 dB', '12 min 34 s')
+    """
+    if unit == "s" and not signed and abs(value) >= 60:
+        minutes, seconds = divmod(round(value), 60)
+        return f"{minutes} min {seconds} s"
+    if unit == "abs":  # errors of computation, many orders below one
+        return f"{value:.1e}".replace("-", MINUS)
+    scale, digits, suffix = _STYLES.get(unit, (1, 2, f" {unit}"))
+    if unit == "s" and abs(value) < 10:
+        digits = 2
+    value = round(scale * value, digits) + 0.0  # adding zero turns a negative zero into zero
+    return f"{value:{'+' if signed and value else ''}.{digits}f}{suffix}".replace("-", MINUS)
+
+
+def suffix(unit: str) -> str:
+    """Sign or words that :func:`format_value` writes behind the number: ``%``, ``°``, `` dB``."""
+    return _STYLES.get(unit, (1, 2, f" {unit}"))[2]

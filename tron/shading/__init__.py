@@ -6,15 +6,13 @@ Everything here is linear and scene-referred; exposure and AgX come at the very 
 """
 
 from tron.estimation import Estimation
-from tron.shading.background import background_share
-from tron.shading.bounce import BouncedLight, BounceTransport
-from tron.shading.cubemap import CubemapLight
-from tron.shading.environment import EnvironmentLight, EnvironmentMap
-from tron.shading.fixed_rays import FixedRays
+from tron.shading.bounces.bounce import BouncedLight, BounceTransport
+from tron.shading.composition import background_share
+from tron.shading.direct.irradiance import irradiance
+from tron.shading.environments.cubemap import CubemapLight
+from tron.shading.environments.environment import EnvironmentLight, EnvironmentMap
 from tron.shading.guidance import Guidance, render_guidance
-from tron.shading.irradiance import irradiance
-from tron.shading.lighting import Lighting
-from tron.shading.split_sum import SplitSum
+from tron.shading.lighting import Lighting, SplitSum
 
 __all__ = [
     "BounceTransport",
@@ -23,7 +21,6 @@ __all__ = [
     "EnvironmentLight",
     "EnvironmentMap",
     "Estimation",
-    "FixedRays",
     "Guidance",
     "Lighting",
     "SplitSum",

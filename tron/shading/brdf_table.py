@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from tron.aligned import aligned
+from tron.runtime import aligned
 
 TABLE_SIZE = 256
 TABLE_SAMPLES = 32

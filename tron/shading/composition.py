@@ -1,9 +1,10 @@
 """Light that arrives at a surface -> radiance that leaves it towards a view: one formula for every picture.
 
     pbr         kd U + S                       nothing in the way
-    shadowed    kd E + S                       shadows on the diffuse part
-    lit         kd (E + I) + o S + ks M        and light that has met the scene
+    shadowed    kd' E + S                      shadows on the diffuse part
+    lit         kd' E + kd I + o S + ks M      and light that has met the scene
 
+kd' is kd for the directions that light arrives from (:mod:`tron.shading.burley`), kd that of even light.
 U is the unshadowed irradiance / pi, E what arrives of it, I the irradiance / pi of bounced light, S the
 split-sum specular of the environment alone, o the share of it that escapes the scene, M the mean radiance
 over the lobe of the scene that is in the way of the rest. kd and ks are those of
@@ -18,18 +19,27 @@ above openness alone.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from tron.estimation import Diffuse
+from tron.shading.direct.visibility import shading_normal
+from tron.shading.lighting import SplitSum
 from tron.shading.reflectance import reflectance
-from tron.shading.split_sum import SplitSum
-from tron.shading.visibility import shading_normal
+from tron.tracing.hierarchy.transmittance import OPAQUE_TRANSMITTANCE
 
 if TYPE_CHECKING:
     from tron.tracing import Surface
+
+
+CLEAR_TRANSMITTANCE = 0.25
+"""From here on what lies behind is seen with its full share."""
+_END = 1 / 64
+"""The transition is 0 and 1 in float32 this near its ends, where its terms would overflow."""
+Array = TypeVar("Array")
 
 
 @dataclass
@@ -49,29 +59,46 @@ class Bounced:
 
 @dataclass
 class Response:
-    """A surface under the environment, towards its view: kd, ks, U and S, one lane each, linear."""
+    """A surface under the environment, towards its view: kd, kd', ks, U and S, one lane each, linear."""
 
     diffuse: mi.Color3f
+    arriving: mi.Color3f
     lobe: mi.Color3f
     unshadowed: mi.Color3f
     specular: mi.Color3f
 
     @classmethod
-    def of(cls, surface: Surface, split_sum: SplitSum, diffuse: Diffuse) -> Response:
-        """The response along the surface's own rays; differentiable by material, normal and light."""
+    def of(
+        cls, surface: Surface, split_sum: SplitSum, diffuse: Diffuse, terms: mi.Vector3f | None = None
+    ) -> Response:
+        """The response along the surface's own rays; differentiable by material, normal and light.
+
+        ``terms`` as of :func:`reflectance`, for kd'; without them it is kd.
+        """
         normal, to_camera = shading_normal(surface), -surface.direction
-        share = reflectance(surface, split_sum.brdf, dr.dot(normal, to_camera), diffuse)
+        cosine = dr.dot(normal, to_camera)
+        share = reflectance(surface, split_sum.brdf, cosine, diffuse)
+        arriving = share.diffuse
+        if terms is not None:
+            arriving = reflectance(surface, split_sum.brdf, cosine, diffuse, terms).diffuse
         mirrored = split_sum.reflected(normal, to_camera, surface.roughness)
-        return cls(share.diffuse, share.specular, split_sum.diffuse(normal), mirrored * share.specular)
+        return cls(
+            share.diffuse, arriving, share.specular, split_sum.diffuse(normal), mirrored * share.specular
+        )
+
+    def open(self) -> mi.Color3f:
+        """Radiance with nothing in the way."""
+        return self.diffuse * self.unshadowed + self.specular
 
     def direct(self, irradiance: mi.Color3f) -> mi.Color3f:
         """Radiance of direct light, of which ``irradiance`` / pi arrives."""
-        return self.diffuse * irradiance + self.specular
+        return self.arriving * irradiance + self.specular
 
     def lit(self, irradiance: mi.Color3f, bounced: Bounced) -> mi.Color3f:
         """Radiance of all light: ``irradiance`` / pi of it is direct."""
         return (
-            self.diffuse * (irradiance + bounced.indirect)
+            self.arriving * irradiance
+            + self.diffuse * bounced.indirect
             + bounced.openness * self.specular
             + self.lobe * bounced.mirrored
         )
@@ -90,3 +117,33 @@ def evenly_bounced(
     """
     share = dr.lerp(mi.Color3f(openness), dr.minimum(visibility, 1), roughness)
     return Bounced(indirect, share, indirect)
+
+
+def background_share(transmittance: Array) -> Array:
+    """Weight in [0, 1] of the radiance behind surfels, by their transmittance T; theirs is one minus it.
+
+        share(T) = 0                                            T <= 0.01
+                   T / (1 + exp(1/s - 1/(1 - s)))               s = (T - 0.01) / (0.25 - 0.01)
+                   T                                            T >= 0.25
+
+    Surfels that make up a solid leave a few thousandths of the light, a hundredth of all rays more than two
+    hundredths. That is invisible until a sun stands behind: its radiance may be 10^4 times exposed white. So
+    a transmittance below 0.01 counts as none, as it does for shadow rays, and the rest comes back by the
+    smooth transition function, which is flat to every order at both ends: at T = 0.026 it lets through 10^-8.
+    The share is smooth and monotone. What is shaded has the weight 1 - share, so that opaque surfels are not
+    dimmed either. Opacity itself, which is the mask, stays 1 - T.
+
+    Args:
+        transmittance: 1 - opacity of the surfels along a ray, any shape, in [0, 1]; differentiable if it is
+            of Dr.Jit's.
+    """
+    arrays, choose = (np, np.where) if isinstance(transmittance, np.ndarray) else (dr, dr.select)
+    along = (transmittance - OPAQUE_TRANSMITTANCE) / (CLEAR_TRANSMITTANCE - OPAQUE_TRANSMITTANCE)
+    along = arrays.clip(along, _END, 1 - _END)
+    transition = 1 / (1 + arrays.exp(1 / along - 1 / (1 - along)))
+    return choose(transmittance > OPAQUE_TRANSMITTANCE, transmittance * transition, 0)
+
+
+def over_background(shaded: mi.Color3f, behind: mi.Color3f, opacity: mi.Float) -> mi.Color3f:
+    """Linear radiance of surfels of this ``opacity`` in front of ``behind``; of none, ``behind`` alone."""
+    return dr.select(opacity > 0, dr.lerp(shaded, behind, background_share(1 - opacity)), behind)

@@ -1,45 +1,47 @@
 """G-buffer + environment -> guidance: the buffers that the neural renderer is conditioned on.
 
-    pbr         unshadowed split-sum
+    pbr         unshadowed split-sum, as of even light
     irradiance  what a white diffuse surface sends out, shadows included: U times the share that arrives
     shadowed    direct light, with shadows on the diffuse part
-    indirect    irradiance / pi by light that bounced between the surfels (:mod:`tron.shading.bounce`)
+    indirect    irradiance / pi by light that bounced between the surfels (:mod:`tron.shading.bounces.bounce`)
     lit         all light: what a path tracer shows
 
 The formulas are those of :mod:`tron.shading.composition`; U is the unshadowed irradiance / pi. The n-ray
 estimates of shadowed and unshadowed irradiance share their rays, so the share that arrives keeps the shadows
 and sheds the noise of the light, and U, which has none, puts the light back (Heitz et al. 2018). From 16 rays
-it is their ratio, below a regression that is not biased in shadow (:mod:`tron.shading.few_rays`). At 64 rays
-under a sun this takes the relative error from 0.13 to 0.04; irradiance over unshadowed is exactly 1 where
-nothing is in the way. :class:`tron.estimation.Estimation` chooses, also the paper's plain mean.
+it is their ratio, below a regression that is not biased in shadow (:mod:`tron.shading.direct.visibility`). At
+64 rays under a sun this takes the relative error from 0.13 to 0.04; irradiance over unshadowed is exactly 1
+where nothing is in the way. :class:`tron.estimation.Estimation` chooses, also the paper's plain mean.
 
 Every buffer shows the environment where surfels are absent: (1 - share) x shaded + share x radiance seen,
-with the share of :mod:`tron.shading.background`, exactly 0 behind opaque surfels. All of it is linear;
+with the share of :mod:`tron.shading.composition`, exactly 0 behind opaque surfels. All of it is linear;
 exposure and AgX are applied when a buffer is looked at or loaded.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from tron.cameras import Camera
+from tron.color import to_display
 from tron.estimation import FINAL, Diffuse, Estimation
-from tron.shading.background import over_background
-from tron.shading.bounce import BouncedLight
-from tron.shading.composition import Bounced, Response, evenly_bounced
-from tron.shading.irradiance import Occluder
+from tron.io.images import write_image
+from tron.shading.bounces.bounce import BouncedLight
+from tron.shading.composition import Bounced, Response, evenly_bounced, over_background
+from tron.shading.direct.irradiance import Occluder
+from tron.shading.direct.visibility import Shadows, visibility_and_terms
 from tron.shading.lighting import Lighting
-from tron.shading.reflections import Mirror, reflections
-from tron.shading.supersampling import averaged, averaged_surface
-from tron.shading.visibility import Shadows, visibility
+from tron.shading.reflections import Mirror, metal_reflections, reflections, with_metals
 
 if TYPE_CHECKING:
-    from tron.cameras import Camera
     from tron.tracing import GBuffer, Surface
 
 
@@ -64,7 +66,8 @@ class Guidance:
         lit: (H, W, 3) radiance with bounced light; ``shadowed`` where none was baked.
         mask: (H, W) opacity of the surfels in [0, 1].
         gbuffer: ``GBuffer.numpy()``, which is no buffer of its own; of sub-pixels the means
-            (:func:`tron.shading.supersampling.averaged_surface`).
+            (:func:`tron.shading.guidance.averaged_surface`).
+        lighting: the light it is of, whose exposure pictures have.
     """
 
     pbr: np.ndarray
@@ -75,6 +78,7 @@ class Guidance:
     lit: np.ndarray
     mask: np.ndarray
     gbuffer: dict[str, np.ndarray]
+    lighting: Lighting | None = None
     BUFFERS: ClassVar[tuple[str, ...]]
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -83,8 +87,28 @@ class Guidance:
             raise KeyError(name)
         return np.atleast_3d(getattr(self, name))
 
+    def write(self, path: str | os.PathLike[str], name: str = "lit", exposure: float | None = None) -> None:
+        """Write a buffer: as a picture to .png or .jpg, its linear values to .exr or .hdr.
 
-Guidance.BUFFERS = tuple(field.name for field in fields(Guidance) if field.name != "gbuffer")
+        Args:
+            path: of the file; its suffix chooses.
+            name: one of :attr:`BUFFERS`. Pictures of light are exposed and go through AgX.
+            exposure: factor before AgX; None: the light's.
+
+        Raises:
+            TronError: the light has no exposure, or the file cannot be written.
+        """
+        image = self[name]
+        if Path(path).suffix.lower() in (".png", ".jpg", ".jpeg") and name != "mask":
+            if exposure is None:
+                exposure = 1.0 if self.lighting is None else self.lighting.exposure()
+            image = to_display(image, exposure)
+        write_image(path, image)
+
+
+Guidance.BUFFERS = tuple(
+    field.name for field in fields(Guidance) if field.name not in ("gbuffer", "lighting")
+)
 
 
 @dataclass
@@ -94,15 +118,19 @@ class Arriving:
     Attributes:
         visibility: share of the unshadowed irradiance that arrives, by channel.
         mirror: by reflection rays; None without.
+        metals: by those of metals alone, in previews (:mod:`tron.shading.reflections`); None without.
+        terms: of Burley's diffuse part for what arrives (:mod:`tron.shading.burley`); None: as of even light.
     """
 
     visibility: mi.Color3f
     mirror: Mirror | None = None
+    terms: mi.Vector3f | None = None
+    metals: Mirror | None = None
 
     def in_rows(self, gbuffer: GBuffer) -> Arriving:
         """Of pixels row by row, where lanes are those of ``gbuffer``."""
-        mirror = None if self.mirror is None else gbuffer.in_rows(self.mirror)
-        return Arriving(gbuffer.in_rows(self.visibility), mirror)
+        found = (self.visibility, self.mirror, self.terms, self.metals)
+        return Arriving(*(None if value is None else gbuffer.in_rows(value) for value in found))
 
 
 def render_guidance(
@@ -164,12 +192,16 @@ def arriving_light(
 ) -> Arriving:
     """Light that reaches the pixels of :func:`trace_view`; arguments as of :func:`render_guidance`."""
     estimation = estimation.of_sub_pixel()
-    arriving = Arriving(visibility(tracer, gbuffer, lighting, estimation, seed))
+    share, terms = visibility_and_terms(tracer, gbuffer, lighting, estimation, seed)
+    arriving = Arriving(share, terms=terms)
     if bounce is not None and estimation.bounces and estimation.reflections:
         occluder = tracer.sided(estimation.two_sided)
         arriving.mirror = reflections(
             occluder, gbuffer, lighting, bounce, estimation.reflections, seed, estimation.diffuse
         )
+    elif bounce is not None and estimation.bounces and estimation.filtered:
+        occluder = tracer.sided(estimation.two_sided)
+        arriving.metals = metal_reflections(occluder, gbuffer, lighting, bounce, estimation, seed)
     return arriving
 
 
@@ -185,7 +217,7 @@ def shade_surface(
     Light bounces where ``surface`` has the values of a bake (``BouncedLight.values``). ``background`` as of
     :func:`render_guidance`. Returns the colours of :class:`Guidance` by name, on the device, one lane a ray.
     """
-    response = Response.of(surface, lighting.split_sum, diffuse)
+    response = Response.of(surface, lighting.split_sum, diffuse, arriving.terms)
     irradiance = response.unshadowed * arriving.visibility
     bounced = _bounced(surface, arriving)
     if background is None:
@@ -194,7 +226,7 @@ def shade_surface(
         behind = mi.Color3f(*(dr.opaque(mi.Float, float(channel)) for channel in background))
 
     buffers = {
-        "pbr": response.direct(response.unshadowed),
+        "pbr": response.open(),
         "irradiance": irradiance,
         "unshadowed": response.unshadowed,
         "shadowed": response.direct(irradiance),
@@ -211,7 +243,8 @@ def _bounced(surface: Surface, arriving: Arriving) -> Bounced | None:
         return None
     indirect, openness = mi.Color3f(*surface.values[:3]), surface.values[3]
     if arriving.mirror is None:
-        return evenly_bounced(indirect, openness, arriving.visibility, surface.roughness)
+        even = evenly_bounced(indirect, openness, arriving.visibility, surface.roughness)
+        return even if arriving.metals is None else with_metals(even, arriving.metals, surface)
     return Bounced(indirect, arriving.mirror.openness, arriving.mirror.radiance)
 
 
@@ -231,4 +264,63 @@ def shade(
     if estimation.supersample > 1:
         colors = {name: averaged(color, estimation.supersample) for name, color in colors.items()}
         buffers = averaged_surface(buffers, estimation.supersample)
-    return Guidance(**colors, mask=buffers["opacity"], gbuffer=buffers)
+    return Guidance(**colors, mask=buffers["opacity"], gbuffer=buffers, lighting=lighting)
+
+
+def averaged(image: np.ndarray, times: int) -> np.ndarray:
+    """(H times, W times, ...) -> (H, W, ...): means of ``times`` x ``times`` sub-pixels."""
+    height, width = (side // times for side in image.shape[:2])
+    return image.reshape(height, times, width, times, *image.shape[2:]).mean((1, 3))
+
+
+def averaged_surface(gbuffer: dict[str, np.ndarray], times: int) -> dict[str, np.ndarray]:
+    """A G-buffer of sub-pixels -> of pixels, by what each field is.
+
+    Opacity and the premultiplied ``rgb`` are means. Base color, roughness, metallic, position and other
+    values are means by opacity, as compositing along one ray has them, and 0 where it is 0. Normal and
+    direction are brought back to unit length. Depth is the mean by opacity of the sub-pixels that have one.
+
+    Args:
+        gbuffer: ``GBuffer.numpy()``, (H times, W times, ...) each.
+        times: sub-pixels along a pixel's side.
+    """
+    opacity = gbuffer["opacity"]
+    weights = dict.fromkeys(gbuffer, opacity)
+    weights["depth"] = opacity * (gbuffer["depth"] > 0)
+    weights |= {name: np.ones_like(opacity) for name in ("opacity", "rgb", "direction")}
+    means = {name: _mean(image, weights[name], times) for name, image in gbuffer.items()}
+    for name in ("normal", "direction"):
+        length = np.linalg.norm(means[name], axis=-1, keepdims=True)
+        means[name] = means[name] / np.where(length > 0, length, 1)
+    return means
+
+
+def _mean(image: np.ndarray, weight: np.ndarray, times: int) -> np.ndarray:
+    weight = weight.reshape(*weight.shape, *(1,) * (image.ndim - 2))
+    total = averaged(weight, times)
+    return averaged(image * weight, times) / np.where(total > 0, total, 1)
+
+
+# Guidance under a light is sampled once a pixel, since shadow rays are dear; camera rays are not. These maps
+# are means over 2 x 2 sub-pixels, so that a network that is given them can tell a texture from noise and how
+# much of a pixel an edge covers.
+
+SUB_PIXELS = 2
+"""Sub-pixels along a pixel's side."""
+
+
+def surface_maps(tracer: ViewTracer, camera: Camera) -> dict[str, np.ndarray]:
+    """Members ``albedo`` and ``surface`` of one view, (H, W, 3) float32 in [0, 1], 0 where no surfels are.
+
+    ``albedo`` is linear base color; the channels of ``surface`` are |n . v| of the unit normal and the unit
+    direction to the camera, roughness and metallic. Each sub-pixel counts by its opacity.
+    """
+    fine = camera.resized(SUB_PIXELS * camera.width, SUB_PIXELS * camera.height)
+    seen = tracer.gbuffer(fine).numpy()
+    facing = np.abs((seen["normal"] * seen["direction"]).sum(-1))
+    maps = {
+        "albedo": seen["base_color"],
+        "surface": np.stack([facing, seen["roughness"], seen["metallic"]], axis=-1),
+    }
+    opacity = seen["opacity"][..., None]
+    return {name: averaged(np.clip(image, 0, 1) * opacity, SUB_PIXELS) for name, image in maps.items()}

@@ -20,6 +20,7 @@ import mitsuba as mi
 
 from tron.estimation import Diffuse
 from tron.shading.brdf_table import GLASS_INDEX, BrdfTable
+from tron.shading.burley import burley_factor
 
 DIELECTRIC_F0 = 0.04
 MOST_ALBEDO = 0.99
@@ -48,7 +49,11 @@ class Reflectance:
 
 
 def reflectance(
-    material: Material, table: BrdfTable, cosine: mi.Float | None = None, diffuse: Diffuse = "principled"
+    material: Material,
+    table: BrdfTable,
+    cosine: mi.Float | None = None,
+    diffuse: Diffuse = "principled",
+    terms: mi.Vector3f | None = None,
 ) -> Reflectance:
     """Reflectance of a material, differentiable in it.
 
@@ -57,13 +62,17 @@ def reflectance(
         table: of the active variant.
         cosine: n.v; None: the mean over all directions of view, by the cosine, as of light that bounces.
         diffuse: the model.
+        terms: of the light, :mod:`tron.shading.burley`; None: of even light.
     """
     scale, bias, factor, glass = table(material.roughness, cosine)
     body = material.base_color * (1 - material.metallic)
     if diffuse == "lambert":
         return Reflectance(body, _f0(material) * scale + bias)
     specular = _blend(material, glass, material.base_color * scale + bias)
-    return Reflectance(dr.minimum(body * factor, 1 - specular), specular)
+    share = dr.minimum(body * factor, 1 - specular)
+    if terms is not None:  # of one direction it is no albedo, and may be more than what is left
+        share *= burley_factor(terms, material.roughness, factor) / factor
+    return Reflectance(share, specular)
 
 
 def fresnel(material: Material, cosine: mi.Float, diffuse: Diffuse = "principled") -> mi.Color3f:

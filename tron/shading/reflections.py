@@ -12,7 +12,7 @@ by channel: the split sum, which has no noise, keeps the light, the rays decide 
 taken from as many rays again that are drawn from the light: few of the lobe's see a sun, whose highlight
 would stand in shadows. m = p / (p + p_light) is the balance heuristic (Veach 1997), for rays of both kinds.
 
-A ray of the lobe is stopped by one surfel (:mod:`tron.tracing.first_hit`). R is the composition of
+A ray of the lobe is stopped by one surfel (:mod:`tron.tracing.hierarchy.first_hit`). R is the composition of
 :mod:`tron.shading.composition` at the surfel's centre with the bake's light, so a mirror shows highlights of
 what it mirrors. A back face shows what ``BouncedLight.behind`` says.
 """
@@ -25,19 +25,21 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from tron.estimation import Diffuse
+from tron.estimation import Diffuse, Estimation
 from tron.seeds import integer
-from tron.shading.bounce import BouncedLight
-from tron.shading.composition import Response, evenly_bounced
-from tron.shading.irradiance import ORIGIN_OFFSET
+from tron.shading.bounces.bounce import BouncedLight
+from tron.shading.composition import Bounced, Response, evenly_bounced
+from tron.shading.direct.irradiance import ORIGIN_OFFSET
+from tron.shading.direct.neighbours import neighbourhood_mean
+from tron.shading.direct.sampling import PixelPoints
 from tron.shading.lighting import Lighting
 from tron.shading.reflectance import Material, fresnel
-from tron.shading.sampling import PixelPoints
-from tron.tracing.centres import centres
-from tron.tracing.first_hit import NOTHING, FirstHit, ray_seeds
+from tron.tracing.hierarchy.first_hit import NOTHING, FirstHit, ray_seeds
+from tron.tracing.surface import centres
 
 if TYPE_CHECKING:
     from tron.tracing import GBuffer, Surface, SurfelTracer
+
 
 SMOOTHEST = 0.02
 """Least roughness of the rays: below, a lobe is narrower than float32 can draw."""
@@ -64,6 +66,7 @@ def reflections(
     rays: int,
     seed: int,
     diffuse: Diffuse = "principled",
+    where: mi.Bool | bool = True,
 ) -> Mirror:
     """The view of each pixel's lobe.
 
@@ -77,13 +80,14 @@ def reflections(
         rays: of each pixel.
         seed: root of their random numbers.
         diffuse: the model of the material.
+        where: the pixels that send any.
     """
     with dr.suspend_grad():
         points = PixelPoints.make(rays, 2, gbuffer.width, seed, "reflections")
         root = dr.opaque(mi.UInt32, integer(seed, "reflections", "stops"))
         offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
         pixel, lobe = gbuffer.pixel, Lobe.of(gbuffer)
-        seen = (gbuffer.opacity > 0) & (lobe.view.z > 0)
+        seen = where & (gbuffer.opacity > 0) & (lobe.view.z > 0)
         origin, run = gbuffer.position + gbuffer.normal * offset, points.run(pixel)
         dr.eval(pixel, lobe, seen, origin, run)
         none = dr.zeros(mi.Color3f, dr.width(pixel))
@@ -230,3 +234,53 @@ def masking(cosine: mi.Float, alpha: mi.Float) -> mi.Float:
     """Smith's G_1 of GGX at ``cosine`` to the normal."""
     alpha2 = dr.square(alpha)
     return 2 * cosine / (cosine + dr.safe_sqrt(alpha2 + (1 - alpha2) * dr.square(cosine)))
+
+
+# A metal shows nothing but reflections, so the bounced light around it will not do: a room of metal is 1.02,
+# 1.17 and 1.51 of the truth by channel, with one ray 0.89, 0.96 and 1.10. Other surfaces keep that light, and
+# scenes without metals cost nothing. The rougher a metal, the more its neighbours' rays count; a mirror keeps
+# its own.
+
+RAYS = 1
+ROUGH = 0.2
+"""Roughness from which on neighbours count in full."""
+
+
+def metal_share(surface: Surface) -> mi.Float:
+    """Weight in [0, 1] of the rays' findings: 0 up to a metallic of one half, then linear."""
+    return dr.clip(2 * surface.metallic - 1, 0, 1)
+
+
+def metal_reflections(
+    tracer: SurfelTracer,
+    gbuffer: GBuffer,
+    lighting: Lighting,
+    bounce: BouncedLight,
+    estimation: Estimation,
+    seed: int,
+) -> Mirror | None:
+    """The view of each metal pixel's lobe, of few rays; None where there is no metal."""
+    metal = (gbuffer.opacity > 0) & (metal_share(gbuffer) > 0)
+    if not dr.any(metal):
+        return None
+    found = reflections(tracer, gbuffer, lighting, bounce, RAYS, seed, estimation.diffuse, metal)
+    own = [*found.openness, *found.radiance]
+    values = [dr.select(metal, value, 0) for value in own] + [dr.select(metal, mi.Float(1), 0)]
+    dr.eval(values)
+    (*means, weight), _ = neighbourhood_mean(values, gbuffer, tracer.scene.spacing)
+    rough = dr.clip(gbuffer.roughness / ROUGH, 0, 1)
+    weight = dr.select(metal, weight, 1)
+    smooth = [dr.lerp(value, mean / weight, rough) for value, mean in zip(own, means, strict=True)]
+    mirror = Mirror(mi.Color3f(*smooth[:3]), mi.Color3f(*smooth[3:]))
+    dr.eval(mirror)
+    return mirror
+
+
+def with_metals(even: Bounced, mirror: Mirror, surface: Surface) -> Bounced:
+    """Light that bounced; metals show what their rays found."""
+    share = metal_share(surface)
+    return Bounced(
+        even.indirect,
+        dr.lerp(even.openness, mirror.openness, share),
+        dr.lerp(even.mirrored, mirror.radiance, share),
+    )

@@ -17,9 +17,9 @@ from typing import IO
 import numpy as np
 
 from tron.errors import TronError
-from tron.shards.reader import DAMAGED, LARGEST_MEMBER, MOST_FILES, require_plain
+from tron.shards.dataset_folder import DAMAGE
+from tron.shards.reader import DAMAGED, LARGEST_MEMBER, MOST_FILES, BoundedTarInfo, require_plain
 from tron.shards.schema import META_SUFFIX, parse_name
-from tron.shards.tar_headers import BoundedTarInfo
 
 INDEX_VERSION = "v1.2"
 INDEX_SUFFIX = ".idx"
@@ -82,7 +82,7 @@ def _scanned(file: IO[bytes], where: str) -> Iterator[Entry]:
             for count, info in enumerate(tar):
                 require_plain(info, count, where)
                 yield info.name, info.offset_data, info.size
-    except (tarfile.TarError, OSError, EOFError, UnicodeError, ValueError) as error:
+    except DAMAGE as error:
         raise TronError(f"shard is damaged: {error}", where, DAMAGED) from error
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from tron.dataset_folder import DatasetFolder, Place
 from tron.errors import TronError
+from tron.shards.dataset_folder import DatasetFolder, Place
 from tron.shards.schema import SCHEMA_VERSION, SHARD_PATTERN, require_schema
 from tron.storage import write_if_changed
 
@@ -64,13 +64,19 @@ class Manifest(BaseModel):
             raise TronError("no manifest.json, so this is no dataset folder", str(folder), mend)
         if size > LARGEST_MANIFEST:
             raise TronError("manifest.json is too large to be one", path, mend)
+        return cls.parse(place.read(MANIFEST_NAME), str(folder))
+
+    @classmethod
+    def parse(cls, data: bytes, folder: str) -> Manifest:
+        """A manifest of its file's bytes; TronError, naming the folder, where it is damaged."""
         try:
-            manifest = cls.model_validate_json(place.read(MANIFEST_NAME))
+            manifest = cls.model_validate_json(data)
         except ValidationError as error:
             first = error.errors()[0]
             field = ".".join(str(part) for part in first["loc"])
+            path, mend = f"{folder.rstrip('/')}/{MANIFEST_NAME}", "give the folder that tron-datagen wrote"
             raise TronError(f"manifest is damaged at '{field}': {first['msg']}", path, mend) from error
-        require_schema(manifest.schema_version, str(folder))
+        require_schema(manifest.schema_version, folder)
         return manifest
 
     def save(self, folder: str | Path) -> None:

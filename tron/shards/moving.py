@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from tron.errors import TronError
-from tron.images import decode_png, encode_png
+from tron.io.images import decode_png, encode_png
 from tron.shards.schema import ClipMeta
 
 KEY = "motion"

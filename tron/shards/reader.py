@@ -1,19 +1,19 @@
-"""Read shards back: an explicit table of decoders, nothing is ever unpickled or extracted to disk."""
+"""Read shards back by a table of decoders: nothing is unpickled or extracted to disk; and check datasets."""
 
 from __future__ import annotations
 
 import tarfile
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import IO
+from typing import Self
 
 import numpy as np
 from pydantic import ValidationError
 
-from tron.dataset_folder import DatasetFolder, Place, is_url
 from tron.errors import TronError
-from tron.images import decode_exr, decode_png
-from tron.shards.manifest import Manifest
+from tron.io.images import decode_exr, decode_png
+from tron.shards.dataset_folder import DAMAGE, DatasetFolder, Place, is_url, open_stream
+from tron.shards.manifest import Manifest, ShardEntry
 from tron.shards.schema import (
     MEMBERS,
     META_SUFFIX,
@@ -23,57 +23,61 @@ from tron.shards.schema import (
     parse_name,
     require_schema,
 )
-from tron.shards.tar_headers import BoundedTarInfo
 
 LARGEST_MEMBER = 256 * 2**20
 LARGEST_META = 16 * 2**20
+LARGEST_EXTENSION = 2**16
 MOST_FILES = 200_000  # of one shard: 64 clips of 93 frames x 12 members are 71,424
 DAMAGED = "make the shard again with tron-datagen"
+_EXTENSIONS = {
+    tarfile.GNUTYPE_LONGNAME,
+    tarfile.GNUTYPE_LONGLINK,
+    tarfile.XHDTYPE,
+    tarfile.XGLTYPE,
+    tarfile.SOLARIS_XHDTYPE,
+}
 _DECODERS: dict[str, Callable[[bytes], np.ndarray]] = {"exr": decode_exr, "png": decode_png}
 
 
-def tar_files(path: Place, members: Collection[str] | None = None) -> Iterator[tuple[str, str, bytes]]:
+class BoundedTarInfo(tarfile.TarInfo):
+    """Header of a tar's member, for the ``tarinfo`` of :func:`tarfile.open`.
+
+    Python's own reads an extended header (a long name, PAX attributes; our shards have none) of any size into
+    memory before it gives a member. Raises tarfile.ReadError where one is larger than LARGEST_EXTENSION.
+    """
+
+    @classmethod
+    def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Self:
+        """Header of a block of 512 bytes."""
+        info = super().frombuf(buf, encoding, errors)
+        if info.type in _EXTENSIONS and info.size > LARGEST_EXTENSION:
+            raise tarfile.ReadError(f"extended header of {info.size} bytes")
+        return info
+
+
+def tar_files(place: Place, members: Collection[str] | None = None) -> Iterator[tuple[str, str, bytes]]:
     """Files of one shard in order: (key, name within the clip such as "f00.pbr.exr", bytes).
 
-    path: of the shard, or its URL: that is read as it comes, a few megabytes at a time.
+    place: path of the shard, its URL, or `pipe:COMMAND` that prints it; all but paths are read as they come.
     members: only these members and the metadata; the bytes of others are skipped (default: all). Refuses
     with TronError links, devices, folders, names outside the schema (so also absolute paths and `..`),
     compressed or damaged tars and files beyond the size limit; such a file's bytes are not read.
     """
+    # Plain tars only ("r:", and "r|" without seeking): no decompression bombs.
+    mode = "r|" if is_url(place) else "r:"
     try:
-        # "r:" reads plain tars only: no decompression bombs
-        with _opened(path) as opened, tarfile.open(fileobj=opened, mode="r:", tarinfo=BoundedTarInfo) as tar:
+        with open_stream(place) as opened, tarfile.open(None, mode, opened, tarinfo=BoundedTarInfo) as tar:
             for count, info in enumerate(tar):
-                key, member = require_plain(info, count, str(path))
+                key, member = require_plain(info, count, str(place))
                 if members is not None and member != "meta" and member not in members:
                     continue
                 file = tar.extractfile(info)
                 data = file.read() if file else b""
                 if len(data) != info.size:
-                    raise TronError(f"shard ends within member {info.name!r}", str(path), DAMAGED)
+                    raise TronError(f"shard ends within member {info.name!r}", str(place), DAMAGED)
                 yield key, info.name[len(key) + 1 :], data
-    except _DAMAGED as error:
-        raise TronError(f"shard is damaged: {error}", str(path), DAMAGED) from error
-
-
-@contextmanager
-def _opened(path: Place) -> Iterator[IO[bytes]]:
-    """A shard to read, on a disk or in a store."""
-    if not is_url(path):
-        with open(path, "rb") as file:
-            yield file
-        return
-    folder, _, name = str(path).rpartition("/")
-    with DatasetFolder(folder).open(name) as file:
-        try:
-            yield file
-        except (TronError, *_DAMAGED):
-            raise
-        except Exception as error:  # stores raise whatever their package does
-            raise TronError(f"cannot read: {type(error).__name__}: {error}", str(path)) from error
-
-
-_DAMAGED = (tarfile.TarError, OSError, EOFError, UnicodeError, ValueError)
+    except DAMAGE as error:
+        raise TronError(f"shard is damaged: {error}", str(place), DAMAGED) from error
 
 
 def require_plain(info: tarfile.TarInfo, count: int, where: str) -> tuple[str, str]:
@@ -202,3 +206,66 @@ def group_clips(files: Iterable[tuple[str, str, bytes]]) -> Iterator[tuple[str, 
         gathered[name] = data
     if current is not None:
         yield current, gathered
+
+
+def verify(folder: Place) -> list[str]:
+    """Problems of a dataset folder (path or URL), one line each, with shard and clip; empty when it is whole.
+
+    Finds missing, stray and truncated shards (a tar cut at a member's end reads without an error: only the
+    count shows it), flipped bytes, missing, repeated and unknown members, and files that do not decode.
+    """
+    place = DatasetFolder(folder)
+    manifest = Manifest.load(folder)
+    sizes = place.sizes()
+    problems: list[str] = []
+    listed = Counter(entry.name for entry in manifest.shards)
+    problems += [f"{name}: listed {count} times" for name, count in listed.items() if count > 1]
+    problems += [
+        f"{name}: not in the manifest"
+        for name in sorted(sizes)
+        if name.endswith(".tar") and name not in listed
+    ]
+    owner: dict[str, str] = {}
+    for entry in manifest.shards:
+        if entry.name not in sizes:
+            problems.append(f"{entry.name}: missing ({entry.samples} clips)")
+            continue
+        if sizes[entry.name] != entry.bytes:
+            problems.append(f"{entry.name}: {sizes[entry.name]} bytes, should be {entry.bytes}")
+        elif place.sha256(entry.name) != entry.sha256:
+            problems.append(f"{entry.name}: sha256 differs: its bytes have changed")
+        clips: dict[str, dict[str, bytes]] = {}
+        try:
+            for key, name, data in tar_files(place.where(entry.name)):
+                files = clips.setdefault(key, {})
+                if name in files:
+                    problems.append(f"{entry.name}: {key}: member {name} is there twice")
+                files[name] = data
+                if name == "meta.json":  # the last file of a clip: decode it now and let its bytes go
+                    problems += _clip_problems(entry, key, files)
+                    clips[key] = dict.fromkeys(files, b"")
+        except TronError as error:
+            problems.append(f"{entry.name}: {error}")
+        problems += [
+            f"{entry.name}: {k}: no meta.json" for k, files in clips.items() if "meta.json" not in files
+        ]
+        problems += [f"{entry.name}: {key}: clip is missing" for key in entry.keys if key not in clips]
+        problems += [f"{entry.name}: {key}: not in the manifest" for key in clips if key not in entry.keys]
+        if entry.samples != len(entry.keys):
+            problems.append(f"{entry.name}: manifest says {entry.samples} clips and names {len(entry.keys)}")
+        for key in entry.keys:
+            if key in owner:
+                problems.append(f"{entry.name}: {key}: also in {owner[key]}")
+            owner[key] = entry.name
+    return problems
+
+
+def _clip_problems(entry: ShardEntry, key: str, files: dict[str, bytes]) -> list[str]:
+    try:
+        clip = decode_clip(files)
+    except TronError as error:
+        return [f"{entry.name}: {key}: {error}"]
+    problems = []
+    if clip.meta.key != key or clip.meta.split != entry.split:
+        problems.append(f"{entry.name}: {key}: its metadata say {clip.meta.key} of {clip.meta.split}")
+    return problems

@@ -42,7 +42,7 @@ class Member:
         bytes: of one value on disk: 4 (unit normals need them), 2 or 1.
         color_space: of colours, unless a clip's metadata say otherwise; None: these are no colours.
         clips: which clips hold it; those with references are of splits with reference_buffers (test splits).
-        meaning: one line for docs/data.md.
+        meaning: one line for docs/guides/datasets.md.
     """
 
     extension: Literal["exr", "png"]
@@ -113,7 +113,7 @@ def light_members() -> tuple[str, ...]:
 
 
 def surface_members() -> tuple[str, ...]:
-    """Names of the guidance that is under no light (:func:`tron.shading.surface_maps.surface_maps`)."""
+    """Names of the guidance that is under no light (:func:`tron.shading.guidance.surface_maps`)."""
     return tuple(name for name in guidance_members() if MEMBERS[name].color_space != "linear")
 
 
@@ -141,7 +141,7 @@ _META_PATTERN = re.compile(r"([A-Za-z0-9_-]{1,60})\.meta\.json")
 
 
 def members_table() -> str:
-    """MEMBERS in Markdown, which stands in docs/data.md."""
+    """MEMBERS in Markdown, which stands in docs/guides/datasets.md."""
     rows = ["| member | file | values | colours | clips | meaning |", "|---|---|---|---|---|---|"]
     kinds = {1: "8 bits", 2: "half float", 4: "float"}
     for name, member in MEMBERS.items():
@@ -159,7 +159,7 @@ class ClipMeta(BaseModel):
         scene: name of the scene; the split's other clips show it under other lights.
         light: name of the light.
         cameras: `Camera.to_dict()` of each frame, OpenCV, pixels, world-to-camera.
-        exposure: factor on linear values before AgX, one a light (docs/conventions.md, 5).
+        exposure: factor on linear values before AgX, one a light (conventions.md, 5).
         color_space: of each member that holds colours; photographs are "display".
         seeds: root seed, and the first frame's seed of each kind of randomness.
         spp: samples a pixel of each kind.
@@ -259,16 +259,6 @@ def require_schema(version: int, where: str | Path) -> None:
             str(where),
             "make it again in a new folder with the tron-datagen command of its README.md or card.md",
         )
-
-
-def member_name(key: str, frame: int, member: str) -> str:
-    """The tar member that holds one buffer of one frame, e.g. `s000012-l2.f00.pbr.exr`."""
-    return f"{key}.f{frame:02d}.{member}.{MEMBERS[member].extension}"
-
-
-def meta_name(key: str) -> str:
-    """The tar member that holds a clip's metadata."""
-    return f"{key}.{META_SUFFIX}"
 
 
 def parse_name(name: str) -> tuple[str, int | None, str]:

@@ -1,30 +1,30 @@
-"""Write clips into tar shards whose bytes depend on the clips alone."""
+"""Write clips into tar shards by webdataset's TarWriter; their bytes depend on the clips alone."""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import sys
-import tarfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from tarfile import BLOCKSIZE
 from types import TracebackType
-from typing import IO
+from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 
 from tron.errors import TronError
-from tron.images import encode_exr, encode_png
+from tron.io.images import encode_exr, encode_png
 from tron.shards.index import Entry, index_name, index_text, padded
 from tron.shards.manifest import ShardEntry
+from tron.shards.reader import file_name
 from tron.shards.schema import (
     MEMBERS,
+    META_SUFFIX,
     SPLIT_PATTERN,
     ClipMeta,
     clip_members,
-    member_name,
-    meta_name,
     shard_name,
 )
 from tron.storage import atomic_path, write_atomic
@@ -53,7 +53,8 @@ class ShardWriter:
         self._keys: list[str] = []
         self._files: list[Entry] = []
         self._stack = ExitStack()
-        self._tar: tarfile.TarFile | None = None
+        self._end = 0
+        self._tar: Any = None
         self._file: _HashingFile | None = None
 
     def __enter__(self) -> ShardWriter:
@@ -87,26 +88,29 @@ class ShardWriter:
         if meta.key in self._keys or any(meta.key in entry.keys for entry in self.entries):
             raise TronError(f"clip {meta.key} is written twice")
         files = [
-            (member_name(meta.key, index, member), _encode(meta, index, member, frame[member]))
+            (file_name(index, member), _encode(meta, index, member, frame[member]))
             for index, frame in enumerate(frames)
             for member in _members_of(meta, index, frame)
         ]
-        files.append((meta_name(meta.key), (meta.model_dump_json() + "\n").encode()))
+        files.append((META_SUFFIX, (meta.model_dump_json() + "\n").encode()))
         tar = self._open_shard()
         for name, data in files:
-            info = tarfile.TarInfo(name)  # mtime 0, uid 0, mode 0644: no clock and no user in the bytes
-            info.size = len(data)
-            tar.addfile(info, io.BytesIO(data))
-            self._files.append((name, tar.offset - padded(len(data)), len(data)))
+            tar.write({"__key__": meta.key, name: data})  # one by one: it sorts what it is given at once
+            self._files.append((f"{meta.key}.{name}", self._end + BLOCKSIZE, len(data)))
+            self._end += BLOCKSIZE + padded(len(data))
         self._keys.append(meta.key)
         if len(self._keys) == self.samples_per_shard:
             self._finish_shard()
 
-    def _open_shard(self) -> tarfile.TarFile:
+    def _open_shard(self) -> Any:
         if self._tar is None:
+            from webdataset.writer import TarWriter  # loads torch, which who only reads clips need not have
+
             path = self._stack.enter_context(atomic_path(self.folder / shard_name(self.split, self._index)))
             self._file = _HashingFile(self._stack.enter_context(path.open("wb")))
-            self._tar = tarfile.TarFile(fileobj=self._file, mode="w", format=tarfile.USTAR_FORMAT)
+            # No clock and no user in the bytes.
+            self._tar = TarWriter(cast(BinaryIO, self._file), "", "", mode=0o644, mtime=0, encoder=False)
+            self._end = 0
         return self._tar
 
     def _finish_shard(self) -> None:
@@ -129,7 +133,7 @@ class ShardWriter:
 
 
 class _HashingFile(io.RawIOBase):
-    """Hash what is written on its way to the file: the tar writer never seeks back."""
+    """Hash what is written on its way to the file."""
 
     def __init__(self, file: IO[bytes]):
         super().__init__()
@@ -138,10 +142,9 @@ class _HashingFile(io.RawIOBase):
     def writable(self) -> bool:
         return True
 
-    def tell(self) -> int:
-        return self.size
-
     def write(self, data) -> int:
+        if self.file.closed:  # after a failure: Python flushes the tar that was left when it is collected
+            return len(data)
         self.file.write(data)
         self.hash.update(data)
         self.size += len(data)
@@ -168,5 +171,5 @@ def _encode(meta: ClipMeta, index: int, member: str, image: np.ndarray) -> bytes
     if not np.isfinite(image).all():
         raise TronError(f"{where} holds {int((~np.isfinite(image)).sum())} values that are not finite")
     if kind.extension == "png":
-        return encode_png(image)
-    return encode_exr(image, half=kind.bytes == 2)
+        return encode_png(image, color=kind.color_space is not None)
+    return encode_exr(image, half=kind.bytes == 2, color=kind.color_space is not None)

@@ -36,7 +36,7 @@ from tron.tracing.kernel import (
     log_response_slope,
     value_packets,
 )
-from tron.tracing.relisting import lanes_of
+from tron.tracing.tiled.kbuffer import lanes_of
 
 COPIED_BYTES = 1 << 30
 """Most memory for the copies into which threads add the gradients of one kind of record."""

@@ -1,6 +1,6 @@
 """Front-to-back compositing of sorted hits: ``sum_i T_i alpha_i f_i``, ``T_i = prod_{j<i} (1 - alpha_j)``.
 
-(Equation 3 of the TRON paper; docs/conventions.md, 7.) Compositing ends at the first hit after which T is
+(Equation 3 of the TRON paper; conventions.md, 7.) Compositing ends at the first hit after which T is
 below 0.001. The ids of the composited hits are written out in order, so that the adjoint can replay exactly
 this list.
 """

@@ -8,14 +8,17 @@ opacity is
 
 with ``response(q) = exp(-q / 2)`` for degree 2 (2DGS, Huang et al. 2024) and ``exp(-(4.5 / 81) q^2)`` for
 degree 4 (3DGRT's generalised Gaussian, Moenne-Loccoz et al. 2024). Both reach the same value at three
-sigma (docs/conventions.md, 6). Nothing else evaluates this formula, except the float64 oracle in
+sigma (conventions.md, 6). Nothing else evaluates this formula, except the float64 oracle in
 :mod:`tron.tracing.reference`.
 """
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import wraps
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -32,10 +35,13 @@ GEOMETRY_PACKETS = 3
 """A geometry record is 12 floats: centre, opacity | t_u / s_u, radius | t_v / s_v, q_cut."""
 RADIUS = 7
 """Place of the radius in a geometry record."""
+CUT = 11
+"""Place of q_cut, the squared Mahalanobis distance at which a surfel is cut: negative, it counts nowhere."""
 FEATURE_PACKETS = 3
 """A feature record is 12 floats: normal, roughness | base color, metallic | radiance of SH degree 0, 0."""
 SH_PACKETS = 12
 """An SH record is 48 floats as scenes store them: (red, green, blue) of one coefficient after the other."""
+Function = TypeVar("Function", bound=Callable)
 
 
 def value_packets(count: int) -> int:
@@ -110,6 +116,28 @@ class SurfelRecords:
             values=None if self.values is None else dr.detach(self.values),
         )
 
+    def turned_over(self) -> SurfelRecords:
+        """The same disks with their sides exchanged."""
+        return replace(
+            self,
+            geometry=turned_geometry(self.geometry),
+            features=_negated(self.features, FEATURE_PACKETS, 0),
+        )
+
+
+def turned_geometry(geometry: mi.Float) -> mi.Float:
+    """Geometry records of the same disks with their sides exchanged: t_v is negated."""
+    return _negated(geometry, GEOMETRY_PACKETS, 2)
+
+
+def _negated(records: mi.Float, packets: int, packet: int) -> mi.Float:
+    """Records of so many packets, the first three floats of one of which change their sign."""
+    index = dr.arange(mi.UInt32, dr.width(records))
+    place = index % (4 * packets)
+    values = dr.select((place >= 4 * packet) & (place < 4 * packet + 3), -records, records)
+    dr.eval(values)
+    return values
+
 
 @dataclass
 class SurfelHit:
@@ -183,3 +211,25 @@ def intersect(
         u=u,
         v=v,
     )
+
+
+def recorded(function: Function) -> Function:
+    """Freeze ``function``, which is recorded once for each kind of arguments; ``__wrapped__`` is Dr.Jit's.
+
+    Nothing is collected in between: a Mitsuba object that is freed while Dr.Jit records a function aborts the
+    process, and Python's collector of cycles may free one at any allocation: an integrator or a scene that
+    nobody holds any more.
+    """
+    frozen = dr.freeze(function, limit=64, warn_after=1000)
+
+    @wraps(frozen)
+    def call(*arguments: object) -> object:
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return frozen(*arguments)
+        finally:
+            if collects:
+                gc.enable()
+
+    return call  # pyright: ignore[reportReturnType]

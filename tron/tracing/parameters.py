@@ -16,10 +16,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from tron.aligned import aligned
 from tron.errors import TronError
 from tron.gaussians.fields import PARAMETERS
 from tron.gaussians.harmonics import SH_C0
+from tron.runtime import aligned
 from tron.tracing.kernel import SH_PACKETS, SurfelRecords, cut_radius_squared, value_packets
 
 if TYPE_CHECKING:

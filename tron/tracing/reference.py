@@ -13,8 +13,8 @@ import numpy as np
 
 from tron.gaussians.harmonics import eval_sh
 from tron.tracing.compositing import STOP_TRANSMITTANCE
+from tron.tracing.hierarchy.transmittance import BACK_FACE_SPACINGS, OPAQUE_TRANSMITTANCE
 from tron.tracing.kernel import MAX_ALPHA, MIN_ALPHA, MIN_RESPONSE, T_MIN
-from tron.tracing.transmittance import BACK_FACE_SPACINGS, OPAQUE_TRANSMITTANCE
 
 
 class Scene(Protocol):
@@ -43,7 +43,7 @@ class ReferenceHits:
         median_depth: (P,) distance of the first hit after which T < 0.5, or 0.
         hits: (P,) int, number of composited hits.
         margin: (P,) smallest distance of any value that the ray compares before it stops to its threshold
-            (alpha cut, stop, median): pixels with a tiny margin may differ in float32.
+            (T_MIN, alpha cut, stop, median): pixels with a tiny margin may differ in float32.
         gap: (P,) smallest distance along the ray between two composited hits that are neighbours; where it is
             tiny, rounding may order them otherwise.
         candidates: (P,) int, surfels whose kernel counts where the ray hits them, on either side.
@@ -186,6 +186,7 @@ def _composite_block(
     reached = np.where(remaining < STOP_TRANSMITTANCE, last, np.inf)
     compared = hit.front & (hit.t > 0) & (hit.t <= reached[:, None] + 1e-5)
     cuts = np.where(compared, hit.margin, np.inf).min(1, initial=np.inf)
+    starts = np.where(hit.counted & hit.front, np.abs(hit.t - T_MIN), np.inf).min(1, initial=np.inf)
     return ReferenceHits(
         normal=out[:, 0:3],
         base_color=out[:, 3:6],
@@ -196,7 +197,7 @@ def _composite_block(
         transmittance=remaining,
         median_depth=median,
         hits=hits,
-        margin=np.minimum(margin, cuts),
+        margin=np.minimum(np.minimum(margin, cuts), starts),
         gap=gap,
         candidates=(hit.counted & (hit.t > T_MIN)).sum(1),
         front=visible.sum(1),

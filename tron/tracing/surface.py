@@ -1,7 +1,7 @@
 """Sums over hits -> surface points: the normalisation that every ray of the library goes through.
 
 Composited channels are alpha-weighted sums, so materials are divided by opacity and the normal is brought
-back to unit length (docs/conventions.md, 7). The surface point is at the median depth; where transmittance
+back to unit length (conventions.md, 7). The surface point is at the median depth; where transmittance
 never falls below one half there is no median, and the alpha-weighted mean depth stands in where opacity is
 not zero.
 """
@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.tracing.compositing import CHANNELS, Composite
+from tron.tracing.kernel import FEATURE_PACKETS, GEOMETRY_PACKETS, SurfelRecords
 
 
 @dataclass
@@ -72,4 +73,31 @@ def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surf
         opacity=opacity,
         direction=direction,
         values=[value * inverse for value in channels[CHANNELS:]],
+    )
+
+
+def centres(records: SurfelRecords, surfel: mi.UInt32, active: mi.Bool | bool = True) -> Surface:
+    """Centres, unit normals and materials of ``surfel``, one lane each, differentiable in the records.
+
+    Opacity is 1, also the surfels' own; 0 in inactive lanes. There is no ray: depth, direction and rgb are 0.
+    """
+    active = mi.Bool(active)
+
+    def packet(values: mi.Float, index: mi.UInt32) -> mi.Vector4f:
+        return dr.gather(mi.Vector4f, values, index, active)
+
+    centre = packet(records.geometry, surfel * GEOMETRY_PACKETS)
+    normal, base = (packet(records.features, surfel * FEATURE_PACKETS + k) for k in range(2))
+    return Surface(
+        position=mi.Point3f(centre.x, centre.y, centre.z),
+        depth=mi.Float(0),
+        normal=mi.Normal3f(normal.x, normal.y, normal.z),
+        normal_sum=mi.Normal3f(normal.x, normal.y, normal.z),
+        base_color=mi.Color3f(base.x, base.y, base.z),
+        roughness=normal.w,
+        metallic=base.w,
+        rgb=mi.Color3f(0),
+        opacity=dr.select(active, mi.Float(1), 0),
+        direction=mi.Vector3f(0),
+        values=[],
     )

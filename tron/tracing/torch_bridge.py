@@ -28,9 +28,10 @@ import torch
 
 from tron.errors import TronError
 from tron.gaussians.fields import FIELDS, PARAMETERS
+from tron.runtime import torch_device
 from tron.tracing.gbuffer import trace_gbuffer
 from tron.tracing.parameters import SurfelParameters, pack
-from tron.tracing.tiles import build_tiles
+from tron.tracing.tiled.tiles import build_tiles
 
 if TYPE_CHECKING:
     from tron.cameras import Camera
@@ -41,11 +42,13 @@ IMAGES = (
 )
 
 
-def tensors_of(scene: GaussianScene, device: str | torch.device = "cpu") -> dict[str, torch.Tensor]:
-    """A scene's parameters as leaves that require gradients, under the names of :data:`PARAMETERS`."""
-    return {
-        name: torch.tensor(getattr(scene, name), device=device).requires_grad_(True) for name in PARAMETERS
-    }
+def tensors_of(scene: GaussianScene) -> dict[str, torch.Tensor]:
+    """A scene's parameters as leaves that require gradients, on the device of the active variant.
+
+    They are under the names of :data:`PARAMETERS`.
+    """
+    on = {"device": torch_device(), "requires_grad": True}
+    return {name: torch.tensor(getattr(scene, name), **on) for name in PARAMETERS}
 
 
 def render(
@@ -95,7 +98,7 @@ def _image(value: Any, camera: Camera) -> mi.TensorXf:
 
 def _check(surfels: Mapping[str, torch.Tensor]) -> int:
     """The number of surfels, if every tensor is as the tracer can read it in place."""
-    device = "cuda" if dr.backend_v(mi.Float) == dr.JitBackend.CUDA else "cpu"
+    device = torch_device()
     for name in PARAMETERS:
         if name not in surfels:
             raise TronError(f"the surfels have no {name}")

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from tron.errors import TronError
-from tron.tracing.bvh import build_bvh, refit
-from tron.tracing.first_hit import FirstHit, first_hits
+from tron.tracing.adjoint import attach, has_gradients
 from tron.tracing.gbuffer import GBuffer, trace_gbuffer
-from tron.tracing.kernel import SurfelRecords
+from tron.tracing.hierarchy.bvh import Bvh, build_bvh, refit
+from tron.tracing.hierarchy.first_hit import FirstHit, first_hits, queued_transmittance
+from tron.tracing.hierarchy.transmittance import BackFaces, Fans, transmittance
+from tron.tracing.kernel import CUT, GEOMETRY_PACKETS, SurfelRecords, turned_geometry
 from tron.tracing.parameters import SurfelParameters, pack, pack_values
-from tron.tracing.rays import trace_rays
-from tron.tracing.shadow_gradient import transmittance_by_opacity
-from tron.tracing.shadow_queue import queued_transmittance
-from tron.tracing.surface import Surface
-from tron.tracing.tiles import build_tiles
-from tron.tracing.transmittance import BackFaces, Fans, transmittance
+from tron.tracing.surface import Surface, surface
+from tron.tracing.tiled.kbuffer import RelistedHits, Search, composite_rounds, lanes_of, search_hierarchy
+from tron.tracing.tiled.tiles import build_tiles
 
 if TYPE_CHECKING:
     from tron.cameras import Camera
@@ -39,16 +40,23 @@ class SurfelTracer:
             for surfels that move there is :meth:`moved`.
         parameters: traced instead of the scene's own arrays; results are differentiable by those of them that
             have gradients enabled, as often as they are asked for. After new values, :meth:`update`.
+        backdrop: (M,) bool, surfels that cameras see and no other ray meets; None: every ray meets all.
 
     Attributes:
         records: the surfels as every kernel reads them, without gradients. bvh: their hierarchy.
     """
 
-    def __init__(self, scene: GaussianScene, *, parameters: SurfelParameters | None = None) -> None:
-        self.scene, self._parameters = scene, parameters
+    def __init__(
+        self,
+        scene: GaussianScene,
+        *,
+        parameters: SurfelParameters | None = None,
+        backdrop: np.ndarray | None = None,
+    ) -> None:
+        self.scene, self._parameters, self._backdrop = scene, parameters, backdrop
         self.records = pack(parameters or SurfelParameters.from_scene(scene)).detached()
         # Not built when first needed: that may be inside a recorded loop, where nothing can be evaluated.
-        self.bvh = build_bvh(self.records)
+        self.bvh = build_bvh(self._met())
         self._sorted_area = self.bvh.area
         self._two_sided, self._beyond = True, BackFaces.of(self.records, scene.spacing)
 
@@ -87,6 +95,14 @@ class SurfelTracer:
         other._two_sided = two_sided
         return other
 
+    def turned_over(self) -> SurfelTracer:
+        """The same surfels with their sides exchanged, in the same hierarchy; without gradients."""
+        other = copy(self)
+        other.scene, other._parameters = self.scene.turned_over(np.ones(len(self.scene), bool)), None
+        other.records = self.records.turned_over()
+        other.bvh = replace(self.bvh, geometry=turned_geometry(self.bvh.geometry))
+        return other
+
     def update(self) -> None:
         """Take the new values of ``parameters``: as many surfels, which may have moved."""
         if self._parameters is not None:
@@ -95,10 +111,24 @@ class SurfelTracer:
 
     def _take(self, records: SurfelRecords) -> None:
         self.records = records
-        self.bvh = refit(self.bvh.order, self.bvh.levels, records)
+        self.bvh = refit(self.bvh.order, self.bvh.levels, self._met())
         if bool((self.bvh.area > LOOSE_BOXES * self._sorted_area)[0]):
-            self.bvh = build_bvh(records)
+            self.bvh = build_bvh(self._met())
             self._sorted_area = self.bvh.area
+
+    def with_scene(self, scene: GaussianScene) -> SurfelTracer:
+        """A tracer of another scene of the same surfels, sorted anew, with the same backdrop and sides."""
+        return SurfelTracer(scene, backdrop=self._backdrop).sided(self._two_sided)
+
+    def _met(self) -> SurfelRecords:
+        """The records that rays of no camera meet: those of the backdrop count nowhere."""
+        if self._backdrop is None:
+            return self.records
+        geometry = dr.copy(self.records.geometry)
+        surfel = mi.UInt32(np.flatnonzero(self._backdrop).astype(np.uint32))
+        dr.scatter(geometry, mi.Float(-1), surfel * (4 * GEOMETRY_PACKETS) + CUT)
+        dr.eval(geometry)
+        return replace(self.records, geometry=geometry)
 
     def attached(self) -> SurfelRecords:
         """The records, attached to the parameters that have gradients enabled.
@@ -147,7 +177,7 @@ class SurfelTracer:
         """One surfel a ray, by chance, each as likely as its weight in compositing: see :mod:`.first_hit`.
 
         For a fan of rays from each origin, as :meth:`transmittances` has them; back faces count as for shadow
-        rays. ``seeds`` of each ray: :func:`tron.tracing.first_hit.ray_seeds`.
+        rays. ``seeds`` of each ray: :func:`tron.tracing.hierarchy.first_hit.ray_seeds`.
         """
         return first_hits(self.bvh, Fans(origin, directions, active), self.back_faces, seeds)
 
@@ -168,9 +198,28 @@ class SurfelTracer:
         trace = transmittance if recorded else queued_transmittance
         return trace(self.bvh, Fans(origin, directions, active), self.back_faces)
 
-    def transmittance_by_opacity(
-        self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
-    ) -> mi.Float:
-        """:meth:`transmittance`, differentiable by the opacities; not inside a recorded loop."""
-        fans = Fans(dr.detach(origin), [dr.detach(direction)], [mi.Bool(active)])
-        return transmittance_by_opacity(self.attached(), self.bvh, fans, self.back_faces)
+
+def trace_rays(
+    records: SurfelRecords, bvh: Bvh, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
+) -> Surface:
+    """Trace, composite and normalise; differentiable in the records and, through SH alone, in ``direction``.
+
+    Args:
+        records: the surfels. bvh: their hierarchy.
+        origin: world. direction: unit, world.
+        active: lanes to trace; the others see nothing.
+    """
+    still = records.detached()
+    at, along = dr.detach(origin), dr.detach(direction)
+    search = search_hierarchy(bvh, at, along)
+    sums = composite_rounds(still, search, along, active)
+    if has_gradients(records, direction):
+        dr.eval(sums)
+        ray = dr.arange(mi.UInt32, dr.width(sums.count))
+
+        def search_lanes(lane: mi.UInt32) -> Search:
+            return search_hierarchy(bvh, lanes_of(at, lane), lanes_of(along, lane))
+
+        hits = RelistedHits(still, search_lanes, along, ray, sums.count)
+        sums = attach(sums, records, at, direction, [hits])
+    return surface(sums, at, along)

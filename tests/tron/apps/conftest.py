@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tron.apps.relight import cli
+from tron.apps.relight.command import cli
 from tron.gaussians.harmonics import rgb_to_dc
 from tron.gaussians.scene import GaussianScene, quats_from_normals
-from tron.shading.environment import EnvironmentMap
+from tron.shading.environments.environment import EnvironmentMap
 
 SIZE = 32
 """Pixels along a side of a frame that the command renders here."""
@@ -58,14 +58,18 @@ def scene_path(ball_on_floor, tmp_path_factory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def light_path(tmp_path_factory) -> Path:
+def lamp() -> EnvironmentMap:
     """A dim sky with a bright patch low in the +x direction."""
     image = np.full((32, 64, 3), 0.3, np.float32)
     row, column = 9, 16  # u = atan2(x, y) / 2 pi = 1/4
     image[row - 1 : row + 2, column - 2 : column + 2] = 60.0
+    return EnvironmentMap(image)
+
+
+@pytest.fixture(scope="module")
+def light_path(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("light") / "lamp.exr"
-    EnvironmentMap(image).save(path)
+    lamp().save(path)
     return path
 
 
@@ -79,3 +83,22 @@ def relight(variant) -> Callable[..., int]:
         return int(exit_info.value.code or 0)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def orbit_of_four(made_once, variant) -> Path:
+    """What the command makes of the ball from +x, +y, -x, -y in its best quality; not to be changed."""
+
+    def make(folder: Path) -> None:
+        make_ball_on_floor().save(folder / "surfels.ply")
+        lamp().save(folder / "lamp.exr")
+        words = [
+            *(f"scene={folder / 'surfels.ply'}", f"environment={folder / 'lamp.exr'}"),
+            *(f"output_dir={folder / 'out'}", f"width={SIZE}", f"height={SIZE}", f"variant={variant}"),
+            *("frames=4", "quality=final", "buffers=[irradiance,indirect,shadowed,lit,normal,position]"),
+        ]
+        with pytest.raises(SystemExit) as stop:
+            cli(words)
+        assert not stop.value.code
+
+    return made_once(f"orbit_of_four-{variant}", make) / "out"

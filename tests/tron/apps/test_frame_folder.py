@@ -5,7 +5,7 @@ import pytest
 
 from tron.apps.frame_folder import FrameFolder
 from tron.errors import TronError
-from tron.images import read_image
+from tron.io.images import read_image
 from tron.seeds import generator
 
 

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tron.apps.framing import find_subject, plan_cameras, turn_cameras, upright
+from tron.apps.framing import plan_cameras, turn_cameras
+from tron.cameras import Camera
+from tron.framing import find_subject, upright
 from tron.seeds import generator
 
 VIEW = {"width": 64, "height": 48, "fov_deg": 50.0}
@@ -83,3 +85,24 @@ def test_turned_cameras_see_the_turned_world_as_before(ball_on_floor):
         np.testing.assert_allclose(
             after.project(scene.means @ rotation.T)[0], before.project(scene.means)[0], atol=1e-3
         )
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (0.6, 0, 0.8)])
+def test_a_camera_around_a_scene_is_the_one_that_stands_still(ball_on_floor, up):
+    upright_scene = ball_on_floor()
+    scene = upright_scene.rotated(upright(np.array(up, float)).T)
+    np.testing.assert_allclose(scene.up, up, atol=1e-6)
+    image = {"width": 64, "height": 48, "fov_deg": 50}
+    camera = Camera.around(scene, **image)
+    (still,) = plan_cameras(scene, "still", 1, **image)
+    np.testing.assert_allclose(camera.world_to_camera, still.world_to_camera, atol=1e-9)
+    assert camera.up @ scene.up > 0.8
+    np.testing.assert_allclose(scene.upright().up, (0, 0, 1), atol=1e-6)
+    pixels, depth = Camera.around(scene, azimuth_deg=120, **image).project(scene.means[scene.object_id == 1])
+    assert (depth > 0).all()
+    assert ((pixels > 0) & (pixels < (64, 48))).all(1).mean() > 0.97
+
+
+def test_a_scene_that_is_upright_is_left_alone(ball_on_floor):
+    scene = ball_on_floor()
+    assert scene.upright() is scene

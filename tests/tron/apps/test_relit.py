@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tron.apps.relight_settings import Settings
+from tron.apps.relight.settings import Settings
 from tron.cameras import Camera
 from tron.color import agx, to_display
 from tron.gaussians.scene import GaussianScene
-from tron.images import read_image
+from tron.io.images import read_image
 from tron.seeds import generator
-from tron.shading.background import background_share
-from tron.shading.environment import EnvironmentMap
+from tron.shading.composition import background_share
+from tron.shading.environments.environment import EnvironmentMap
 
 SIZE = 32
 STEP = 1.01 / 255
@@ -33,8 +33,8 @@ def lights(tmp_path_factory) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def over(variant, scene_path, lights, tmp_path_factory):
-    """One frame over each background, all from one folder of buffers: name -> folder of pictures."""
-    from tron.apps.relight import cli
+    """One frame over each background: name -> folder of pictures."""
+    from tron.apps.relight.command import cli
 
     base = tmp_path_factory.mktemp("over")
     for name, background in BACKGROUNDS.items():
@@ -128,7 +128,7 @@ def test_opaque_pixels_do_not_depend_on_the_background(over):
 
 
 def test_foreground_over_the_sky_is_the_picture_in_the_environment(over, lights):
-    """The buffers let anyone composite by the one rule of tron.shading.background."""
+    """The buffers let anyone composite by the one rule of tron.shading.composition."""
     folder = over / "environment"
     foreground, mask, lit, relit = (
         picture(folder, name, suffix="exr") for name in ("foreground", "mask", "lit", "relit")
@@ -191,7 +191,7 @@ def test_what_has_alpha_is_black_behind_in_videos_and_sheets(
 
 def test_a_networks_picture_is_composited_by_the_mask(relight, scene_path, lights, tmp_path):
     from tron.neural.configs import PixelMLPConfig
-    from tron.neural.pixel_mlp import PixelMLP
+    from tron.neural.networks.pixel_mlp import PixelMLP
     from tron.neural.weights import save_renderer
 
     save_renderer(tmp_path / "r.safetensors", PixelMLP(PixelMLPConfig(width=4)))
@@ -221,7 +221,7 @@ def test_a_turn_starts_at_its_first_angle_and_loops():
 @pytest.fixture
 def counted(monkeypatch) -> dict[str, int]:
     """Calls so far of what bounces cost: "trace" a scene's transport, "bake" a light."""
-    from tron.shading.bounce import BounceTransport
+    from tron.shading.bounces.bounce import BounceTransport
 
     calls = {"trace": 0, "bake": 0}
 
@@ -276,15 +276,10 @@ def test_without_bounces_the_picture_is_shadowed_and_nothing_is_traced_for_them(
     assert sheet.shape[0] == 18 + 3 * (SIZE + 2), "the relit picture and those"
 
 
-def test_bounced_light_fills_the_shadow_and_has_the_colour_of_what_sent_it(
-    relight, scene_path, light_path, tmp_path
-):
+def test_bounced_light_fills_the_shadow_and_has_the_colour_of_what_sent_it(orbit_of_four):
     """A lamp on a reddish ball (base color 0.8, 0.3, 0.2) over a grey floor, which turns red beside it."""
-    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={tmp_path}", "frames=4"]
-    assert relight(*base, "quality=final", "buffers=[indirect,shadowed,lit,normal,position]") == 0
-    indirect, lit, shadowed, normal, position = (
-        picture(tmp_path, name, 0, "exr") for name in ("indirect", "lit", "shadowed", "normal", "position")
-    )
+    names = ("indirect", "lit", "shadowed", "normal", "position")
+    indirect, lit, shadowed, normal, position = (picture(orbit_of_four, name, 0, "exr") for name in names)
     on_floor = (normal[..., 2] > 0.99) & (position[..., 2] < 0.05)
     from_ball = np.linalg.norm(position[..., :2], axis=-1)
     near, far = on_floor & (from_ball < 0.5), on_floor & (from_ball > 1.2)
@@ -294,22 +289,6 @@ def test_bounced_light_fills_the_shadow_and_has_the_colour_of_what_sent_it(
     red = [indirect[where][:, 0].mean() / indirect[where][:, 2].mean() for where in (near, far)]
     assert red[0] > 1.3
     assert lit[near].mean() > 1.02 * shadowed[near].mean()
-
-
-def test_a_run_that_is_finished_traces_no_bounces(relight, scene_path, lights, tmp_path, counted):
-    base = [f"scene={scene_path}", f"environment={lights[0]}", "frames=1", f"output_dir={tmp_path}"]
-    assert relight(*base) == 0
-    before = dict(counted)
-    assert relight(*base, "exposure=0.1") == 0
-    assert counted == before
-
-
-@pytest.mark.parametrize("setting", ["bounces=1", "reflections=2", "supersample=2", "diffuse=lambert"])
-def test_other_light_in_the_same_folder_is_refused(relight, scene_path, lights, tmp_path, capsys, setting):
-    base = [f"scene={scene_path}", f"environment={lights[0]}", "frames=1", f"output_dir={tmp_path}"]
-    assert relight(*base) == 0
-    assert relight(*base, setting) == 2
-    assert setting.split("=")[0] in capsys.readouterr().err
 
 
 def frame_files(output_dir: Path, index: int | None = None) -> dict[str, bytes]:

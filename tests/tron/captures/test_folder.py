@@ -14,7 +14,7 @@ from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder, write_capture
 from tron.errors import TronError
-from tron.images import read_image
+from tron.io.images import read_image
 from tron.seeds import generator
 from tron.trajectories import spiral
 

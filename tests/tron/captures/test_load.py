@@ -13,7 +13,7 @@ def test_format_takes_the_names_of_the_table() -> None:
 
 
 def test_the_documentation_names_every_format() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "reconstruction.md").read_text("utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "guides" / "captures.md").read_text("utf-8")
     documented = [row.split("|")[2].strip(" `") for row in page.splitlines() if row.startswith("| ")]
     assert set(FORMATS) <= set(documented)
 

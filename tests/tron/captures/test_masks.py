@@ -9,8 +9,8 @@ import pytest
 from tron.captures import LoadSettings, load_capture
 from tron.captures.folder import write_capture
 from tron.captures.masks import beside_reduced, find_mask, mask_values
-from tron.captures.photo_files import PhotoHeader
-from tron.captures.photo_views import mask_of
+from tron.captures.photos.photo_files import PhotoHeader
+from tron.captures.photos.photo_views import mask_of
 from tron.errors import TronError
 
 PLACES = {
@@ -162,8 +162,8 @@ def test_what_is_believed_survives_a_capture_folder(folder: Path, write, tmp_pat
 def test_features_are_not_sought_under_masks(tmp_path: Path, write) -> None:
     from PIL import Image
 
-    from tron.captures.photo_files import inspect_photo
-    from tron.captures.structure_from_motion import _copy, _copy_masks
+    from tron.captures.photos.photo_files import inspect_photo
+    from tron.captures.posing.structure_from_motion import _copy, _copy_masks
 
     paths = [tmp_path / f"{name}.png" for name in "ab"]
     for path in paths:

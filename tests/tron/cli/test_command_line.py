@@ -3,6 +3,7 @@
 import json
 import logging
 import pstats
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -145,7 +146,7 @@ def run(toy_conf: str, capsys: pytest.CaptureFixture[str], monkeypatch, tmp_path
         (["output_dir=o", "note=${nowhere}"], ["nowhere"]),
         (["frames=3"], ["'output_dir' has no value", "output_dir=VALUE"]),
         (["demo"], ["'demo'", "write key=value"]),
-        (["output_dir=a(1).ply"], ["cannot read", """'output_dir="a(1).ply"'"""]),
+        (["note=a(1).ply"], ["cannot read", """'note="a(1).ply"'"""]),
         (["--multirun"], ["--multirun", "--help"]),
         (["--cfg", "hydra"], ["--cfg", "hydra"]),
         (["--log-level", "loud"], ["--log-level", "loud", "warning"]),
@@ -210,6 +211,7 @@ def test_own_recipes_come_from_a_config_dir(run: Run, tmp_path: Path):
     assert run("--config-dir", "my recipes", "experiment=mine", "output_dir=o")[0] == 0
     assert run.seen[0].frames == 9  # type: ignore[attr-defined]
     assert run("experiment=mine", "output_dir=o")[0] == 2
+    assert "mine" in run("--config-dir", "my recipes", "--help")[1]
 
 
 def test_nothing_is_written_and_the_working_directory_stays(run: Run, tmp_path: Path):
@@ -283,8 +285,57 @@ def test_an_interruption_exits_130_without_a_traceback(run: Run):
     assert run("output_dir=o", does=interrupt) == (
         130,
         "",
-        "tron-toy: interrupted; the same command goes on from here\n",
+        "tron-toy: interrupted; what is finished is kept, and the same command goes on from it\n",
     )
+
+
+def test_sigterm_unwinds_and_exits_143_without_a_traceback(run: Run):
+    """And what `main` knows better about its own end is said instead."""
+    before = signal.getsignal(signal.SIGTERM)
+
+    def end(_):
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except SystemExit as end:
+            end.add_note("all is lost")
+            raise
+
+    assert run("output_dir=o", does=end) == (143, "", "tron-toy: terminated; all is lost\n")
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_an_interruption_that_a_destructor_swallows_comes_again():
+    """In a process of its own: those that run tests side by side have signal handlers of theirs."""
+    program = """
+import time
+from tron.termination import termination_unwinds
+
+class Held:
+    def __del__(self):
+        raise KeyboardInterrupt
+
+with termination_unwinds():
+    try:
+        Held()
+        time.sleep(10)
+    except KeyboardInterrupt:
+        print("came again")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.stdout == "came again\n", done.stderr
+
+
+def test_an_interruption_that_an_import_makes_another_error_of_is_one(run: Run):
+    def load(_):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            try:
+                raise ImportError("an error while initializing the extension") from error
+            except ImportError:
+                raise NameError("_drjit_ext") from None
+
+    assert run("output_dir=o", does=load)[0] == 130
 
 
 def test_a_defect_keeps_its_traceback(run: Run):

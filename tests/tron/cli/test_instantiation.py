@@ -52,6 +52,10 @@ def test_it_makes_what_the_recipe_names(target):
         ({"price": 1, "lens": lens(fov="x")}, "wrong value for 'shop.lens.fov' ('x'): "),
         ({"price": 1, "lens": lens(fow=1)}, "wrong value for 'shop.lens.fow' (1): "),
         ({"prize": 1}, "shop cannot be made: "),
+        (
+            {"_target_": "no_shop.Shop"},
+            "shop cannot be made: Error loading 'no_shop.Shop' (here): a module",
+        ),
         ({"price": 1, "_target_": "toy_shop.Shopp"}, "shop cannot be made: "),
     ],
 )

@@ -10,29 +10,14 @@ from tron.errors import TronError
 from tron.gaussians.edit import moved
 from tron.gaussians.harmonics import eval_sh
 from tron.gaussians.scene import GaussianScene
-from tron.seeds import generator
 
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
 SHIFT = np.array([0.5, -2.0, 1.0])
 
 
 @pytest.fixture
-def scene() -> GaussianScene:
-    rng = generator(0, "tests", "edit")
-    n = 40
-    quats = rng.normal(size=(n, 4))
-    return GaussianScene(
-        means=rng.normal(size=(n, 3)),
-        quats=quats / np.linalg.norm(quats, axis=1, keepdims=True),
-        log_scales=rng.normal(size=(n, 2)) - 3,
-        opacity_logits=rng.normal(size=n),
-        sh=rng.normal(size=(n, 16, 3)),
-        base_color=rng.random((n, 3)),
-        roughness=rng.random(n),
-        metallic=rng.random(n),
-        object_id=np.arange(n) % 3,
-        spacing=0.1,
-    ).validate()
+def scene(random_scene) -> GaussianScene:
+    return random_scene()
 
 
 def test_centres_normals_and_radiance_turn_together(scene: GaussianScene) -> None:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tron.color import srgb_to_linear
 from tron.errors import TronError
 from tron.gaussians.ply import MATERIAL_PROPERTIES
-from tron.gaussians.scene import GaussianScene, quats_from_matrices
+from tron.gaussians.scene import GaussianScene
 from tron.seeds import generator
 
 LAYOUT = (
@@ -23,23 +23,9 @@ LAYOUT = (
 
 
 @pytest.fixture
-def scene() -> GaussianScene:
-    rng = generator(0, "test", "ply")
-    count = 25
-    return GaussianScene(
-        means=rng.normal(size=(count, 3)),
-        quats=quats_from_matrices(Rotation.random(count, rng).as_matrix()),
-        log_scales=rng.uniform(-4, -2, (count, 2)),
-        opacity_logits=rng.normal(size=count),
-        sh=rng.normal(size=(count, 16, 3)) * 0.2,
-        base_color=rng.uniform(size=(count, 3)),
-        roughness=rng.uniform(size=count),
-        metallic=rng.uniform(size=count),
-        object_id=rng.integers(0, 2**30, count),
-        kernel_degree=4,
-        spacing=0.0123456789,
-        up=np.array([0.0, -1.0, 0.0]),
-    )
+def scene(random_scene) -> GaussianScene:
+    ids, up = np.arange(25) * 2**25 + 1, np.array([0.0, -1.0, 0.0])
+    return random_scene(25, object_id=ids, kernel_degree=4, spacing=0.0123456789, up=up)
 
 
 def rewrite(path, drop=(), change=None, text=False, order="<", comments=()):
@@ -238,10 +224,7 @@ def test_half_a_set_of_materials_is_refused(scene, tmp_path):
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("x", np.nan, "position"),
-        ("f_rest_7", np.inf, "sh of 1"),
         ("roughness", np.nan, "roughness"),
-        ("scale_0", np.inf, "scale is not finite"),
         ("base_color_1", 7.0, r"base_color of 1 surfels is outside \[0, 1\]"),
     ],
 )
@@ -254,15 +237,6 @@ def test_bad_values_are_refused(scene, tmp_path, name, value, words):
     refuse(path, words)
 
 
-def test_a_zero_quaternion_is_refused_and_named(scene, tmp_path):
-    path = tmp_path / "a.ply"
-    scene.save(path)
-    keep = np.ones(len(scene), np.float32)
-    keep[11] = 0
-    rewrite(path, change={f"rot_{k}": scene.quats[:, k] * keep for k in range(4)})
-    refuse(path, "surfel 11 is a zero quaternion")
-
-
 HEADER = "ply\nformat {format} 1.0\n{body}end_header\n"
 FLOATS = "".join(f"property float {name}\n" for name in LAYOUT)
 
@@ -270,23 +244,12 @@ FLOATS = "".join(f"property float {name}\n" for name in LAYOUT)
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"", "not a PLY"),
+        (b"", "an empty file"),
         (b"\x89PNG\r\n\x1a\n" + bytes(100), "not a PLY"),
-        (b"ply\nformat ascii 1.0\n" + b"comment x\n" * 50_000, "no end"),
-        (HEADER.format(format="binary_little_endian", body=f"element vertex {10**12}\n{FLOATS}"), "declares"),
-        (HEADER.format(format="ascii", body=f"element vertex {10**12}\n{FLOATS}"), "declares"),
         (
             HEADER.format(format="binary_little_endian", body=f"element vertex {10**12}\n"),
             "without properties",
         ),
-        (
-            HEADER.format(
-                format="binary_little_endian",
-                body=f"element vertex 0\n{FLOATS}element face {10**12}\nproperty list uchar int i\n",
-            ),
-            "declares",
-        ),
-        (HEADER.format(format="ascii", body=f"element vertex -3\n{FLOATS}"), "no vertex|not a readable"),
         (HEADER.format(format="ascii", body=f"element vertex 0\n{FLOATS}"), "no surfels"),
         (HEADER.format(format="ascii", body="element face 0\nproperty float x\n"), "no vertex element"),
         (HEADER.format(format="purple", body=f"element vertex 0\n{FLOATS}"), "not a readable PLY"),
@@ -300,7 +263,7 @@ FLOATS = "".join(f"property float {name}\n" for name in LAYOUT)
         ),
     ],
 )
-def test_hostile_files_are_refused_at_once(tmp_path, content, words):
+def test_files_without_surfels_are_refused_at_once(tmp_path, content, words):
     path = tmp_path / "hostile.ply"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     refuse(path, words)

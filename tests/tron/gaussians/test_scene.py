@@ -8,33 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from tron.errors import TronError
 from tron.gaussians.harmonics import eval_sh
-from tron.gaussians.scene import (
-    GaussianScene,
-    measure_spacing,
-    quats_from_matrices,
-    quats_from_normals,
-    rotation_matrices,
-)
-from tron.seeds import generator
+from tron.gaussians.scene import measure_spacing, quats_from_normals, rotation_matrices
 
 
-def random_scene(count: int = 40) -> GaussianScene:
-    rng = generator(0, "test", "scene")
-    return GaussianScene(
-        means=rng.normal(size=(count, 3)),
-        quats=quats_from_matrices(Rotation.random(count, rng).as_matrix()),
-        log_scales=rng.uniform(-4, -2, (count, 2)),
-        opacity_logits=rng.normal(size=count),
-        sh=rng.normal(size=(count, 16, 3)) * 0.1,
-        base_color=rng.uniform(size=(count, 3)),
-        roughness=rng.uniform(size=count),
-        metallic=rng.uniform(size=count),
-        object_id=rng.integers(0, 5, count),
-        spacing=0.1,
-    ).validate()
-
-
-def test_frames_are_right_handed_and_orthonormal():
+def test_frames_are_right_handed_and_orthonormal(random_scene):
     scene = random_scene()
     u, v = scene.tangents()
     np.testing.assert_allclose(np.cross(u, v), scene.normals(), atol=1e-6)
@@ -42,7 +19,7 @@ def test_frames_are_right_handed_and_orthonormal():
     np.testing.assert_allclose((u * v).sum(1), 0, atol=1e-6)
 
 
-def test_a_known_quaternion_gives_a_known_normal():
+def test_a_known_quaternion_gives_a_known_normal(random_scene):
     scene = random_scene(1)
     half = np.sqrt(0.5)
     scene.quats = np.array([[half, half, 0, 0]], np.float32)  # a quarter turn about +x takes +z to -y
@@ -56,7 +33,7 @@ def test_every_normal_has_a_frame():
     np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-6)
 
 
-def test_facing_turns_normals_to_the_point_and_keeps_the_disk():
+def test_facing_turns_normals_to_the_point_and_keeps_the_disk(random_scene):
     scene = random_scene()
     point = np.array([3.0, -2.0, 5.0])
     facing = scene.facing(point)
@@ -68,7 +45,7 @@ def test_facing_turns_normals_to_the_point_and_keeps_the_disk():
     assert facing.means is scene.means
 
 
-def test_rotation_moves_centres_normals_radiance_and_up_together():
+def test_rotation_moves_centres_normals_radiance_and_up_together(random_scene):
     scene = random_scene()
     rotation = Rotation.from_euler("zyx", [1.0, 0.4, -2.0]).as_matrix()
     turned = scene.rotated(rotation).validate()
@@ -81,7 +58,7 @@ def test_rotation_moves_centres_normals_radiance_and_up_together():
     )
 
 
-def test_trimmed_bounds_ignore_strays():
+def test_trimmed_bounds_ignore_strays(random_scene):
     scene = random_scene(1000)
     scene.means[0] = [1e5, -1e5, 1e5]
     low, high = scene.bounds(trim=0.01)
@@ -117,7 +94,7 @@ def test_spacing_of_coincident_or_single_surfels_is_positive():
         ("up", np.array([0.0, 0.0, 2.0]), "up is"),
     ],
 )
-def test_broken_scenes_are_refused_by_name(field, value, words):
+def test_broken_scenes_are_refused_by_name(random_scene, field, value, words):
     broken = dataclasses.replace(random_scene(), **{field: value})
     with pytest.raises(TronError, match=words):
         broken.validate()

@@ -14,10 +14,10 @@ from tron.cameras import Camera, mitsuba_sensor
 from tron.errors import TronError
 from tron.estimation import Estimation
 from tron.gaussians.scene import GaussianScene
-from tron.integrators.environment import environment_of
+from tron.integrators.guidance import environment_of
 from tron.seeds import generator
-from tron.shading.bounce import BounceTransport
-from tron.shading.environment import EnvironmentMap
+from tron.shading.bounces.bounce import BounceTransport
+from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
 from tron.tracing import SurfelTracer
 
@@ -93,7 +93,7 @@ def test_choices_about_bounced_light_are_the_librarys(surfels, light) -> None:
     np.testing.assert_array_equal(seen["lit"], seen["shadowed"])
 
 
-def test_transport_is_traced_once_and_light_baked_once(surfels, light, monkeypatch) -> None:
+def test_transport_is_traced_once_and_light_baked_once(variant: str, surfels, light, monkeypatch) -> None:
     calls: list[str] = []
     for name in ("trace", "direct"):
         plain = getattr(BounceTransport, name)
@@ -110,7 +110,8 @@ def test_transport_is_traced_once_and_light_baked_once(surfels, light, monkeypat
         return channels(mi.render(scene, integrator=integrator), integrator)["lit"]
 
     first = lit()
-    np.testing.assert_array_equal(lit(), first)
+    # A GPU adds in no fixed order.
+    np.testing.assert_allclose(lit(), first, rtol=0, atol=1e-6 if variant.startswith("cuda") else 0)
     assert calls == ["trace", "direct"]
     emitter["light.scale"] = 2.0
     emitter.update()
@@ -140,7 +141,9 @@ def test_many_rays_a_pixel_average_the_same_light(surfels, light) -> None:
 
 
 @pytest.mark.parametrize("kind", ["upright", "tilted", "mirrored", "sky"])
-def test_the_background_is_what_mitsubas_path_tracer_shows(surfels, light, kind: str) -> None:
+def test_the_background_is_what_mitsubas_path_tracer_shows(
+    surfels, light, texture_error: float, kind: str
+) -> None:
     """Orientation: the same scene without surfels, by Mitsuba itself."""
     emitter = light.to_mitsuba()
     if kind == "tilted":
@@ -156,11 +159,13 @@ def test_the_background_is_what_mitsubas_path_tracer_shows(surfels, light, kind:
     empty = seen["A"] == 0
     assert empty.mean() > 0.2
     assert truth[empty].std() > 0.05 * truth[empty].mean()
-    limit = 1e-3 if kind == "upright" else 0.02  # of resampling
+    limit = 1e-3 + texture_error if kind == "upright" else 0.02  # of resampling
     assert np.abs(seen["main"] - truth)[empty].mean() < limit * truth[empty].mean()
     if kind != "upright":
         return
-    np.testing.assert_allclose(seen["main"][empty], truth[empty], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(
+        seen["main"][empty], truth[empty], rtol=1e-3, atol=1e-3 + texture_error * np.ptp(light.image)
+    )
 
 
 @pytest.mark.parametrize("rotation", [0.0, 90.0, 33.3, -120.0])
@@ -175,7 +180,9 @@ def test_an_upright_envmap_is_read_texel_by_texel(variant: str, light, rotation:
 
 
 @pytest.mark.parametrize("row,column", [(0, 5), (3, 0), (7, 31), (11, 9)])
-def test_a_one_hot_light_stands_where_the_plugin_shows_it(variant: str, row: int, column: int) -> None:
+def test_a_one_hot_light_stands_where_the_plugin_shows_it(
+    variant: str, texture_error: float, row: int, column: int
+) -> None:
     image = np.zeros((16, 32, 3), np.float32)
     image[row, column] = (1.0, 2.0, 3.0)
     scene = scene_of(EnvironmentMap(image, 25.0).to_mitsuba())
@@ -185,7 +192,9 @@ def test_a_one_hot_light_stands_where_the_plugin_shows_it(variant: str, row: int
     si.wi = -mi.Vector3f(d.T.astype(np.float32).copy())
     truth = np.array(scene.environment().eval(si)).T
     assert truth.max() > 0.1
-    np.testing.assert_allclose(environment_of(scene).lookup(d), truth, atol=1e-4)
+    np.testing.assert_allclose(
+        environment_of(scene).lookup(d), truth, atol=1e-4 + texture_error * np.ptp(image)
+    )
 
 
 def test_a_constant_emitter_is_a_constant_map(variant: str) -> None:

@@ -12,9 +12,9 @@ import pytest
 from tron import integrators
 from tron.cameras import Camera, mitsuba_sensor
 from tron.errors import TronError
-from tron.integrators.stacked_lights import StackedLights, hilbert_order
+from tron.integrators.many_lights import StackedLights, hilbert_order
 from tron.seeds import generator, integer
-from tron.shading.environment import EnvironmentMap
+from tron.shading.environments.environment import EnvironmentMap
 
 pytestmark = pytest.mark.usefixtures("registered")
 

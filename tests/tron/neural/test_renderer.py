@@ -6,9 +6,9 @@ import torch
 
 from tron import seeds
 from tron.errors import TronError
-from tron.neural.backbone import Backbone
 from tron.neural.configs import BackboneConfig, CosmosConfig, PixelMLPConfig, RendererConfig
-from tron.neural.pixel_mlp import PixelMLP
+from tron.neural.networks.backbone import Backbone
+from tron.neural.networks.pixel_mlp import PixelMLP
 from tron.neural.renderer import NeuralRenderer, render_clip
 from tron.shards.schema import GUIDANCE, TARGET
 
@@ -199,6 +199,19 @@ def test_rendering_changes_neither_mode_nor_weights():
     render_clip(renderer, dict.fromkeys(GUIDANCE, np.ones((1, 8, 8, 3), np.float32)))
     assert renderer.training
     assert all(torch.equal(v, before[k]) for k, v in renderer.state_dict().items())
+
+
+@pytest.mark.parametrize("value, instead", [(np.nan, 0.0), (np.inf, 1.0), (-np.inf, 0.0)])
+def test_one_pixel_that_is_not_finite_blackens_nothing(value: float, instead: float, caplog):
+    renderer = awake(NeuralRenderer(RendererConfig(window=1, backbone=SMALL)))
+    clip = {name: seeds.generator(0, name).random((2, 16, 16, 3), np.float32) for name in GUIDANCE}
+    clip["pbr"][1, 3, 4] = value
+    drawn = render_clip(renderer, clip)
+    assert np.isfinite(drawn).all()
+    (line,) = (record.getMessage() for record in caplog.records)
+    assert line.startswith("3 values of pbr are NaN or infinite")
+    clip["pbr"][1, 3, 4] = instead
+    np.testing.assert_array_equal(drawn, render_clip(renderer, clip))
 
 
 def test_render_clip_refuses_what_is_no_clip():

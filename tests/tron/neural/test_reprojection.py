@@ -6,7 +6,7 @@ import pytest
 from tron import seeds
 from tron.cameras import Camera
 from tron.flow import Match, surface_motion
-from tron.neural.reprojection import OWN_WEIGHT, averaged
+from tron.neural.clips import OWN_WEIGHT, averaged
 
 SIZE, FRAMES, DISTANCE = 48, 5, 4.0
 CAMERAS = [

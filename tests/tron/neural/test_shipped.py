@@ -14,11 +14,19 @@ def test_a_shipped_checkpoint_is_given_what_its_name_says_and_has_a_card(name: s
     assert set(load_renderer(path).config.guidance) == {
         "pbr",
         "irradiance",
-        *(["lit", "albedo", "surface"] if name == "lit" else []),
+        *(["lit", "albedo", "surface"] if name == "surfaces" else []),
     }
     assert path.stat().st_size < 8_000_000
     _, _, card = (shipped.FOLDER / "README.md").read_text().partition(f"## `{name}`")
     assert f"sha256 `{sha256(path)[:8]}...`" in card.partition("\n## ")[0]
+
+
+def test_former_names_still_mean_them_and_say_so_once(caplog):
+    shipped._say_renamed.cache_clear()
+    for former, name in (("lit", "surfaces"), ("pair", "paper")):
+        assert [shipped.checkpoint_file(former) for _ in range(2)] == [shipped.shipped(name)] * 2
+        assert caplog.text.count(f"'{former}' is called '{name}' now") == 1
+    assert shipped.checkpoint_file("lit.safetensors").name == "lit.safetensors"
 
 
 def test_other_names_are_none_of_ours():

@@ -10,9 +10,9 @@ import torch
 from safetensors.torch import save_file
 
 from tron.errors import TronError
+from tron.neural.codecs.published_files import folder_state, torch_state
+from tron.neural.codecs.wan import load_wan
 from tron.neural.configs import BackboneConfig
-from tron.neural.published_files import folder_state, torch_state
-from tron.neural.wan import load_wan
 from tron.neural.weights import load_cosmos_state
 
 INDEX = "diffusion_pytorch_model.safetensors.index.json"

@@ -14,9 +14,9 @@ from diffusers.loaders.single_file_utils import (
 from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
 
 from tron.errors import TronError
-from tron.neural.backbone import Backbone, transformer
+from tron.neural.codecs.published_files import load_strictly
 from tron.neural.configs import COSMOS_0_6B
-from tron.neural.published_files import load_strictly
+from tron.neural.networks.backbone import Backbone, transformer
 
 Shapes = dict[str, tuple[int, ...]]
 

@@ -9,9 +9,9 @@ import torch
 
 from tron import seeds
 from tron.errors import TronError
+from tron.neural.clips import Overlap, windows
 from tron.neural.configs import RendererConfig, UNetRendererConfig
 from tron.neural.renderer import NeuralRenderer, render_clip, render_frames
-from tron.neural.windows import Overlap, windows
 from tron.shards.schema import GUIDANCE
 
 OVERLAPS: tuple[Overlap, ...] = ("newest", "mean", "anchor")

@@ -15,7 +15,8 @@ from tron.estimation import Estimation
 from tron.gaussians import GaussianScene
 from tron.gaussians.harmonics import SH_COUNT, rgb_to_dc
 from tron.gaussians.scene import quats_from_normals
-from tron.shading import EnvironmentMap, Lighting, irradiance, render_guidance
+from tron.shading import EnvironmentMap, Lighting, render_guidance
+from tron.shading.direct.irradiance import irradiance
 from tron.tracing import SurfelTracer
 
 SIZE = 32
@@ -159,6 +160,8 @@ def painted_capture(painted: GaussianScene, capture_of) -> Capture:
 @pytest.fixture
 def one_thread(variant: str) -> None:
     """Sums in a fixed order; the fixture drjit_threads gives the threads back."""
+    if variant.startswith("cuda"):
+        pytest.skip("a GPU adds in no fixed order: nothing repeats there bit by bit")
     import drjit as dr
     import torch
 

@@ -11,12 +11,11 @@ import torch
 from safetensors.torch import save_file
 
 from tron.errors import TronError
-from tron.reconstruction.checkpoint import Checkpoint, save_checkpoint
-from tron.reconstruction.density import DensityControl
+from tron.reconstruction.geometry.losses import Weights
+from tron.reconstruction.geometry.surfels import ROWS, LearntSurfels
+from tron.reconstruction.geometry.training import DensityControl, Plan, Stage
+from tron.reconstruction.pipeline import Checkpoint, save_checkpoint
 from tron.reconstruction.settings import DensitySettings
-from tron.reconstruction.supervision import Weights
-from tron.reconstruction.surfels import ROWS, LearntSurfels
-from tron.reconstruction.training import Plan, Stage
 
 RATES = {"means": 0.1, "sh_dc": 0.2}
 
@@ -28,8 +27,9 @@ def stage(painted, painted_capture) -> Stage:
     plan = Plan("radiance", 100, Weights(rgb=1.0), RATES, density=density)
     surfels = LearntSurfels.of_scene(painted, RATES)
     for name in RATES:
-        surfels[name].grad = torch.rand(surfels[name].shape, generator=torch.Generator().manual_seed(0))
-    density.observe(surfels, torch.zeros(3))
+        pull = torch.rand(surfels[name].shape, generator=torch.Generator().manual_seed(0))
+        surfels[name].grad = pull.to(surfels.device)
+    density.observe(surfels, torch.zeros(3, device=surfels.device))
     surfels.step()
     made = Stage(plan, painted_capture.train_views, surfels, 2, 0)
     made.step, made.psnr = 42, 21.5
@@ -42,18 +42,18 @@ def test_everything_comes_back(stage: Stage, tmp_path: Path) -> None:
     found = Checkpoint(path)
     assert (found.stage, found.step, found.psnr, found.seconds) == ("radiance", 42, 21.5, 12.5)
     assert found.made_with == {"seed": 3, "radiance": {"steps": 100}}
-    surfels = found.surfels(RATES, "cpu")
+    surfels = found.surfels(RATES)
     before, after = stage.surfels.state(), surfels.state()
     assert before.keys() == after.keys()
     for name in before:
-        np.testing.assert_array_equal(before[name].numpy(), after[name].numpy(), err_msg=name)
+        np.testing.assert_array_equal(before[name].cpu().numpy(), after[name].cpu().numpy(), err_msg=name)
     density = DensityControl(DensitySettings(), 1.0, 0)
     again = Stage(Plan("radiance", 100, Weights(rgb=1.0), RATES, density=density), stage.views, surfels, 2, 0)
     found.resume(again)
     assert (again.step, again.psnr) == (42, 21.5)
     assert stage.plan.density is not None
-    np.testing.assert_array_equal(density.total.numpy(), stage.plan.density.total.numpy())
-    np.testing.assert_array_equal(density.seen.numpy(), stage.plan.density.seen.numpy())
+    np.testing.assert_array_equal(density.total.cpu().numpy(), stage.plan.density.total.cpu().numpy())
+    np.testing.assert_array_equal(density.seen.cpu().numpy(), stage.plan.density.seen.cpu().numpy())
 
 
 def test_a_psnr_that_is_not_known_yet_survives(stage: Stage, tmp_path: Path) -> None:
@@ -64,9 +64,11 @@ def test_a_psnr_that_is_not_known_yet_survives(stage: Stage, tmp_path: Path) -> 
 
 def test_the_surfels_of_an_earlier_stage_can_be_asked_for(stage: Stage, tmp_path: Path) -> None:
     save_checkpoint(tmp_path / "c", stage, {}, 0.0)
-    other = Checkpoint(tmp_path / "c").surfels({"base_color": 0.1}, "cpu")
+    other = Checkpoint(tmp_path / "c").surfels({"base_color": 0.1})
     for name in ROWS:
-        np.testing.assert_array_equal(other[name].detach().numpy(), stage.surfels[name].detach().numpy())
+        np.testing.assert_array_equal(
+            other[name].detach().cpu().numpy(), stage.surfels[name].detach().cpu().numpy()
+        )
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
@@ -94,7 +96,7 @@ def test_a_checkpoint_that_lacks_a_tensor_names_it(stage: Stage, tmp_path: Path)
     found = Checkpoint(tmp_path / "c")
     del found.tensors["surfels.quats"]
     with pytest.raises(TronError, match=r"lacks .*surfels\.quats"):
-        found.surfels(RATES, "cpu")
+        found.surfels(RATES)
 
 
 def refused(path: Path) -> str:

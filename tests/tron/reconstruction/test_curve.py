@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tron.apps.reconstruct.run import Curve
 from tron.errors import TronError
-from tron.reconstruction.curve import Curve
-from tron.reconstruction.evaluation import mean_figures, score_views
+from tron.reconstruction.geometry.surfels import LearntSurfels
+from tron.reconstruction.geometry.training import Stage, StepSummary, materials_plan, radiance_plan
+from tron.reconstruction.scores import mean_figures, score_views
 from tron.reconstruction.settings import DensitySettings, MaterialSettings, RadianceSettings
-from tron.reconstruction.surfels import LearntSurfels
-from tron.reconstruction.training import Stage, StepSummary, materials_plan, radiance_plan
 from tron.tracing import SurfelTracer
 
 
@@ -61,7 +61,7 @@ def test_the_seconds_are_those_of_the_steps_alone(stage, painted_capture, tmp_pa
         now[0] += 1
         return found(*arguments)
 
-    from tron.reconstruction import training
+    from tron.reconstruction.geometry import training
 
     found = training.targets
     monkeypatch.setattr(training, "targets", targets)

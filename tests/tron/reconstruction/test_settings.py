@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from tron.apps.reconstruct import Settings
+from tron.apps.reconstruct.command import Settings
 from tron.cli.recipes import check, compose_recipe
 from tron.reconstruction.settings import (
     DensitySettings,
@@ -78,7 +78,7 @@ def test_the_papers_recipe_has_room_for_a_million_surfels(paper: Settings) -> No
 
 
 def test_the_defaults_are_the_papers_but_for_what_so_short_a_schedule_needs(paper: Settings) -> None:
-    """Each measured: docs/experiments.md."""
+    """Each measured: dev/LOG.md."""
     own, its = (
         flat({name: values[name] for name in ("radiance", "materials")})
         for values in (ReconstructionSettings().model_dump(mode="json"), paper.model_dump(mode="json"))

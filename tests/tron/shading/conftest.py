@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from tron.cameras import Camera
-from tron.shading.cubemap import CubemapLight, texel_directions
-from tron.shading.environment import EnvironmentMap
+from tron.shading.environments.cubemap import CubemapLight, texel_directions
+from tron.shading.environments.environment import EnvironmentMap
 from tron.tracing import GBuffer, Surface
 
 CENTRE, RADIUS = np.array([0.0, 0.0, 0.8]), 0.5

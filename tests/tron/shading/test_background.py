@@ -9,8 +9,8 @@ import numpy as np
 from tron.cameras import Camera
 from tron.estimation import Estimation
 from tron.seeds import generator
-from tron.shading.background import CLEAR_TRANSMITTANCE, background_share
-from tron.shading.environment import EnvironmentMap
+from tron.shading.composition import CLEAR_TRANSMITTANCE, background_share
+from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
 from tron.tracing import SurfelTracer
 

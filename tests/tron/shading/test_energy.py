@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from tron.shading.brdf_table import brdf_table
-from tron.shading.environment import EnvironmentLight, EnvironmentMap
+from tron.shading.environments.environment import EnvironmentLight, EnvironmentMap
+from tron.shading.lighting import SplitSum
 from tron.shading.reflectance import DIELECTRIC_F0, reflectance
-from tron.shading.split_sum import SplitSum
 
 
 @pytest.fixture

@@ -5,9 +5,9 @@ import pytest
 
 from tron.cameras import Camera
 from tron.estimation import Estimation
-from tron.shading.environment import EnvironmentMap
+from tron.shading.direct.irradiance import irradiance
+from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
-from tron.shading.irradiance import irradiance
 from tron.shards.schema import light_members
 
 BUFFERS = [name for name in Guidance.BUFFERS if name != "mask"]

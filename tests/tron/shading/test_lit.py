@@ -11,8 +11,8 @@ import pytest
 from tron.cameras import Camera, mitsuba_sensor
 from tron.estimation import Estimation
 from tron.seeds import generator
-from tron.shading.bounce import BounceTransport
-from tron.shading.environment import EnvironmentMap
+from tron.shading.bounces.bounce import BounceTransport
+from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Guidance, Lighting, render_guidance
 from tron.tracing import SurfelTracer
 
@@ -87,8 +87,7 @@ def test_without_a_bake_lit_is_shadowed(variant: str, dense_surfels) -> None:
     assert guidance.indirect[guidance.mask > 0.999].max() == 0
 
 
-@pytest.mark.parametrize("reflections", [0, 8])
-@pytest.mark.parametrize("shape", ["plane", "sphere", "box"])
+@pytest.mark.parametrize(("shape", "reflections"), [("plane", 0), ("sphere", 8), ("box", 0), ("box", 8)])
 def test_a_convex_object_alone_is_lit_as_if_nothing_bounced(
     dense_surfels, shape: str, reflections: int
 ) -> None:
@@ -103,9 +102,9 @@ def test_a_convex_object_alone_is_lit_as_if_nothing_bounced(
     assert difference.mean() < mean * guidance.shadowed[inside].mean()
 
 
-@pytest.mark.parametrize("reflections", [0, 8])
 @pytest.mark.parametrize(
-    ("metallic", "roughness", "least"), [(0.0, 0.8, 0.98), (0.0, 0.2, 0.95), (1.0, 0.4, 0.88)]
+    ("metallic", "roughness", "least", "reflections"),
+    [(0.0, 0.8, 0.98, 0), (0.0, 0.2, 0.95, 8), (1.0, 0.4, 0.88, 8)],
 )
 def test_white_surfaces_all_but_vanish_in_a_furnace(
     dense_surfels, metallic: float, roughness: float, least: float, reflections: int
@@ -132,8 +131,7 @@ def test_white_surfaces_all_but_vanish_in_a_furnace(
     assert guidance.shadowed[inside].min() < 0.9 or metallic == 1
 
 
-@pytest.mark.parametrize("light", ["sun", "smooth"])
-@pytest.mark.parametrize("metal", [True, False])
+@pytest.mark.parametrize(("light", "metal"), [("sun", False), ("sun", True), ("smooth", True)])
 def test_lit_is_what_mitsubas_path_tracer_shows(dense_surfels, sun_map, light: str, metal: bool) -> None:
     environment = smooth() if light == "smooth" else sun_map
     scene, shapes = still_life(dense_surfels, metal)

@@ -7,12 +7,12 @@ import pytest
 
 from tron.errors import TronError
 from tron.seeds import generator
-from tron.shading.cubemap import direction_face, face_direction
-from tron.shading.environment import EnvironmentLight, EnvironmentMap
+from tron.shading.environments.cubemap import direction_face, face_direction
+from tron.shading.environments.environment import EnvironmentLight, EnvironmentMap
+from tron.shading.environments.prefilter import LightTree, ggx_prefilter
 from tron.shading.guidance import Lighting
-from tron.shading.prefilter import LightTree, ggx_prefilter
+from tron.shading.lighting import SplitSum
 from tron.shading.reflectance import reflectance
-from tron.shading.split_sum import SplitSum
 
 
 def unit(n: int, seed: int = 0) -> np.ndarray:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tron.shading.surface_maps import surface_maps
+from tron.shading.guidance import surface_maps
 from tron.shards.schema import surface_members
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 
 import drjit as dr
@@ -11,13 +12,14 @@ import pytest
 
 from tron import seeds
 from tron.cameras import Camera
+from tron.errors import TronError
 from tron.gaussians.fields import PARAMETERS
-from tron.tracing import Surface, reference
-from tron.tracing.bvh import build_bvh
+from tron.tracing import Surface, SurfelTracer, reference
 from tron.tracing.gbuffer import trace_gbuffer
+from tron.tracing.hierarchy.bvh import build_bvh
 from tron.tracing.parameters import SurfelParameters, pack
-from tron.tracing.rays import trace_rays
-from tron.tracing.tiles import build_tiles
+from tron.tracing.tiled.tiles import build_tiles
+from tron.tracing.tracer import trace_rays
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -231,3 +233,40 @@ def test_without_gradients_nothing_more_is_done(random_scene):
 
     scene = random_scene(30)
     assert kernels(SurfelParameters.from_scene(scene)) == kernels(differentiable(scene))
+
+
+def test_shadows_have_no_gradient(disks):
+    scene = disks([[0, 0, 0.5]], [True], opacity=0.5, sigma=0.3)
+    tracer = SurfelTracer(scene, parameters=differentiable(scene))
+    through = tracer.transmittance(mi.Point3f(0, 0, 0), mi.Vector3f(0, 0, 1))
+    assert 0 < float(through[0]) < 1
+    assert not dr.grad_enabled(through)
+
+
+def test_gradients_come_as_often_as_they_are_asked_for(random_scene):
+    scene = random_scene(60)
+    parameters = differentiable(scene)
+    tracer = SurfelTracer(scene, parameters=parameters)
+    camera = Camera.look_at((2.5, 1, 0.7), (0, 0, 0), fov_deg=50, width=12, height=8)
+    gradients = []
+    for _ in range(3):
+        dr.backward(dr.sum(tracer.gbuffer(camera).opacity))
+        gradients.append(np.array(dr.grad(parameters.opacity_logits)))
+        dr.clear_grad(parameters.opacity_logits)
+    assert np.abs(gradients[0]).max() > 0
+    np.testing.assert_allclose(gradients[1], gradients[0], rtol=1e-5)
+    np.testing.assert_allclose(gradients[2], gradients[0], rtol=1e-5)
+
+
+def test_a_tracer_follows_its_parameters(random_scene):
+    scene = random_scene(60)
+    parameters = SurfelParameters.from_scene(scene)
+    tracer = SurfelTracer(scene, parameters=parameters)
+    camera = Camera.look_at((2.5, 1, 0.7), (0, 0, 0), fov_deg=50, width=12, height=8)
+    moved = dataclasses.replace(scene, means=scene.means + np.float32([0.1, -0.2, 0.3]))
+    parameters.means = mi.Float(moved.means.ravel())
+    tracer.update()
+    expected = SurfelTracer(moved).gbuffer(camera).numpy()
+    np.testing.assert_allclose(tracer.gbuffer(camera).numpy()["rgb"], expected["rgb"], atol=1e-6)
+    with pytest.raises(TronError, match="follows parameters"):
+        tracer.moved(moved)

@@ -19,7 +19,7 @@ from tron.tracing.compositing import MATERIAL_PACKETS, Composite, HitList, radia
 from tron.tracing.gbuffer import tile_rays, trace_tiles
 from tron.tracing.kernel import FEATURE_PACKETS, SurfelRecords, intersect
 from tron.tracing.parameters import SurfelParameters, pack
-from tron.tracing.tiles import build_tiles
+from tron.tracing.tiled.tiles import build_tiles
 
 pytestmark = pytest.mark.usefixtures("variant")
 

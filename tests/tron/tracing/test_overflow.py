@@ -14,11 +14,12 @@ from tron.cameras import Camera
 from tron.errors import TronError
 from tron.gaussians.fields import PARAMETERS
 from tron.gaussians.scene import GaussianScene
-from tron.tracing import SurfelTracer, adjoint, gbuffer, reference, relisting
+from tron.tracing import SurfelTracer, adjoint, gbuffer, reference
 from tron.tracing.compositing import HitList
+from tron.tracing.gbuffer import stream
 from tron.tracing.hits import MAX_HITS
 from tron.tracing.parameters import SurfelParameters
-from tron.tracing.streaming import stream
+from tron.tracing.tiled import kbuffer
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -179,7 +180,7 @@ def test_gradients_of_crowds_need_no_more_memory_than_they_are_given(disks, came
 
     expected = gradients(scene, trace)
     most, reserved = 20 * 120, []
-    for module in (gbuffer, relisting):
+    for module in (gbuffer, kbuffer):
         monkeypatch.setattr(module, "LISTED_IDS", most)
 
     class Watched(HitList):
@@ -188,7 +189,7 @@ def test_gradients_of_crowds_need_no_more_memory_than_they_are_given(disks, came
             reserved.append(room * dr.width(ray))
             return HitList.empty(ray, room)
 
-    monkeypatch.setattr(relisting, "HitList", Watched)
+    monkeypatch.setattr(kbuffer, "HitList", Watched)
     found = gradients(scene, trace)
     assert len(reserved) >= 4  # 63 pixels, at most 20 of which have room at a time
     assert max(reserved) <= most

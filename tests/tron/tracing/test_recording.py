@@ -9,7 +9,7 @@ from tron.runtime import activate
 activate("llvm_ad_rgb")
 import drjit as dr
 import mitsuba as mi
-from tron.tracing.recording import recorded
+from tron.tracing.kernel import recorded
 
 class Cycle:
     def __init__(self):

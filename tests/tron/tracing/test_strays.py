@@ -13,8 +13,8 @@ import pytest
 from tron import seeds
 from tron.gaussians.scene import GaussianScene
 from tron.tracing import SurfelTracer, reference
-from tron.tracing.bvh import CHILDREN, LEAF_SIZE
-from tron.tracing.traversal import walk
+from tron.tracing.hierarchy.bvh import CHILDREN, LEAF_SIZE
+from tron.tracing.hierarchy.traversal import walk
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -36,7 +36,7 @@ def view(angle: float, size: int = 24) -> Camera:
 @pytest.mark.parametrize("degree", [2, 4])
 def test_images_are_those_of_the_tracer(random_scene, device, degree):
     scene = random_scene(60, degree=degree)
-    seen = render(tensors_of(scene, device), CAMERA, kernel_degree=degree)
+    seen = render(tensors_of(scene), CAMERA, kernel_degree=degree)
     expected = SurfelTracer(scene).gbuffer(CAMERA).numpy()
     for name in IMAGES:
         np.testing.assert_allclose(seen[name].detach().cpu().numpy(), expected[name], atol=1e-5, err_msg=name)
@@ -45,10 +45,10 @@ def test_images_are_those_of_the_tracer(random_scene, device, degree):
 def test_backward_gives_the_gradients_of_dr_jit(random_scene, device):
     from tron.tracing.gbuffer import trace_gbuffer
     from tron.tracing.parameters import pack
-    from tron.tracing.tiles import build_tiles
+    from tron.tracing.tiled.tiles import build_tiles
 
     scene = random_scene(60)
-    surfels = tensors_of(scene, device)
+    surfels = tensors_of(scene)
     seen = render(surfels, CAMERA)
     ((seen["rgb"] ** 2).sum() + seen["roughness"].sum() + seen["normal"][..., 1].sum()).backward()
 
@@ -72,7 +72,7 @@ def test_backward_gives_the_gradients_of_dr_jit(random_scene, device):
 
 
 def test_parameters_are_read_where_they_are(random_scene, device, monkeypatch):
-    surfels = tensors_of(random_scene(30), device)
+    surfels = tensors_of(random_scene(30))
     addresses = {}
 
     def spy(parameters):
@@ -88,7 +88,7 @@ def test_parameters_are_read_where_they_are(random_scene, device, monkeypatch):
 
 def test_frozen_tensors_get_no_gradient_and_the_others_keep_theirs(random_scene, device):
     scene = random_scene(60)
-    free, frozen = tensors_of(scene, device), tensors_of(scene, device)
+    free, frozen = tensors_of(scene), tensors_of(scene)
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         frozen[name].requires_grad_(False)
     for surfels in (free, frozen):
@@ -103,7 +103,7 @@ def test_a_module_of_parameters_is_optimised_until_the_pictures_agree(random_sce
     scene = random_scene(40, sh_degree=1)
     views = [view(angle) for angle in np.linspace(0, 2 * np.pi, 6, endpoint=False)]
     with torch.no_grad():
-        truth = tensors_of(scene, device)
+        truth = tensors_of(scene)
         photos = [render(truth, camera, sh_degree=1)["rgb"] for camera in views]
     generator = torch.Generator().manual_seed(seeds.integer(0, "tests", "perturbation"))
     surfels = torch.nn.ParameterDict(
@@ -138,14 +138,14 @@ def train(surfels: dict[str, torch.Tensor], count: int) -> None:
 
 
 def test_later_views_need_no_other_kernels_and_more_surfels_one(random_scene, device, kernels_of):
-    surfels = tensors_of(random_scene(58), device)
+    surfels = tensors_of(random_scene(58))
     first = kernels_of(lambda: train(surfels, 20))
     assert first
     assert kernels_of(lambda: train(surfels, 5)) <= first, "compiled anew"
     # Dr.Jit writes the width of the parameters into the kernel that unpacks their gradients.
-    assert len(kernels_of(lambda: train(tensors_of(random_scene(64), device), 5)) - first) <= 1
+    assert len(kernels_of(lambda: train(tensors_of(random_scene(64)), 5)) - first) <= 1
     # Room for the records' gradients has grown, and its width is written into the kernel that replays hits.
-    assert len(kernels_of(lambda: train(tensors_of(random_scene(75), device), 5)) - first) <= 2
+    assert len(kernels_of(lambda: train(tensors_of(random_scene(75)), 5)) - first) <= 2
 
 
 def test_steps_keep_nothing(random_scene, device):
@@ -155,7 +155,7 @@ def test_steps_keep_nothing(random_scene, device):
         tensors = sum(issubclass(type(thing), torch.Tensor) for thing in gc.get_objects())
         return str(dr.whos(as_string=True)).count("\n"), tensors
 
-    surfels = tensors_of(random_scene(60), device)
+    surfels = tensors_of(random_scene(60))
     train(surfels, 5)
     variables, tensors = kept()
     train(surfels, 20)
@@ -166,7 +166,7 @@ def test_steps_keep_nothing(random_scene, device):
 
 def test_tensors_that_cannot_be_read_in_place_are_refused(random_scene, device):
     def changed(name, value):
-        return {**tensors_of(random_scene(10), device), name: value}
+        return {**tensors_of(random_scene(10)), name: value}
 
     with pytest.raises(TronError, match=r"means has shape \(3, 10\)"):
         render(changed("quats", torch.zeros(3, 4)) | {"means": torch.zeros(3, 10)}, CAMERA)

@@ -1,1 +1,0 @@
-"""Checklists that are shipped."""

@@ -1,0 +1,328 @@
+"""The catalogue of the user's assets: what each file is, where it comes from, and whether it may be used.
+
+A catalogue is a JSON list beside the files (``catalogue.json``) or elsewhere:
+
+    [{"path": "FlightHelmet/FlightHelmet.gltf", "licence": "CC0-1.0", "author": "...", "source":
+    "https://..."}]
+
+``path`` is relative to the folder; ``licence`` is required for use, the rest is for the dataset card. ``up``
+may be ``"z"`` for models that do not stand on y. A file without a licence is used only if its name is allowed
+explicitly.
+
+A model is read as textured parts that surfels can represent. Textures become linear float32 images; glTF's
+metallic-roughness model maps one to one onto Mitsuba's ``principled``. Surfels and shadow rays know opaque
+surfaces only, so transparency is decided once, here: what is below the cut-off of alpha (one half where the
+material blends) is cut away, the rest becomes opaque. Path tracer, G-buffers and reference then agree on what
+is there.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+
+from datagen.files.contents import Content, compared, model_contents
+from datagen.files.gltf.meshes import read_parts
+from datagen.files.obj import read_obj
+from datagen.files.parts import Part, split_mirrored, without_slivers
+from datagen.world.lights import Contrast, HdriSpec, classify
+from tron.errors import TronError
+from tron.shading.environments.environment import EnvironmentMap
+from tron.storage import sha256
+
+log = logging.getLogger(__name__)
+
+SUFFIXES = (".gltf", ".glb", ".obj")
+MOST_TRIANGLES = 5_000_000
+
+NEEDLE = 1e-3
+"""Least width over length of a model: below it no pixel and no surfel would find it."""
+
+_Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+CATALOGUE_NAME = "catalogue.json"
+LARGEST_CATALOGUE = 64 * 2**20
+LISTED = 20
+"""Names that an error lists at most."""
+
+
+class Asset(BaseModel):
+    """One file that scenes may use.
+
+    Attributes:
+        id: name by which specifications call it: the file's stem, or its path where stems collide.
+        path: relative to the folder, with forward slashes.
+        sha256: of the file itself (a .gltf's textures are files of their own).
+        contents: all that it was made from, where it was read.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    id: str
+    path: str
+    sha256: str
+    licence: str | None = None
+    author: str | None = None
+    source: str | None = None
+    up: Literal["y", "z"] = "y"
+    contents: tuple[Content, ...] = ()
+
+    def hashes(self) -> frozenset[str]:
+        """Hashes that it must not share with another to be another."""
+        return compared(self.contents) or frozenset([self.sha256])
+
+
+class Refused(BaseModel):
+    """A model of the folder that cannot be used, and why, on one line."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    id: str
+    path: str
+    reason: str
+
+
+class Entry(BaseModel):
+    """Entry of a catalogue; fields as in :class:`Asset`."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    path: str
+    licence: str | None = None
+    author: str | None = None
+    source: str | None = None
+    up: Literal["y", "z"] = "y"
+
+
+def find_assets(
+    folder: Path,
+    suffixes: Sequence[str] = SUFFIXES,
+    catalogue: Path | None = None,
+    allow_unlicensed: Collection[str] | Literal["all"] = (),
+    names: Collection[str] = (),
+) -> list[Asset]:
+    """List the usable files of a folder in order of path.
+
+    Args:
+        folder: searched with its subfolders.
+        suffixes: what counts as an asset.
+        catalogue: JSON file; None looks for catalogue.json in the folder.
+        allow_unlicensed: ids to accept without a licence, or all of them.
+        names: ids to list alone; empty: all.
+
+    Raises:
+        TronError: the folder or catalogue is missing or unreadable, nothing was found, an id is not there, or
+            files have no licence and their ids are not allowed.
+    """
+    if not folder.is_dir():
+        raise TronError("folder of assets not found", folder)
+    paths = sorted(
+        p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.suffix.lower() in suffixes
+    )
+    if not paths:
+        raise TronError(f"no {', '.join(suffixes)} in the folder", folder)
+    entries = read_catalogue(
+        catalogue if catalogue is not None else folder / CATALOGUE_NAME, catalogue is not None
+    )
+    stems = Counter(Path(path).stem for path in paths)
+    found = {
+        Path(path).stem if stems[Path(path).stem] == 1 else str(Path(path).with_suffix("")): path
+        for path in paths
+    }
+    if missing := sorted(set(names) - found.keys()):
+        raise TronError(f"no asset '{missing[0]}'", folder, f"there are {', '.join(found)}")
+    assets, unlicensed = [], {}
+    for name, path in found.items():
+        if names and name not in names:
+            continue
+        entry = entries.get(path, Entry(path=path))
+        if not entry.licence:
+            unlicensed[name] = path
+        assets.append(Asset(id=name, sha256=sha256(folder / path), **entry.model_dump()))
+    require_licences("asset", folder, unlicensed, allow_unlicensed)
+    return assets
+
+
+def require_licences(
+    kind: str, folder: Path, unlicensed: Mapping[str, str], allowed: Collection[str] | Literal["all"]
+) -> None:
+    """Make sure that every file without a licence is one that the user allowed.
+
+    Args:
+        kind: what they are, in one word or two.
+        folder: of the files.
+        unlicensed: id -> path in the folder, of each without a licence.
+        allowed: ids to use all the same, or all of them.
+
+    Raises:
+        TronError: some are not; it names every one, the first LISTED of very many.
+    """
+    missing = {} if allowed == "all" else {k: path for k, path in unlicensed.items() if k not in allowed}
+    if not missing:
+        return
+    names = list(missing)
+    mend = f"state it in {CATALOGUE_NAME}, or use it nevertheless with allow_unlicensed=[{names[0]}]"
+    if len(names) == 1:
+        raise TronError(f"{kind} '{names[0]}' has no licence", folder / missing[names[0]], mend)
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    raise TronError(
+        f"{len(names)} {kind}s have no licence: {', '.join(names[:LISTED])}{more}",
+        folder,
+        f"state them in {CATALOGUE_NAME}, or use them nevertheless by name, or with allow_unlicensed=all",
+    )
+
+
+def find_models(
+    folder: Path,
+    catalogue: Path | None = None,
+    allow_unlicensed: Collection[str] | Literal["all"] = (),
+    names: Collection[str] = (),
+) -> tuple[list[Asset], list[Refused]]:
+    """List the models of a folder that can be used, and those that cannot, each of them read once.
+
+    A model that cannot be used is left out with a warning; asked for by name, it is an error.
+
+    Raises:
+        TronError: as :func:`find_assets`, a model of ``names`` that cannot be used, or none that can.
+    """
+    usable, refused = [], []
+    for asset in find_assets(folder, SUFFIXES, catalogue, allow_unlicensed, names):
+        try:
+            parts = load_model(folder / asset.path, asset.up)
+        except TronError as error:
+            if names:
+                raise
+            reason = f"{error.what}: {error.mend}" if error.mend else error.what
+            refused.append(Refused(id=asset.id, path=asset.path, reason=" ".join(reason.split())))
+        else:
+            contents = model_contents(folder, asset.path, parts)
+            usable.append(asset.model_copy(update={"contents": contents}))
+    for model in refused if usable else ():
+        log.warning("model left out: %s: %s", folder / model.path, model.reason)
+    if not usable:
+        raise TronError(
+            f"none of the {len(refused)} models can be used; '{refused[0].id}': {refused[0].reason}", folder
+        )
+    return usable, refused
+
+
+def find_environments(
+    folder: Path, catalogue: Path | None = None, allow_unlicensed: Collection[str] | Literal["all"] = ()
+) -> tuple[list[Asset], list[HdriSpec]]:
+    """List the maps of a folder with their measured contrast; raises as :func:`find_assets` does."""
+    assets = [
+        asset.model_copy(update={"contents": (Content(path=asset.path, kind="map", sha256=asset.sha256),)})
+        for asset in find_assets(folder, (".hdr", ".exr"), catalogue, allow_unlicensed)
+    ]
+    specs = [
+        HdriSpec(
+            path=a.path, sha256=a.sha256, rotation_deg=0.0, contrast=_contrast(str(folder / a.path), a.sha256)
+        )
+        for a in assets
+    ]
+    return assets, specs
+
+
+@lru_cache(maxsize=4096)
+def _contrast(path: str, _sha256: str) -> Contrast:
+    return classify(EnvironmentMap.load(path))
+
+
+def load_models(folder: Path, assets: Sequence[Asset]) -> dict[str, list[Part]]:
+    """Asset id -> its parts in the unit ball, z up; read once a process."""
+    return {asset.id: _load(str(folder / asset.path), asset.up, asset.sha256) for asset in assets}
+
+
+@lru_cache(maxsize=64)
+def _load(path: str, up: str, _sha256: str) -> list[Part]:
+    return load_model(path, up)
+
+
+def read_catalogue(path: Path, required: bool) -> dict[str, Entry]:
+    """Path -> entry of a catalogue; none where it is not there.
+
+    Raises:
+        TronError: it cannot be read, or is ``required`` and not there.
+    """
+    if not path.is_file():
+        if required:
+            raise TronError("catalogue not found", path)
+        return {}
+    try:
+        if path.stat().st_size > LARGEST_CATALOGUE:
+            raise ValueError("file is too large to be a catalogue")
+        entries = TypeAdapter(list[Entry]).validate_python(json.loads(path.read_text("utf-8")))
+    except (OSError, ValueError, RecursionError, ValidationError) as error:
+        raise TronError(
+            f"catalogue cannot be read: {_reason(error)}", path, 'write [{"path": ..., "licence": ...}, ...]'
+        ) from error
+    return {entry.path: entry for entry in entries}
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        return f"entry {'.'.join(map(str, first['loc']))}: {first['msg']}"
+    return str(error)
+
+
+def load_model(path: str | Path, up: str = "y") -> list[Part]:
+    """Read a model; it comes out standing (z up) and fitted into the unit ball around the origin.
+
+    Args:
+        path: .gltf, .glb or .obj.
+        up: the file's own up axis, ``y`` (glTF's rule, OBJ's habit) or ``z``.
+
+    Raises:
+        TronError: a file that is missing, damaged, too large, refers to what lies outside its folder, needs
+            what is not read, or has nothing to show.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise TronError("model not found", path)
+    try:
+        parts = (
+            read_obj(path, MOST_TRIANGLES)
+            if path.suffix.lower() == ".obj"
+            else read_parts(path, MOST_TRIANGLES)
+        )
+        return _fitted(parts, up)
+    except TronError as error:
+        raise TronError(error.what, error.where or path, error.mend) from error
+    except Exception as error:  # trimesh, DracoPy and damaged JSON raise whatever they stumble over
+        raise TronError(f"model cannot be read: {type(error).__name__}: {error}", path) from error
+
+
+def _fitted(parts: list[Part], up: str) -> list[Part]:
+    """Parts with area, z up, in the unit ball."""
+    with np.errstate(all="ignore"):  # overflow is found below
+        parts = [part for part in map(without_slivers, parts) if len(part.faces)]
+    if not parts:
+        raise TronError("model has no opaque triangles")
+    if sum(len(part.faces) for part in parts) > MOST_TRIANGLES:
+        raise TronError(f"model has more than {MOST_TRIANGLES:,} triangles", mend="simplify it")
+    if not all(np.isfinite(part.vertices).all() for part in parts):
+        raise TronError("model has vertices that are not finite")
+    if any(part.uv is not None and not np.isfinite(part.uv).all() for part in parts):
+        raise TronError("model has texture coordinates that are not finite")
+    turn = _Y_UP_TO_Z_UP if up == "y" else np.eye(3)
+    parts = [replace(p, vertices=p.vertices @ turn.T, normals=p.normals @ turn.T) for p in parts]
+    used = np.concatenate([part.vertices for part in parts])
+    centre = 0.5 * used.min(axis=0) + 0.5 * used.max(axis=0)
+    with np.errstate(over="ignore"):
+        radius = float(np.linalg.norm(used - centre, axis=1).max())
+    if not 0 < radius < np.inf:
+        raise TronError("model has no extent, or more than numbers hold")
+    parts = [replace(part, vertices=(part.vertices - centre) / radius) for part in parts]
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(((used - centre) / radius).T)), 0.0))
+    if spread[1] < NEEDLE * spread[2]:
+        raise TronError(f"model is {spread[2] / max(spread[1], 1e-30):,.0f} times longer than wide: a needle")
+    return [piece for part in parts for piece in split_mirrored(part)]

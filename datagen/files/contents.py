@@ -1,0 +1,144 @@
+"""Contents of the user's files, by hash: two files under two names may be one model, texture or map.
+
+A model is its own file, the files that it refers to, and what comes out of them: its triangles, and each
+image on them. So a copy under another name, stored as another kind of file or dressed anew is found by what
+they share.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import unquote
+
+import numpy as np
+from PIL import Image
+from pydantic import BaseModel, ConfigDict
+
+from datagen.files.gltf.document import confined, read_document
+from datagen.files.gltf.materials import require_size
+from datagen.files.mtl import find_libraries, joined_lines, read_library
+from datagen.files.parts import Part
+from tron.errors import TronError
+from tron.storage import sha256
+
+ContentKind = Literal["model", "buffer", "library", "mesh", "texture", "plain", "map"]
+_UNCOMPARED = ("library", "plain")
+_READ = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "TGA", "TIFF", "GIF")
+_IMAGES = ("base_color", "roughness", "metallic", "normal_map")
+
+
+class Content(BaseModel):
+    """Bytes that something was made from.
+
+    Attributes:
+        path: relative to the folder; what was decoded from a file is named behind a ``#``.
+        kind: what it is; a ``library`` (an OBJ's .mtl) is neither mesh, texture nor map, and a ``plain``
+            image of a single colour is nobody's: neither tells that two things share anything.
+        sha256: 64 hexadecimal digits.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    path: str
+    kind: ContentKind
+    sha256: str
+
+
+def compared(contents: Sequence[Content]) -> frozenset[str]:
+    """Hashes by which two things are told to share something."""
+    return frozenset(each.sha256 for each in contents if each.kind not in _UNCOMPARED)
+
+
+def model_contents(folder: Path, path: str, parts: Sequence[Part]) -> tuple[Content, ...]:
+    """Contents of a model that was read: its file, the files beside it, its triangles and its images.
+
+    Args:
+        folder: of the assets.
+        path: of the model, relative to it.
+        parts: the model as :func:`datagen.files.assets.load_model` gives it.
+    """
+    found = [Content(path=path, kind="model", sha256=sha256(folder / path))]
+    for file, kind in _references(folder / path):
+        name = file.relative_to(folder.resolve()).as_posix()
+        kind = texture_kind(file) if kind == "texture" else kind
+        found.append(Content(path=name, kind=kind, sha256=sha256(file)))
+    found.append(Content(path=f"{path}#mesh", kind="mesh", sha256=_mesh_hash(parts)))
+    images = [_image_hash(image) for image in _images(parts)]
+    found += [
+        Content(path=f"{path}#texture{i}", kind="texture", sha256=digest)
+        for i, digest in enumerate(dict.fromkeys(images))
+    ]
+    return tuple(dict.fromkeys(found))
+
+
+def _references(path: Path) -> Iterator[tuple[Path, ContentKind]]:
+    """Files that a model refers to, with links followed; what is not there is left to the model's reader."""
+    named: list[tuple[str, ContentKind]] = []
+    if path.suffix.lower() == ".obj":
+        yield from _of_obj(path)
+    else:
+        tree = read_document(path).tree
+        kinds: dict[str, ContentKind] = {"buffers": "buffer", "images": "texture"}
+        for key, kind in kinds.items():
+            uris = [entry.get("uri") for entry in tree.get(key, []) if isinstance(entry, dict)]
+            own = (unquote(uri) for uri in uris if isinstance(uri, str) and not uri.startswith("data:"))
+            for uri in own:
+                named.append((uri, kind))
+    for name, kind in named:
+        try:
+            file = confined(path, name)
+        except TronError:
+            continue
+        yield file, kind
+
+
+def _of_obj(path: Path) -> Iterator[tuple[Path, ContentKind]]:
+    for library in find_libraries(path, joined_lines(path.read_bytes().decode("utf-8", "replace")))[0]:
+        yield library, "library"
+        for material in read_library(library).values():
+            for texture in material.textures.values():
+                try:
+                    yield texture.file(path), "texture"
+                except TronError:
+                    continue
+
+
+def texture_kind(path: Path) -> ContentKind:
+    """``plain`` for an image of one colour, such as a flat normal map; what cannot be read is a texture."""
+    try:
+        with Image.open(path, formats=_READ) as image:
+            require_size(image.width, image.height)
+            ranges = np.atleast_2d(image.getextrema())
+    except (OSError, SyntaxError, ValueError, TronError, Image.DecompressionBombError):
+        return "texture"
+    return "plain" if (ranges[:, 0] == ranges[:, 1]).all() else "texture"
+
+
+def _mesh_hash(parts: Sequence[Part]) -> str:
+    """Hash of all triangles as float32, in an order of their own: how they are dressed is not in it."""
+    corners = [np.asarray(part.vertices, np.float32)[np.asarray(part.faces)] for part in parts]
+    rows = np.concatenate(corners).reshape(-1, 9) + np.float32(0.0)
+    return hashlib.sha256(np.ascontiguousarray(rows[np.lexsort(rows.T)]).tobytes()).hexdigest()
+
+
+def _images(parts: Sequence[Part]) -> list[np.ndarray]:
+    """Images on the parts, but those of a single colour."""
+    found: dict[int, Any] = {}
+    for part in parts:
+        for name in _IMAGES:
+            value = getattr(part, name)
+            pictured = np.ndim(value) == (2 if name in ("roughness", "metallic") else 3)
+            if (
+                pictured
+                and np.ptp(value.reshape(-1, value.shape[-1] if value.ndim == 3 else 1), axis=0).any()
+            ):
+                found[id(value)] = value
+    return list(found.values())
+
+
+def _image_hash(image: np.ndarray) -> str:
+    shape = ",".join(map(str, image.shape)).encode()
+    return hashlib.sha256(shape + np.ascontiguousarray(image, np.float32).tobytes()).hexdigest()

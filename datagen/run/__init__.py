@@ -1,0 +1,1 @@
+"""Runs: the plan, the workers that make it, failures, stores, merging, validation."""

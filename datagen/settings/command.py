@@ -1,0 +1,549 @@
+"""The settings of ``tron-datagen``: what every key means, and what it may be."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pydantic import (
+    BaseModel,
+    Field,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+    model_validator,
+)
+
+from datagen.settings import SettingsModel
+from datagen.settings.captures import CapturedSettings, CaptureSettings, PseudoCaptureSettings
+from datagen.settings.split import SplitSettings, SurfelReconstruction, SurfelSources
+from datagen.world.lights import Family, LightChoice
+from tron.errors import TronError
+from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounces
+from tron.run_folder import leaves
+
+Mode = Literal["make", "plan", "validate", "merge", "captures", "pseudo_captures", "equal_error"]
+Split = Literal["train", "train_b", "validation", "test"]
+SHARD = re.compile(r"([1-9][0-9]{0,8})/([1-9][0-9]{0,8})")
+SCALING = ("shard", "merge", "merge_incomplete", "store")
+"""Keys that decide where parts of a dataset are made and kept, and nothing of what is in it."""
+
+Item = TypeVar("Item")
+
+OUTSIDE = {
+    *("output_dir", "mode", "only", "workers", "worker_timeout", "recycle_after", "scene_timeout", "cluster"),
+    *("capture", "pseudo_capture", "equal_error", "variety_against", "disjoint_from"),
+    *SCALING,
+}
+"""Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
+
+ESTIMATED = ("estimator", "two_sided", "diffuse", "bounces", "reflections", "supersample")
+"""Keys that decide how light on the surfels is estimated, named as in Estimation."""
+
+CAPTURED: dict[str, Any] = {
+    **dict.fromkeys(("seed", "path_frames", "objects", "families", "mesh_edge", "texels_per_unit"), True),
+    **dict.fromkeys(("environment_height", "assets", "asset_names", "asset_share", "textures"), True),
+    **dict.fromkeys(("texture_share", "environments", "map_share", "share_maps", "share_models"), True),
+    **dict.fromkeys(("checklist", "catalogue", "allow_unlicensed", "variant"), True),
+    "test": {"style", "frames"},
+    "capture": set(CaptureSettings.model_fields) - {"scenes"},
+}
+"""Keys that decide what is in a capture."""
+
+OF_CAPTURES = {"source", "captures", "captured"}
+"""Keys of source=captured alone; the other source ignores ``captured``."""
+
+OF_BOTH_SOURCES = {"seed", "clips_per_shard", "variant", *ESTIMATED}
+"""Keys that decide what is in a dataset of either source."""
+
+TEST_LIGHTS: list[LightChoice] = ["sun", "studio", "overcast"]
+"""Lights of the test split, unless the user gave some."""
+
+SPLITS: tuple[Split, ...] = ("train", "train_b", "validation", "test")
+
+RELIT = "_relit"
+"""Behind the name of a split: its captures under lights that their photos never saw."""
+
+SHARD_SPLITS: tuple[str, ...] = tuple(f"{name}{suffix}" for suffix in ("", RELIT) for name in SPLITS)
+"""Splits that shards may be of."""
+
+
+class ScaleSettings(SettingsModel):
+    """Parts of a dataset, and where its shards go."""
+
+    shard: str | None = Field(
+        None,
+        description="Make one of n disjoint parts, i/n with 1 <= i <= n: every n-th scene of the plan, with "
+        "the names and bytes of a run of all. Each part has an output_dir of its own; mode=merge joins them.",
+        examples=["2/8"],
+    )
+    merge: list[Path] = Field(
+        default_factory=list, description="Folders of the parts that mode=merge joins in output_dir."
+    )
+    merge_incomplete: bool = Field(
+        False, description="Join parts although scenes of the dataset are in none of them."
+    )
+    store: str | None = Field(
+        None,
+        description="URL that fsspec writes to, such as s3://bucket/dataset: finished shards are sent there "
+        "and leave output_dir; the other files follow at the end. mode=validate checks what is there. "
+        "Credentials are the environment's.",
+        examples=["s3://bucket/dataset"],
+    )
+
+    @field_validator("shard")
+    @classmethod
+    def _one_of_n(cls, value: str | None) -> str | None:
+        if value is not None:
+            found = SHARD.fullmatch(value)
+            if found is None or int(found[1]) > int(found[2]):
+                raise ValueError("give i/n with 1 <= i <= n, such as 2/8")
+        return value
+
+    @field_validator("store")
+    @classmethod
+    def _a_url(cls, value: str | None) -> str | None:
+        if value is not None and "://" not in value:
+            raise ValueError("give a URL, such as s3://bucket/dataset")
+        return value if value is None else value.rstrip("/")
+
+
+class EqualErrorSettings(SettingsModel):
+    """Comparison of guidance with the path tracer, on the test scenes of a dataset."""
+
+    reference_spp: int = Field(
+        default=1024, ge=2, multiple_of=2, description="Paths per pixel of what counts as the truth."
+    )
+    rounds: int = Field(default=3, ge=1, le=100, description="Times that each frame is rendered, in turns.")
+
+
+class Settings(ScaleSettings):
+    """Settings of ``tron-datagen``."""
+
+    output_dir: Path = Field(description="Folder of the dataset; an interrupted run resumes there.")
+    mode: Mode = Field(
+        "make",
+        description="make the dataset; plan it: print what is missing, the bytes and hours it takes and the "
+        "memory of a worker, by a table of measured costs, and render nothing; validate the one in "
+        "output_dir and list every problem; join the parts in `merge`; path-trace captures for "
+        "tron-reconstruct into "
+        "output_dir/captures; photograph the splits' scenes as a phone would, with the truth kept apart in "
+        "output_dir/truth (pseudo_captures); or measure on the test scenes in output_dir how long the path "
+        "tracer takes to be as near the truth as guidance is (equal_error).",
+    )
+    seed: int = Field(
+        0, description="Root of all randomness; a scene depends on it, its split and its index alone."
+    )
+    source: Literal["synthetic", "captured"] = Field(
+        "synthetic",
+        description="What is made: synthetic scenes, drawn from seeds and path-traced; or captured ones: "
+        "each folder of photos in captures is reconstructed and lit, and its photos are the truth. Only "
+        "seed, clips_per_shard, variant, estimation of the light and keys of the run concern both: other "
+        "keys of synthetic scenes are refused with captured.",
+    )
+    captures: Path | None = Field(
+        None,
+        description="Local folder with a capture a sub-folder, whatever tron-reconstruct reads, for "
+        "source=captured.",
+    )
+    captured: CapturedSettings = Field(
+        default_factory=lambda: CapturedSettings(), description="Training pairs of captures."
+    )
+    train: SplitSettings = Field(SplitSettings(scenes=16), description="First training split.")
+    train_b: SplitSettings = Field(
+        SplitSettings(scenes=4, style="object"), description="Second training split, of another distribution."
+    )
+    validation: SplitSettings = Field(
+        SplitSettings(scenes=2, lights=["any"] * 2),
+        description="Scenes whose PSNR training shows; nothing is trained on them.",
+    )
+    test: SplitSettings = Field(
+        SplitSettings(scenes=4, lights=[], reference_buffers=True),
+        description="Held-out scenes under held-out lights, for evaluation alone: training never reads them.",
+    )
+    capture: CaptureSettings = Field(
+        CaptureSettings(), description="Captures to reconstruct, of the test scenes."
+    )
+    pseudo_capture: PseudoCaptureSettings = Field(
+        PseudoCaptureSettings(), description="Captures whose truth is hidden, of the splits' scenes."
+    )
+    equal_error: EqualErrorSettings = Field(
+        EqualErrorSettings(), description="Comparison of guidance with the path tracer."
+    )
+    path_frames: int = Field(
+        93, ge=1, le=100_000, description="Frames of the whole path that clips are cut from."
+    )
+    objects: tuple[int, int] | None = Field(
+        None,
+        description="Least and greatest number of objects of a scene, such as [2,4]; null takes the style's "
+        "own.",
+        examples=["[2,4]"],
+    )
+    families: list[Family] | None = Field(
+        None,
+        description="Light families that any, high, medium and low draw from, a list as above; null: [hdri] "
+        "where environments is given; else any draws from the usual ones more often, and high, medium and "
+        "low from every family but hdri.",
+        examples=["[sun,overcast]"],
+    )
+    views: int = Field(64, ge=1, description="Views whose G-buffers the surfels are made from.")
+    view_width: int = Field(256, ge=8, le=8192, description="Width of those views in pixels.")
+    view_height: int = Field(256, ge=8, le=8192, description="Height of those views in pixels.")
+    surfels: int = Field(60_000, ge=100, description="Approximate number of surfels of a scene.")
+    refine_steps: int = Field(
+        200,
+        ge=0,
+        le=100_000,
+        description="Optimisation steps that fit a scene's surfels to its G-buffers; 0 takes them as made.",
+    )
+    surfels_from: SurfelSources = Field(
+        SurfelSources(),
+        description="What scenes' surfels are made from: gbuffers, reconstruction, or shares of the scenes.",
+        examples=["{gbuffers: 3, reconstruction: 1}"],
+    )
+    surfel_reconstruction: SurfelReconstruction = Field(
+        SurfelReconstruction(), description="Reconstruction of surfels, where they are made by it."
+    )
+    estimator: Estimator = Field(
+        FINAL.estimator,
+        description="Irradiance of the surfels. ratio: unshadowed irradiance times the share of it that "
+        "arrives; plain: the Monte Carlo mean, as in the paper.",
+    )
+    two_sided: bool = Field(
+        FINAL.two_sided,
+        description="Back faces block the surfels' shadow rays beyond two spacings; false: never, as in the "
+        "paper.",
+    )
+    diffuse: Diffuse = Field(
+        FINAL.diffuse,
+        description="Material that the surfels are shaded with: principled, as the path tracer's; lambert, "
+        "as in the paper.",
+    )
+    bounces: int = Field(
+        FINAL.bounces,
+        ge=0,
+        le=16,
+        description="Times that light bounces between the surfels in lit; 0: lit is direct light alone.",
+    )
+    reflections: int = Field(
+        FINAL.reflections,
+        ge=0,
+        description="Rays per pixel that find what glossy surfels mirror; 0: the bounced light around them.",
+    )
+    supersample: Literal[1, 2] = Field(
+        FINAL.supersample,
+        description="2: guidance on 2 x 2 sub-pixels with a quarter of the rays each, averaged.",
+    )
+    mesh_edge: float = Field(
+        0.04,
+        gt=0,
+        le=1,
+        description="Longest edge of procedural meshes in world units.",
+    )
+    texels_per_unit: float | None = Field(
+        None,
+        gt=0,
+        le=4096,
+        description="Texels a world unit of the textures on procedural pieces; null: two along a pixel of "
+        "frames and views at the median distance of cameras and things. A scene has 64 for each pixel of a "
+        "frame at most, between one and eight million; where those are too few, the log says how many a unit "
+        "they are.",
+    )
+    environment_height: int = Field(
+        256, ge=8, le=8192, description="Rows of the lat-long maps that lights are baked to."
+    )
+    assets: Path | None = Field(None, description="Folder of .gltf, .glb and .obj models to use as objects.")
+    asset_names: list[str] = Field(
+        default_factory=list, description="Names of the assets to use; empty: all in the folder."
+    )
+    asset_share: float = Field(
+        1.0, ge=0, le=1, description="Share of objects drawn from assets, where given."
+    )
+    textures: Path | None = Field(
+        None, description="Folder of PBR texture sets to lay on procedural pieces whose role they suit."
+    )
+    texture_share: float = Field(
+        0.5, ge=0, le=1, description="Share of pieces with a texture set, among those that one suits."
+    )
+    environments: Path | None = Field(None, description="Folder of .hdr and .exr maps to use as lights.")
+    map_share: float = Field(
+        1.0,
+        ge=0,
+        le=1,
+        description="Share of lights drawn from environments, where given, of those that any or a contrast "
+        "asks for.",
+    )
+    share_models: bool = Field(
+        False,
+        description="All models and texture sets serve every split; false: every fourth of each serves the "
+        "test split alone, where there are four.",
+    )
+    checklist: str | None = Field(
+        None,
+        description="Named maps and models of a benchmark, a YAML file or tron_synth: of environments those "
+        "alone are used; for what is missing something procedural stands in, by share, and mode=plan lists "
+        "it.",
+    )
+    disjoint_from: list[Path] = Field(
+        default_factory=list,
+        description="Folders of datasets that are trained on: a model, texture or map of theirs, by hash, or "
+        "a scene is refused before any is made; with mode=validate it is a problem.",
+    )
+    share_maps: bool = Field(
+        False,
+        description="All maps light every split; false: every fourth lights the test split alone, where "
+        "there are four.",
+    )
+    catalogue: Path | None = Field(
+        None,
+        description="JSON list of path, licence, author, source; null: catalogue.json in each folder.",
+    )
+    allow_unlicensed: Literal["all"] | list[str] = Field(
+        default_factory=list,
+        description="Names of models, textures and maps to use although the catalogue has no licence; all: "
+        "every one.",
+    )
+    only: list[str] = Field(default_factory=list, description="Make these scenes only, such as train-000012.")
+    variety_against: Path | None = Field(
+        None,
+        description="Folder of another dataset whose histograms are drawn beside this one's in README.md.",
+    )
+    clips_per_shard: int = Field(
+        64, ge=1, description="Maximum number of clips of a shard; no shard spans two scenes."
+    )
+    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = Field(
+        "llvm_ad_rgb", description="Mitsuba variant; on cuda_ad_rgb bytes are not repeatable."
+    )
+    workers: int | None = Field(
+        None,
+        ge=1,
+        description="Worker processes of the cluster; null: one per core with cluster=local.",
+    )
+    worker_timeout: float = Field(
+        600.0, gt=0, description="Seconds to wait for the cluster's first worker: jobs may queue for long."
+    )
+    recycle_after: int = Field(
+        50,
+        ge=1,
+        description="Scenes a worker makes before it restarts, since Mitsuba's memory grows; not with "
+        "cluster=address.",
+    )
+    scene_timeout: float | None = Field(
+        None,
+        gt=0,
+        description="Seconds after which a scene fails and its worker is replaced; null: 20 times what "
+        "mode=plan says of it, 600 at the least, and a day for captures that are rendered. Not with "
+        "cluster=none.",
+    )
+    cluster: dict[str, Any] | None = Field(
+        None,
+        description="Where scenes are made, see cluster=NAME below; `tron-datagen cluster=NAME --help` lists "
+        "its keys, conf/datagen/cluster says what they mean.",
+    )
+
+    @field_validator(*SPLITS, mode="wrap")
+    @classmethod
+    def _judge_what_is_made(
+        cls, value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo
+    ) -> SplitSettings:
+        """A split without scenes may say what it likes; captures have the test split's style."""
+        captures = info.data.get("mode") == "captures"
+        made = info.field_name == "test" if captures else not _without_scenes(value)
+        if made or not isinstance(value, Mapping | SplitSettings):
+            return handler(value)
+        return SplitSettings.model_construct(**dict(value))
+
+    @field_validator("cluster", mode="before")
+    @classmethod
+    def _no_cluster(cls, value: Any) -> Any:
+        if value and "_target_" not in value:
+            raise ValueError("a cluster has a _target_: choose one by cluster=NAME")
+        return value or None
+
+    @field_validator("captures", mode="before")
+    @classmethod
+    def _local_captures(cls, value: Any) -> Any:
+        if "://" in str(value):
+            raise ValueError("captures must be a local folder, not an address: copy them here first")
+        return value
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Settings:
+        OF_SOURCE[self.source].require(self)
+        require_bounces(self.bounces, self.reflections)
+        return self
+
+    def split(self, name: str) -> SplitSettings:
+        """The settings of one split; of captures, how large and long its clips are."""
+        return OF_SOURCE[self.source].split(self, name)
+
+    def estimation(self, split: str) -> Estimation:
+        """Estimation of the light on the surfels."""
+        chosen = {name: getattr(self, name) for name in ESTIMATED}
+        return Estimation(rays=self.split(split).guidance_spp, **chosen)
+
+    def used_splits(self) -> list[Split]:
+        """The splits that have scenes; of captures, those that may have some."""
+        return OF_SOURCE[self.source].used_splits(self)
+
+    def light_families(self) -> list[Family] | None:
+        """The families that ``any`` chooses from; None: the usual ones."""
+        if self.families is not None:
+            return list(self.families)
+        return ["hdri"] if self.environments is not None else None
+
+    def recipe(self) -> dict[str, Any]:
+        """Keys that decide a scene's content, plain values: not where it goes, who makes it or how many."""
+        return OF_SOURCE[self.source].recipe(self)
+
+    def capture_recipe(self) -> dict[str, Any]:
+        """Keys that decide a capture's content, as plain values."""
+        return self.model_dump(mode="json", include=CAPTURED)
+
+    def pseudo_capture_recipe(self) -> dict[str, Any]:
+        """Keys that decide a pseudo-capture's content, as plain values; of the splits that have scenes."""
+        splits = {name: {"style", "frames"} for name in self.used_splits()}
+        shared = {key: True for key in CAPTURED if key not in ("capture", "test")}
+        return self.model_dump(mode="json", include={**shared, **splits, "pseudo_capture": True})
+
+
+class KeysOfSynthetic:
+    """What keys mean for scenes that are drawn from seeds, split by split: ``captured`` says nothing."""
+
+    def require(self, settings: Settings) -> None:
+        """Raise ValueError where a split cannot be drawn, or a key is of captures or of datasets alone."""
+        if settings.captures is not None:
+            raise ValueError("captures is of source=captured: give source=captured, or leave it out")
+        if settings.mode in ("captures", "pseudo_captures"):
+            for name in ("shard", "store"):
+                if getattr(settings, name):
+                    raise ValueError(f"{name} is of datasets: leave it out with mode={settings.mode}")
+        captures = settings.mode == "captures"
+        lights = {"capture": settings.capture.lights} if captures else {}
+        for name in ["test"] if captures else self.used_splits(settings):
+            split = self.split(settings, name)
+            if not split.lights:
+                raise ValueError(f"{name}.lights is empty: a scene has a light or more")
+            if split.frames > settings.path_frames:
+                raise ValueError(
+                    f"{name}.frames is {split.frames}, longer than path_frames, {settings.path_frames}"
+                )
+            if settings.mode == "pseudo_captures":
+                shots = settings.pseudo_capture
+                lights["pseudo_capture"] = [*shots.lights, *shots.relights]
+            elif not captures:
+                lights[name] = split.lights
+        for name, wanted in lights.items():
+            hdri = "hdri" in {*wanted, *(settings.light_families() or ())}
+            if settings.environments is None and hdri:
+                raise ValueError(f"{name}.lights or families ask for hdri: give environments=FOLDER")
+        if settings.objects is not None and not 1 <= settings.objects[0] <= settings.objects[1]:
+            raise ValueError("objects must be [least, greatest] with 1 <= least <= greatest")
+
+    def split(self, settings: Settings, name: str) -> SplitSettings:
+        """As it is typed; the test split has lights of its own where none were."""
+        chosen = getattr(settings, name)
+        if name == "test" and not chosen.lights:
+            usual = TEST_LIGHTS if settings.environments is None else ["any"] * len(TEST_LIGHTS)
+            return chosen.model_copy(update={"lights": usual})
+        return chosen
+
+    def used_splits(self, settings: Settings) -> list[Split]:
+        """Those with scenes."""
+        return [name for name in SPLITS if self.split(settings, name).scenes]
+
+    def recipe(self, settings: Settings) -> dict[str, Any]:
+        """All keys but those of captures and of the run; of the splits that have scenes."""
+        values, used = (
+            settings.model_dump(mode="json", exclude=OUTSIDE | OF_CAPTURES),
+            self.used_splits(settings),
+        )
+        for name in SPLITS:
+            if name in used:
+                del values[name]["scenes"]
+            else:
+                del values[name]
+        if "test" in values:
+            values["test"]["lights"] = self.split(settings, "test").lights
+        return values
+
+
+class KeysOfCaptured:
+    """What keys mean for folders of photos: ``captures`` and ``captured`` say what is made of them."""
+
+    def require(self, settings: Settings) -> None:
+        """Raise ValueError without captures, or where a key is of synthetic scenes."""
+        if settings.captures is None:
+            raise ValueError("source=captured needs captures=DIR, a folder with a capture a sub-folder")
+        if settings.mode not in ("make", "plan", "validate", "merge"):
+            raise ValueError(f"mode={settings.mode} is of source=synthetic")
+        ours = OF_CAPTURES | OF_BOTH_SOURCES | OUTSIDE - {"variety_against", "disjoint_from"}
+        for name, field in Settings.model_fields.items():
+            default = field.get_default(call_default_factory=True)
+            if name not in ours and getattr(settings, name) != default:
+                key = _first_difference(name, getattr(settings, name), default)
+                raise ValueError(f"{key} is of source=synthetic: leave it out with source=captured")
+
+    def split(self, settings: Settings, name: str) -> SplitSettings:
+        """How large and long its clips are; no scene of it is drawn."""
+        wanted = settings.captured
+        size = {key: getattr(wanted, key) for key in ("width", "height", "guidance_spp")}
+        frames = 1 if name.endswith(RELIT) else wanted.frames
+        return SplitSettings(scenes=0, lights=["any"], frames=frames, **size)
+
+    def used_splits(self, settings: Settings) -> list[Split]:
+        """Those that captures may be in."""
+        wanted = settings.captured
+        return [name for name in SPLITS if wanted.split_by_name or getattr(wanted.shares, name)]
+
+    def recipe(self, settings: Settings) -> dict[str, Any]:
+        """The keys of captures and of both sources, without places and seeds that follow from others."""
+        seeded = {"reconstruction": {"seed", "checkpoint_every"}, "light": {"seed"}}
+        places = dict.fromkeys(("names", "relit", "truth", "reconstructed"), True)
+        values = settings.model_dump(
+            mode="json",
+            include={"source", "captured", *OF_BOTH_SOURCES},
+            exclude={"captured": {**places, **seeded}},
+        )
+        # That there are such clips, not where their truth lies.
+        given = {"relit": settings.captured.relit, "truth": settings.captured.truth}
+        values["captured"] |= {name: True for name, folder in given.items() if folder is not None}
+        return values
+
+
+OF_SOURCE: dict[str, KeysOfSynthetic | KeysOfCaptured] = {
+    "synthetic": KeysOfSynthetic(),
+    "captured": KeysOfCaptured(),
+}
+"""What the keys mean, by ``source``; what is made of them, ``datagen.sources`` says."""
+
+
+def _without_scenes(split: Any) -> bool:
+    return isinstance(split, Mapping) and split.get("scenes") == 0
+
+
+def _first_difference(name: str, value: Any, default: Any) -> str:
+    """Dotted key, as it is typed, of the first setting below ``name`` that is not the default's."""
+    if not isinstance(value, BaseModel) or not isinstance(default, BaseModel):
+        return name
+    given, shipped = (leaves({name: each.model_dump(mode="json")}) for each in (value, default))
+    return next((key for key in given if given[key] != shipped.get(key)), name)
+
+
+def part_of(items: Sequence[Item], shard: str | None) -> list[Item]:
+    """The items that ``shard=i/n`` makes: i - 1, i - 1 + n, ...; all of them without it.
+
+    Raises:
+        TronError: there are fewer items than parts, so that some would be empty.
+    """
+    if shard is None:
+        return list(items)
+    number, count = map(int, shard.split("/"))
+    if count > len(items):
+        raise TronError(
+            f"shard={shard} asks for more parts than there are scenes, {len(items)}",
+            mend=f"give shard=i/n with n of at most {len(items)}",
+        )
+    return list(items[number - 1 :: count])

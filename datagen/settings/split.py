@@ -1,0 +1,168 @@
+"""The settings of one split of a dataset, and of what the surfels of its scenes are made from."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, PositiveInt, ValidationInfo, field_validator, model_validator
+
+from datagen.settings import SettingsModel
+from datagen.world.lights import LightChoice
+from datagen.world.styles import STYLES, StyleChoice
+from tron.seeds import generator
+
+
+class SplitSettings(SettingsModel):
+    """One split: how many scenes of which kind, and how they are rendered."""
+
+    scenes: int = Field(ge=0, le=1_000_000, description="Number of scenes.")
+    style: (
+        StyleChoice
+        | Annotated[list[StyleChoice], Field(min_length=1)]
+        | Annotated[dict[str, PositiveInt], Field(min_length=1)]
+    ) = Field(
+        default="table",
+        description="What stands in a scene, on what, and how it is filmed. Scenes take those of a list in "
+        "turns; {object: 15, table: 25} makes the first 15 scenes of one and the next 25 of another.",
+        examples=["[mixed,table]"],
+    )
+    lights: list[LightChoice] = Field(
+        default=["any"] * 4,
+        max_length=64,
+        description="Light of each clip of a scene, one clip for each in the list. any draws one of "
+        "families; high, medium and low draw one of such contrast; hdri takes one of the maps in "
+        "environments. [], of test alone: three of environments where it is given, else a sun, a studio and "
+        "an overcast sky.",
+    )
+    lights_share_path: bool = Field(
+        default=True,
+        description="All clips of a scene show it from the same cameras: each frame is path-traced under all "
+        "lights at once, which share its paths, rays and G-buffers. false: each clip begins at a place of "
+        "its own.",
+    )
+    moving_objects: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Share of scenes in whose clips an object is lifted and turned; their frames cost more.",
+    )
+    moving_lights: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Share of lights that turn about the zenith within their clip; their frames cost more.",
+    )
+    still_camera: bool = Field(
+        default=False,
+        description="All frames of a clip are seen from the place of its first: what changes is what moves.",
+    )
+    frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
+    width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
+    height: int = Field(default=256, ge=8, le=8192, description="Frame height in pixels.")
+    path_spp: int = Field(
+        default=256,
+        ge=1,
+        description="Paths per pixel of path-traced frames; rounded up to a product of near numbers.",
+    )
+    guidance_spp: int = Field(
+        default=64, ge=2, multiple_of=2, description="Shadow rays per pixel of the surfels' irradiance, even."
+    )
+    reference_buffers: bool = Field(
+        default=False,
+        description="Also store Mitsuba's direct irradiance, with and without shadows, base color, normals, "
+        "depth, roughness and metallic, and the surfels' own.",
+    )
+    reference_spp: int = Field(
+        default=128, ge=2, description="Shadow rays per pixel of Mitsuba's direct irradiance."
+    )
+
+    @field_validator("style", mode="before")
+    @classmethod
+    def _is_not_one_of_old(cls, value: Any) -> Any:
+        for name in value if isinstance(value, (list, dict)) else [value]:
+            if name in ("A", "B"):
+                raise ValueError(f"style {name} is no more; write {'table' if name == 'A' else 'object'}")
+        return value
+
+    @field_validator("style")
+    @classmethod
+    def _counts_every_scene(cls, value: Any, info: ValidationInfo) -> Any:
+        if not isinstance(value, dict):
+            return value
+        if unknown := [name for name in value if name not in ("mixed", *STYLES)]:
+            raise ValueError(f"no style '{unknown[0]}'; there are mixed, {', '.join(STYLES)}")
+        scenes = info.data.get("scenes")
+        if scenes is not None and sum(value.values()) != scenes:
+            counts = " + ".join(map(str, value.values()))
+            raise ValueError(f"it counts {counts} scenes, but scenes={scenes}: make them equal")
+        return value
+
+    def style_of(self, index: int) -> StyleChoice:
+        """Style of the scene of that number; counts begin anew behind the last of them, as lists do."""
+        if isinstance(self.style, dict):
+            ends = np.cumsum(list(self.style.values()))
+            return list(self.style)[int(np.searchsorted(ends, index % ends[-1], side="right"))]
+        return self.style[index % len(self.style)] if isinstance(self.style, list) else self.style
+
+
+Source = Literal["gbuffers", "reconstruction"]
+PriorName = Literal["ground_truth", "joint"]
+
+
+class SurfelSources(SettingsModel):
+    """Shares of the scenes by what their surfels are made from; the name of one alone gives it all."""
+
+    gbuffers: float = Field(
+        default=1.0,
+        ge=0,
+        description="Share of scenes whose surfels are made from true G-buffers: clean guidance, soon made.",
+    )
+    reconstruction: float = Field(
+        default=0.0,
+        ge=0,
+        description="Share of scenes whose surfels are reconstructed from path-traced pictures, as captures "
+        "are: their flaws are in the guidance, for the network to mend.",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_alone(cls, value: Any) -> Any:
+        if value in ("gbuffers", "reconstruction"):
+            return {"gbuffers": 0.0, "reconstruction": 0.0, value: 1.0}
+        return value
+
+    @model_validator(mode="after")
+    def _some(self) -> SurfelSources:
+        if not self.gbuffers + self.reconstruction > 0:
+            raise ValueError("one share must be above 0")
+        return self
+
+    def of(self, seed: int, split: str, index: int) -> Source:
+        """Source of a scene's surfels, a function of root seed, split and index alone."""
+        total = self.gbuffers + self.reconstruction
+        drawn = generator(seed, split, index, "surfels_from").random() * total
+        return "reconstruction" if drawn < self.reconstruction else "gbuffers"
+
+
+class SurfelReconstruction(SettingsModel):
+    """Reconstruction of a scene's surfels from its own views, path-traced under one of its lights."""
+
+    prior: PriorName = Field(
+        default="ground_truth",
+        description="ground_truth: the scene's true normals and materials guide it, as a very good prior "
+        "would; joint: nothing but the pictures.",
+    )
+    steps_scaler: float = Field(
+        default=0.1,
+        gt=0,
+        le=100,
+        description="Factor on the steps of its stages: 0.1 takes 3,000 + 700, 1 the paper's 30,000 + 7,000.",
+    )
+    path_spp: int = Field(default=64, ge=1, description="Paths per pixel of the views.")
+    reference_spp: int = Field(
+        default=16, ge=2, description="Shadow rays per pixel of their true irradiance, which is kept beside."
+    )
+    checkpoint_every: int = Field(
+        default=500, ge=1, description="Steps between checkpoints, which an interrupted run goes on from."
+    )

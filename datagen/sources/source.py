@@ -1,0 +1,116 @@
+"""What every source of clips can do: plan scenes, make one, and say what it costs and comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from datagen.dataset.clip_preview import preview_bytes
+from datagen.dataset.records import Record, Work
+from datagen.files.sources import Sources
+from datagen.settings.command import Settings
+from tron.run_folder import RunFolder
+from tron.shards.schema import MEMBERS, clip_members
+
+SURFEL_BYTES = 320
+"""Bytes on disk of a surfel."""
+CHECKPOINT_BYTES = 1200
+"""Bytes of a surfel in a reconstruction's checkpoint: parameters, two moments of Adam, a copy."""
+
+
+@dataclass(frozen=True)
+class SceneCost:
+    """Cost of one scene.
+
+    Attributes:
+        seconds: of one core, kernels compiled; within a factor of two.
+        bytes: on disk, with previews.
+        memory: of the worker at its largest, bytes; 0 where it is not known.
+    """
+
+    seconds: float
+    bytes: float
+    memory: float
+
+
+class Source(Protocol):
+    """Where the clips of a dataset come from; all methods but :meth:`make` are quick and write nothing."""
+
+    def plan(self, settings: Settings) -> list[Work]:
+        """Every scene of the dataset, in order of split and index; TronError where there are none."""
+        ...
+
+    def planned(self, settings: Settings) -> dict[str, Any]:
+        """Split -> what config.yaml keeps of its scenes: their number, or their names."""
+        ...
+
+    def require_same(
+        self, run: RunFolder, before: dict[str, Any], scenes: Mapping[str, Any], settings: Settings
+    ) -> None:
+        """Make sure that a folder's dataset is this one, or one that may grow to be.
+
+        Args:
+            run: the folder.
+            before: recipe of what it holds.
+            scenes: what was planned of it.
+            settings: of what is asked for.
+
+        Raises:
+            TronError: names the first key that differs, or the scenes that lack.
+        """
+
+    def ready(self, settings: Settings) -> None:
+        """Raise TronError where what scenes are made with cannot be had, before the first of them."""
+
+    def make(self, item: Work, settings: Settings, sources: Sources) -> Record:
+        """Make one scene: its files, its shards and at last its record. Runs in a worker.
+
+        Everything is written under final names atomically; a second run writes the same bytes.
+
+        Raises:
+            TronError: it cannot be made.
+        """
+        ...
+
+    def clips(self, item: Work, settings: Settings) -> int:
+        """Clips that a scene gives, about."""
+        ...
+
+    def frames(self, item: Work, settings: Settings) -> int:
+        """Frames of all its clips, about."""
+        ...
+
+    def surfels(self, settings: Settings) -> int:
+        """Surfels of a scene, at the most."""
+        ...
+
+    def cost(self, item: Work, settings: Settings) -> SceneCost:
+        """Cost of a scene that is not made yet."""
+        ...
+
+    def scratch_bytes(self, item: Work, settings: Settings) -> int:
+        """Bytes on disk that a scene takes at the most while it is made, and then no more."""
+        ...
+
+    def kept_bytes(self, settings: Settings, items: Iterable[Work], shards: bool = True) -> int:
+        """Bytes that finished scenes keep, as if nothing compressed: shards if asked for, previews, surfels.
+
+        Half-precision EXR hardly compresses noise.
+        """
+        total = 0
+        for item in items:
+            recipe = settings.split(item.split)
+            members = [MEMBERS[name] for name in clip_members(recipe.reference_buffers)]
+            pixel = sum(member.bytes * member.channels for member in members)
+            frame = recipe.width * recipe.height * pixel + 16_384
+            stored = self.frames(item, settings) * frame if shards else 0
+            previews = preview_bytes(recipe.width, recipe.height, recipe.frames, len(members))
+            total += stored + self.clips(item, settings) * previews + self.surfels(settings) * SURFEL_BYTES
+        return total
+
+
+def spooled_bytes(settings: Settings, split: str) -> int:
+    """Bytes of a pixel of a frame that waits on disk for its shard."""
+    members = (MEMBERS[name] for name in clip_members(settings.split(split).reference_buffers))
+    return sum(max(member.bytes, 2) * member.channels for member in members)

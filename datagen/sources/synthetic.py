@@ -1,0 +1,490 @@
+"""Surfels of a synthetic scene and, light by light, its clips of training pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from datagen.clock import stage
+from datagen.dataset.records import RECORD_NAME, Record, Refinement, Work, clear_work, scene_folder
+from datagen.dataset.spool import Frame, Spool, ViewSpool, stored_guidance, view_bytes, write_clips
+from datagen.dataset.variety import Histograms, frame_histograms, surface_members, total
+from datagen.files.sources import Sources
+from datagen.settings.command import SPLITS, Settings
+from datagen.settings.split import Source as SurfelSource
+from datagen.settings.split import SplitSettings
+from datagen.sources.reconstructed import reconstruct_surfels, refine_surfels
+from datagen.sources.source import CHECKPOINT_BYTES, SceneCost, Source, spooled_bytes
+from datagen.truth.build import FIRST_ID, Geometry, draw_and_build
+from datagen.truth.pathtrace import (
+    LANES,
+    DirectIrradiance,
+    direct_irradiance,
+    gbuffers,
+    metered,
+    render_frames,
+    render_lights,
+    stacked_lights,
+    stream_gbuffers,
+)
+from datagen.world.lights import classify, contrast_share
+from datagen.world.motion import Pose
+from datagen.world.scene import SceneSpec, scene_name
+from tron.cameras import Camera
+from tron.errors import TronError
+from tron.gaussians.edit import moved
+from tron.gaussians.initialize import GBufferView, sample_bytes, surfels_from_gbuffers
+from tron.gaussians.scene import GaussianScene
+from tron.reconstruction.settings import MaterialSettings, RadianceSettings
+from tron.relighting import EnvironmentMap, Guidance, Illumination, Relighter, views_under
+from tron.run_folder import CHOOSE_ANOTHER, RunFolder
+from tron.runtime import activate
+from tron.seeds import integer
+from tron.shards.moving import KEY as MOTION
+from tron.shards.moving import Moving
+from tron.shards.schema import ClipMeta, color_spaces
+from tron.storage import write_atomic
+
+REFERENCE_REFLECTIONS = 16
+"""Rays a pixel of the member lit_reflections."""
+
+# Processor seconds of one core of a Xeon with kernels compiled, measured stage by stage on twelve scenes of
+# five recipes (2026-11-25; 96 x 96 to 192 x 192 pixels, 20,000 to 60,000 surfels): the sum was 0.67 to 1.46
+# of what eleven took and 0.47 of a room.
+BUILD = 1.5  # meshes, textures, scenes of Mitsuba
+VIEW = 2.0e-6  # a pixel of the views that surfels are made from
+STEP, STEP_PIXEL, STEP_SURFEL = 0.006, 5e-7, 1e-6  # an optimisation step, its view's pixels, its surfels
+PATH = 1.0e-6  # a path of one light
+SHARED_PATH = 0.53  # share of it where four lights or more have their paths in common
+LIGHT = 0.9  # a light made ready, its bounces baked
+RAY = 2.6e-7  # a shadow ray of guidance, with the rest of its frame
+FINER, REFERENCE_RAY = 4e-5, 7.6e-8  # a pixel of the finer frames of reference buffers, a ray of them
+WRITTEN = 4.5e-8  # a byte before compression
+
+# Bytes on disk.
+COMPRESSED = 0.45  # over those that half floats would take: 0.3 to 0.4, of large frames 0.6
+PICTURE_BYTES = 32  # a pixel of a scene's own pictures: 8-bit colours and half-float maps, hardly compressed
+
+# Bytes of memory.
+PROCESS = 0.55e9  # libraries and kernels
+LANE = 430  # a path in flight
+FRAME_BYTES = 256  # a pixel's buffers under one light
+VIEW_BYTES = 49  # a pixel of a true G-buffer; LANES / 2 pixels are rendered at a time, and copied
+
+
+class SyntheticSource(Source):
+    """Scenes that are drawn from seeds and path-traced, one clip a light."""
+
+    def plan(self, settings: Settings) -> list[Work]:
+        """As many scenes a split as it asks for; each has numbers of shards of its own."""
+        items = []
+        for split in settings.used_splits():
+            recipe = settings.split(split)
+            shards = -(-len(recipe.lights) // settings.clips_per_shard)
+            items += [Work(split, i, scene_name(split, i), i * shards) for i in range(recipe.scenes)]
+        if not items:
+            raise TronError("the dataset would have no scenes", "give a split scenes, e.g. train.scenes=16")
+        return items
+
+    def planned(self, settings: Settings) -> dict[str, Any]:
+        """Split -> number of its scenes."""
+        return {split: settings.split(split).scenes for split in SPLITS}
+
+    def require_same(
+        self, run: RunFolder, before: dict[str, Any], scenes: Mapping[str, Any], settings: Settings
+    ) -> None:
+        """Let more scenes be added, and splits begin; nothing else may change."""
+        before, now = dict(before), settings.recipe()
+        for split in SPLITS:
+            if not scenes.get(split):  # there is nothing of it yet, so it may be anything from now on
+                before.pop(split, None)
+                now.pop(split, None)
+        for split in set(before) & set(SPLITS) - set(now):
+            del before[split]  # fewer scenes than there are: that is told below
+        run.require(now, before)
+        for split in SPLITS:
+            if scenes.get(split, 0) > settings.split(split).scenes:
+                raise TronError(
+                    f"output_dir holds {scenes[split]} scenes of {split}, more than {split}.scenes asks for",
+                    settings.output_dir,
+                    CHOOSE_ANOTHER,
+                )
+
+    def make(self, item: Work, settings: Settings, sources: Sources) -> Record:
+        """See :func:`make_scene`."""
+        return make_scene(item, settings, sources)
+
+    def clips(self, item: Work, settings: Settings) -> int:
+        """One a light."""
+        return len(settings.split(item.split).lights)
+
+    def frames(self, item: Work, settings: Settings) -> int:
+        """Frames of those."""
+        return self.clips(item, settings) * settings.split(item.split).frames
+
+    def surfels(self, settings: Settings) -> int:
+        """As many as are asked for."""
+        return settings.surfels
+
+    def cost(self, item: Work, settings: Settings) -> SceneCost:
+        """By the table above."""
+        recipe = settings.split(item.split)
+        pixels, frames = recipe.width * recipe.height, self.frames(item, settings)
+        views = settings.views * settings.view_width * settings.view_height
+        shares = settings.surfels_from
+        rebuilt = shares.reconstruction / (shares.gbuffers + shares.reconstruction)
+        both_stages = RadianceSettings().steps + MaterialSettings().steps
+        whole_steps = round(both_stages * settings.surfel_reconstruction.steps_scaler)
+        steps = (1 - rebuilt) * settings.refine_steps + rebuilt * whole_steps
+        path = PATH * (SHARED_PATH if len(recipe.lights) >= 4 else 1)
+        reference = FINER + REFERENCE_RAY * recipe.reference_spp if recipe.reference_buffers else 0
+        whole = self.kept_bytes(settings, [item])
+        frame = pixels * (path * recipe.path_spp + RAY * recipe.guidance_spp + reference)
+        photographed = rebuilt * views * settings.surfel_reconstruction.path_spp * PATH
+        step = STEP + STEP_PIXEL * settings.view_width * settings.view_height + STEP_SURFEL * settings.surfels
+        surfels = VIEW * views + step * steps + photographed
+        seconds = BUILD + surfels + LIGHT * len(recipe.lights) + frames * frame + WRITTEN * whole
+        gathered = sample_bytes(settings.surfels, views) + 2 * LANES * VIEW_BYTES
+        lanes = min(LANES, pixels * recipe.path_spp)
+        # One frame's buffers under every light, and a clip's encoded files until they are in the shard.
+        held = len(recipe.lights) * pixels * FRAME_BYTES + whole / max(self.clips(item, settings), 1)
+        return SceneCost(seconds, COMPRESSED * whole, PROCESS + max(gathered, LANE * lanes + held))
+
+    def scratch_bytes(self, item: Work, settings: Settings) -> int:
+        """Views that surfels are fitted to, or pictures and a checkpoint; then frames of clips."""
+        recipe = settings.split(item.split)
+        views = settings.views + (-(-settings.views // 2) if recipe.moving_objects else 0)
+        clip = recipe.frames * recipe.width * recipe.height * spooled_bytes(settings, item.split)
+        judges = view_bytes(recipe.frames, recipe.width, recipe.height)
+        refined = view_bytes(views, settings.view_width, settings.view_height) + judges
+        pictures = settings.views * settings.view_width * settings.view_height * PICTURE_BYTES
+        spooled = clip * (len(recipe.lights) if recipe.lights_share_path else 1)
+        shares, rebuilt = settings.surfels_from, 0
+        if shares.reconstruction:  # it lies there until the clips are written
+            rebuilt = pictures + settings.surfels * CHECKPOINT_BYTES
+        made = refined if settings.refine_steps and shares.gbuffers else 0
+        return max(made, rebuilt + max(judges if rebuilt else 0, spooled))
+
+
+@stage("surfels")
+def make_surfels(
+    spec: SceneSpec, geometry: Geometry, settings: Settings
+) -> tuple[GaussianScene, Refinement | None]:
+    """Surfels through what its capture's views see of a scene, then fitted to it, and what that gained.
+
+    They are judged by the cameras of the first clip, which are not among those.
+    """
+    seen = _seen(spec, geometry, spec.views(settings.views, settings.view_width, settings.view_height))
+    if not settings.refine_steps:
+        return surfels_from_gbuffers(seen, count=settings.surfels), None
+    recipe = settings.split(spec.split)
+    folder = scene_folder(settings.output_dir, spec.name)
+    seed = integer(spec.seed, spec.split, spec.index, "refinement")
+    with ViewSpool(folder) as shown, ViewSpool(folder) as judges:
+        surfels = surfels_from_gbuffers(shown.passing(seen), count=settings.surfels)
+        cameras = spec.clip(0, recipe.frames, recipe.width, recipe.height)
+        for _ in judges.passing(stream_gbuffers(geometry, cameras)):
+            pass
+        views, held_out = shown.views(), judges.views()
+        return refine_surfels(surfels, views, held_out, settings.refine_steps, seed)
+
+
+def _seen(spec: SceneSpec, geometry: Geometry, cameras: Sequence[Camera]) -> Iterator[GBufferView]:
+    """True G-buffers of the views that surfels are made from, a few in memory at a time.
+
+    Where an object moves, every other view comes once more with the object away and left out: what it rests
+    on has no hole.
+    """
+    yield from stream_gbuffers(geometry, cameras)
+    if spec.motion is not None:
+        number = _move(spec, geometry, 1.0)
+        for view in stream_gbuffers(geometry, cameras[::2]):
+            yield replace(view, valid=view.valid & (view.object_id != number))
+        _move(spec, geometry, 0.0)
+
+
+def _move(spec: SceneSpec, geometry: Geometry, time: float) -> int:
+    """Put the object that moves where it is at a time; its id."""
+    number = _moving_id(spec)
+    geometry.move(number, _pose(spec, time))
+    return number
+
+
+def _moving_id(spec: SceneSpec) -> int:
+    assert spec.motion is not None
+    return FIRST_ID + len(spec.surroundings) + spec.motion.object
+
+
+def _pose(spec: SceneSpec, time: float) -> Pose:
+    assert spec.motion is not None
+    return spec.motion.pose(spec.objects[spec.motion.object], time)
+
+
+def make_clips(
+    spec: SceneSpec, geometry: Geometry, surfels: GaussianScene, settings: Settings
+) -> Iterator[tuple[ClipMeta, Sequence[Frame]]]:
+    """Render one clip a light, in the order of the specification.
+
+    Each frame holds the schema's members, linear: guidance from the surfels, rgb path-traced from the meshes,
+    both under the same baked map; with reference buffers also what Mitsuba says of the pixel centres. Lights
+    that share a path share each frame's G-buffers and its paths. A clip's frames are read while it is the
+    last that was given.
+    """
+    with stage("guidance"):
+        seed = integer(spec.seed, spec.split, spec.index, "bounce")
+        relighter = Relighter(surfels, settings.estimation(spec.split), seed).prepare()
+    folder = scene_folder(settings.output_dir, spec.name)
+    for group in spec.groups():
+        with Spool(folder, len(group)) as spool:
+            for k, meta in enumerate(_film(spec, geometry, relighter, group, settings, spool)):
+                yield meta, spool.clip(k)
+
+
+@dataclass
+class _Lit:
+    """One light of a group, made ready.
+
+    Attributes:
+        number: its place in the scene's list, which names its seeds.
+        lit: the surfels under it.
+        seeds: what they are for -> one a frame.
+        exposure: of its clip.
+    """
+
+    number: int
+    environment: EnvironmentMap
+    lit: Illumination
+    seeds: dict[str, list[int]]
+    exposure: float
+
+
+@dataclass
+class _Moment:
+    """A scene at one time of its clips: where things are and how they are lit.
+
+    Attributes:
+        scenes: under no light, for frames that all lights share; or one a light.
+        stacked: the lights of frames that are path-traced under all of them at once.
+    """
+
+    relighter: Relighter
+    lights: list[_Lit]
+    scenes: list[mi.Scene]
+    stacked: mi.Integrator | None
+
+
+def _moment(
+    spec: SceneSpec,
+    geometry: Geometry,
+    relighter: Relighter,
+    maps: Mapping[int, EnvironmentMap],
+    settings: Settings,
+    time: float,
+) -> _Moment:
+    """The scene at a time from 0 to 1 under the lights of these numbers; moves the geometry."""
+    recipe = settings.split(spec.split)
+    if spec.motion is not None:
+        which = relighter.scene.object_id == _move(spec, geometry, time)
+        if time and which.any():
+            relighter = relighter.changed(moved(relighter.scene, which, *_pose(spec, time)))
+    lights = [_prepare(spec, relighter, number, map_, settings, time) for number, map_ in maps.items()]
+    together = spec.cameras.shared
+    if together and not recipe.reference_buffers:
+        scenes = [geometry.lit()]
+    else:
+        scenes = [geometry.lit(light.environment) for light in lights]
+    stacked = stacked_lights([light.environment for light in lights], spec.path_bounces) if together else None
+    return _Moment(relighter, lights, scenes, stacked)
+
+
+@stage("guidance")
+def _film(
+    spec: SceneSpec,
+    geometry: Geometry,
+    relighter: Relighter,
+    group: Sequence[int],
+    settings: Settings,
+    spool: Spool,
+) -> list[ClipMeta]:
+    """Render the clips of lights that are filmed from the same places, frame by frame."""
+    recipe = settings.split(spec.split)
+    cameras = spec.clip(group[0], recipe.frames, recipe.width, recipe.height)
+    still = spec.motion is None and not any(spec.turns_deg)
+    maps = {
+        number: spec.lights[number].bake(settings.environment_height, settings.environments)
+        for number in group
+    }
+    now = _moment(spec, geometry, relighter, maps, settings, 0.0)
+    first = now.lights
+    poses, shown = [], []
+    for i, camera in enumerate(cameras):
+        time = i / max(len(cameras) - 1, 1)
+        if i and not still:
+            now = _moment(spec, geometry, relighter, maps, settings, time)
+        (truth,) = gbuffers(geometry, [camera])
+        if spec.motion is not None:
+            poses.append(_pose(spec, time).matrix())
+            shown.append(truth.valid & (truth.object_id == _moving_id(spec)))
+        spp, seed = recipe.path_spp, first[0].seeds["path"][i]
+        if now.stacked is None:
+            rgb = render_frames(now.scenes[0], [camera], spp, [seed], spec.path_bounces)
+        else:
+            rgb = render_lights(now.scenes[0], now.stacked, camera, spp, seed)
+        views = views_under([light.lit for light in now.lights], camera)
+        surfaces = now.relighter.surface_maps(camera)
+        finer = [light.lit.framed(supersample=2) for light in now.lights if recipe.reference_buffers]
+        fine = views_under(finer, camera) if finer else []
+        for k, light in enumerate(now.lights):
+            if spec.metered and i == 0:
+                first[k].exposure = metered(rgb[k], truth.valid, light.exposure)
+            guidance = light.lit.render(camera, light.seeds["guidance"][i], view=views[k])
+            frame = stored_guidance(guidance) | surfaces
+            frame |= {"rgb": rgb[k], "foreground": truth.valid.astype(np.float32)}
+            if recipe.reference_buffers:
+                seed = light.seeds["reference"][i]
+                direct = direct_irradiance(geometry, now.scenes[k], camera, recipe.reference_spp, seed)
+                frame |= _reference(camera, truth, guidance, direct, light.environment)
+                seed, mirrors = light.seeds["guidance"][i], finer[k].estimation.bounces > 0
+                mirrored = finer[k].framed(reflections=REFERENCE_REFLECTIONS * mirrors)
+                frame["lit_supersampled"] = finer[k].render(camera, seed, view=fine[k]).lit
+                frame["lit_reflections"] = mirrored.render(camera, seed, view=fine[k]).lit
+            spool.add(k, frame)
+    if spec.motion is not None:
+        _move(spec, geometry, 0.0)
+    source = settings.surfels_from.of(spec.seed, spec.split, spec.index)
+    motion = Moving(np.stack(poses), np.stack(shown)).text() if poses else ""
+    return [_meta(spec, light, cameras, recipe, source, motion) for light in first]
+
+
+def _prepare(
+    spec: SceneSpec,
+    relighter: Relighter,
+    number: int,
+    environment: EnvironmentMap,
+    settings: Settings,
+    time: float,
+) -> _Lit:
+    recipe, shared = settings.split(spec.split), spec.cameras.shared
+    if spec.turns_deg:
+        environment = environment.rotated(spec.turns_deg[number] * time)
+    if shared:  # lights that are traced together have texels at the same places
+        environment = environment.baked().resized(settings.environment_height)
+    lit = relighter.under(environment, integer(spec.seed, spec.split, spec.index, "light", number, "bounce"))
+    own = ("light", number, "frame")
+    where = {"path": ("frame",) if shared else own, "guidance": own, "reference": own}
+    seeds = {what: _seeds(spec, recipe.frames, what, *path) for what, path in where.items()}
+    return _Lit(number, environment, lit, seeds, environment.exposure())
+
+
+def _meta(
+    spec: SceneSpec,
+    lit: _Lit,
+    cameras: Sequence[Camera],
+    recipe: SplitSettings,
+    surfels_from: SurfelSource,
+    motion: str,
+) -> ClipMeta:
+    light = spec.lights[lit.number]
+    spp = {"path": recipe.path_spp, "guidance": recipe.guidance_spp}
+    if recipe.reference_buffers:
+        spp["reference"] = recipe.reference_spp
+    return ClipMeta(
+        key=f"{spec.name}-l{lit.number}",
+        scene=spec.name,
+        light=f"{spec.name}-{light.family}{lit.number}",
+        light_family=light.family,
+        split=spec.split,
+        frames=len(cameras),
+        width=recipe.width,
+        height=recipe.height,
+        cameras=[camera.to_dict() for camera in cameras],
+        exposure=lit.exposure,
+        color_space=color_spaces(recipe.reference_buffers),
+        seeds={"root": spec.seed, **{f"{what}0": values[0] for what, values in lit.seeds.items()}},
+        spp=spp,
+        extra={
+            "style": spec.style,
+            "surfels_from": surfels_from,
+            "contrast": classify(lit.environment),
+            "contrast_share": contrast_share(lit.environment),
+            "turn_deg": spec.turns_deg[lit.number] if spec.turns_deg else 0.0,
+            "moving_object": spec.motion is not None,
+            MOTION: motion,
+            "light_spec": light.model_dump_json(),  # text: families differ in their keys, and tables cannot
+        },
+    )
+
+
+def _seeds(spec: SceneSpec, frames: int, what: str, *path: str | int) -> list[int]:
+    return [integer(spec.seed, spec.split, spec.index, *path, i, what) for i in range(frames)]
+
+
+def _reference(
+    camera: Camera,
+    truth: GBufferView,
+    guidance: Guidance,
+    direct: DirectIrradiance,
+    environment: EnvironmentMap,
+) -> Frame:
+    """Reference members of one frame; behind the scene irradiance shows the environment, as guidance does."""
+    seen = truth.valid[..., None]
+    behind = environment.lookup(camera.rays())
+    light = {"irradiance": direct.shadowed, "unshadowed": direct.unshadowed}
+    surface = {
+        "base_color": truth.base_color,
+        "normal": truth.normal,
+        "depth": np.linalg.norm(truth.position - camera.position, axis=-1),
+        "roughness": truth.roughness,
+        "metallic": truth.metallic,
+    }
+    return (
+        {f"{name}_ref": np.where(seen, image, behind) for name, image in light.items()}
+        | {f"{name}_ref": np.where(seen, np.atleast_3d(image), 0.0) for name, image in surface.items()}
+        | {name: guidance.gbuffer[name] for name in surface}
+    )
+
+
+def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
+    """Make one scene: specification, surfels, shards, contact sheets and at last its record.
+
+    Runs in a worker. Everything is written under final names atomically; a second run writes the same bytes.
+    """
+    activate(settings.variant, threads=1)
+    output = settings.output_dir
+    spec, geometry = draw_and_build(item, settings, sources, settings.split(item.split).lights)
+    folder = scene_folder(output, item.name)
+    write_atomic(folder / "spec.json", spec.to_json())
+    refinement = reconstruction = None
+    if settings.surfels_from.of(settings.seed, item.split, item.index) == "reconstruction":
+        surfels, reconstruction = reconstruct_surfels(spec, geometry, settings)
+    else:
+        surfels, refinement = make_surfels(spec, geometry, settings)
+    surfels.save(folder / "surfels.ply")
+
+    clips = make_clips(spec, geometry, surfels, settings)
+    files = write_clips(output, item, clips, settings.clips_per_shard)
+    record = Record(
+        name=item.name,
+        shards=files.shards,
+        quarantined=files.quarantined,
+        refinement=refinement,
+        clips=files.rows(),
+        variety=_variety(geometry, files.made),
+        reconstruction=reconstruction,
+    )
+    clear_work(folder)
+    write_atomic(folder / RECORD_NAME, record.model_dump_json(indent=1) + "\n")
+    return record
+
+
+def _variety(geometry: Geometry, made: Sequence[tuple[ClipMeta, Frame]]) -> Histograms:
+    """Histograms of the clips' first frames: those beside them show the same."""
+    cameras = [Camera.from_dict(meta.cameras[0]) for meta, _ in made]
+    return total(
+        frame_histograms(frame | surface_members(truth), camera, meta.extra.get("contrast_share"))
+        for (meta, frame), camera, truth in zip(made, cameras, gbuffers(geometry, cameras))
+    )

@@ -1,0 +1,1 @@
+"""Scenes in Mitsuba: meshes, textures, G-buffers, path tracing."""

@@ -1,0 +1,447 @@
+"""SceneSpec -> Mitsuba scene.
+
+All procedural objects and what surrounds them are one mesh under one ``principled`` material whose parameters
+and normals come from one atlas. Every synthetic scene then has the same kernel, whatever it holds: Dr.Jit
+compiles it once and finds it in its cache for all others. Parts of the user's models bring a mesh and a
+material each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from datagen.clock import stage
+from datagen.dataset.records import Work
+from datagen.files.assets import load_models
+from datagen.files.parts import Part, Sampling, outline
+from datagen.files.sources import Sources, of_split, slots
+from datagen.files.texture_sets import opened
+from datagen.settings.command import Settings
+from datagen.truth import texels
+from datagen.world.lights import LightChoice
+from datagen.world.materials import PhotographedSpec
+from datagen.world.materials.photographed import Photographed
+from datagen.world.motion import Pose, Share
+from datagen.world.scene import SceneSpec, draw_scene
+from datagen.world.shapes import make_pieces, split_creases
+from datagen.world.styles import Choice
+from tron.cameras import Camera
+from tron.errors import TronError
+from tron.runtime import aligned
+from tron.shading.environments.environment import EnvironmentMap
+
+FIRST_ID = 1
+"""Object id of the first of the surroundings; 0 is nothing."""
+
+TEXELS_A_PIXEL = 2.0
+"""Texels along a pixel's side at the distance that things are seen from: bilinear lookups blur about one."""
+
+NEAREST = 1.0
+"""Least distance, world units, that textures are made for; nearer than that they are seen coarser."""
+
+PATH_SAMPLES = 8
+"""Cameras of a path that its distance is taken from."""
+
+TEXELS_A_FRAME = 64
+"""Texels of a scene for each pixel of a frame: what is not in it, or behind, wants some as well."""
+
+FEWEST, MOST = 2**20, 2**23
+"""Bounds of that number, whatever the frames' size."""
+
+
+class _Solid(NamedTuple):
+    """A piece in its object's frame, where it stands, and its object's id."""
+
+    surface: texels.Surface
+    matrix: np.ndarray
+    object_id: int
+
+
+@dataclass
+class Surface:
+    """One Mitsuba mesh and what is needed to read its true materials at a hit.
+
+    Attributes:
+        shape: the mesh, with its material.
+        principled: the innermost material, which knows base color, roughness and metallic.
+        normal_map: texture of tangent-space normals as (n + 1) / 2, or None.
+        object_id: (F,) uint32 object of each triangle.
+        rest: (V, 3) positions and normals before anything moved.
+    """
+
+    shape: mi.Mesh
+    principled: mi.BSDF
+    normal_map: mi.Texture | None
+    object_id: np.ndarray
+    rest: tuple[np.ndarray, ...] | None = None
+
+
+@dataclass
+class Geometry:
+    """A scene without its light."""
+
+    surfaces: list[Surface]
+
+    def move(self, object_id: int, pose: Pose) -> None:
+        """Put an object where it is at a time, away from where it rests; scenes made before do not follow."""
+        for surface in self.surfaces:
+            if not (surface.object_id == object_id).any():
+                continue
+            parameters = mi.traverse(surface.shape)
+            if surface.rest is None:
+                surface.rest = tuple(
+                    np.array(parameters[f"vertex_{name}"]).reshape(-1, 3) for name in ("positions", "normals")
+                )
+            faces = np.array(parameters["faces"]).reshape(-1, 3)
+            which = np.unique(faces[surface.object_id == object_id])
+            positions, normals = (array.copy() for array in surface.rest)
+            positions[which] = (positions[which] - pose.pivot) @ pose.rotation.T + pose.pivot + pose.shift
+            normals[which] = normals[which] @ pose.rotation.T
+            parameters["vertex_positions"], parameters["vertex_normals"] = _flat(positions), _flat(normals)
+            parameters.update()
+
+    def lit(self, environment: EnvironmentMap | None = None) -> mi.Scene:
+        """The Mitsuba scene under a light; without one it still answers rays."""
+        scene: dict[str, Any] = {"type": "scene"}
+        scene |= {f"surface{i}": surface.shape for i, surface in enumerate(self.surfaces)}
+        if environment is not None:
+            scene["environment"] = environment.to_mitsuba()
+        return mi.load_dict(scene)
+
+
+def build(
+    spec: SceneSpec,
+    models: Mapping[str, list[Part]] | None = None,
+    edge: float = 0.05,
+    texels_per_unit: float = 64.0,
+    most_texels: int = texels.MOST_TEXELS,
+    photographed: Callable[[PhotographedSpec], Photographed] | None = None,
+) -> Geometry:
+    """Build a scene's meshes and materials.
+
+    Args:
+        spec: the scene.
+        models: asset id -> its parts (unit ball, z up), for the assets that the scene names.
+        edge: longest edge of the procedural meshes, world units.
+        texels_per_unit: density of the textures on them.
+        most_texels: of all of them; where that is too few, the density falls.
+        photographed: opens the user's texture sets, where the scene names some.
+
+    Raises:
+        TronError: the scene names an asset or a texture set that was not given.
+    """
+    solids, surfaces = [], []
+    for number, item in enumerate((*spec.surroundings, *spec.objects), start=FIRST_ID):
+        matrix = item.placement.matrix()
+        if item.shape is not None and item.materials:
+            # Subdivision rounds what is curved; walls, floors and terrain come as fine as they are.
+            fine = np.inf if number < FIRST_ID + len(spec.surroundings) else edge
+            for mesh, slot in make_pieces(item.shape, fine):
+                material = item.materials[slot % len(item.materials)]
+                if isinstance(material, PhotographedSpec):
+                    if photographed is None:
+                        raise TronError(
+                            f"the scene needs the texture set '{material.texture_set}'",
+                            spec.name,
+                            "give its folder as textures=...",
+                        )
+                    material = photographed(material)
+                solids.append(_Solid(texels.Surface(*split_creases(mesh), material), matrix, number))
+            continue
+        parts = (models or {}).get(str(item.asset))
+        if parts is None:
+            raise TronError(
+                f"the scene needs the asset {item.asset!r}", spec.name, "give its folder as assets=..."
+            )
+        surfaces += [_textured(part.moved(matrix, item.size), number, i) for i, part in enumerate(parts)]
+    return Geometry([_solids(solids, texels_per_unit, most_texels), *surfaces])
+
+
+def _solids(solids: Sequence[_Solid], texels_per_unit: float, most: int = texels.MOST_TEXELS) -> Surface:
+    """All procedural pieces as one mesh under one material, whose textures are one atlas."""
+    atlas = texels.bake([solid.surface for solid in solids], texels_per_unit, most)
+    vertices, normals, uvs, faces, ids, count = [], [], [], [], [], 0
+    for (surface, matrix, object_id), (index, uv, corners) in zip(solids, atlas.laid):
+        rotation = matrix[:3, :3]
+        vertices.append(surface.vertices[index] @ rotation.T + matrix[:3, 3])
+        normals.append(surface.normals[index] @ rotation.T)
+        uvs.append(uv)
+        faces.append(corners + count)
+        ids.append(np.full(len(corners), object_id, np.uint32))
+        count += len(index)
+    principled = mi.load_dict(
+        {
+            "type": "principled",
+            "base_color": _texture(limited(atlas.base_color, atlas.metallic), half=True),
+            "roughness": _texture(atlas.roughness, half=True),
+            "metallic": _texture(atlas.metallic, half=True),
+            "specular": 0.5,
+        }
+    )
+    normal_map = mi.load_dict(_texture(atlas.normal_map, half=True))
+    bsdf: Any = mi.load_dict({"type": "normalmap", "normalmap": normal_map, "bsdf": principled})
+    # Cloth, leaves and walls are open; a back face that renders black would not match its surfels.
+    bsdf = mi.load_dict({"type": "twosided", "bsdf": bsdf})
+    mesh = _mesh("solids", bsdf, *(np.concatenate(part) for part in (vertices, normals, faces, uvs)))
+    return Surface(mesh, principled, normal_map, np.concatenate(ids))
+
+
+def _textured(part: Part, object_id: int, index: int) -> Surface:
+    per_vertex = part.base_color.ndim == 2
+    look = part.sampling.get
+    base_color = (
+        {"type": "mesh_attribute", "name": "vertex_base_color"}
+        if per_vertex
+        else _texture(part.base_color, look("base_color"))
+    )
+    if part.tint is not None:
+        base_color = tinted(base_color)
+    metallic = _texture(part.metallic, look("metallic"))
+    if part.base_color.max() > DIELECTRIC:
+        base_color = limited_texture(base_color, metallic)
+    principled = mi.load_dict(
+        {
+            "type": "principled",
+            "base_color": base_color,
+            "roughness": _texture(part.roughness, look("roughness")),
+            "metallic": metallic,
+            "specular": 0.5,
+        }
+    )
+    bsdf: Any = principled
+    normal_map = None
+    if part.normal_map is not None:
+        normal_map = mi.load_dict(_texture(part.normal_map, look("normal_map")))
+        bsdf = mi.load_dict({"type": "normalmap", "normalmap": normal_map, "bsdf": principled})
+    # Models are often open shells; a back face that renders black would not match its surfels.
+    bsdf = mi.load_dict({"type": "twosided", "bsdf": bsdf})
+    mesh = _mesh(f"object{object_id}-{index}", bsdf, part.vertices, part.normals, part.faces, part.uv)
+    if per_vertex:
+        mesh.add_attribute("vertex_base_color", 3, _flat(part.base_color))
+    if part.tint is not None:
+        mesh.add_attribute(ATTRIBUTE, 3, _flat(part.tint))
+    return Surface(mesh, principled, normal_map, np.full(len(part.faces), object_id, np.uint32))
+
+
+def _texture(value: np.ndarray | float, sampling: Sampling | None = None, half: bool = False) -> Any:
+    """A constant or an image as Mitsuba texture; values are linear already, ``half`` halves their memory."""
+    image = np.asarray(value, np.float32)
+    if image.ndim == 0:
+        return float(image)
+    if image.ndim == 1:
+        return {"type": "rgb", "value": image.tolist()}
+    pixels = np.ascontiguousarray(image if image.ndim == 3 else image[..., None])
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
+    if half:
+        texture |= {"format": "fp16", "wrap_mode": "clamp"}
+    if sampling is not None:
+        texture |= {"to_uv": mi.ScalarTransform3f(sampling.matrix), "wrap_mode": sampling.wrap}
+    return texture
+
+
+def _flat(values: np.ndarray) -> Any:
+    return aligned(np.ascontiguousarray(values, np.float32).ravel())
+
+
+def _mesh(
+    name: str,
+    bsdf: mi.BSDF,
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray | None,
+) -> mi.Mesh:
+    properties = mi.Properties()
+    properties["bsdf"] = bsdf
+    mesh = mi.Mesh(
+        name,
+        len(vertices),
+        len(faces),
+        props=properties,
+        has_vertex_normals=True,
+        has_vertex_texcoords=uv is not None,
+    )
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = _flat(vertices)
+    parameters["vertex_normals"] = _flat(normals)
+    parameters["faces"] = aligned(np.ascontiguousarray(faces, np.uint32).ravel())
+    if uv is not None:
+        parameters["vertex_texcoords"] = _flat(uv)
+    parameters.update()
+    return mesh
+
+
+@cache
+def register(_variant: str, name: str, color: Callable[[Any, Any, Any], Any]) -> None:
+    """Make a texture known to the variant in use, whose class has to be made under it.
+
+    Args:
+        name: its plugin type; its inputs are ``image`` and ``metallic``, a texture each.
+        color: linear RGB of the texture at a surface interaction.
+    """
+
+    class Derived(mi.Texture):
+        """A texture computed from its inputs at the same point."""
+
+        def __init__(self, properties: mi.Properties):
+            super().__init__(properties)
+            self.image: Any = properties.get_texture("image", 1.0)
+            self.metallic = properties.get_texture("metallic", 0.0)
+
+        def eval(self, si: Any, active: Any = True) -> Any:
+            return self.eval_3(si, active)
+
+        def eval_3(self, si: Any, active: Any = True) -> Any:
+            return color(self, si, active)
+
+        def eval_1(self, si: Any, active: Any = True) -> Any:
+            return mi.luminance(self.eval_3(si, active))
+
+        def mean(self) -> Any:
+            return self.image.mean()
+
+        def is_spatially_varying(self) -> bool:
+            return True
+
+        def to_string(self) -> str:
+            return f"{name}[{self.image}]"
+
+    mi.register_texture(name, Derived)
+
+
+ATTRIBUTE = "vertex_tint"
+
+
+def tinted(image: dict[str, Any]) -> Any:
+    """Mitsuba texture: that of a dictionary, times the mesh's attribute ``vertex_tint``; both linear RGB."""
+    register(str(mi.variant()), "tinted", _product)
+    return mi.load_dict({"type": "tinted", "image": image})
+
+
+def _product(texture: Any, si: Any, active: Any) -> mi.Color3f:
+    return texture.image.eval_3(si, active) * si.shape.eval_attribute_3(ATTRIBUTE, si, active)
+
+
+DIELECTRIC = 0.85
+"""Highest base color of a surface that is no metal, that path tracing makes no light.
+
+Mitsuba's ``principled`` adds its dielectric layer (specular 0.5) to its diffuse part and takes nothing away
+for it: with base color 1 and roughness 1 a surface sends out 1.08 times what arrives, averaged over views,
+and a closed white room never settles. At 0.85 the same average is 0.92 at most; at grazing views it can
+still pass 1 (1.2 at 6 degrees above the surface). Metals have no diffuse part, so they may be white:
+
+    base_color <= 0.85 + 0.15 metallic
+"""
+
+
+def highest(metallic: Any) -> Any:
+    """Highest base color, linear, of what is ``metallic`` in [0, 1]; NumPy and Dr.Jit alike."""
+    return DIELECTRIC + (1 - DIELECTRIC) * metallic
+
+
+def limited(base_color: np.ndarray, metallic: np.ndarray) -> np.ndarray:
+    """``base_color`` (..., 3), linear, no higher than ``metallic`` (..., 1) allows."""
+    return np.minimum(base_color, highest(metallic))
+
+
+def limited_texture(base_color: dict[str, Any] | mi.Texture, metallic: dict[str, Any] | float) -> mi.Texture:
+    """Mitsuba texture: linear ``base_color``, no higher than ``metallic`` allows at the same point."""
+    register(str(mi.variant()), "limited", _limited)
+    return mi.load_dict({"type": "limited", "image": base_color, "metallic": metallic})
+
+
+def _limited(texture: Any, si: Any, active: Any) -> mi.Color3f:
+    most = highest(texture.metallic.eval_1(si, active))
+    return dr.minimum(texture.image.eval_3(si, active), mi.Color3f(most))
+
+
+@stage("build")
+def draw_and_build(
+    item: Work, settings: Settings, sources: Sources, lights: Sequence[LightChoice]
+) -> tuple[SceneSpec, Geometry]:
+    """A scene's specification, with a light of each of the given families, and its meshes."""
+    recipe = settings.split(item.split)
+    checked, sources = slots(settings, sources), of_split(settings, sources, item.split)
+    models = load_models(settings.assets, sources.assets) if settings.assets is not None else {}
+    spec = draw_scene(
+        settings.seed,
+        item.split,
+        item.index,
+        style=recipe.style_of(item.index),
+        lights=lights,
+        families=settings.light_families(),
+        environments=sources.environments,
+        map_share=settings.map_share * (checked.map_share if checked else 1.0),
+        choice=Choice(
+            assets={name: outline(parts) for name, parts in models.items()},
+            asset_share=settings.asset_share * (checked.model_share if checked else 1.0),
+            objects=settings.objects,
+            textures=sources.textures,
+            texture_share=settings.texture_share,
+        ),
+        frames=recipe.frames,
+        path_frames=settings.path_frames,
+        lights_share_path=recipe.lights_share_path,
+        moving=Share(recipe.moving_objects, recipe.moving_lights),
+        still_camera=recipe.still_camera,
+    )
+    return spec, scene_geometry(spec, settings, sources)
+
+
+def scene_geometry(spec: SceneSpec, settings: Settings, sources: Sources) -> Geometry:
+    """Build a scene; models are read once a process, texture sets at the size that the scene needs.
+
+    Raises:
+        TronError: the scene names an asset or a texture set that is not among the sources.
+    """
+    models = load_models(settings.assets, sources.assets) if settings.assets is not None else {}
+    density = texels_per_unit(spec, settings)
+
+    def photographed(material: PhotographedSpec) -> Photographed:
+        return opened(material, settings.textures, sources.textures, density)
+
+    most = most_texels(spec, settings)
+    return build(spec, models, settings.mesh_edge, density, most_texels=most, photographed=photographed)
+
+
+def texels_per_unit(spec: SceneSpec, settings: Settings) -> float:
+    """Texels a world unit of a scene: the setting, or what suits the frames and views that are made of it."""
+    if settings.texels_per_unit is not None:
+        return settings.texels_per_unit
+    return max(_suited(spec, cameras) for cameras in _cameras(spec, settings))
+
+
+def most_texels(spec: SceneSpec, settings: Settings) -> int:
+    """Texels of a scene at most."""
+    if settings.texels_per_unit is not None:
+        return MOST
+    pixels = max(cameras[0].width * cameras[0].height for cameras in _cameras(spec, settings))
+    return int(np.clip(TEXELS_A_FRAME * pixels, FEWEST, MOST))
+
+
+def _cameras(spec: SceneSpec, settings: Settings) -> list[list[Camera]]:
+    """Some cameras of each path that pictures are taken from."""
+    recipe = settings.split(spec.split)
+    captures = {"captures": settings.capture, "pseudo_captures": settings.pseudo_capture}
+    if settings.mode in captures:
+        capture = captures[settings.mode]
+        return [spec.views(PATH_SAMPLES, capture.width, capture.height)]
+    return [
+        spec.views(PATH_SAMPLES, settings.view_width, settings.view_height),
+        spec.cameras.film.cameras(PATH_SAMPLES, recipe.width, recipe.height),
+    ]
+
+
+def _suited(spec: SceneSpec, cameras: list[Camera]) -> float:
+    """TEXELS_A_PIXEL at the median distance of cameras and things."""
+    things = np.array([item.placement.position for item in spec.objects or spec.surroundings])
+    places = np.array([camera.position for camera in cameras])
+    distance = float(np.median(np.linalg.norm(places[:, None] - things, axis=-1)))
+    return TEXELS_A_PIXEL * cameras[0].fx / max(distance, NEAREST)

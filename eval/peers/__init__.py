@@ -1,1 +1,0 @@
-"""Other renderers that ours is timed against, and the scenes on which."""

@@ -1,0 +1,150 @@
+"""Laws of a room's bounds: what no photo shows is closed, what one shows to be open stays open."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tron.cameras import Camera
+from tron.captures import View
+from tron.gaussians import GaussianScene
+from tron.reconstruction.geometry.seen_space import enclosed
+from tron.seeds import generator
+from tron.tracing import SurfelTracer
+
+WINDOW = 0.3
+
+
+def room(dense: Any, ceiling: bool) -> GaussianScene:
+    """The inside of the cube of side 2 about the origin, with a window in the wall at x = 1."""
+    box = dense.box(half=1.0)
+    x, y, z = box.points.T
+    kept = ~((x > 0.99) & (np.abs(y) < WINDOW) & (np.abs(z) < WINDOW))
+    if not ceiling:
+        kept &= z < 0.99
+    sheet = type(box)(box.points[kept], -box.normals[kept], box.mitsuba)
+    return dense.scene(sheet)
+
+
+@pytest.fixture(scope="module")
+def photos() -> list[View]:
+    """From a circle at half the height, across the room; the ceiling is above all of them."""
+    views = []
+    for i in range(10):
+        eye = 0.6 * np.array([np.cos(0.2 * np.pi * i), np.sin(0.2 * np.pi * i), 0.0])
+        camera = Camera.look_at(eye, (0, 0, 0), fov_deg=50, width=20, height=20)
+        views.append(View(str(i), camera, np.full((20, 20, 3), 0.5, np.float32), "display"))
+    return views
+
+
+def light_from(scene: GaussianScene, targets: np.ndarray) -> np.ndarray:
+    """Transmittance (N,) from the middle of the room towards points (N, 3)."""
+    ways = targets / np.linalg.norm(targets, axis=1, keepdims=True)
+    start = mi.Point3f(*(dr.zeros(mi.Float, len(ways)) for _ in range(3)))
+    return SurfelTracer(scene).transmittance(start, mi.Vector3f(ways.T.astype(np.float32))).numpy()
+
+
+def _some(value: Any, kept: np.ndarray) -> Any:
+    return value[kept] if isinstance(value, np.ndarray) and len(value) == len(kept) else value
+
+
+def over(low: tuple[float, ...], high: tuple[float, ...], count: int = 2000) -> np.ndarray:
+    return generator(0, "tests", "targets").uniform(low, high, (count, 3))
+
+
+def test_a_ceiling_that_no_photo_shows_lets_no_light_in(dense_surfels, photos: list[View]) -> None:
+    found = room(dense_surfels, ceiling=False)
+    closed = enclosed(found, photos, seed=0)
+    above = over((-0.95, -0.95, 1), (0.95, 0.95, 1))
+    assert light_from(found, above).min() > 0.9
+    assert light_from(closed, above).mean() < 0.01
+    new = slice(len(found), None)
+    assert len(closed) > len(found)
+    assert np.array_equal(closed.means[: len(found)], found.means)
+    assert (np.einsum("mi,mi->m", closed.normals()[new], closed.means[new]) < 0).all(), "not inwards"
+    closed.validate()
+
+
+def test_new_surfels_have_the_colours_near_by(dense_surfels, photos: list[View]) -> None:
+    """Red walls where x is negative, green ones where it is not."""
+    found = room(dense_surfels, ceiling=False)
+    right = found.means[:, 0] > 0
+    found.base_color[:] = np.where(right[:, None], (0.1, 0.8, 0.1), (0.8, 0.1, 0.1))
+    found.sh[:, 0] = found.base_color
+    closed = enclosed(found, photos, seed=0)
+    new = np.arange(len(found), len(closed))
+    far = new[np.abs(closed.means[new, 0]) > 0.7]
+    wanted = np.where(closed.means[far, :1] > 0, (0.1, 0.8, 0.1), (0.8, 0.1, 0.1))
+    assert len(far) > 100
+    np.testing.assert_allclose(closed.base_color[far], wanted, atol=1e-5)
+    np.testing.assert_allclose(closed.sh[far, 0], wanted, atol=1e-5)
+
+
+def test_strays_outside_do_not_move_the_ceiling(dense_surfels, photos: list[View]) -> None:
+    found = room(dense_surfels, ceiling=False)
+    found.means[:10] += np.array([0, 0, 4], np.float32)
+    closed = enclosed(found, photos, seed=0)
+    assert len(closed) > len(found)
+    assert closed.means[len(found) :, 2].max() < 1.2
+
+
+def test_a_window_that_photos_show_stays_open(dense_surfels, photos: list[View]) -> None:
+    """To its edge, which the surfels of the wall blur by half a spacing."""
+    within = 0.9 * WINDOW
+    window = over((1, -within, -within), (1, within, within))
+    found = room(dense_surfels, ceiling=False)
+    closed = enclosed(found, photos, seed=0)
+    assert light_from(found, window).mean() - light_from(closed, window).mean() < 0.01
+    assert light_from(closed, window).mean() > 0.95
+
+
+def test_a_window_beside_what_is_closed_stays_open(dense_surfels, photos: list[View]) -> None:
+    """A slit from floor to ceiling, whose middle photos show: surfels that close its ends leave it open."""
+    found = room(dense_surfels, ceiling=True)
+    x, y = found.means.T[:2]
+    kept = ~((x > 0.99) & (np.abs(y) < WINDOW))
+    found = GaussianScene(**{f.name: _some(getattr(found, f.name), kept) for f in fields(GaussianScene)})
+    closed = enclosed(found, photos, seed=0)
+    shown = over((1, -0.9 * WINDOW, -0.65), (1, 0.9 * WINDOW, 0.65))
+    assert len(closed) > len(found)
+    assert light_from(closed, shown).mean() > 0.95
+
+
+def test_a_window_that_no_photo_shows_is_taken_for_a_wall(dense_surfels, photos: list[View]) -> None:
+    """Nobody can know: the photos that look at it are those from the other side of the room."""
+    away = [view for view in photos if view.camera.forward[0] < 0.2]
+    assert 2 < len(away) < len(photos)
+    closed = enclosed(room(dense_surfels, ceiling=True), away, seed=0)
+    within = 0.8 * WINDOW
+    assert light_from(closed, over((1, -within, -within), (1, within, within))).mean() < 0.05
+
+
+def test_a_room_that_is_closed_stays_as_it_is(dense_surfels, photos: list[View]) -> None:
+    found = room(dense_surfels, ceiling=True)
+    closed = enclosed(found, photos, seed=0)
+    assert len(closed) - len(found) < 20, "of 20,000 places asked"
+
+
+def test_photos_from_without_are_told_of(dense_surfels, caplog: pytest.LogCaptureFixture) -> None:
+    ball = dense_surfels.scene(dense_surfels.sphere(radius=0.3))
+    views = []
+    for i in range(6):
+        turn = np.pi / 3 * i
+        camera = Camera.look_at(
+            (2 * np.cos(turn), 2 * np.sin(turn), 0), (0, 0, 0), fov_deg=5, width=8, height=8
+        )
+        views.append(View(str(i), camera, np.zeros((8, 8, 3), np.float32), "display"))
+    enclosed(ball, views, seed=0)
+    assert "indoors=true is for photos from within one" in caplog.text
+
+
+def test_the_same_seed_gives_the_same_surfels(dense_surfels, photos: list[View]) -> None:
+    found = room(dense_surfels, ceiling=False)
+    one, other, another = (enclosed(found, photos, seed) for seed in (3, 3, 4))
+    assert np.array_equal(one.means, other.means)
+    assert not np.array_equal(one.means, another.means)

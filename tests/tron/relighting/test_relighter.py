@@ -1,0 +1,236 @@
+"""Laws of a scene that can be lit: every part has the same settings, and what changes is as if made anew."""
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from tron.cameras import Camera
+from tron.color import to_display
+from tron.errors import TronError
+from tron.estimation import Estimation
+from tron.gaussians.edit import moved, subset
+from tron.gaussians.scene import GaussianScene
+from tron.io.images import read_image
+from tron.relighting import Guidance, Illumination, Relighter, views_under
+from tron.seeds import generator
+from tron.shading.bounces.bounce import BothSides, BounceTransport, facing
+from tron.shading.environments.environment import EnvironmentMap
+from tron.shading.guidance import render_guidance
+from tron.shading.lighting import Lighting
+from tron.tracing import SurfelTracer
+
+VIEWS = [
+    Camera.look_at((3 * np.cos(turn), 3 * np.sin(turn), 1.5), (0, 0, 0.4), fov_deg=40, width=32, height=32)
+    for turn in (0.0, 2.0, 4.0)
+]
+BALL, SPACING = 1, 0.06
+
+
+@pytest.fixture(scope="module")
+def light() -> EnvironmentMap:
+    """A dim sky with a bright patch low in the +x direction."""
+    image = np.full((32, 64, 3), 0.3, np.float32)
+    image[8:11, 14:17] = 60.0
+    return EnvironmentMap(image)
+
+
+@pytest.fixture(scope="module")
+def scene(dense_surfels) -> GaussianScene:
+    """A reddish ball, part metal, on a grey floor."""
+    floor, ball = dense_surfels.plane(SPACING, 1.5), dense_surfels.sphere(SPACING, 0.5, 0.5)
+    which = np.repeat([0, BALL], [len(floor.points), len(ball.points)])
+    return dense_surfels.scene(
+        floor, ball, spacing=SPACING, object_id=which, metallic=0.6 * which, roughness=0.8 - 0.5 * which,
+        base_color=np.where(which[:, None] == BALL, [0.8, 0.3, 0.2], 0.5),
+        log_scales=np.full((len(which), 2), np.log(0.4 * SPACING)),
+    )  # fmt: skip
+
+
+def without_sign(scene: GaussianScene) -> GaussianScene:
+    """The scene with half of its surfels turned over, and not saying which."""
+    over = generator(0, "tests", "over").random(len(scene)) < 0.5
+    return replace(scene.turned_over(over), oriented=False)
+
+
+def by_hand(
+    scene: GaussianScene, cameras: list[Camera], light: EnvironmentMap, estimation: Estimation
+) -> Iterator[Guidance]:
+    """A frame of each camera, every part of it made by itself and given the settings by itself."""
+    tracer, lighting = SurfelTracer(scene).sided(estimation.two_sided), Lighting(light)
+    bounce = faces = backs = None
+    if estimation.bounces and scene.oriented:
+        bounce = BounceTransport.trace(tracer, seed=5).bake(lighting, estimation, seed=5)
+    elif estimation.bounces:
+        faces, backs = BothSides.trace(tracer, seed=5).bake(lighting, estimation, seed=5)
+    for seed, camera in enumerate(cameras):
+        seen = bounce
+        if faces is not None and backs is not None:
+            seen = facing(faces, backs, scene.looks_away(camera.position))
+        shown = SurfelTracer(scene if scene.oriented else scene.facing(camera.position))
+        yield render_guidance(shown, camera, lighting, estimation, seed, bounce=seen)
+
+
+def assert_same(one: Guidance, other: Guidance) -> None:
+    for name in Guidance.BUFFERS:
+        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+@pytest.mark.parametrize("two_sided", [True, False], ids=["two-sided", "one-sided"])
+def test_every_part_has_the_same_settings(scene, light, two_sided):
+    """Sides, bounces, reflections, normals without a sign: as of a fresh bake by hand."""
+    for signed, (bounces, reflections) in itertools.product((True, False), ((0, 0), (1, 0), (4, 0), (4, 2))):
+        each = scene if signed else without_sign(scene)
+        estimation = Estimation(rays=8, two_sided=two_sided, bounces=bounces, reflections=reflections)
+        lit = Relighter(each, estimation, 5).under(light)
+        cameras = VIEWS[:1] if signed else VIEWS[:2]
+        for seed, frame in enumerate(by_hand(each, cameras, light, estimation)):
+            assert_same(lit.render(cameras[seed], seed), frame)
+
+
+def test_one_sided_surfels_send_no_light_out_of_their_backs(scene, light):
+    """What two sides add where rays meet backs; that both halves are one-sided shows in the frame."""
+    one, both = (
+        Relighter(scene, Estimation(rays=8, two_sided=two_sided)).under(light) for two_sided in (False, True)
+    )
+    backs = [np.array(lit.relighter.transport.rays.met) % 2 for lit in (one, both)]
+    missed = np.array(one.relighter.transport.rays.met) == np.uint32(0xFFFFFFFF)
+    assert not (backs[0].astype(bool) & ~missed).any()
+    assert one.relighter.transport.undersides is None
+
+
+def indirect(lit: Illumination, view: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Indirect irradiance where the view sees surfels, and where that is."""
+    guidance = lit.render(view)
+    return guidance.indirect, guidance.mask > 0.9
+
+
+def test_normals_without_a_sign_get_the_light_of_the_side_that_a_camera_sees(light, scene):
+    """Half of the surfels turned over: every camera sees what it sees of the scene that knows its sides."""
+    known, found = Relighter(scene).under(light), Relighter(without_sign(scene)).under(light)
+    for view in VIEWS:
+        truth, inside = indirect(known, view)
+        ours, also = indirect(found, view)
+        both = inside & also
+        assert both.sum() > 400
+        error = np.abs(ours - truth)[both].mean() / truth[both].mean()
+        assert error < 0.1, f"relative error {error:.3f}"
+
+
+def test_mirrors_show_the_light_of_the_side_that_they_see(light, scene):
+    """A far side that no camera sees is seen in the mirror below it, by its own light."""
+    metal = replace(
+        scene, metallic=np.ones_like(scene.metallic), roughness=np.full_like(scene.roughness, 0.15)
+    )
+    means = []
+    for each in (metal, replace(metal, oriented=False)):
+        guidance = Relighter(each, Estimation(reflections=16)).under(light).render(VIEWS[0])
+        means.append(guidance.lit[guidance.mask > 0.9].mean())
+    assert means[1] == pytest.approx(means[0], rel=0.05)
+
+
+def test_a_scene_without_bounces_bakes_nothing(light, scene, monkeypatch):
+    monkeypatch.setattr(BounceTransport, "trace", None)
+    lit = Relighter(scene, Estimation(bounces=0)).prepare().under(light)
+    assert lit.bounced(VIEWS[0]) is None
+    guidance = lit.render(VIEWS[0])
+    np.testing.assert_array_equal(guidance.lit, guidance.shadowed)
+
+
+def test_one_tracer_serves_all_cameras_where_sides_are_known(variant, scene):
+    relighter = Relighter(scene)
+    assert relighter.tracer(VIEWS[0]) is relighter.tracer(VIEWS[1])
+    relighter = Relighter(without_sign(scene))
+    assert relighter.tracer(VIEWS[0]) is relighter.tracer(replace(VIEWS[0]))
+    assert relighter.tracer(VIEWS[0]) is not relighter.tracer(VIEWS[1])
+    with pytest.raises(TronError, match="no sign"):
+        _ = relighter.transport
+
+
+def test_frames_of_other_rays_share_a_bake(light, scene):
+    lit = Relighter(scene, Estimation(rays=8)).under(light)
+    finest = lit.framed(rays=16, reflections=2, supersample=2)
+    assert finest.bounced(VIEWS[0]) is lit.bounced(VIEWS[0])
+    wanted = Estimation(rays=16, reflections=2, supersample=2)
+    assert finest.estimation == wanted
+    assert_same(finest.render(VIEWS[0]), Relighter(scene, wanted).under(light).render(VIEWS[0]))
+    with pytest.raises(ValueError, match="bounces"):
+        Relighter(scene, Estimation(bounces=0)).under(light).framed(reflections=2)
+
+
+def test_a_turned_light_is_the_light_turned(light, scene):
+    relighter = Relighter(scene, Estimation(rays=8))
+    turned, alone = relighter.under(light).turned_to(90), relighter.under(light.rotated(90))
+    assert_same(turned.render(VIEWS[0]), alone.render(VIEWS[0]))
+
+
+def test_views_under_many_lights_are_those_under_each(light, scene):
+    relighter = Relighter(scene, Estimation(rays=8))
+    lights = [relighter.under(light, seed) for seed in (1, 2)]
+    for lit, view in zip(lights, views_under(lights, VIEWS[1]), strict=True):
+        assert_same(lit.render(VIEWS[1], view=view), lit.render(VIEWS[1]))
+
+
+CHANGES = {
+    "moved": lambda scene: moved(scene, scene.object_id == BALL, translation=np.array([0.3, -0.2, 0.1])),
+    "painted": lambda scene: replace(scene, base_color=1 - scene.base_color),
+    "thinned": lambda scene: replace(scene, opacity_logits=scene.opacity_logits - BALL * 3),
+    "parted": lambda scene: subset(scene, scene.object_id == 0),
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "signed"), [*((change, True) for change in CHANGES), ("moved", False), ("parted", False)]
+)
+def test_a_changed_scene_is_lit_as_if_it_were_new(light, scene, change, signed):
+    """A frame to the noise of a bake, none where nothing has moved; rays to the bit, drawn in one order."""
+    before = Relighter(scene if signed else without_sign(scene), Estimation(rays=16), 3).prepare()
+    first = before.under(light).render(VIEWS[1])
+    other = CHANGES[change](before.scene)
+    found, fresh = before.changed(other), Relighter(other, Estimation(rays=16), 3)
+    (ours, theirs) = (each.under(light) for each in (found, fresh))
+    anew = (BounceTransport if signed else BothSides).trace(found._tracer, seed=3)
+    rays = [
+        each.faces.rays if isinstance(each, BothSides) else each.rays for each in (found._transport, anew)
+    ]
+    assert dr.all(rays[0].met == rays[1].met)
+    ours, theirs = ours.render(VIEWS[1]), theirs.render(VIEWS[1])
+    if change == "moved":
+        error = np.abs(ours.lit - theirs.lit).mean() / theirs.lit.mean()
+        assert error < 0.01, f"relative error {error:.4f}"
+    else:
+        assert_same(ours, theirs)
+    assert_same(before.under(light).render(VIEWS[1]), first)
+
+
+def test_a_backdrop_stays_in_no_light_s_way_when_things_move(light, scene):
+    behind = np.zeros(len(scene), bool)
+    behind[scene.object_id == 0] = True
+    before = Relighter(scene, Estimation(rays=8), backdrop=behind).prepare()
+    there = moved(scene, scene.object_id == BALL, translation=np.array([0.0, 0.0, 0.2]))
+    met = np.array(before.changed(there).transport.rays.met)
+    hit = met[met != np.uint32(0xFFFFFFFF)] // 2
+    assert hit.size
+    assert not behind[hit].any()
+    with pytest.raises(TronError, match="backdrop"):
+        before.changed(subset(scene, ~behind))
+
+
+def test_frames_are_written_as_pictures_and_as_light(light, scene, tmp_path):
+    frame = Relighter(scene, Estimation(rays=8)).under(light.rotated(30)).render(VIEWS[0])
+    frame.write(tmp_path / "lit.png")
+    shown = read_image(tmp_path / "lit.png")
+    np.testing.assert_allclose(shown, to_display(frame.lit, light.exposure()), atol=0.5 / 255 + 1e-6)
+    frame.write(tmp_path / "pbr.png", "pbr", exposure=2.0)
+    shown = read_image(tmp_path / "pbr.png")
+    np.testing.assert_allclose(shown, to_display(frame.pbr, 2.0), atol=0.5 / 255 + 1e-6)
+    frame.write(tmp_path / "lit.exr")
+    np.testing.assert_allclose(read_image(tmp_path / "lit.exr"), frame.lit, rtol=1e-3)
+    frame.write(tmp_path / "mask.png", "mask")
+    shown = read_image(tmp_path / "mask.png")
+    np.testing.assert_allclose(shown.reshape(32, 32, -1)[..., 0], frame.mask, atol=0.5 / 255 + 1e-6)
+    with pytest.raises(KeyError):
+        frame.write(tmp_path / "none.png", "none")

@@ -1,0 +1,59 @@
+"""Burley's diffuse factor of the light that arrives, against Mitsuba's material and a sun by itself."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tron.cameras import Camera
+from tron.estimation import Estimation
+from tron.seeds import generator
+from tron.shading.burley import burley_factor, burley_terms
+from tron.shading.environments.environment import EnvironmentMap
+from tron.shading.guidance import Lighting, render_guidance
+
+
+def upper(count: int, name: str) -> mi.Vector3f:
+    directions = generator(0, "tests", name).normal(size=(3, count))
+    directions[2] = np.abs(directions[2]) + 0.05
+    return mi.Vector3f((directions / np.linalg.norm(directions, axis=0)).astype(np.float32))
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.6, 1.0])
+def test_the_factor_is_the_diffuse_part_of_mitsubas_principled(variant: str, roughness: float) -> None:
+    """Its colour is what a base color of 0.8 adds to black: the lobe above does not depend on it."""
+    view, light = upper(500, "view"), upper(500, "light")
+    seen = dr.zeros(mi.SurfaceInteraction3f, 500)
+    seen.wi = view
+    values = []
+    for base in (0.8, 0.0):
+        material = {"type": "principled", "roughness": roughness, "specular": 0.5, "metallic": 0.0}
+        bsdf = mi.load_dict({**material, "base_color": {"type": "rgb", "value": base}})
+        values.append(np.array(bsdf.eval(mi.BSDFContext(), seen, light))[0])
+    terms = burley_terms(mi.Vector3f(0, 0, 1), -view, light)
+    ours = np.array(burley_factor(terms, mi.Float(roughness), mi.Float(0))) * 0.8 / np.pi * np.array(light.z)
+    np.testing.assert_allclose(ours, values[0] - values[1], rtol=2e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("estimation", [Estimation(rays=64), Estimation(rays=2, filtered=True)])
+@pytest.mark.parametrize("behind", [True, False])
+def test_a_floor_under_a_low_sun_has_the_factor_of_its_direction(
+    variant: str, sphere_over_plane, behind: bool, estimation: Estimation
+) -> None:
+    """The mean over all directions of light was 1.3 times and 0.6 times of it."""
+    image = np.zeros((128, 256, 3), np.float32)
+    image[55, 126:130] = 1000.0  # 12 degrees up, along -y
+    tracer, lighting = sphere_over_plane(sphere=False, base_color=0.5), Lighting(EnvironmentMap(image))
+    eye = (0.0, -6.0 if behind else 6.0, 2.0)
+    view = Camera.look_at(eye, (0, 0, 0), fov_deg=4, width=16, height=16)
+    found = render_guidance(tracer, view, lighting, estimation)
+    polar = 55 / 127 * np.pi
+    light = mi.Vector3f(0, -float(np.sin(polar)), float(np.cos(polar)))
+    along = mi.Vector3f(*(-np.array(eye) / np.linalg.norm(eye)).tolist())
+    roughness = mi.Float(float(found.gbuffer["roughness"].mean()))
+    factor = np.array(burley_factor(burley_terms(mi.Vector3f(0, 0, 1), along, light), roughness, mi.Float(0)))
+    other = render_guidance(sphere_over_plane(sphere=False, base_color=0.0), view, lighting, estimation)
+    diffuse = (found.shadowed - other.shadowed)[..., 0] / (0.5 * found.irradiance[..., 0])
+    np.testing.assert_allclose(np.median(diffuse), factor[0], rtol=0.03)

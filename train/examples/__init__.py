@@ -1,0 +1,1 @@
+"""Training examples: read from shards, cropped, varied, mixed."""

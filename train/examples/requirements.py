@@ -1,0 +1,106 @@
+"""Checks of a curriculum against its splits and its network, before anything is decoded or trained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from train.curriculum import Stage
+from train.examples.framing import covering_size
+from train.examples.sources import MOST_TRIES
+from tron.errors import TronError
+from tron.neural.protocols import Renderer
+from tron.shards.clip_store import ClipStore
+from tron.shards.schema import ClipMeta
+
+
+def firsts_whole(clips: ClipStore, members: Sequence[str] = ()) -> list[ClipMeta]:
+    """Metadata of the first clip of each of the splits of a store, as :func:`first_whole` finds it."""
+    return [first_whole(clips, members, start) for start in clips.first_of_splits()]
+
+
+def first_whole(clips: ClipStore, members: Sequence[str] = (), start: int = 0) -> ClipMeta:
+    """Metadata of the first clip from a number on that has them, and these members in its first frame.
+
+    Raises:
+        TronError: none of 64 has, all of one split; it says what is wrong with the first.
+    """
+    failure: TronError | None = None
+    for number in range(start, min(start + MOST_TRIES, len(clips))):
+        if clips.split_of(number) != clips.split_of(start):
+            break
+        try:
+            meta = clips.meta(number)
+            for name in members:
+                clips.read_frames(number, [0], [name])
+        except TronError as error:
+            failure = failure or error
+        else:
+            return meta
+    assert failure is not None
+    raise failure
+
+
+def require_members(clips: ClipStore, split: str, members: Sequence[str]) -> None:
+    """TronError, naming the buffer, unless a split holds the members that samples are to have."""
+    for name in members:
+        try:
+            firsts_whole(clips, [name])
+        except TronError as error:
+            raise TronError(
+                f"split '{split}' gives no buffer '{name}': {error.what}",
+                error.where,
+                error.mend or "choose renderer.config.guidance among the buffers that the dataset holds",
+            ) from error
+
+
+def require_clips(split: str, clips: int, processes: int) -> None:
+    """TronError where a split has fewer clips than there are processes to learn from them."""
+    if clips < processes:
+        raise TronError(
+            f"split '{split}' has {clips} clips for {processes} processes",
+            mend="train on fewer devices, or make more clips",
+        )
+
+
+def require_fit(stage: Stage, split: str, first: ClipMeta) -> None:
+    """TronError unless a stage finds its frames and sizes in clips like the first of a split."""
+    if first.frames < stage.frames:
+        raise TronError(
+            f"stage {stage.name} needs clips of {stage.frames} frames, split '{split}' has {first.frames}",
+            mend="make longer clips, or shorten the stage's frames",
+        )
+    width, height = require_size(stage, split, first)
+    if stage.crop and stage.crop > min(width, height):
+        raise TronError(f"stage {stage.name} crops {stage.crop} pixels of {width} x {height}")
+
+
+def require_size(stage: Stage, split: str, first: ClipMeta) -> tuple[int, int]:
+    """Size of a stage's frames before its crop; TronError where a split's are smaller."""
+    if stage.size is not None:
+        try:
+            covering_size((first.width, first.height), stage.size)
+        except TronError as error:
+            raise TronError(error.what, f"stage {stage.name}, split '{split}'", error.mend) from error
+    return stage.size or (first.width, first.height)
+
+
+def require_renderer(stage: Stage, renderer: Renderer) -> None:
+    """TronError unless a network can be trained as a stage says: its crop, size, frames and weights."""
+    block, factor = renderer.space_block, renderer.temporal_factor
+    if (stage.frames - 1) % factor:
+        raise TronError(
+            f"stage {stage.name} has {stage.frames} frames, the renderer takes 1 + {factor}n",
+            mend=f"give it {1 + factor * max(1, (stage.frames - 1) // factor)}",
+        )
+    sides = {"crop": (stage.crop,) if stage.crop else (), "size": stage.size or ()}
+    for key, given in sides.items():
+        if odd := [side for side in given if side % block]:
+            raise TronError(
+                f"stage {stage.name} has a {key} of {odd[0]} pixels, the renderer takes multiples of {block}",
+                mend=f"give it {max(block, odd[0] // block * block)}",
+            )
+    if stage.train_only == "temporal" and not renderer.temporal_weights():
+        raise TronError(
+            f"stage {stage.name} trains temporal weights alone, and this renderer has none",
+            mend="leave train_only at all, or choose a renderer with temporal paths",
+        )

@@ -1,0 +1,82 @@
+"""Settings of tron-reconstruct."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from tron.apps.reconstruct.splat_capture import SplatSettings
+from tron.captures import LoadSettings
+from tron.captures.load import CaptureSettings
+from tron.reconstruction.settings import FitSettings, ReconstructionSettings
+
+
+class Paths(BaseModel):
+    """Capture that is reconstructed, and the folder that the files go to."""
+
+    capture: Path = Field(
+        description="folder of photos, with or without poses, or of path-traced views; or a PLY of splats"
+    )
+    output_dir: Path = Field(description="folder for scene.ply, environment.exr, metrics.json and pictures")
+
+
+class ReportSettings(BaseModel):
+    """Page of a reconstruction."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    frames: int = Field(
+        default=36, ge=0, le=1000, description="frames of each film of the scene relit; 0: no films"
+    )
+    side: int = Field(default=192, ge=16, le=2048, description="their width and height, pixels")
+    views: int = Field(default=4, ge=1, le=100, description="held-out views that are shown")
+
+
+# Bases are listed the other way round than their keys: pydantic collects fields from the last base first.
+class Settings(ReconstructionSettings, CaptureSettings, Paths):
+    """Everything that tron-reconstruct can be told."""
+
+    splats: SplatSettings = Field(
+        default=SplatSettings(), description="virtual cameras that film a PLY of splats"
+    )
+    prior: Any = Field(description="source of normals, materials and irradiance, by _target_ (prior=NAME)")
+    light: FitSettings | None = Field(
+        default=FitSettings(), description="environment map and scale; null fits none"
+    )
+    report: ReportSettings | None = Field(
+        default=ReportSettings(), description="report.html; null writes none"
+    )
+    score_every: int = Field(
+        0, ge=0, description="steps between two scores of the held-out views, kept in curve.json; 0: none"
+    )
+    lpips_weights: Path | None = Field(
+        None, description="local vgg16-397923af.pth, to score LPIPS as well; nothing is downloaded"
+    )
+    overwrite: bool = Field(False, description="begin anew in an output_dir made with other settings")
+    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = Field(
+        "llvm_ad_rgb", description="Mitsuba variant: processor or NVIDIA GPU"
+    )
+    threads: int | None = Field(
+        None, ge=1, description="threads of the renderer; null: all; 1 makes runs repeat bit by bit"
+    )
+
+    def of_loading(self) -> LoadSettings:
+        """Reading of the capture; poses that are found are kept in the output folder."""
+        return LoadSettings(
+            **{name: getattr(self, name) for name in CaptureSettings.model_fields},
+            workspace=self.output_dir / "structure_from_motion",
+            threads=self.threads or 0,
+            seed=self.seed,
+        )
+
+    def of_surfels(self) -> ReconstructionSettings:
+        """Those that the surfels depend on."""
+        return ReconstructionSettings(
+            **{name: getattr(self, name) for name in ReconstructionSettings.model_fields}
+        )
+
+    def kept(self) -> dict[str, Any]:
+        """Plain values for metrics.json, by which a finished run is known again."""
+        return {**self.model_dump(mode="json"), "overwrite": False}

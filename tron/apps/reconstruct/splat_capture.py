@@ -1,0 +1,217 @@
+"""A file of splats as a capture: filmed by virtual cameras, with what they saw as photos and depth maps.
+
+A plain 3DGS scan knows how it looks, not where its surfaces face nor what they are made of: its normals are
+its shortest axes, with signs that mean nothing. Its pictures and median depths from many sides are all that
+is taken from it; surfaces, materials and light are then found as from photos.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial import KDTree
+
+from tron.apps.framing import plan_cameras
+from tron.apps.surroundings import DESCRIPTION, Surrounded, Treatment, treat_surroundings
+from tron.cameras import Camera
+from tron.captures import Capture, View
+from tron.errors import TronError
+from tron.framing import has_floor
+from tron.gaussians.foreign_files import PACKED_SPLATS, refuse_foreign
+from tron.gaussians.ply import check_header
+from tron.gaussians.scene import GaussianScene
+from tron.runtime import torch_device
+from tron.seeds import generator
+
+if TYPE_CHECKING:
+    from tron.reconstruction.progress import Track
+    from tron.reconstruction.settings import FusionSettings
+
+log = logging.getLogger(__name__)
+
+FOV_DEG, INSIDE_FOV_DEG = 40.0, 75.0
+HIGHEST_DEG = 75.0
+LOWEST_DEG = {True: 8.0, False: -30.0}
+"""Elevation of the lowest camera around a scene with a floor, under which nothing is seen, and without."""
+LOOKS = 8
+"""Directions in which each place inside a room is filmed."""
+INSIDE_ELEVATIONS_DEG = (-20.0, 10.0)
+PLACES_TRIED = 2000
+TRIMMED = 0.05
+"""Share of the splats beyond each side of the box that places inside are drawn from."""
+SOLID = 0.5
+"""Opacity from which a pixel shows a surface."""
+THIN = 0.02
+"""Opacity below which a pixel's colour is not known."""
+
+
+class SplatSettings(BaseModel):
+    """Virtual cameras that film a file of splats."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    cameras: Literal["around", "inside", "both"] = Field(
+        default="around",
+        description="around the subject, for things; inside, for rooms: from free places, in all directions; "
+        "both: half of each",
+    )
+    views: int = Field(default=64, ge=4, le=10_000, description="number of pictures")
+    surroundings: Treatment = Field(default="drop", description=DESCRIPTION)
+    side: int = Field(default=200, ge=16, le=8192, description="their width and height, pixels")
+
+
+def is_splats(path: Path) -> bool:
+    """Whether a path is a file of splats by its name, packed ones included, which are refused when read."""
+    return path.is_file() and path.name.lower().endswith((".ply", ".ply.gz", *PACKED_SPLATS))
+
+
+def film_splats(
+    path: Path,
+    settings: SplatSettings,
+    up: Sequence[float] | None,
+    test_every: int,
+    fusion: FusionSettings,
+    seed: int,
+    track: Track,
+) -> Capture:
+    """The capture of a file of splats, in its own world.
+
+    Images are display values with the splats' opacity as their mask. Depths, of training views alone, are
+    those of the median hit where these views agree: they are fused, and rays walked to the surface.
+
+    Args:
+        path: a 3DGS, 2DGS or TRON PLY.
+        settings: of the cameras.
+        up: direction in the file's world; None: what the file says.
+        test_every: each view of this distance is held out, from the first; 0 holds out none.
+        fusion: of the depths.
+        seed: root of the places inside.
+        track: shows progress.
+
+    Raises:
+        TronError: the file is packed, is no PLY of Gaussians or is damaged; no free place is inside.
+    """
+    refuse_foreign(path)
+    check_header(path)
+    scene = GaussianScene.load(path)
+    if up is not None:
+        scene.up = np.asarray(up, np.float64) / np.linalg.norm(up)
+    elif scene.up_guessed:
+        log.warning(
+            "%s does not say which way is up: -y is taken, as in most 3DGS files; if the picture lies on its "
+            "side, give up=[0,0,1] or another direction",
+            path,
+        )
+    surrounded = treat_surroundings(scene, settings.surroundings, path, "splats.surroundings")
+    cameras = virtual_cameras(surrounded.content, settings, seed)
+    views = [
+        _filmed(surrounded, f"film_{number:05d}", camera)
+        for number, camera in enumerate(track(cameras, "filming splats"))
+    ]
+    test = frozenset(view.name for view in views[::test_every]) if test_every else frozenset()
+    agreed = iter(_agreeing([view for view in views if view.name not in test], fusion))
+    views = [replace(view, depth=None) if view.name in test else next(agreed) for view in views]
+    return Capture(tuple(views), test, up=scene.up, offset=scene.offset)
+
+
+def virtual_cameras(scene: GaussianScene, settings: SplatSettings, seed: int) -> list[Camera]:
+    """The cameras of the settings, those around the scene first."""
+    outside = {"around": settings.views, "inside": 0, "both": settings.views // 2}[settings.cameras]
+    cameras = []
+    if outside:
+        elevation_deg = (LOWEST_DEG[has_floor(scene)], HIGHEST_DEG)
+        view = {"width": settings.side, "height": settings.side, "fov_deg": FOV_DEG}
+        cameras += plan_cameras(scene, "spiral", outside, **view, elevation_deg=elevation_deg)
+    if inside := settings.views - outside:
+        cameras += _inside(scene, inside, settings.side, seed)
+    return cameras
+
+
+def _inside(scene: GaussianScene, count: int, side: int, seed: int) -> list[Camera]:
+    """Cameras at the freest places of the scene's box that lie far from one another."""
+    low, high = scene.bounds(TRIMMED)
+    drawn = generator(seed, "splats", "places").uniform(low, high, (PLACES_TRIED, 3))
+    solid = scene.means[scene.opacities() > 0.5]
+    if not len(solid):
+        raise TronError("no splat is opaque, so nothing tells free space", mend="use splats.cameras=around")
+    room = KDTree(solid).query(drawn)[0]
+    places: list[np.ndarray] = []
+    apart = room.copy()
+    for _ in range(-(-count // LOOKS)):
+        best = int(apart.argmax())
+        places.append(drawn[best])
+        apart = np.minimum(apart, np.linalg.norm(drawn - drawn[best], axis=1))
+    east, north = _level(scene.up)
+    cameras = []
+    for number in range(count):
+        place, look = places[number // LOOKS], number % LOOKS
+        azimuth = 2 * np.pi * (look + 0.5 * (number // LOOKS)) / LOOKS
+        elevation = np.radians(INSIDE_ELEVATIONS_DEG[look % 2])
+        ahead = np.cos(azimuth) * east + np.sin(azimuth) * north
+        direction = np.cos(elevation) * ahead + np.sin(elevation) * scene.up
+        view = {"up": scene.up, "fov_deg": INSIDE_FOV_DEG, "width": side, "height": side}
+        cameras.append(Camera.look_at(place, place + direction, **view))
+    return cameras
+
+
+def _level(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit directions (3,) across ``up`` and each other."""
+    east = np.cross(np.eye(3)[np.abs(up).argmin()], up)
+    east /= np.linalg.norm(east)
+    return east, np.cross(up, east)
+
+
+def _agreeing(views: Sequence[View], settings: FusionSettings) -> list[View]:
+    """The views with the depths that they agree on, 0 elsewhere; without any where there is no surface."""
+    import torch
+
+    from tron.reconstruction.geometry.fusion import DepthMap, empty_rays, fused_views
+
+    def tensor(values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(torch_device())
+
+    maps = []
+    for view in views:
+        subject, depth = view.read("mask") > SOLID, view.read("depth")
+        empty = empty_rays(torch.from_numpy(subject).to(torch_device()))
+        maps.append(DepthMap(view.camera, tensor(depth), tensor(subject & (depth > 0)), empty))
+    agreed = fused_views(maps, settings)
+    if not agreed:
+        return [replace(view, depth=None) for view in views]
+    return [replace(view, depth=depth.cpu().numpy()) for view, (depth, _) in zip(views, agreed)]
+
+
+def _filmed(surrounded: Surrounded, name: str, camera: Camera) -> View:
+    """The view of the content; what surrounds it is its sky, where that is to be seen."""
+    buffers = _buffers(surrounded.content, camera)
+    mask = np.clip(buffers["opacity"], 0, 1)
+    if surrounded.backdrop is None:
+        return View(name, camera, _color(buffers), "display", mask=mask, depth=buffers["depth"])
+    seen = _buffers(surrounded.shown, camera, surrounded.backdrop)
+    sky = np.clip(seen["opacity"], 0, 1) * (1 - mask)
+    return View(name, camera, _color(seen), "display", mask=mask, depth=buffers["depth"], sky_mask=sky)
+
+
+def _buffers(
+    scene: GaussianScene, camera: Camera, backdrop: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
+    from tron.tracing import SurfelTracer  # Mitsuba: not for --help
+
+    # Where normals have no sign, each camera sees the side that it is on, but of a backdrop the inside alone.
+    away = scene.looks_away(camera.position) if not scene.oriented else np.zeros(len(scene), bool)
+    shown = scene.turned_over(away if backdrop is None else away & ~backdrop)
+    return SurfelTracer(shown).gbuffer(camera).numpy()
+
+
+def _color(buffers: dict[str, np.ndarray]) -> np.ndarray:
+    """(H, W, 3) display colours, black where next to nothing is."""
+    opacity = np.clip(buffers["opacity"], 0, 1)
+    solid = opacity > THIN
+    color = buffers["rgb"] / np.where(solid, opacity, 1)[..., None]
+    return np.where(solid[..., None], np.clip(color, 0, 1), 0)

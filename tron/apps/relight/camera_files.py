@@ -1,0 +1,263 @@
+"""Cameras that a scene was filmed with, paths between them, and paths from files.
+
+Files are TRON's own lists, those of 3DGS, transforms.json and nerfstudio's viewer's.
+
+Either the cameras or the scene may have had its large coordinates taken away: :func:`in_frame_of`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tron.cameras import Camera, focus_of, opengl_to_opencv, rigid_pose
+from tron.errors import TronError, located
+from tron.io.local_frame import ORIGIN, moved_cameras
+from tron.io.recognised import refuse_by_sight
+from tron.io.transforms_json import cameras_of_transforms
+from tron.storage import write_atomic
+from tron.trajectories import keyframed
+
+if TYPE_CHECKING:
+    from tron.captures import View
+
+_MEND = (
+    'give a list, {"cameras": [...]} as in relight.json, cameras.json of a 3DGS model, a transforms.json, or '
+    "nerfstudio's camera_path.json"
+)
+CAMERAS = "cameras.json"
+_AROUND_DEG = 60.0
+_KERNEL_DEG = 15.0
+
+
+def read_cameras(path: Path, width: int, height: int) -> list[Camera]:
+    """Cameras of a JSON file, resized.
+
+    The file is a list of cameras (Camera.to_dict), or an object with such a list as "cameras", as
+    relight.json and the metadata of shards have it; the cameras.json of a 3DGS model; a transforms.json, in
+    the world of its capture (:func:`cameras_of_transforms`); or nerfstudio's camera_path.json, whose world is
+    that of the scene that nerfstudio exports (`ns-export gaussian-splat`).
+
+    Raises TronError if the file is missing, is no such JSON, holds no camera, or has another aspect ratio.
+    """
+    cameras = cameras_of(path, (width, height))
+    for camera in cameras:
+        if abs(camera.width * height - camera.height * width) > max(width, height):
+            scale = max(width, height) / max(camera.width, camera.height)
+            fit = [2 * round(scale * side / 2) for side in (camera.width, camera.height)]
+            raise TronError(
+                f"cameras are {camera.width} x {camera.height}, frames {width} x {height}",
+                path,
+                f"choose the same aspect ratio, such as width={fit[0]} height={fit[1]}",
+            )
+    return [camera.resized(width, height) for camera in cameras]
+
+
+def cameras_of(path: Path, size: tuple[int, int] = (512, 512)) -> list[Camera]:
+    """Cameras of a JSON file (see :func:`read_cameras`) at their own size; TronError likewise.
+
+    Args:
+        path: the file.
+        size: (width, height) in pixels of cameras that have none, as those of NeRF's transforms.json.
+    """
+    refuse_by_sight(path, "cameras are a JSON file")
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise TronError(f"cannot read: {error.strerror or error}", path) from error
+    except ValueError as error:
+        raise TronError(f"not JSON: {error}", path, _MEND) from error
+    if isinstance(content, dict) and "frames" in content and "cameras" not in content:
+        return cameras_of_transforms(path, size)
+    saved_by_viewer = isinstance(content, dict) and "camera_path" in content
+    key = "camera_path" if saved_by_viewer else "cameras"
+    entries = content.get(key) if isinstance(content, dict) else content
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+        raise TronError("no cameras found", path, _MEND)
+    with located(path):
+        if saved_by_viewer:
+            return _nerfstudio(content)
+        return [_graphdeco(each) if "rotation" in each else Camera.from_dict(each) for each in entries]
+
+
+def _graphdeco(entry: dict[str, Any]) -> Camera:
+    """Camera of 3DGS' cameras.json: centre, rows of the rotation camera-to-world (OpenCV), focal lengths.
+
+    The principal point is the middle, as 3DGS renders it (`camera_to_JSON` of its utils/camera_utils.py).
+    """
+    try:
+        to_world = np.eye(4)
+        to_world[:3, :3], to_world[:3, 3] = entry["rotation"], entry["position"]
+        fx, fy = float(entry["fx"]), float(entry["fy"])
+        width, height = int(entry["width"]), int(entry["height"])
+    except KeyError as error:
+        raise TronError(f"camera of a 3DGS model lacks the field {error.args[0]!r}") from error
+    except (TypeError, ValueError) as error:
+        raise TronError(f"camera of a 3DGS model has an unreadable field: {error}") from error
+    return Camera(fx, fy, width / 2, height / 2, width, height, np.linalg.inv(rigid_pose(to_world)))
+
+
+def _nerfstudio(content: dict[str, Any]) -> list[Camera]:
+    """Cameras of nerfstudio's camera_path.json.
+
+    Each has 16 numbers camera-to-world, row-major, in OpenGL's axes, and the vertical field of view, degrees.
+    """
+    kind = content.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise TronError(f"nerfstudio's camera path is {kind}", mend="save a perspective one")
+    try:
+        width, height = int(content["render_width"]), int(content["render_height"])
+        return [_camera(entry, width, height) for entry in content["camera_path"]]
+    except KeyError as error:
+        raise TronError(f"nerfstudio's camera path lacks {error.args[0]!r}") from error
+    except (TypeError, ValueError, ZeroDivisionError) as error:
+        raise TronError(f"nerfstudio's camera path has an unreadable field: {error}") from error
+
+
+def _camera(entry: dict[str, Any], width: int, height: int) -> Camera:
+    to_world = opengl_to_opencv(np.asarray(entry["camera_to_world"], np.float64).reshape(4, 4))
+    focal = 0.5 * height / math.tan(0.5 * math.radians(float(entry["fov"])))
+    return Camera(focal, focal, width / 2, height / 2, width, height, np.linalg.inv(to_world))
+
+
+def in_frame_of(offset: np.ndarray, cameras: Sequence[Camera], path: Path) -> list[Camera]:
+    """Cameras of a file in the local frame of a scene; shifted in float64.
+
+    A file that says its own ``offset``, as cameras.json and relight.json of a scene with one do, holds
+    positions about it. One that says none holds coordinates of the map or of the local frame: whichever its
+    cameras are nearer to.
+
+    Args:
+        offset: (3,) of the scene, zero where nothing was taken away from it.
+        cameras: of the file.
+        path: the file, JSON.
+
+    Raises:
+        TronError: its offset is not three finite numbers.
+    """
+    own = _stated_offset(path)
+    if own is None:
+        middle = np.median([camera.position for camera in cameras], axis=0)
+        own = np.zeros(3) if np.linalg.norm(middle - offset) < np.linalg.norm(middle) else offset
+    return moved_cameras(cameras, own - offset)
+
+
+def stated(offset: np.ndarray) -> dict[str, list[float]]:
+    """Entry of a file of cameras for an offset (3,); none where nothing was taken away."""
+    return {"offset": [float(value) for value in offset]} if np.any(offset) else {}
+
+
+def _stated_offset(path: Path) -> np.ndarray | None:
+    """(3,) float64 offset that a file of cameras states, if it does."""
+    content = json.loads(path.read_text("utf-8"))
+    if not isinstance(content, dict) or content.get("offset") is None:
+        return None
+    try:
+        offset = np.array(content["offset"], np.float64)
+    except (TypeError, ValueError):
+        offset = np.empty(0)
+    if offset.shape != (3,) or not np.isfinite(offset).all():
+        raise TronError("offset is not three finite numbers", path)
+    return offset
+
+
+def write_cameras(folder: Path, views: Sequence[View], offset: np.ndarray = ORIGIN) -> None:
+    """Write cameras.json: the views' cameras in their order, for ``tron-relight cameras=``.
+
+    A clip has one size, so that all have that of the most of them: others are cut or continued about their
+    middle, at their own focal length. An offset (3,), what was taken away from large coordinates, is kept.
+    """
+    (width, height), _ = Counter((v.camera.width, v.camera.height) for v in views).most_common(1)[0]
+    cameras = [_framed(view.camera, width, height).to_dict() for view in views]
+    content = {"names": [view.name for view in views], **stated(offset), "cameras": cameras}
+    write_atomic(folder / CAMERAS, json.dumps(content, indent=1) + "\n")
+
+
+def filmed_cameras(scene: Path, offset: np.ndarray = ORIGIN) -> list[Camera] | None:
+    """Cameras that a scene, of an offset (3,), was filmed with, if a file beside it says so; else None.
+
+    Raises:
+        TronError: the file holds no cameras.
+    """
+    path = scene.with_name(CAMERAS)
+    return in_frame_of(offset, cameras_of(path), path) if path.is_file() else None
+
+
+def filmed_orbit(
+    filmed: Sequence[Camera],
+    n: int,
+    *,
+    up: np.ndarray,
+    width: int,
+    height: int,
+    fov_deg: float,
+    distance: float = 1.0,
+) -> list[Camera]:
+    """A path that loops, from where the photos were taken.
+
+    Around what the photos look at if they were taken from all sides; to and fro from the middle, slowing
+    down at the ends, if they leave a gap of more than 60 degrees. Height, distance and what is looked at
+    are, for each direction, those of the photos taken from about there (means with a Gaussian of 15
+    degrees), so that the path lies between them. Where photos look outwards, as in a room, it goes through
+    their cameras in order.
+
+    Args:
+        filmed: at least one camera.
+        n: number of frames.
+        up: (3,) unit, world.
+        width, height: pixels.
+        fov_deg: horizontal field of view.
+        distance: factor on the distance to what is looked at.
+    """
+    image = {"up": up, "width": width, "height": height, "fov_deg": fov_deg}
+    focus, outward = focus_of([camera.camera_to_world for camera in filmed])
+    places = np.stack([camera.position for camera in filmed])
+    axes = np.stack([camera.forward for camera in filmed])
+    if outward:
+        keys = [Camera.look_at(place, place + axis, **image) for place, axis in zip(places, axes)]
+        return keyframed(keys, n)
+    east, north = _level(up)
+    offsets = places - focus
+    azimuth = np.degrees(np.arctan2(offsets @ north, offsets @ east))
+    seen = places + np.maximum(((focus - places) * axes).sum(1), 0)[:, None] * axes
+    height_of, reach = offsets @ up, np.hypot(offsets @ east, offsets @ north)
+    cameras = []
+    for angle in _angles(azimuth, n):
+        apart = (azimuth - angle + 180) % 360 - 180
+        # Relative to the nearest, so that no sum of weights vanishes.
+        weights = np.exp(-0.5 * (apart**2 - (apart**2).min()) / _KERNEL_DEG**2)
+        weights /= weights.sum()
+        out = np.cos(np.radians(angle)) * east + np.sin(np.radians(angle)) * north
+        place, target = focus + (weights @ reach) * out + (weights @ height_of) * up, weights @ seen
+        cameras.append(Camera.look_at(target + distance * (place - target), target, **image))
+    return cameras
+
+
+def _angles(azimuth: np.ndarray, n: int) -> np.ndarray:
+    """(n,) degrees: all around, or to and fro over the arc that holds all azimuths."""
+    ordered = np.sort(azimuth % 360)
+    gaps = np.diff(ordered, append=ordered[0] + 360)
+    widest = int(gaps.argmax())
+    if gaps[widest] < _AROUND_DEG:
+        return 360 * np.arange(n) / n
+    first, span = ordered[(widest + 1) % len(ordered)], 360 - gaps[widest]
+    return first + span * (0.5 + 0.5 * np.sin(2 * np.pi * np.arange(n) / n))
+
+
+def _level(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit directions at right angles to up and to one another, right-handed with it."""
+    east = np.cross((0.0, 1.0, 0.0) if abs(up[1]) < 0.9 else (0.0, 0.0, 1.0), up)
+    east /= np.linalg.norm(east)
+    return east, np.cross(up, east)
+
+
+def _framed(camera: Camera, width: int, height: int) -> Camera:
+    dx, dy = (width - camera.width) / 2, (height - camera.height) / 2
+    return replace(camera, cx=camera.cx + dx, cy=camera.cy + dy, width=width, height=height)

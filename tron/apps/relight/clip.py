@@ -1,0 +1,204 @@
+"""One light's clip on disk: linear buffers that are traced once, pictures made of them, and videos."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from functools import cache, cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tron import seeds
+from tron.apps.frame_folder import FrameFolder
+from tron.apps.relit import RelitPicture, surfels_alone
+from tron.cameras import Camera
+from tron.cli.progress import track, working
+from tron.estimation import Estimation
+from tron.flow import surface_motion
+from tron.gaussians.scene import GaussianScene
+from tron.io.images import write_image
+from tron.neural.clips import Overlap, averaged_frames
+from tron.shards.schema import GUIDANCE, displayed, surface_members
+
+if TYPE_CHECKING:
+    from tron.neural.protocols import Renderer
+    from tron.relighting import Illumination, Relighter
+    from tron.shading.environments.environment import EnvironmentMap
+    from tron.shading.lighting import Lighting
+
+log = logging.getLogger(__name__)
+
+DEPTH = "depth"
+"""Buffer that the motion of surfaces is known by."""
+
+
+@dataclass
+class Clip:
+    """Frames under one light.
+
+    Attributes:
+        environment: the light, not turned.
+        rotations: its turn in each frame, degrees.
+        exposure: factor before AgX.
+        picture: how the relit picture is made.
+        folder: the frames; claimed before anything is written.
+        guidance: buffers that the neural renderer is conditioned on, and that are shown.
+        keeps_linear: whether the relit picture is written as EXR too.
+        seconds: of each frame that was traced in this run.
+    """
+
+    environment: EnvironmentMap
+    rotations: Sequence[float]
+    exposure: float
+    picture: RelitPicture
+    folder: FrameFolder
+    guidance: Sequence[str] = GUIDANCE
+    keeps_linear: bool = False
+    seconds: list[float] = field(default_factory=list)
+    _turned: tuple[float, Illumination] | None = None
+
+    @cached_property
+    def _lighting(self) -> Lighting:
+        """The environment, prepared when the first frame is traced."""
+        from tron.shading.lighting import Lighting
+
+        return Lighting(self.environment)
+
+    def light(self, relighter: Relighter, index: int) -> Illumination:
+        """The environment as frame ``index`` has it, baked where it has turned."""
+        rotation = self.rotations[index]
+        if self._turned is None or self._turned[0] != rotation:
+            baking = working("light that bounces, baked") if self._turned is None else nullcontext()
+            with baking:
+                self._turned = rotation, relighter.under(self._lighting.turned_to(rotation))
+        return self._turned[1]
+
+    def write_pictures(self, index: int) -> None:
+        """Write the pictures of a frame whose buffers are there, those that need no network."""
+        for name in self.guidance:
+            self.folder.write_picture(index, name, self._shown(index, name))
+        if not self.picture.neural:
+            self.folder.path(index, "neural", "png").unlink(missing_ok=True)  # of an earlier run
+            self.folder.write_picture(index, "relit", self.picture.display(self.folder, index, self.exposure))
+        if self.keeps_linear:
+            write_image(self.folder.path(index, "relit", "exr"), self.picture.linear(self.folder, index))
+        else:  # that of an earlier run may stand before another background
+            self.folder.path(index, "relit", "exr").unlink(missing_ok=True)
+
+    def draw(
+        self,
+        renderer: Renderer,
+        window: int | None = None,
+        overlap: Overlap = "anchor",
+        weights: Mapping[str, float] | None = None,
+        cameras: Sequence[Camera] | None = None,
+        reproject: int = 1,
+    ) -> None:
+        """Write the neural renderer's pictures, as `render_frames` gives them.
+
+        With cameras, one a frame, and the buffer DEPTH in the folder, ``reproject`` frames each are averaged
+        along their motion (`tron.apps.relight.command.averaged_frames_of` says how many).
+        """
+        from tron.neural.renderer import render_frames
+
+        frames = len(self.rotations)
+        drawn = render_frames(renderer, self._displayed, frames, window, overlap, weights)
+        if cameras is not None and reproject > 1:
+            motion = surface_motion(cameras, self._depth)
+            drawn = averaged_frames(drawn, frames, reproject, motion, overlap)
+        for index, neural in enumerate(track(drawn, "neural", frames)):
+            self.folder.write_picture(index, "neural", neural)
+            relit = self.picture.display(self.folder, index, self.exposure, neural)
+            self.folder.write_picture(index, "relit", relit)
+
+    def _displayed(self, index: int) -> dict[str, np.ndarray]:
+        return {name: self._shown(index, name) for name in self.guidance}
+
+    def _shown(self, index: int, name: str) -> np.ndarray:
+        return displayed(name, self.folder.read(index, name), self.exposure)
+
+    def _depth(self, index: int) -> np.ndarray:
+        return self.folder.read(index, DEPTH)[..., 0].copy()  # a view would keep all three channels
+
+    def assemble(self, output_dir: Path, fps: float) -> None:
+        """Write videos and the contact sheet from the pictures of all frames."""
+        frames, drawn = len(self.rotations), ["neural"] if self.picture.neural else []
+        for name, pictures in {
+            "relit": ["relit"],
+            "guidance": [*self.guidance, *drawn],
+            "neural": drawn,
+        }.items():
+            if pictures:
+                self.folder.write_video(output_dir / f"{name}.mp4", frames, pictures, fps)
+            else:
+                (output_dir / f"{name}.mp4").unlink(missing_ok=True)  # of an earlier run
+        self.folder.write_sheet(output_dir / "contact_sheet.png", frames, ["relit", *self.guidance, *drawn])
+
+
+def trace(
+    scene: GaussianScene,
+    cameras: Sequence[Camera],
+    clips: Sequence[Clip],
+    *,
+    estimation: Estimation,
+    seed: int,
+    backdrop: np.ndarray | None = None,
+) -> None:
+    """Trace the frames that are missing, and write the pictures of all.
+
+    Args:
+        scene: the surfels.
+        cameras: one a frame.
+        clips: one a light.
+        estimation: of the light.
+        seed: root of its random numbers; a frame's do not depend on the environment.
+        backdrop: (M,) bool, surfels that are in no light's way (:class:`tron.relighting.Relighter`).
+    """
+    from tron.relighting import Relighter
+
+    bounces, rays = seeds.integer(seed, "relight", "bounces"), partial(track, label="where light bounces")
+    relighter = Relighter(scene, estimation, bounces, backdrop=backdrop, track=rays)
+    for clip in clips:
+        if lacking := clip.folder.lacking(len(cameras)):
+            log.info("frames that have no %s yet are traced again", ", ".join(lacking))
+    if not all(clip.folder.finished(index) for clip in clips for index in range(len(cameras))):
+        relighter.prepare()
+    for index, camera in enumerate(track(cameras, "guidance")):
+        surfaces = cache(partial(relighter.surface_maps, camera))  # alike under all lights
+        for clip in clips:
+            if not clip.folder.finished(index):
+                started = time.perf_counter()
+                light, ray_seed = clip.light(relighter, index), seeds.integer(seed, "relight", index)
+                buffers = _shade(light, camera, ray_seed, clip.folder.buffers, surfaces)
+                clip.seconds.append(time.perf_counter() - started)
+                clip.folder.write(index, buffers)
+            clip.write_pictures(index)
+
+
+def _shade(
+    light: Illumination,
+    camera: Camera,
+    seed: int,
+    names: Sequence[str],
+    surfaces: Callable[[], dict[str, np.ndarray]],
+) -> dict[str, np.ndarray]:
+    """The buffers ``names`` of one frame; ``surfaces`` gives those that no light shines on."""
+    from tron.shading.composition import background_share
+    from tron.shading.guidance import averaged
+
+    frame = light.trace(camera, seed)
+    guidance = frame.shade()
+    # The share is no linear function of opacity: a pixel has the mean of those of its sub-pixels.
+    transmittance = 1 - frame.view.images({"opacity": frame.view.opacity})["opacity"]
+    share = averaged(background_share(transmittance), light.estimation.supersample)
+    made = guidance.gbuffer | vars(guidance) | {"share": share.astype(np.float32)}
+    if not set(names).isdisjoint(surface_members()):
+        made |= surfaces()
+    if "foreground" in names:
+        made["foreground"] = surfels_alone(frame.shade((0, 0, 0)).lit, made["share"])
+    return {name: made[name] for name in names}

@@ -1,0 +1,375 @@
+"""tron-relight: a Gaussian scene under new lights, along a camera path.
+
+Three passes over the frames, each from the files of the one before it, so that a run that was cut short goes
+on where it stopped: guidance (linear EXR, and PNG to look at), the neural renderer where there is one, and
+videos. Several lights share the scene and what each camera sees of it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import tron
+from tron.apps.frame_folder import FrameFolder
+from tron.apps.framing import plan_cameras, turn_cameras
+from tron.apps.relight.camera_files import (
+    CAMERAS,
+    filmed_cameras,
+    filmed_orbit,
+    in_frame_of,
+    read_cameras,
+    stated,
+)
+from tron.apps.relight.clip import DEPTH, Clip, trace
+from tron.apps.relight.settings import Settings
+from tron.apps.relit import RelitPicture
+from tron.apps.surroundings import treat_surroundings
+from tron.cameras import Camera
+from tron.cli.command_line import command
+from tron.cli.installation import require_extra
+from tron.cli.progress import working
+from tron.cli.recipes import model_defaults
+from tron.errors import TronError, located
+from tron.framing import upright
+from tron.gaussians.foreign_files import refuse_foreign
+from tron.gaussians.ply import check_header
+from tron.gaussians.scene import GaussianScene
+from tron.io.recognised import refuse_by_sight
+from tron.neural.clips import check_frames
+from tron.neural.shipped import DEFAULT, SHIPPED, checkpoint_file
+from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
+from tron.shards.schema import GUIDANCE
+from tron.storage import locked, require_free_space, sha256, write_atomic
+
+if TYPE_CHECKING:
+    from tron.neural.protocols import Renderer
+    from tron.shading.environments.environment import EnvironmentMap
+
+
+log = logging.getLogger(__name__)
+
+
+def main(settings: Settings) -> None:
+    """Light a Gaussian scene with environment maps and film it along a camera path.
+
+    Writes frames/NNNN.relit.png, relit.mp4 (the neural renderer's pictures where there is a checkpoint,
+    otherwise shadows, reflections and the light that bounces between the surfels), what they are made of as
+    frames/NNNN.{pbr,irradiance,...}.exr (linear) and .png (AgX), guidance.mp4, contact_sheet.png and
+    relight.json; with a checkpoint also NNNN.neural.png and neural.mp4. An interrupted run resumes when it is
+    started again.
+    """
+    from tron.shading.environments.environment import (
+        EnvironmentMap,  # Mitsuba: not for --help or a mistyped key
+    )
+
+    clock = _Clock()
+    lights = settings.by_light()
+    _check_paths(settings, lights)
+    size = settings.width, settings.height
+    given = None if settings.cameras is None else read_cameras(settings.cameras, *size)
+    with working("reading the lights, the network and the scene"):
+        environments = [EnvironmentMap.load(light.light) for light in lights]
+        activate(settings.variant, settings.threads)
+        settings, renderer = chosen_network(settings)
+        lights = settings.by_light()
+        scene = _load_scene(settings)
+    offset = scene.offset
+    if given is not None and settings.cameras is not None:
+        given = in_frame_of(offset, given, settings.cameras)
+    turn = upright(scene.up)  # to +z, which is up in environment maps
+    scene = scene if np.allclose(turn, np.eye(3)) else scene.rotated(turn)
+    with working("looking for surroundings"):
+        surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
+    scene = surrounded.shown
+    if given is not None:
+        cameras = turn_cameras(given, turn)
+    else:
+        cameras = _planned(settings, surrounded.content, turn, offset)
+    # Without a network the relit picture is one of them, and is shown as such; so is lit if nothing bounces.
+    guidance = [name for name in GUIDANCE if name != settings.source and (settings.bounces or name != "lit")]
+    guidance = guidance if renderer is None else renderer.config.guidance
+    averaged = averaged_frames_of(settings, len(cameras))
+    network = describe_network(settings, renderer, len(cameras))
+    clips = [_clip(*each, len(cameras), guidance, averaged > 1) for each in zip(lights, environments)]
+    clock.lap("loading")
+
+    pixels = len(clips) * len(cameras) * settings.width * settings.height
+    require_free_space(settings.output_dir, pixels * 6 * (len(clips[0].folder.buffers) + 3))
+    log.info(clips[0].picture.describe())
+    with locked(settings.output_dir):
+        for light, clip in zip(lights, clips):
+            clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite, model_defaults(Settings))
+        traced = {"estimation": settings.estimation(), "seed": settings.seed}
+        trace(scene, cameras, clips, **traced, backdrop=surrounded.backdrop)
+        clock.lap("guidance")
+        if renderer is not None:
+            for clip in clips:
+                tuned = settings.window, settings.overlap, settings.weights
+                clip.draw(renderer, *tuned, cameras, averaged)
+            clock.lap("neural")
+        with working("videos and contact sheets"):
+            for light, clip in zip(lights, clips):
+                clip.assemble(light.output_dir, settings.fps)
+        clock.lap("videos")
+        for light, clip in zip(lights, clips):
+            report = _report(light, clip, scene, turn_cameras(cameras, turn.T), clock)
+            report["network"] = network
+            report |= stated(offset)
+            write_atomic(light.output_dir / "relight.json", json.dumps(report, indent=1) + "\n")
+            made = len(cameras), len(clip.seconds), light.output_dir / "relit.mp4"
+            log.info("frames: %d, rendered now: %d; look at %s", *made)
+
+
+def _planned(settings: Settings, scene: GaussianScene, turn: np.ndarray, offset: np.ndarray) -> list[Camera]:
+    """The camera path that the settings name, in the world in which up is +z; of the file's offset (3,)."""
+    view = {
+        "width": settings.width,
+        "height": settings.height,
+        "fov_deg": settings.fov,
+        "distance": settings.distance,
+    }
+    filmed = None
+    if settings.trajectory in ("orbit", "still"):
+        try:
+            filmed = filmed_cameras(settings.scene, offset)
+        except TronError as error:
+            log.warning("%s; the orbit is planned without it", error)
+    if filmed is None:
+        return plan_cameras(scene, settings.trajectory, settings.frames, **view)
+    log.info("the orbit stays between the %d cameras of %s", len(filmed), settings.scene.with_name(CAMERAS))
+    filmed = turn_cameras(filmed, turn)
+    if settings.trajectory == "orbit":
+        return filmed_orbit(filmed, settings.frames, up=scene.up, **view)
+    return filmed_orbit(filmed, 1, up=scene.up, **view) * settings.frames
+
+
+class _Clock:
+    """Seconds of each part of a run."""
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps[name] = round(now - self._last, 3)
+        self._last = now
+
+
+def _check_paths(settings: Settings, lights: Sequence[Settings]) -> None:
+    """Every file is there and is of its kind as far as names and headers tell, before anything is loaded."""
+    maps = [light.light for light in lights]
+    # The default checkpoint is no mistake where it is missing.
+    asked = None if settings.takes_default else settings.checkpoint
+    checkpoint = None if asked is None else checkpoint_file(asked)
+    for path in (settings.scene, *maps, settings.cameras, checkpoint, settings.vae):
+        if path is not None and not path.is_file():
+            if path.is_dir():
+                refuse_by_sight(path, "this should be a file")
+                raise TronError("cannot read: is a folder", path, "give one file of it")
+            names = f"checkpoints of the package are {', '.join(SHIPPED)}" if path == checkpoint else ""
+            raise TronError("file not found", path, names)
+    if settings.output_dir.exists() and not settings.output_dir.is_dir():
+        raise TronError("output_dir is a file", settings.output_dir, "give a folder, which need not exist")
+    refuse_foreign(settings.scene)
+    check_header(settings.scene)
+
+
+def _load_scene(settings: Settings) -> GaussianScene:
+    scene = GaussianScene.load(settings.scene)
+    if scene.materials_guessed:
+        log.warning(
+            "%s has no materials%s: they are guessed from its colours, which keep the light it was captured "
+            "in; tron-reconstruct capture=%s output_dir=OUT finds surfaces, materials and light",
+            settings.scene, "" if scene.oriented else " and normals without a sign", settings.scene,
+        )  # fmt: skip
+    if settings.up is not None:
+        scene.up = np.array(settings.up) / np.linalg.norm(settings.up)
+    elif scene.up_guessed:
+        log.warning(
+            "%s does not say which way is up: -y is taken, as in most 3DGS files; if the picture lies on its "
+            "side, give up=[0,0,1] or another direction",
+            settings.scene,
+        )
+    return scene
+
+
+def _clip(
+    light: Settings, environment: EnvironmentMap, frames: int, guidance: Sequence[str], averaged: bool
+) -> Clip:
+    picture = RelitPicture(light.background, light.source)
+    needed = (*guidance, *picture.buffers, *light.buffers, *([DEPTH] if averaged else []))
+    buffers = [name for name in needed if name != "relit"]
+    return Clip(
+        environment=environment,
+        rotations=light.rotations(frames),
+        exposure=environment.exposure() if light.exposure == "auto" else light.exposure,
+        picture=picture,
+        folder=FrameFolder(light.output_dir / "frames", tuple(dict.fromkeys(buffers))),
+        guidance=guidance,
+        keeps_linear="relit" in light.buffers,
+    )
+
+
+def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> dict[str, Any]:
+    """Recipe of the linear frames: all that their pixels depend on, as JSON values."""
+    filmed = light.scene.with_name(CAMERAS)
+    keys = {
+        "rotation",
+        "trajectory",
+        "quality",
+        "width",
+        "height",
+        "fov",
+        "distance",
+        "seed",
+        "variant",
+        "surroundings",
+    }
+    return {
+        "scene_sha256": sha256(light.scene),
+        "environment_sha256": sha256(light.light),
+        "filmed_sha256": sha256(filmed) if light.cameras is None and filmed.is_file() else None,
+        "cameras_sha256": None if light.cameras is None else sha256(light.cameras),
+        "frames": len(cameras),
+        "up": [round(float(value), 6) for value in turn[2]],
+        **light.model_dump(mode="json", include=keys),
+        **light.estimation().model_dump(mode="json"),
+        "version": tron.__version__,
+    }
+
+
+def _report(
+    light: Settings, clip: Clip, scene: GaussianScene, cameras: Sequence[Camera], clock: _Clock
+) -> dict[str, Any]:
+    return {
+        "version": tron.__version__,
+        "settings": light.model_dump(mode="json"),
+        "relit": clip.picture.source,
+        "scene": {
+            "surfels": len(scene),
+            "kernel_degree": scene.kernel_degree,
+            "spacing": scene.spacing,
+            "materials_guessed": scene.materials_guessed,
+            "oriented": scene.oriented,
+        },
+        "exposure": clip.exposure,
+        "frames": len(cameras),
+        "frames_rendered": len(clip.seconds),
+        "first_frame_seconds": clip.seconds[0] if clip.seconds else None,
+        "frame_seconds_median": float(np.median(clip.seconds)) if clip.seconds else None,
+        "seconds": clock.laps,
+        "machine": describe_machine(),
+        "rotations": list(clip.rotations),
+        "cameras": [camera.to_dict() for camera in cameras],
+    }
+
+
+def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
+    """The settings as they will be followed, and the network on its device, or None without one.
+
+    A checkpoint that was asked for has to fit. That of checkpoint=auto gives way with a line in the log:
+    where the libraries of networks or its file are not installed; where nothing bounces and it is given lit;
+    where radiance is asked for, which a network does not draw; and where lit has sub-pixels or rays for
+    reflections (quality=final), for it learnt from single samples and makes finer pictures worse
+    (dev/LOG.md). Where window, overlap, reproject or weights are chosen, it has to fit too.
+
+    Raises:
+        TronError: the checkpoint is missing, damaged, or does not fit the settings.
+    """
+    if settings.checkpoint is None:
+        return settings, None
+    if not settings.takes_default:
+        return settings, _loaded(settings)
+    try:
+        if "relit" in settings.buffers:
+            raise TronError("buffers ask for relit.exr, and a network draws display values")
+        estimation = settings.estimation()
+        if estimation.supersample > 1 or estimation.reflections > 0:
+            raise TronError(
+                f"{DEFAULT} learnt from single samples a pixel, and this picture is better without it",
+                mend=f"give checkpoint={DEFAULT} to have it all the same",
+            )
+        settings = settings.model_copy(update={"checkpoint": Path(DEFAULT)})
+        return settings, _loaded(settings)
+    except TronError as error:
+        if settings.tuned:
+            raise
+        log.info("No network: %s", error)
+        return settings.model_copy(update={"checkpoint": None}), None
+
+
+def averaged_frames_of(settings: Settings, frames: int) -> int:
+    """Frames that each one is the mean of along its motion: 1 where the light turns, or nothing is drawn."""
+    turns = len(set(settings.rotations(frames))) > 1
+    return 1 if settings.checkpoint is None or turns else min(settings.reproject, frames)
+
+
+def describe_network(settings: Settings, renderer: Renderer | None, frames: int) -> dict[str, Any] | None:
+    """Record of the network for relight.json, None without one; weights null: equal ones."""
+    if renderer is None or settings.checkpoint is None:
+        return None
+    return {
+        "checkpoint": str(settings.checkpoint),
+        "sha256": sha256(checkpoint_file(settings.checkpoint)),
+        "guidance": list(renderer.config.guidance),
+        "window": settings.window or renderer.config.window,
+        "overlap": settings.overlap,
+        "reproject": averaged_frames_of(settings, frames),
+        "weights": settings.weights or getattr(renderer.config, "weights", None),
+    }
+
+
+def _loaded(settings: Settings) -> Renderer:
+    assert settings.checkpoint is not None
+    require_extra("checkpoint", "network")
+    from tron.neural.weights import load_renderer
+
+    if settings.threads is not None:
+        set_torch_threads(settings.threads)
+    path = checkpoint_file(settings.checkpoint)
+    try:
+        renderer = load_renderer(path, settings.vae)
+    except ModuleNotFoundError:  # diffusers, of networks that are transformers
+        require_extra(f"checkpoint {path}", "train")
+        raise
+    if settings.bounces == 0 and "lit" in renderer.config.guidance:
+        what = "the network is given lit, which has no bounced light with bounces=0 (fidelity=paper sets it)"
+        raise TronError(what, path, "give bounces=4, or take a checkpoint of pbr and irradiance")
+    _check_drawing(settings, renderer, path)
+    log.info("Network: checkpoint %s, of %s", settings.checkpoint, ", ".join(renderer.config.guidance))
+    return renderer.to(torch_device())
+
+
+def _check_drawing(settings: Settings, renderer: Renderer, path: Path) -> None:
+    with located(path):
+        check_frames(settings.window or renderer.config.window, renderer.temporal_factor)
+        renderer.check_weights(settings.weights)
+
+
+cli = command(
+    "tron-relight",
+    "conf.relight",
+    Settings,
+    main,
+    examples=(
+        "tron-relight scene=surfels.ply environment=studio.hdr output_dir=outputs/relit",
+        "tron-relight scene=surfels.ply environment=studio.hdr quality=final reflections=16 output_dir=out",
+        "tron-relight scene=scan.ply environment=[dawn.hdr,night.hdr] output_dir=out",
+        "tron-relight scene=surfels.ply environment=a.hdr trajectory=still rotation=[0,360] output_dir=out",
+        "tron-relight scene=surfels.ply environment=a.hdr background=transparent output_dir=out",
+        "tron-relight scene=surfels.ply environment=a.hdr checkpoint=renderer.safetensors output_dir=out",
+        "tron-relight scene=surfels.ply environment=a.hdr checkpoint=paper overlap=newest "
+        "'weights={pbr: 0.3, irradiance: 0.7}' output_dir=out",
+    ),
+)
+
+if __name__ == "__main__":
+    cli()

@@ -1,0 +1,265 @@
+"""Settings of tron-relight."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from tron.apps.framing import TrajectoryName
+from tron.apps.relit import Background
+from tron.apps.surroundings import DESCRIPTION, Treatment
+from tron.errors import TronError
+from tron.estimation import FINAL, FINEST, PREVIEW, Estimation, Estimator, require_bounces
+from tron.neural.clips import Overlap
+from tron.neural.configs import check_sizes
+from tron.neural.shipped import AUTO, DEFAULT, SHIPPED
+from tron.shards.schema import guidance_members, light_members
+
+DEFAULT_BUFFERS = (*light_members(), "indirect", "foreground", "mask", "share", "depth")
+BUFFERS = (
+    *dict.fromkeys((*DEFAULT_BUFFERS, *guidance_members())),
+    *("base_color", "normal", "position", "roughness", "metallic", "rgb"),  # of the G-buffer
+    "relit",
+)
+if TYPE_CHECKING:
+    BufferName = str
+else:
+    BufferName = Literal[BUFFERS]
+QUALITY = {"preview": PREVIEW, "final": FINEST}
+
+Side = Annotated[int, Field(ge=8, le=8192)]
+
+
+class Settings(BaseModel):
+    """Everything that tron-relight can be told."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    scene: Path = Field(description="PLY of the scene: TRON's, or a plain 3DGS or 2DGS file")
+    environment: Path | Annotated[tuple[Path, ...], Field(min_length=1)] = Field(
+        description="lat-long environment map, .hdr or .exr (.png and .jpg are clipped); of several, "
+        "[a.hdr,b.hdr], each has its own folder in output_dir, named after the file",
+        examples=["[a.hdr,b.hdr]"],
+    )
+    output_dir: Path = Field(description="folder for frames, videos and relight.json")
+    background: Background = Field(
+        "environment",
+        description="what stands behind the surfels in the relit picture: the environment, nothing (PNG with "
+        "alpha; black in videos), or a colour as on screen, such as [1,1,1] for white",
+        examples=["[1,1,1]"],
+    )
+    surroundings: Treatment = Field("drop", description=DESCRIPTION)
+    rotation: float | tuple[float, float] = Field(
+        0.0,
+        description="turn of the environment about up, degrees, counter-clockwise seen from above; [0,360] "
+        "turns it evenly over the clip, whose end is left out so that it loops: frame i of n is at 360 i/n",
+        examples=["[0,360]"],
+    )
+    trajectory: TrajectoryName = Field(
+        "orbit",
+        description="camera path around the scene; still: no motion. Where cameras.json lies beside the "
+        "scene, orbit and still keep between its cameras",
+    )
+    cameras: Path | None = Field(
+        None,
+        description="JSON to use instead of a trajectory: a list of cameras (as in relight.json), "
+        "cameras.json of a 3DGS model, a transforms.json, or nerfstudio's camera_path.json",
+    )
+    quality: Literal["preview", "final"] = Field(
+        "preview",
+        description="preview: 2 shadow rays per pixel, denoised; final: 64, over 2 x 2 sub-pixels, and 4 "
+        "rays that look for reflections of the scene in itself",
+    )
+    bounces: int = Field(
+        FINAL.bounces,
+        ge=0,
+        le=16,
+        description="times that light bounces between the surfels; 0: direct light alone, and the relit "
+        "picture is 'shadowed'",
+    )
+    reflections: int | None = Field(
+        None, ge=0, description="GGX rays per pixel that meet the scene, for glossy things; null: by quality"
+    )
+    supersample: Literal[1, 2] | None = Field(
+        None, description="2: the mean of 2 x 2 sub-pixels, with a quarter of the rays each; null: by quality"
+    )
+    diffuse: Literal["principled", "lambert"] = Field(
+        FINAL.diffuse,
+        description="diffuse reflection: that of the principled material, or Lambert's, as in the paper",
+    )
+    estimator: Estimator = Field(
+        FINAL.estimator,
+        description="ratio: unshadowed irradiance times the share of it that arrives; plain: the Monte Carlo "
+        "mean, as in the paper",
+    )
+    two_sided: bool = Field(
+        FINAL.two_sided,
+        description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
+    )
+    denoise: bool | None = Field(
+        None, description="edge-avoiding filter of the shadows; null: with quality=preview alone"
+    )
+    frames: int = Field(60, ge=1, le=10_000, description="number of frames (those of `cameras` win)")
+    width: Side = Field(512, description="pixels")
+    height: Side = Field(512, description="pixels")
+    fov: float = Field(40.0, gt=1, lt=150, description="horizontal field of view, degrees")
+    distance: float = Field(1.0, gt=0, le=100, description="factor on the automatic distance to the subject")
+    fps: float = Field(24.0, gt=0, le=240, description="frames a second of the videos")
+    exposure: Literal["auto"] | Annotated[float, Field(gt=0)] = Field(
+        "auto", description="factor before the tone curve; auto: from the light on an upward plane"
+    )
+    up: tuple[float, float, float] | None = Field(
+        None,
+        description="up direction of the scene, such as [0,0,1]; null: the file's own, -y where it has none",
+        examples=["[0,0,1]"],
+    )
+    checkpoint: Path | None = Field(
+        Path(AUTO),
+        description="renderer.safetensors, or the name of a checkpoint that comes with the package "
+        f"({', '.join(SHIPPED)}): the relit picture is then the neural renderer's; auto: {DEFAULT} where it "
+        "makes the picture better, which the log says, otherwise none; null: no network. A network wants "
+        "pip install 'tron-relight[network]'",
+        examples=["pair"],
+    )
+    window: int | None = Field(
+        None,
+        ge=1,
+        description="frames that the neural renderer sees at once, sliding by one; null: as the checkpoint "
+        "says, which is 1 for those of the package",
+    )
+    overlap: Overlap = Field(
+        "anchor",
+        description="which window draws a frame that lies in several: the one in whose middle it stands "
+        "(anchor), the one that ends with it (newest), or the mean of all",
+    )
+    reproject: int = Field(
+        5,
+        ge=1,
+        le=33,
+        description="neural frames that each one is the mean of: those around it (before it with "
+        "overlap=newest), brought to it along the exact motion of surfaces, against flicker, unless the "
+        "light turns; 1: itself",
+    )
+    weights: dict[str, float] | None = Field(
+        None,
+        description="weights of the neural renderer's buffers, one for each; null: the checkpoint's own",
+        examples=["{pbr: 0.3, irradiance: 0.7}"],
+    )
+    vae: Path | None = Field(None, description="WAN 2.1 VAE, for checkpoints that were trained with it")
+    buffers: tuple[BufferName, ...] = Field(
+        DEFAULT_BUFFERS,
+        description=f"buffers written as EXR, of {', '.join(BUFFERS)}; relit is the relit picture before "
+        "exposure (without checkpoint)",
+        examples=["[pbr]"],
+    )
+    overwrite: bool = Field(False, description="replace frames that were made with other settings")
+    seed: int = Field(0, description="root of all random numbers")
+    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = Field(
+        "llvm_ad_rgb", description="Mitsuba variant: processor or NVIDIA GPU"
+    )
+    threads: int | None = Field(None, ge=1, description="threads of renderer and network; null: all")
+
+    @field_validator("up")
+    @classmethod
+    def _is_a_direction(cls, up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if up is not None and not 0 < math.hypot(*up) < math.inf:
+            raise ValueError("a direction has a length: give three numbers that are not all 0")
+        return up
+
+    @model_validator(mode="after")
+    def _has_radiance(self) -> Settings:
+        if self.checkpoint is not None and "relit" in self.buffers and not self.takes_default:
+            raise ValueError(
+                "a network draws display values, so there is no relit.exr with a checkpoint: leave 'relit' "
+                "out of buffers, or take 'shadowed'"
+            )
+        return self
+
+    @field_validator("weights")
+    @classmethod
+    def _weigh_something(cls, weights: dict[str, float] | None) -> dict[str, float] | None:
+        if weights is not None:
+            check_sizes(weights)
+        return weights
+
+    @model_validator(mode="after")
+    def _draws_what_it_tunes(self) -> Settings:
+        if self.tuned and self.checkpoint is None:
+            what = f"{self.tuned[0]} is the neural renderer's"
+            raise ValueError(f"{what}: give a checkpoint too, or leave it out")
+        return self
+
+    @model_validator(mode="after")
+    def _reflects_something(self) -> Settings:
+        require_bounces(self.bounces, self.reflections or 0)
+        return self
+
+    def estimation(self) -> Estimation:
+        """Estimation of the light: what quality says, unless the settings do."""
+        said = {
+            "filtered": self.denoise,
+            "reflections": self.reflections if self.bounces else 0,
+            "supersample": self.supersample,
+            **self.model_dump(include={"estimator", "two_sided", "bounces", "diffuse"}),
+        }
+        given = {name: value for name, value in said.items() if value is not None}
+        return Estimation(**{**QUALITY[self.quality].model_dump(), **given})
+
+    @property
+    def tuned(self) -> list[str]:
+        """Settings of the neural renderer that were chosen."""
+        chosen = {
+            "window": self.window,
+            "weights": self.weights,
+            "overlap": self.overlap != "anchor",
+            "reproject": self.reproject != 5,
+        }
+        return [name for name, given in chosen.items() if given]
+
+    @property
+    def takes_default(self) -> bool:
+        """Whether the checkpoint is the one that nobody asked for, which may give way."""
+        return self.checkpoint is not None and str(self.checkpoint) == AUTO
+
+    @property
+    def source(self) -> Literal["neural", "lit", "shadowed"]:
+        """Origin of the relit picture."""
+        if self.checkpoint is not None:
+            return "neural"
+        return "lit" if self.bounces else "shadowed"
+
+    def by_light(self) -> list[Settings]:
+        """The settings that give each environment's frames alone.
+
+        Raises:
+            TronError: two environments would share a folder.
+        """
+        if isinstance(self.environment, Path) or len(self.environment) == 1:
+            only = self.environment if isinstance(self.environment, Path) else self.environment[0]
+            return [self.model_copy(update={"environment": only})]
+        stems = [path.stem for path in self.environment]
+        twice = [path for path in self.environment if stems.count(path.stem) > 1]
+        if twice:
+            named = ", ".join(map(str, twice))
+            raise TronError("environments of one name would share a folder", named, "rename one of them")
+        return [
+            self.model_copy(update={"environment": path, "output_dir": self.output_dir / path.stem})
+            for path in self.environment
+        ]
+
+    @property
+    def light(self) -> Path:
+        """File of the environment, where these are the settings of one light alone (`by_light`)."""
+        assert isinstance(self.environment, Path)
+        return self.environment
+
+    def rotations(self, frames: int) -> list[float]:
+        """Turn of the environment in each of so many frames, degrees.
+
+        From a to b the end is left out, so that a whole turn loops: a + (b - a) i / n.
+        """
+        first, end = self.rotation if isinstance(self.rotation, tuple) else (self.rotation, self.rotation)
+        return [first + (end - first) * index / frames for index in range(frames)]

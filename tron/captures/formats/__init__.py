@@ -1,0 +1,1 @@
+"""Formats of posed captures, one a file."""

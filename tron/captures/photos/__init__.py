@@ -1,0 +1,1 @@
+"""Photographs: files, masks, depth, lenses, and the views that they become."""

@@ -1,0 +1,1 @@
+"""Poses of photos and videos that have none, by structure from motion."""

@@ -1,0 +1,1 @@
+"""Files of pictures, videos and cameras, and what their headers say of colour."""

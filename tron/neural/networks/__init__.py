@@ -1,0 +1,1 @@
+"""Networks that a renderer is made of."""

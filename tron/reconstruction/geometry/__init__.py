@@ -1,0 +1,1 @@
+"""Surfels of a capture: first ones, stereo, training, what views agree on."""

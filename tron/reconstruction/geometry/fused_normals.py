@@ -1,0 +1,107 @@
+"""Normals that the surfels' own depths agree on: they shape surfaces in stage 1 where no prior gives any.
+
+Every so many steps the median depths of all training views are rendered and fused (:mod:`.fusion`), and each
+view takes the normals of the fused surface back. Until the next time they are what the surfels' normals are
+pulled to by 2DGS's normal consistency (Huang et al. 2024, equation 14)
+
+    mean over pixels of sum_i w_i (1 - n_i . N) = opacity - (sum_i w_i n_i) . N,
+
+with N fixed: 2DGS takes it from the depth of the one view, which is noise until depth is right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from tron.captures import View
+from tron.gaussians.fields import FIELDS, PARAMETERS
+from tron.reconstruction.geometry.fusion import DepthMap, empty_rays, fused_views
+from tron.reconstruction.geometry.surfels import LearntSurfels
+from tron.reconstruction.settings import ConsistencySettings
+from tron.tracing.torch_bridge import render
+
+_SURFACE = 0.5
+_GEOMETRY = ("means", "quats", "log_scales", "opacity_logits")
+_STATE = "fused."
+
+
+def normal_consistency(rendered: Mapping[str, Tensor], fused: Tensor) -> Tensor:
+    """Mean over the pixels whose normal is known of opacity - (sum of w n) . N, a scalar.
+
+    Args:
+        rendered: images of :func:`tron.tracing.torch_bridge.render`.
+        fused: (H, W, 3) unit normals, world, or zero where the views do not agree.
+    """
+    known = (fused * fused).sum(-1) > 0.25
+    apart = rendered["opacity"] - (rendered["normal_sum"] * fused).sum(-1)
+    return (apart * known).sum() / known.sum().clamp(min=1)
+
+
+class FusedNormals:
+    """The fused normals of the training views, made anew as the surfels change.
+
+    They are a function of the surfels' geometry when they were last made, which is what a checkpoint keeps of
+    them.
+
+    Args:
+        settings: how often, how fine.
+        views: of the stage.
+        kernel_degree: of the surfels.
+    """
+
+    def __init__(self, settings: ConsistencySettings, views: Sequence[View], kernel_degree: int) -> None:
+        self.settings, self.views, self.kernel_degree = settings, views, kernel_degree
+        self._normals: dict[str, Tensor] = {}
+        self._made_from: dict[str, Tensor] = {}
+
+    def before(self, surfels: LearntSurfels, step: int) -> None:
+        """Make them anew if that is due before ``step`` (from 0)."""
+        if step % self.settings.every == 0:
+            self._make({name: surfels[name].detach().clone() for name in _GEOMETRY})
+
+    def of(self, view: View) -> dict[str, Tensor]:
+        """``fused_normal``, (H, W, 3) float32 unit, world, zero where unknown; empty where there is none."""
+        normals = self._normals.get(view.name)
+        return {} if normals is None else {"fused_normal": normals.float()}
+
+    def state(self) -> dict[str, Tensor]:
+        """The geometry that they were made from, for a checkpoint."""
+        return {f"{_STATE}{name}": values for name, values in self._made_from.items()}
+
+    def restore(self, stored: Mapping[str, Tensor], device: torch.device) -> None:
+        """Inverse of :meth:`state`; before the first step there is none."""
+        if _STATE + _GEOMETRY[0] not in stored:
+            return
+        self._make({name: stored[_STATE + name].to(device) for name in _GEOMETRY})
+
+    @torch.no_grad()
+    def _make(self, tensors: Mapping[str, Tensor]) -> None:
+        self._made_from = dict(tensors)
+        maps = [self._depth_map(view) for view in self.views]
+        # Half precision is a hundredth of a degree, and half the memory of many large views.
+        fused = fused_views(maps, self.settings)
+        self._normals = {view.name: normal.half() for view, (_, normal) in zip(self.views, fused)}
+
+    def _depth_map(self, view: View) -> DepthMap:
+        seen = render(
+            _without_radiance(self._made_from), view.camera, kernel_degree=self.kernel_degree, sh_degree=0
+        )
+        depth = seen["depth"]
+        empty = None
+        if view.has("mask"):
+            empty = empty_rays(torch.from_numpy(view.read("mask")).to(depth.device) > _SURFACE)
+        return DepthMap(view.camera, depth, (depth > 0).float(), empty)
+
+
+def _without_radiance(geometry: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The surfels as the renderer takes them, all black."""
+    count = len(geometry["means"])
+    black = {
+        name: geometry["means"].new_zeros((count, *FIELDS[name].shape))
+        for name in PARAMETERS
+        if name not in geometry
+    }
+    return {**geometry, **black}

@@ -1,0 +1,1 @@
+"""Base color, roughness and metallic of surfels, together with the light."""

@@ -1,0 +1,188 @@
+"""Materials of each surfel by evidence over views, in a light that is known.
+
+For a roughness r and a metallic m of 0 or 1, what leaves a surfel towards a camera is linear in its base
+color b (:mod:`tron.shading.composition`, with E + I received, o S + I mirrored by the lobe of r):
+
+    m = 0    c = b D (E + I) + E_glass (o S + I)
+    m = 1    c = (b A + B) (o S + I)
+
+so each photo of the surfel gives a b for each (r, m); their median is the base color if that were its
+material, and how well it explains all photos says whether it is. A highlight that moves with the camera is
+explained by a lobe of its width and by no other; a surfel that shows none is explained by all alike, and
+then its neighbours of like colour decide: losses are summed over them. Where they know nothing either, the
+material is what ``prior_roughness`` says, dielectric.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.spatial import KDTree
+
+from tron.gaussians import GaussianScene
+from tron.reconstruction.light.surfel_colors import FLOOR, Observations, SurfelColors, grouped_median
+from tron.runtime import aligned
+from tron.shading.brdf_table import BrdfTable
+from tron.shading.lighting import Lighting
+
+ROUGHNESSES = np.array([0.15, 0.25, 0.35, 0.5, 0.7, 0.95])
+"""Widths of lobes that are tried."""
+_ROBUST = 0.1  # log difference beyond which an observation is doubted
+_DARK = 0.1  # share of the mean colour that is added before logarithms: the dark is noise
+_LIKE = 24  # neighbours that decide together
+_CHROMA = 0.3  # log colour that counts as one spacing between neighbours
+_CERTAIN = 0.02  # mean loss by which a material must be better to be e times as likely
+_PRIOR = 0.02  # loss of a roughness at 1 from the prior's
+_METAL_LOSS = 0.06  # loss of a polished metal: few things are one
+_ROUGH_METAL_LOSS = 5.0
+"""Loss of a metal of roughness 1, over a polished one's: it looks like paint, and in a light that is somewhat
+wrong fur looks like it."""
+
+
+@dataclass(frozen=True)
+class Received:
+    """Light at M surfels, linear, / pi, in the unit of the observations.
+
+    Attributes:
+        direct: (M, 3) irradiance that arrives of the environment.
+        unshadowed: (M, 3) the same with nothing in the way.
+        bounced: (M, 3) irradiance of bounced light.
+        openness: (M,) share of directions in which nothing is met.
+    """
+
+    direct: np.ndarray
+    unshadowed: np.ndarray
+    bounced: np.ndarray
+    openness: np.ndarray
+
+
+@dataclass(frozen=True)
+class Materials:
+    """Materials of M surfels.
+
+    Attributes:
+        base_color: (M, 3) float32, linear, not limited to 1.
+        roughness, metallic: (M,) float32 in [0, 1].
+        confidence: (M,) float32 in [0, 1]: how much of the choice of roughness and metallic the photos made.
+    """
+
+    base_color: np.ndarray
+    roughness: np.ndarray
+    metallic: np.ndarray
+    confidence: np.ndarray
+
+
+def materials_of(
+    scene: GaussianScene,
+    found: Observations,
+    colors: SurfelColors,
+    lighting: Lighting,
+    received: Received,
+    prior_roughness: float,
+) -> Materials:
+    """Choose each surfel's material; of surfels that no photo shows, by their neighbours.
+
+    Args:
+        scene: geometry.
+        found: observations of its surfels.
+        colors: of the same.
+        lighting: the light, in their unit.
+        received: what it gives the surfels.
+        prior_roughness: where nothing is known.
+    """
+    color = found.color / colors.gain[found.view]
+    dark = _DARK * float(color.mean())
+    surfel, count = found.surfel, found.surfels
+    total = (received.direct + received.bounced)[surfel]
+    share = np.clip(received.direct / np.maximum(received.unshadowed, 1e-6), 0, 1)
+    normal = scene.normals()[surfel]
+    cosine = np.einsum("nc,nc->n", normal, found.to_camera)
+    mirrored = 2 * cosine[:, None] * normal - found.to_camera
+    bases, losses = [], []
+    for metal in (False, True):
+        for roughness in ROUGHNESSES:
+            scale, bias, diffuse, glass = _table(roughness, cosine)
+            open_ = received.openness[:, None] * (1 - roughness) + roughness * share
+            lobe = open_[surfel] * _prefiltered(lighting, mirrored, roughness) + received.bounced[surfel]
+            lobe = np.maximum(lobe, 1e-5)
+            if metal:
+                each = (color / lobe - bias[:, None]) / scale[:, None]
+            else:
+                each = (color - glass[:, None] * lobe) / np.maximum(diffuse[:, None] * total, 1e-5)
+            base = np.clip(grouped_median(each, surfel, count), 0, 2)
+            of = base[surfel]
+            if metal:
+                wanted = (of * scale[:, None] + bias[:, None]) * lobe
+            else:
+                wanted = of * diffuse[:, None] * total + glass[:, None] * lobe
+            off = np.abs(np.log((color + dark) / (wanted + dark))).mean(1)
+            loss = np.bincount(surfel, np.log1p(off / _ROBUST), count)
+            bases.append(base)
+            losses.append(loss)
+    return choose(scene, colors, np.stack(bases), np.stack(losses), prior_roughness)
+
+
+def choose(
+    scene: GaussianScene, colors: SurfelColors, bases: np.ndarray, losses: np.ndarray, prior_roughness: float
+) -> Materials:
+    """The materials of M surfels among K candidates, dielectrics of all roughnesses before metals.
+
+    Args:
+        scene: geometry.
+        colors: of its surfels.
+        bases: (K, M, 3) base color of each candidate.
+        losses: (K, M) loss of each, summed over the surfel's photos.
+        prior_roughness: where nothing is known.
+    """
+    seen = np.flatnonzero(colors.seen)
+    log = np.log(np.maximum(colors.color, FLOOR))
+    place = np.concatenate([scene.means / scene.spacing, log / _CHROMA], 1)
+    # Surfels that no photo shows have no colour: place alone says who is near.
+    like = _nearest(place[seen], place)
+    blind = np.flatnonzero(~colors.seen)
+    if len(blind):
+        like[blind] = _nearest(scene.means[seen], scene.means[blind])
+    like = seen[like]
+    count = np.maximum(colors.count[like].sum(1), 1)
+    mean = losses[:, like].sum(-1) / count
+    roughness = np.tile(ROUGHNESSES, 2)
+    metallic = np.repeat([0.0, 1.0], len(ROUGHNESSES))
+    prior = _PRIOR * (roughness - prior_roughness) ** 2
+    prior = prior + _METAL_LOSS * (1 + _ROUGH_METAL_LOSS * roughness**2) * metallic
+    score = mean + prior[:, None]
+    weight = np.exp(-(score - score.min(0)) / _CERTAIN)
+    weight /= weight.sum(0)
+    own = np.exp(-(prior - prior.min()) / _CERTAIN)
+    own /= own.sum()
+    told = 0.5 * np.abs(weight - own[:, None]).sum(0)
+    # Base color is a surfel's own; where it has none it is its neighbours'.
+    base = np.einsum("km,kmc->mc", weight, bases)
+    if len(blind):
+        base[blind] = base[like[blind]].mean(1)
+    return Materials(
+        base.astype(np.float32),
+        (roughness @ weight).astype(np.float32),
+        (metallic @ weight).astype(np.float32),
+        told.astype(np.float32),
+    )
+
+
+def _nearest(of: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """(N, K) indices of the nearest of some places to others."""
+    return np.reshape(KDTree(of).query(places, k=min(_LIKE, len(of)))[1], (len(places), -1))
+
+
+def _table(roughness: float, cosine: np.ndarray) -> list[np.ndarray]:
+    """A, B, D and E of :mod:`tron.shading.brdf_table`, (N,) each."""
+    table = BrdfTable.load()
+    lanes = mi.Float(aligned(np.clip(cosine, 0, 1).astype(np.float32)))
+    return [np.array(value) for value in table(dr.full(mi.Float, float(roughness), len(cosine)), lanes)]
+
+
+def _prefiltered(lighting: Lighting, direction: np.ndarray, roughness: float) -> np.ndarray:
+    """(N, 3) mean radiance over lobes about directions."""
+    lanes = mi.Vector3f(*[mi.Float(aligned(column.astype(np.float32))) for column in direction.T])
+    return np.array(lighting.split_sum.prefiltered(lanes, dr.opaque(mi.Float, float(roughness)))).T

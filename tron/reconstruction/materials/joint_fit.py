@@ -1,0 +1,282 @@
+"""Light and materials of a capture together, from its photos and the reconstructed geometry."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from pydantic import Field
+from scipy.spatial import KDTree
+
+from tron.captures import Capture
+from tron.captures.view import ToneCurve
+from tron.estimation import Estimation
+from tron.gaussians import GaussianScene
+from tron.reconstruction.light.fit_pairs import Light, LightSettings, Points, TooFewSeen, fit_light
+from tron.reconstruction.light.sky_visibility import PhotographedSky, photographed_sky, sky_transport
+from tron.reconstruction.light.sun import Sun, SunSearch
+from tron.reconstruction.light.surfel_colors import SurfelColors, mean_colors, observe
+from tron.reconstruction.materials.brdf_search import Materials, Received, materials_of
+from tron.reconstruction.progress import Track, untracked
+from tron.reconstruction.settings import Settings
+from tron.relighting import Relighter
+from tron.seeds import generator
+from tron.shading.bounces.bounce import BounceTransport
+from tron.shading.environments.cubemap import CubemapLight
+from tron.shading.environments.environment import EnvironmentMap
+from tron.shading.lighting import Lighting
+from tron.tracing import SurfelTracer
+from tron.tracing.hierarchy.first_hit import NOTHING
+
+log = logging.getLogger(__name__)
+
+MAP_HEIGHT = 256
+"""Rows of the environment map; a sun narrower than a row is a row wide."""
+_PHOTOS = 2
+_USUAL = 0.6
+"""Photos, and share of the usual number of them, that show a surfel whose colour tells of the light.
+
+Where few look, as at a table's edge, surfels face anywhere.
+"""
+_METAL = 0.5  # metallic from here on: no diffuse part to speak of
+_RAYS = 64  # shadow rays of a surfel
+_BACK = 0.5  # light of a back face as a share of what photos show of its front
+
+
+class JointSettings(Settings):
+    """Settings of the joint fit."""
+
+    tone_curve: ToneCurve | None = Field(
+        default=None,
+        description="Display curve of the images: srgb for photos, agx for path-traced ones; null: what the "
+        "capture says.",
+    )
+    same_exposure: bool = Field(
+        default=False, description="All photos are exposed and white-balanced alike; false: each by itself."
+    )
+    roughness: float = Field(default=0.6, ge=0, le=1, description="Roughness where no lobe is seen.")
+    sun: float = Field(
+        default=0.005, ge=0, le=1,
+        description="Share of the differences between neighbours that a sun must explain to be one; 1: none.",
+    )  # fmt: skip
+    rounds: int = Field(default=1, ge=1, description="Times that light and materials are found in turns.")
+    light: LightSettings = Field(default=LightSettings(), description="Fit of the light.")
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """Light and materials that explain a capture's photos.
+
+    Attributes:
+        scene: the surfels with materials.
+        environment: the light, in the unit of the photos over the capture's exposure.
+        sun: its part that is a lobe; None where no shadows tell of one.
+        colors: what the photos agree on.
+    """
+
+    scene: GaussianScene
+    environment: EnvironmentMap
+    sun: Sun | None
+    colors: SurfelColors
+
+    def said(self) -> dict[str, Any]:
+        """Plain values for a report."""
+        sun = self.sun
+        return {
+            "sun": None
+            if sun is None
+            else {
+                "direction": [round(float(x), 5) for x in sun.direction],
+                "width_deg": round(float(np.degrees(sun.width)), 2),
+            },
+            "surfels_seen": round(float(self.colors.seen.mean()), 4),
+            "spread": round(float(np.median(self.colors.spread[self.colors.seen])), 4),
+        }
+
+
+def fit_jointly(
+    capture: Capture,
+    scene: GaussianScene,
+    prior: JointSettings,
+    seed: int,
+    track: Track = untracked,
+) -> JointFit:
+    """Find light and materials on frozen surfels.
+
+    Args:
+        capture: its training views are looked at.
+        scene: geometry; its materials are not looked at.
+        prior: settings.
+        seed: root of the random numbers.
+        track: wraps long loops.
+
+    Raises:
+        TooFewSeen: the photos show too few of the surfels.
+        TronError: a loss is not finite.
+    """
+    relighter, curve = Relighter(scene, seed=seed), prior.tone_curve or capture.tone_curve
+    tracer = relighter.tracer(capture.train_views[0].camera)
+    found = observe(tracer, capture.train_views, capture.exposure, curve, track)
+    colors = mean_colors(found, prior.same_exposure)
+    if not colors.seen.any():
+        raise TooFewSeen(
+            "no surfel is shown well enough by two photos",
+            mend="take larger pictures (max_side=) and more steps; cameras and masks must be the scene's",
+        )
+    shown = _everywhere(colors, scene)
+    transport = relighter.transport
+    bounced = photographed_bounces(transport, shown)
+    sky = photographed_sky(
+        tracer, capture.train_views, colors.gain, capture.exposure, curve,
+        prior.light.resolution, seed, track,
+    )  # fmt: skip
+    finder = LightFinder(tracer, colors, bounced, sky, prior, seed)
+    diffuse, metallic = shown, np.zeros(len(scene), np.float32)
+    for _ in range(prior.rounds):
+        light, sun = finder.find(diffuse, metallic)
+        environment = environment_of(light, sun)
+        lighting = Lighting(environment)
+        received = receive(transport, lighting, bounced, seed)
+        materials = materials_of(scene, found, colors, lighting, received, prior.roughness)
+        # What is left without highlights and metals tells of the light better.
+        diffuse = materials.base_color * (received.direct + received.bounced)
+        metallic = materials.metallic
+    return JointFit(_with(scene, materials), _scaled(environment, 1 / capture.exposure), sun, colors)
+
+
+class LightFinder:
+    """Light from the colours of some of the surfels that photos show, whose rays are traced once.
+
+    Args:
+        tracer: the surfels.
+        colors: what photos show of them.
+        bounced: (M, 3) irradiance / pi that bounced.
+        sky: what photos show of it.
+        prior, seed: as of :func:`fit_jointly`.
+    """
+
+    def __init__(
+        self,
+        tracer: SurfelTracer,
+        colors: SurfelColors,
+        bounced: np.ndarray,
+        sky: PhotographedSky,
+        prior: JointSettings,
+        seed: int,
+    ) -> None:
+        self.tracer, self.prior, self.seed = tracer, prior, seed
+        self.sky = sky
+        scene = tracer.scene
+        usual = np.median(colors.count[colors.seen])
+        usable = np.flatnonzero(colors.count >= max(_PHOTOS, _USUAL * usual))
+        draw = generator(seed, "joint light", "points")
+        self.chosen = np.sort(draw.permutation(usable)[: prior.light.points])
+        self.position, self.normal = scene.means[self.chosen], scene.normals()[self.chosen]
+        self.bounced = bounced[self.chosen]
+        self.transport = sky_transport(tracer, self.position, self.normal, prior.light.resolution, seed)
+
+    def find(self, diffuse: np.ndarray, metallic: np.ndarray) -> tuple[Light, Sun | None]:
+        """The light, and the sun in it, if shadows tell of one.
+
+        Args:
+            diffuse: (M, 3) light that surfels send out in all directions alike.
+            metallic: (M,), those above a half do not count.
+        """
+        settings, seed = self.prior.light, self.seed
+        kept = metallic[self.chosen] < _METAL
+        surfels = Points(
+            self.position[kept],
+            self.normal[kept],
+            diffuse[self.chosen][kept],
+            self.bounced[kept],
+            self.transport[kept],
+        )
+        radius = settings.patch * self.tracer.scene.spacing
+        points = surfels.averaged(surfels.patches(radius, settings.alike))
+        soft = fit_light(points, settings, seed, self.sky)
+        if self.prior.sun >= 1:
+            return soft, None
+        search = SunSearch(self.tracer, surfels, soft, radius, settings.robust, settings.alike, seed)
+        direction, strength = search.find()
+        width = search.width(direction, strength)
+        lit = replace(points, lobe=search.received(direction, width))
+        begin = replace(soft, sun=np.full(3, strength * search.rest.mean(), np.float32))
+        sunny = fit_light(lit, settings, seed, self.sky, begin)
+        gain = 1 - search.loss(sunny, lit) / search.loss(soft, points)
+        log.info("a sun explains %.1f %% of the differences between neighbours", 100 * gain)
+        if gain < self.prior.sun:
+            return soft, None
+        return sunny, Sun(direction, width, sunny.sun)
+
+
+def receive(transport: BounceTransport, lighting: Lighting, bounced: np.ndarray, seed: int) -> Received:
+    """Light at all surfels."""
+    estimation = Estimation(rays=_RAYS)
+    with dr.suspend_grad():
+        unshadowed = np.array(lighting.split_sum.diffuse(mi.Vector3f(transport.surfels().normal))).T
+        share = np.array(transport.visible(lighting, estimation, seed)).T
+        openness = np.array(transport.openness())
+    return Received(unshadowed * share, unshadowed, bounced, openness)
+
+
+def photographed_bounces(transport: BounceTransport, shown: np.ndarray) -> np.ndarray:
+    """(M, 3) irradiance / pi of bounced light at surfels that send out what photos show of them (M, 3)."""
+    code = np.array(transport.rays.met).reshape(-1, len(shown))
+    sent = np.concatenate([shown, np.zeros((1, 3), shown.dtype)])
+    total = np.zeros_like(shown)
+    for ray in code:
+        there = ray != NOTHING
+        share = np.where(ray & 1, _BACK, 1.0).astype(np.float32)
+        total += share[:, None] * sent[np.where(there, ray >> 1, len(shown))]
+    return total / len(code)
+
+
+def _everywhere(colors: SurfelColors, scene: GaussianScene) -> np.ndarray:
+    """(M, 3) colours of all surfels: where no photo shows one, the mean of the nearest that one does."""
+    seen = np.flatnonzero(colors.seen)
+    near = np.reshape(KDTree(scene.means[seen]).query(scene.means, k=min(4, len(seen)))[1], (len(scene), -1))
+    guessed = colors.color[seen[near]].mean(1)
+    return np.where(colors.seen[:, None], colors.color, guessed).astype(np.float32)
+
+
+def _with(scene: GaussianScene, materials: Materials) -> GaussianScene:
+    return replace(
+        scene,
+        base_color=np.clip(materials.base_color, 0, 1),
+        roughness=np.clip(materials.roughness, 0, 1),
+        metallic=np.clip(materials.metallic, 0, 1),
+    )
+
+
+def _scaled(environment: EnvironmentMap, factor: float) -> EnvironmentMap:
+    return EnvironmentMap(environment.image * np.float32(factor))
+
+
+def environment_of(light: Light, sun: Sun | None) -> EnvironmentMap:
+    """The light as a lat-long map."""
+    resolution = round((len(light.texels) / 6) ** 0.5)
+    texels = mi.Float(light.texels.astype(np.float32).ravel())
+    image = CubemapLight(texels, resolution).to_environment(MAP_HEIGHT).image
+    if sun is not None:
+        image = image + _lobe_image(sun)
+    return EnvironmentMap(image)
+
+
+def _lobe_image(sun: Sun) -> np.ndarray:
+    """(H, 2 H, 3) float32 of the lobe alone, with its irradiance whatever the map rounds off."""
+    height = MAP_HEIGHT
+    polar = np.arange(height)[:, None] * np.pi / (height - 1)
+    around = (np.arange(2 * height) + 0.5)[None] * np.pi / height
+    directions = np.stack(
+        np.broadcast_arrays(np.sin(polar) * np.sin(around), np.sin(polar) * np.cos(around), np.cos(polar)), -1
+    )
+    wide = replace(sun, width=max(sun.width, np.pi / height))
+    image = wide.radiance(directions)
+    cosine = np.maximum(directions @ sun.direction, 0)
+    solid = EnvironmentMap(np.ones((height, 2 * height, 3), np.float32)).solid_angles()[:, None]
+    received = np.einsum("ij,ijc->c", cosine * solid / np.pi, image)
+    return (image * (sun.strength / np.maximum(received, 1e-20))).astype(np.float32)

@@ -1,0 +1,30 @@
+"""`prior=joint`: light and materials are what explains the photos on the surfels; nothing else is asked."""
+
+from __future__ import annotations
+
+import logging
+
+from tron.captures import Capture
+from tron.gaussians.fields import MATERIALS
+from tron.reconstruction.light.fit_pairs import TooFewSeen
+from tron.reconstruction.materials.joint_fit import JointSettings, fit_jointly
+from tron.reconstruction.priors.prior import Light, Materials, Prior, Surfels
+
+log = logging.getLogger(__name__)
+
+
+class Joint(JointSettings, Prior):
+    """Prior of nothing but photos: see :mod:`tron.reconstruction.materials.joint_fit`."""
+
+    def check(self, capture: Capture) -> None:
+        """Photos are enough."""
+
+    def find_materials(self, surfels: Surfels) -> Materials:
+        """Find light and materials together; neither where photos show too few surfels: the log says so."""
+        try:
+            fit = fit_jointly(surfels.capture, surfels.scene, self, surfels.seed, surfels.track)
+        except TooFewSeen as error:  # surfaces were not found: that is no reason to lose what was
+            log.warning("%s: base color is what the photos show, and there is no light", error)
+            return Materials(surfels.scene)
+        light = Light(fit.environment, fit.said())
+        return Materials(fit.scene, MATERIALS, light, fit.colors.gain)

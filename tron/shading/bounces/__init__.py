@@ -1,0 +1,1 @@
+"""Light that bounces between surfels: traced once, baked once a light."""

@@ -1,0 +1,258 @@
+"""Cosine-distributed rays of every surfel, and what stops each of them: the part of bounces without light.
+
+A ray's direction and its chances depend on the seed, on its surfel and on nothing that moves, so rays can be
+traced again one by one. Of a scene in which some surfels have moved, few rays have changed: those of moved
+surfels, those that met one, and those that one has come in the way of. The last are found by all rays in a
+hierarchy of the moved surfels alone, where a stop counts if it is nearer than what was met before. Together
+that is what tracing all rays anew gives, to the byte.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from copy import copy
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.seeds import integer
+from tron.shading.direct.irradiance import ORIGIN_OFFSET
+from tron.shading.direct.sampling import BLOCK_BITS, PixelPoints, morton
+from tron.tracing.gbuffer import GBuffer
+from tron.tracing.hierarchy.bvh import Bvh, build_bvh
+from tron.tracing.hierarchy.first_hit import NOTHING, FirstHit, first_hits, ray_seeds
+from tron.tracing.hierarchy.transmittance import Fans
+from tron.tracing.kernel import GEOMETRY_PACKETS, SurfelRecords, intersect
+from tron.tracing.surface import centres
+from tron.tracing.tiled.tiles import tile_pixels
+from tron.tracing.tracer import SurfelTracer
+
+AT_ONCE = 1 << 20
+"""Surfels whose rays are traced at a time, and single rays."""
+MANY = 0.2
+"""Share of surfels that have moved above which it is quicker to trace all rays anew."""
+_WIDTH = 1 << BLOCK_BITS
+
+
+@dataclass
+class Part:
+    """Surfels that are treated at once, as an image of their centres.
+
+    Attributes:
+        gbuffer: the image, 64 pixels across; opacity 0 where there is no surfel.
+        surfel: mi.UInt32, of each lane.
+        first: pixels of the parts before.
+    """
+
+    gbuffer: GBuffer
+    surfel: mi.UInt32
+    first: int
+
+
+def parts(tracer: SurfelTracer, some: mi.UInt32 | None = None) -> Iterator[Part]:
+    """All surfels, or ``some``, in the hierarchy's order along the Z curve of square blocks.
+
+    Pixels that are neighbours there are neighbours in space: they share the strata of one sequence, their
+    rays pass the same nodes, and they can lend each other their noise.
+    """
+    order = tracer.bvh.order if some is None else some
+    count = dr.width(order) if len(tracer.scene) else 0
+    for first in range(0, count, AT_ONCE):
+        height = _WIDTH * -(-min(AT_ONCE, count - first) // _WIDTH**2)
+        _, x, y, _ = tile_pixels(_WIDTH, height)
+        block = (y >> BLOCK_BITS) << (2 * BLOCK_BITS)
+        place = dr.opaque(mi.UInt32, first) + (block | morton(x, y & (_WIDTH - 1)))
+        inside = place < dr.opaque(mi.UInt32, count)
+        surfel = dr.gather(mi.UInt32, order, place, inside)
+        surface = centres(tracer.records, surfel, inside)
+        dr.eval(surface, surfel)
+        yield Part(GBuffer(**vars(surface), width=_WIDTH, height=height), surfel, first)
+
+
+@dataclass
+class _Lanes:
+    """Beginnings of the rays of some lanes, one surfel a lane."""
+
+    surfel: mi.UInt32
+    active: mi.Bool
+    origin: mi.Point3f
+    frame: mi.Frame3f
+    run: mi.UInt32
+
+
+class SurfelRays:
+    """``rays`` rays of each of the M surfels of ``tracer``, below ``seed``.
+
+    Where they begin and end follows the surfels, which may move: :meth:`after`.
+
+    Attributes:
+        met: mi.UInt32 (rays x M), ray r of surfel i at r M + i: twice the surfel met, plus 1 where it is met
+            from the back; ``NOTHING``.
+    """
+
+    def __init__(
+        self,
+        tracer: SurfelTracer,
+        rays: int,
+        seed: int,
+        track: Callable[[range], Iterable[int]] = iter,
+    ) -> None:
+        self.tracer, self.rays = tracer, rays
+        self._count = dr.opaque(mi.UInt32, len(tracer.scene))
+        self._points = PixelPoints.make(rays, 1, _WIDTH, seed, "bounce")
+        self._root = dr.opaque(mi.UInt32, integer(seed, "bounce", "stops"))
+        # A surfel keeps its strata wherever it goes.
+        self._pixel = dr.zeros(mi.UInt32, len(tracer.scene))
+        for part in parts(tracer):
+            pixel = part.gbuffer.pixel + part.first
+            dr.scatter(self._pixel, pixel, part.surfel, part.gbuffer.opacity > 0)
+        dr.eval(self._pixel)
+        self.met = self._trace(track)
+
+    def after(self, tracer: SurfelTracer) -> SurfelRays:
+        """The same rays, of the same surfels where ``tracer`` has them."""
+        other = copy(self)
+        other.tracer = tracer
+        changed = _changed(self.tracer.records, tracer.records)
+        moved = dr.compress(changed)
+        if dr.width(moved) > MANY * dr.width(changed):
+            other.met = other._trace(iter)
+        elif dr.width(moved) > 0:
+            other.met = dr.gather(mi.UInt32, self.met, dr.arange(mi.UInt32, dr.width(self.met)))
+            dr.eval(other.met)  # a copy: it is written to
+            other._meet(_hierarchy_of(tracer.records, moved), changed)
+            other._trace_again(self.met, changed)
+        return other
+
+    def meeting(self, met: mi.UInt32) -> SurfelRays:
+        """The same rays, said to meet something else: ``met`` of any number of surfels."""
+        other = copy(self)
+        other.met = met
+        return other
+
+    def of_some(self, tracer: SurfelTracer, surfel: mi.UInt32) -> mi.UInt32:
+        """Codes, as ``met``, of what stops the rays of some surfels (B,) in ``tracer``: (rays x B)."""
+        other, some = copy(self), dr.opaque(mi.UInt32, dr.width(surfel))
+        other.tracer = tracer
+        met = dr.empty(mi.UInt32, self.rays * dr.width(surfel))
+        for first in range(0, dr.width(surfel), AT_ONCE):
+            count = min(AT_ONCE, dr.width(surfel) - first)
+            lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
+            there = dr.full(mi.Bool, True, count)
+            dr.eval(lane, there)  # else where they stand in the kernels depends on what was computed before
+            for ray, directions, seeds, lanes in other._fans(dr.gather(mi.UInt32, surfel, lane), there):
+                hits = tracer.first_hits(lanes.origin, directions, [there] * len(directions), seeds)
+                for k, hit in enumerate(hits):
+                    dr.scatter(met, _code(hit), (ray + k) * some + lane)
+                dr.eval(met)
+        return met
+
+    def _lanes(self, surfel: mi.UInt32, active: mi.Bool) -> _Lanes:
+        at = centres(self.tracer.records, surfel, active)
+        offset = dr.opaque(mi.Float, ORIGIN_OFFSET * self.tracer.scene.spacing)
+        run = self._points.run(dr.gather(mi.UInt32, self._pixel, surfel, active))
+        lanes = _Lanes(surfel, active, at.position + at.normal * offset, mi.Frame3f(at.normal), run)
+        dr.eval(lanes)
+        return lanes
+
+    def _ray(self, lanes: _Lanes, ray: mi.UInt32) -> tuple[mi.Vector3f, mi.UInt32]:
+        """Unit world direction and seed."""
+        u = self._points.point(lanes.run, ray, mi.UInt32(0))
+        direction = lanes.frame.to_world(mi.warp.square_to_cosine_hemisphere(u))
+        return direction, ray_seeds(self._root, lanes.surfel, ray)
+
+    def _fans(
+        self, surfel: mi.UInt32, active: mi.Bool, track: Callable[[range], Iterable[int]] = iter
+    ) -> Iterator[tuple[mi.UInt32, list[mi.Vector3f], list[mi.UInt32], _Lanes]]:
+        """All rays of the surfels, a fan at a time: its first ray, directions, seeds, where it begins."""
+        lanes = self._lanes(surfel, active)
+        for first in track(range(0, self.rays, self._points.fan)):
+            ray = dr.opaque(mi.UInt32, first)
+            rays = [self._ray(lanes, ray + k) for k in range(self._points.fan)]
+            directions, seeds = [direction for direction, _ in rays], [seed for _, seed in rays]
+            dr.eval(directions, seeds)
+            yield ray, directions, seeds, lanes
+
+    def _trace(self, track: Callable[[range], Iterable[int]]) -> mi.UInt32:
+        """Trace all rays: ``met``."""
+        met = dr.empty(mi.UInt32, self.rays * len(self.tracer.scene))
+        for part in parts(self.tracer):
+            for ray, directions, seeds, lanes in self._fans(part.surfel, part.gbuffer.opacity > 0, track):
+                active = [lanes.active] * len(directions)
+                hits = self.tracer.first_hits(lanes.origin, directions, active, seeds)
+                for k, hit in enumerate(hits):
+                    dr.scatter(met, _code(hit), (ray + k) * self._count + lanes.surfel, lanes.active)
+                dr.eval(met)
+        return met
+
+    def _meet(self, few: Bvh, changed: mi.Bool) -> None:
+        """Let the rays of unmoved surfels meet those that have moved, where they are nearer."""
+        records, back_faces = self.tracer.records, self.tracer.back_faces
+        for part in parts(self.tracer):
+            still = (part.gbuffer.opacity > 0) & ~dr.gather(mi.Bool, changed, part.surfel)
+            for ray, directions, seeds, lanes in self._fans(part.surfel, still):
+                fans = Fans(lanes.origin, directions, [still] * len(directions))
+                for k, hit in enumerate(first_hits(few, fans, back_faces, seeds)):
+                    place = (ray + k) * self._count + lanes.surfel
+                    before = dr.gather(mi.UInt32, self.met, place, still)
+                    there = still & (before != NOTHING)
+                    held = intersect(records.geometry, dr.select(there, before >> 1, 0), lanes.origin,
+                                     directions[k], records.degree)  # fmt: skip
+                    distance = dr.select(there, held.t, dr.inf)
+                    tie = (hit.distance == distance) & (hit.surfel < (before >> 1))
+                    nearer = still & (hit.surfel != NOTHING) & ((hit.distance < distance) | tie)
+                    dr.scatter(self.met, _code(hit), place, nearer)
+                dr.eval(self.met)
+
+    def _trace_again(self, before: mi.UInt32, changed: mi.Bool) -> None:
+        """Trace the rays of surfels that have moved and those that met one, one by one."""
+        every = dr.arange(mi.UInt32, dr.width(before))
+        # In the hierarchy's order, so that neighbours are traced together.
+        surfel = dr.gather(mi.UInt32, self.tracer.bvh.order, every % self._count)
+        ray = every // self._count
+        met = dr.gather(mi.UInt32, before, ray * self._count + surfel)
+        hit = dr.gather(mi.Bool, changed, met >> 1, met != NOTHING)
+        again = dr.compress(hit | dr.gather(mi.Bool, changed, surfel))
+        for first in range(0, dr.width(again), AT_ONCE):
+            lane = dr.arange(mi.UInt32, min(AT_ONCE, dr.width(again) - first)) + dr.opaque(mi.UInt32, first)
+            which = dr.gather(mi.UInt32, again, lane)
+            surfel = dr.gather(mi.UInt32, self.tracer.bvh.order, which % self._count)
+            ray = which // self._count
+            lanes = self._lanes(surfel, dr.full(mi.Bool, True, dr.width(lane)))
+            direction, seed = self._ray(lanes, ray)
+            (hit,) = self.tracer.first_hits(lanes.origin, [direction], [lanes.active], [seed])
+            dr.scatter(self.met, _code(hit), ray * self._count + surfel)
+            dr.eval(self.met)
+
+
+def _code(hit: FirstHit) -> mi.UInt32:
+    """A hit as it is kept: :attr:`SurfelRays.met`."""
+    code = 2 * hit.surfel + dr.select(hit.front, mi.UInt32(0), 1)
+    return dr.select(hit.surfel == NOTHING, NOTHING, code)
+
+
+def _changed(before: SurfelRecords, now: SurfelRecords) -> mi.Bool:
+    """Surfels whose place, orientation, size or opacity is another."""
+    surfel, same = dr.arange(mi.UInt32, now.count), mi.Bool(True)
+    for packet in range(GEOMETRY_PACKETS):
+        index = surfel * GEOMETRY_PACKETS + packet
+        pairs = [dr.gather(mi.Vector4f, records.geometry, index) for records in (before, now)]
+        same &= dr.all(pairs[0] == pairs[1])
+    changed = ~same
+    dr.eval(changed)
+    return changed
+
+
+def _hierarchy_of(records: SurfelRecords, surfel: mi.UInt32) -> Bvh:
+    """A hierarchy of some surfels, which keep their numbers."""
+    count = dr.width(surfel)
+    geometry = dr.empty(mi.Float, 4 * GEOMETRY_PACKETS * count)
+    for packet in range(GEOMETRY_PACKETS):
+        value = dr.gather(mi.Vector4f, records.geometry, surfel * GEOMETRY_PACKETS + packet)
+        dr.scatter(geometry, value, dr.arange(mi.UInt32, count) * GEOMETRY_PACKETS + packet)
+    dr.eval(geometry)
+    few = build_bvh(replace(records, geometry=geometry, count=count))
+    order = dr.gather(mi.UInt32, surfel, few.order)
+    dr.eval(order)
+    return replace(few, order=order)

@@ -1,0 +1,86 @@
+"""Burley's diffuse factor for the light that arrives: rough floors under low suns.
+
+The diffuse part of Mitsuba's ``principled`` (:mod:`tron.shading.brdf_table`) is a polynomial in roughness r,
+
+    base / pi (t_0 + t_1 r + t_2 r^2)       t_0 = (1 - F_l / 2) (1 - F_v / 2)
+                                            t_1 = (1 + l.v) (F_l + F_v - F_l F_v)
+                                            t_2 = (1 + l.v)^2 F_l F_v
+
+with F_l = (1 - n.l)^5, F_v alike. The means of t_0, t_1 and t_2 over the shadow rays, each by the luminance
+that it brings, give the factor of the light that arrives, differentiable in r. The table's D is their mean
+over even light: of a floor of roughness 1 under a sun 15 degrees high, seen 15 degrees from its plane, it
+made 1.17 of path tracing's radiance on one side and 0.70 on the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.color import LUMINANCE
+from tron.tracing.surface import Surface
+
+
+def burley_terms(normal: mi.Vector3f, along: mi.Vector3f, light: mi.Vector3f) -> mi.Vector3f:
+    """t_0, t_1, t_2 for unit world normals, directions from the camera, and directions to the light."""
+    towards = _schlick(dr.dot(normal, light))
+    away = _schlick(-dr.dot(normal, along))
+    back = 1 - dr.dot(light, along)
+    return mi.Vector3f(
+        (1 - towards / 2) * (1 - away / 2),
+        back * (towards + away - towards * away),
+        back * back * towards * away,
+    )
+
+
+@dataclass
+class BurleySums:
+    """Sums of the terms over the light that arrives, and of its luminance; one lane a pixel."""
+
+    normal: mi.Vector3f
+    along: mi.Vector3f
+    terms: mi.Vector3f
+    weight: mi.Float
+
+    @classmethod
+    def none(cls, surface: Surface) -> BurleySums:
+        """Nothing has arrived yet."""
+        lanes = dr.width(surface.opacity)
+        normal, along = dr.detach(mi.Vector3f(surface.normal)), dr.detach(surface.direction)
+        sums = cls(normal, along, dr.zeros(mi.Vector3f, lanes), dr.zeros(mi.Float, lanes))
+        dr.eval(normal, along)
+        dr.make_opaque(sums.terms, sums.weight)
+        return sums
+
+    def add(
+        self, directions: Sequence[mi.Vector3f], light: Sequence[mi.Color3f], visible: Sequence[mi.Float]
+    ) -> None:
+        """Add rays: unit world directions, the linear light along them, and the share that arrives."""
+        for direction, value, share in zip(directions, light, visible, strict=True):
+            weight = grey(value) * share
+            self.terms += weight * burley_terms(self.normal, self.along, direction)
+            self.weight += weight
+        dr.eval(self.terms, self.weight)
+
+
+def mean_terms(sums: mi.Vector3f, weight: mi.Float) -> mi.Vector3f:
+    """Means of terms, from sums of them by ``weight``; 0 of no weight."""
+    there = weight > 0
+    return dr.select(there, sums / dr.select(there, weight, 1), 0)
+
+
+def burley_factor(terms: mi.Vector3f, roughness: mi.Float, otherwise: mi.Float) -> mi.Float:
+    """Factor on Lambert's albedo; ``otherwise`` where there are no terms, which is where t_0 is 0."""
+    return dr.select(terms.x > 0, terms.x + roughness * (terms.y + roughness * terms.z), otherwise)
+
+
+def _schlick(cosine: mi.Float) -> mi.Float:
+    return (1 - dr.clip(cosine, 0, 1)) ** 5
+
+
+def grey(color: mi.Color3f) -> mi.Float:
+    """Luminance of linear BT.709."""
+    return dr.dot(color, mi.Color3f(LUMINANCE))

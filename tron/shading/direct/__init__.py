@@ -1,0 +1,1 @@
+"""Shadowed light of the environment at surface points, from few rays."""

@@ -1,0 +1,1 @@
+"""Light from every direction: maps, cubemaps, files, prefiltering."""

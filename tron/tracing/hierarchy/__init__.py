@@ -1,0 +1,1 @@
+"""All other rays through a bounding volume hierarchy."""

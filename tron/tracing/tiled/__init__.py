@@ -1,0 +1,1 @@
+"""Camera rays along the lists of screen tiles."""
