@@ -205,10 +205,11 @@ def showcase_films(scene: GaussianScene, capture: Capture, frames: int, side: in
     relighter = Relighter(scene.rotated(turn), QUALITY["preview"], integer(0, "report", "bounces"))
     films = {}
     for name, light in showcase_lights().items():
-        lit, exposure, pictures = relighter.under(light), light.exposure(), []
+        lit, exposure, pictures = relighter.under(light), None, []
         for number, camera in enumerate(track(cameras, f"report: {name}")):
             guidance = lit.render(camera, integer(0, "report", number))
-            pictures.append(to_display(guidance.lit, exposure))
+            exposure = guidance.exposure() if exposure is None else exposure
+            pictures.append(to_display(guidance.lit, exposure, look="photograph"))
         films[name] = _film(pictures)
     return films
 

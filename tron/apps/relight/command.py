@@ -204,13 +204,14 @@ def _load_scene(settings: Settings) -> GaussianScene:
 def _clip(
     light: Settings, environment: EnvironmentMap, frames: int, guidance: Sequence[str], averaged: bool
 ) -> Clip:
-    picture = RelitPicture(light.background, light.source)
+    picture = RelitPicture(light.background, light.source, light.look)
     needed = (*guidance, *picture.buffers, *light.buffers, *([DEPTH] if averaged else []))
     buffers = [name for name in needed if name != "relit"]
     return Clip(
         environment=environment,
         rotations=light.rotations(frames),
-        exposure=environment.exposure() if light.exposure == "auto" else light.exposure,
+        exposure=environment.exposure(),
+        chosen=None if light.exposure == "auto" else light.exposure,
         picture=picture,
         folder=FrameFolder(light.output_dir / "frames", tuple(dict.fromkeys(buffers))),
         guidance=guidance,
@@ -260,7 +261,8 @@ def _report(
             "materials_guessed": scene.materials_guessed,
             "oriented": scene.oriented,
         },
-        "exposure": clip.exposure,
+        "exposure": clip.shown_exposure,
+        "guidance_exposure": clip.exposure,
         "frames": len(cameras),
         "frames_rendered": len(clip.seconds),
         "first_frame_seconds": clip.seconds[0] if clip.seconds else None,

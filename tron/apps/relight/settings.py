@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from tron.apps.framing import TrajectoryName
 from tron.apps.relit import Background
 from tron.apps.surroundings import DESCRIPTION, Treatment
+from tron.color import Look
 from tron.errors import TronError
 from tron.estimation import FINAL, FINEST, PREVIEW, Estimation, Estimator, require_bounces
 from tron.neural.clips import Overlap
@@ -109,7 +110,13 @@ class Settings(BaseModel):
     distance: float = Field(1.0, gt=0, le=100, description="factor on the automatic distance to the subject")
     fps: float = Field(24.0, gt=0, le=240, description="frames a second of the videos")
     exposure: Literal["auto"] | Annotated[float, Field(gt=0)] = Field(
-        "auto", description="factor before the tone curve; auto: from the light on an upward plane"
+        "auto",
+        description="factor before the tone curve of the relit picture; auto: metered for the light that "
+        "falls on the subject in the first frame, one for the clip, which the log says",
+    )
+    look: Look = Field(
+        "photograph",
+        description="tone of the relit picture: AgX with the contrast that photographs have, or none",
     )
     up: tuple[float, float, float] | None = Field(
         None,
