@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
-from tron.apps.framing import plan_cameras, turn_cameras
 from tron.apps.reconstruct.pictures import chosen_views, view_pictures
 from tron.apps.reconstruct.settings import ReportSettings
 from tron.apps.relight.settings import QUALITY
@@ -33,7 +32,7 @@ from tron.seeds import integer
 from tron.shading.environments.environment import EnvironmentMap
 from tron.storage import write_atomic
 from tron.tracing import SurfelTracer
-from tron.trajectories import keyframed
+from tron.trajectories import keyframed, plan_cameras, turn_cameras
 
 TRUTH = ("normal", "base_color", "roughness", "metallic")
 SMALLER_IS_BETTER = ("lpips", "roughness_mae", "metallic_mae")

@@ -16,6 +16,7 @@ import numpy as np
 
 from tron import seeds
 from tron.apps.frame_folder import FrameFolder
+from tron.apps.relight.settings import ProxyChoice
 from tron.apps.relit import RelitPicture, surfels_alone
 from tron.cameras import Camera
 from tron.cli.progress import track, working
@@ -178,6 +179,9 @@ def trace(
     estimation: Estimation,
     seed: int,
     backdrop: np.ndarray | None = None,
+    proxy: ProxyChoice = "auto",
+    filmed: Sequence[Camera] | None = None,
+    proxy_file: Path | None = None,
 ) -> None:
     """Trace the frames that are missing, and write the pictures of all.
 
@@ -188,11 +192,17 @@ def trace(
         estimation: of the light.
         seed: root of its random numbers; a frame's do not depend on the environment.
         backdrop: (M,) bool, surfels that are in no light's way (:class:`tron.relighting.Relighter`).
+        proxy, filmed, proxy_file: whether light sees a proxy, cameras to film it, and where it is kept, as
+            there.
     """
     from tron.relighting import Relighter
 
     bounces, rays = seeds.integer(seed, "relight", "bounces"), partial(track, label="where light bounces")
-    relighter = Relighter(scene, estimation, bounces, backdrop=backdrop, track=rays)
+    relighter = Relighter(
+        scene, estimation, bounces, backdrop=backdrop, track=rays,
+        proxy=proxy, cameras=filmed, proxy_file=proxy_file,
+        filming=partial(track, label="filming a proxy for light"),
+    )  # fmt: skip
     for clip in clips:
         if lacking := clip.folder.lacking(len(cameras)):
             log.info("frames that have no %s yet are traced again", ", ".join(lacking))

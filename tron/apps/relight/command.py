@@ -18,7 +18,6 @@ import numpy as np
 
 import tron
 from tron.apps.frame_folder import FrameFolder
-from tron.apps.framing import plan_cameras, turn_cameras
 from tron.apps.relight.camera_files import (
     CAMERAS,
     filmed_cameras,
@@ -47,6 +46,7 @@ from tron.neural.shipped import DEFAULT, SHIPPED, checkpoint_file
 from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
 from tron.shards.schema import GUIDANCE
 from tron.storage import locked, require_free_space, sha256, write_atomic
+from tron.trajectories import plan_cameras, turn_cameras
 
 if TYPE_CHECKING:
     from tron.neural.protocols import Renderer
@@ -88,10 +88,11 @@ def main(settings: Settings) -> None:
     with working("looking for surroundings"):
         surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
     scene = surrounded.shown
+    filmed = _filmed(settings.scene, turn, offset)
     if given is not None:
         cameras = turn_cameras(given, turn)
     else:
-        cameras = _planned(settings, surrounded.content, turn, offset)
+        cameras = _planned(settings, surrounded.content, filmed)
     # Without a network the relit picture is one of them, and is shown as such; so is lit if nothing bounces.
     guidance = [name for name in GUIDANCE if name != settings.source and (settings.bounces or name != "lit")]
     guidance = guidance if renderer is None else renderer.config.guidance
@@ -106,7 +107,8 @@ def main(settings: Settings) -> None:
     with locked(settings.output_dir):
         for light, clip in zip(lights, clips):
             clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite, model_defaults(Settings))
-        traced = {"estimation": settings.estimation(), "seed": settings.seed}
+        traced = {"estimation": settings.estimation(), "seed": settings.seed, "proxy": settings.proxy}
+        traced |= {"filmed": filmed, "proxy_file": settings.scene.with_suffix(".proxy.ply")}
         trace(scene, cameras, clips, **traced, backdrop=surrounded.backdrop)
         clock.lap("guidance")
         if renderer is not None:
@@ -127,24 +129,27 @@ def main(settings: Settings) -> None:
             log.info("frames: %d, rendered now: %d; look at %s", *made)
 
 
-def _planned(settings: Settings, scene: GaussianScene, turn: np.ndarray, offset: np.ndarray) -> list[Camera]:
-    """The camera path that the settings name, in the world in which up is +z; of the file's offset (3,)."""
+def _filmed(path: Path, turn: np.ndarray, offset: np.ndarray) -> list[Camera] | None:
+    """Cameras that a scene was filmed with, in the world turned by ``turn``; None where none lie beside."""
+    try:
+        filmed = filmed_cameras(path, offset)
+    except TronError as error:
+        log.warning("%s; the scene is filmed and orbited without it", error)
+        return None
+    return None if filmed is None else turn_cameras(filmed, turn)
+
+
+def _planned(settings: Settings, scene: GaussianScene, filmed: list[Camera] | None) -> list[Camera]:
+    """The camera path that the settings name, between the cameras that the scene was filmed with if any."""
     view = {
         "width": settings.width,
         "height": settings.height,
         "fov_deg": settings.fov,
         "distance": settings.distance,
     }
-    filmed = None
-    if settings.trajectory in ("orbit", "still"):
-        try:
-            filmed = filmed_cameras(settings.scene, offset)
-        except TronError as error:
-            log.warning("%s; the orbit is planned without it", error)
-    if filmed is None:
+    if filmed is None or settings.trajectory not in ("orbit", "still"):
         return plan_cameras(scene, settings.trajectory, settings.frames, **view)
     log.info("the orbit stays between the %d cameras of %s", len(filmed), settings.scene.with_name(CAMERAS))
-    filmed = turn_cameras(filmed, turn)
     if settings.trajectory == "orbit":
         return filmed_orbit(filmed, settings.frames, up=scene.up, **view)
     return filmed_orbit(filmed, 1, up=scene.up, **view) * settings.frames
@@ -233,11 +238,12 @@ def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> 
         "seed",
         "variant",
         "surroundings",
+        "proxy",
     }
     return {
         "scene_sha256": sha256(light.scene),
         "environment_sha256": sha256(light.light),
-        "filmed_sha256": sha256(filmed) if light.cameras is None and filmed.is_file() else None,
+        "filmed_sha256": sha256(filmed) if filmed.is_file() else None,
         "cameras_sha256": None if light.cameras is None else sha256(light.cameras),
         "frames": len(cameras),
         "up": [round(float(value), 6) for value in turn[2]],

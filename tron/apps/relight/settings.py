@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from tron.apps.framing import TrajectoryName
 from tron.apps.relit import Background
 from tron.apps.surroundings import DESCRIPTION, Treatment
 from tron.color import Look
@@ -18,6 +17,7 @@ from tron.neural.clips import Overlap
 from tron.neural.configs import check_sizes
 from tron.neural.shipped import AUTO, DEFAULT, SHIPPED
 from tron.shards.schema import guidance_members, light_members
+from tron.trajectories import TrajectoryName
 
 DEFAULT_BUFFERS = (*light_members(), "indirect", "foreground", "mask", "share", "depth")
 BUFFERS = (
@@ -31,6 +31,7 @@ else:
     BufferName = Literal[BUFFERS]
 QUALITY = {"preview": PREVIEW, "final": FINEST}
 
+ProxyChoice = Literal["auto", "always", "never"]
 Side = Annotated[int, Field(ge=8, le=8192)]
 
 
@@ -53,6 +54,12 @@ class Settings(BaseModel):
         examples=["[1,1,1]"],
     )
     surroundings: Treatment = Field("drop", description=DESCRIPTION)
+    proxy: ProxyChoice = Field(
+        "auto",
+        description="what light sees of a scan whose splats lie in many layers: one layer of surfels, made "
+        "once and kept beside it as NAME.proxy.ply; auto: where the scan is thick by the log's number, or "
+        "its normals have no sign; never: the scan itself",
+    )
     rotation: float | tuple[float, float] = Field(
         0.0,
         description="turn of the environment about up, degrees, counter-clockwise seen from above; [0,360] "
