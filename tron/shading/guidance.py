@@ -137,6 +137,7 @@ class Arriving:
         visibility: share of the unshadowed irradiance that arrives, by channel.
         mirror: by reflection rays; None without.
         metals: by those of metals alone, in previews (:mod:`tron.shading.reflections`); None without.
+        behind: radiance behind the surfels (:class:`tron.relighting.ground.Ground`); None: the environment's.
         terms: of Burley's diffuse part for what arrives (:mod:`tron.shading.burley`); None: as of even light.
     """
 
@@ -144,10 +145,11 @@ class Arriving:
     mirror: Mirror | None = None
     terms: mi.Vector3f | None = None
     metals: Mirror | None = None
+    behind: mi.Color3f | None = None
 
     def in_rows(self, gbuffer: GBuffer) -> Arriving:
         """Of pixels row by row, where lanes are those of ``gbuffer``."""
-        found = (self.visibility, self.mirror, self.terms, self.metals)
+        found = (self.visibility, self.mirror, self.terms, self.metals, self.behind)
         return Arriving(*(None if value is None else gbuffer.in_rows(value) for value in found))
 
 
@@ -238,7 +240,9 @@ def shade_surface(
     response = Response.of(surface, lighting.split_sum, diffuse, arriving.terms)
     irradiance = response.unshadowed * arriving.visibility
     bounced = _bounced(surface, arriving)
-    if background is None:
+    if background is None and arriving.behind is not None:
+        behind = arriving.behind
+    elif background is None:
         behind = lighting.light.radiance(surface.direction)
     else:
         behind = mi.Color3f(*(dr.opaque(mi.Float, float(channel)) for channel in background))

@@ -32,6 +32,7 @@ from tron.storage import write_atomic
 if TYPE_CHECKING:
     from tron.neural.protocols import Renderer
     from tron.relighting import Illumination, Relighter
+    from tron.relighting.ground import Ground
     from tron.shading.environments.environment import EnvironmentMap
     from tron.shading.guidance import Guidance
     from tron.shading.lighting import Lighting
@@ -182,6 +183,7 @@ def trace(
     proxy: ProxyChoice = "auto",
     filmed: Sequence[Camera] | None = None,
     proxy_file: Path | None = None,
+    ground: Ground | None = None,
 ) -> None:
     """Trace the frames that are missing, and write the pictures of all.
 
@@ -194,6 +196,7 @@ def trace(
         backdrop: (M,) bool, surfels that are in no light's way (:class:`tron.relighting.Relighter`).
         proxy, filmed, proxy_file: whether light sees a proxy, cameras to film it, and where it is kept, as
             there.
+        ground: what the scene stands on, as there.
     """
     from tron.relighting import Relighter
 
@@ -201,7 +204,7 @@ def trace(
     relighter = Relighter(
         scene, estimation, bounces, backdrop=backdrop, track=rays,
         proxy=proxy, cameras=filmed, proxy_file=proxy_file,
-        filming=partial(track, label="filming a proxy for light"),
+        filming=partial(track, label="filming a proxy for light"), ground=ground,
     )  # fmt: skip
     for clip in clips:
         if lacking := clip.folder.lacking(len(cameras)):

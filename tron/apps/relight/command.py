@@ -50,6 +50,7 @@ from tron.trajectories import plan_cameras, turn_cameras
 
 if TYPE_CHECKING:
     from tron.neural.protocols import Renderer
+    from tron.relighting.ground import Ground
     from tron.shading.environments.environment import EnvironmentMap
 
 
@@ -109,6 +110,7 @@ def main(settings: Settings) -> None:
             clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite, model_defaults(Settings))
         traced = {"estimation": settings.estimation(), "seed": settings.seed, "proxy": settings.proxy}
         traced |= {"filmed": filmed, "proxy_file": settings.scene.with_suffix(".proxy.ply")}
+        traced["ground"] = _ground(settings, surrounded.content, cameras, float(turn[2] @ offset))
         trace(scene, cameras, clips, **traced, backdrop=surrounded.backdrop)
         clock.lap("guidance")
         if renderer is not None:
@@ -127,6 +129,20 @@ def main(settings: Settings) -> None:
             write_atomic(light.output_dir / "relight.json", json.dumps(report, indent=1) + "\n")
             made = len(cameras), len(clip.seconds), light.output_dir / "relit.mp4"
             log.info("frames: %d, rendered now: %d; look at %s", *made)
+
+
+def _ground(
+    settings: Settings, scene: GaussianScene, cameras: Sequence[Camera], offset: float
+) -> Ground | None:
+    """What the scene, z up, stands on; ``offset`` is the height that was taken away from its file's."""
+    from tron.relighting.ground import Ground, stands_free
+
+    if settings.ground == "none" or (settings.ground == "auto" and not stands_free(scene, cameras)):
+        return None
+    given = settings.ground if isinstance(settings.ground, float) else None
+    ground = Ground.under(scene, cameras[0], None if given is None else given - offset)
+    log.info("it stands on a ground at height %.4g; ground=none takes it away", ground.height + offset)
+    return ground
 
 
 def _filmed(path: Path, turn: np.ndarray, offset: np.ndarray) -> list[Camera] | None:
@@ -238,6 +254,7 @@ def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> 
         "seed",
         "variant",
         "surroundings",
+        "ground",
         "proxy",
     }
     return {

@@ -53,6 +53,11 @@ class Settings(BaseModel):
         "alpha; black in videos), or a colour as on screen, such as [1,1,1] for white",
         examples=["[1,1,1]"],
     )
+    ground: Literal["auto", "none"] | float = Field(
+        "auto",
+        description="level plane that shows the environment's ground and shadows of what stands there; auto: "
+        "below a thing that has no floor of its own; or its height along up, in the scene's units",
+    )
     surroundings: Treatment = Field("drop", description=DESCRIPTION)
     proxy: ProxyChoice = Field(
         "auto",
