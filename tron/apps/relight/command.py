@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -71,10 +72,10 @@ def main(settings: Settings) -> None:
     )
 
     clock = _Clock()
+    _check_paths(settings, settings.by_light())
+    settings = settings.shaped()
     lights = settings.by_light()
-    _check_paths(settings, lights)
-    size = settings.width, settings.height
-    given = None if settings.cameras is None else read_cameras(settings.cameras, *size)
+    given = None if settings.cameras is None else read_cameras(settings.cameras, *settings.size)
     with working("reading the lights, the network and the scene"):
         environments = [EnvironmentMap.load(light.light) for light in lights]
         activate(settings.variant, settings.threads)
@@ -102,7 +103,7 @@ def main(settings: Settings) -> None:
     clips = [_clip(*each, len(cameras), guidance, averaged > 1) for each in zip(lights, environments)]
     clock.lap("loading")
 
-    pixels = len(clips) * len(cameras) * settings.width * settings.height
+    pixels = len(clips) * len(cameras) * math.prod(settings.size)
     require_free_space(settings.output_dir, pixels * 6 * (len(clips[0].folder.buffers) + 3))
     log.info(clips[0].picture.describe())
     with locked(settings.output_dir):
