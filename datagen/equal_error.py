@@ -94,7 +94,7 @@ def _judge_scene(
 ) -> list[dict[str, Any]]:
     """A case for each light of the scene."""
     recipe, wanted = settings.split(spec.split), settings.equal_error
-    relighter = Relighter(scene)
+    relighter = Relighter(scene, proxy="never")
     copy(relighter).prepare()  # compiles it
     _, seconds = timed(lambda: relighter.transport.rays.met)
     cases = []
@@ -153,7 +153,7 @@ class _Frame:
         lighting = Lighting(self._environment)
 
         def bake() -> BouncedLight | None:
-            return relighter.under(lighting).bounced(self._camera)
+            return relighter.under(lighting).bounced
 
         light = relighter.under(lighting)
 

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tron.apps.framing import plan_cameras
 from tron.cameras import Camera
 from tron.gaussians import GaussianScene
 from tron.gaussians.harmonics import rgb_to_dc
 from tron.gaussians.scene import quats_from_normals
 from tron.relighting import EnvironmentMap
 from tron.runtime import activate
+from tron.trajectories import plan_cameras
 
 FLOOR, BALL, RING = 1, 2, 3
 OUTPUTS = Path("outputs/examples")

@@ -1,5 +1,7 @@
 """Camera paths around a target: the data engine's spiral and oscillation, an orbit, a stand, and keyframes.
 
+Around a scene that nobody has framed, :func:`plan_cameras` finds target and distance (:mod:`tron.framing`).
+
 Angles are in degrees. Azimuth turns counter-clockwise about ``up`` seen from its tip, and is measured from
 the world's x axis where up is +z. Elevation is the angle above the plane through the target orthogonal to
 ``up``.
@@ -8,17 +10,22 @@ the world's x axis where up is +z. Elevation is the angle above the plane throug
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NotRequired, TypedDict, Unpack
+from dataclasses import replace
+from typing import Any, Literal, NotRequired, TypedDict, Unpack
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from tron.cameras import Camera
 from tron.errors import TronError
-from tron.framing import outward
+from tron.framing import Surfels, find_subject, framed, has_floor, outward
 
 Vector = Sequence[float] | np.ndarray
 Z_UP = (0.0, 0.0, 1.0)
+TrajectoryName = Literal["orbit", "spiral", "oscillating", "still"]
+FILM_FOV_DEG, HIGHEST_DEG = 40.0, 75.0
+LOWEST_DEG = {True: 8.0, False: -30.0}
+"""Elevation of the lowest camera around a scene with a floor, under which nothing is seen, and without."""
 
 
 class View(TypedDict):
@@ -176,3 +183,51 @@ def _around(azimuth_deg: np.ndarray, elevation_deg: np.ndarray, **view: Unpack[V
         raise TronError(f"radius of a camera path must be positive, not {radius}")
     positions = target + radius * outward(azimuth_deg, elevation_deg, up)
     return [Camera.look_at(position, target, **image) for position in positions]
+
+
+_PATHS = {"orbit": orbit, "spiral": spiral, "oscillating": oscillating, "still": still}
+
+
+def plan_cameras(
+    scene: Surfels,
+    trajectory: TrajectoryName,
+    frames: int,
+    *,
+    width: int,
+    height: int,
+    fov_deg: float,
+    distance: float = 1.0,
+    **path: Any,
+) -> list[Camera]:
+    """A camera path around the scene's subject.
+
+    Args:
+        scene: the surfels, and which way is up.
+        trajectory: name of a path of this module.
+        frames: number of cameras.
+        width, height: pixels.
+        fov_deg: horizontal field of view, degrees.
+        distance: factor on the automatic distance.
+        path: what the trajectory is told beside, such as its elevations.
+    """
+    subject = find_subject(scene)
+    view = {"target": subject.centre, "up": scene.up, "width": width, "height": height, "fov_deg": fov_deg}
+
+    def at(radius: float) -> list[Camera]:
+        return _PATHS[trajectory](frames, radius=radius, **view, **path)
+
+    return framed(subject, at, width=width, height=height, fov_deg=fov_deg, distance=distance)
+
+
+def turn_cameras(cameras: list[Camera], rotation: np.ndarray) -> list[Camera]:
+    """The same views of a world turned about its origin by a (3, 3) rotation."""
+    turn = np.eye(4)
+    turn[:3, :3] = rotation.T
+    return [replace(camera, world_to_camera=camera.world_to_camera @ turn) for camera in cameras]
+
+
+def film_around(scene: Surfels, views: int, side: int) -> list[Camera]:
+    """Cameras on a spiral around the scene's subject, of ``side`` x ``side`` pixels, to film all of it."""
+    elevation_deg = (LOWEST_DEG[has_floor(scene)], HIGHEST_DEG)
+    view = {"width": side, "height": side, "fov_deg": FILM_FOV_DEG}
+    return plan_cameras(scene, "spiral", views, **view, elevation_deg=elevation_deg)

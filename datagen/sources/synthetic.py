@@ -236,7 +236,7 @@ def make_clips(
     """
     with stage("guidance"):
         seed = integer(spec.seed, spec.split, spec.index, "bounce")
-        relighter = Relighter(surfels, settings.estimation(spec.split), seed).prepare()
+        relighter = Relighter(surfels, settings.estimation(spec.split), seed, proxy="never").prepare()
     folder = scene_folder(settings.output_dir, spec.name)
     for group in spec.groups():
         with Spool(folder, len(group)) as spool:

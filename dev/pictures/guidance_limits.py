@@ -96,7 +96,7 @@ def lit(scene: GaussianScene, light: EnvironmentMap) -> np.ndarray:
 
 def from_photographs(scene: GaussianScene, light: EnvironmentMap) -> GaussianScene:
     """What a plain 3DGS file of the scene under ``light`` says of it: colours, not what they are made of."""
-    bounced = Relighter(scene).under(light).bounced(VIEW)
+    bounced = Relighter(scene).under(light).bounced
     assert bounced is not None
     shone = np.array(bounced.outgoing).T
     return replace(

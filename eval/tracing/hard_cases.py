@@ -77,7 +77,7 @@ def measure_hard_cases(rounds: int) -> Iterator[Row]:
 
 def thin_shadows(case: Case) -> tuple[dict[int, float], dict[int, float]]:
     """Means of irradiance of few filtered rays over that of many, in deep and in half shadow."""
-    light = Relighter(case.scene(), Estimation(rays=REFERENCE, bounces=0)).under(case.light)
+    light = Relighter(case.scene(), Estimation(rays=REFERENCE, bounces=0), proxy="never").under(case.light)
     many = light.render(case.camera, 99)
     truth, solid = luminance(many.irradiance), many.mask > 0.99
     share = truth / np.maximum(luminance(many.unshadowed), 1e-9)
@@ -94,7 +94,7 @@ def thin_shadows(case: Case) -> tuple[dict[int, float], dict[int, float]]:
 
 def over_truth(case: Case, estimation: Estimation) -> np.ndarray:
     """(3,) mean of ``lit`` over the path tracer's, where the pixels are solid."""
-    found = Relighter(case.scene(), estimation).under(case.light).render(case.camera)
+    found = Relighter(case.scene(), estimation, proxy="never").under(case.light).render(case.camera)
     solid = found.mask > 0.99
     return found.lit[solid].mean(0) / case.path_traced(PATHS, 16)[solid].mean(0)
 
@@ -106,7 +106,7 @@ def metal_times(rounds: int, size: int = 256) -> dict[str, Times]:
     dull = replace(scene, metallic=np.zeros_like(scene.metallic))
     contestants = {}
     for name, other in (("with", scene), ("without", dull)):
-        light = Relighter(other, PREVIEW).under(case.light)
+        light = Relighter(other, PREVIEW, proxy="never").under(case.light)
         contestants[name] = lambda light=light: light.render(case.camera)
     return interleaved(contestants, rounds)
 

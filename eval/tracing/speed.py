@@ -314,12 +314,12 @@ def measure_bounce(contenders: Contenders, size: int, rounds: int) -> Found:
     The frame with it is rendered by the ``Relighter``, and by hand from what that has traced and baked.
     """
     view, lighting = camera(size), Lighting(soft())
-    untraced = Relighter(contenders.scene)
+    untraced = Relighter(contenders.scene, proxy="never")
     light = copy(untraced).under(lighting)
-    tracer, baked = untraced.tracer(view), light.bounced(view)
+    tracer, baked = untraced.tracer(view), light.bounced
     contestants = {
         "transport": lambda: copy(untraced).transport.rays.met,
-        "bake": lambda: light.relighter.under(lighting).bounced(view),
+        "bake": lambda: light.relighter.under(lighting).bounced,
         "frame": lambda: render_guidance(tracer, view, lighting, FINAL),
         "lit frame": lambda: render_guidance(tracer, view, lighting, FINAL, bounce=baked),
         "relighter": lambda: light.render(view),

@@ -121,7 +121,7 @@ def test_all_chance_comes_from_seeds():
 
 
 LIGHTS_BY_HAND = re.compile(
-    r"(?:BounceTransport|BothSides)\.trace\(|[Tt]ransport\.bake\(|\.bake\(light(?:ing)?\b|\.sided\("
+    r"BounceTransport\.trace\(|[Tt]ransport\.bake\(|\.bake\(light(?:ing)?\b|\.sided\("
 )
 OWN_LIGHT = ("tron/relighting/", "tron/shading/", "tron/tracing/", "tron/integrators/")
 OWN_RAYS = {"tron/reconstruction/light/fit_environment.py"}

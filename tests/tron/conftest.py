@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tron.cameras import Camera
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 
 SPACING = 0.05
@@ -128,3 +129,20 @@ def kernels_of(variant: str) -> Callable[[Callable[[], object]], set[str]]:
         return {re.sub(r"drjit_[0-9a-f]+|align \d+", "", kernel["ir"].getvalue()) for kernel in kernels}
 
     return texts
+
+
+def cameras_around(count: int, distance: float = 4.0, size: int = 32) -> list[Camera]:
+    """Cameras on three rings that look at the origin."""
+    cameras = []
+    for i in range(count):
+        turn, height = 2 * np.pi * i / count, (2.0, 0.3, -2.0)[i % 3]
+        eye = np.array([3 * np.cos(turn), 3 * np.sin(turn), height])
+        eye *= distance / np.linalg.norm(eye)
+        cameras.append(Camera.look_at(eye, (0, 0, 0), fov_deg=32, width=size, height=size))
+    return cameras
+
+
+@pytest.fixture(scope="session")
+def around() -> Callable[..., list[Camera]]:
+    """Makes cameras on three rings that look at the origin."""
+    return cameras_around

@@ -81,8 +81,10 @@ _TYPE_BYTES = {
 _EXPORT = "is it a Gaussian scene? export it as an uncompressed 3DGS or 2DGS PLY"
 
 
-def write_ply(path: str | Path, scene: Mapping[str, Any]) -> None:
+def write_ply(path: str | Path, scene: Mapping[str, Any], comments: Sequence[str] = ()) -> None:
     """Write what a valid scene holds, by the names of GaussianScene's attributes, and its ``normals`` (M, 3).
+
+    Other ``comments`` stand in the header, after those of the scene.
 
     Raises:
         TronError: the file cannot be written.
@@ -107,7 +109,9 @@ def write_ply(path: str | Path, scene: Mapping[str, Any]) -> None:
         rows[name] = values
     element = plyfile.PlyElement.describe(rows, "vertex")
     with atomic_path(path) as temporary:
-        plyfile.PlyData([element], byte_order="<", comments=_constants(scene)).write(str(temporary))
+        plyfile.PlyData([element], byte_order="<", comments=[*_constants(scene), *comments]).write(
+            str(temporary)
+        )
 
 
 def read_ply(path: str | Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A scene that can be lit: the one place that traces bounces, picks the sides of surfels and bakes light.
+"""A scene that can be lit: the one place that makes a proxy, traces bounces, picks sides and bakes light.
 
     relighter = Relighter(GaussianScene.load("scene.ply"), Estimation(rays=64))
     light = relighter.under(EnvironmentMap.load("studio.hdr").rotated(90))   # bakes once
@@ -9,17 +9,19 @@
 What bounces depends on the scene, traced once, and on the light and its turn, baked for each; not on the
 camera. One :class:`Estimation` reaches the tracer's sides, the rays between surfels, the bake and the frames.
 
-Normals of plain 3DGS files have no sign, and their surfels are turned to each camera, which takes a tracer a
-camera. Their light is not traced anew for each, which would take longer than the frame: it is traced for both
-sides of every surfel, and each camera is shown the sides that face it.
+Light does not see a scan that is thick, nor one whose normals have no sign, as those of plain 3DGS files: it
+sees a proxy, one layer of oriented surfels (:mod:`tron.relighting.proxy`). Cameras see the scan itself, whose
+surfels without a sign are turned to each of them.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -28,14 +30,19 @@ import numpy as np
 from tron.cameras import Camera
 from tron.errors import TronError
 from tron.estimation import FINAL, Estimation
+from tron.gaussians.edit import subset
 from tron.gaussians.scene import GaussianScene
+from tron.relighting.ground import Ground
+from tron.relighting.proxy import THICK, Choice, ProxiedTracer, Proxy, fingerprint, make_proxy, thickness
 from tron.runtime import activate
-from tron.shading.bounces.bounce import BothSides, BouncedLight, BounceTransport, facing
+from tron.shading.bounces.bounce import BouncedLight, BounceTransport
 from tron.shading.environments.cubemap import CubemapLight
 from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Arriving, Guidance, arriving_light, shade, surface_maps, trace_views
 from tron.shading.lighting import Lighting
 from tron.tracing import GBuffer, SurfelTracer
+
+log = logging.getLogger(__name__)
 
 Light = EnvironmentMap | CubemapLight | Lighting
 REACH = ("oriented", "spacing", "kernel_degree", "log_scales", "opacity_logits")
@@ -51,6 +58,12 @@ class Relighter:
         seed: root of the random numbers of rays between surfels, and of bakes that are given no other.
         backdrop: (M,) bool, surfels that are seen, from the side they show, and in no light's way.
         track: wraps the loop over rays of the surfels, to show progress.
+        proxy: whether light sees a proxy: where the scene is thick or its normals have no sign (auto), or as
+            said.
+        cameras: that the scene was filmed with, to film its proxy; None: from around it.
+        proxy_file: PLY that keeps the proxy; taken where it was made from the same, else written.
+        filming: wraps the loop over the proxy's views, to show progress.
+        ground: what the scene stands on and throws shadows on, where frames show the environment.
     """
 
     def __init__(
@@ -61,55 +74,108 @@ class Relighter:
         *,
         backdrop: np.ndarray | None = None,
         track: Callable[[range], Iterable[int]] = iter,
+        proxy: Choice = "auto",
+        cameras: Sequence[Camera] | None = None,
+        proxy_file: Path | None = None,
+        filming: Callable[[range], Iterable[int]] = iter,
+        ground: Ground | None = None,
     ) -> None:
         if mi.variant() is None:
             activate()
         self.scene, self.estimation, self.seed = scene, estimation, seed
-        self._backdrop, self._track = backdrop, track
+        self._backdrop, self._track, self.ground = backdrop, track, ground
+        self._choice, self._cameras, self._proxy_file, self._filming = proxy, cameras, proxy_file, filming
         self._tracer = SurfelTracer(scene, backdrop=backdrop).sided(estimation.two_sided)
         self._turned_to: tuple[bytes, SurfelTracer] | None = None
 
-    def tracer(self, camera: Camera) -> SurfelTracer:
+    def tracer(self, camera: Camera) -> SurfelTracer | ProxiedTracer:
         """The tracer for a camera: one for all, unless surfels are turned to each."""
+        return (
+            self._seen_by(camera) if self._proxied is None else self._proxied.showing(self._seen_by(camera))
+        )
+
+    def _seen_by(self, camera: Camera) -> SurfelTracer:
+        """The scene itself; surfels without a sign are turned to the camera, but not those of a backdrop."""
         if self.scene.oriented:
             return self._tracer
         position = camera.position.tobytes()
         if self._turned_to is None or self._turned_to[0] != position:
-            shown = self.scene.turned_over(self._turned(camera))
-            self._turned_to = position, self._tracer.with_scene(shown)
+            away = self.scene.looks_away(camera.position)
+            turned = away if self._backdrop is None else away & ~self._backdrop
+            self._turned_to = position, self._tracer.turned_over(turned)
         return self._turned_to[1]
 
-    def _turned(self, camera: Camera) -> np.ndarray:
-        """(M,) bool: surfels whose other side a camera sees; a backdrop is not seen from behind."""
-        away = self.scene.looks_away(camera.position)
-        return away if self._backdrop is None else away & ~self._backdrop
+    @cached_property
+    def proxy(self) -> Proxy | None:
+        """What light sees in place of the scene; None: the scene. Made when it is first asked for."""
+        content = self.scene if self._backdrop is None else subset(self.scene, ~self._backdrop)
+        tracer = self._tracer if self._backdrop is None else SurfelTracer(content)
+        needed, said = self._needs_proxy(tracer)
+        if not needed:
+            if said:
+                log.info("%s: light sees the scan itself", said)
+            return None
+        made_from = "" if self._proxy_file is None else fingerprint(content, self._cameras)
+        kept = None if self._proxy_file is None else Proxy.load(self._proxy_file, made_from)
+        if kept is not None:
+            log.info("%s: light sees the proxy of %s, %d surfels", said, self._proxy_file, len(kept.surfels))
+            return kept
+        made = make_proxy(tracer, self._cameras, self._filming)
+        if made is None:
+            log.warning("%s, but views of the scene agree on no surface: light sees the scan itself", said)
+            return None
+        log.info("%s: light sees a proxy of %d surfels", said, len(made.surfels))
+        if self._proxy_file is not None:
+            try:
+                made.save(self._proxy_file, made_from)
+            except TronError as error:
+                log.info("the proxy is not kept: %s", error)
+        return made
+
+    def _needs_proxy(self, tracer: SurfelTracer) -> tuple[bool, str]:
+        """Whether light sees a proxy, and why, in words; empty words where nobody has to know."""
+        if self._choice != "auto":
+            return self._choice == "always", f"proxy={self._choice}"
+        thick = thickness(tracer, self._cameras)
+        said = f"{thick:.0%} of the opaque pixels are thicker than a spacing (thick from {THICK:.0%} on)"
+        if thick >= THICK:
+            return True, said
+        if not self.scene.oriented:
+            return True, f"{said}, and normals have no sign"
+        return False, ""
+
+    @cached_property
+    def _proxied(self) -> ProxiedTracer | None:
+        proxy = self.proxy
+        if proxy is None:
+            return None
+        light = SurfelTracer(proxy.surfels).sided(self.estimation.two_sided)
+        return ProxiedTracer(self._tracer, light, proxy.voxel, self._backdrop)
+
+    @cached_property
+    def _outward(self) -> np.ndarray:
+        """(M,) bool: surfels that look at the middle of the scene."""
+        return ~self.scene.looks_away(np.median(self.scene.means, axis=0))
+
+    @property
+    def _light(self) -> SurfelTracer:
+        """Surfels that light bounces among: the proxy's, or the scene's, turned outward without a sign."""
+        if self._proxied is not None:
+            return self._proxied.light
+        return self._tracer if self.scene.oriented else self._tracer.turned_over(self._outward)
 
     def surface_maps(self, camera: Camera) -> dict[str, np.ndarray]:
         """:func:`tron.shading.guidance.surface_maps` of a view: what no light changes."""
         return surface_maps(self.tracer(camera), camera)
 
-    @property
-    def transport(self) -> BounceTransport:
-        """Ways of light between surfels, traced when they are first asked for.
-
-        Raises:
-            TronError: normals have no sign, and each surfel has two sides that bounce.
-        """
-        if isinstance(self._transport, BothSides):
-            raise TronError(
-                "the normals of this scene have no sign", mend="turn them first: scene.facing(point)"
-            )
-        return self._transport
-
     @cached_property
-    def _transport(self) -> BounceTransport | BothSides:
-        kind = BounceTransport if self.scene.oriented else BothSides
-        return kind.trace(self._tracer, seed=self.seed, track=self._track)
+    def transport(self) -> BounceTransport:
+        """Ways of light between the surfels that it sees, traced when they are first asked for."""
+        return BounceTransport.trace(self._light, seed=self.seed, track=self._track)
 
     def prepare(self) -> Relighter:
-        """Trace what does not depend on lights now rather than under the first of them; returns itself."""
-        if self.estimation.bounces:
-            _ = self._transport
+        """Make what does not depend on lights now rather than under the first of them; returns itself."""
+        _ = self.transport if self.estimation.bounces else self.proxy
         return self
 
     def under(self, light: Light, seed: int | None = None) -> Illumination:
@@ -122,7 +188,7 @@ class Relighter:
         lighting = light if isinstance(light, Lighting) else Lighting(light)
         baked, seed = None, self.seed if seed is None else seed
         if self.estimation.bounces:
-            baked = self._transport.bake(lighting, self.estimation, seed=seed)
+            baked = self.transport.bake(lighting, self.estimation, seed=seed)
         return Illumination(self, lighting, self.estimation, seed, baked)
 
     def changed(self, scene: GaussianScene) -> Relighter:
@@ -131,7 +197,8 @@ class Relighter:
         Where surfels have moved or have other materials, the hierarchy is refitted and only rays that have
         changed are traced again: as if all were, to the bit. Rays are drawn in the hierarchy's order, which a
         refitted one keeps, so that what has moved has other noise than in a new ``Relighter``. Where sizes or
-        opacities differ, or surfels come or go, all is made anew.
+        opacities differ, surfels come or go, or light sees a proxy, all is made anew. Whether there is a
+        proxy stays as it was.
 
         Raises:
             TronError: another number of surfels than the backdrop has.
@@ -139,16 +206,21 @@ class Relighter:
         before = self.scene
         if self._backdrop is not None and len(scene) != len(self._backdrop):
             raise TronError("surfels have come or gone before a backdrop", mend="make a new Relighter")
-        if not all(np.array_equal(getattr(scene, name), getattr(before, name)) for name in REACH):
-            return Relighter(scene, self.estimation, self.seed, backdrop=self._backdrop, track=self._track)
+        proxy: Choice = "never" if self.proxy is None else "always"
+        reaches = all(np.array_equal(getattr(scene, name), getattr(before, name)) for name in REACH)
+        if not reaches or self.proxy is not None:
+            return Relighter(
+                scene, self.estimation, self.seed, backdrop=self._backdrop, track=self._track,
+                proxy=proxy, cameras=self._cameras, filming=self._filming, ground=self.ground,
+            )  # fmt: skip
         other = copy(self)
         other.scene, other._tracer, other._turned_to = scene, self._tracer.moved(scene), None
-        traced = other.__dict__.pop("_transport", None)
+        traced = other.__dict__.pop("transport", None)
         # Rays that look for moved surfels alone would find those of a backdrop too, and are not those of a
         # hierarchy that was sorted anew.
         kept = other._tracer.bvh.order is self._tracer.bvh.order and self._backdrop is None
         if traced is not None and kept:
-            other.__dict__["_transport"] = traced.moved(other._tracer)
+            other.__dict__["transport"] = traced.moved(other._light)
         return other
 
 
@@ -161,19 +233,14 @@ class Illumination:
         lighting: the prepared environment.
         estimation: of frames: the relighter's but for what :meth:`framed` has changed.
         seed: root of the shadow rays of surfels.
+        bounced: the bake, at the surfels that light sees; None where nothing bounces.
     """
 
     relighter: Relighter
     lighting: Lighting
     estimation: Estimation
     seed: int
-    _baked: BouncedLight | tuple[BouncedLight, BouncedLight] | None
-
-    def bounced(self, camera: Camera) -> BouncedLight | None:
-        """Bounced light as the tracer of a camera takes it; None where nothing bounces."""
-        if isinstance(self._baked, tuple):
-            return facing(*self._baked, self.relighter._turned(camera))
-        return self._baked
+    bounced: BouncedLight | None
 
     def turned_to(self, rotation_deg: float) -> Illumination:
         """The same environment at another rotation about +z: baked, not prepared again.
@@ -195,14 +262,16 @@ class Illumination:
         given = {"rays": rays, "filtered": filtered, "reflections": reflections, "supersample": supersample}
         wanted: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         other = Estimation.model_validate(self.estimation.model_dump() | wanted)
-        return Illumination(self.relighter, self.lighting, other, self.seed, self._baked)
+        return Illumination(self.relighter, self.lighting, other, self.seed, self.bounced)
 
     def trace(self, camera: Camera, seed: int = 0, view: GBuffer | None = None) -> TracedFrame:
         """Trace all rays of a frame; see :meth:`render`."""
-        tracer, bounce = self.relighter.tracer(camera), self.bounced(camera)
+        tracer, bounce = self.relighter.tracer(camera), self.bounced
         if view is None:
             (view,) = trace_views(tracer, camera, self.estimation, [bounce])
         arriving = arriving_light(tracer, view, self.lighting, self.estimation, seed, bounce)
+        if ground := self.relighter.ground:
+            arriving.behind = ground.behind(tracer, view, camera, self.lighting, self.estimation, seed)
         return TracedFrame(self.lighting, self.estimation, view, arriving)
 
     def render(
@@ -245,5 +314,5 @@ class TracedFrame:
 def views_under(lights: Sequence[Illumination], camera: Camera) -> list[GBuffer]:
     """What a camera sees under each of several lights of one relighter and estimation, traced once."""
     first = lights[0]
-    bounces = [light.bounced(camera) for light in lights]
+    bounces = [light.bounced for light in lights]
     return trace_views(first.relighter.tracer(camera), camera, first.estimation, bounces)

@@ -167,7 +167,7 @@ def _overwrite(sums: Composite, some: Composite, ray: mi.UInt32) -> None:
     """Overwrite the sums of the rays ``ray``."""
     for target, source in zip(sums.channels, some.channels, strict=True):
         dr.scatter(target, source, ray)
-    for name in ("mean_depth", "transmittance", "median_depth", "count"):
+    for name in ("mean_depth", "transmittance", "median_depth", "begin_depth", "count"):
         dr.scatter(getattr(sums, name), getattr(some, name), ray)
     dr.eval(sums)
 

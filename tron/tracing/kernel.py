@@ -116,25 +116,27 @@ class SurfelRecords:
             values=None if self.values is None else dr.detach(self.values),
         )
 
-    def turned_over(self) -> SurfelRecords:
-        """The same disks with their sides exchanged."""
+    def turned_over(self, which: mi.Bool) -> SurfelRecords:
+        """The same disks, those of ``which``, M lanes, with their sides exchanged."""
         return replace(
             self,
-            geometry=turned_geometry(self.geometry),
-            features=_negated(self.features, FEATURE_PACKETS, 0),
+            geometry=turned_geometry(self.geometry, which),
+            features=_negated(self.features, FEATURE_PACKETS, 0, which),
         )
 
 
-def turned_geometry(geometry: mi.Float) -> mi.Float:
-    """Geometry records of the same disks with their sides exchanged: t_v is negated."""
-    return _negated(geometry, GEOMETRY_PACKETS, 2)
+def turned_geometry(geometry: mi.Float, which: mi.Bool) -> mi.Float:
+    """Geometry records of the same disks, some with their sides exchanged: t_v is negated."""
+    return _negated(geometry, GEOMETRY_PACKETS, 2, which)
 
 
-def _negated(records: mi.Float, packets: int, packet: int) -> mi.Float:
-    """Records of so many packets, the first three floats of one of which change their sign."""
+def _negated(records: mi.Float, packets: int, packet: int, which: mi.Bool) -> mi.Float:
+    """Records of so many packets; the first three floats of one packet change their sign in ``which``."""
     index = dr.arange(mi.UInt32, dr.width(records))
-    place = index % (4 * packets)
-    values = dr.select((place >= 4 * packet) & (place < 4 * packet + 3), -records, records)
+    place, record = index % (4 * packets), index // (4 * packets)
+    turned = dr.gather(mi.Bool, which, record, record < dr.opaque(mi.UInt32, dr.width(which)))
+    turned &= (place >= 4 * packet) & (place < 4 * packet + 3)
+    values = dr.select(turned, -records, records)
     dr.eval(values)
     return values
 

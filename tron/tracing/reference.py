@@ -41,9 +41,10 @@ class ReferenceHits:
         roughness, metallic, mean_depth: (P,).
         transmittance: (P,) after the last counted hit.
         median_depth: (P,) distance of the first hit after which T < 0.5, or 0.
+        lift: (P,) distance from the first hit after which T < 0.9 to that one, or 0.
         hits: (P,) int, number of composited hits.
         margin: (P,) smallest distance of any value that the ray compares before it stops to its threshold
-            (T_MIN, alpha cut, stop, median): pixels with a tiny margin may differ in float32.
+            (T_MIN, alpha cut, stop, median, lift): pixels with a tiny margin may differ in float32.
         gap: (P,) smallest distance along the ray between two composited hits that are neighbours; where it is
             tiny, rounding may order them otherwise.
         candidates: (P,) int, surfels whose kernel counts where the ray hits them, on either side.
@@ -58,6 +59,7 @@ class ReferenceHits:
     mean_depth: np.ndarray
     transmittance: np.ndarray
     median_depth: np.ndarray
+    lift: np.ndarray
     hits: np.ndarray
     margin: np.ndarray
     gap: np.ndarray
@@ -165,7 +167,7 @@ def _composite_block(
     order = np.argsort(along, axis=1, kind="stable")  # stable: coincident surfels stay in the order of ids
     most = int(visible.sum(1).max(initial=0))
     out = np.zeros((rays, 12))
-    remaining, median, hits = np.ones(rays), np.zeros(rays), np.zeros(rays, int)
+    remaining, median, begin, hits = np.ones(rays), np.zeros(rays), np.zeros(rays), np.zeros(rays, int)
     last, margin, gap = np.zeros(rays), np.full(rays, np.inf), np.full(rays, np.inf)
     for slot in range(most):
         ray = np.flatnonzero((visible.sum(1) > slot) & (remaining >= STOP_TRANSMITTANCE))
@@ -176,10 +178,11 @@ def _composite_block(
         values = np.concatenate([materials[surfel], rgb, t[:, None]], 1)
         out[ray] += (before * alpha)[:, None] * values
         median[ray] = np.where((before >= 0.5) & (after < 0.5), t, median[ray])
+        begin[ray] = np.where((before >= 0.9) & (after < 0.9), t, begin[ray])
         if slot > 0:
             gap[ray] = np.minimum(gap[ray], t - last[ray])
-        thresholds = np.minimum(np.abs(after - 0.5), np.abs(after - STOP_TRANSMITTANCE))
-        margin[ray] = np.minimum(margin[ray], thresholds)
+        for threshold in (0.9, 0.5, STOP_TRANSMITTANCE):
+            margin[ray] = np.minimum(margin[ray], np.abs(after - threshold))
         remaining[ray], last[ray] = after, t
         hits[ray] += 1
     # What lies behind the hit that stopped a ray is never compared with anything.
@@ -196,6 +199,7 @@ def _composite_block(
         mean_depth=out[:, 11],
         transmittance=remaining,
         median_depth=median,
+        lift=np.where(median > 0, median - begin, 0),
         hits=hits,
         margin=np.minimum(np.minimum(margin, cuts), starts),
         gap=gap,

@@ -25,6 +25,8 @@ class Surface:
         position: mi.Point3f, world; meaningless where opacity is 0.
         depth: mi.Float, distance along the unit ray to the median hit, world units; 0 where there is none.
             Not differentiated.
+        lift: mi.Float, distance to it from the first hit after which less than 0.9 of the light is left: how
+            thick what stands for a surface is, world units; 0 where there is none. Not differentiated.
         normal: mi.Normal3f, unit, world, geometric; zero where opacity is 0.
         normal_sum: mi.Normal3f, sum of ``w n`` before it is brought to unit length: shorter than the opacity
             where the surfels of a ray face several ways.
@@ -38,6 +40,7 @@ class Surface:
 
     position: mi.Point3f
     depth: mi.Float
+    lift: mi.Float
     normal: mi.Normal3f
     normal_sum: mi.Normal3f
     base_color: mi.Color3f
@@ -64,6 +67,7 @@ def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surf
     return Surface(
         position=origin + distance * direction,
         depth=depth,
+        lift=dr.select(depth > 0, depth - dr.detach(sums.begin_depth), 0),
         normal=dr.select(oriented, normal / dr.sqrt(dr.select(oriented, squared, 1)), 0),
         normal_sum=normal,
         base_color=mi.Color3f(*channels[4:7]) * inverse,
@@ -79,7 +83,8 @@ def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surf
 def centres(records: SurfelRecords, surfel: mi.UInt32, active: mi.Bool | bool = True) -> Surface:
     """Centres, unit normals and materials of ``surfel``, one lane each, differentiable in the records.
 
-    Opacity is 1, also the surfels' own; 0 in inactive lanes. There is no ray: depth, direction and rgb are 0.
+    Opacity is 1, also the surfels' own; 0 in inactive lanes. There is no ray, and 0 is what comes of one:
+    depth, lift, direction and rgb.
     """
     active = mi.Bool(active)
 
@@ -91,6 +96,7 @@ def centres(records: SurfelRecords, surfel: mi.UInt32, active: mi.Bool | bool = 
     return Surface(
         position=mi.Point3f(centre.x, centre.y, centre.z),
         depth=mi.Float(0),
+        lift=mi.Float(0),
         normal=mi.Normal3f(normal.x, normal.y, normal.z),
         normal_sum=mi.Normal3f(normal.x, normal.y, normal.z),
         base_color=mi.Color3f(base.x, base.y, base.z),

@@ -95,12 +95,17 @@ class SurfelTracer:
         other._two_sided = two_sided
         return other
 
-    def turned_over(self) -> SurfelTracer:
-        """The same surfels with their sides exchanged, in the same hierarchy; without gradients."""
-        other = copy(self)
-        other.scene, other._parameters = self.scene.turned_over(np.ones(len(self.scene), bool)), None
-        other.records = self.records.turned_over()
-        other.bvh = replace(self.bvh, geometry=turned_geometry(self.bvh.geometry))
+    def turned_over(self, which: np.ndarray | None = None) -> SurfelTracer:
+        """The same surfels in the same hierarchy, sides exchanged; without gradients.
+
+        ``which``: (M,) bool, those that are turned; None: all.
+        """
+        which = np.ones(len(self.scene), bool) if which is None else which
+        other, turned = copy(self), mi.Bool(which)
+        other.scene, other._parameters = self.scene.turned_over(which), None
+        other.records = self.records.turned_over(turned)
+        in_order = dr.gather(mi.Bool, turned, self.bvh.order)
+        other.bvh = replace(self.bvh, geometry=turned_geometry(self.bvh.geometry, in_order))
         return other
 
     def update(self) -> None:
@@ -115,10 +120,6 @@ class SurfelTracer:
         if bool((self.bvh.area > LOOSE_BOXES * self._sorted_area)[0]):
             self.bvh = build_bvh(self._met())
             self._sorted_area = self.bvh.area
-
-    def with_scene(self, scene: GaussianScene) -> SurfelTracer:
-        """A tracer of another scene of the same surfels, sorted anew, with the same backdrop and sides."""
-        return SurfelTracer(scene, backdrop=self._backdrop).sided(self._two_sided)
 
     def _met(self) -> SurfelRecords:
         """The records that rays of no camera meet: those of the backdrop count nowhere."""

@@ -92,8 +92,8 @@ def test_the_recipe_says_how_many_things_there_are():
 def test_the_recipe_says_of_what_kinds_and_materials_they_are(style):
     choice = Choice(objects=(4, 4), things=("vase", "book"), materials=("metal", "paint"))
     drawn = [
-        draw_scene(index, "train", 0, style=style, lights=["overcast"], choice=choice, frames=2, path_frames=2)
-        for index in range(2)
+        draw_scene(seed, "train", 0, style=style, lights=["overcast"], choice=choice, frames=2, path_frames=2)
+        for seed in range(2)
     ]
     objects = [item for spec in drawn for item in spec.objects]
     assert {item.shape.kind for item in objects} == {"vase", "book"}
@@ -103,8 +103,9 @@ def test_the_recipe_says_of_what_kinds_and_materials_they_are(style):
 
 def test_unknown_kinds_and_families_are_refused_with_those_that_there_are():
     for key, known in (("things", "'vase'"), ("materials", "'metal'")):
+        words = [f"train.{key}=[floor]", "output_dir=data"]
         with pytest.raises(TronError, match=known):
-            check(compose_recipe("conf.datagen", Settings, [f"train.{key}=[floor]", "output_dir=d"]), Settings)
+            check(compose_recipe("conf.datagen", Settings, words), Settings)
 
 
 @pytest.mark.long

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tron.apps.framing import plan_cameras, turn_cameras
 from tron.cameras import Camera
 from tron.framing import find_subject, upright
 from tron.seeds import generator
+from tron.trajectories import plan_cameras, turn_cameras
 
 VIEW = {"width": 64, "height": 48, "fov_deg": 50.0}
 

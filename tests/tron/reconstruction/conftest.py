@@ -97,23 +97,6 @@ def painted_spheres(per_sphere: int = 300) -> GaussianScene:
     return scene.validate()
 
 
-def cameras_around(count: int, distance: float = 4.0, size: int = SIZE) -> list[Camera]:
-    """Cameras on three rings that look at the origin."""
-    cameras = []
-    for i in range(count):
-        turn, height = 2 * np.pi * i / count, (2.0, 0.3, -2.0)[i % 3]
-        eye = np.array([3 * np.cos(turn), 3 * np.sin(turn), height])
-        eye *= distance / np.linalg.norm(eye)
-        cameras.append(Camera.look_at(eye, (0, 0, 0), fov_deg=32, width=size, height=size))
-    return cameras
-
-
-@pytest.fixture(scope="session")
-def around() -> Callable[..., list[Camera]]:
-    """Makes cameras on three rings that look at the origin."""
-    return cameras_around
-
-
 def seen_by(tracer: SurfelTracer, camera: Camera, name: str) -> View:
     """What a camera sees of a scene, its true maps included; the opacity is the mask."""
     seen = tracer.gbuffer(camera).numpy()
@@ -140,12 +123,12 @@ def painted(variant: str) -> GaussianScene:
 
 
 @pytest.fixture(scope="session")
-def capture_of(variant: str) -> Callable[..., Capture]:
+def capture_of(variant: str, around: Callable[..., list[Camera]]) -> Callable[..., Capture]:
     """Makes the capture of a scene with all true maps; every fourth of its views is held out."""
 
     def make(scene: GaussianScene, views: int = 12) -> Capture:
         tracer = SurfelTracer(scene)
-        made = [seen_by(tracer, camera, f"{i:02d}") for i, camera in enumerate(cameras_around(views))]
+        made = [seen_by(tracer, camera, f"{i:02d}") for i, camera in enumerate(around(views, size=SIZE))]
         return Capture(tuple(made), test=frozenset(view.name for view in made[::4]))
 
     return make

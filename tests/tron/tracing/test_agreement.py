@@ -44,7 +44,8 @@ def scene_of(seed: int, count: int, degree: int, size: float) -> GaussianScene:
 def columns(seen: Surface) -> dict[str, np.ndarray]:
     """Sums of each ray, brought back from the normalised fields."""
     opacity = np.array(seen.opacity)
-    fields = {"opacity": opacity, "depth": np.array(seen.depth), "rgb": np.array(seen.rgb).T}
+    fields = {name: np.array(getattr(seen, name)) for name in ("opacity", "depth", "lift")}
+    fields["rgb"] = np.array(seen.rgb).T
     for name in ("base_color", "roughness", "metallic"):
         fields[name] = np.array(getattr(seen, name)).T * (
             opacity[:, None] if name == "base_color" else opacity
@@ -72,6 +73,7 @@ def test_tiles_hierarchy_and_reference_agree(seed, count, degree, size, distance
     expected = {
         "opacity": 1 - truth.transmittance,
         "depth": truth.median_depth,
+        "lift": truth.lift,
         **{name: getattr(truth, name) for name in ("rgb", "base_color", "roughness", "metallic")},
     }
     tracer = SurfelTracer(scene)

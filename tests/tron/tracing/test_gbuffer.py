@@ -30,6 +30,7 @@ def compare(scene, camera, tolerance=1e-4):
     for name, expected in {
         "opacity": opacity,
         "depth": truth.median_depth,
+        "lift": truth.lift,
         "rgb": truth.rgb,
         "normal_sum": truth.normal,
         "base_color": truth.base_color,

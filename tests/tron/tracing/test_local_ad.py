@@ -98,7 +98,7 @@ def test_hand_written_adjoint_is_what_local_differentiation_gives(random_scene, 
     restart()
     direction = rays.direction
     basis = sh_basis(direction.x, direction.y, direction.z)
-    weights = type(sums)(outer[:11], outer[11], outer[12], mi.Float(0), mi.UInt32(0))
+    weights = type(sums)(outer[:11], outer[11], outer[12], mi.Float(0), mi.Float(0), mi.UInt32(0))
     (kept,) = hits[0]
     accumulate_gradients(records, sums, weights, kept, rays.origin, direction, basis)
     for name, hand, local in zip(buffers, by_hand, gradients(), strict=True):

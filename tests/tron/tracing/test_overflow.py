@@ -54,6 +54,7 @@ def assert_agrees(seen, truth):
     assert steady.mean() > 0.9
     np.testing.assert_allclose(np.array(seen.opacity)[steady], opacity[steady], atol=1e-5)
     np.testing.assert_allclose(np.array(seen.depth)[steady], truth.median_depth[steady], atol=1e-5)
+    np.testing.assert_allclose(np.array(seen.lift)[steady], truth.lift[steady], atol=1e-5)
     color = np.array(seen.base_color).T * opacity[:, None]
     np.testing.assert_allclose(color[steady], truth.base_color[steady], atol=1e-5)
 

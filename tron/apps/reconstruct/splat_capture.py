@@ -17,17 +17,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import KDTree
 
-from tron.apps.framing import plan_cameras
 from tron.apps.surroundings import DESCRIPTION, Surrounded, Treatment, treat_surroundings
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.errors import TronError
-from tron.framing import has_floor
 from tron.gaussians.foreign_files import PACKED_SPLATS, refuse_foreign
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
-from tron.runtime import torch_device
 from tron.seeds import generator
+from tron.trajectories import film_around
 
 if TYPE_CHECKING:
     from tron.reconstruction.progress import Track
@@ -35,10 +33,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FOV_DEG, INSIDE_FOV_DEG = 40.0, 75.0
-HIGHEST_DEG = 75.0
-LOWEST_DEG = {True: 8.0, False: -30.0}
-"""Elevation of the lowest camera around a scene with a floor, under which nothing is seen, and without."""
+INSIDE_FOV_DEG = 75.0
 LOOKS = 8
 """Directions in which each place inside a room is filmed."""
 INSIDE_ELEVATIONS_DEG = (-20.0, 10.0)
@@ -125,9 +120,7 @@ def virtual_cameras(scene: GaussianScene, settings: SplatSettings, seed: int) ->
     outside = {"around": settings.views, "inside": 0, "both": settings.views // 2}[settings.cameras]
     cameras = []
     if outside:
-        elevation_deg = (LOWEST_DEG[has_floor(scene)], HIGHEST_DEG)
-        view = {"width": settings.side, "height": settings.side, "fov_deg": FOV_DEG}
-        cameras += plan_cameras(scene, "spiral", outside, **view, elevation_deg=elevation_deg)
+        cameras += film_around(scene, outside, settings.side)
     if inside := settings.views - outside:
         cameras += _inside(scene, inside, settings.side, seed)
     return cameras
@@ -169,22 +162,16 @@ def _level(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _agreeing(views: Sequence[View], settings: FusionSettings) -> list[View]:
     """The views with the depths that they agree on, 0 elsewhere; without any where there is no surface."""
-    import torch
-
-    from tron.reconstruction.geometry.fusion import DepthMap, empty_rays, fused_views
-
-    def tensor(values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(torch_device())
+    from tron.tracing.fusion import DepthMap, empty_rays, fused_views  # Mitsuba: not for --help
 
     maps = []
     for view in views:
         subject, depth = view.read("mask") > SOLID, view.read("depth")
-        empty = empty_rays(torch.from_numpy(subject).to(torch_device()))
-        maps.append(DepthMap(view.camera, tensor(depth), tensor(subject & (depth > 0)), empty))
-    agreed = fused_views(maps, settings)
+        maps.append(DepthMap(view.camera, depth, subject & (depth > 0), empty_rays(subject)))
+    agreed = fused_views(maps, settings.truncation, settings.sigma, settings.most_voxels)
     if not agreed:
         return [replace(view, depth=None) for view in views]
-    return [replace(view, depth=depth.cpu().numpy()) for view, (depth, _) in zip(views, agreed)]
+    return [replace(view, depth=depth) for view, (depth, _) in zip(views, agreed)]
 
 
 def _filmed(surrounded: Surrounded, name: str, camera: Camera) -> View:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +19,6 @@ import numpy as np
 
 import tron
 from tron.apps.frame_folder import FrameFolder
-from tron.apps.framing import plan_cameras, turn_cameras
 from tron.apps.relight.camera_files import (
     CAMERAS,
     filmed_cameras,
@@ -47,9 +47,11 @@ from tron.neural.shipped import DEFAULT, SHIPPED, checkpoint_file
 from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
 from tron.shards.schema import GUIDANCE
 from tron.storage import locked, require_free_space, sha256, write_atomic
+from tron.trajectories import plan_cameras, turn_cameras
 
 if TYPE_CHECKING:
     from tron.neural.protocols import Renderer
+    from tron.relighting.ground import Ground
     from tron.shading.environments.environment import EnvironmentMap
 
 
@@ -70,10 +72,10 @@ def main(settings: Settings) -> None:
     )
 
     clock = _Clock()
+    _check_paths(settings, settings.by_light())
+    settings = settings.shaped()
     lights = settings.by_light()
-    _check_paths(settings, lights)
-    size = settings.width, settings.height
-    given = None if settings.cameras is None else read_cameras(settings.cameras, *size)
+    given = None if settings.cameras is None else read_cameras(settings.cameras, *settings.size)
     with working("reading the lights, the network and the scene"):
         environments = [EnvironmentMap.load(light.light) for light in lights]
         activate(settings.variant, settings.threads)
@@ -88,10 +90,11 @@ def main(settings: Settings) -> None:
     with working("looking for surroundings"):
         surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
     scene = surrounded.shown
+    filmed = _filmed(settings.scene, turn, offset)
     if given is not None:
         cameras = turn_cameras(given, turn)
     else:
-        cameras = _planned(settings, surrounded.content, turn, offset)
+        cameras = _planned(settings, surrounded.content, filmed)
     # Without a network the relit picture is one of them, and is shown as such; so is lit if nothing bounces.
     guidance = [name for name in GUIDANCE if name != settings.source and (settings.bounces or name != "lit")]
     guidance = guidance if renderer is None else renderer.config.guidance
@@ -100,13 +103,15 @@ def main(settings: Settings) -> None:
     clips = [_clip(*each, len(cameras), guidance, averaged > 1) for each in zip(lights, environments)]
     clock.lap("loading")
 
-    pixels = len(clips) * len(cameras) * settings.width * settings.height
+    pixels = len(clips) * len(cameras) * math.prod(settings.size)
     require_free_space(settings.output_dir, pixels * 6 * (len(clips[0].folder.buffers) + 3))
     log.info(clips[0].picture.describe())
     with locked(settings.output_dir):
         for light, clip in zip(lights, clips):
             clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite, model_defaults(Settings))
-        traced = {"estimation": settings.estimation(), "seed": settings.seed}
+        traced = {"estimation": settings.estimation(), "seed": settings.seed, "proxy": settings.proxy}
+        traced |= {"filmed": filmed, "proxy_file": settings.scene.with_suffix(".proxy.ply")}
+        traced["ground"] = _ground(settings, surrounded.content, cameras, float(turn[2] @ offset))
         trace(scene, cameras, clips, **traced, backdrop=surrounded.backdrop)
         clock.lap("guidance")
         if renderer is not None:
@@ -127,24 +132,41 @@ def main(settings: Settings) -> None:
             log.info("frames: %d, rendered now: %d; look at %s", *made)
 
 
-def _planned(settings: Settings, scene: GaussianScene, turn: np.ndarray, offset: np.ndarray) -> list[Camera]:
-    """The camera path that the settings name, in the world in which up is +z; of the file's offset (3,)."""
+def _ground(
+    settings: Settings, scene: GaussianScene, cameras: Sequence[Camera], offset: float
+) -> Ground | None:
+    """What the scene, z up, stands on; ``offset`` is the height that was taken away from its file's."""
+    from tron.relighting.ground import Ground, stands_free
+
+    if settings.ground == "none" or (settings.ground == "auto" and not stands_free(scene, cameras)):
+        return None
+    given = settings.ground if isinstance(settings.ground, float) else None
+    ground = Ground.under(scene, cameras[0], None if given is None else given - offset)
+    log.info("it stands on a ground at height %.4g; ground=none takes it away", ground.height + offset)
+    return ground
+
+
+def _filmed(path: Path, turn: np.ndarray, offset: np.ndarray) -> list[Camera] | None:
+    """Cameras that a scene was filmed with, in the world turned by ``turn``; None where none lie beside."""
+    try:
+        filmed = filmed_cameras(path, offset)
+    except TronError as error:
+        log.warning("%s; the scene is filmed and orbited without it", error)
+        return None
+    return None if filmed is None else turn_cameras(filmed, turn)
+
+
+def _planned(settings: Settings, scene: GaussianScene, filmed: list[Camera] | None) -> list[Camera]:
+    """The camera path that the settings name, between the cameras that the scene was filmed with if any."""
     view = {
         "width": settings.width,
         "height": settings.height,
         "fov_deg": settings.fov,
         "distance": settings.distance,
     }
-    filmed = None
-    if settings.trajectory in ("orbit", "still"):
-        try:
-            filmed = filmed_cameras(settings.scene, offset)
-        except TronError as error:
-            log.warning("%s; the orbit is planned without it", error)
-    if filmed is None:
+    if filmed is None or settings.trajectory not in ("orbit", "still"):
         return plan_cameras(scene, settings.trajectory, settings.frames, **view)
     log.info("the orbit stays between the %d cameras of %s", len(filmed), settings.scene.with_name(CAMERAS))
-    filmed = turn_cameras(filmed, turn)
     if settings.trajectory == "orbit":
         return filmed_orbit(filmed, settings.frames, up=scene.up, **view)
     return filmed_orbit(filmed, 1, up=scene.up, **view) * settings.frames
@@ -204,13 +226,14 @@ def _load_scene(settings: Settings) -> GaussianScene:
 def _clip(
     light: Settings, environment: EnvironmentMap, frames: int, guidance: Sequence[str], averaged: bool
 ) -> Clip:
-    picture = RelitPicture(light.background, light.source)
+    picture = RelitPicture(light.background, light.source, light.look)
     needed = (*guidance, *picture.buffers, *light.buffers, *([DEPTH] if averaged else []))
     buffers = [name for name in needed if name != "relit"]
     return Clip(
         environment=environment,
         rotations=light.rotations(frames),
-        exposure=environment.exposure() if light.exposure == "auto" else light.exposure,
+        exposure=environment.exposure(),
+        chosen=None if light.exposure == "auto" else light.exposure,
         picture=picture,
         folder=FrameFolder(light.output_dir / "frames", tuple(dict.fromkeys(buffers))),
         guidance=guidance,
@@ -232,11 +255,13 @@ def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> 
         "seed",
         "variant",
         "surroundings",
+        "ground",
+        "proxy",
     }
     return {
         "scene_sha256": sha256(light.scene),
         "environment_sha256": sha256(light.light),
-        "filmed_sha256": sha256(filmed) if light.cameras is None and filmed.is_file() else None,
+        "filmed_sha256": sha256(filmed) if filmed.is_file() else None,
         "cameras_sha256": None if light.cameras is None else sha256(light.cameras),
         "frames": len(cameras),
         "up": [round(float(value), 6) for value in turn[2]],
@@ -260,7 +285,8 @@ def _report(
             "materials_guessed": scene.materials_guessed,
             "oriented": scene.oriented,
         },
-        "exposure": clip.exposure,
+        "exposure": clip.shown_exposure,
+        "guidance_exposure": clip.exposure,
         "frames": len(cameras),
         "frames_rendered": len(clip.seconds),
         "first_frame_seconds": clip.seconds[0] if clip.seconds else None,

@@ -1,8 +1,8 @@
 """Normals that the surfels' own depths agree on: they shape surfaces in stage 1 where no prior gives any.
 
-Every so many steps the median depths of all training views are rendered and fused (:mod:`.fusion`), and each
-view takes the normals of the fused surface back. Until the next time they are what the surfels' normals are
-pulled to by 2DGS's normal consistency (Huang et al. 2024, equation 14)
+Every so many steps the median depths of all training views are rendered and fused
+(:mod:`tron.tracing.fusion`), and each view takes the normals of the fused surface back. Until the next time
+they are what the surfels' normals are pulled to by 2DGS's normal consistency (Huang et al. 2024, equation 14)
 
     mean over pixels of sum_i w_i (1 - n_i . N) = opacity - (sum_i w_i n_i) . N,
 
@@ -18,9 +18,9 @@ from torch import Tensor
 
 from tron.captures import View
 from tron.gaussians.fields import FIELDS, PARAMETERS
-from tron.reconstruction.geometry.fusion import DepthMap, empty_rays, fused_views
 from tron.reconstruction.geometry.surfels import LearntSurfels
 from tron.reconstruction.settings import ConsistencySettings
+from tron.tracing.fusion import DepthMap, empty_rays, fused_views
 from tron.tracing.torch_bridge import render
 
 _SURFACE = 0.5
@@ -82,18 +82,21 @@ class FusedNormals:
         self._made_from = dict(tensors)
         maps = [self._depth_map(view) for view in self.views]
         # Half precision is a hundredth of a degree, and half the memory of many large views.
-        fused = fused_views(maps, self.settings)
-        self._normals = {view.name: normal.half() for view, (_, normal) in zip(self.views, fused)}
+        how = self.settings
+        fused = fused_views(maps, how.truncation, how.sigma, how.most_voxels)
+        device = tensors[_GEOMETRY[0]].device
+        self._normals = {
+            view.name: torch.from_numpy(normal).half().to(device)
+            for view, (_, normal) in zip(self.views, fused)
+        }
 
     def _depth_map(self, view: View) -> DepthMap:
         seen = render(
             _without_radiance(self._made_from), view.camera, kernel_degree=self.kernel_degree, sh_degree=0
         )
-        depth = seen["depth"]
-        empty = None
-        if view.has("mask"):
-            empty = empty_rays(torch.from_numpy(view.read("mask")).to(depth.device) > _SURFACE)
-        return DepthMap(view.camera, depth, (depth > 0).float(), empty)
+        depth = seen["depth"].cpu().numpy()
+        empty = empty_rays(view.read("mask") > _SURFACE) if view.has("mask") else None
+        return DepthMap(view.camera, depth, depth > 0, empty)
 
 
 def _without_radiance(geometry: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -1,9 +1,8 @@
 """Geometry of photographs without any prior: plane sweep, fusion, and what all views agree on.
 
 Each photograph's depth comes from its neighbours (:func:`swept`), depths that other photographs do not
-confirm are dropped, the rest is fused (:mod:`.fusion`), and each view takes its depth and normals back from
-the fused field (:func:`.fusion.consensus`). Photos, poses, masks and, where there are any, sparse points are
-all that is used.
+confirm are dropped, the rest is fused (:mod:`tron.tracing.fusion`), and each view takes its depth and normals
+back from the fused field. Photos, poses, masks and, where there are any, sparse points are all that is used.
 
 The sweep is from "A space-sweep approach to true multi-image matching" (Collins 1996): planes through space,
 even in inverse distance, on each of which every pixel is compared with where the neighbouring photographs see
@@ -24,7 +23,6 @@ import torch
 from torch import Tensor
 
 from tron.captures import Capture, View
-from tron.reconstruction.geometry.fusion import DepthMap, empty_rays, fused_views
 from tron.reconstruction.geometry.matching import (
     Photograph,
     agreed_cost,
@@ -38,6 +36,7 @@ from tron.reconstruction.geometry.seen_space import random_points
 from tron.reconstruction.progress import Track, untracked
 from tron.reconstruction.settings import StereoSettings
 from tron.runtime import torch_device
+from tron.tracing.fusion import DepthMap, empty_rays, fused_views
 
 log = logging.getLogger(__name__)
 
@@ -111,19 +110,17 @@ def stereo_maps(
     confident = sum(int(each.sum()) for each in known) / max(subject, 1)
     maps = [
         DepthMap(
-            photograph.camera, each.depth, torch.where(ok, 1.0, settings.unsure if view.has("mask") else 0.0),
-            empty_rays(photograph.subject) if view.has("mask") else None,
+            photograph.camera,
+            each.depth.cpu().numpy(),
+            np.where(ok.cpu().numpy(), 1.0, settings.unsure if view.has("mask") else 0.0),
+            empty_rays(photograph.subject.cpu().numpy()) if view.has("mask") else None,
         )
         for view, photograph, each, ok in zip(views, photographs, found, known)
     ]  # fmt: skip
     log.info("stereo: %.0f %% of the pixels have a depth that other photos confirm", 100 * confident)
-    return StereoMaps(
-        tuple(
-            _with_maps(view, photograph, depth, normal)
-            for view, photograph, (depth, normal) in zip(views, photographs, fused_views(maps, settings))
-        ),
-        confident,
-    )
+    agreed = fused_views(maps, settings.truncation, settings.sigma, settings.most_voxels)
+    every = zip(views, photographs, agreed)
+    return StereoMaps(tuple(_with_maps(view, shown, *found) for view, shown, found in every), confident)
 
 
 def most_side(views: Sequence[View], wanted: int) -> int:
@@ -136,14 +133,14 @@ def most_side(views: Sequence[View], wanted: int) -> int:
     return max(int(min(wanted, max(longest)) * min((_MOST_PIXELS / pixels) ** 0.5, 1)), 1)
 
 
-def _with_maps(view: View, photograph: Photograph, depth: Tensor, normal: Tensor) -> View:
+def _with_maps(view: View, photograph: Photograph, depth: np.ndarray, normal: np.ndarray) -> View:
     return View(
         view.name,
         photograph.camera,
         photograph.image.movedim(0, -1).cpu().numpy().clip(0, 1),
         view.space,
-        depth=depth.cpu().numpy(),
-        normal=normal.cpu().numpy(),
+        depth=depth,
+        normal=normal,
         mask=photograph.subject.float().cpu().numpy() if view.has("mask") else None,
     )
 

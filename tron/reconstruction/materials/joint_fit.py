@@ -118,7 +118,7 @@ def fit_jointly(
         TooFewSeen: the photos show too few of the surfels.
         TronError: a loss is not finite.
     """
-    relighter, curve = Relighter(scene, seed=seed), prior.tone_curve or capture.tone_curve
+    relighter, curve = Relighter(scene, seed=seed, proxy="never"), prior.tone_curve or capture.tone_curve
     tracer = relighter.tracer(capture.train_views[0].camera)
     found = observe(tracer, capture.train_views, capture.exposure, curve, track)
     colors = mean_colors(found, prior.same_exposure)

@@ -12,8 +12,7 @@ camera saw, with light of their own. Rays are stopped as in
 :mod:`tron.tracing.hierarchy.first_hit`, so each estimates the composited radiance without bias.
 
 Memory: 4 bytes a ray are kept, 128 MB of a million surfels with 32 rays each. While rays are traced,
-a million surfels at a time take another 250 bytes each: 380 MB in all, measured. Surfels of two faces
-(:class:`BothSides`) take more than three times that.
+a million surfels at a time take another 250 bytes each: 380 MB in all, measured.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from tron.errors import TronError
 from tron.estimation import FINAL, Diffuse, Estimation
@@ -362,86 +360,3 @@ class Undersides:
         for part in parts(self.tracer, self.surfel):
             place = dr.gather(mi.UInt32, self.place, part.surfel, part.gbuffer.opacity > 0)
             yield replace(part, surfel=place)
-
-
-def _joined(fronts: mi.Color3f, backs: mi.Color3f) -> mi.Color3f:
-    return mi.Color3f(*(dr.concat([front, back]) for front, back in zip(fronts, backs, strict=True)))
-
-
-@dataclass
-class BothSides:
-    """Transport of both faces of M surfels whose normals have no sign, as in plain files of 3DGS.
-
-    Each surfel has two faces with light of their own, whichever way its normal was turned: M surfels are 2 M
-    faces, and a ray that meets a surfel meets the face on its side. Transport is traced once for the scene,
-    once for the scene turned over (:meth:`trace`); a camera is then given the faces that it sees.
-
-    Attributes:
-        front: of the faces that the normals point away from, as if there were no others.
-        back: of the others.
-        faces: of all 2 M, fronts first; no ray meets a back.
-    """
-
-    front: BounceTransport
-    back: BounceTransport
-    faces: BounceTransport
-
-    @classmethod
-    def trace(
-        cls,
-        tracer: SurfelTracer,
-        rays: int = RAYS,
-        seed: int = 0,
-        track: Callable[[range], Iterable[int]] = iter,
-    ) -> BothSides:
-        """Trace ``rays`` rays of each face; arguments and errors as of :meth:`BounceTransport.trace`."""
-        return cls._of(*(SurfelRays(side, rays, seed, track) for side in (tracer, tracer.turned_over())))
-
-    @classmethod
-    def _of(cls, front: SurfelRays, back: SurfelRays) -> BothSides:
-        met = _of_faces(front.met, back.met, len(front.tracer.scene))
-        return cls(BounceTransport(front), BounceTransport(back), BounceTransport(front.meeting(met)))
-
-    def moved(self, tracer: SurfelTracer) -> BothSides:
-        """The same rays among surfels that have moved; as of :meth:`BounceTransport.moved`."""
-        return self._of(self.front.rays.after(tracer), self.back.rays.after(tracer.turned_over()))
-
-    def bake(
-        self, lighting: Lighting, estimation: Estimation = FINAL, seed: int = 0
-    ) -> tuple[BouncedLight, BouncedLight]:
-        """Light of ``lighting`` at the fronts, and at the backs: see :meth:`BounceTransport.bake`."""
-        sides = [side.bake(lighting, estimation, bounces=0, seed=seed) for side in (self.front, self.back)]
-        albedo = self.front.albedo(estimation.diffuse)
-        albedo, direct = _joined(albedo, albedo), _joined(*(side.direct for side in sides))
-        indirect = self.faces.indirect(direct, albedo, estimation.bounces)
-        outgoing = albedo * (direct + indirect)
-        count = len(self.front.tracer.scene)
-        for number, side in enumerate(sides):
-            face = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, number * count)
-            side.indirect = dr.gather(mi.Color3f, indirect, face)
-            side.outgoing = dr.gather(mi.Color3f, outgoing, face)
-        dr.eval(sides)
-        return sides[0], sides[1]
-
-
-def _of_faces(front: mi.UInt32, back: mi.UInt32, count: int) -> mi.UInt32:
-    """Codes of ``SurfelRays.met`` for the rays of all faces, from those of either side."""
-    surfels = dr.opaque(mi.UInt32, count)
-    place = dr.arange(mi.UInt32, dr.width(front) + dr.width(back))
-    ray, face = place // (2 * surfels), place % (2 * surfels)
-    over = face >= surfels
-    own = ray * surfels + dr.select(over, face - surfels, face)
-    code = dr.select(over, dr.gather(mi.UInt32, back, own, over), dr.gather(mi.UInt32, front, own, ~over))
-    other = over ^ ((code & 1) == 1)
-    met = dr.select(code == NOTHING, NOTHING, 2 * ((code >> 1) + dr.select(other, surfels, 0)))
-    dr.eval(met)
-    return met
-
-
-def facing(fronts: BouncedLight, backs: BouncedLight, turned: np.ndarray) -> BouncedLight:
-    """Of each surfel the light of its front, or where it is ``turned`` over, (M,) bool, of its back."""
-    over, front = mi.Bool(turned), vars(fronts)
-    shown = BouncedLight(**{name: dr.select(over, light, front[name]) for name, light in vars(backs).items()})
-    shown.behind = dr.select(over, fronts.outgoing, backs.outgoing)
-    dr.eval(shown)
-    return shown

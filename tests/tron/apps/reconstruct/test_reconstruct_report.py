@@ -10,7 +10,6 @@ import av
 import numpy as np
 import pytest
 
-from tron.apps.framing import turn_cameras
 from tron.apps.reconstruct.report import (
     BALL,
     ball_pictures,
@@ -27,7 +26,7 @@ from tron.color import to_display
 from tron.seeds import generator
 from tron.shading.environments.environment import EnvironmentMap
 from tron.tracing import SurfelTracer
-from tron.trajectories import orbit
+from tron.trajectories import orbit, turn_cameras
 
 MIDDLE = BALL // 2
 SMALL = ReportSettings(frames=4, side=32, views=2)
