@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -210,7 +211,8 @@ def _load_scene(settings: Settings) -> GaussianScene:
         log.warning(
             "%s has no materials%s: they are guessed from its colours, which keep the light it was captured "
             "in; tron-reconstruct capture=%s output_dir=OUT finds surfaces, materials and light",
-            settings.scene, "" if scene.oriented else " and normals without a sign", settings.scene,
+            settings.scene, "" if scene.oriented else " and normals without a sign",
+            quote(str(settings.scene)),
         )  # fmt: skip
     if settings.up is not None:
         scene.up = np.array(settings.up) / np.linalg.norm(settings.up)
