@@ -133,6 +133,8 @@ def test_a_capture_that_is_written_stands_where_its_files_stood(tmp_path, write)
     np.testing.assert_allclose(np.sort(stored, axis=0), np.sort(given, axis=0), rtol=0, atol=1e-6)
     again = load_capture(tmp_path / "out")
     np.testing.assert_array_equal(again.offset, capture.offset)
+    assert again.points is not None
+    assert capture.points is not None
     np.testing.assert_allclose(again.points, capture.points, atol=1e-6)
     for mine, other in zip(again.views, capture.views):
         np.testing.assert_allclose(mine.camera.world_to_camera, other.camera.world_to_camera, atol=1e-8)
