@@ -16,6 +16,7 @@ from tron.gaussians.scene import GaussianScene
 from tron.io.images import read_image
 from tron.metering import incident_exposure
 from tron.relighting import Guidance, Illumination, Relighter, views_under
+from tron.relighting.proxy import Choice
 from tron.seeds import generator
 from tron.shading.bounces.bounce import BounceTransport
 from tron.shading.environments.environment import EnvironmentMap
@@ -198,11 +199,13 @@ CHANGES = {
 )
 def test_a_changed_scene_is_lit_as_if_it_were_new(light, scene, change, signed):
     """A frame to the noise of a bake, none where nothing has moved; rays to the bit, drawn in one order."""
-    which = {} if signed else {"proxy": "never"}
-    before = Relighter(scene if signed else without_sign(scene), Estimation(rays=16), 3, **which).prepare()
+    proxy: Choice = "auto" if signed else "never"
+    before = Relighter(
+        scene if signed else without_sign(scene), Estimation(rays=16), 3, proxy=proxy
+    ).prepare()
     first = before.under(light).render(VIEWS[1])
     other = CHANGES[change](before.scene)
-    found, fresh = before.changed(other), Relighter(other, Estimation(rays=16), 3, **which)
+    found, fresh = before.changed(other), Relighter(other, Estimation(rays=16), 3, proxy=proxy)
     (ours, theirs) = (each.under(light) for each in (found, fresh))
     anew = BounceTransport.trace(found._light, seed=3)
     assert dr.all(found.transport.rays.met == anew.rays.met)
