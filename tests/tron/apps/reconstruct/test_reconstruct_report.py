@@ -92,12 +92,12 @@ def test_films_go_all_around_only_where_it_was_photographed_all_around(variant, 
     arc = around(12, 120)
     path = film_cameras(scene, capture_of(arc, scene), 8, 32)
     assert len(path) == 8
-    assert {(camera.width, camera.height) for camera in path} == {(32, 32)}
+    assert {(camera.width, camera.height) for camera in path} == {(32, 26)}  # the photos are 24 x 20
     positions = np.stack([camera.position for camera in path])
     photographed = np.stack([camera.position for camera in arc])
-    np.testing.assert_allclose(positions[0], photographed[0], atol=1e-9)
-    np.testing.assert_allclose(positions[4], photographed[-1], atol=1e-9)
-    np.testing.assert_allclose(positions[5:], positions[3:0:-1], atol=1e-12)  # back the same way: it loops
+    ends = np.linalg.norm(positions[[0, -1], None] - photographed[[0, -1]], axis=-1)
+    assert min(ends.trace(), ends[::-1].trace()) < 0.4  # from one end to the other, once
+    assert np.linalg.norm(positions[:, None] - positions, axis=-1)[np.triu_indices(8, 1)].min() > 0.1
     nearest = np.linalg.norm(positions[:, None] - photographed, axis=-1).min(axis=1)
     assert nearest.max() < 0.5
     for camera in path:
@@ -115,7 +115,7 @@ def test_films_hold_every_frame_and_differ_between_lights(variant, ball_on_floor
         with av.open(io.BytesIO(video), "r") as container:
             frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
         assert len(frames) == 4
-        assert frames[0].shape == (32, 32, 3)
+        assert frames[0].shape == (26, 32, 3)
         assert np.abs(frames[0].astype(float) - frames[2]).mean() > 1
         means.append(np.mean(frames, axis=0))
     assert len(films) == 3
