@@ -36,8 +36,6 @@ def sided_light(height: int = 32) -> EnvironmentMap:
 def lit_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     """The scene is a cloud of surfels: thick by the number, and light is to see it as it is."""
     monkeypatch.setattr("tron.relighting.relighter.THICK", 2.0)
-    for name, value in {"VIEWS": 24, "SIDE": 96}.items():  # of scans whose normals have no sign
-        monkeypatch.setattr("tron.relighting.proxy." + name, value)
 
 
 @pytest.fixture(scope="module")
