@@ -107,6 +107,7 @@ PAPER = {
         "reflections": 0,
         "supersample": 1,
         "diffuse": "lambert",
+        "proxy": "never",
     },
     "datagen": {"estimator": "plain", "two_sided": False, "diffuse": "lambert", "bounces": 0},
     "reconstruct": {
