@@ -163,7 +163,7 @@ def read_library(path: Path) -> dict[str, MtlMaterial]:
             material.roughness = _numbers(value, key)[0]
         elif key == "pm":
             material.metallic = _numbers(value, key)[0]
-        elif key in _TEXTURES:
+        elif key in _TEXTURES and value:  # exporters write the statement without a name
             material.textures[key] = _texture(value, path, material.left_out)
         elif key in _LEFT_OUT and value not in ("0", "0.0", "0.000000"):
             material.left_out.append(key.capitalize() if key.startswith("p") else key)

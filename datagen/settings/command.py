@@ -42,12 +42,15 @@ OUTSIDE = {
 ESTIMATED = ("estimator", "two_sided", "diffuse", "bounces", "reflections", "supersample")
 """Keys that decide how light on the surfels is estimated, named as in Estimation."""
 
+OF_A_SCENE = {"style", "things", "materials", "frames"}
+"""Keys of a split that decide what stands in a scene and along which path it is filmed."""
+
 CAPTURED: dict[str, Any] = {
     **dict.fromkeys(("seed", "path_frames", "objects", "families", "mesh_edge", "texels_per_unit"), True),
     **dict.fromkeys(("environment_height", "assets", "asset_names", "asset_share", "textures"), True),
     **dict.fromkeys(("texture_share", "environments", "map_share", "share_maps", "share_models"), True),
     **dict.fromkeys(("checklist", "catalogue", "allow_unlicensed", "variant"), True),
-    "test": {"style", "frames"},
+    "test": OF_A_SCENE,
     "capture": set(CaptureSettings.model_fields) - {"scenes"},
 }
 """Keys that decide what is in a capture."""
@@ -404,7 +407,7 @@ class Settings(ScaleSettings):
 
     def pseudo_capture_recipe(self) -> dict[str, Any]:
         """Keys that decide a pseudo-capture's content, as plain values; of the splits that have scenes."""
-        splits = {name: {"style", "frames"} for name in self.used_splits()}
+        splits = dict.fromkeys(self.used_splits(), OF_A_SCENE)
         shared = {key: True for key in CAPTURED if key not in ("capture", "test")}
         return self.model_dump(mode="json", include={**shared, **splits, "pseudo_capture": True})
 

@@ -9,6 +9,8 @@ from pydantic import Field, PositiveInt, ValidationInfo, field_validator, model_
 
 from datagen.settings import SettingsModel
 from datagen.world.lights import LightChoice
+from datagen.world.materials import ProceduralName
+from datagen.world.shapes import ThingName
 from datagen.world.styles import STYLES, StyleChoice
 from tron.seeds import generator
 
@@ -26,6 +28,18 @@ class SplitSettings(SettingsModel):
         description="What stands in a scene, on what, and how it is filmed. Scenes take those of a list in "
         "turns; {object: 15, table: 25} makes the first 15 scenes of one and the next 25 of another.",
         examples=["[mixed,table]"],
+    )
+    things: list[ThingName] = Field(
+        default=[],
+        description="Kinds of procedural objects, each as likely as another, in place of the style's own; [] "
+        "leaves them to the style.",
+        examples=["[vase,mug,book]"],
+    )
+    materials: list[ProceduralName] = Field(
+        default=[],
+        description="Families of procedural materials, of things and of what they stand on: those that suit "
+        "a piece, or any of these where none does; [] takes all.",
+        examples=["[paint,plastic,metal]"],
     )
     lights: list[LightChoice] = Field(
         default=["any"] * 4,

@@ -383,6 +383,8 @@ def draw_and_build(
             assets={name: outline(parts) for name, parts in models.items()},
             asset_share=settings.asset_share * (checked.model_share if checked else 1.0),
             objects=settings.objects,
+            things=tuple(recipe.things),
+            materials=tuple(recipe.materials),
             textures=sources.textures,
             texture_share=settings.texture_share,
         ),

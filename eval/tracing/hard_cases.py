@@ -39,7 +39,7 @@ Vector = tuple[float, float, float]
 
 def measure_hard_cases(rounds: int) -> Iterator[Row]:
     """Render all of them and their truth, a few minutes: rows of every case, and of the worst."""
-    deep, half = thin_shadows(bars())
+    deep, half, lit_deep, lit_half = thin_shadows(bars())
     sheets, suns = {}, {}
     for height in HEIGHTS:
         way = toward(*SHEET_SUN)
@@ -67,6 +67,8 @@ def measure_hard_cases(rounds: int) -> Iterator[Row]:
     for name, found, n in (
         ("thin_shadow.deep", deep, TRIALS),
         ("thin_shadow.half", half, TRIALS),
+        ("thin_shadow.lit_over_paths.deep", lit_deep, TRIALS),
+        ("thin_shadow.lit_over_paths.half", lit_half, TRIALS),
         ("sheet.ratio", sheets, 1),
         ("low_sun.ratio", suns, 1),
         ("metal.ratio", metal, 1),
@@ -75,20 +77,24 @@ def measure_hard_cases(rounds: int) -> Iterator[Row]:
             yield Row(metric=f"{name}.{case}", value=value, unit="x", n=n)
 
 
-def thin_shadows(case: Case) -> tuple[dict[int, float], dict[int, float]]:
-    """Means of irradiance of few filtered rays over that of many, in deep and in half shadow."""
+def thin_shadows(case: Case) -> tuple[dict[int, float], ...]:
+    """Ratios in deep and half shadow: of irradiance to many rays', of ``lit`` to Mitsuba's paths."""
     light = Relighter(case.scene(), Estimation(rays=REFERENCE, bounces=0), proxy="never").under(case.light)
     many = light.render(case.camera, 99)
     truth, solid = luminance(many.irradiance), many.mask > 0.99
     share = truth / np.maximum(luminance(many.unshadowed), 1e-9)
     where = (solid & (share < DEEP), solid & (share >= DEEP) & (share < HALF))
-    found: tuple[dict[int, float], dict[int, float]] = ({}, {})
+    traced = luminance(case.path_traced(PATHS))
+    bounced = Relighter(case.scene(), Estimation(rays=REFERENCE)).under(case.light)
+    found: tuple[dict[int, float], ...] = ({}, {}, {}, {})
     for rays in RAYS:
-        fewer = light.framed(rays=rays, filtered=True)
+        fewer, bouncing = (each.framed(rays=rays, filtered=True) for each in (light, bounced))
         few = [fewer.render(case.camera, k).irradiance for k in range(TRIALS)]
-        mean = np.mean([luminance(image) for image in few], 0)
-        for ratios, chosen in zip(found, where, strict=True):
-            ratios[rays] = float(mean[chosen].mean() / truth[chosen].mean())
+        lit = [bouncing.render(case.camera, k).lit for k in range(TRIALS)]
+        means = [np.mean([luminance(image) for image in images], 0) for images in (few, lit)]
+        pairs = [(mean, other, chosen) for mean, other in zip(means, (truth, traced)) for chosen in where]
+        for ratios, (mean, other, chosen) in zip(found, pairs, strict=True):
+            ratios[rays] = float(mean[chosen].mean() / other[chosen].mean())
     return found
 
 

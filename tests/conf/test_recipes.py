@@ -107,6 +107,8 @@ PAPER = {
         "reflections": 0,
         "supersample": 1,
         "diffuse": "lambert",
+        "look": "none",
+        "ground": "none",
         "proxy": "never",
     },
     "datagen": {"estimator": "plain", "two_sided": False, "diffuse": "lambert", "bounces": 0},

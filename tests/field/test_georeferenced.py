@@ -11,6 +11,7 @@ from PIL import Image
 from tron.apps.relight.camera_files import filmed_cameras, in_frame_of, read_cameras, write_cameras
 from tron.cameras import Camera, opencv_to_opengl
 from tron.captures import load_capture
+from tron.captures.folder import write_capture
 from tron.captures.view import View
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
@@ -116,6 +117,29 @@ def test_a_georeferenced_capture_equals_the_same_about_the_origin(tmp_path, writ
     )
 
 
+@pytest.mark.parametrize("write", [write_colmap, write_transforms])
+def test_a_capture_that_is_written_stands_where_its_files_stood(tmp_path, write):
+    write(tmp_path / "there", ECEF)
+    capture = load_capture(tmp_path / "there")
+    write_capture(tmp_path / "out", capture)
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    for frame, camera in zip(frames, standing(level(ECEF))[0]):
+        np.testing.assert_allclose(
+            opencv_to_opengl(np.array(frame["transform_matrix"])), at(camera, ECEF), atol=1e-6
+        )
+    rows = plyfile.PlyData.read(str(tmp_path / "out" / "points.ply"))["vertex"]
+    stored = np.stack([rows[axis] for axis in "xyz"], axis=1)
+    given = standing(level(ECEF))[1] + ECEF  # COLMAP keeps no order
+    np.testing.assert_allclose(np.sort(stored, axis=0), np.sort(given, axis=0), rtol=0, atol=1e-6)
+    again = load_capture(tmp_path / "out")
+    np.testing.assert_array_equal(again.offset, capture.offset)
+    assert again.points is not None
+    assert capture.points is not None
+    np.testing.assert_allclose(again.points, capture.points, atol=1e-6)
+    for mine, other in zip(again.views, capture.views):
+        np.testing.assert_allclose(mine.camera.world_to_camera, other.camera.world_to_camera, atol=1e-8)
+
+
 @pytest.mark.parametrize(
     ("distance", "taken"), [(0, False), (1, False), (0.9 * LARGE, False), (1.1 * LARGE, True), (1e6, True)]
 )
@@ -163,6 +187,13 @@ def test_a_scan_in_doubles_has_no_slices(tmp_path, caplog, place):
     again = GaussianScene.load(tmp_path / "c.ply")
     for name in ("means", "offset"):
         np.testing.assert_array_equal(getattr(again, name), getattr(there, name))
+    there.save(tmp_path / "map.ply", on_map=True)
+    rows = plyfile.PlyData.read(str(tmp_path / "map.ply"))["vertex"]
+    on_map = np.stack([rows[axis] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(on_map, there.means + there.offset, rtol=0, atol=1e-9)
+    back = GaussianScene.load(tmp_path / "map.ply")
+    np.testing.assert_allclose(back.means + (back.offset - there.offset), there.means, atol=1e-6)
+    assert back.oriented == there.oriented
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     turned = there.rotated(turn)
     world = (turned.means + turned.offset) @ turn

@@ -77,6 +77,7 @@ COLORS = {
     "carriage returns": (PLAIN.replace("\n", "\r\n"), {"a": "newmtl m\r\nKd 0.8 0.1 0.1\r\n"}, RED),
     "tabs, capitals and a byte order mark": (PLAIN, {"a": "\ufeffnewmtl\tm\n\tKD\t0.8 0.1 0.1\n"}, RED),
     "one number of colour": (PLAIN, {"a": "newmtl m\nKd 0.8\n"}, (0.8, 0.8, 0.8)),
+    "a texture without a name": (PLAIN, {"a": "newmtl m\nKd 0.8 0.1 0.1\nmap_Kd \nbump\n"}, RED),
     "a second of that name": (PLAIN, {"a": "newmtl m\nKd 0.8 0.1 0.1\nnewmtl m\nKd 0 1 0\n"}, RED),
 }  # fmt: skip
 

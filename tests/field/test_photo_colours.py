@@ -128,10 +128,11 @@ def pillow(kind: str, **saved) -> bytes:
     return stream.getvalue()
 
 
-def adobe_exif() -> bytes:
+def exif_of(space: int, index: str | None = None) -> bytes:
     exif = Image.Exif()
-    exif.get_ifd(0x8769)[0xA001] = 0xFFFF
-    exif.get_ifd(0x8769)[0xA005] = {1: "R03"}
+    exif.get_ifd(0x8769)[0xA001] = space
+    if index is not None:
+        exif.get_ifd(0x8769)[0xA005] = {1: index}
     return exif.tobytes()
 
 
@@ -145,7 +146,11 @@ def from_hdr(name: str):
 CASES = {
     "p3.jpg": (lambda: pillow("JPEG", quality=100, subsampling=0, icc_profile=ICC_P3), from_p3),
     "adobe.jpg": (lambda: pillow("JPEG", quality=100, subsampling=0, icc_profile=ICC_ADOBE), from_adobe),
-    "exif.jpg": (lambda: pillow("JPEG", quality=100, subsampling=0, exif=adobe_exif()), from_adobe),
+    "exif.jpg": (
+        lambda: pillow("JPEG", quality=100, subsampling=0, exif=exif_of(0xFFFF, "R03")),
+        from_adobe,
+    ),
+    "exif_2.jpg": (lambda: pillow("JPEG", quality=100, subsampling=0, exif=exif_of(2)), from_adobe),
     "p3_8.png": (lambda: png(stored(8), icc_chunk(ICC_P3)), from_p3),
     "p3_16.png": (lambda: png(stored(16), icc_chunk(ICC_P3)), from_p3),
     "table_16.png": (lambda: png(stored(16), icc_chunk(profile(P3, table_curve()))), from_p3),
@@ -239,6 +244,21 @@ def test_a_profile_that_is_of_no_use_is_a_line(data: bytes, said: str):
     (note,) = colors_of_profile(data, "RGB").notes()
     assert said in note
     assert "read as sRGB" in note
+
+
+@pytest.mark.parametrize(
+    "space, profile, said",
+    [
+        (1, None, ""),
+        (0xFFFF, None, "EXIF says that its colours are not sRGB's"),
+        (0xFFFF, ICC_P3, "colours are brought from Display P3"),
+    ],
+)
+def test_a_profile_that_was_lost_is_a_line(tmp_path: Path, space: int, profile: bytes | None, said: str):
+    """EXIF's ColorSpace of 65535 stands for another space than sRGB; the profile says which."""
+    (tmp_path / "a.jpg").write_bytes(pillow("JPEG", exif=exif_of(space), icc_profile=profile))
+    assert len(inspect_photo(tmp_path / "a.jpg").notes) == (said != "")
+    assert said in "".join(inspect_photo(tmp_path / "a.jpg").notes)
 
 
 def test_what_is_no_colour_is_not_converted(tmp_path: Path):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+import re
+import shlex
 import tarfile
 import zipfile
 from collections.abc import Callable
@@ -152,6 +154,18 @@ def test_the_commands_say_so(tmp_path: Path, monkeypatch, capsys, role: str, nam
     assert stop.value.code == 2, line
     assert len(line.splitlines()) == 1
     assert words[0] in line
+
+
+@pytest.mark.parametrize("kind", ["polycam", "record3d", "3dgs", "splatfacto"])
+def test_commands_that_a_line_names_can_be_typed(tmp_path: Path, kind: str) -> None:
+    """Whatever the folder is called: the shell takes each path for one word."""
+    path = tmp_path / "a (1), [b] & c" / kind
+    KNOWN[kind][0](path)
+    with pytest.raises(TronError) as caught:
+        load_capture(path)
+    assert caught.value.mend is not None
+    words = shlex.split(re.sub("[`;]", " ", caught.value.mend))
+    assert any(str(path) in word for word in words), words
 
 
 def test_an_empty_folder_and_one_around_a_capture(tmp_path: Path) -> None:

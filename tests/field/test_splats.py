@@ -102,6 +102,7 @@ def test_mip_splatting_is_read_with_its_filter(tmp_path, caplog):
         (["beta"], [], "beta (kernels of another shape"),
         (["sg_axis_count", "sg_sharp_0"], [], "sg_axis_count and 1 more (colours by spherical Gaussians)"),
         (["sb_params_0"], [], "sb_params_0 (colours by spherical Beta"),
+        (["trbf_center", "motion_0", "omega_0"], [], "trbf_center and 2 more (splats that move"),
         ([], ["SplatRenderMode: mip"], "SplatRenderMode: mip"),
         ([], ["SplatRenderMode: default"], None),
         (["segment", "red", "nx"], [], None),

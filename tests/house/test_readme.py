@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,13 @@ def test_the_python_examples_do_what_they_say(tmp_path, monkeypatch):
     picture = np.array(names["picture"])
     assert picture.shape == (24, 24, 3 * (len(Guidance.BUFFERS) - 1) + 1)  # buffers, opacity
     assert 0.3 < picture[12, 12, 0] < 0.45
+
+
+def test_every_extra_is_named_with_its_size():
+    extras = tomllib.loads((README.parent / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for page in (README, README.parent / "docs/start/install.md"):
+        rows = "".join(line for line in page.read_text().splitlines() if line.startswith("|"))
+        assert [name for name in extras if name not in ("dev", "surfels") and f"`{name}`" not in rows] == []
 
 
 def test_the_line_for_cuda_users_names_the_gpu_or_says_in_one_line_why_not():

@@ -310,11 +310,12 @@ def test_two_photos_without_poses(tmp_path: Path) -> None:
     assert not (tmp_path / "structure_from_motion").exists()
 
 
-def test_photos_without_features(tmp_path: Path) -> None:
+def test_photos_without_features(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for index in range(3):
         Image.fromarray(np.full((64, 64, 3), 40 * index, np.uint8)).save(tmp_path / f"{index}.jpg")
     settings = LoadSettings(workspace=tmp_path / "work", threads=1)
     assert "none of 3 photos could be posed" in refusal(tmp_path, settings)
+    assert "sfm.cc" not in capfd.readouterr().err  # a line of COLMAP's own, of C++
 
 
 COLMAP_FILES = ["cameras", "images", "points3D", "rigs", "frames"]

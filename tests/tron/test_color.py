@@ -147,3 +147,29 @@ def test_luminance_is_the_y_of_colour_science():
 def test_exposure_is_a_factor_on_linear_light():
     x = np.abs(linear_samples(100))
     assert (color.to_display(x, 0.25) == color.agx(0.25 * x)).all()
+
+
+def test_agx_is_undone_within_its_range():
+    x = np.abs(linear_samples(200)).clip(1e-3, 10)
+    np.testing.assert_allclose(color.from_agx(color.agx(x)), x, rtol=1e-4)
+    assert np.isfinite(color.from_agx(np.array([[0.0, 0.5, 1.0]]))).all()
+
+
+def test_the_look_of_photographs_keeps_grey_and_turns_the_curve_about_it():
+    grey = np.full((3, 3), 0.18) * np.array([[2**-0.01], [1.0], [2**0.01]])
+    plain, look = color.agx(grey), color.agx(grey, look="photograph")
+    np.testing.assert_allclose(look[1], plain[1], atol=1e-4)
+    contrast, saturation = color.LOOKS["photograph"]
+    assert (look[2, 0] - look[0, 0]) / (plain[2, 0] - plain[0, 0]) == pytest.approx(contrast, rel=1e-2)
+    # Saturation by OpenColorIO's CDL, of a picture without contrast.
+    graded = ocio.CDLTransform()
+    graded.setSat(saturation)
+    processor = ocio.Config.CreateRaw().getProcessor(graded).getDefaultCPUProcessor()
+    x = np.abs(linear_samples(50)).astype(np.float32)
+    low, high = color.AGX_LOG2_RANGE
+    pivot = 0.18 * 2 ** (low + color._AGX_PIVOT[0] * (high - low)) / 0.18
+    inset = x @ np.array(color.AGX_INSET).T
+    steeper = np.maximum(pivot * (inset / pivot) ** contrast @ np.linalg.inv(np.array(color.AGX_INSET)).T, 0)
+    kept = (steeper > 0).all(axis=1)
+    expected = np.array([processor.applyRGB(list(pixel)) for pixel in color.agx(steeper[kept])])
+    np.testing.assert_allclose(color.agx(x[kept], look="photograph"), expected.clip(0, 1), atol=2e-3)

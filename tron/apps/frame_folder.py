@@ -49,7 +49,7 @@ class FrameFolder:
         mend = "choose another output_dir, or replace them with overwrite=true"
         run = RunFolder(self.folder, "frames", SETTINGS_NAME, mend, defaults)
         if overwrite and run.difference(made_with) is not None:
-            run.clear("*.exr", "*.png")
+            run.clear("*.exr", "*.png", "exposure.json")
         else:
             run.require(made_with)
         run.keep(made_with)

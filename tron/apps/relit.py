@@ -23,7 +23,7 @@ import numpy as np
 from pydantic import Field
 
 from tron.apps.frame_folder import FrameFolder
-from tron.color import to_display
+from tron.color import Look, to_display
 
 Channel = Annotated[float, Field(ge=0, le=1)]
 Background = Literal["environment", "transparent"] | tuple[Channel, Channel, Channel]
@@ -36,10 +36,12 @@ class RelitPicture:
     Attributes:
         background: behind the surfels: "environment", "transparent" or a display colour, see above.
         source: the picture of the surfels: a network's, or a buffer of guidance.
+        look: of the picture (:data:`tron.color.LOOKS`).
     """
 
     background: Background
     source: Literal["neural", "lit", "shadowed"]
+    look: Look = "none"
 
     @property
     def neural(self) -> bool:
@@ -72,12 +74,15 @@ class RelitPicture:
 
         Args:
             folder: frames with ``buffers``.
-            exposure: the light's.
-            neural: the network's picture (H, W, 3), display values, if it is the source.
+            exposure: factor before AgX.
+            neural: radiance (H, W, 3) that the network's picture stands for, if it is the source.
         """
+        linear = neural
+        if linear is None:
+            linear = folder.read(index, self.source if self.background == "environment" else "foreground")
+        surfels = to_display(linear, exposure, look=self.look)
         if self.background == "environment":
-            return to_display(folder.read(index, self.source), exposure) if neural is None else neural
-        surfels = to_display(folder.read(index, "foreground"), exposure) if neural is None else neural
+            return surfels
         if self.background == "transparent":
             return np.concatenate([surfels, folder.read(index, "mask")[..., :1]], axis=2)
         return composite(surfels, self.background, folder.read(index, "share")[..., :1])

@@ -8,6 +8,7 @@
 
 nerfstudio and instant-ngp read the cameras, images, split and points and pass over the rest. The object
 "tron" says what their format has no word for: colour space, exposure, up, which maps belong to which view.
+What was taken away from large coordinates is put back, in float64, and is named as "offset".
 Reading trusts nothing in the file: paths that leave the folder are refused, by name or by link.
 """
 
@@ -32,6 +33,7 @@ from tron.captures.settings import PhotoSettings
 from tron.captures.view import MAPS, ColorSpace, View
 from tron.errors import TronError, located
 from tron.io.images import MAX_SIDE, encode_exr, encode_png, read_image
+from tron.io.local_frame import ORIGIN, moved_cameras
 from tron.io.transforms_json import read_json
 from tron.storage import atomic_folder
 
@@ -104,6 +106,7 @@ class _Tron(BaseModel):
     test: list[str]
     skipped: dict[str, str] = Field(default_factory=dict)
     points: InnerPath | None = None
+    offset: tuple[float, float, float] | None = None
     views: dict[str, _ViewEntry]
 
     @field_validator("version")
@@ -164,7 +167,8 @@ def write_capture(
             file_path, entry = _write_view(folder, view, stem)
             entries[file_path] = entry
         if capture.points is not None:
-            (folder / POINTS_NAME).write_bytes(encode_points(capture.points, capture.point_colors))
+            places = capture.points + capture.offset if capture.offset.any() else capture.points
+            (folder / POINTS_NAME).write_bytes(encode_points(places, capture.point_colors))
         text = _describe(capture, entries).model_dump_json(indent=1, exclude_none=True) + "\n"
         (folder / TRANSFORMS_NAME).write_bytes(text.encode())
 
@@ -193,6 +197,7 @@ def read_capture_folder(path: str | os.PathLike[str]) -> Capture:
         points = colors = None
         if tron.points is not None:
             points, colors = read_points(_existing(folder, tron.points))
+            points = points if tron.offset is None else points - tron.offset
         return Capture(
             views=tuple(views),
             test=frozenset(tron.test),
@@ -203,6 +208,7 @@ def read_capture_folder(path: str | os.PathLike[str]) -> Capture:
             transform=np.array(tron.transform),
             skipped=tron.skipped,
             tone_curve="agx",
+            offset=np.array(tron.offset or ORIGIN),
         )
 
 
@@ -287,17 +293,19 @@ def _write(path: Path, data: bytes) -> None:
 def _describe(capture: Capture, entries: Mapping[str, _ViewEntry]) -> _Transforms:
     intrinsics = [_intrinsics(view.camera) for view in capture.views]
     shared = intrinsics[0] if all(each == intrinsics[0] for each in intrinsics) else {}
+    cameras = moved_cameras([view.camera for view in capture.views], capture.offset)
     frames = [
         _Frame(
             file_path=file_path,
-            transform_matrix=_matrix(opencv_to_opengl(view.camera.camera_to_world)),
+            transform_matrix=_matrix(opencv_to_opengl(moved.camera_to_world)),
             **({} if shared else own),
         )
-        for view, own, file_path in zip(capture.views, intrinsics, entries)
+        for moved, own, file_path in zip(cameras, intrinsics, entries)
     ]
     train = [path for path, entry in entries.items() if entry.name not in capture.test]
     test = [path for path, entry in entries.items() if entry.name in capture.test]
     x, y, z = capture.up.tolist()
+    east, north, high = capture.offset.tolist()
     points = None if capture.points is None else POINTS_NAME
     tron = _Tron(
         version=FORMAT_VERSION,
@@ -308,6 +316,7 @@ def _describe(capture: Capture, entries: Mapping[str, _ViewEntry]) -> _Transform
         test=sorted(capture.test),
         skipped=dict(capture.skipped),
         points=points,
+        offset=(east, north, high) if capture.offset.any() else None,
         views=dict(entries),
     )
     return _Transforms(
@@ -395,6 +404,7 @@ def _camera(transforms: _Transforms, frame: _Frame, name: str) -> Camera:
         if values[key] is None:
             raise TronError(f"{key} is missing", f"view {name}")
     camera_to_world = opengl_to_opencv(np.array(frame.transform_matrix))
+    camera_to_world[:3, 3] -= transforms.tron.offset or ORIGIN
     # Rotations that are a little off are transposed twice on their way here: the translation is solved for,
     # which gives back what was written, not R R^T times it.
     world_to_camera = np.eye(4)
@@ -436,8 +446,8 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def encode_points(points: np.ndarray, colors: np.ndarray | None) -> bytes:
-    """PLY of points (N, 3) in float32 and display colours (N, 3) in 8 bits."""
-    columns = [(axis, "<f4") for axis in "xyz"]
+    """PLY of points (N, 3) in float32, or in float64 as they are, and display colours (N, 3) in 8 bits."""
+    columns = [(axis, "<f8" if points.dtype == np.float64 else "<f4") for axis in "xyz"]
     if colors is not None:
         columns += [(channel, "u1") for channel in _CHANNELS]
     rows = np.empty(len(points), columns)

@@ -8,6 +8,7 @@ import re
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 from scipy.special import log_expit
@@ -29,7 +30,7 @@ def refuse_foreign(path: Path) -> None:
     """Raise TronError if a file, by its name or what it begins with, needs a step before it is a scene."""
     suffix = path.suffix.lower()
     if suffix in VIDEOS:
-        mend = f"tron-reconstruct capture={path.name} output_dir=OUT makes a scene of its frames"
+        mend = f"tron-reconstruct capture={quote(path.name)} output_dir=OUT makes a scene of its frames"
         raise TronError("a video is no scene", path, mend)
     if suffix in PACKED_SPLATS:
         raise packed_splats(path, PACKED_SPLATS[suffix])
@@ -40,7 +41,8 @@ def packed_splats(path: Path, kind: str) -> TronError:
     """The error for Gaussians in a packed format, such as "Niantic's .spz"."""
     plain = path.name.removesuffix(path.suffix).removesuffix(".compressed") + ".ply"
     mend = (
-        f"make a plain 3DGS PLY: npx @playcanvas/splat-transform {path.name} {plain}, or superspl.at/convert"
+        f"make a plain 3DGS PLY: npx @playcanvas/splat-transform {quote(path.name)} {quote(plain)}, "
+        "or superspl.at/convert"
     )
     return TronError(f"Gaussians in a packed format, {kind}", path, mend)
 
@@ -85,6 +87,7 @@ _PROPERTIES = {
     r"sb_params_.*": "colours by spherical Beta functions",
     r"sg_.*": "colours by spherical Gaussians",
     r"sv_.*": "colours by spherical Voronoi cells",
+    r"trbf_.*|motion_\d+|omega_\d+": "splats that move, as in Spacetime Gaussians",
 }
 """Properties by a pattern of their names, and what they change."""
 _MODE = "splatrendermode:"

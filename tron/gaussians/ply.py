@@ -104,7 +104,8 @@ def write_ply(path: str | Path, scene: Mapping[str, Any], comments: Sequence[str
     add([THIRD_SCALE], log_scales.min(axis=1) + np.float32(np.log(FLATNESS)))
     for name in ("quats", *MATERIALS, "object_id"):
         add(FIELDS[name].properties, scene[name])
-    rows = np.empty(len(sh), dtype=[(name, "<i4" if name == "object_id" else "<f4") for name in columns])
+    kinds = {name: "<f8" if values.dtype == np.float64 else "<f4" for name, values in columns.items()}
+    rows = np.empty(len(sh), dtype=list((kinds | {"object_id": "<i4"}).items()))
     for name, values in columns.items():
         rows[name] = values
     element = plyfile.PlyElement.describe(rows, "vertex")
@@ -159,7 +160,8 @@ def read_ply(path: str | Path) -> dict[str, Any]:
         raise TronError("the scene has no surfels", path)
     offset = constants.get("offset", [0.0, 0.0, 0.0])
     means = field("means")
-    if not constants:  # where a file of TRON's stands was decided when it was written
+    # Where a file of TRON's stands was decided when it was written, but where its coordinates were put back.
+    if not constants or columns["x"].dtype == np.float64:
         means, offset = _about_local_origin(columns, path)
     quats, log_scales = flattened(field("quats"), stack(scales))
     sh = _harmonics(columns, stack, path)

@@ -204,13 +204,20 @@ class GaussianScene:
         if self.offset.shape != (3,) or not np.isfinite(self.offset).all():
             raise TronError(f"offset is {self.offset.tolist()}", mend="give three finite numbers")
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, on_map: bool = False) -> None:
         """Write a PLY that 3DGS readers open too (:mod:`tron.gaussians.ply`), atomically.
+
+        Args:
+            path: the file.
+            on_map: put ``offset`` back, in float64, for programs that know nothing of our comment.
 
         Raises:
             TronError: the scene is not whole, or the file cannot be written.
         """
-        write_ply(path, vars(self.validate()) | {"normals": self.normals()})
+        content = vars(self.validate()) | {"normals": self.normals()}
+        if on_map and self.offset.any():
+            content |= {"means": self.means + self.offset, "offset": np.zeros(3)}
+        write_ply(path, content)
 
     @classmethod
     def load(cls, path: str | Path) -> GaussianScene:

@@ -2,7 +2,8 @@
 
 Of several statements the first holds: PNG's cICP, an ICC profile, HEIC's nclx, PNG's sRGB chunk, its gAMA and
 cHRM, EXIF's Adobe RGB. Without any a picture is in sRGB. Profiles are Pillow's ImageCms' work; what has 16
-bits, which that cannot take, goes through the profile's own curves and matrix.
+bits, which that cannot take, goes through the profile's own curves and matrix. EXIF's "uncalibrated", which
+phones write beside a profile, is a line where the profile was lost.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ _SRGB_GAMMA, _GAMMA_MARGIN = 1 / 2.2, 0.05
 """A gAMA within this share of sRGB's stands for sRGB, as libpng has it."""
 _ADOBE = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 _ADOBE_GAMMA = 563 / 256
-_INTEROPERABILITY, _ADOBE_INTEROPERABILITY = 0xA005, "R03"
+_EXIF, _COLOR_SPACE, _INTEROPERABILITY = 0x8769, 0xA001, 0xA005
+_ADOBE_SPACE, _UNCALIBRATED, _ADOBE_INTEROPERABILITY = 2, 0xFFFF, "R03"
+"""Of EXIF's ColorSpace: 2, which the standard does not have, is what some cameras write for Adobe RGB."""
 _SAME_LEVELS = 2
 """Profiles that change no colour by more levels of 8 bits are sRGB's, of which many are about."""
 _STEPS = 9
@@ -101,13 +104,20 @@ def colors_of_file(picture: Image.Image, data: bytes = b"") -> DisplayColors:
         return DisplayColors()
     if b"gAMA" in chunks or b"cHRM" in chunks:
         return _colors_of_gamma(chunks)
-    try:
-        index = picture.getexif().get_ifd(_INTEROPERABILITY).get(1, "")
-    except KeyError:  # Pillow before 13 says so that there is no such folder
-        index = ""
-    if str(index).strip("\0 ") == _ADOBE_INTEROPERABILITY:
+    space, index = _exif(picture, _EXIF, _COLOR_SPACE), _exif(picture, _INTEROPERABILITY, 1)
+    if space == _ADOBE_SPACE or str(index).strip("\0 ") == _ADOBE_INTEROPERABILITY:
         return DisplayColors("Adobe RGB (EXIF)", _by_gamma(_ADOBE_GAMMA, _ADOBE))
+    if space == _UNCALIBRATED:
+        return DisplayColors(note="EXIF says that its colours are not sRGB's, and not which: read as sRGB")
     return DisplayColors()
+
+
+def _exif(picture: Image.Image, folder: int, tag: int) -> Any:
+    """A value of one of EXIF's folders; None where it is not there."""
+    try:
+        return picture.getexif().get_ifd(folder).get(tag)
+    except KeyError:  # Pillow before 13 says so that there is no such folder
+        return None
 
 
 def colors_of_code_points(primaries: int, transfer: int, where: str) -> DisplayColors:

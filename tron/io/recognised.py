@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from shlex import quote
 from typing import NamedTuple
 
 from tron.errors import TronError
@@ -139,9 +140,9 @@ def _folder(path: Path) -> Sight | None:
         newest = max(
             path.glob("point_cloud/iteration_*/point_cloud.ply"), key=lambda each: _number(each.parent)
         )
-        return Sight("a model folder of 3DGS", f"tron-relight scene={newest} takes its splats")
+        return Sight("a model folder of 3DGS", f"tron-relight scene={quote(str(newest))} takes its splats")
     if (path / "nerfstudio_models").is_dir():
-        config = path / "config.yml"
+        config = quote(str(path / "config.yml"))
         mend = (
             f"`ns-export gaussian-splat --load-config {config} --output-dir OUT` writes a PLY of its splats"
         )
@@ -151,8 +152,8 @@ def _folder(path: Path) -> Sight | None:
 
 def _converted(program: str, path: Path, photos: Path) -> str:
     return (
-        f"capture={photos} poses its photos anew; `ns-process-data {program} --data {path} --output-dir OUT` "
-        "makes a transforms.json that keeps its poses"
+        f"capture={quote(str(photos))} poses its photos anew; `ns-process-data {program} "
+        f"--data {quote(str(path))} --output-dir OUT` makes a transforms.json that keeps its poses"
     )
 
 

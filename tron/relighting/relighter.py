@@ -32,6 +32,7 @@ from tron.errors import TronError
 from tron.estimation import FINAL, Estimation
 from tron.gaussians.edit import subset
 from tron.gaussians.scene import GaussianScene
+from tron.relighting.ground import Ground
 from tron.relighting.proxy import THICK, Choice, ProxiedTracer, Proxy, fingerprint, make_proxy, thickness
 from tron.runtime import activate
 from tron.shading.bounces.bounce import BouncedLight, BounceTransport
@@ -62,6 +63,7 @@ class Relighter:
         cameras: that the scene was filmed with, to film its proxy; None: from around it.
         proxy_file: PLY that keeps the proxy; taken where it was made from the same, else written.
         filming: wraps the loop over the proxy's views, to show progress.
+        ground: what the scene stands on and throws shadows on, where frames show the environment.
     """
 
     def __init__(
@@ -76,11 +78,12 @@ class Relighter:
         cameras: Sequence[Camera] | None = None,
         proxy_file: Path | None = None,
         filming: Callable[[range], Iterable[int]] = iter,
+        ground: Ground | None = None,
     ) -> None:
         if mi.variant() is None:
             activate()
         self.scene, self.estimation, self.seed = scene, estimation, seed
-        self._backdrop, self._track = backdrop, track
+        self._backdrop, self._track, self.ground = backdrop, track, ground
         self._choice, self._cameras, self._proxy_file, self._filming = proxy, cameras, proxy_file, filming
         self._tracer = SurfelTracer(scene, backdrop=backdrop).sided(estimation.two_sided)
         self._turned_to: tuple[bytes, SurfelTracer] | None = None
@@ -208,7 +211,7 @@ class Relighter:
         if not reaches or self.proxy is not None:
             return Relighter(
                 scene, self.estimation, self.seed, backdrop=self._backdrop, track=self._track,
-                proxy=proxy, cameras=self._cameras, filming=self._filming,
+                proxy=proxy, cameras=self._cameras, filming=self._filming, ground=self.ground,
             )  # fmt: skip
         other = copy(self)
         other.scene, other._tracer, other._turned_to = scene, self._tracer.moved(scene), None
@@ -267,6 +270,8 @@ class Illumination:
         if view is None:
             (view,) = trace_views(tracer, camera, self.estimation, [bounce])
         arriving = arriving_light(tracer, view, self.lighting, self.estimation, seed, bounce)
+        if ground := self.relighter.ground:
+            arriving.behind = ground.behind(tracer, view, camera, self.lighting, self.estimation, seed)
         return TracedFrame(self.lighting, self.estimation, view, arriving)
 
     def render(

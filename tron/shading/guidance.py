@@ -31,9 +31,10 @@ import mitsuba as mi
 import numpy as np
 
 from tron.cameras import Camera
-from tron.color import to_display
+from tron.color import Look, to_display
 from tron.estimation import FINAL, Diffuse, Estimation
 from tron.io.images import write_image
+from tron.metering import incident_exposure
 from tron.shading.bounces.bounce import BouncedLight
 from tron.shading.composition import Bounced, Response, evenly_bounced, over_background
 from tron.shading.direct.irradiance import Occluder
@@ -87,22 +88,39 @@ class Guidance:
             raise KeyError(name)
         return np.atleast_3d(getattr(self, name))
 
-    def write(self, path: str | os.PathLike[str], name: str = "lit", exposure: float | None = None) -> None:
+    def exposure(self, look: Look = "photograph") -> float:
+        """Factor on linear values before AgX that a photographer would choose; 1 of a frame without light.
+
+        Raises:
+            TronError: nothing is lit.
+        """
+        if self.lighting is None:
+            return 1.0
+        forward = self.gbuffer["direction"].mean((0, 1), dtype=np.float64)
+        card = self.lighting.environment.unoccluded(-forward / np.linalg.norm(forward))
+        return incident_exposure(self, card, look)
+
+    def write(
+        self,
+        path: str | os.PathLike[str],
+        name: str = "lit",
+        exposure: float | None = None,
+        look: Look = "photograph",
+    ) -> None:
         """Write a buffer: as a picture to .png or .jpg, its linear values to .exr or .hdr.
 
         Args:
             path: of the file; its suffix chooses.
             name: one of :attr:`BUFFERS`. Pictures of light are exposed and go through AgX.
-            exposure: factor before AgX; None: the light's.
+            exposure: factor before AgX; None: :meth:`exposure`.
+            look: of pictures (:data:`tron.color.LOOKS`).
 
         Raises:
-            TronError: the light has no exposure, or the file cannot be written.
+            TronError: nothing is lit, or the file cannot be written.
         """
         image = self[name]
         if Path(path).suffix.lower() in (".png", ".jpg", ".jpeg") and name != "mask":
-            if exposure is None:
-                exposure = 1.0 if self.lighting is None else self.lighting.exposure()
-            image = to_display(image, exposure)
+            image = to_display(image, self.exposure(look) if exposure is None else exposure, look=look)
         write_image(path, image)
 
 
@@ -119,6 +137,7 @@ class Arriving:
         visibility: share of the unshadowed irradiance that arrives, by channel.
         mirror: by reflection rays; None without.
         metals: by those of metals alone, in previews (:mod:`tron.shading.reflections`); None without.
+        behind: radiance behind the surfels (:class:`tron.relighting.ground.Ground`); None: the environment's.
         terms: of Burley's diffuse part for what arrives (:mod:`tron.shading.burley`); None: as of even light.
     """
 
@@ -126,10 +145,11 @@ class Arriving:
     mirror: Mirror | None = None
     terms: mi.Vector3f | None = None
     metals: Mirror | None = None
+    behind: mi.Color3f | None = None
 
     def in_rows(self, gbuffer: GBuffer) -> Arriving:
         """Of pixels row by row, where lanes are those of ``gbuffer``."""
-        found = (self.visibility, self.mirror, self.terms, self.metals)
+        found = (self.visibility, self.mirror, self.terms, self.metals, self.behind)
         return Arriving(*(None if value is None else gbuffer.in_rows(value) for value in found))
 
 
@@ -220,7 +240,9 @@ def shade_surface(
     response = Response.of(surface, lighting.split_sum, diffuse, arriving.terms)
     irradiance = response.unshadowed * arriving.visibility
     bounced = _bounced(surface, arriving)
-    if background is None:
+    if background is None and arriving.behind is not None:
+        behind = arriving.behind
+    elif background is None:
         behind = lighting.light.radiance(surface.direction)
     else:
         behind = mi.Color3f(*(dr.opaque(mi.Float, float(channel)) for channel in background))

@@ -43,10 +43,11 @@ class Lighting:
         self.light = EnvironmentLight(environment) if drawn else environment
         self.split_sum = SplitSum(self.light, cubemap_resolution)
 
-    def exposure(self) -> float:
-        """:meth:`EnvironmentMap.exposure` of the light, as errors are."""
+    @property
+    def environment(self) -> EnvironmentMap:
+        """The light as a map, turned as it is."""
         light = self.light
-        return (light.to_environment() if isinstance(light, CubemapLight) else light.environment).exposure()
+        return light.to_environment() if isinstance(light, CubemapLight) else light.environment
 
     def turned_to(self, rotation_deg: float) -> Lighting:
         """The same environment at another rotation about +z, in microseconds: lookups are turned.

@@ -34,7 +34,7 @@ HONOURED = {
     "KHR_draco_mesh_compression": "decoded by DracoPy",
     "KHR_mesh_quantization": "integers become what they stand for",
     "KHR_texture_transform": "offset, scale and rotation",
-    "KHR_texture_basisu": "KTX2, decoded by opengl_basisu (`pip install 'tron-relight[ktx2]'`)",
+    "KHR_texture_basisu": "KTX2: plain pixels; Basis by opengl_basisu (`pip install 'tron-relight[ktx2]'`)",
     "EXT_texture_webp": "decoded by Pillow",
     "EXT_texture_avif": "decoded by Pillow",
 }

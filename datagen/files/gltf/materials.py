@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import io
 import struct
+import zlib
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
+import pyarrow
 from PIL import Image
 
 from datagen.files.gltf.document import Document
@@ -23,6 +25,8 @@ from tron.errors import TronError
 LARGEST_TEXTURE = 8192 * 8192
 _FORMATS = ("PNG", "JPEG", "WEBP", "AVIF")
 _KTX2 = b"\xabKTX 20\xbb\r\n\x1a\n"
+_PLAIN = {23: "rgb", 29: "rgb", 30: "bgr", 36: "bgr", 37: "rgba", 43: "rgba", 44: "bgra", 50: "bgra"}
+"""Vulkan's formats of 8 bits a channel, UNORM and SRGB, that a KTX2 may hold without Basis."""
 
 DIELECTRIC = 0.04
 """Reflectance at normal incidence of what is no metal."""
@@ -294,7 +298,8 @@ def _source(texture: dict[str, Any]) -> int:
 def decode_image(data: memoryview) -> np.ndarray:
     """(h, w, 3) or, with alpha, (h, w, 4) uint8, top row first, as stored.
 
-    PNG, JPEG, WebP and AVIF by Pillow, KTX2 by opengl_basisu where that is installed.
+    PNG, JPEG, WebP and AVIF by Pillow, KTX2 of plain pixels here, of Basis by opengl_basisu where that is
+    installed.
 
     Raises:
         TronError: another format, damaged data, or more than LARGEST_TEXTURE pixels.
@@ -302,15 +307,32 @@ def decode_image(data: memoryview) -> np.ndarray:
     try:
         if bytes(data[:12]) == _KTX2:
             require_size(*struct.unpack_from("<2I", data, 20))
-            return _decode_basis(bytes(data))
+            plain = _PLAIN.get(struct.unpack_from("<I", data, 12)[0])
+            return _decode_basis(bytes(data)) if plain is None else _plain_pixels(bytes(data), plain)
         # Only these: Pillow's PostScript reader starts a program.
         with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
             require_size(image.width, image.height)
             return pixels(image)
     except Image.DecompressionBombError as error:
         raise TronError("texture is too large", mend="shrink it") from error
-    except (OSError, SyntaxError, ValueError, IndexError, struct.error) as error:
+    except (OSError, SyntaxError, ValueError, IndexError, struct.error, zlib.error) as error:
         raise TronError(f"texture cannot be read: {error}", mend=f"store it as {_FORMATS[0]}") from error
+
+
+def _plain_pixels(data: bytes, channels: str) -> np.ndarray:
+    """(h, w, 3 or 4) uint8 of the largest level of a KTX2 without Basis (Khronos, KTX 2.0, section 3)."""
+    width, height = struct.unpack_from("<2I", data, 20)
+    (scheme,) = struct.unpack_from("<I", data, 44)
+    start, stored = struct.unpack_from("<2Q", data, 80)
+    size, level = width * height * len(channels), data[start : start + stored]
+    if scheme == 2:
+        level = pyarrow.decompress(level, size, codec="zstd", asbytes=True)
+    elif scheme == 3:
+        level = zlib.decompressobj().decompress(level, size)
+    elif scheme != 0:
+        raise ValueError(f"supercompression {scheme} of KTX2 is not read")
+    image = np.frombuffer(level, np.uint8, size).reshape(height, width, len(channels))
+    return image[..., [channels.index(channel) for channel in "rgba"[: len(channels)]]]
 
 
 def _decode_basis(data: bytes) -> np.ndarray:

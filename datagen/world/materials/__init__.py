@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Union
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Literal, Union
 
 import numpy as np
 from pydantic import Field
@@ -34,6 +35,7 @@ __all__ = [
     "Material",
     "MaterialSpec",
     "PhotographedSpec",
+    "ProceduralName",
     "draw_material",
 ]
 
@@ -57,10 +59,20 @@ SOLIDS: tuple[type[Solid], ...] = (
 )
 """Families that roles choose from, each as likely as another; a new one changes what seeds give."""
 
-FAMILIES: dict[str, type[Material]] = {
-    str(material.model_fields["family"].default): material for material in (*SOLIDS, PhotographedSpec)
-}
+
+def name_of(family: type[Material]) -> str:
+    """Name of a family in specifications and recipes."""
+    return str(family.model_fields["family"].default)
+
+
+FAMILIES: dict[str, type[Material]] = {name_of(family): family for family in (*SOLIDS, PhotographedSpec)}
 """Name -> family."""
+
+if TYPE_CHECKING:
+    ProceduralName = str
+else:
+    ProceduralName = Literal[tuple(map(name_of, SOLIDS))]
+    """Name of a family that is drawn from seeds."""
 
 if TYPE_CHECKING:
     MaterialSpec = Material
@@ -68,7 +80,18 @@ else:
     MaterialSpec = Annotated[Union[tuple(FAMILIES.values())], Field(discriminator="family")]  # noqa: UP007
 
 
-def draw_material(rng: np.random.Generator, role: Role = "any", *, large: bool = False) -> Material:
-    """Draw a material that suits a role; ``large``: for a floor or a wall, whose features are larger."""
-    suited = [solid for solid in SOLIDS if role in solid.roles]
+def draw_material(
+    rng: np.random.Generator, role: Role = "any", *, large: bool = False, families: Sequence[str] = ()
+) -> Material:
+    """Draw a material that suits a role.
+
+    Args:
+        rng: source of the family and of its parameters.
+        role: what it is made into.
+        large: for a floor or a wall, whose features are larger.
+        families: names of the families to choose from, of SOLIDS; those that suit the role, or all of them
+            where none does. Empty: any that suits.
+    """
+    allowed = [solid for solid in SOLIDS if not families or name_of(solid) in families]
+    suited = [solid for solid in allowed if role in solid.roles] or allowed
     return suited[int(rng.integers(len(suited)))].draw(rng, role, large=large)

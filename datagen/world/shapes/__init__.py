@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -29,6 +30,7 @@ __all__ = [
     "Role",
     "ShapeSpec",
     "Standing",
+    "ThingName",
     "draw_shape",
     "make_pieces",
     "split_creases",
@@ -48,6 +50,12 @@ SHAPES: dict[str, Kind] = {
     **SURROUNDINGS,
 }
 """Every kind of shape by its name."""
+
+if TYPE_CHECKING:
+    ThingName = str
+else:
+    ThingName = Literal[tuple(name for name in SHAPES if name not in SURROUNDINGS)]
+    """Name of a kind that stands on something."""
 
 
 def draw_shape(rng: np.random.Generator, kinds: Sequence[str], size: tuple[float, float]) -> ShapeSpec:

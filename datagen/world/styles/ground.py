@@ -38,7 +38,7 @@ def ground(streams: Streams, choice: Choice) -> Composition:
     Raises:
         TronError: nothing came to rest, or no camera found a way.
     """
-    land = fixture(streams("surroundings"), "terrain", SIZE)
+    land = fixture(streams("surroundings"), "terrain", SIZE, choice)
     rng = streams("objects")
     low, high = choice.objects or COUNT
     number = int(rng.integers(low, high + 1))

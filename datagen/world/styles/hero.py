@@ -40,7 +40,7 @@ def hero(streams: Streams, choice: Choice) -> Composition:
         TronError: nothing came to rest.
     """
     things = draw_things(streams("objects"), choice.objects or (1, 1), GROUPS, SIZE, choice)
-    floor = fixture(streams("surroundings"), "floor", FLOOR * np.sqrt(2.0))
+    floor = fixture(streams("surroundings"), "floor", FLOOR * np.sqrt(2.0), choice)
     rest = settle(streams("layout"), [thing.body for thing in things], floor.ground, radius=0.3 * len(things))
     objects, left_out = placed(things, rest)
     target = (0.0, 0.0, 0.5 * top_of(objects))

@@ -41,7 +41,7 @@ def room(streams: Streams, choice: Choice) -> Composition:
         TronError: nothing came to rest, or no camera found a way.
     """
     rng = streams("surroundings")
-    shell = fixture(rng, "room_shell", rng.uniform(*SIZE))
+    shell = fixture(rng, "room_shell", rng.uniform(*SIZE), choice)
     rng = streams("objects")
     low, high = choice.objects or COUNT
     number = int(rng.integers(low, high + 1))

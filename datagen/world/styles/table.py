@@ -48,7 +48,7 @@ def table(streams: Streams, choice: Choice) -> Composition:
     things = draw_things(streams("objects"), choice.objects or COUNT, GROUPS, SIZE, choice)
     rng = streams("surroundings")
     kind, size = UNDER[int(rng.integers(len(UNDER)))]
-    under = fixture(rng, kind, size)
+    under = fixture(rng, kind, size, choice)
     rng = streams("layout")
     reach = min(REACH, 0.9 * float(np.abs([*under.ground.low[:2], *under.ground.high[:2]]).min()))
     heaped = int(len(things) * rng.choice([0.0, 0.5, 0.7]))

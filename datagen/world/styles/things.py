@@ -73,7 +73,7 @@ def draw_thing(
     rng: np.random.Generator,
     groups: Sequence[tuple[str, ...]],
     size: Sizes,
-    choice: Choice | None = None,
+    choice: Choice,
     *,
     large: bool = False,
 ) -> Thing:
@@ -83,17 +83,19 @@ def draw_thing(
         rng: source of all of it.
         groups: kinds to choose from, each group as likely as another.
         size: least and greatest radius, world units.
-        choice: the user's models, which take the place of a share of the things.
+        choice: the user's models, which take the place of a share of the things; the kinds that take the
+            place of the groups, and the families that materials are of.
         large: the features of its materials are as large as on a floor.
     """
-    if choice is not None and choice.assets and rng.random() < choice.asset_share:
+    if choice.assets and rng.random() < choice.asset_share:
         names = sorted(choice.assets)
         name, radius = names[int(rng.integers(len(names)))], round(float(rng.uniform(*size)), 6)
         mesh: Trimesh = choice.assets[name].copy().apply_scale(radius)
         return Thing(None, (), name, radius, Body([mesh], upright=True))
+    groups = (choice.things,) if choice.things else groups
     shape = draw_shape(rng, groups[int(rng.integers(len(groups)))], size)
     kind = SHAPES[shape.kind]
-    materials = tuple(draw_material(rng, role, large=large) for role in kind.roles)
+    materials = tuple(draw_material(rng, role, large=large, families=choice.materials) for role in kind.roles)
     pieces = [piece.mesh for piece in make_pieces(shape, COARSE_EDGE)]
     return Thing(shape, materials, None, shape.size, Body(pieces, upright=kind.upright))
 
@@ -102,6 +104,7 @@ def fixture(
     rng: np.random.Generator,
     kind: str,
     size: float,
+    choice: Choice,
     parameters: Mapping[int, float] | None = None,
 ) -> Fixture:
     """Something that stands still around the things, such as a floor; what stands on it stands at z = 0.
@@ -110,13 +113,16 @@ def fixture(
         rng: source of its proportions and materials.
         kind: the shape, one of those that things stand on.
         size: radius of the ball around its middle that it just fits.
+        choice: the families that its materials are of.
         parameters: proportions that are not left to chance, by their number.
     """
     drawn = rng.random(4)
     for number, value in (parameters or {}).items():
         drawn[number] = value
     shape = ShapeSpec(kind=kind, size=size, parameters=tuple(drawn), seed=int(rng.integers(2**31)))
-    materials = tuple(draw_material(rng, role, large=True) for role in SHAPES[kind].roles)
+    materials = tuple(
+        draw_material(rng, role, large=True, families=choice.materials) for role in SHAPES[kind].roles
+    )
     ground = standing(shape)
     lift = round(-float(ground.low[2]), 6)
     placement = Placement(quaternion=(1.0, 0.0, 0.0, 0.0), position=(0.0, 0.0, lift))
@@ -129,7 +135,7 @@ def draw_things(
     count: tuple[int, int],
     groups: Sequence[tuple[str, ...]],
     size: Sizes,
-    choice: Choice | None = None,
+    choice: Choice,
 ) -> list[Thing]:
     """Draw some things, as :func:`draw_thing` does; ``count`` is their least and greatest number."""
     number = int(rng.integers(count[0], count[1] + 1))
@@ -167,6 +173,8 @@ class Choice:
         assets: id -> mesh in a unit ball, z up, standing; empty means procedural shapes only.
         asset_share: probability that an object is an asset, where there are any.
         objects: least and greatest number of objects; None takes the style's own.
+        things: kinds of procedural objects, each as likely as another; empty takes the style's own.
+        materials: families of procedural materials; empty takes all.
         textures: texture sets; empty means procedural materials only.
         texture_share: probability that a piece has one of them, where one suits its role.
     """
@@ -174,6 +182,8 @@ class Choice:
     assets: Mapping[str, Trimesh] = field(default_factory=dict)
     asset_share: float = 1.0
     objects: tuple[int, int] | None = None
+    things: tuple[str, ...] = ()
+    materials: tuple[str, ...] = ()
     textures: tuple[Offered, ...] = ()
     texture_share: float = 0.5
 

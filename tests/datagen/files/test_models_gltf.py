@@ -7,9 +7,11 @@
 import base64
 import io
 import struct
+import zlib
 
 import DracoPy
 import numpy as np
+import pyarrow
 import pytest
 import trimesh
 from PIL import Image
@@ -273,10 +275,33 @@ def test_ktx2_is_decoded_where_its_decoder_is_installed(tmp_path, write_glb, qua
 def test_ktx2_that_cannot_be_read_is_refused_in_a_line():
     pytest.importorskip("opengl_basisu", reason="no decoder of KTX2: pip install 'tron-relight[ktx2]'")
     whole = base64.b64decode(KTX2["etc1s"])
-    plain = whole[:12] + struct.pack("<I", 23) + whole[16:]  # Vulkan's RGB8, which is no Basis
-    for data in (whole[:16], whole[:90], whole[:-40], plain):
+    blocks = whole[:12] + struct.pack("<I", 146) + whole[16:]  # BC7, which is neither Basis nor plain
+    for data in (whole[:16], whole[:90], whole[:-40], blocks):
         with pytest.raises(TronError, match="texture cannot be read"):
             decode_image(memoryview(data))
+
+
+def plain_ktx2(pixels: np.ndarray, code: int, scheme: int = 0) -> bytes:
+    """KTX2 of one level: the header, the index, and the pixels behind an empty description."""
+    stored = {0: bytes, 2: lambda raw: pyarrow.compress(raw, codec="zstd", asbytes=True), 3: zlib.compress}
+    level = stored[scheme](pixels.tobytes())
+    height, width = pixels.shape[:2]
+    header = struct.pack("<9I", code, 1, width, height, 0, 0, 1, 1, scheme)
+    index = struct.pack("<4I2Q", 104, 0, 104, 0, 0, 0) + struct.pack("<3Q", 104, len(level), pixels.nbytes)
+    return b"\xabKTX 20\xbb\r\n\x1a\n" + header + index + level
+
+
+@pytest.mark.parametrize("scheme", [0, 2, 3])
+@pytest.mark.parametrize(
+    ("code", "order"),
+    [(23, [0, 1, 2]), (29, [0, 1, 2]), (36, [2, 1, 0]), (43, [0, 1, 2, 3]), (50, [2, 1, 0, 3])],
+)
+def test_ktx2_of_plain_pixels_is_read(code: int, order: list[int], scheme: int):
+    image = generator(0, "ktx2").integers(0, 256, (5, 3, len(order)), np.uint8)
+    data = plain_ktx2(image[..., order], code, scheme)
+    np.testing.assert_array_equal(decode_image(memoryview(data)), image)
+    with pytest.raises(TronError, match="texture cannot be read"):
+        decode_image(memoryview(data[:-9]))
 
 
 def test_ktx2_without_a_decoder_is_refused_or_its_substitute_is_read(

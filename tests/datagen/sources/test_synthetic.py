@@ -9,10 +9,9 @@ from datagen.files.sources import Sources
 from datagen.settings.command import Settings
 from datagen.sources.synthetic import make_clips, make_surfels
 from datagen.truth import build as building
-from datagen.truth.build import build, draw_and_build
+from datagen.truth.build import draw_and_build
 from datagen.truth.pathtrace import direct_irradiance, gbuffers, render_frames
 from datagen.world.lights import Family
-from datagen.world.scene import draw_scene
 from tron import metrics
 from tron.cli.recipes import check, compose_recipe
 from tron.color import luminance, to_display
@@ -110,8 +109,9 @@ def test_shared_frames_are_path_traced_as_each_light_alone(shared):
 @pytest.mark.parametrize("index", [0, 1, 2])
 def test_20k_surfels_and_their_irradiance_on_held_out_views_of_textured_scenes(index, variant):
     families = tuple(LEAST_DB)
-    spec = draw_scene(0, "test", index, style="object", lights=families, frames=5, path_frames=24)
-    geometry = build(spec)
+    demo = check(compose_recipe("conf.datagen", Settings, ["experiment=demo", "output_dir=data"]), Settings)
+    item = Work("test", index, f"test-{index:06d}", first_shard=0)
+    spec, geometry = draw_and_build(item, demo, Sources(), families)
     surfels = surfels_from_gbuffers(gbuffers(geometry, spec.views(32, 128, 128)), count=20_000)
     assert len(surfels) == pytest.approx(20_000, rel=0.02)
     tracer = SurfelTracer(surfels)

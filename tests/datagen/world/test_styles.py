@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from datagen.settings.command import Settings
 from datagen.world.objects import Placement
 from datagen.world.paths import WalkPath
 from datagen.world.scene import SceneSpec, draw_scene
@@ -12,6 +13,7 @@ from datagen.world.settling import Body
 from datagen.world.shapes import SHAPES, Standing, make_pieces, standing
 from datagen.world.styles import MIXED, STYLES, Choice
 from datagen.world.styles.cameras import Obstacles, unhindered
+from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
 from tron.seeds import generator
 
@@ -84,6 +86,26 @@ def test_the_recipe_says_how_many_things_there_are():
     spec = draw("table", 1, (3, 3))
     assert len(spec.objects) + spec.left_out == 3
     assert len(draw("object", 0).objects) == 1
+
+
+@pytest.mark.parametrize("style", ["table", "room"])
+def test_the_recipe_says_of_what_kinds_and_materials_they_are(style):
+    choice = Choice(objects=(4, 4), things=("vase", "book"), materials=("metal", "paint"))
+    drawn = [
+        draw_scene(seed, "train", 0, style=style, lights=["overcast"], choice=choice, frames=2, path_frames=2)
+        for seed in range(2)
+    ]
+    objects = [item for spec in drawn for item in spec.objects]
+    assert {item.shape.kind for item in objects} == {"vase", "book"}
+    of_all = [item for spec in drawn for item in (*spec.surroundings, *spec.objects)]
+    assert {material.family for item in of_all for material in item.materials} == {"metal", "paint"}
+
+
+def test_unknown_kinds_and_families_are_refused_with_those_that_there_are():
+    for key, known in (("things", "'vase'"), ("materials", "'metal'")):
+        words = [f"train.{key}=[floor]", "output_dir=data"]
+        with pytest.raises(TronError, match=known):
+            check(compose_recipe("conf.datagen", Settings, words), Settings)
 
 
 @pytest.mark.long

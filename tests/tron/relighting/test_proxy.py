@@ -211,10 +211,11 @@ def test_a_file_that_cannot_be_written_stops_nothing(fog, tmp_path, caplog):
 @pytest.mark.usefixtures("short_film")
 def test_a_changed_scan_is_filmed_anew(fog, light):
     before = Relighter(fog, Estimation(rays=8), 3).prepare()
-    other = moved(fog, fog.object_id == 1, translation=np.array([0.0, 0.6, 0.0]))
-    ours, fresh = before.changed(other), Relighter(other, Estimation(rays=8), 3)
+    changed = moved(fog, fog.object_id == 1, translation=np.array([0.0, 0.6, 0.0]))
+    ours, fresh = before.changed(changed), Relighter(changed, Estimation(rays=8), 3)
     for name in Guidance.BUFFERS:
-        np.testing.assert_array_equal(*(each.under(light).render(VIEW)[name] for each in (ours, fresh)))
+        one, other = (each.under(light).render(VIEW)[name] for each in (ours, fresh))
+        np.testing.assert_array_equal(one, other)
 
 
 def test_fog_that_shows_no_surface_is_lit_itself(clean, light, caplog):

@@ -14,7 +14,9 @@ from tron.estimation import Estimation
 from tron.gaussians.edit import moved, subset
 from tron.gaussians.scene import GaussianScene
 from tron.io.images import read_image
+from tron.metering import incident_exposure
 from tron.relighting import Guidance, Illumination, Relighter, views_under
+from tron.relighting.proxy import Choice
 from tron.seeds import generator
 from tron.shading.bounces.bounce import BounceTransport
 from tron.shading.environments.environment import EnvironmentMap
@@ -197,11 +199,13 @@ CHANGES = {
 )
 def test_a_changed_scene_is_lit_as_if_it_were_new(light, scene, change, signed):
     """A frame to the noise of a bake, none where nothing has moved; rays to the bit, drawn in one order."""
-    which = {} if signed else {"proxy": "never"}
-    before = Relighter(scene if signed else without_sign(scene), Estimation(rays=16), 3, **which).prepare()
+    proxy: Choice = "auto" if signed else "never"
+    before = Relighter(
+        scene if signed else without_sign(scene), Estimation(rays=16), 3, proxy=proxy
+    ).prepare()
     first = before.under(light).render(VIEWS[1])
     other = CHANGES[change](before.scene)
-    found, fresh = before.changed(other), Relighter(other, Estimation(rays=16), 3, **which)
+    found, fresh = before.changed(other), Relighter(other, Estimation(rays=16), 3, proxy=proxy)
     (ours, theirs) = (each.under(light) for each in (found, fresh))
     anew = BounceTransport.trace(found._light, seed=3)
     assert dr.all(found.transport.rays.met == anew.rays.met)
@@ -231,8 +235,11 @@ def test_frames_are_written_as_pictures_and_as_light(light, scene, tmp_path):
     frame = Relighter(scene, Estimation(rays=8)).under(light.rotated(30)).render(VIEWS[0])
     frame.write(tmp_path / "lit.png")
     shown = read_image(tmp_path / "lit.png")
-    np.testing.assert_allclose(shown, to_display(frame.lit, light.exposure()), atol=0.5 / 255 + 1e-6)
-    frame.write(tmp_path / "pbr.png", "pbr", exposure=2.0)
+    metered = incident_exposure(frame, light.rotated(30).unoccluded(-VIEWS[0].forward), "photograph")
+    assert frame.exposure() == pytest.approx(metered, rel=1e-4)
+    expected = to_display(frame.lit, metered, look="photograph")
+    np.testing.assert_allclose(shown, expected, atol=0.5 / 255 + 1e-4)
+    frame.write(tmp_path / "pbr.png", "pbr", exposure=2.0, look="none")
     shown = read_image(tmp_path / "pbr.png")
     np.testing.assert_allclose(shown, to_display(frame.pbr, 2.0), atol=0.5 / 255 + 1e-6)
     frame.write(tmp_path / "lit.exr")

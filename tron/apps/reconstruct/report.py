@@ -17,12 +17,13 @@ import scipy.stats
 
 from tron.apps.reconstruct.pictures import chosen_views, view_pictures
 from tron.apps.reconstruct.settings import ReportSettings
+from tron.apps.relight.camera_files import filmed_orbit
 from tron.apps.relight.settings import QUALITY
 from tron.cameras import Camera
 from tron.captures import Capture
 from tron.cli.progress import track
 from tron.color import to_display
-from tron.framing import find_subject, upright
+from tron.framing import upright
 from tron.gaussians.scene import GaussianScene
 from tron.io.video import VideoWriter
 from tron.relighting import Relighter
@@ -32,7 +33,7 @@ from tron.seeds import integer
 from tron.shading.environments.environment import EnvironmentMap
 from tron.storage import write_atomic
 from tron.tracing import SurfelTracer
-from tron.trajectories import keyframed, plan_cameras, turn_cameras
+from tron.trajectories import turn_cameras
 
 TRUTH = ("normal", "base_color", "roughness", "metallic")
 SMALLER_IS_BETTER = ("lpips", "roughness_mae", "metallic_mae")
@@ -41,11 +42,6 @@ LEAST = 5
 """Views from which a range is printed."""
 MAP_HEIGHT = 128
 """Rows of the map of a light."""
-FOV_DEG = 40.0
-GAP_DEG = 100.0
-"""Widest angle without photos that an orbit may pass."""
-STOPS = 7
-"""Most photos that a path from photo to photo goes through."""
 FPS = 12
 BALL = 160
 """Pixels along a side of a ball's picture."""
@@ -202,47 +198,30 @@ def _balls(light: EnvironmentMap) -> list[Picture]:
 
 
 def showcase_films(scene: GaussianScene, capture: Capture, frames: int, side: int) -> dict[str, bytes]:
-    """Name of each showcase light -> an MP4 of the scene in it, ``side`` x ``side`` pixels, that loops."""
+    """Name of each showcase light -> an MP4 of the scene in it, ``side`` pixels the longer side."""
     turn = upright(scene.up)
     cameras = turn_cameras(film_cameras(scene, capture, frames, side), turn)
     photographed, seed = turn_cameras(capture.train_cameras, turn), integer(0, "report", "bounces")
     relighter = Relighter(scene.rotated(turn), QUALITY["preview"], seed, cameras=photographed)
     films = {}
     for name, light in showcase_lights().items():
-        lit, exposure, pictures = relighter.under(light), light.exposure(), []
+        lit, exposure, pictures = relighter.under(light), None, []
         for number, camera in enumerate(track(cameras, f"report: {name}")):
             guidance = lit.render(camera, integer(0, "report", number))
-            pictures.append(to_display(guidance.lit, exposure))
+            exposure = guidance.exposure() if exposure is None else exposure
+            pictures.append(to_display(guidance.lit, exposure, look="photograph"))
         films[name] = _film(pictures)
     return films
 
 
 def film_cameras(scene: GaussianScene, capture: Capture, frames: int, side: int) -> list[Camera]:
-    """Cameras from where the scene was photographed, in its world: all around it, or along the photos.
-
-    All around where the photos leave no gap of more than GAP_DEG; else from photo to photo and back, because
-    what nobody photographed is not there.
-    """
+    """Cameras between those of the photos, in their world, frames in their shape, ``side`` the longer one."""
     photographed = [view.camera for view in capture.views]
-    centre = find_subject(scene).centre
-    if _widest_gap(photographed, centre, scene.up) <= GAP_DEG:
-        return plan_cameras(scene, "orbit", frames, width=side, height=side, fov_deg=FOV_DEG)
-    stops = np.unique(np.linspace(0, len(photographed) - 1, STOPS).astype(int))
-    forth = keyframed([_square(photographed[i], side) for i in stops], frames // 2 + 1)
-    return [*forth, *forth[-2:0:-1]]
-
-
-def _widest_gap(cameras: Sequence[Camera], centre: np.ndarray, up: np.ndarray) -> float:
-    """Widest angle about ``up`` through ``centre`` in which no camera stands, degrees."""
-    offsets = (np.stack([camera.position for camera in cameras]) - centre) @ upright(up).T
-    azimuths = np.sort(np.degrees(np.arctan2(offsets[:, 1], offsets[:, 0])))
-    return float(np.diff([*azimuths, azimuths[0] + 360]).max())
-
-
-def _square(camera: Camera, side: int) -> Camera:
-    """A camera at the same place whose square picture holds no more than the narrower way of the photo."""
-    focal = side * max(camera.fx / camera.width, camera.fy / camera.height)
-    return Camera(focal, focal, side / 2, side / 2, side, side, camera.world_to_camera)
+    first = photographed[0]
+    scale = side / max(first.width, first.height)
+    width, height = (2 * round(scale * pixels / 2) for pixels in (first.width, first.height))
+    view = {"width": width, "height": height, "fov_deg": first.fov_deg}
+    return filmed_orbit(photographed, frames, up=scene.up, **view)
 
 
 def _film(frames: Sequence[np.ndarray]) -> bytes:

@@ -28,9 +28,9 @@ class ReportSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     frames: int = Field(
-        default=36, ge=0, le=1000, description="frames of each film of the scene relit; 0: no films"
+        default=24, ge=0, le=1000, description="frames of each film of the scene relit; 0: no films"
     )
-    side: int = Field(default=192, ge=16, le=2048, description="their width and height, pixels")
+    side: int = Field(default=320, ge=16, le=2048, description="pixels of their longer side")
     views: int = Field(default=4, ge=1, le=100, description="held-out views that are shown")
 
 

@@ -200,11 +200,11 @@ def filmed_orbit(
     fov_deg: float,
     distance: float = 1.0,
 ) -> list[Camera]:
-    """A path that loops, from where the photos were taken.
+    """A path from where the photos were taken.
 
-    Around what the photos look at if they were taken from all sides; to and fro from the middle, slowing
-    down at the ends, if they leave a gap of more than 60 degrees. Height, distance and what is looked at
-    are, for each direction, those of the photos taken from about there (means with a Gaussian of 15
+    Around what the photos look at if they were taken from all sides, which loops; once from one end to the
+    other, slowing down there, if they leave a gap of more than 60 degrees. Height, distance and what is
+    looked at are, for each direction, those of the photos taken from about there (means with a Gaussian of 15
     degrees), so that the path lies between them. Where photos look outwards, as in a room, it goes through
     their cameras in order.
 
@@ -241,14 +241,14 @@ def filmed_orbit(
 
 
 def _angles(azimuth: np.ndarray, n: int) -> np.ndarray:
-    """(n,) degrees: all around, or to and fro over the arc that holds all azimuths."""
+    """(n,) degrees: all around, or once over the arc that holds all azimuths; its middle where n is 1."""
     ordered = np.sort(azimuth % 360)
     gaps = np.diff(ordered, append=ordered[0] + 360)
     widest = int(gaps.argmax())
     if gaps[widest] < _AROUND_DEG:
         return 360 * np.arange(n) / n
     first, span = ordered[(widest + 1) % len(ordered)], 360 - gaps[widest]
-    return first + span * (0.5 + 0.5 * np.sin(2 * np.pi * np.arange(n) / n))
+    return first + span * (0.5 - 0.5 * np.cos(np.pi * (np.arange(n) + 0.5) / n))
 
 
 def _level(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

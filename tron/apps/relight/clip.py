@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,23 +20,31 @@ from tron.apps.relight.settings import ProxyChoice
 from tron.apps.relit import RelitPicture, surfels_alone
 from tron.cameras import Camera
 from tron.cli.progress import track, working
+from tron.color import LOOKS, from_agx
 from tron.estimation import Estimation
 from tron.flow import surface_motion
 from tron.gaussians.scene import GaussianScene
 from tron.io.images import write_image
 from tron.neural.clips import Overlap, averaged_frames
 from tron.shards.schema import GUIDANCE, displayed, surface_members
+from tron.storage import write_atomic
 
 if TYPE_CHECKING:
     from tron.neural.protocols import Renderer
     from tron.relighting import Illumination, Relighter
+    from tron.relighting.ground import Ground
     from tron.shading.environments.environment import EnvironmentMap
+    from tron.shading.guidance import Guidance
     from tron.shading.lighting import Lighting
 
 log = logging.getLogger(__name__)
 
 DEPTH = "depth"
 """Buffer that the motion of surfaces is known by."""
+
+METERED = (
+    "exposure %.4g, metered in the first frame; exposure=%.4g keeps it, twice as much is a stop brighter"
+)
 
 
 @dataclass
@@ -45,11 +54,12 @@ class Clip:
     Attributes:
         environment: the light, not turned.
         rotations: its turn in each frame, degrees.
-        exposure: factor before AgX.
+        exposure: factor before AgX of buffers and of what networks draw: the light's.
         picture: how the relit picture is made.
         folder: the frames; claimed before anything is written.
         guidance: buffers that the neural renderer is conditioned on, and that are shown.
         keeps_linear: whether the relit picture is written as EXR too.
+        chosen: the relit picture's factor before AgX; None: as the first frame is metered.
         seconds: of each frame that was traced in this run.
     """
 
@@ -60,6 +70,7 @@ class Clip:
     folder: FrameFolder
     guidance: Sequence[str] = GUIDANCE
     keeps_linear: bool = False
+    chosen: float | None = None
     seconds: list[float] = field(default_factory=list)
     _turned: tuple[float, Illumination] | None = None
 
@@ -79,13 +90,32 @@ class Clip:
                 self._turned = rotation, relighter.under(self._lighting.turned_to(rotation))
         return self._turned[1]
 
+    @cached_property
+    def shown_exposure(self) -> float:
+        """Factor before AgX of the relit picture; where it is metered, :meth:`meter` has been called."""
+        return self.chosen or json.loads(self._reading.read_bytes())[self.picture.look]
+
+    @property
+    def _reading(self) -> Path:
+        return self.folder.folder / "exposure.json"
+
+    @property
+    def metered(self) -> bool:
+        """Whether the exposure of the relit picture is known, from this run or an earlier one."""
+        return self.chosen is not None or self._reading.is_file()
+
+    def meter(self, frame: Guidance) -> None:
+        """Set the exposure by the first frame."""
+        write_atomic(self._reading, json.dumps({look: frame.exposure(look) for look in LOOKS}) + "\n")
+
     def write_pictures(self, index: int) -> None:
         """Write the pictures of a frame whose buffers are there, those that need no network."""
         for name in self.guidance:
             self.folder.write_picture(index, name, self._shown(index, name))
         if not self.picture.neural:
             self.folder.path(index, "neural", "png").unlink(missing_ok=True)  # of an earlier run
-            self.folder.write_picture(index, "relit", self.picture.display(self.folder, index, self.exposure))
+            relit = self.picture.display(self.folder, index, self.shown_exposure)
+            self.folder.write_picture(index, "relit", relit)
         if self.keeps_linear:
             write_image(self.folder.path(index, "relit", "exr"), self.picture.linear(self.folder, index))
         else:  # that of an earlier run may stand before another background
@@ -114,7 +144,8 @@ class Clip:
             drawn = averaged_frames(drawn, frames, reproject, motion, overlap)
         for index, neural in enumerate(track(drawn, "neural", frames)):
             self.folder.write_picture(index, "neural", neural)
-            relit = self.picture.display(self.folder, index, self.exposure, neural)
+            radiance = from_agx(neural) / np.float32(self.exposure)
+            relit = self.picture.display(self.folder, index, self.shown_exposure, radiance)
             self.folder.write_picture(index, "relit", relit)
 
     def _displayed(self, index: int) -> dict[str, np.ndarray]:
@@ -152,6 +183,7 @@ def trace(
     proxy: ProxyChoice = "auto",
     filmed: Sequence[Camera] | None = None,
     proxy_file: Path | None = None,
+    ground: Ground | None = None,
 ) -> None:
     """Trace the frames that are missing, and write the pictures of all.
 
@@ -164,6 +196,7 @@ def trace(
         backdrop: (M,) bool, surfels that are in no light's way (:class:`tron.relighting.Relighter`).
         proxy, filmed, proxy_file: whether light sees a proxy, cameras to film it, and where it is kept, as
             there.
+        ground: what the scene stands on, as there.
     """
     from tron.relighting import Relighter
 
@@ -171,7 +204,7 @@ def trace(
     relighter = Relighter(
         scene, estimation, bounces, backdrop=backdrop, track=rays,
         proxy=proxy, cameras=filmed, proxy_file=proxy_file,
-        filming=partial(track, label="filming a proxy for light"),
+        filming=partial(track, label="filming a proxy for light"), ground=ground,
     )  # fmt: skip
     for clip in clips:
         if lacking := clip.folder.lacking(len(cameras)):
@@ -181,11 +214,14 @@ def trace(
     for index, camera in enumerate(track(cameras, "guidance")):
         surfaces = cache(partial(relighter.surface_maps, camera))  # alike under all lights
         for clip in clips:
-            if not clip.folder.finished(index):
+            if not clip.folder.finished(index) or not clip.metered:
                 started = time.perf_counter()
                 light, ray_seed = clip.light(relighter, index), seeds.integer(seed, "relight", index)
-                buffers = _shade(light, camera, ray_seed, clip.folder.buffers, surfaces)
+                frame, buffers = _shade(light, camera, ray_seed, clip.folder.buffers, surfaces)
                 clip.seconds.append(time.perf_counter() - started)
+                if not clip.metered:
+                    clip.meter(frame)
+                    log.info(METERED, clip.shown_exposure, clip.shown_exposure)
                 clip.folder.write(index, buffers)
             clip.write_pictures(index)
 
@@ -196,8 +232,8 @@ def _shade(
     seed: int,
     names: Sequence[str],
     surfaces: Callable[[], dict[str, np.ndarray]],
-) -> dict[str, np.ndarray]:
-    """The buffers ``names`` of one frame; ``surfaces`` gives those that no light shines on."""
+) -> tuple[Guidance, dict[str, np.ndarray]]:
+    """One frame and its buffers ``names``; ``surfaces`` gives those that no light shines on."""
     from tron.shading.composition import background_share
     from tron.shading.guidance import averaged
 
@@ -211,4 +247,4 @@ def _shade(
         made |= surfaces()
     if "foreground" in names:
         made["foreground"] = surfels_alone(frame.shade((0, 0, 0)).lit, made["share"])
-    return {name: made[name] for name in names}
+    return guidance, {name: made[name] for name in names}

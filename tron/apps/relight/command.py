@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,6 +52,7 @@ from tron.trajectories import plan_cameras, turn_cameras
 
 if TYPE_CHECKING:
     from tron.neural.protocols import Renderer
+    from tron.relighting.ground import Ground
     from tron.shading.environments.environment import EnvironmentMap
 
 
@@ -70,10 +73,10 @@ def main(settings: Settings) -> None:
     )
 
     clock = _Clock()
+    _check_paths(settings, settings.by_light())
+    settings = settings.shaped()
     lights = settings.by_light()
-    _check_paths(settings, lights)
-    size = settings.width, settings.height
-    given = None if settings.cameras is None else read_cameras(settings.cameras, *size)
+    given = None if settings.cameras is None else read_cameras(settings.cameras, *settings.size)
     with working("reading the lights, the network and the scene"):
         environments = [EnvironmentMap.load(light.light) for light in lights]
         activate(settings.variant, settings.threads)
@@ -101,7 +104,7 @@ def main(settings: Settings) -> None:
     clips = [_clip(*each, len(cameras), guidance, averaged > 1) for each in zip(lights, environments)]
     clock.lap("loading")
 
-    pixels = len(clips) * len(cameras) * settings.width * settings.height
+    pixels = len(clips) * len(cameras) * math.prod(settings.size)
     require_free_space(settings.output_dir, pixels * 6 * (len(clips[0].folder.buffers) + 3))
     log.info(clips[0].picture.describe())
     with locked(settings.output_dir):
@@ -109,6 +112,7 @@ def main(settings: Settings) -> None:
             clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite, model_defaults(Settings))
         traced = {"estimation": settings.estimation(), "seed": settings.seed, "proxy": settings.proxy}
         traced |= {"filmed": filmed, "proxy_file": settings.scene.with_suffix(".proxy.ply")}
+        traced["ground"] = _ground(settings, surrounded.content, cameras, float(turn[2] @ offset))
         trace(scene, cameras, clips, **traced, backdrop=surrounded.backdrop)
         clock.lap("guidance")
         if renderer is not None:
@@ -127,6 +131,20 @@ def main(settings: Settings) -> None:
             write_atomic(light.output_dir / "relight.json", json.dumps(report, indent=1) + "\n")
             made = len(cameras), len(clip.seconds), light.output_dir / "relit.mp4"
             log.info("frames: %d, rendered now: %d; look at %s", *made)
+
+
+def _ground(
+    settings: Settings, scene: GaussianScene, cameras: Sequence[Camera], offset: float
+) -> Ground | None:
+    """What the scene, z up, stands on; ``offset`` is the height that was taken away from its file's."""
+    from tron.relighting.ground import Ground, stands_free
+
+    if settings.ground == "none" or (settings.ground == "auto" and not stands_free(scene, cameras)):
+        return None
+    given = settings.ground if isinstance(settings.ground, float) else None
+    ground = Ground.under(scene, cameras[0], None if given is None else given - offset)
+    log.info("it stands on a ground at height %.4g; ground=none takes it away", ground.height + offset)
+    return ground
 
 
 def _filmed(path: Path, turn: np.ndarray, offset: np.ndarray) -> list[Camera] | None:
@@ -193,7 +211,8 @@ def _load_scene(settings: Settings) -> GaussianScene:
         log.warning(
             "%s has no materials%s: they are guessed from its colours, which keep the light it was captured "
             "in; tron-reconstruct capture=%s output_dir=OUT finds surfaces, materials and light",
-            settings.scene, "" if scene.oriented else " and normals without a sign", settings.scene,
+            settings.scene, "" if scene.oriented else " and normals without a sign",
+            quote(str(settings.scene)),
         )  # fmt: skip
     if settings.up is not None:
         scene.up = np.array(settings.up) / np.linalg.norm(settings.up)
@@ -209,13 +228,14 @@ def _load_scene(settings: Settings) -> GaussianScene:
 def _clip(
     light: Settings, environment: EnvironmentMap, frames: int, guidance: Sequence[str], averaged: bool
 ) -> Clip:
-    picture = RelitPicture(light.background, light.source)
+    picture = RelitPicture(light.background, light.source, light.look)
     needed = (*guidance, *picture.buffers, *light.buffers, *([DEPTH] if averaged else []))
     buffers = [name for name in needed if name != "relit"]
     return Clip(
         environment=environment,
         rotations=light.rotations(frames),
-        exposure=environment.exposure() if light.exposure == "auto" else light.exposure,
+        exposure=environment.exposure(),
+        chosen=None if light.exposure == "auto" else light.exposure,
         picture=picture,
         folder=FrameFolder(light.output_dir / "frames", tuple(dict.fromkeys(buffers))),
         guidance=guidance,
@@ -237,6 +257,7 @@ def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> 
         "seed",
         "variant",
         "surroundings",
+        "ground",
         "proxy",
     }
     return {
@@ -266,7 +287,8 @@ def _report(
             "materials_guessed": scene.materials_guessed,
             "oriented": scene.oriented,
         },
-        "exposure": clip.exposure,
+        "exposure": clip.shown_exposure,
+        "guidance_exposure": clip.exposure,
         "frames": len(cameras),
         "frames_rendered": len(clip.seconds),
         "first_frame_seconds": clip.seconds[0] if clip.seconds else None,

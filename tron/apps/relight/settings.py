@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from tron.apps.relight.camera_files import CAMERAS, cameras_of
 from tron.apps.relit import Background
 from tron.apps.surroundings import DESCRIPTION, Treatment
+from tron.color import Look
 from tron.errors import TronError
 from tron.estimation import FINAL, FINEST, PREVIEW, Estimation, Estimator, require_bounces
 from tron.neural.clips import Overlap
@@ -28,6 +30,9 @@ if TYPE_CHECKING:
     BufferName = str
 else:
     BufferName = Literal[BUFFERS]
+LONGER_SIDE = 512
+"""Pixels of the longer side of a frame, unless the settings say it."""
+
 QUALITY = {"preview": PREVIEW, "final": FINEST}
 
 ProxyChoice = Literal["auto", "always", "never"]
@@ -51,6 +56,11 @@ class Settings(BaseModel):
         description="what stands behind the surfels in the relit picture: the environment, nothing (PNG with "
         "alpha; black in videos), or a colour as on screen, such as [1,1,1] for white",
         examples=["[1,1,1]"],
+    )
+    ground: Literal["auto", "none"] | float = Field(
+        "auto",
+        description="level plane that shows the environment's ground and shadows of what stands there; auto: "
+        "below a thing that has no floor of its own; or its height along up, in the scene's units",
     )
     surroundings: Treatment = Field("drop", description=DESCRIPTION)
     proxy: ProxyChoice = Field(
@@ -110,13 +120,25 @@ class Settings(BaseModel):
         None, description="edge-avoiding filter of the shadows; null: with quality=preview alone"
     )
     frames: int = Field(60, ge=1, le=10_000, description="number of frames (those of `cameras` win)")
-    width: Side = Field(512, description="pixels")
-    height: Side = Field(512, description="pixels")
-    fov: float = Field(40.0, gt=1, lt=150, description="horizontal field of view, degrees")
+    width: Side | None = Field(
+        None,
+        description="pixels; null: in the shape of the cameras of `cameras`, or of cameras.json beside the "
+        "scene, 512 the longer side; without any, square",
+    )
+    height: Side | None = Field(None, description="pixels; null: likewise")
+    fov: float | None = Field(
+        None, gt=1, lt=150, description="horizontal field of view, degrees; null: as those cameras', or 40"
+    )
     distance: float = Field(1.0, gt=0, le=100, description="factor on the automatic distance to the subject")
     fps: float = Field(24.0, gt=0, le=240, description="frames a second of the videos")
     exposure: Literal["auto"] | Annotated[float, Field(gt=0)] = Field(
-        "auto", description="factor before the tone curve; auto: from the light on an upward plane"
+        "auto",
+        description="factor before the tone curve of the relit picture; auto: metered for the light that "
+        "falls on the subject in the first frame, one for the clip, which the log says",
+    )
+    look: Look = Field(
+        "photograph",
+        description="tone of the relit picture: AgX with the contrast that photographs have, or none",
     )
     up: tuple[float, float, float] | None = Field(
         None,
@@ -256,6 +278,37 @@ class Settings(BaseModel):
             self.model_copy(update={"environment": path, "output_dir": self.output_dir / path.stem})
             for path in self.environment
         ]
+
+    def shaped(self) -> Settings:
+        """The settings with the size and the field of view of frames, as the photos have them where known."""
+        path = self.cameras or self.scene.with_name(CAMERAS)
+        shape, fov = (LONGER_SIDE, LONGER_SIDE), 40.0
+        if path.is_file():
+            try:
+                first = cameras_of(path)[0]
+            except TronError:
+                if self.cameras is not None:
+                    raise
+            else:
+                shape = first.width, first.height
+                fov = first.fov_deg
+        across = shape[0] / shape[1]
+        width, height = self.width, self.height
+        if width is None and height is None:
+            scale = LONGER_SIDE / max(shape)
+            width, height = (max(8, 2 * round(scale * side / 2)) for side in shape)
+        elif width is None and height is not None:
+            width = max(8, 2 * round(height * across / 2))
+        elif height is None and width is not None:
+            height = max(8, 2 * round(width / across / 2))
+        return self.model_copy(update={"width": width, "height": height, "fov": self.fov or fov})
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of frames, where these are :meth:`shaped`."""
+        assert self.width is not None
+        assert self.height is not None
+        return self.width, self.height
 
     @property
     def light(self) -> Path:

@@ -80,7 +80,6 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a sparse model; TronError if pycolmap cannot or if it holds no posed image."""
     pycolmap = load_pycolmap()
     require_whole(folder)
-    pycolmap.logging.minloglevel = 3  # what is wrong with a file is ours to report
     try:
         model = pycolmap.Reconstruction(folder)
     except Exception as error:  # damaged files raise ValueError, IndexError, MemoryError, RuntimeError

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from tron.captures.photos.photo_files import SUFFIXES
@@ -59,7 +60,7 @@ def refusal(path: Path, captures: str, holds_capture: Callable[[Path], bool]) ->
     inner = [each for each in sorted(path.iterdir()) if each.is_dir() and holds_capture(each)]
     if inner:
         others = f", or another of {len(inner)} such folders in it" if len(inner) > 1 else ""
-        return TronError("neither poses nor photos", path, f"give capture={inner[0]}{others}")
+        return TronError("neither poses nor photos", path, f"give capture={quote(str(inner[0]))}{others}")
     return TronError("neither poses nor photos", path, f"give a folder of one of these: {captures}")
 
 
@@ -67,7 +68,7 @@ def _kind(file: Path) -> tuple[str, str] | None:
     """Kind of a file or folder by its look, and what to do with it; None of an unknown kind."""
     suffix = file.suffix.lower()
     if suffix in VIDEOS:
-        return "a video", f"give the file itself, capture={file}"
+        return "a video", f"give the file itself, capture={quote(str(file))}"
     if suffix in PACKED_SPLATS:
         mend = (
             f"they are a scene already, for tron-relight scene=FILE.ply: {packed_splats(file, suffix).mend}"

@@ -199,7 +199,7 @@ def _sees_only_image(lens: Lens, focal: float, cx: float, cy: float) -> bool:
 
 
 def load_pycolmap() -> Any:
-    """The module pycolmap; SIGTERM means what it meant before.
+    """The module pycolmap, silent, for errors are ours to report; SIGTERM means what it meant before.
 
     As it is imported, glog puts a handler of its own in the place of any other, in every thread's name: it
     prints a native stack and kills the process with whatever is in hand. The action is saved and put back
@@ -211,4 +211,5 @@ def load_pycolmap() -> Any:
     import pycolmap
 
     system.sigaction(int(signal.SIGTERM), action, None)
+    pycolmap.logging.minloglevel = 3
     return pycolmap

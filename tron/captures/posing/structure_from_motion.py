@@ -254,7 +254,6 @@ def _eight_bits(picture: Image.Image) -> Image.Image:
 def _map(workspace: Path, count: int, settings: PosingSettings, progress: Progress) -> None:
     """Make ``workspace/sparse`` of ``workspace/images``: the largest model."""
     pycolmap = load_pycolmap()
-    pycolmap.logging.minloglevel = 2
     pycolmap.set_random_seed(settings.seed)
     threads = settings.threads or (os.cpu_count() or 1)
     database, images = workspace / "database.db", workspace / "images"

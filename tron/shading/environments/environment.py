@@ -172,6 +172,17 @@ class EnvironmentMap:
         weights *= 2 / self.image.shape[1]
         return np.einsum("i,ijc->c", weights, self.image, dtype=np.float64)
 
+    def unoccluded(self, normal: np.ndarray, rows: int = 64) -> np.ndarray:
+        """(3,) float64: radiance of a white diffuse plane with nothing in the way, E / pi.
+
+        Args:
+            normal: (3,) unit, world.
+            rows: of the map that is summed; fewer are quicker, and blur what light grazes the plane.
+        """
+        light = self.baked().resized(min(rows, self.image.shape[0]))
+        facing = np.maximum(light.directions() @ np.asarray(normal, np.float64), 0) / np.pi
+        return np.einsum("i,ij,ijc->c", light.solid_angles(), facing, light.image, dtype=np.float64)
+
     def exposure(self) -> float:
         """The one scalar that every buffer under this light is multiplied by before AgX.
 

@@ -36,14 +36,15 @@ def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, 
     buffers = ("depth", "irradiance", "lit", "mask", "normal", "pbr")
     expected = [f"{i:04d}.{name}.exr" for i in range(2) for name in buffers]
     expected += [f"{i:04d}.{name}.png" for i in range(2) for name in ("irradiance", "pbr", "relit")]
-    assert frames == sorted([*expected, "settings.json"])
+    assert frames == sorted([*expected, "exposure.json", "settings.json"])
     assert read_video(out / "guidance.mp4").shape == (2, SIZE, 2 * SIZE, 3)
     assert read_video(out / "relit.mp4").shape == (2, SIZE, SIZE, 3)
     assert read_image(out / "contact_sheet.png").shape == (18 + 3 * (SIZE + 2), 110 + 2 * (SIZE + 2), 3)
     assert not (out / "neural.mp4").exists()
     report = json.loads((out / "relight.json").read_text())
     assert report["frames"] == report["frames_rendered"] == 2
-    assert report["exposure"] == pytest.approx(EnvironmentMap.load(light_path).exposure())
+    assert report["guidance_exposure"] == pytest.approx(EnvironmentMap.load(light_path).exposure())
+    assert report["exposure"] == json.loads((out / "frames" / "exposure.json").read_text())["photograph"]
     assert report["scene"]["materials_guessed"] is False
     assert report["relit"] == "lit"
 
@@ -228,15 +229,19 @@ def test_a_new_renderer_is_given_lit_and_shows_it(relight, scene_path, light_pat
     save_renderer(checkpoint, PixelMLP(PixelMLPConfig(width=4)))
     base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=2"]
     assert relight(*base, f"checkpoint={checkpoint}", "reproject=1") == 0
+    report = json.loads((out / "relight.json").read_text())
     for index in range(2):
         neural, lit, pbr = (
             read_image(out / "frames" / f"{index:04d}.{name}.png") for name in ("neural", "lit", "pbr")
         )
         np.testing.assert_allclose(neural, lit, atol=1.01 / 255)
         assert np.abs(lit - pbr).max() > 0.05
-        relit = out / "frames" / f"{index:04d}.relit.png"
-        assert relit.read_bytes() == relit.with_name(f"{index:04d}.neural.png").read_bytes()
-    assert json.loads((out / "relight.json").read_text())["relit"] == "neural"
+        radiance = read_image(out / "frames" / f"{index:04d}.lit.exr")
+        exposed = to_display(radiance, report["exposure"], look="photograph")
+        relit = read_image(out / "frames" / f"{index:04d}.relit.png")
+        assert np.abs(relit - exposed).max() < 0.02
+        assert np.abs(relit - neural).max() > 0.05  # the network draws under the exposure that it learnt with
+    assert report["relit"] == "neural"
     assert read_video(out / "guidance.mp4").shape == (2, SIZE, 4 * SIZE, 3)
     assert read_video(out / "neural.mp4").shape == (2, SIZE, SIZE, 3)
 
@@ -296,7 +301,7 @@ def test_a_clip_from_disk_is_the_clip_in_memory(tmp_path, overlap, reproject):
     cameras = [Camera.look_at((x, -5, 0), (x, 0, 0), fov_deg=40, width=16, height=16) for x in places]
     motion = surface_motion(cameras, depths.__getitem__) if reproject > 1 else None
     light, picture = EnvironmentMap.constant(1.0), RelitPicture("environment", "neural")
-    clip = Clip(light, [0.0] * 8, 0.7, picture, folder)
+    clip = Clip(light, [0.0] * 8, 0.7, picture, folder, chosen=0.7)
     clip.draw(renderer, overlap=overlap, cameras=cameras, reproject=reproject)
     linear = {name: np.stack([folder.read(i, name) for i in range(8)]) for name in GUIDANCE}
     shown = {name: to_display(buffer, 0.7) for name, buffer in linear.items()}

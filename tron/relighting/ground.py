@@ -1,0 +1,116 @@
+"""A ground to stand on: the environment's own, on a level plane, with the shadows of what stands there.
+
+A map is infinitely far, so what is lit by it floats before it. Here the map is projected from a point above
+the plane, as high as the camera, onto the plane, the local scene of Debevec ("Rendering synthetic objects
+into real scenes", 1998): the horizon stays where it is, and the ground keeps its place when the camera moves.
+Each point of it shows what the map has there, times the share of light that arrives: the map was taken when
+nothing stood there.
+
+No light is sent up from the plane to the scene: the map's lower half does that, shadows or not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from tron.cameras import Camera
+from tron.estimation import Estimation
+from tron.framing import find_subject, has_floor
+from tron.gaussians.scene import GaussianScene
+from tron.seeds import integer
+from tron.shading.direct.visibility import Shadows, visibility
+from tron.shading.lighting import Lighting
+from tron.tracing import GBuffer
+
+LOWEST = 0.002
+"""Share of the opaque surfels that may lie below the ground: strays."""
+
+_OPAQUE_LOGIT = 0.0
+_LEAST_EYE = 0.3
+"""Least height from which the map is projected, in radii of the subject: from lower, all is horizon."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A level plane, z up, that shows the environment.
+
+    Attributes:
+        height: z of the plane, world units.
+        eye: (3,) point that the map is projected from, world.
+    """
+
+    height: float
+    eye: tuple[float, float, float]
+
+    @classmethod
+    def under(cls, scene: GaussianScene, camera: Camera, height: float | None = None) -> Ground:
+        """The plane that a scene stands on, seen from as high as a camera is.
+
+        Args:
+            scene: with z up.
+            camera: the first of a clip.
+            height: of the plane, world units; None: the lowest surfels', strays apart.
+        """
+        subject = find_subject(scene)
+        if height is None:
+            solid = scene.opacity_logits > _OPAQUE_LOGIT
+            height = float(np.quantile(scene.means[solid if solid.any() else slice(None), 2], LOWEST))
+        rise = max(float(camera.position[2]) - height, _LEAST_EYE * subject.radius)
+        return cls(height, (float(subject.centre[0]), float(subject.centre[1]), height + rise))
+
+    def behind(
+        self,
+        tracer: Shadows,
+        view: GBuffer,
+        camera: Camera,
+        lighting: Lighting,
+        estimation: Estimation,
+        seed: int,
+    ) -> mi.Color3f:
+        """Linear radiance behind the surfels of a view: the ground's, in their shadow, and the environment's.
+
+        Args:
+            tracer: what casts shadows.
+            view: of ``camera``, of sub-pixels or not.
+            lighting: the prepared environment.
+            estimation: of the light, as of the frame.
+            seed: root of the frame's random numbers.
+        """
+        origin = mi.Point3f(*(float(v) for v in camera.position))
+        height, eye = dr.opaque(mi.Float, self.height), mi.Point3f(*self.eye)
+        dr.make_opaque(origin, eye)
+        down = view.direction.z < 0
+        distance = (height - origin.z) / dr.select(down, view.direction.z, -1)
+        seen = down & (distance > 0) & (view.opacity < 1)
+        met = mi.Point3f(dr.fma(distance, view.direction, mi.Vector3f(origin)))
+        position = dr.select(seen, met, view.position)
+        plane = replace(
+            view,
+            position=position,
+            depth=dr.select(seen, distance, 0),
+            normal=mi.Normal3f(0, 0, dr.select(seen, 1, 0)),
+            opacity=dr.select(seen, mi.Float(1), 0),
+            values=[],
+        )
+        dr.eval(plane)
+        share = visibility(tracer, plane, lighting, estimation.of_sub_pixel(), integer(seed, "ground"))
+        outward = dr.select(seen, dr.normalize(position - eye), view.direction)
+        radiance = lighting.light.radiance(mi.Vector3f(outward))
+        return dr.select(seen, radiance * share, radiance)
+
+
+def stands_free(scene: GaussianScene, cameras: Sequence[Camera]) -> bool:
+    """Whether a scene, z up, is a thing without a floor of its own that all cameras see from without."""
+    if has_floor(scene):
+        return False
+    subject = find_subject(scene)
+    lowest = Ground.under(scene, cameras[0]).height
+    return all(
+        camera.position[2] > lowest and np.linalg.norm(camera.position - subject.centre) > subject.radius
+        for camera in cameras
+    )
