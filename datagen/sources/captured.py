@@ -175,7 +175,7 @@ def make_capture(item: Work, settings: Settings) -> Record:
             raise TronError("surfels or light cannot be read back", folder, "look for a full or failing disk")
     tell(item, "guidance")
     with stage("guidance"):
-        surfels = CapturedSurfels(item, settings, found)
+        surfels = CapturedSurfels(item, settings, found, capture.train_cameras)
         with made_clips(item, settings, photos, found, surfels) as clips:
             tell(item, "write")
             made = [_written(item, settings, clips, len(clips))]

@@ -230,12 +230,16 @@ class CapturedSurfels:
     Args:
         item, settings: the capture and its recipe.
         found: its surfels.
+        cameras: that they were found from, in their world; None: not known.
     """
 
-    def __init__(self, item: Work, settings: Settings, found: Found) -> None:
+    def __init__(
+        self, item: Work, settings: Settings, found: Found, cameras: Sequence[Camera] | None = None
+    ) -> None:
         self._item, self._settings, self._streams = item, settings, ("captured", item.capture)
         seed = integer(settings.seed, *self._streams, "bounce")
-        self._relighter = Relighter(found.scene, settings.estimation(item.split), seed).prepare()
+        estimation = settings.estimation(item.split)
+        self._relighter = Relighter(found.scene, estimation, seed, cameras=cameras).prepare()
 
     def under(self, environment: EnvironmentMap, *light: int | str) -> LitSurfels:
         """The surfels under a light, whose words name its random streams: none for the capture's own."""

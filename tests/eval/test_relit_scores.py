@@ -32,6 +32,12 @@ def sided_light(height: int = 32) -> EnvironmentMap:
     return replace(EnvironmentMap.constant(1.0, height), image=image)
 
 
+@pytest.fixture(autouse=True)
+def lit_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scene is a cloud of surfels: thick by the number, and light is to see it as it is."""
+    monkeypatch.setattr("tron.relighting.relighter.THICK", 2.0)
+
+
 @pytest.fixture(scope="module")
 def scene(variant, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("relit") / "scene.ply"

@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from tron.cameras import Camera
 from tron.captures.view import MAPS, ToneCurve, View
 from tron.errors import TronError
 
@@ -91,6 +92,11 @@ class Capture:
     def train_views(self) -> Sequence[View]:
         """The views that are learnt from, in order."""
         return [view for view in self.views if view.name not in self.test]
+
+    @property
+    def train_cameras(self) -> list[Camera]:
+        """Cameras of the views that are learnt from, in order."""
+        return [view.camera for view in self.train_views]
 
     @cached_property
     def content(self) -> str:

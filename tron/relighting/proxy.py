@@ -54,6 +54,9 @@ THICK = 0.08
 """Share of thick pixels from which a proxy gains."""
 _THICK_VIEWS, _THICK_SIDE, _OPAQUE = 8, 256, 0.99
 VIEWS, SIDE, MOST_VOXELS, TRUNCATION, SIGMA, SURFELS = 64, 300, 256, 4.0, 1.0, 60_000
+"""Views of the film, most pixels of their sides, voxels along the longest side, as :mod:`tron.tracing.fusion`
+has them, and most surfels. Coarser voxels leak, finer ones keep the scan's noise."""
+_LEAST_SIDE, _PIXELS_PER_SPLAT = 64, 2.0
 _SOLID = 0.5
 _NEAR_VOXELS = 4.0
 """Voxels up to which light sees the proxy alone, and by which the proxy may lie behind the scan."""
@@ -138,7 +141,8 @@ def make_proxy(
         track: wraps the loop over the views, to show progress.
     """
     scene, buffers, maps = tracer.scene, [], []
-    film = _film(scene, cameras, VIEWS, SIDE)
+    side = min(max(round((_PIXELS_PER_SPLAT * len(scene)) ** 0.5), _LEAST_SIDE), SIDE)
+    film = _film(scene, cameras, VIEWS, side)
     for number in track(range(len(film))):
         view = seen_by(tracer, film[number])
         names = ("depth", "opacity", "base_color", "roughness", "metallic")

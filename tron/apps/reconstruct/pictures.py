@@ -39,7 +39,8 @@ def write_sheet(
     rows: dict[str, list[np.ndarray]] = {}
     light = None
     if environment is not None and settings is not None:
-        light = Relighter(tracer.scene, sheet_estimation(settings)).under(environment)
+        filmed = capture.train_cameras
+        light = Relighter(tracer.scene, sheet_estimation(settings), cameras=filmed).under(environment)
     for number, view in enumerate(views):
         for name, image in view_pictures(tracer, view, called).items():
             rows.setdefault(name, []).append(image)

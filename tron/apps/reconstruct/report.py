@@ -159,7 +159,11 @@ def _views(
 ) -> list[Pictures]:
     """Some views with every channel, and what materials and light together make of them."""
     tracer, blocks = SurfelTracer(scene), []
-    lit = None if light is None else Relighter(scene, QUALITY["preview"]).under(light)
+    lit = (
+        None
+        if light is None
+        else Relighter(scene, QUALITY["preview"], cameras=capture.train_cameras).under(light)
+    )
     for number, view in enumerate(chosen_views(capture, settings.views)):
         figures = report["views"].get(view.name, {})
         channels = view_pictures(tracer, view, called)
@@ -197,7 +201,8 @@ def showcase_films(scene: GaussianScene, capture: Capture, frames: int, side: in
     """Name of each showcase light -> an MP4 of the scene in it, ``side`` pixels the longer side."""
     turn = upright(scene.up)
     cameras = turn_cameras(film_cameras(scene, capture, frames, side), turn)
-    relighter = Relighter(scene.rotated(turn), QUALITY["preview"], integer(0, "report", "bounces"))
+    photographed, seed = turn_cameras(capture.train_cameras, turn), integer(0, "report", "bounces")
+    relighter = Relighter(scene.rotated(turn), QUALITY["preview"], seed, cameras=photographed)
     films = {}
     for name, light in showcase_lights().items():
         lit, exposure, pictures = relighter.under(light), None, []

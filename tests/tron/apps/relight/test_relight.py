@@ -180,8 +180,7 @@ def test_a_plain_3dgs_file_is_relit_with_a_warning(
     plyfile.PlyData([plyfile.PlyElement.describe(plain, "vertex")], byte_order="<").write(str(path))
     masks = []
     caplog.set_level("INFO")
-    for name, value in {"VIEWS": 24, "SIDE": 96}.items():
-        monkeypatch.setattr("tron.relighting.proxy." + name, value)
+    monkeypatch.setattr("tron.relighting.proxy.VIEWS", 24)
     for scene, out in ((scene_path, tmp_path / "ours"), (path, tmp_path / "plain")):
         base = [f"scene={scene}", f"environment={light_path}", f"output_dir={out}", "frames=1"]
         assert relight(*base, "up=[0,0,1]") == 0
