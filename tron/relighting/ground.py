@@ -87,7 +87,7 @@ class Ground:
         down = view.direction.z < 0
         distance = (height - origin.z) / dr.select(down, view.direction.z, -1)
         seen = down & (distance > 0) & (view.opacity < 1)
-        position = dr.select(seen, origin + distance * view.direction, view.position)
+        position = dr.select(seen, mi.Point3f(dr.fma(distance, view.direction, mi.Vector3f(origin))), view.position)
         plane = replace(
             view,
             position=position,
@@ -99,7 +99,7 @@ class Ground:
         dr.eval(plane)
         share = visibility(tracer, plane, lighting, estimation.of_sub_pixel(), integer(seed, "ground"))
         outward = dr.select(seen, dr.normalize(position - eye), view.direction)
-        radiance = lighting.light.radiance(outward)
+        radiance = lighting.light.radiance(mi.Vector3f(outward))
         return dr.select(seen, radiance * share, radiance)
 
 

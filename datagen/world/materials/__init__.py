@@ -60,7 +60,6 @@ SOLIDS: tuple[type[Solid], ...] = (
 """Families that roles choose from, each as likely as another; a new one changes what seeds give."""
 
 
-
 def name_of(family: type[Material]) -> str:
     """Name of a family in specifications and recipes."""
     return str(family.model_fields["family"].default)

@@ -95,9 +95,7 @@ def draw_thing(
     groups = (choice.things,) if choice.things else groups
     shape = draw_shape(rng, groups[int(rng.integers(len(groups)))], size)
     kind = SHAPES[shape.kind]
-    materials = tuple(
-        draw_material(rng, role, large=large, families=choice.materials) for role in kind.roles
-    )
+    materials = tuple(draw_material(rng, role, large=large, families=choice.materials) for role in kind.roles)
     pieces = [piece.mesh for piece in make_pieces(shape, COARSE_EDGE)]
     return Thing(shape, materials, None, shape.size, Body(pieces, upright=kind.upright))
 

@@ -1,6 +1,5 @@
 """Laws of a scene that can be lit: every part has the same settings, and what changes is as if made anew."""
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -18,7 +17,7 @@ from tron.io.images import read_image
 from tron.metering import incident_exposure
 from tron.relighting import Guidance, Illumination, Relighter, views_under
 from tron.seeds import generator
-from tron.shading.bounces.bounce import BothSides, BounceTransport, facing
+from tron.shading.bounces.bounce import BounceTransport
 from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import render_guidance
 from tron.shading.lighting import Lighting
@@ -62,17 +61,11 @@ def by_hand(
 ) -> Iterator[Guidance]:
     """A frame of each camera, every part of it made by itself and given the settings by itself."""
     tracer, lighting = SurfelTracer(scene).sided(estimation.two_sided), Lighting(light)
-    bounce = faces = backs = None
-    if estimation.bounces and scene.oriented:
+    bounce = None
+    if estimation.bounces:
         bounce = BounceTransport.trace(tracer, seed=5).bake(lighting, estimation, seed=5)
-    elif estimation.bounces:
-        faces, backs = BothSides.trace(tracer, seed=5).bake(lighting, estimation, seed=5)
     for seed, camera in enumerate(cameras):
-        seen = bounce
-        if faces is not None and backs is not None:
-            seen = facing(faces, backs, scene.looks_away(camera.position))
-        shown = SurfelTracer(scene if scene.oriented else scene.facing(camera.position))
-        yield render_guidance(shown, camera, lighting, estimation, seed, bounce=seen)
+        yield render_guidance(tracer, camera, lighting, estimation, seed, bounce=bounce)
 
 
 def assert_same(one: Guidance, other: Guidance) -> None:
@@ -82,14 +75,27 @@ def assert_same(one: Guidance, other: Guidance) -> None:
 
 @pytest.mark.parametrize("two_sided", [True, False], ids=["two-sided", "one-sided"])
 def test_every_part_has_the_same_settings(scene, light, two_sided):
-    """Sides, bounces, reflections, normals without a sign: as of a fresh bake by hand."""
-    for signed, (bounces, reflections) in itertools.product((True, False), ((0, 0), (1, 0), (4, 0), (4, 2))):
-        each = scene if signed else without_sign(scene)
+    """Sides, bounces, reflections: as of a fresh bake by hand; a clean scene has no proxy."""
+    for bounces, reflections in ((0, 0), (1, 0), (4, 0), (4, 2)):
         estimation = Estimation(rays=8, two_sided=two_sided, bounces=bounces, reflections=reflections)
-        lit = Relighter(each, estimation, 5).under(light)
-        cameras = VIEWS[:1] if signed else VIEWS[:2]
-        for seed, frame in enumerate(by_hand(each, cameras, light, estimation)):
-            assert_same(lit.render(cameras[seed], seed), frame)
+        lit = Relighter(scene, estimation, 5).under(light)
+        for seed, frame in enumerate(by_hand(scene, VIEWS[:2], light, estimation)):
+            assert_same(lit.render(VIEWS[seed], seed), frame)
+
+
+def test_surfels_without_a_sign_are_turned_to_each_camera_and_outward_to_light(scene, light):
+    """Where light sees the scan itself: direct light of both sides, bounces of those that look outward."""
+    blind, estimation = without_sign(scene), Estimation(rays=8)
+    outward = blind.turned_over(~blind.looks_away(np.median(blind.means, axis=0)))
+    bounce = BounceTransport.trace(SurfelTracer(outward), seed=5).bake(Lighting(light), estimation, seed=5)
+    lit = Relighter(blind, estimation, 5, proxy="never").under(light)
+    for seed, camera in enumerate(VIEWS[:2]):
+        tracer = SurfelTracer(blind.facing(camera.position))
+        truth = render_guidance(tracer, camera, Lighting(light), estimation, seed, bounce=bounce)
+        ours = lit.render(camera, seed)
+        np.testing.assert_allclose(ours.irradiance, truth.irradiance, atol=1e-3)
+        error = np.abs(ours.indirect - truth.indirect).mean() / truth.indirect.mean()
+        assert error < 0.01, f"relative error {error:.4f}"
 
 
 def test_one_sided_surfels_send_no_light_out_of_their_backs(scene, light):
@@ -109,18 +115,24 @@ def indirect(lit: Illumination, view: Camera) -> tuple[np.ndarray, np.ndarray]:
     return guidance.indirect, guidance.mask > 0.9
 
 
+@pytest.mark.usefixtures("short_film")
 def test_normals_without_a_sign_get_the_light_of_the_side_that_a_camera_sees(light, scene):
-    """Half of the surfels turned over: every camera sees what it sees of the scene that knows its sides."""
+    """Half of the surfels turned over: through a proxy every camera sees what it sees of the signed scene."""
     known, found = Relighter(scene).under(light), Relighter(without_sign(scene)).under(light)
     for view in VIEWS:
         truth, inside = indirect(known, view)
         ours, also = indirect(found, view)
         both = inside & also
         assert both.sum() > 400
-        error = np.abs(ours - truth)[both].mean() / truth[both].mean()
-        assert error < 0.1, f"relative error {error:.3f}"
+        # Of other rays, which are few: means of 8 x 8 pixels.
+        ours, truth = (
+            (image * both[..., None]).reshape(4, 8, 4, 8, 3).sum((1, 3)) for image in (ours, truth)
+        )
+        error = np.abs(ours - truth).sum() / truth.sum()
+        assert error < 0.12, f"relative error {error:.3f}"
 
 
+@pytest.mark.usefixtures("short_film")
 def test_mirrors_show_the_light_of_the_side_that_they_see(light, scene):
     """A far side that no camera sees is seen in the mirror below it, by its own light."""
     metal = replace(
@@ -130,13 +142,13 @@ def test_mirrors_show_the_light_of_the_side_that_they_see(light, scene):
     for each in (metal, replace(metal, oriented=False)):
         guidance = Relighter(each, Estimation(reflections=16)).under(light).render(VIEWS[0])
         means.append(guidance.lit[guidance.mask > 0.9].mean())
-    assert means[1] == pytest.approx(means[0], rel=0.05)
+    assert means[1] == pytest.approx(means[0], rel=0.1)
 
 
 def test_a_scene_without_bounces_bakes_nothing(light, scene, monkeypatch):
     monkeypatch.setattr(BounceTransport, "trace", None)
     lit = Relighter(scene, Estimation(bounces=0)).prepare().under(light)
-    assert lit.bounced(VIEWS[0]) is None
+    assert lit.bounced is None
     guidance = lit.render(VIEWS[0])
     np.testing.assert_array_equal(guidance.lit, guidance.shadowed)
 
@@ -144,17 +156,15 @@ def test_a_scene_without_bounces_bakes_nothing(light, scene, monkeypatch):
 def test_one_tracer_serves_all_cameras_where_sides_are_known(variant, scene):
     relighter = Relighter(scene)
     assert relighter.tracer(VIEWS[0]) is relighter.tracer(VIEWS[1])
-    relighter = Relighter(without_sign(scene))
+    relighter = Relighter(without_sign(scene), proxy="never")
     assert relighter.tracer(VIEWS[0]) is relighter.tracer(replace(VIEWS[0]))
     assert relighter.tracer(VIEWS[0]) is not relighter.tracer(VIEWS[1])
-    with pytest.raises(TronError, match="no sign"):
-        _ = relighter.transport
 
 
 def test_frames_of_other_rays_share_a_bake(light, scene):
     lit = Relighter(scene, Estimation(rays=8)).under(light)
     finest = lit.framed(rays=16, reflections=2, supersample=2)
-    assert finest.bounced(VIEWS[0]) is lit.bounced(VIEWS[0])
+    assert finest.bounced is lit.bounced
     wanted = Estimation(rays=16, reflections=2, supersample=2)
     assert finest.estimation == wanted
     assert_same(finest.render(VIEWS[0]), Relighter(scene, wanted).under(light).render(VIEWS[0]))
@@ -188,16 +198,14 @@ CHANGES = {
 )
 def test_a_changed_scene_is_lit_as_if_it_were_new(light, scene, change, signed):
     """A frame to the noise of a bake, none where nothing has moved; rays to the bit, drawn in one order."""
-    before = Relighter(scene if signed else without_sign(scene), Estimation(rays=16), 3).prepare()
+    which = {} if signed else {"proxy": "never"}
+    before = Relighter(scene if signed else without_sign(scene), Estimation(rays=16), 3, **which).prepare()
     first = before.under(light).render(VIEWS[1])
     other = CHANGES[change](before.scene)
-    found, fresh = before.changed(other), Relighter(other, Estimation(rays=16), 3)
+    found, fresh = before.changed(other), Relighter(other, Estimation(rays=16), 3, **which)
     (ours, theirs) = (each.under(light) for each in (found, fresh))
-    anew = (BounceTransport if signed else BothSides).trace(found._tracer, seed=3)
-    rays = [
-        each.faces.rays if isinstance(each, BothSides) else each.rays for each in (found._transport, anew)
-    ]
-    assert dr.all(rays[0].met == rays[1].met)
+    anew = BounceTransport.trace(found._light, seed=3)
+    assert dr.all(found.transport.rays.met == anew.rays.met)
     ours, theirs = ours.render(VIEWS[1]), theirs.render(VIEWS[1])
     if change == "moved":
         error = np.abs(ours.lit - theirs.lit).mean() / theirs.lit.mean()

@@ -59,6 +59,7 @@ class SphereOverPlane:
         seen = Surface(
             position=position,
             depth=dr.select(seen, t, 0),
+            lift=mi.Float(0),
             normal=mi.Normal3f(dr.select(seen, normal, 0)),
             normal_sum=mi.Normal3f(dr.select(seen, normal, 0)),
             base_color=mi.Color3f(self.base_color) * one,

@@ -164,7 +164,9 @@ def test_frames_of_an_older_release_keep_the_defaults_of_settings_that_it_lacked
     assert json.loads(record.read_text()) == whole
 
 
-def test_a_plain_3dgs_file_is_relit_with_a_warning(relight, scene_path, light_path, tmp_path, caplog):
+def test_a_plain_3dgs_file_is_relit_with_a_warning(
+    relight, scene_path, light_path, tmp_path, caplog, monkeypatch
+):
     """Without materials, and with normals of random sign, as 3DGS writes them."""
     rows = plyfile.PlyData.read(str(scene_path))["vertex"].data
     names = [name for name in rows.dtype.names if name not in (*MATERIAL_PROPERTIES, "object_id")]
@@ -177,6 +179,9 @@ def test_a_plain_3dgs_file_is_relit_with_a_warning(relight, scene_path, light_pa
     path = tmp_path / "plain.ply"
     plyfile.PlyData([plyfile.PlyElement.describe(plain, "vertex")], byte_order="<").write(str(path))
     masks = []
+    caplog.set_level("INFO")
+    for name, value in {"VIEWS": 24, "SIDE": 96}.items():
+        monkeypatch.setattr("tron.relighting.proxy." + name, value)
     for scene, out in ((scene_path, tmp_path / "ours"), (path, tmp_path / "plain")):
         base = [f"scene={scene}", f"environment={light_path}", f"output_dir={out}", "frames=1"]
         assert relight(*base, "up=[0,0,1]") == 0
@@ -187,6 +192,17 @@ def test_a_plain_3dgs_file_is_relit_with_a_warning(relight, scene_path, light_pa
     # Whichever way its normals point, the surface is there; kernel degree 2 is softer than the scene's 4.
     assert np.abs(masks[0] - masks[1]).mean() < 0.1
     assert "which way is up" not in caplog.text
+    assert not scene_path.with_suffix(".proxy.ply").exists()
+    assert (tmp_path / "plain.proxy.ply").is_file()
+    assert "filming a proxy for light: 0 of 24" in caplog.messages
+    assert any("normals have no sign: light sees a proxy of" in line for line in caplog.messages)
+    caplog.clear()
+    base = [f"scene={path}", f"environment={light_path}", "frames=1", "up=[0,0,1]"]
+    assert relight(*base, f"output_dir={tmp_path / 'kept'}") == 0
+    assert any("light sees the proxy of" in line for line in caplog.messages)
+    caplog.clear()
+    assert relight(*base, f"output_dir={tmp_path / 'never'}", "proxy=never") == 0
+    assert "proxy=never: light sees the scan itself" in caplog.messages
     silent = tmp_path / "silent"
     assert relight(f"scene={path}", f"environment={light_path}", f"output_dir={silent}", "frames=1") == 0
     assert "does not say which way is up: -y is taken" in caplog.text
