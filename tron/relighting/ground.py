@@ -87,7 +87,9 @@ class Ground:
         down = view.direction.z < 0
         distance = (height - origin.z) / dr.select(down, view.direction.z, -1)
         seen = down & (distance > 0) & (view.opacity < 1)
-        position = dr.select(seen, mi.Point3f(dr.fma(distance, view.direction, mi.Vector3f(origin))), view.position)
+        position = dr.select(
+            seen, mi.Point3f(dr.fma(distance, view.direction, mi.Vector3f(origin))), view.position
+        )
         plane = replace(
             view,
             position=position,
