@@ -136,8 +136,10 @@ class Relighter:
 
     def _needs_proxy(self, tracer: SurfelTracer) -> tuple[bool, str]:
         """Whether light sees a proxy, and why, in words; empty words where nobody has to know."""
-        if self._choice != "auto":
-            return self._choice == "always", f"proxy={self._choice}"
+        if self._choice == "never":
+            return False, ""
+        if self._choice == "always":
+            return True, "proxy=always"
         thick = thickness(tracer, self._cameras)
         said = f"{thick:.0%} of the opaque pixels are thicker than a spacing (thick from {THICK:.0%} on)"
         if thick >= THICK:

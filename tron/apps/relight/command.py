@@ -114,6 +114,8 @@ def main(settings: Settings) -> None:
             clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite, model_defaults(Settings))
         traced = {"estimation": settings.estimation(), "seed": settings.seed, "proxy": settings.proxy}
         traced |= {"filmed": filmed, "proxy_file": settings.scene.with_suffix(".proxy.ply")}
+        if settings.proxy == "never":
+            log.info("proxy=never: light sees the scan itself")
         traced["ground"] = _ground(settings, surrounded.content, cameras, float(turn[2] @ offset))
         trace(scene, cameras, clips, **traced, backdrop=surrounded.backdrop)
         clock.lap("guidance")
