@@ -131,10 +131,12 @@ def carry(scan: GaussianScene, fit: JointFit, curve: ToneCurve) -> GaussianScene
 def _explained(
     scene: GaussianScene, proxy: Proxy, fit: JointFit, capture: Capture, curve: ToneCurve, seed: int
 ) -> float:
-    """Mean PSNR, display values, of some views under the found light against the film, where it is opaque."""
+    """Mean PSNR, display values, of some views under the found light against the film, where it is opaque.
+
+    Of held-out views where there are any.
+    """
     light = Relighter(scene, Estimation(rays=_RAYS, filtered=True), seed, proxy=proxy).under(fit.environment)
-    views = capture.train_views
-    found = []
+    views, found = capture.test_views or capture.train_views, []
     for number in np.unique(np.linspace(0, len(views) - 1, _COMPARED).astype(int)):
         view = views[number]
         solid = view.read("mask") > _SOLID

@@ -193,8 +193,9 @@ def test_the_command_keeps_every_surfel_and_finds_the_light(plain, tmp_path, cap
     (folder / "cameras.json").write_text(json.dumps([camera.to_dict() for camera in lying]))
     out = tmp_path / "out"
     with pytest.raises(SystemExit) as end:
-        cli([f"capture={scan}", "up=[0,0,1]", "splats.views=12", "splats.side=48", "threads=1", "report=null",
-             "prior.light.points=300", "prior.light.steps=20", f"output_dir={out}"])  # fmt: skip
+        cli([f"capture={scan}", "up=[0,0,1]", "splats.views=12", "splats.side=48", "threads=1",
+             "report.frames=0", "prior.light.points=300", "prior.light.steps=20",
+             f"output_dir={out}"])  # fmt: skip
     assert end.value.code == 0
     found, before = GaussianScene.load(out / "scene.ply"), GaussianScene.load(scan)
     for name in ("means", "log_scales", "opacity_logits", "sh"):
@@ -210,3 +211,6 @@ def test_the_command_keeps_every_surfel_and_finds_the_light(plain, tmp_path, cap
     kept = json.loads((out / "cameras.json").read_text())["cameras"]
     assert (len(kept), kept[0]["width"], kept[0]["height"]) == (12, 48, 36)
     assert "the scan looks as it did to" in caplog.text
+    page = (out / "report.html").read_text()
+    assert f"All {len(before):,} surfels of the scan were kept" in page
+    assert "Under the light that was found it looks as it did to" in page

@@ -28,7 +28,7 @@ def asked(variant, monkeypatch) -> list[int]:
     def carry(capture, settings, seed, track):
         found.append(len(capture.views))
         scan = capture.scan
-        green = np.tile(np.float32([0.1, 0.6, 0.1]), (len(scan), 1))
+        green = np.tile(np.array([0.1, 0.6, 0.1], np.float32), (len(scan), 1))
         scene = replace(scan, base_color=green, roughness=np.full(len(scan), 0.25), materials_guessed=False)
         return SimpleNamespace(scene=scene, proxy=Proxy(replace(scene, oriented=True), 0.1))
 
