@@ -231,3 +231,15 @@ def film_around(scene: Surfels, views: int, side: int) -> list[Camera]:
     elevation_deg = (LOWEST_DEG[has_floor(scene)], HIGHEST_DEG)
     view = {"width": side, "height": side, "fov_deg": FILM_FOV_DEG}
     return plan_cameras(scene, "spiral", views, **view, elevation_deg=elevation_deg)
+
+
+def film_with(cameras: Sequence[Camera], views: int, side: int) -> list[Camera]:
+    """Some ``views`` of the cameras, evenly, or all where there are fewer; the longer sides are ``side``."""
+    numbers = np.linspace(0, len(cameras) - 1, min(views, len(cameras))).round().astype(int)
+    resized = []
+    for camera in (cameras[number] for number in numbers):
+        share = side / max(camera.width, camera.height)
+        resized.append(
+            camera.resized(max(round(share * camera.width), 1), max(round(share * camera.height), 1))
+        )
+    return resized

@@ -52,6 +52,9 @@ PEERS = set().union(
 ASKED_FOR = {
     ("tron.apps.relight.command", "tron.neural.weights"),
     ("tron.apps.relight.clip", "tron.neural.renderer"),
+    ("tron.apps.relight.scan_materials", "tron.reconstruction.film"),
+    ("tron.apps.relight.scan_materials", "tron.reconstruction.materials.carried"),
+    ("tron.apps.relight.scan_materials", "tron.reconstruction.materials.joint_fit"),
     ("tron.reconstruction.priors.rgbx", "diffusers"),
     ("tron.reconstruction.priors.rgbx", "transformers"),
 }

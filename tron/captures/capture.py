@@ -13,6 +13,7 @@ import numpy as np
 from tron.cameras import Camera
 from tron.captures.view import MAPS, ToneCurve, View
 from tron.errors import TronError
+from tron.gaussians.scene import GaussianScene
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,7 @@ class Capture:
             all, because all show one light. Radiance of unknown scale has 1.
         skipped: what the files name and the capture lacks: name -> why, such as "image not found".
         tone_curve: that display images went through.
+        scan: surfels that were filmed and are to stay; None: a reconstruction makes its own.
 
     Raises:
         TronError: no views, names that repeat, a held-out name that no view has, no view left to train on,
@@ -48,6 +50,7 @@ class Capture:
     skipped: Mapping[str, str] = field(default_factory=dict)
     tone_curve: ToneCurve = "srgb"
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    scan: GaussianScene | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "views", tuple(self.views))

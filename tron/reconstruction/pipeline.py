@@ -25,6 +25,7 @@ from torch import Tensor
 from tron.captures import Capture, View
 from tron.color import srgb_to_linear
 from tron.errors import TronError
+from tron.gaussians.fields import MATERIALS
 from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
 from tron.metrics import LPIPS
@@ -39,10 +40,13 @@ from tron.reconstruction.geometry.training import (
     materials_plan,
     radiance_plan,
 )
+from tron.reconstruction.materials.carried import Carried
 from tron.reconstruction.priors.prior import FIELDS, Light, Prior, Surfels
 from tron.reconstruction.progress import Track, untracked
-from tron.reconstruction.scores import ViewScore, score_views
+from tron.reconstruction.scores import Seen, ViewScore, score_views
 from tron.reconstruction.settings import FitSettings, ReconstructionSettings
+from tron.relighting import Relighter
+from tron.relighting.proxy import Proxy
 from tron.run_folder import RunFolder
 from tron.storage import write_atomic
 from tron.termination import Termination, termination_noted
@@ -71,6 +75,7 @@ class Reconstruction:
         confident: share of the subject's pixels whose depth stereo found and other photos confirm; None where
             stereo was not asked.
         seconds: of surfels with materials, those before an interruption included, and of the light.
+        proxy: what light sees of a scan that was kept; None where surfels are new.
     """
 
     scene: GaussianScene
@@ -81,6 +86,7 @@ class Reconstruction:
     source: str
     confident: float | None
     seconds: dict[str, float]
+    proxy: Proxy | None = None
 
 
 def reconstruct(
@@ -95,6 +101,9 @@ def reconstruct(
     track: Track = untracked,
 ) -> Reconstruction:
     """Find surfels, materials and light of a capture, whose images are display values.
+
+    Where the capture films a scan, its surfels stay, and get materials (:meth:`Prior.carry`); there is no
+    checkpoint of that. Where they cannot, which the log says, new ones are learnt.
 
     Args:
         capture: training views are learnt from, the others only scored.
@@ -123,6 +132,12 @@ def reconstruct(
             "encode it for display",
         )
     prior.check(capture)
+    if capture.scan is not None:
+        started = time.perf_counter()
+        carried = prior.carry(capture, settings.seed, track)
+        if carried is not None:
+            return _kept(carried, capture, settings, light, lpips, track, time.perf_counter() - started)
+        log.warning("the scan's surfels are not kept: new ones are learnt")
     run = _Run(settings, made_with(capture, prior, settings), checkpoint, watch)
     extent = extent_of(views)
     source_of(capture, settings.initial)  # a lacking one is told before a prior works for hours
@@ -155,10 +170,35 @@ def reconstruct(
     if light is not None:
         lit = found.light or prior.find_light(frozen, tracer, light)
     seconds["light"] = time.perf_counter() - started
+    scores = _scores(tracer, capture, settings, lpips, track)
+    return Reconstruction(found.scene, lit, scores, found.learnt, found.gains, seconds=seconds, **run.begun)
+
+
+def _scores(
+    seen: Seen, capture: Capture, settings: ReconstructionSettings, lpips: LPIPS | None, track: Track
+) -> dict[str, list[ViewScore]]:
+    views = capture.train_views
     judged = {"test": capture.test_views, "train": views[:: max(1, len(views) // TRAIN_VIEWS_SCORED)]}
     background = settings.radiance.background
-    scores = {which: score_views(tracer, some, background, lpips, track) for which, some in judged.items()}
-    return Reconstruction(found.scene, lit, scores, found.learnt, found.gains, seconds=seconds, **run.begun)
+    return {which: score_views(seen, some, background, lpips, track) for which, some in judged.items()}
+
+
+def _kept(
+    carried: Carried,
+    capture: Capture,
+    settings: ReconstructionSettings,
+    light: FitSettings | None,
+    lpips: LPIPS | None,
+    track: Track,
+    seconds: float,
+) -> Reconstruction:
+    """The reconstruction of a scan whose surfels stay."""
+    seen = Relighter(carried.scene.validate(), proxy=carried.proxy)
+    lit = None if light is None else Light(carried.fit.environment, carried.said())
+    return Reconstruction(
+        carried.scene, lit, _scores(seen, capture, settings, lpips, track), MATERIALS, None, source="scan",
+        confident=None, seconds={"surfels": seconds, "light": 0.0}, proxy=carried.proxy,
+    )  # fmt: skip
 
 
 def made_with(capture: Capture, prior: Prior, settings: ReconstructionSettings) -> dict[str, Any]:

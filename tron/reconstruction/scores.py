@@ -10,13 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
+from tron.cameras import Camera
 from tron.captures import View
+from tron.gaussians.scene import GaussianScene
 from tron.metrics import LPIPS, angular_errors_deg, capped_psnr, scale_albedo, ssim
 from tron.reconstruction.progress import Track, untracked
-from tron.shading.guidance import ViewTracer
+from tron.tracing import GBuffer
 
 _SUBJECT = 0.5
 BACKGROUND = {"black": 0.0, "white": 1.0, "random": 0.0}
@@ -37,8 +40,17 @@ class ViewScore:
     figures: Mapping[str, float]
 
 
+class Seen(Protocol):
+    """What a camera sees of surfels: of a tracer, or of a Relighter, which turns surfels without a sign."""
+
+    @property
+    def scene(self) -> GaussianScene: ...
+
+    def gbuffer(self, camera: Camera) -> GBuffer: ...
+
+
 def score_views(
-    tracer: ViewTracer,
+    tracer: Seen,
     views: Sequence[View],
     background: str = "black",
     lpips: LPIPS | None = None,

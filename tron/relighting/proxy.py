@@ -44,7 +44,7 @@ from tron.gaussians.scene import GaussianScene
 from tron.tracing import GBuffer, SurfelTracer
 from tron.tracing.fusion import DepthMap, consensus, empty_rays, fuse, pixel_footprint
 from tron.tracing.hierarchy.first_hit import FirstHit
-from tron.trajectories import film_around
+from tron.trajectories import film_around, film_with
 
 log = logging.getLogger(__name__)
 
@@ -174,16 +174,7 @@ def _layer(
 
 def _film(scene: GaussianScene, cameras: Sequence[Camera] | None, views: int, side: int) -> list[Camera]:
     """Some ``views`` of the cameras, evenly, with images of ``side`` at most; without any: around."""
-    if not cameras:
-        return film_around(scene, views, side)
-    some = [
-        cameras[k] for k in np.linspace(0, len(cameras) - 1, min(views, len(cameras))).round().astype(int)
-    ]
-    shares = [side / max(camera.width, camera.height) for camera in some]
-    return [
-        camera.resized(max(round(share * camera.width), 1), max(round(share * camera.height), 1))
-        for camera, share in zip(some, shares)
-    ]
+    return film_with(cameras, views, side) if cameras else film_around(scene, views, side)
 
 
 def seen_by(tracer: SurfelTracer, camera: Camera) -> GBuffer:

@@ -59,7 +59,7 @@ class Relighter:
         backdrop: (M,) bool, surfels that are seen, from the side they show, and in no light's way.
         track: wraps the loop over rays of the surfels, to show progress.
         proxy: whether light sees a proxy: where the scene is thick or its normals have no sign (auto), or as
-            said.
+            said; or one that is there.
         cameras: that the scene was filmed with, to film its proxy; None: from around it.
         proxy_file: PLY that keeps the proxy; taken where it was made from the same, else written.
         filming: wraps the loop over the proxy's views, to show progress.
@@ -74,7 +74,7 @@ class Relighter:
         *,
         backdrop: np.ndarray | None = None,
         track: Callable[[range], Iterable[int]] = iter,
-        proxy: Choice = "auto",
+        proxy: Choice | Proxy = "auto",
         cameras: Sequence[Camera] | None = None,
         proxy_file: Path | None = None,
         filming: Callable[[range], Iterable[int]] = iter,
@@ -108,6 +108,8 @@ class Relighter:
     @cached_property
     def proxy(self) -> Proxy | None:
         """What light sees in place of the scene; None: the scene. Made when it is first asked for."""
+        if isinstance(self._choice, Proxy):
+            return self._choice
         content = self.scene if self._backdrop is None else subset(self.scene, ~self._backdrop)
         tracer = self._tracer if self._backdrop is None else SurfelTracer(content)
         needed, said = self._needs_proxy(tracer)
@@ -134,8 +136,10 @@ class Relighter:
 
     def _needs_proxy(self, tracer: SurfelTracer) -> tuple[bool, str]:
         """Whether light sees a proxy, and why, in words; empty words where nobody has to know."""
-        if self._choice != "auto":
-            return self._choice == "always", f"proxy={self._choice}"
+        if self._choice == "never":
+            return False, ""
+        if self._choice == "always":
+            return True, "proxy=always"
         thick = thickness(tracer, self._cameras)
         said = f"{thick:.0%} of the opaque pixels are thicker than a spacing (thick from {THICK:.0%} on)"
         if thick >= THICK:
@@ -163,6 +167,10 @@ class Relighter:
         if self._proxied is not None:
             return self._proxied.light
         return self._tracer if self.scene.oriented else self._tracer.turned_over(self._outward)
+
+    def gbuffer(self, camera: Camera, values: Sequence[mi.Float] = ()) -> GBuffer:
+        """What a camera sees; ``values`` of the surfels that light sees are composited too."""
+        return self.tracer(camera).gbuffer(camera, values)
 
     def surface_maps(self, camera: Camera) -> dict[str, np.ndarray]:
         """:func:`tron.shading.guidance.surface_maps` of a view: what no light changes."""

@@ -9,13 +9,14 @@ import numpy as np
 from tron.captures import Capture, View
 from tron.color import linear_to_srgb, to_display
 from tron.estimation import Estimation
+from tron.gaussians.scene import GaussianScene
 from tron.io.images import write_image
-from tron.reconstruction.scores import picture, wanted_picture
+from tron.reconstruction.scores import Seen, picture, wanted_picture
 from tron.reconstruction.settings import FitSettings
 from tron.relighting import Relighter
+from tron.relighting.proxy import Proxy
 from tron.report.contact_sheet import labelled_sheet
 from tron.shading.environments.environment import EnvironmentMap
-from tron.tracing import SurfelTracer
 
 SHEET_VIEWS = 6
 SHADOW_RAYS = 16
@@ -23,26 +24,27 @@ SHADOW_RAYS = 16
 
 def write_sheet(
     path: Path,
-    tracer: SurfelTracer,
+    scene: GaussianScene,
     capture: Capture,
     environment: EnvironmentMap | None,
     settings: FitSettings | None,
     called: str = "photo",
+    proxy: Proxy | None = None,
 ) -> None:
     """Held-out views (training views, if none is) with every channel of the G-buffer and the guidance.
 
     The guidance needs the ``environment`` and the ``settings`` of shadows.
     ``lit`` beside the photo, or what it is ``called``, shows how far materials and light explain it, what
-    bounces included.
+    bounces included. ``proxy`` is what light sees of a scan that was kept.
     """
-    views = chosen_views(capture, SHEET_VIEWS)
+    views, seen = chosen_views(capture, SHEET_VIEWS), Relighter(scene, proxy=proxy or "never")
     rows: dict[str, list[np.ndarray]] = {}
     light = None
     if environment is not None and settings is not None:
-        filmed = capture.train_cameras
-        light = Relighter(tracer.scene, sheet_estimation(settings), cameras=filmed).under(environment)
+        filmed, estimation = capture.train_cameras, sheet_estimation(settings)
+        light = Relighter(scene, estimation, proxy=proxy or "auto", cameras=filmed).under(environment)
     for number, view in enumerate(views):
-        for name, image in view_pictures(tracer, view, called).items():
+        for name, image in view_pictures(seen, view, called).items():
             rows.setdefault(name, []).append(image)
         if light is not None:
             guidance = light.render(view.camera, number)
@@ -57,12 +59,12 @@ def chosen_views(capture: Capture, count: int) -> list[View]:
     return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, count).astype(int))]
 
 
-def view_pictures(tracer: SurfelTracer, view: View, called: str = "photo") -> dict[str, np.ndarray]:
+def view_pictures(seen: Seen, view: View, called: str = "photo") -> dict[str, np.ndarray]:
     """A view's photo and what the surfels show of it: channel -> (H, W) or (H, W, 3) display values.
 
     ``called``: channel of the photo.
     """
-    buffers = tracer.gbuffer(view.camera).numpy()
+    buffers = seen.gbuffer(view.camera).numpy()
     rendered, wanted = picture(buffers), wanted_picture(view)
     return {
         called: wanted,

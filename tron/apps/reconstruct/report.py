@@ -27,12 +27,12 @@ from tron.framing import upright
 from tron.gaussians.scene import GaussianScene
 from tron.io.video import VideoWriter
 from tron.relighting import Relighter
+from tron.relighting.proxy import Proxy
 from tron.report.page import Cell, Film, Films, Picture, Pictures, Table, Tile, format_value
 from tron.report.render import render_template
 from tron.seeds import integer
 from tron.shading.environments.environment import EnvironmentMap
 from tron.storage import write_atomic
-from tron.tracing import SurfelTracer
 from tron.trajectories import turn_cameras
 
 TRUTH = ("normal", "base_color", "roughness", "metallic")
@@ -72,6 +72,7 @@ def write_page(
     capture: Capture,
     light: EnvironmentMap | None,
     called: str = "photo",
+    proxy: Proxy | None = None,
 ) -> None:
     """Write the page of a finished reconstruction.
 
@@ -83,6 +84,7 @@ def write_page(
         capture: that they were found from.
         light: that the scene was seen in, where it was found.
         called: one picture of the capture: "photo", or "filmed view" of a scan of splats.
+        proxy: what light sees of a scan that was kept.
     """
     figures = {
         key: (title.format(views=f"{called}s"), unit, says.format(view=called, views=f"{called}s"))
@@ -103,8 +105,8 @@ def write_page(
         report=report, called=called, seconds=seconds, said=said, sun_height=sun_height,
         tiles=[*tiles, Tile("Surfels", f"{report['surfels']:,}"), Tile("Time", seconds)],
         figures=_figures(report, figures),
-        films=_films(scene, capture, settings) if settings.frames else [],
-        views=_views(scene, capture, light, settings, report, called),
+        films=_films(scene, capture, settings, proxy) if settings.frames else [],
+        views=_views(scene, capture, light, settings, report, called, proxy),
         balls=None if light is None else _balls(light), contrast=None if light is None else light.contrast(),
         truth={field for view in capture.test_views for field in TRUTH if view.has(field)},
         table=Table, films_of=Films, pictures_of=Pictures, shown=format_value, exp=np.exp,
@@ -141,11 +143,13 @@ def _figures(
     return rows
 
 
-def _films(scene: GaussianScene, capture: Capture, settings: ReportSettings) -> list[Film]:
+def _films(
+    scene: GaussianScene, capture: Capture, settings: ReportSettings, proxy: Proxy | None
+) -> list[Film]:
     size = settings.side, settings.side
     return [
         Film(video, size, name, f"a walk around the scene under a {name}")
-        for name, video in showcase_films(scene, capture, settings.frames, settings.side).items()
+        for name, video in showcase_films(scene, capture, settings.frames, settings.side, proxy).items()
     ]
 
 
@@ -156,17 +160,17 @@ def _views(
     settings: ReportSettings,
     report: Mapping[str, Any],
     called: str,
+    proxy: Proxy | None,
 ) -> list[Pictures]:
     """Some views with every channel, and what materials and light together make of them."""
-    tracer, blocks = SurfelTracer(scene), []
-    lit = (
-        None
-        if light is None
-        else Relighter(scene, QUALITY["preview"], cameras=capture.train_cameras).under(light)
-    )
+    seen, blocks = Relighter(scene, proxy=proxy or "never"), []
+    lit, filmed = None, capture.train_cameras
+    if light is not None:
+        relighter = Relighter(scene, QUALITY["preview"], proxy=proxy or "auto", cameras=filmed)
+        lit = relighter.under(light)
     for number, view in enumerate(chosen_views(capture, settings.views)):
         figures = report["views"].get(view.name, {})
-        channels = view_pictures(tracer, view, called)
+        channels = view_pictures(seen, view, called)
         if lit is not None:
             shown = lit.render(view.camera, number).lit
             channels["lit by the light found"] = to_display(shown, capture.exposure)
@@ -197,12 +201,17 @@ def _balls(light: EnvironmentMap) -> list[Picture]:
     ]
 
 
-def showcase_films(scene: GaussianScene, capture: Capture, frames: int, side: int) -> dict[str, bytes]:
+def showcase_films(
+    scene: GaussianScene, capture: Capture, frames: int, side: int, proxy: Proxy | None = None
+) -> dict[str, bytes]:
     """Name of each showcase light -> an MP4 of the scene in it, ``side`` pixels the longer side."""
     turn = upright(scene.up)
     cameras = turn_cameras(film_cameras(scene, capture, frames, side), turn)
+    turned = None if proxy is None else Proxy(proxy.surfels.rotated(turn), proxy.voxel)
     photographed, seed = turn_cameras(capture.train_cameras, turn), integer(0, "report", "bounces")
-    relighter = Relighter(scene.rotated(turn), QUALITY["preview"], seed, cameras=photographed)
+    relighter = Relighter(
+        scene.rotated(turn), QUALITY["preview"], seed, proxy=turned or "auto", cameras=photographed
+    )
     films = {}
     for name, light in showcase_lights().items():
         lit, exposure, pictures = relighter.under(light), None, []

@@ -27,7 +27,6 @@ from tron.reconstruction.geometry.training import Stage, StepSummary
 from tron.reconstruction.scores import BACKGROUND, mean_figures, picture, wanted_picture
 from tron.runtime import describe_machine
 from tron.storage import write_atomic
-from tron.tracing import SurfelTracer
 from tron.tracing.torch_bridge import render
 
 log = logging.getLogger(__name__)
@@ -47,7 +46,7 @@ def run(settings: Settings, capture: Capture, prior: Prior, lpips: LPIPS | None)
         lpips: scores LPIPS as well.
     """
     out = settings.output_dir
-    bars = StageBars()
+    bars = StageBars("first surfels" if capture.scan is None else "materials and light of the scan")
     curve = None
     if settings.score_every and capture.test:
         curve = Curve(out / "curve.json", capture.test_views, settings.score_every)
@@ -66,13 +65,14 @@ def run(settings: Settings, capture: Capture, prior: Prior, lpips: LPIPS | None)
         bars.close()
     found.scene.save(out / "scene.ply")
     write_cameras(out, capture.views, capture.offset)
-    tracer = SurfelTracer(found.scene)
     environment = None if found.light is None else found.light.environment
     if environment is not None:
         environment.save(out / "environment.exr")
     called = "filmed view" if is_splats(settings.capture) else "photo"
     with working("contact sheet"):
-        write_sheet(out / "contact_sheet.png", tracer, capture, environment, settings.light, called)
+        write_sheet(
+            out / "contact_sheet.png", found.scene, capture, environment, settings.light, called, found.proxy
+        )
         if environment is not None:
             write_light(out / "light.png", environment)
     report = _report(settings, capture, found)
@@ -80,7 +80,9 @@ def run(settings: Settings, capture: Capture, prior: Prior, lpips: LPIPS | None)
         report["curve"] = curve.points
     if settings.report is not None:
         with working("report"):
-            write_page(out / PAGE, settings.report, report, found.scene, capture, environment, called)
+            write_page(
+                out / PAGE, settings.report, report, found.scene, capture, environment, called, found.proxy
+            )
     write_atomic(out / "metrics.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
     return report
 
@@ -93,9 +95,9 @@ def shown_by(capture: Capture) -> list[str]:
 class StageBars:
     """A bar for each stage as it comes, and a name for what lies before and between them."""
 
-    def __init__(self) -> None:
+    def __init__(self, first: str = "first surfels") -> None:
         self._stage = ""
-        self._bar: Progress | None = working("first surfels")
+        self._bar: Progress | None = working(first)
 
     def watch(self, progress: StepSummary) -> None:
         """Show a step."""

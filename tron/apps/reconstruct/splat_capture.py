@@ -1,8 +1,9 @@
 """A file of splats as a capture: filmed by virtual cameras, with what they saw as photos and depth maps.
 
 A plain 3DGS scan knows how it looks, not where its surfaces face nor what they are made of: its normals are
-its shortest axes, with signs that mean nothing. Its pictures and median depths from many sides are all that
-is taken from it; surfaces, materials and light are then found as from photos.
+its shortest axes, with signs that mean nothing. Its pictures and median depths from many sides tell materials
+and light, for its own surfels, which stay (:mod:`tron.reconstruction.materials.carried`), or for new ones,
+whose surfaces are then found as from photos.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import KDTree
 
-from tron.apps.surroundings import DESCRIPTION, Surrounded, Treatment, treat_surroundings
+from tron.apps.relight.camera_files import CAMERAS, filmed_cameras
+from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.errors import TronError
@@ -25,7 +27,7 @@ from tron.gaussians.foreign_files import PACKED_SPLATS, refuse_foreign
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
 from tron.seeds import generator
-from tron.trajectories import film_around
+from tron.trajectories import film_around, film_with
 
 if TYPE_CHECKING:
     from tron.reconstruction.progress import Track
@@ -42,8 +44,6 @@ TRIMMED = 0.05
 """Share of the splats beyond each side of the box that places inside are drawn from."""
 SOLID = 0.5
 """Opacity from which a pixel shows a surface."""
-THIN = 0.02
-"""Opacity below which a pixel's colour is not known."""
 
 
 class SplatSettings(BaseModel):
@@ -51,10 +51,15 @@ class SplatSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    cameras: Literal["around", "inside", "both"] = Field(
-        default="around",
+    geometry: Literal["scan", "new"] = Field(
+        default="scan",
+        description="scan: all of its surfels stay as they are and get materials, in a minute; new: other "
+        "surfels are learnt from the film, which takes many minutes and loses detail, but gives them normals",
+    )
+    cameras: Literal["auto", "around", "inside", "both"] = Field(
+        default="auto",
         description="around the subject, for things; inside, for rooms: from free places, in all directions; "
-        "both: half of each",
+        "both: half of each; auto: as in cameras.json beside the file, where photos looked, else around",
     )
     views: int = Field(default=64, ge=4, le=10_000, description="number of pictures")
     surroundings: Treatment = Field(default="drop", description=DESCRIPTION)
@@ -104,20 +109,27 @@ def film_splats(
             path,
         )
     surrounded = treat_surroundings(scene, settings.surroundings, path, "splats.surroundings")
-    cameras = virtual_cameras(surrounded.content, settings, seed)
-    views = [
-        _filmed(surrounded, f"film_{number:05d}", camera)
-        for number, camera in enumerate(track(cameras, "filming splats"))
-    ]
+    filmed = filmed_cameras(path, scene.offset) if settings.cameras == "auto" else None
+    if filmed is None:
+        cameras = virtual_cameras(surrounded.content, settings, seed)
+    else:
+        log.info("%s is filmed from where its photos were taken: %s", path, path.with_name(CAMERAS))
+        cameras = film_with(filmed, settings.views, settings.side)
+    from tron.reconstruction.film import film  # Mitsuba: not for --help
+
+    views = film(surrounded.content, cameras, track)
+    if surrounded.backdrop is not None:
+        views = [_under_its_sky(view, surrounded.shown, surrounded.backdrop) for view in views]
     test = frozenset(view.name for view in views[::test_every]) if test_every else frozenset()
     agreed = iter(_agreeing([view for view in views if view.name not in test], fusion))
     views = [replace(view, depth=None) if view.name in test else next(agreed) for view in views]
-    return Capture(tuple(views), test, up=scene.up, offset=scene.offset)
+    scan = surrounded.content if settings.geometry == "scan" else None
+    return Capture(tuple(views), test, up=scene.up, offset=scene.offset, scan=scan)
 
 
 def virtual_cameras(scene: GaussianScene, settings: SplatSettings, seed: int) -> list[Camera]:
     """The cameras of the settings, those around the scene first."""
-    outside = {"around": settings.views, "inside": 0, "both": settings.views // 2}[settings.cameras]
+    outside = {"inside": 0, "both": settings.views // 2}.get(settings.cameras, settings.views)
     cameras = []
     if outside:
         cameras += film_around(scene, outside, settings.side)
@@ -174,31 +186,14 @@ def _agreeing(views: Sequence[View], settings: FusionSettings) -> list[View]:
     return [replace(view, depth=depth) for view, (depth, _) in zip(views, agreed)]
 
 
-def _filmed(surrounded: Surrounded, name: str, camera: Camera) -> View:
-    """The view of the content; what surrounds it is its sky, where that is to be seen."""
-    buffers = _buffers(surrounded.content, camera)
-    mask = np.clip(buffers["opacity"], 0, 1)
-    if surrounded.backdrop is None:
-        return View(name, camera, _color(buffers), "display", mask=mask, depth=buffers["depth"])
-    seen = _buffers(surrounded.shown, camera, surrounded.backdrop)
-    sky = np.clip(seen["opacity"], 0, 1) * (1 - mask)
-    return View(name, camera, _color(seen), "display", mask=mask, depth=buffers["depth"], sky_mask=sky)
-
-
-def _buffers(
-    scene: GaussianScene, camera: Camera, backdrop: np.ndarray | None = None
-) -> dict[str, np.ndarray]:
+def _under_its_sky(view: View, shown: GaussianScene, backdrop: np.ndarray) -> View:
+    """The view of the content with what surrounds it, which is its sky where that is to be seen."""
+    from tron.reconstruction.film import straight_color
     from tron.tracing import SurfelTracer  # Mitsuba: not for --help
 
-    # Where normals have no sign, each camera sees the side that it is on, but of a backdrop the inside alone.
-    away = scene.looks_away(camera.position) if not scene.oriented else np.zeros(len(scene), bool)
-    shown = scene.turned_over(away if backdrop is None else away & ~backdrop)
-    return SurfelTracer(shown).gbuffer(camera).numpy()
-
-
-def _color(buffers: dict[str, np.ndarray]) -> np.ndarray:
-    """(H, W, 3) display colours, black where next to nothing is."""
-    opacity = np.clip(buffers["opacity"], 0, 1)
-    solid = opacity > THIN
-    color = buffers["rgb"] / np.where(solid, opacity, 1)[..., None]
-    return np.where(solid[..., None], np.clip(color, 0, 1), 0)
+    # Each camera sees the side that it is on, but of a backdrop the inside alone.
+    if not shown.oriented:
+        shown = shown.turned_over(shown.looks_away(view.camera.position) & ~backdrop)
+    seen = SurfelTracer(shown).gbuffer(view.camera).numpy()
+    sky = np.clip(seen["opacity"], 0, 1) * (1 - view.read("mask"))
+    return replace(view, image=straight_color(seen), sky_mask=sky)

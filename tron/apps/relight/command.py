@@ -13,7 +13,6 @@ import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +28,7 @@ from tron.apps.relight.camera_files import (
     stated,
 )
 from tron.apps.relight.clip import DEPTH, Clip, trace
+from tron.apps.relight.scan_materials import with_materials
 from tron.apps.relight.settings import Settings
 from tron.apps.relit import RelitPicture
 from tron.apps.surroundings import treat_surroundings
@@ -92,6 +92,8 @@ def main(settings: Settings) -> None:
         surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
     scene = surrounded.shown
     filmed = _filmed(settings.scene, turn, offset)
+    if scene.materials_guessed and settings.materials == "auto":
+        scene = with_materials(scene, settings.scene, filmed, settings.seed, surrounded.backdrop)
     if given is not None:
         cameras = turn_cameras(given, turn)
     else:
@@ -112,6 +114,8 @@ def main(settings: Settings) -> None:
             clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite, model_defaults(Settings))
         traced = {"estimation": settings.estimation(), "seed": settings.seed, "proxy": settings.proxy}
         traced |= {"filmed": filmed, "proxy_file": settings.scene.with_suffix(".proxy.ply")}
+        if settings.proxy == "never":
+            log.info("proxy=never: light sees the scan itself")
         traced["ground"] = _ground(settings, surrounded.content, cameras, float(turn[2] @ offset))
         trace(scene, cameras, clips, **traced, backdrop=surrounded.backdrop)
         clock.lap("guidance")
@@ -207,12 +211,11 @@ def _check_paths(settings: Settings, lights: Sequence[Settings]) -> None:
 
 def _load_scene(settings: Settings) -> GaussianScene:
     scene = GaussianScene.load(settings.scene)
-    if scene.materials_guessed:
+    if scene.materials_guessed and settings.materials == "as_is":
         log.warning(
-            "%s has no materials%s: they are guessed from its colours, which keep the light it was captured "
-            "in; tron-reconstruct capture=%s output_dir=OUT finds surfaces, materials and light",
+            "%s has no materials%s: they are guessed from its colours, which keep the light that it was "
+            "captured in",
             settings.scene, "" if scene.oriented else " and normals without a sign",
-            quote(str(settings.scene)),
         )  # fmt: skip
     if settings.up is not None:
         scene.up = np.array(settings.up) / np.linalg.norm(settings.up)
@@ -259,6 +262,7 @@ def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> 
         "surroundings",
         "ground",
         "proxy",
+        "materials",
     }
     return {
         "scene_sha256": sha256(light.scene),

@@ -69,6 +69,11 @@ class Settings(BaseModel):
         "once and kept beside it as NAME.proxy.ply; auto: where the scan is thick by the log's number, or "
         "its normals have no sign; never: the scan itself",
     )
+    materials: Literal["auto", "as_is"] = Field(
+        "auto",
+        description="of a scan without any; auto: found once with the light it was captured in, which is "
+        "taken out of its colours, and kept beside it as NAME.materials.ply; as_is: guessed from its colours",
+    )
     rotation: float | tuple[float, float] = Field(
         0.0,
         description="turn of the environment about up, degrees, counter-clockwise seen from above; [0,360] "

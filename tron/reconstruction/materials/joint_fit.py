@@ -64,6 +64,11 @@ class JointSettings(Settings):
         description="Share of the differences between neighbours that a sun must explain to be one; 1: none.",
     )  # fmt: skip
     rounds: int = Field(default=1, ge=1, description="Times that light and materials are found in turns.")
+    neutral: bool = Field(
+        default=False,
+        description="Mean irradiance over what the photos show is grey and as bright as white paper in them, "
+        "as of a camera that balances white and exposes for what it sees; false: as it was found.",
+    )
     light: LightSettings = Field(default=LightSettings(), description="Fit of the light.")
 
 
@@ -76,12 +81,17 @@ class JointFit:
         environment: the light, in the unit of the photos over the capture's exposure.
         sun: its part that is a lobe; None where no shadows tell of one.
         colors: what the photos agree on.
+        shown: (M, 3) linear light that leaves the surfels; where no photo shows one, its neighbours'.
+        balance: (3,) mean irradiance / pi over what is seen that was moved from the light into base color,
+            in the unit of the photos; ones where nothing was.
     """
 
     scene: GaussianScene
     environment: EnvironmentMap
     sun: Sun | None
     colors: SurfelColors
+    shown: np.ndarray
+    balance: np.ndarray
 
     def said(self) -> dict[str, Any]:
         """Plain values for a report."""
@@ -95,6 +105,7 @@ class JointFit:
             },
             "surfels_seen": round(float(self.colors.seen.mean()), 4),
             "spread": round(float(np.median(self.colors.spread[self.colors.seen])), 4),
+            "balance": [round(float(x), 4) for x in self.balance],
         }
 
 
@@ -145,7 +156,13 @@ def fit_jointly(
         # What is left without highlights and metals tells of the light better.
         diffuse = materials.base_color * (received.direct + received.bounced)
         metallic = materials.metallic
-    return JointFit(_with(scene, materials), _scaled(environment, 1 / capture.exposure), sun, colors)
+    balance = np.ones(3, np.float32)
+    if prior.neutral:
+        balance = (received.direct + received.bounced)[colors.seen].mean(0).astype(np.float32)
+        materials = replace(materials, base_color=materials.base_color * balance)
+        sun = None if sun is None else replace(sun, strength=sun.strength / balance)
+    environment = EnvironmentMap(environment.image / (balance * np.float32(capture.exposure)))
+    return JointFit(_with(scene, materials), environment, sun, colors, shown, balance)
 
 
 class LightFinder:
@@ -250,10 +267,6 @@ def _with(scene: GaussianScene, materials: Materials) -> GaussianScene:
         roughness=np.clip(materials.roughness, 0, 1),
         metallic=np.clip(materials.metallic, 0, 1),
     )
-
-
-def _scaled(environment: EnvironmentMap, factor: float) -> EnvironmentMap:
-    return EnvironmentMap(environment.image * np.float32(factor))
 
 
 def environment_of(light: Light, sun: Sun | None) -> EnvironmentMap:

@@ -7,8 +7,10 @@ import logging
 from tron.captures import Capture
 from tron.gaussians.fields import MATERIALS
 from tron.reconstruction.light.fit_pairs import TooFewSeen
+from tron.reconstruction.materials.carried import Carried, carry_materials
 from tron.reconstruction.materials.joint_fit import JointSettings, fit_jointly
 from tron.reconstruction.priors.prior import Light, Materials, Prior, Surfels
+from tron.reconstruction.progress import Track
 
 log = logging.getLogger(__name__)
 
@@ -18,6 +20,10 @@ class Joint(JointSettings, Prior):
 
     def check(self, capture: Capture) -> None:
         """Photos are enough."""
+
+    def carry(self, capture: Capture, seed: int, track: Track) -> Carried | None:
+        """See :func:`carry_materials`."""
+        return carry_materials(capture, self, seed, track)
 
     def find_materials(self, surfels: Surfels) -> Materials:
         """Find light and materials together; neither where photos show too few surfels: the log says so."""

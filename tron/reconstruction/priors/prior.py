@@ -25,6 +25,7 @@ from tron.errors import TronError
 from tron.gaussians import GaussianScene
 from tron.gaussians.fields import MATERIALS
 from tron.reconstruction.light.fit_environment import fit_environment
+from tron.reconstruction.materials.carried import Carried
 from tron.reconstruction.progress import Track, untracked
 from tron.reconstruction.settings import FitSettings
 from tron.shading.environments.environment import EnvironmentMap
@@ -107,6 +108,10 @@ class Prior(ABC):
     def teach(self, capture: Capture, fields: Collection[str], track: Track) -> Capture:  # noqa: ARG002
         """The capture, its training views with those of the fields that the prior has; by itself as it is."""
         return capture
+
+    def carry(self, capture: Capture, seed: int, track: Track) -> Carried | None:  # noqa: ARG002
+        """Find materials for the surfels of the capture's scan, and its light; None: not by this prior."""
+        log.info("prior %s finds materials on new surfels alone", type(self).__name__)
 
     @abstractmethod
     def find_materials(self, surfels: Surfels) -> Materials:

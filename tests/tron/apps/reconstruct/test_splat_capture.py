@@ -1,5 +1,7 @@
 """Splats as a capture: pictures and depths are those of the surfaces, whichever way the disks were turned."""
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -163,10 +165,52 @@ def test_paths_go_about_the_up_of_the_file(ball_on_floor):
 def test_the_command_makes_a_plain_file_relightable(variant, plain, tmp_path):
     with pytest.raises(SystemExit) as end:
         cli(
-            [f"capture={plain}", "splats.views=9", "splats.side=32", *QUICK, f"output_dir={tmp_path / 'out'}"]
-        )
+            [f"capture={plain}", "splats.views=9", "splats.side=32", *QUICK, "splats.geometry=new",
+             f"output_dir={tmp_path / 'out'}"]
+        )  # fmt: skip
     assert end.value.code == 0
     scene = GaussianScene.load(tmp_path / "out" / "scene.ply")
     assert scene.oriented
     assert not scene.materials_guessed
     assert scene.up.tolist() == [0, -1, 0]
+
+
+@pytest.fixture
+def few_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"VIEWS": 12, "SIDE": 64}.items():
+        monkeypatch.setattr(f"tron.relighting.proxy.{name}", value)
+
+
+@pytest.mark.usefixtures("few_views", "variant")
+def test_the_command_keeps_every_surfel_and_finds_the_light(plain, tmp_path, caplog):
+    """From the folder's own cameras.json, whose views are filmed again."""
+    caplog.set_level("INFO")
+    folder = tmp_path / "model"
+    folder.mkdir()
+    scan = Path(shutil.copy(plain, folder / "scan.ply"))
+    cameras = virtual_cameras(GaussianScene.load(plain).upright(), SplatSettings(views=20), 0)
+    lying = [replace(camera, width=64, height=48, cy=24.0, cx=32.0) for camera in cameras]
+    (folder / "cameras.json").write_text(json.dumps([camera.to_dict() for camera in lying]))
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit) as end:
+        cli([f"capture={scan}", "up=[0,0,1]", "splats.views=12", "splats.side=48", "threads=1",
+             "report.frames=0", "prior.light.points=300", "prior.light.steps=20",
+             f"output_dir={out}"])  # fmt: skip
+    assert end.value.code == 0
+    found, before = GaussianScene.load(out / "scene.ply"), GaussianScene.load(scan)
+    for name in ("means", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(before, name), err_msg=name)
+    assert not found.materials_guessed
+    assert not found.oriented
+    report = json.loads((out / "metrics.json").read_text())
+    assert report["first_surfels"]["source"] == "scan"
+    assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
+    assert len(report["light"]["balance"]) == 3
+    assert report["test"]["psnr"] > 30, "the scan looks as it did"
+    assert (out / "environment.exr").is_file()
+    kept = json.loads((out / "cameras.json").read_text())["cameras"]
+    assert (len(kept), kept[0]["width"], kept[0]["height"]) == (12, 48, 36)
+    assert "the scan looks as it did to" in caplog.text
+    page = (out / "report.html").read_text()
+    assert f"All {len(before):,} surfels of the scan were kept" in page
+    assert "Under the light that was found it looks as it did to" in page

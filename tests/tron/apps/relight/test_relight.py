@@ -183,7 +183,7 @@ def test_a_plain_3dgs_file_is_relit_with_a_warning(
     monkeypatch.setattr("tron.relighting.proxy.VIEWS", 24)
     for scene, out in ((scene_path, tmp_path / "ours"), (path, tmp_path / "plain")):
         base = [f"scene={scene}", f"environment={light_path}", f"output_dir={out}", "frames=1"]
-        assert relight(*base, "up=[0,0,1]") == 0
+        assert relight(*base, "up=[0,0,1]", "materials=as_is") == 0
         masks.append(read_image(out / "frames" / "0000.mask.exr")[..., 0])
     assert "materials" in caplog.text
     assert "guessed" in caplog.text
@@ -196,14 +196,14 @@ def test_a_plain_3dgs_file_is_relit_with_a_warning(
     assert "filming a proxy for light: 0 of 24" in caplog.messages
     assert any("normals have no sign: light sees a proxy of" in line for line in caplog.messages)
     caplog.clear()
-    base = [f"scene={path}", f"environment={light_path}", "frames=1", "up=[0,0,1]"]
+    base = [f"scene={path}", f"environment={light_path}", "frames=1", "up=[0,0,1]", "materials=as_is"]
     assert relight(*base, f"output_dir={tmp_path / 'kept'}") == 0
     assert any("light sees the proxy of" in line for line in caplog.messages)
     caplog.clear()
     assert relight(*base, f"output_dir={tmp_path / 'never'}", "proxy=never") == 0
     assert "proxy=never: light sees the scan itself" in caplog.messages
     silent = tmp_path / "silent"
-    assert relight(f"scene={path}", f"environment={light_path}", f"output_dir={silent}", "frames=1") == 0
+    assert relight(*base[:3], *base[4:], f"output_dir={silent}") == 0
     assert "does not say which way is up: -y is taken" in caplog.text
     assert json.loads((silent / "frames" / "settings.json").read_text())["up"] == [0, -1, 0]
 

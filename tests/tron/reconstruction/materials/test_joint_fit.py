@@ -230,6 +230,29 @@ def test_photos_alone_tell_light_and_materials(
     assert found.said()["surfels_seen"] == pytest.approx((found.colors.count > 0).mean(), abs=1e-4)
 
 
+def test_irradiance_is_held_grey_and_at_one(scene: GaussianScene, capture: Capture) -> None:
+    """Through whatever glass the photos were taken: what is moved from the light goes into base color."""
+    glass = np.array([1.5, 1.0, 0.6], np.float32)
+    tinted = [replace(view, image=view.read() * glass) for view in capture.views]
+    capture = replace(capture, views=tuple(tinted), exposure=0.5)
+    quick = LightSettings(points=400, steps=30, rounds=1)
+    fits = [
+        fit_jointly(capture, scene, Joint(light=quick, sun=1, neutral=neutral), 0)
+        for neutral in (False, True)
+    ]
+    np.testing.assert_array_equal(fits[0].balance, 1)
+    balance = fits[1].balance
+    np.testing.assert_allclose(fits[1].environment.image, fits[0].environment.image / balance, rtol=1e-5)
+    low = (fits[0].scene.base_color < 0.99) & (fits[1].scene.base_color < 0.99)
+    ratio = (fits[1].scene.base_color / np.maximum(fits[0].scene.base_color, 1e-6))[low.all(1)]
+    np.testing.assert_allclose(ratio, np.broadcast_to(balance, ratio.shape), rtol=1e-4)
+    transport = BounceTransport.trace(SurfelTracer(scene), seed=0)
+    bounced = photographed_bounces(transport, fits[1].shown) / balance
+    light = EnvironmentMap(fits[1].environment.image * np.float32(capture.exposure))
+    total = (receive(transport, Lighting(light), bounced, 0).direct + bounced)[fits[1].colors.seen].mean(0)
+    np.testing.assert_allclose(total, 1, atol=0.03)
+
+
 def _texel_centres(resolution: int) -> np.ndarray:
     centres = cube_texels(resolution)[0]
     face = np.array(direction_face(mi.Vector3f(*[mi.Float(c.astype(np.float32)) for c in centres.T]))[0])

@@ -1,0 +1,91 @@
+"""Materials of a plain scan for tron-relight: found once, kept beside it, and used for what they are of."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tron.apps.relight import scan_materials
+from tron.apps.relight.scan_materials import with_materials
+from tron.gaussians.scene import GaussianScene
+from tron.relighting.proxy import Proxy
+
+CARRY = "tron.reconstruction.materials.carried.carry_materials"
+
+
+@pytest.fixture
+def plain(ball_on_floor) -> GaussianScene:
+    scene = ball_on_floor(0.2)
+    return replace(scene, base_color=np.full((len(scene), 3), 0.5), materials_guessed=True, oriented=False)
+
+
+@pytest.fixture
+def asked(variant, monkeypatch) -> list[int]:
+    """How often materials were looked for; green ones are found."""
+    found = []
+
+    def carry(capture, settings, seed, track):
+        found.append(len(capture.views))
+        scan = capture.scan
+        green = np.tile(np.array([0.1, 0.6, 0.1], np.float32), (len(scan), 1))
+        scene = replace(scan, base_color=green, roughness=np.full(len(scan), 0.25), materials_guessed=False)
+        return SimpleNamespace(scene=scene, proxy=Proxy(replace(scene, oriented=True), 0.1))
+
+    monkeypatch.setattr(CARRY, carry)
+    monkeypatch.setattr(scan_materials, "VIEWS", 4)
+    monkeypatch.setattr(scan_materials, "SIDE", 16)
+    return found
+
+
+def test_materials_are_found_once_and_kept_until_the_scan_changes(asked, plain, tmp_path, caplog):
+    path = tmp_path / "scan.ply"
+    caplog.set_level("INFO")
+    first, again = (with_materials(plain, path, None, 0) for _ in range(2))
+    assert asked == [4]
+    for scene in (first, again):
+        np.testing.assert_array_equal(scene.base_color[:, 1], np.float32(0.6))
+        np.testing.assert_array_equal(scene.roughness, np.float32(0.25))
+        np.testing.assert_array_equal(scene.means, plain.means)
+        np.testing.assert_array_equal(scene.quats, plain.quats)
+        assert not scene.materials_guessed
+    assert any("scan.materials.ply; materials=as_is leaves them out" in line for line in caplog.messages)
+    assert len(GaussianScene.load(tmp_path / "scan.materials.ply")) == len(plain)
+    with_materials(replace(plain, means=plain.means + np.float32(0.1)), path, None, 0)
+    assert asked == [4, 4]
+
+
+def test_the_proxy_that_they_were_found_on_is_the_one_that_light_sees(asked, plain, tmp_path, caplog):
+    from tron.relighting import Relighter
+
+    scene = with_materials(plain, tmp_path / "scan.ply", None, 0)
+    caplog.set_level("INFO")
+    assert Relighter(scene, proxy="always", proxy_file=tmp_path / "scan.proxy.ply").proxy is not None
+    assert any("light sees the proxy of" in line for line in caplog.messages)
+
+
+def test_a_backdrop_stays_as_it_is(asked, plain, tmp_path):
+    backdrop = np.arange(len(plain)) % 7 == 0
+    scene = with_materials(plain, tmp_path / "scan.ply", None, 0, backdrop)
+    np.testing.assert_array_equal(scene.base_color[backdrop], plain.base_color[backdrop])
+    np.testing.assert_array_equal(scene.base_color[~backdrop, 1], np.float32(0.6))
+
+
+def test_a_folder_that_cannot_be_written_stops_nothing(asked, plain, tmp_path, caplog):
+    caplog.set_level("INFO")
+    (tmp_path / "file").write_text("no folder")
+    scene = with_materials(plain, tmp_path / "file" / "scan.ply", None, 0)
+    assert not scene.materials_guessed
+    assert any("materials are not kept" in line for line in caplog.messages)
+
+
+def test_where_none_can_be_told_the_scan_is_as_it_is(asked, plain, tmp_path, monkeypatch):
+    monkeypatch.setattr(CARRY, lambda *_: None)
+    assert with_materials(plain, tmp_path / "scan.ply", None, 0) is plain
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_the_libraries_of_the_fit_the_scan_is_as_it_is(plain, tmp_path, monkeypatch, variant, caplog):
+    monkeypatch.setattr("tron.cli.installation.missing_libraries", lambda extra: ["torch"])
+    assert with_materials(plain, tmp_path / "scan.ply", None, 0) is plain
+    assert "needs torch: pip install 'tron-relight[surfels]'" in caplog.text

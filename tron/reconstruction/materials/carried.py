@@ -1,0 +1,157 @@
+"""Materials of a scan for the surfels that are there, however many layers they lie in.
+
+A scan's own surfels are fog to light: their normals and shadows mean little. So light and materials are found
+on its proxy (:mod:`tron.relighting.proxy`), one layer, from the film that it was made of, by the joint fit
+(:mod:`tron.reconstruction.materials.joint_fit`). What the fit says of shading is then taken out of each
+surfel's own colour, which keeps all of its detail. Of proxy surfel p and the surfels i that are nearest to it
+
+    shade_p = shown_p / max(base_p, 0.01)
+    base_i  = own_i / shade_p, within base_p / 8 and 8 base_p
+    roughness_i, metallic_i = those of p
+
+Photos do not tell bright paint in dim light from dim paint in bright light, nor the colour of either. A
+camera does: it balances white and exposes for what it sees. So mean irradiance over what is seen is held grey
+and at 1 in the scan's own linear unit, before base color is limited. That "the brightest surfaces are at 0.8"
+is false of a man in black leather.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from tron.captures import Capture
+from tron.captures.view import ToneCurve, decoded, encoded
+from tron.estimation import Estimation
+from tron.gaussians.harmonics import dc_to_rgb
+from tron.gaussians.scene import GaussianScene
+from tron.metrics import capped_psnr
+from tron.reconstruction.light.fit_pairs import TooFewSeen
+from tron.reconstruction.light.surfel_colors import FLOOR
+from tron.reconstruction.materials.joint_fit import JointFit, JointSettings, fit_jointly
+from tron.reconstruction.progress import Track, untracked
+from tron.relighting import Relighter
+from tron.relighting.proxy import Proxy, make_proxy
+from tron.tracing import SurfelTracer
+
+log = logging.getLogger(__name__)
+
+_SCALE = 1.0
+"""Weight of how bright base color is, over the photos' 0.05, with which it ran to 1.36 and was clipped."""
+_DARKEST = 0.01
+_APART = 8.0
+"""Largest factor between base colors of a surfel and of its proxy's."""
+_COMPARED, _RAYS, _SOLID = 6, 8, 0.99
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """A scan with materials, and the light that it was captured in.
+
+    Attributes:
+        scene: every surfel of the scan with its own radiance, and with materials.
+        proxy: what light sees of it, with the materials of the fit.
+        fit: of the proxy.
+        explained: dB between the scan's own look and its picture under the light that was found.
+    """
+
+    scene: GaussianScene
+    proxy: Proxy
+    fit: JointFit
+    explained: float
+
+    def said(self) -> dict[str, Any]:
+        """Plain values for a report."""
+        return {**self.fit.said(), "explained_psnr": round(self.explained, 2)}
+
+
+def carry_materials(
+    capture: Capture, settings: JointSettings, seed: int, track: Track = untracked
+) -> Carried | None:
+    """Find materials of a scan and the light it was captured in; None where it shows no surface, with a line.
+
+    Args:
+        capture: film of its ``scan``, whose display values the scan's harmonics are.
+        settings: of the joint fit. A film is exposed alike, and balanced: what they say of that is not asked.
+        seed: root of the random numbers.
+        track: wraps long loops.
+
+    Raises:
+        TronError: a loss is not finite.
+    """
+    scan, views = capture.scan, capture.train_views
+    assert scan is not None
+    proxy = make_proxy(
+        SurfelTracer(scan), [view.camera for view in views], lambda n: track(n, "filming a proxy for light")
+    )
+    if proxy is None:
+        log.warning("views of the scan agree on no surface, so that its materials cannot be told")
+        return None
+    light = settings.light.model_copy(update={"scale": _SCALE})
+    held = {"light": light, "same_exposure": True, "neutral": True}
+    try:
+        fit = fit_jointly(capture, proxy.surfels, settings.model_copy(update=held), seed, track)
+    except TooFewSeen as error:
+        log.warning("materials of the scan cannot be told: %s", error)
+        return None
+    curve = settings.tone_curve or capture.tone_curve
+    scene, proxy = carry(scan, fit, curve), replace(proxy, surfels=fit.scene)
+    explained = _explained(scene, proxy, fit, capture, curve, seed)
+    log.info("%s; under it the scan looks as it did to %.1f dB", described(fit, capture.up), explained)
+    return Carried(scene, proxy, fit, explained)
+
+
+def carry(scan: GaussianScene, fit: JointFit, curve: ToneCurve) -> GaussianScene:
+    """The scan with the materials of a fit of its proxy: see the module.
+
+    Args:
+        scan: its mean colours are display values.
+        fit: of the proxy's surfels.
+        curve: that these display values went through.
+    """
+    proxy = fit.scene
+    near = np.asarray(KDTree(proxy.means).query(scan.means)[1])
+    shade = np.maximum(fit.shown, FLOOR) / np.maximum(proxy.base_color, _DARKEST)
+    own = decoded(np.clip(dc_to_rgb(scan.sh[:, 0]), 0, 1).astype(np.float32), curve)
+    usual = np.maximum(proxy.base_color, _DARKEST)[near]
+    base = np.clip(own / shade[near], usual / _APART, usual * _APART)
+    return replace(
+        scan,
+        base_color=np.clip(base, 0, 1),
+        roughness=proxy.roughness[near],
+        metallic=proxy.metallic[near],
+        materials_guessed=False,
+    )
+
+
+def _explained(
+    scene: GaussianScene, proxy: Proxy, fit: JointFit, capture: Capture, curve: ToneCurve, seed: int
+) -> float:
+    """Mean PSNR, display values, of some views under the found light against the film, where it is opaque.
+
+    Of held-out views where there are any.
+    """
+    light = Relighter(scene, Estimation(rays=_RAYS, filtered=True), seed, proxy=proxy).under(fit.environment)
+    views, found = capture.test_views or capture.train_views, []
+    for number in np.unique(np.linspace(0, len(views) - 1, _COMPARED).astype(int)):
+        view = views[number]
+        solid = view.read("mask") > _SOLID
+        if solid.any():
+            relit = encoded(light.render(view.camera, seed).lit * np.float32(capture.exposure), curve)
+            found.append(capped_psnr(relit, view.read(), solid))
+    return float(np.mean(found)) if found else 0.0
+
+
+def described(fit: JointFit, up: np.ndarray) -> str:
+    """The light that was found, in words; ``up`` (3,) unit, world."""
+    red, green, blue = fit.balance / fit.balance.mean()
+    warm = "neutral" if abs(np.log(red / blue)) < 0.1 else "warm" if red > blue else "cool"
+    tint = f"{warm} before it was balanced (R, G, B {red:.2f}, {green:.2f}, {blue:.2f})"
+    if fit.sun is None:
+        return f"the light that was found has no sun, and was {tint}"
+    height = np.degrees(np.arcsin(np.clip(fit.sun.direction @ up, -1, 1)))
+    return f"the light that was found has a sun {height:.0f} degrees high, and was {tint}"
