@@ -206,9 +206,9 @@ def test_photos_alone_tell_light_and_materials(
         scene, base_color=np.full((len(scene), 3), 0.5), roughness=np.full(len(scene), 0.5),
         metallic=np.zeros(len(scene)),
     )  # fmt: skip
-    # The lamp, 17 degrees wide, explains 0.4 or 1.0 % of these 714 surfels, by the processor's roundings.
-    prior = Joint(light=LightSettings(points=1500), sun=0.002)
-    found = fit_jointly(replace(capture, exposure=4.0), blank, prior, 0)
+    # The lamp, 17 degrees wide, explains -0.1 to 1.0 % of these 714 surfels, by the processor's roundings:
+    # too little to be asked for. Suns are those of test_fit_pairs.
+    found = fit_jointly(replace(capture, exposure=4.0), blank, Joint(light=LightSettings(points=1500)), 0)
     directions, solid = cube_texels(32)
     assert isinstance(lighting.light, EnvironmentLight)
     upper = directions[::40][directions[::40, 2] > 0]
@@ -224,9 +224,6 @@ def test_photos_alone_tell_light_and_materials(
     assert 0.8 < factor < 1.6
     assert off < 0.35
     assert base > 16.5
-    lamp = np.array([0.589, 0.279, 0.758])  # the middle of the small one
-    assert found.sun is not None
-    assert np.degrees(np.arccos(found.sun.direction @ lamp)) < 12
     assert found.said()["surfels_seen"] == pytest.approx((found.colors.count > 0).mean(), abs=1e-4)
 
 
