@@ -243,17 +243,17 @@ def _output(command: list[str]) -> str | None:
 
 
 def aligned(array: np.ndarray) -> np.ndarray:
-    """The array, contiguous, at a multiple of ``ALIGNMENT`` bytes; itself where it is that already.
+    """A contiguous copy at a multiple of ``ALIGNMENT`` bytes, with as many to spare behind its end.
 
-    Dr.Jit borrows the memory of a NumPy array and writes its alignment into the kernels that read it: loads
-    of whole packets where it begins at a multiple of 64 bytes, else loads byte by byte, and gathers of four
-    numbers one by one. NumPy's memory begins at any multiple of 16, by chance, so the same call would now and
-    then compile another and slower kernel.
+    Dr.Jit borrows the memory of a NumPy array. It reads whole packets, past the end of the last one too:
+    where the array ends with its page and the next page is nobody's, that ends the process with a
+    segmentation fault, once in some hundred runs. It also writes the alignment into the kernels that read
+    the array: loads of whole packets where it begins at a multiple of 64 bytes, else loads byte by byte, and
+    gathers of four numbers one by one. NumPy's memory begins at any multiple of 16, by chance, so the same
+    call would now and then compile another and slower kernel.
     """
     array = np.ascontiguousarray(array)
-    if array.ctypes.data % ALIGNMENT == 0:
-        return array
-    memory = np.empty(array.nbytes + ALIGNMENT, np.uint8)
+    memory = np.empty(array.nbytes + 2 * ALIGNMENT, np.uint8)
     first = -memory.ctypes.data % ALIGNMENT
     copy = memory[first : first + array.nbytes].view(array.dtype).reshape(array.shape)
     copy[...] = array

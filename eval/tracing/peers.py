@@ -35,6 +35,7 @@ from eval.tracing.scene import surfels
 from tron.cameras import Camera, mitsuba_sensor
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
+from tron.runtime import aligned
 from tron.tracing import SurfelTracer
 from tron.tracing.compositing import STOP_TRANSMITTANCE
 from tron.tracing.hierarchy.transmittance import OPAQUE_TRANSMITTANCE, BackFaces, blocks
@@ -144,7 +145,7 @@ def primitives(scene: GaussianScene, shape: str = SHAPES[0]) -> mi.Scene:
         "opacities": scene.opacities()[:, None],
         "sh_coeffs": scene.sh[:, 0],
     }
-    columns = {name: mi.TensorXf(np.ascontiguousarray(v, np.float32)) for name, v in tensors.items()}
+    columns = {name: mi.TensorXf(aligned(v.astype(np.float32))) for name, v in tensors.items()}
     return mi.load_dict({"type": "scene", "surfels": {"type": shape, "extent": 3.0, **columns}})
 
 

@@ -7,10 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tron import runtime
 from tron.errors import TronError
+from tron.runtime import ALIGNMENT, aligned
 
 
 @pytest.fixture
@@ -181,3 +183,15 @@ def test_commit_is_gits_own_and_dirt_is_seen(tmp_path: Path):
     assert runtime._git_state(tmp_path) == {"commit": git("rev-parse", "HEAD"), "dirty": False}
     (tmp_path / "a").write_text("b")
     assert runtime._git_state(tmp_path)["dirty"] is True
+
+
+@pytest.mark.parametrize("count", [5, 16, 1021])
+def test_borrowed_arrays_may_be_read_a_packet_past_their_end(count):
+    """Dr.Jit does so, and would end the process where nothing lies behind."""
+    array = aligned(np.arange(count, dtype=np.float32))
+    np.testing.assert_array_equal(array, np.arange(count))
+    memory = array
+    while isinstance(memory.base, np.ndarray):
+        memory = memory.base
+    assert array.ctypes.data % ALIGNMENT == 0
+    assert memory.ctypes.data + memory.nbytes - (array.ctypes.data + array.nbytes) >= ALIGNMENT

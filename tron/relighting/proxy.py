@@ -41,6 +41,7 @@ from tron.gaussians.fields import FIELDS
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.gaussians.ply import write_ply
 from tron.gaussians.scene import GaussianScene
+from tron.runtime import aligned
 from tron.tracing import GBuffer, SurfelTracer
 from tron.tracing.fusion import DepthMap, consensus, empty_rays, fuse, pixel_footprint
 from tron.tracing.hierarchy.first_hit import FirstHit
@@ -207,8 +208,8 @@ class ProxiedTracer:
         normals = light.scene.normals()[nearest]
         if backdrop is not None:
             normals[backdrop] = scan.scene.normals()[backdrop]
-        self._nearest = mi.UInt32(nearest.astype(np.uint32))
-        self._normals = [mi.Float(np.ascontiguousarray(axis)) for axis in normals.T]
+        self._nearest = mi.UInt32(aligned(np.asarray(nearest, np.uint32)))
+        self._normals = [mi.Float(aligned(axis)) for axis in normals.T]
 
     def showing(self, scan: SurfelTracer) -> ProxiedTracer:
         """The same for a camera that sees other sides of the scan's surfels."""

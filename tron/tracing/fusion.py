@@ -18,6 +18,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, maximum_filter
 
 from tron.cameras import Camera
+from tron.runtime import aligned
 
 _NEAREST = 1e-3
 _PADDING = 0.05
@@ -85,7 +86,7 @@ class DistanceField:
 
     def sampler(self) -> Sampler:
         """The field on the device."""
-        grids = mi.TensorXf(np.ascontiguousarray(np.stack([self.value, self.weight], -1), np.float32))
+        grids = mi.TensorXf(aligned(np.stack([self.value, self.weight], -1).astype(np.float32)))
         texture = mi.Texture3f(grids, use_accel=False, wrap_mode=dr.WrapMode.Clamp)
         low, size = _opaque(self.low), _opaque(np.array(self.value.shape))
         return Sampler(texture, low, size, dr.opaque(mi.Float, self.voxel), dr.opaque(mi.Float, self.reach))
@@ -163,7 +164,9 @@ def fuse(maps: Sequence[DepthMap], voxel: float, truncation: float, most_voxels:
     voxel = max(voxel, (1 + 2 * _PADDING) * longest / most_voxels)
     shape = np.ceil((high - low) / voxel).astype(int) + 1
     near, reach = _near(points, low, voxel, shape, truncation), truncation * voxel
-    cells = mi.Point3u(*(mi.UInt32(axis.astype(np.uint32)) for axis in np.unravel_index(near, shape)))
+    cells = mi.Point3u(
+        *(mi.UInt32(aligned(axis.astype(np.uint32))) for axis in np.unravel_index(near, shape))
+    )
     total, seen = _distances(_opaque(low) + mi.Point3f(cells) * dr.opaque(mi.Float, voxel), maps, reach)
     value, weight = np.ones(shape.prod(), np.float32), np.zeros(shape.prod(), np.float32)
     weight[near] = seen
@@ -198,9 +201,9 @@ def _distances(points: mi.Point3f, maps: Sequence[DepthMap], reach: float) -> tu
     depths, weights = [each.depth for each in maps], [each.weight for each in maps]
     found = _summed(
         points,
-        mi.Float(np.ravel(cameras).astype(np.float32)),
-        mi.UInt32(np.ravel(sizes).astype(np.uint32)),
-        *(mi.Float(np.concatenate([np.ravel(a) for a in some]).astype(np.float32))
+        mi.Float(aligned(np.ravel(cameras).astype(np.float32))),
+        mi.UInt32(aligned(np.ravel(sizes).astype(np.uint32))),
+        *(mi.Float(aligned(np.concatenate([np.ravel(a) for a in some]).astype(np.float32)))
           for some in (depths, weights, empty)),
         dr.opaque(mi.UInt32, len(maps)),
         dr.opaque(mi.Float, reach),
@@ -269,9 +272,9 @@ def _walked(field: Sampler, view: DepthMap) -> tuple[np.ndarray, np.ndarray]:
     depths, normals = np.zeros(starts.shape, np.float32), np.zeros((*starts.shape, 3), np.float32)
     if not len(rays):
         return depths, normals
-    ray = mi.Vector3f(rays.T)
+    ray = mi.Vector3f(*(mi.Float(aligned(axis)) for axis in rays.T))
     origin = _opaque(view.camera.position)
-    depth = mi.Float(np.ascontiguousarray(view.depth[starts], np.float32))
+    depth = mi.Float(aligned(view.depth[starts].astype(np.float32)))
     for _ in range(_STEPS):
         depth += _STRIDE * field.reach * field.at(origin + depth * ray)[0]
     value, seen = field.at(origin + depth * ray)

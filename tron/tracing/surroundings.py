@@ -18,6 +18,7 @@ import numpy as np
 
 from tron.gaussians.edit import subset
 from tron.gaussians.scene import GaussianScene
+from tron.runtime import aligned
 from tron.seeds import generator
 from tron.tracing.tracer import SurfelTracer
 
@@ -112,7 +113,7 @@ def _reached(scene: GaussianScene, outer: np.ndarray, middle: np.ndarray, seed: 
     far = subset(scene, outer).facing(middle)
     surface = SurfelTracer(far).trace(
         mi.Point3f(*map(mi.Float, start)),
-        mi.Vector3f(*map(mi.Float, ways.reshape(-1, 3).T.astype(np.float32))),
+        mi.Vector3f(*(mi.Float(aligned(axis)) for axis in ways.reshape(-1, 3).T.astype(np.float32))),
     )
     dr.eval(surface.depth)
     depth = surface.depth.numpy()

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from tron.errors import TronError
+from tron.runtime import aligned
 from tron.tracing.adjoint import attach, has_gradients
 from tron.tracing.gbuffer import GBuffer, trace_gbuffer
 from tron.tracing.hierarchy.bvh import Bvh, build_bvh, refit
@@ -126,7 +127,7 @@ class SurfelTracer:
         if self._backdrop is None:
             return self.records
         geometry = dr.copy(self.records.geometry)
-        surfel = mi.UInt32(np.flatnonzero(self._backdrop).astype(np.uint32))
+        surfel = mi.UInt32(aligned(np.flatnonzero(self._backdrop).astype(np.uint32)))
         dr.scatter(geometry, mi.Float(-1), surfel * (4 * GEOMETRY_PACKETS) + CUT)
         dr.eval(geometry)
         return replace(self.records, geometry=geometry)

@@ -24,6 +24,7 @@ from tron.errors import TronError
 from tron.gaussians.harmonics import SH_COUNT
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.reconstruction.progress import Track, untracked
+from tron.runtime import aligned
 from tron.seeds import generator
 from tron.tracing import SurfelTracer
 
@@ -180,7 +181,8 @@ def _transmittance(tracer: SurfelTracer, origin: np.ndarray, points: np.ndarray)
     ways = points - origin
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     start = mi.Point3f(*(dr.full(mi.Float, float(x), len(points)) for x in origin))
-    return tracer.transmittance(start, mi.Vector3f(ways.T.astype(np.float32))).numpy()
+    along = mi.Vector3f(*(mi.Float(aligned(axis)) for axis in ways.T.astype(np.float32)))
+    return tracer.transmittance(start, along).numpy()
 
 
 def even_directions(count: int) -> np.ndarray:

@@ -23,6 +23,7 @@ from tron.reconstruction.geometry.losses import photometric_loss
 from tron.reconstruction.light.surface_points import PointBatch, SurfacePoints, surface_mask
 from tron.reconstruction.progress import Track, untracked
 from tron.reconstruction.settings import FitSettings
+from tron.runtime import aligned
 from tron.seeds import generator, integer
 from tron.shading.direct.irradiance import ORIGIN_OFFSET, Light, Occluder, RayPlan, shadow_ray, visible_share
 from tron.shading.environments.cubemap import CubemapLight, seamless, texel_directions
@@ -223,7 +224,9 @@ class LogPyramid:
         self._directions = texel_directions(self.resolution)
         dr.eval(self._directions)
         self.levels = {name: dr.zeros(mi.Float, 18 * r**2) for name, r in self._resolutions.items()}
-        self.levels[self.finest] = mi.Float(np.log(radiance.astype(np.float64)).astype(np.float32).ravel())
+        self.levels[self.finest] = mi.Float(
+            aligned(np.log(radiance.astype(np.float64)).astype(np.float32).ravel())
+        )
 
     def rate(self, name: str) -> float:
         """Factor of a level's learning rate: 1 for the coarsest."""

@@ -106,7 +106,7 @@ class SurfacePoints:
         """``count`` random points of a view, with repetition; all of them where it has no more."""
         first, end = self.starts[view], self.starts[view + 1]
         chosen = np.arange(first, end) if end - first <= count else draw.integers(first, end, count)
-        index = mi.UInt32(chosen.astype(np.uint32))
+        index = mi.UInt32(aligned(chosen.astype(np.uint32)))
         position, normal, target = (
             [dr.gather(mi.Float, column, index) for column in columns]
             for columns in (self._position, self._normal, self._target)

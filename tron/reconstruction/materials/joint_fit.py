@@ -24,6 +24,7 @@ from tron.reconstruction.materials.brdf_search import Materials, Received, mater
 from tron.reconstruction.progress import Track, untracked
 from tron.reconstruction.settings import Settings
 from tron.relighting import Relighter
+from tron.runtime import aligned
 from tron.seeds import generator
 from tron.shading.bounces.bounce import BounceTransport
 from tron.shading.environments.cubemap import CubemapLight
@@ -272,7 +273,7 @@ def _with(scene: GaussianScene, materials: Materials) -> GaussianScene:
 def environment_of(light: Light, sun: Sun | None) -> EnvironmentMap:
     """The light as a lat-long map."""
     resolution = round((len(light.texels) / 6) ** 0.5)
-    texels = mi.Float(light.texels.astype(np.float32).ravel())
+    texels = mi.Float(aligned(light.texels.astype(np.float32).ravel()))
     image = CubemapLight(texels, resolution).to_environment(MAP_HEIGHT).image
     if sun is not None:
         image = image + _lobe_image(sun)
