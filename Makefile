@@ -9,7 +9,7 @@ help:  ## list the targets
 setup:  ## make .venv, install the pinned dependencies, check LLVM
 	@.ci/setup
 
-demo: setup  ## from a procedural scene to an evaluated neural renderer (some 20 minutes on two cores)
+demo: setup  ## from a procedural scene to an evaluated neural renderer (13 minutes on two quiet cores)
 	$(BIN)/tron-eval benchmark=demo output_dir=outputs/demo
 	@echo "report: $(CURDIR)/outputs/demo/report.html"
 
