@@ -14,7 +14,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -38,6 +38,7 @@ _LLVM_FOLDERS = (
     "/opt/homebrew/opt/llvm*/lib",
     "/usr/local/opt/llvm*/lib",
 )
+T = TypeVar("T")
 ALIGNMENT = 64
 """Bytes of the widest packet: 16 numbers of 32 bits."""
 
@@ -258,3 +259,11 @@ def aligned(array: np.ndarray) -> np.ndarray:
     copy = memory[first : first + array.nbytes].view(array.dtype).reshape(array.shape)
     copy[...] = array
     return copy
+
+
+def lanes(kind: type[T], rows: np.ndarray) -> T:
+    """Rows (N, C), float32, on the device: a Dr.Jit vector ``kind``, such as mi.Point3f, of N lanes."""
+    import drjit as dr
+
+    number = dr.value_t(kind)
+    return kind(*(number(aligned(column.astype(np.float32))) for column in rows.T))

@@ -25,7 +25,7 @@ from tron.cameras import Camera, mitsuba_sensor
 from tron.color import luminance
 from tron.gaussians.initialize import GBufferView
 from tron.integrators import embed, register
-from tron.runtime import aligned
+from tron.runtime import lanes
 from tron.shading.environments.environment import EnvironmentMap
 
 LANES = 2**22
@@ -285,8 +285,7 @@ def _pixel_rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 def _upload(origins: np.ndarray, directions: np.ndarray) -> mi.Ray3f:
     """Rays on the device, from (N, 3) float32 each."""
-    o, d = ([mi.Float(aligned(column)) for column in values.T] for values in (origins, directions))
-    return mi.Ray3f(mi.Point3f(*o), mi.Vector3f(*d))
+    return mi.Ray3f(lanes(mi.Point3f, origins), lanes(mi.Vector3f, directions))
 
 
 def _download(vector: mi.Vector3f | mi.Color3f) -> np.ndarray:

@@ -35,7 +35,7 @@ from eval.tracing.scene import surfels
 from tron.cameras import Camera, mitsuba_sensor
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
-from tron.runtime import aligned
+from tron.runtime import aligned, lanes
 from tron.tracing import SurfelTracer
 from tron.tracing.compositing import STOP_TRANSMITTANCE
 from tron.tracing.hierarchy.transmittance import OPAQUE_TRANSMITTANCE, BackFaces, blocks
@@ -193,9 +193,9 @@ def quads(scene: GaussianScene) -> mi.Scene:
 def tile_rays(view: Camera) -> tuple[mi.Point3f, mi.Vector3f]:
     """Rays through the pixel centres, a 4 x 4 tile after the other: the order that is best for a packet."""
     tiles = view.rays().reshape(view.height // TILE, TILE, view.width // TILE, TILE, 3)
-    rays = np.ascontiguousarray(tiles.transpose(0, 2, 1, 3, 4).reshape(-1, 3).T, np.float32)
-    origin = dr.repeat(mi.Point3f([float(x) for x in view.position]), rays.shape[1])
-    direction = mi.Vector3f(rays)
+    rays = tiles.transpose(0, 2, 1, 3, 4).reshape(-1, 3)
+    origin = dr.repeat(mi.Point3f([float(x) for x in view.position]), len(rays))
+    direction = lanes(mi.Vector3f, rays)
     dr.eval(origin, direction)
     return origin, direction
 

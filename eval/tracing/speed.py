@@ -37,7 +37,7 @@ from tron.estimation import FINAL
 from tron.gaussians.fields import PARAMETERS
 from tron.gaussians.scene import GaussianScene
 from tron.relighting import Relighter
-from tron.runtime import aligned
+from tron.runtime import lanes
 from tron.shading.direct.irradiance import ORIGIN_OFFSET, irradiance
 from tron.shading.environments.environment import EnvironmentLight
 from tron.shading.guidance import render_guidance
@@ -203,8 +203,8 @@ def random_rays(gbuffer: GBuffer, spacing: float, rays: int, seed: int) -> tuple
     # A unit normal plus a uniform point of the unit sphere is cosine-distributed about the normal.
     directions = normals + 0.999999 * sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origin = mi.Point3f(*(mi.Float(aligned(axis)) for axis in points.T.astype(np.float32)))
-    direction = mi.Vector3f(*(mi.Float(aligned(axis)) for axis in directions.T.astype(np.float32)))
+    origin = lanes(mi.Point3f, points)
+    direction = lanes(mi.Vector3f, directions)
     dr.eval(origin, direction)
     return origin, direction
 

@@ -12,7 +12,7 @@ import pytest
 
 from tron import runtime
 from tron.errors import TronError
-from tron.runtime import ALIGNMENT, aligned
+from tron.runtime import ALIGNMENT, aligned, lanes
 
 
 @pytest.fixture
@@ -185,13 +185,30 @@ def test_commit_is_gits_own_and_dirt_is_seen(tmp_path: Path):
     assert runtime._git_state(tmp_path)["dirty"] is True
 
 
+def test_memory_is_aligned_wherever_it_began():
+    room = np.arange(100, dtype=np.float32)
+    for start in range(20):
+        part = room[start : start + 70].reshape(7, 10)
+        moved = aligned(part)
+        assert moved.ctypes.data % ALIGNMENT == 0
+        np.testing.assert_array_equal(moved, part)
+    strided = aligned(room.reshape(10, 10)[:, 3])
+    assert strided.flags.c_contiguous
+    np.testing.assert_array_equal(strided, room[3::10])
+
+
 @pytest.mark.parametrize("count", [5, 16, 1021])
 def test_borrowed_arrays_may_be_read_a_packet_past_their_end(count):
-    """Dr.Jit does so, and would end the process where nothing lies behind."""
-    array = aligned(np.arange(count, dtype=np.float32))
-    np.testing.assert_array_equal(array, np.arange(count))
+    """Dr.Jit does so, and would end the process where nothing lies behind; what begins well is copied too."""
+    array = aligned(aligned(np.arange(count, dtype=np.float32)))
     memory = array
     while isinstance(memory.base, np.ndarray):
         memory = memory.base
-    assert array.ctypes.data % ALIGNMENT == 0
     assert memory.ctypes.data + memory.nbytes - (array.ctypes.data + array.nbytes) >= ALIGNMENT
+
+
+def test_rows_become_lanes(variant):
+    import mitsuba as mi
+
+    rows = np.arange(12.0).reshape(4, 3)[::2]
+    np.testing.assert_array_equal(np.array(lanes(mi.Vector3f, rows)).T, rows)

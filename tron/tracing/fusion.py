@@ -18,7 +18,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, maximum_filter
 
 from tron.cameras import Camera
-from tron.runtime import aligned
+from tron.runtime import aligned, lanes
 
 _NEAREST = 1e-3
 _PADDING = 0.05
@@ -272,7 +272,7 @@ def _walked(field: Sampler, view: DepthMap) -> tuple[np.ndarray, np.ndarray]:
     depths, normals = np.zeros(starts.shape, np.float32), np.zeros((*starts.shape, 3), np.float32)
     if not len(rays):
         return depths, normals
-    ray = mi.Vector3f(*(mi.Float(aligned(axis)) for axis in rays.T))
+    ray = lanes(mi.Vector3f, rays)
     origin = _opaque(view.camera.position)
     depth = mi.Float(aligned(view.depth[starts].astype(np.float32)))
     for _ in range(_STEPS):

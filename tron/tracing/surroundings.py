@@ -18,7 +18,7 @@ import numpy as np
 
 from tron.gaussians.edit import subset
 from tron.gaussians.scene import GaussianScene
-from tron.runtime import aligned
+from tron.runtime import lanes
 from tron.seeds import generator
 from tron.tracing.tracer import SurfelTracer
 
@@ -109,12 +109,9 @@ def _reached(scene: GaussianScene, outer: np.ndarray, middle: np.ndarray, seed: 
     level = np.sqrt(1 - height**2)
     frame = np.stack([east, np.cross(scene.up, east), scene.up])
     ways = np.stack([level * np.cos(turn), level * np.sin(turn), height], -1) @ frame
-    start = np.repeat(origins, _DIRECTIONS, axis=0).T.astype(np.float32)
+    start = np.repeat(origins, _DIRECTIONS, axis=0)
     far = subset(scene, outer).facing(middle)
-    surface = SurfelTracer(far).trace(
-        mi.Point3f(*map(mi.Float, start)),
-        mi.Vector3f(*(mi.Float(aligned(axis)) for axis in ways.reshape(-1, 3).T.astype(np.float32))),
-    )
+    surface = SurfelTracer(far).trace(lanes(mi.Point3f, start), lanes(mi.Vector3f, ways.reshape(-1, 3)))
     dr.eval(surface.depth)
     depth = surface.depth.numpy()
     ended = depth > 0

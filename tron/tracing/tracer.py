@@ -102,7 +102,7 @@ class SurfelTracer:
         ``which``: (M,) bool, those that are turned; None: all.
         """
         which = np.ones(len(self.scene), bool) if which is None else which
-        other, turned = copy(self), mi.Bool(which)
+        other, turned = copy(self), mi.Bool(aligned(which))
         other.scene, other._parameters = self.scene.turned_over(which), None
         other.records = self.records.turned_over(turned)
         in_order = dr.gather(mi.Bool, turned, self.bvh.order)

@@ -18,7 +18,7 @@ import numpy as np
 from datagen.world.lights.light import Disc, direction, smoothstep
 from datagen.world.lights.noise import Fractal
 from datagen.world.spec import Number, Spec, Triple, between
-from tron.runtime import aligned
+from tron.runtime import lanes
 
 _APERTURE_DEG = 5.0
 _FEWEST = 16
@@ -77,8 +77,7 @@ class Sky:
         )
         si = dr.zeros(mi.SurfaceInteraction3f, max(len(directions), _FEWEST))
         # Where NumPy's memory begins would be a part of the kernel, and so would a width of a few numbers.
-        padded = np.resize(directions, (max(len(directions), _FEWEST), 3)).T.astype(np.float32)
-        si.wi = -mi.Vector3f(*(mi.Float(aligned(axis)) for axis in padded))
+        si.wi = -lanes(mi.Vector3f, np.resize(directions, (max(len(directions), _FEWEST), 3)))
         return np.array(emitter.eval(si)).T[: len(directions)].astype(np.float64)
 
 

@@ -23,7 +23,7 @@ from datagen.world.scene import draw_scene
 from datagen.world.styles import Choice
 from tron.cameras import Camera
 from tron.cli.recipes import check, compose_recipe
-from tron.runtime import ALIGNMENT, aligned
+from tron.runtime import ALIGNMENT
 from tron.seeds import generator
 from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Lighting
@@ -179,17 +179,3 @@ def test_a_second_capture_brings_no_kernel(variant):
     first = shot(0)
     assert first
     assert shot(1) <= first
-
-
-def test_memory_is_aligned_wherever_it_began():
-    room = np.arange(100, dtype=np.float32)
-    for start in range(20):
-        part = room[start : start + 70].reshape(7, 10)
-        moved = aligned(part)
-        assert moved.ctypes.data % ALIGNMENT == 0
-        np.testing.assert_array_equal(moved, part)
-    strided = aligned(room.reshape(10, 10)[:, 3])
-    assert strided.flags.c_contiguous
-    np.testing.assert_array_equal(strided, room[3::10])
-    there = aligned(room)
-    assert aligned(there) is there or there is room

@@ -24,7 +24,7 @@ from tron.errors import TronError
 from tron.gaussians.harmonics import SH_COUNT
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.reconstruction.progress import Track, untracked
-from tron.runtime import aligned
+from tron.runtime import lanes
 from tron.seeds import generator
 from tron.tracing import SurfelTracer
 
@@ -181,8 +181,7 @@ def _transmittance(tracer: SurfelTracer, origin: np.ndarray, points: np.ndarray)
     ways = points - origin
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     start = mi.Point3f(*(dr.full(mi.Float, float(x), len(points)) for x in origin))
-    along = mi.Vector3f(*(mi.Float(aligned(axis)) for axis in ways.T.astype(np.float32)))
-    return tracer.transmittance(start, along).numpy()
+    return tracer.transmittance(start, lanes(mi.Vector3f, ways)).numpy()
 
 
 def even_directions(count: int) -> np.ndarray:

@@ -90,7 +90,9 @@ def fit_environment(
     photos = choose_photos(capture.train_views, settings, capture.exposure) if settings.scale_steps else []
     points = SurfacePoints(tracer, views, POINTS_PER_VIEW, settings.seed, track)
     cubemap = fit_cubemap(tracer.sided(settings.two_sided), points, settings, track)
-    environment = CubemapLight(mi.Float(cubemap.texels.ravel()), settings.resolution).to_environment()
+    environment = CubemapLight(
+        mi.Float(aligned(cubemap.texels.ravel())), settings.resolution
+    ).to_environment()
     scale = LightScale(1.0, np.zeros(0), np.zeros(0))
     if photos:
         lighting = Lighting(environment, settings.split_sum_resolution)

@@ -21,7 +21,7 @@ from tron.captures.view import ToneCurve, linear_light
 from tron.reconstruction.light.surface_points import SKY
 from tron.reconstruction.light.surfel_colors import grouped_median
 from tron.reconstruction.progress import Track, untracked
-from tron.runtime import aligned
+from tron.runtime import aligned, lanes
 from tron.seeds import generator
 from tron.shading.direct.irradiance import ORIGIN_OFFSET, Occluder
 from tron.shading.environments.cubemap import direction_face, texel_directions
@@ -57,9 +57,9 @@ def visibility_towards(
         if not len(point):
             continue
         active, towards = _in_fans(above)[point, fan], _vectors_in_fans(along)[point, fan]
-        lanes = [mi.Bool(aligned(active[:, k])) for k in range(_FAN)]
-        vectors = [_device(mi.Vector3f, towards[:, k]) for k in range(_FAN)]
-        seen = tracer.transmittances(_device(mi.Point3f, start[some][point]), vectors, lanes)
+        going = [mi.Bool(aligned(active[:, k])) for k in range(_FAN)]
+        vectors = [lanes(mi.Vector3f, towards[:, k]) for k in range(_FAN)]
+        seen = tracer.transmittances(lanes(mi.Point3f, start[some][point]), vectors, going)
         block = np.zeros((len(start[some]), -(-rays // _FAN), _FAN), np.float32)
         block[point, fan] = np.stack([np.array(part) for part in seen], -1) * active
         found[some] = block.reshape(len(block), -1)[:, :rays]
@@ -105,10 +105,6 @@ def _in_fans(values: np.ndarray) -> np.ndarray:
 def _vectors_in_fans(vectors: np.ndarray) -> np.ndarray:
     rest = -vectors.shape[1] % _FAN
     return np.pad(vectors, ((0, 0), (0, rest), (0, 0)), mode="edge").reshape(len(vectors), -1, _FAN, 3)
-
-
-def _device(kind: type, vectors: np.ndarray) -> mi.Vector3f:
-    return kind(*[mi.Float(aligned(column.astype(np.float32))) for column in vectors.T])
 
 
 @dataclass(frozen=True)
@@ -172,7 +168,7 @@ def _texel(directions: np.ndarray, resolution: int) -> np.ndarray:
     """(N,) numbers of the texels that unit world directions (N, 3) lie in."""
     if not len(directions):
         return np.zeros(0, int)
-    lanes = mi.Vector3f(*[mi.Float(aligned(column.astype(np.float32))) for column in directions.T])
-    face, u, v = (np.array(value) for value in direction_face(lanes))
+    found = direction_face(lanes(mi.Vector3f, directions))
+    face, u, v = (np.array(value) for value in found)
     column, row = (np.clip(((value + 1) / 2 * resolution).astype(int), 0, resolution - 1) for value in (u, v))
     return (face.astype(int) * resolution + row) * resolution + column

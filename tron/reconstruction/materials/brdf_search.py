@@ -24,7 +24,7 @@ from scipy.spatial import KDTree
 
 from tron.gaussians import GaussianScene
 from tron.reconstruction.light.surfel_colors import FLOOR, Observations, SurfelColors, grouped_median
-from tron.runtime import aligned
+from tron.runtime import aligned, lanes
 from tron.shading.brdf_table import BrdfTable
 from tron.shading.lighting import Lighting
 
@@ -178,11 +178,11 @@ def _nearest(of: np.ndarray, places: np.ndarray) -> np.ndarray:
 def _table(roughness: float, cosine: np.ndarray) -> list[np.ndarray]:
     """A, B, D and E of :mod:`tron.shading.brdf_table`, (N,) each."""
     table = BrdfTable.load()
-    lanes = mi.Float(aligned(np.clip(cosine, 0, 1).astype(np.float32)))
-    return [np.array(value) for value in table(dr.full(mi.Float, float(roughness), len(cosine)), lanes)]
+    along = mi.Float(aligned(np.clip(cosine, 0, 1).astype(np.float32)))
+    return [np.array(value) for value in table(dr.full(mi.Float, float(roughness), len(cosine)), along)]
 
 
 def _prefiltered(lighting: Lighting, direction: np.ndarray, roughness: float) -> np.ndarray:
     """(N, 3) mean radiance over lobes about directions."""
-    lanes = mi.Vector3f(*[mi.Float(aligned(column.astype(np.float32))) for column in direction.T])
-    return np.array(lighting.split_sum.prefiltered(lanes, dr.opaque(mi.Float, float(roughness)))).T
+    along = lanes(mi.Vector3f, direction)
+    return np.array(lighting.split_sum.prefiltered(along, dr.opaque(mi.Float, float(roughness)))).T
