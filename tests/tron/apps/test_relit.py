@@ -355,3 +355,21 @@ def test_every_file_is_looked_for_before_the_scene_is_loaded(
     ):
         assert relight(*base, f"environment={lights[0]}", wrong) == 2
         assert Path(wrong.rstrip("]")).name in capsys.readouterr().err
+
+
+def test_a_thing_without_a_floor_stands_on_a_ground_that_it_shadows(relight, dense_surfels, tmp_path):
+    """Below the ball it is darker than the map, and brighter where the plane lies deeper."""
+    dense_surfels.scene(dense_surfels.sphere(0.08, 0.5), spacing=0.08).save(tmp_path / "ball.ply")
+    EnvironmentMap.constant(1.0).save(tmp_path / "c.exr")
+    base = [f"scene={tmp_path / 'ball.ply'}", f"environment={tmp_path / 'c.exr'}", "trajectory=still"]
+    base += ["frames=1", "buffers=[relit,mask]", "distance=1.6"]
+    shown = {}
+    for ground in ("auto", "none", "-3.0"):
+        out = tmp_path / ground
+        assert relight(*base, f"ground={ground}", f"output_dir={out}") == 0
+        empty = picture(out, "mask", suffix="exr")[..., 0] == 0
+        shown[ground] = picture(out, "relit", suffix="exr")[empty]
+    np.testing.assert_allclose(shown["none"], 1, atol=1e-3)
+    assert shown["auto"].min() < 0.7
+    assert shown["auto"].max() == pytest.approx(1, abs=1e-3)
+    assert shown["auto"].min() + 0.1 < shown["-3.0"].min()

@@ -17,7 +17,7 @@ import scipy.stats
 
 from tron.apps.reconstruct.pictures import chosen_views, view_pictures
 from tron.apps.reconstruct.settings import ReportSettings
-from tron.apps.relight.camera_files import filmed_orbit
+from tron.apps.relight.camera_files import filmed_orbit, frame_size
 from tron.apps.relight.settings import QUALITY
 from tron.cameras import Camera
 from tron.captures import Capture
@@ -227,8 +227,7 @@ def film_cameras(scene: GaussianScene, capture: Capture, frames: int, side: int)
     """Cameras between those of the photos, in their world, frames in their shape, ``side`` the longer one."""
     photographed = [view.camera for view in capture.views]
     first = photographed[0]
-    scale = side / max(first.width, first.height)
-    width, height = (2 * round(scale * pixels / 2) for pixels in (first.width, first.height))
+    width, height = frame_size((first.width, first.height), side)
     view = {"width": width, "height": height, "fov_deg": first.fov_deg}
     return filmed_orbit(photographed, frames, up=scene.up, **view)
 

@@ -50,14 +50,19 @@ def read_cameras(path: Path, width: int, height: int) -> list[Camera]:
     cameras = cameras_of(path, (width, height))
     for camera in cameras:
         if abs(camera.width * height - camera.height * width) > max(width, height):
-            scale = max(width, height) / max(camera.width, camera.height)
-            fit = [2 * round(scale * side / 2) for side in (camera.width, camera.height)]
+            fit = frame_size((camera.width, camera.height), max(width, height))
             raise TronError(
                 f"cameras are {camera.width} x {camera.height}, frames {width} x {height}",
                 path,
                 f"choose the same aspect ratio, such as width={fit[0]} height={fit[1]}",
             )
     return [camera.resized(width, height) for camera in cameras]
+
+
+def frame_size(shape: tuple[int, int], longer: int) -> tuple[int, int]:
+    """Even width and height of a frame in the ``shape`` of another, its ``longer`` side in pixels."""
+    width, height = (max(8, 2 * round(longer * side / max(shape) / 2)) for side in shape)
+    return width, height
 
 
 def cameras_of(path: Path, size: tuple[int, int] = (512, 512)) -> list[Camera]:

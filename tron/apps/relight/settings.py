@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from tron.apps.relight.camera_files import CAMERAS, cameras_of
+from tron.apps.relight.camera_files import CAMERAS, cameras_of, frame_size
 from tron.apps.relit import Background
 from tron.apps.surroundings import DESCRIPTION, Treatment
 from tron.color import Look
@@ -297,15 +297,13 @@ class Settings(BaseModel):
             else:
                 shape = first.width, first.height
                 fov = first.fov_deg
-        across = shape[0] / shape[1]
         width, height = self.width, self.height
         if width is None and height is None:
-            scale = LONGER_SIDE / max(shape)
-            width, height = (max(8, 2 * round(scale * side / 2)) for side in shape)
+            width, height = frame_size(shape, LONGER_SIDE)
         elif width is None and height is not None:
-            width = max(8, 2 * round(height * across / 2))
+            width, _ = frame_size(shape, round(height * max(shape) / shape[1]))
         elif height is None and width is not None:
-            height = max(8, 2 * round(width / across / 2))
+            _, height = frame_size(shape, round(width * max(shape) / shape[0]))
         return self.model_copy(update={"width": width, "height": height, "fov": self.fov or fov})
 
     @property

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tron.apps.relight.camera_files import CAMERAS, filmed_cameras, filmed_orbit, read_cameras, write_cameras
+from tron.apps.relight.settings import Settings
 from tron.cameras import Camera, focus_of
 from tron.captures import View
 from tron.errors import TronError
@@ -133,3 +134,23 @@ def test_another_shape_is_refused_with_one_that_fits(tmp_path: Path) -> None:
 
 def test_no_file_is_no_filmed_space(tmp_path: Path) -> None:
     assert filmed_cameras(tmp_path / "scene.ply") is None
+
+
+@pytest.mark.parametrize(
+    ("given", "size", "fov"),
+    [({}, (384, 512), True), ({"width": 96}, (96, 128), True), ({"height": 64}, (48, 64), True),
+     ({"width": 100, "height": 50, "fov": 20.0}, (100, 50), False)],
+)  # fmt: skip
+def test_frames_have_the_shape_and_lens_of_the_photos(tmp_path: Path, given, size, fov) -> None:
+    photos = views([(48, 64)] * 2)
+    write_cameras(tmp_path, photos)
+    files = {"scene": tmp_path / "scene.ply", "environment": "a.hdr", "output_dir": "out"}
+    shaped = Settings.model_validate({**files, **given}).shaped()
+    assert shaped.size == size
+    assert shaped.fov == pytest.approx(photos[0].camera.fov_deg if fov else 20.0)
+
+
+def test_without_photos_frames_are_square() -> None:
+    files = {"scene": "nowhere/scene.ply", "environment": "a.hdr", "output_dir": "out"}
+    shaped = Settings.model_validate(files).shaped()
+    assert (shaped.size, shaped.fov) == ((512, 512), 40.0)
