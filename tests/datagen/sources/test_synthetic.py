@@ -33,15 +33,22 @@ def test_values_that_are_not_finite_are_found_where_they_are():
     assert first_bad_value(frames) == "frame 2: irradiance has 2 values that are not finite"
 
 
-def test_scenes_take_the_styles_of_a_list_in_turns(tmp_path, monkeypatch):
-    styles = []
-    monkeypatch.setattr(building, "draw_scene", lambda *_, style, **__: styles.append(style))
+def test_scenes_take_the_styles_of_a_list_in_turns_and_the_kinds_of_their_split(tmp_path, monkeypatch):
+    styles, kinds = [], set()
+
+    def drawn(*_, style, choice, **__) -> None:
+        styles.append(style)
+        kinds.add((choice.things, choice.materials))
+
+    monkeypatch.setattr(building, "draw_scene", drawn)
     monkeypatch.setattr(building, "scene_geometry", lambda *_: None)
-    words = ["train.style=[object,table]", f"output_dir={tmp_path}"]
+    words = ["train.style=[object,table]", "train.things=[vase,mug]", "train.materials=[metal]"]
+    words += ["test.things=[book]", f"output_dir={tmp_path}"]
     settings = check(compose_recipe("conf.datagen", Settings, words), Settings)
     for k in range(3):
         draw_and_build(Work("train", k, f"train-{k:06d}", first_shard=0), settings, Sources(), ["overcast"])
     assert styles == ["object", "table", "object"]
+    assert kinds == {(("vase", "mug"), ("metal",))}
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -359,17 +360,20 @@ def test_every_file_is_looked_for_before_the_scene_is_loaded(
 
 def test_a_thing_without_a_floor_stands_on_a_ground_that_it_shadows(relight, dense_surfels, tmp_path):
     """Below the ball it is darker than the map, and brighter where the plane lies deeper."""
-    dense_surfels.scene(dense_surfels.sphere(0.08, 0.5), spacing=0.08).save(tmp_path / "ball.ply")
+    ball = dense_surfels.scene(dense_surfels.sphere(0.08, 0.5), spacing=0.08)
+    ball.save(tmp_path / "ball.ply")
+    replace(ball, offset=np.array([0.0, 0.0, 1000.0])).save(tmp_path / "map.ply")
     EnvironmentMap.constant(1.0).save(tmp_path / "c.exr")
-    base = [f"scene={tmp_path / 'ball.ply'}", f"environment={tmp_path / 'c.exr'}", "trajectory=still"]
-    base += ["frames=1", "buffers=[relit,mask]", "distance=1.6"]
+    base = [f"environment={tmp_path / 'c.exr'}", "trajectory=still", "frames=1", "buffers=[relit,mask]"]
     shown = {}
-    for ground in ("auto", "none", "-3.0"):
-        out = tmp_path / ground
-        assert relight(*base, f"ground={ground}", f"output_dir={out}") == 0
+    for ground in ("auto", "none", "-3.0", "997.0"):
+        out, scene = tmp_path / ground, "map" if ground == "997.0" else "ball"
+        files = [f"scene={tmp_path / scene}.ply", f"output_dir={out}"]
+        assert relight(*base, *files, f"ground={ground}", "distance=1.6") == 0
         empty = picture(out, "mask", suffix="exr")[..., 0] == 0
         shown[ground] = picture(out, "relit", suffix="exr")[empty]
     np.testing.assert_allclose(shown["none"], 1, atol=1e-3)
     assert shown["auto"].min() < 0.7
     assert shown["auto"].max() == pytest.approx(1, abs=1e-3)
     assert shown["auto"].min() + 0.1 < shown["-3.0"].min()
+    np.testing.assert_allclose(shown["997.0"], shown["-3.0"], atol=2e-3)  # on the map, 1,000 higher
