@@ -207,6 +207,16 @@ def check_header(path: Path) -> None:
     _check_sizes(head, size, path)
 
 
+def header_comments(path: Path) -> list[str]:
+    """Comments of a PLY's header; none where the file is not there or no PLY."""
+    try:
+        with path.open("rb") as file:
+            header = file.read(_HEADER_LIMIT).decode("ascii", "replace").partition("end_header")[0]
+    except OSError:
+        return []
+    return [line[len("comment ") :].rstrip() for line in header.splitlines() if line.startswith("comment ")]
+
+
 def _parsed(path: Path) -> plyfile.PlyData:
     try:
         if not is_gzipped(path):

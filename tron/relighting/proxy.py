@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -39,7 +38,7 @@ from tron.cameras import Camera
 from tron.errors import TronError
 from tron.gaussians.fields import FIELDS
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
-from tron.gaussians.ply import write_ply
+from tron.gaussians.ply import header_comments, write_ply
 from tron.gaussians.scene import GaussianScene
 from tron.runtime import aligned
 from tron.tracing import GBuffer, SurfelTracer
@@ -63,7 +62,6 @@ _NEAR_VOXELS = 4.0
 """Voxels up to which light sees the proxy alone, and by which the proxy may lie behind the scan."""
 _GRAZING = 0.05
 _MADE = "of these views and voxels"
-_HEADER = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,14 +89,13 @@ class Proxy:
     @classmethod
     def load(cls, path: Path, made_from: str) -> Proxy | None:
         """Read :meth:`save`'s file; None where there is none, or one that was made from something else."""
+        comments = header_comments(path)
+        voxels = [said.split()[2] for said in comments if said.startswith("tron voxel ")]
+        if f"proxy {made_from}" not in comments or not voxels:
+            return None
         try:
-            with path.open("rb") as file:
-                header = file.read(_HEADER).decode("ascii", "replace")
-            voxel = re.search(r"comment tron voxel (\S+)", header)
-            if voxel is None or f"comment proxy {made_from}\n" not in header:
-                return None
-            return cls(GaussianScene.load(path), float(voxel[1]))
-        except (OSError, ValueError, TronError):
+            return cls(GaussianScene.load(path), float(voxels[0]))
+        except (ValueError, TronError):
             return None
 
 

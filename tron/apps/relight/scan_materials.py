@@ -15,14 +15,13 @@ from tron.cli.progress import track
 from tron.errors import TronError
 from tron.gaussians.edit import subset
 from tron.gaussians.fields import MATERIALS
-from tron.gaussians.ply import write_ply
+from tron.gaussians.ply import header_comments, write_ply
 from tron.gaussians.scene import GaussianScene
 from tron.trajectories import film_around, film_with
 
 log = logging.getLogger(__name__)
 
 VIEWS, SIDE = 64, 200
-_HEADER = 4096
 
 
 def with_materials(
@@ -70,12 +69,11 @@ def with_materials(
 
 
 def _kept(path: Path, made_from: str, count: int) -> GaussianScene | None:
+    if f"materials {made_from}" not in header_comments(path):
+        return None
     try:
-        with path.open("rb") as file:
-            if f"comment materials {made_from}\n" not in file.read(_HEADER).decode("ascii", "replace"):
-                return None
         scene = GaussianScene.load(path)
-    except (OSError, TronError):
+    except TronError:
         return None
     return scene if len(scene) == count else None
 
