@@ -86,6 +86,9 @@ def chosen(scene: GaussianScene, capture: Capture, lighting: Lighting) -> Chosen
     return Chosen(materials, colors, found, received, blank)
 
 
+WHITE = np.ones(3)
+
+
 def psnr(found: np.ndarray, truth: np.ndarray) -> float:
     return float(-10 * np.log10(((found - truth) ** 2).mean()))
 
@@ -105,12 +108,12 @@ def test_where_all_materials_explain_alike_the_prior_decides(scene: GaussianScen
     colors = chosen.colors
     kinds = 2 * len(ROUGHNESSES)
     bases = np.full((kinds, len(scene), 3), 0.5)
-    none = choose(scene, colors, bases, np.zeros((kinds, len(scene))), 0.35)
+    none = choose(scene, colors, bases, np.zeros((kinds, len(scene))), 0.35, WHITE)
     assert none.confidence.max() < 1e-6
     assert none.metallic.max() < 0.35
     told = np.zeros((kinds, len(scene)))
     told[1:] = colors.count  # the first, of the sharpest lobe, explains every photo
-    sharp = choose(scene, colors, bases, told, 0.35)
+    sharp = choose(scene, colors, bases, told, 0.35, WHITE)
     seen = colors.seen
     np.testing.assert_allclose(sharp.roughness[seen], ROUGHNESSES[0], atol=0.01)
     assert sharp.confidence[seen].min() > 0.5
@@ -124,9 +127,24 @@ def test_a_rough_metal_must_prove_itself_more(
     kinds = 2 * len(ROUGHNESSES)
     losses = np.full((kinds, len(scene)), 0.2) * chosen.colors.count
     losses[len(ROUGHNESSES) + list(ROUGHNESSES).index(roughness)] = 0
-    found = choose(scene, chosen.colors, np.full((kinds, len(scene), 3), 0.5), losses, 0.6)
+    found = choose(scene, chosen.colors, np.full((kinds, len(scene), 3), 0.5), losses, 0.6, WHITE)
     seen = chosen.colors.seen
     assert ((found.metallic[seen] > 0.5) == metal).all()
+
+
+@pytest.mark.parametrize(("brightness", "metal"), [(0.55, True), (0.02, False)])
+def test_no_metal_is_dark(scene: GaussianScene, chosen: Chosen, brightness: float, metal: bool) -> None:
+    """What explains all photos better, as a mirror, is metal if it is as bright as iron, and gloss if not."""
+    kinds = 2 * len(ROUGHNESSES)
+    losses = np.full((kinds, len(scene)), 0.3) * chosen.colors.count
+    losses[len(ROUGHNESSES)] = 0
+    bases = np.full((kinds, len(scene), 3), brightness)
+    seen = chosen.colors.seen
+    found = choose(scene, chosen.colors, bases, losses, 0.6, WHITE)
+    assert ((found.metallic[seen] > 0.5) == metal).all()
+    # The same colours under a fiftieth of the light are bright things.
+    dim = choose(scene, chosen.colors, 0.55 / brightness * bases, losses, 0.6, brightness / 0.55 * WHITE)
+    np.testing.assert_allclose(dim.metallic, found.metallic, atol=1e-6)
 
 
 def test_base_color_is_free_of_shadows_and_highlights(scene: GaussianScene, chosen: Chosen) -> None:
@@ -160,7 +178,7 @@ def test_what_no_photo_shows_takes_after_the_nearest_that_one_does(
     losses = np.ones((kinds, len(scene)))
     losses[1 + len(ROUGHNESSES)] = 0  # a metal
     losses[:, blind] = 7.0
-    found = choose(jittered, colors, bases, losses, 0.35)
+    found = choose(jittered, colors, bases, losses, 0.35, WHITE)
     apart = np.linalg.norm(jittered.means[blind][:, None] - jittered.means[~blind][None], axis=2)
     nearest = np.argsort(apart, axis=1)[:, :24]
     np.testing.assert_allclose(
