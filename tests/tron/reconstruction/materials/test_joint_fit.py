@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tron.captures import Capture, View
+from tron.color import luminance
 from tron.estimation import Estimation
 from tron.gaussians import GaussianScene
 from tron.reconstruction import Joint
@@ -16,7 +17,12 @@ from tron.reconstruction.light.fit_pairs import LightSettings
 from tron.reconstruction.light.sky_visibility import _texel, cube_texels, photographed_sky
 from tron.reconstruction.light.surfel_colors import Observations, SurfelColors, mean_colors, observe
 from tron.reconstruction.materials.brdf_search import ROUGHNESSES, Materials, Received, choose, materials_of
-from tron.reconstruction.materials.joint_fit import fit_jointly, photographed_bounces, receive
+from tron.reconstruction.materials.joint_fit import (
+    fit_jointly,
+    metered_light,
+    photographed_bounces,
+    receive,
+)
 from tron.seeds import generator
 from tron.shading.bounces.bounce import BounceTransport
 from tron.shading.environments.cubemap import direction_face
@@ -245,7 +251,7 @@ def test_photos_alone_tell_light_and_materials(
     assert found.said()["surfels_seen"] == pytest.approx((found.colors.count > 0).mean(), abs=1e-4)
 
 
-def test_irradiance_is_held_grey_and_at_one(scene: GaussianScene, capture: Capture) -> None:
+def test_irradiance_is_held_grey_and_where_the_meter_has_it(scene: GaussianScene, capture: Capture) -> None:
     """Through whatever glass the photos were taken: what is moved from the light goes into base color."""
     glass = np.array([1.5, 1.0, 0.6], np.float32)
     tinted = [replace(view, image=view.read() * glass) for view in capture.views]
@@ -265,7 +271,18 @@ def test_irradiance_is_held_grey_and_at_one(scene: GaussianScene, capture: Captu
     bounced = photographed_bounces(transport, fits[1].shown) / balance
     light = EnvironmentMap(fits[1].environment.image * np.float32(capture.exposure))
     total = (receive(transport, Lighting(light), bounced, 0).direct + bounced)[fits[1].colors.seen].mean(0)
-    np.testing.assert_allclose(total, 1, atol=0.03)
+    colors = fits[1].colors
+    metered = metered_light(luminance(colors.color[colors.seen].mean(0)))
+    np.testing.assert_allclose(total / metered, 1, atol=0.03)
+
+
+def test_a_meter_shows_middle_grey_whatever_the_subject() -> None:
+    """Subject and surroundings in one light, exposed to 0.18 in the mean: the light is found again."""
+    for albedo in (0.02, 0.1, 0.25, 0.6):
+        light = 0.18 / (0.3 * albedo + 0.7 * 0.25)
+        assert metered_light(light * albedo) == pytest.approx(light)
+    assert metered_light(0.25 * 0.72) == pytest.approx(0.72)
+    assert metered_light(2.0) == pytest.approx(2.5)  # burnt out: nothing reflects more than 0.8
 
 
 def _texel_centres(resolution: int) -> np.ndarray:
