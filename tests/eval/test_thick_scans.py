@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ SIDE = 8
 def truth(tmp_path: Path) -> tuple[View, Path]:
     """A view of a wall under an even light: the left half gets all of it, the right half a tenth."""
     camera = Camera.look_at((0, -3, 0), (0, 0, 0), up=(0, 0, 1), fov_deg=40, width=SIDE, height=SIDE)
-    normal = np.broadcast_to(np.float32([0, -1, 0]), (SIDE, SIDE, 3))
+    normal = np.broadcast_to(np.array([0, -1, 0], np.float32), (SIDE, SIDE, 3))
     share = np.where(np.arange(SIDE) < SIDE // 2, 1.0, 0.1)
     arrived = np.broadcast_to(share[None, :, None], (SIDE, SIDE, 3)).astype(np.float32)
     view = View("wall", camera, 0.5 * arrived, "linear", mask=np.ones((SIDE, SIDE)), irradiance=arrived)
@@ -30,7 +31,7 @@ def truth(tmp_path: Path) -> tuple[View, Path]:
     return View("wall", camera, 0.5 * arrived, "linear", normal=normal), path
 
 
-def relighter(irradiance: np.ndarray) -> SimpleNamespace:
+def relighter(irradiance: np.ndarray) -> Any:
     """Shows an irradiance (H, W, 3) whatever the light, of a surface of albedo 0.5."""
     frame = {"lit": 0.5 * irradiance, "irradiance": irradiance, "unshadowed": np.ones_like(irradiance)}
     return SimpleNamespace(under=lambda light: SimpleNamespace(render=lambda camera, seed: frame))
