@@ -237,7 +237,7 @@ class Stage:
             plan.density.observe(surfels, camera)
         surfels.step()
         if plan.density is not None:
-            plan.density.after(surfels, number)
+            plan.density.after(surfels, number, plan.smaller(self.step))
         self.step = number
         self._remember(rendered, target, background)
         seconds = time.perf_counter() - began
@@ -349,11 +349,14 @@ class DensityControl:
         self.total = torch.zeros(len(surfels), device=surfels.device)
         self.seen = torch.zeros(len(surfels), device=surfels.device)
 
-    def after(self, surfels: LearntSurfels, step: int) -> None:
-        """Add, remove and reset surfels as is due once ``step`` (from 1) is done."""
+    def after(self, surfels: LearntSurfels, step: int, smaller: int = 1) -> None:
+        """Add, remove and reset surfels as is due once ``step`` (from 1) is done.
+
+        Pictures that are ``smaller`` than the photos by a factor have room for so many times fewer surfels.
+        """
         s = self.settings
         if s.start < step < s.end and step % s.every == 0:
-            self._add(surfels, step)
+            self._add(surfels, step, s.most // smaller)
         if step % s.prune_every == 0 and step < s.end:
             self._prune(surfels)
         if s.reset_every and step < s.end and step % s.reset_every == 0:
@@ -368,10 +371,10 @@ class DensityControl:
         if len(self.total) == len(kept):
             self.total, self.seen = self.total[kept], self.seen[kept]
 
-    def _add(self, surfels: LearntSurfels, step: int) -> None:
+    def _add(self, surfels: LearntSurfels, step: int, most: int) -> None:
         s = self.settings
         pull = self.total / self.seen.clamp(min=1)
-        capacity = max(s.most - len(surfels), 0)
+        capacity = max(most - len(surfels), 0)
         chosen = torch.nonzero(pull > s.threshold)[:, 0]
         if len(chosen) > capacity:  # a clone and a split both add one
             chosen = chosen[torch.topk(pull[chosen], capacity, sorted=False).indices].sort().values
