@@ -384,4 +384,4 @@ class Checkpoint:
         if stage.exposures is not None:
             stage.exposures.restore(self.tensors)
         if stage.fused is not None:
-            stage.fused.restore(self.tensors, stage.surfels.device)
+            stage.fused.restore(self.tensors, stage.surfels.device, stage.pictured())

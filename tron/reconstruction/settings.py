@@ -29,6 +29,7 @@ class Settings(BaseModel):
 
 
 Smoothing = Annotated[float, Field(ge=0, description="Gaussian that smooths the fused field, voxels.")]
+Share = Annotated[float, Field(ge=0, le=1)]
 MostVoxels = Annotated[
     int, Field(ge=8, le=1024, description="Maximum number of voxels along the scene's longest side.")
 ]
@@ -166,6 +167,11 @@ class RadianceSettings(Settings):
     mask: float = Field(default=0.2, ge=0, description="Weight of |opacity - mask|, where views have masks.")
     background: Literal["black", "white", "random"] = Field(
         default="black", description="Background behind surfels and masked subjects."
+    )
+    coarse: tuple[Share, ...] = Field(
+        default=(),
+        description="Shares of the steps that see photos reduced, smallest first: [0.2, 0.3] takes a fifth "
+        "of them at a quarter of the size, then three tenths at half of it; [] takes all whole.",
     )
     exposures: bool = Field(
         default=True,
