@@ -105,6 +105,7 @@ class JointFit:
                 "width_deg": round(float(np.degrees(sun.width)), 2),
             },
             "surfels_seen": round(float(self.colors.seen.mean()), 4),
+            "mirroring": round(self.colors.mirroring(self.scene.means), 4),
             "spread": round(float(np.median(self.colors.spread[self.colors.seen])), 4),
             "balance": [round(float(x), 4) for x in self.balance],
         }
