@@ -13,7 +13,6 @@ from tron.reconstruction.priors.prior import Light, Materials, Prior, Surfels
 from tron.reconstruction.progress import Track
 
 log = logging.getLogger(__name__)
-_MIRRORS = 0.05  # share of the surfels from which it is said
 
 
 class Joint(JointSettings, Prior):
@@ -33,12 +32,5 @@ class Joint(JointSettings, Prior):
         except TooFewSeen as error:  # surfaces were not found: that is no reason to lose what was
             log.warning("%s: base color is what the photos show, and there is no light", error)
             return Materials(surfels.scene)
-        said = fit.said()
-        if said["mirroring"] >= _MIRRORS:
-            log.warning(
-                "%.0f %% of what photos show changes with the view as mirrors, polished metal, black gloss and "
-                "glass do: neither its shape nor its materials are to be relied on",
-                100 * said["mirroring"],
-            )
-        light = Light(fit.environment, said)
+        light = Light(fit.environment, fit.said())
         return Materials(fit.scene, MATERIALS, light, fit.colors.gain)

@@ -197,7 +197,7 @@ def test_what_is_masked_is_not_seen_and_white_is_marked(
     ("material", "least", "most"),
     [
         ({"type": "conductor", "material": "Ag"}, 0.2, 1.0),
-        ({"type": "dielectric"}, 0.2, 1.0),
+        ({"type": "dielectric"}, 0.08, 1.0),
         ({"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.4}}, 0.0, 0.01),
         ({"type": "roughplastic", "alpha": 0.1}, 0.0, 0.05),
     ],
