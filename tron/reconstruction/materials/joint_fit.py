@@ -147,8 +147,8 @@ def fit_jointly(
     mirroring = colors.mirroring(scene.means)
     if mirroring >= _MIRRORS:
         log.warning(
-            "%.0f %% of what is seen changes with the view as mirrors, polished metal, black gloss and glass do: "
-            "neither its shape nor its materials are to be relied on",
+            "%.0f %% of what is seen changes with the view as mirrors, polished metal, black gloss and glass "
+            "do: neither its shape nor its materials are to be relied on",
             100 * mirroring,
         )
     transport = relighter.transport
