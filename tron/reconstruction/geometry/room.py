@@ -35,8 +35,8 @@ POINTS = 20_000
 """Samples of the hull."""
 AROUND, PERHAPS = 0.7, 0.45
 """Share of the level directions that end on a surfel, in a room and in what may be one."""
-OVERHEAD = 0.15
-"""Share of the hull overhead that photos of a room may show to be open."""
+OVERHEAD = 0.4
+"""Share of the hull overhead that photos of a room may show to be open: windows, and what was not found."""
 _DIRECTIONS = 200
 _LEVEL, _RISING = np.sin(np.radians([15.0, 30.0]))
 """Sines of the elevation up to which a direction is level, and from which it is overhead."""
@@ -92,12 +92,12 @@ def closed_indoors(
     Args:
         scene: surfels; those that are there stay, and come first.
         views: cameras are looked at, not images.
-        indoors: whether they were taken in a room; auto: where :attr:`Bounds.room` says so, and no mask says
-            what the subject is.
+        indoors: whether they were taken in a room; auto: where :attr:`Bounds.room` says so, and no mask of
+            theirs says what is subject or sky.
         seed: root of the random numbers.
         track: wraps the loop over the views.
     """
-    if not indoors or (indoors == "auto" and any(view.has("mask") for view in views)):
+    if not indoors or (indoors == "auto" and any(view.has("mask") or view.has("sky_mask") for view in views)):
         return scene
     bounds = bounds_of(scene, views, seed, track)
     if bounds is None:
