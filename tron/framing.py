@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
+from scipy.ndimage import label
 
 from tron.errors import TronError
 
@@ -26,6 +27,8 @@ _FLOOR_SHARE = 0.2
 _SUBJECT_SHARE = 0.005
 # Enough points and cameras to find a distance by; a camera comes no nearer than this many radii.
 _PROBES = 2000
+# Parts that stand out are sought up to so many radii, in cells of that share of one, each with some surfels.
+_REACH, _CELLS, _CROWD = 1.5, 24, 3
 _PROBE_CAMERAS = 24
 _NEAREST = 1.2
 
@@ -82,7 +85,24 @@ def find_subject(scene: Surfels) -> Subject:
     centre = (low + high) / 2
     from_centre = np.linalg.norm(shown - centre, axis=1)
     radius = float(np.quantile(from_centre, 1 - STRAYS))
-    return Subject(shown[from_centre <= radius], centre, max(radius, scene.spacing))
+    near = from_centre <= _REACH * radius
+    held = shown[near][_joined(shown[near], from_centre[near] <= radius, max(radius, scene.spacing) / _CELLS)]
+    low, high = held.min(0), held.max(0)
+    centre = (low + high) / 2
+    radius = float(np.linalg.norm(held - centre, axis=1).max())
+    return Subject(held, centre, max(radius, scene.spacing))
+
+
+def _joined(points: np.ndarray, core: np.ndarray, cell: float) -> np.ndarray:
+    """(N,) bool: points of the ``core`` (N,), and those that hang together with most of it, in cells.
+
+    A leaf or a hand that stands out holds fewer surfels than strays may, but no gap parts it from the rest.
+    """
+    place = ((points - points.min(0)) / cell).astype(int)
+    held = np.zeros(place.max(0) + 1, int)
+    np.add.at(held, tuple(place.T), 1)
+    part = label(held >= _CROWD, np.ones((3, 3, 3)))[0][tuple(place.T)]
+    return core | ((part > 0) & (part == np.bincount(part[core]).argmax()))
 
 
 def has_floor(scene: Surfels) -> bool:

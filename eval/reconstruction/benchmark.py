@@ -31,8 +31,6 @@ WAYS = {
     "depth_init": "depth maps, true prior",
     "photos": "photographs, no prior",
 }
-RELIT_ENLARGED = 2
-"""Pixels of a relit fox per pixel of its photo, along a side."""
 SCANS = {"raw": "the file as it is", "splats": "the file as a capture"}
 Part = Literal["scenes", "photos", "splats", "fox"]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
@@ -91,7 +89,7 @@ class Reconstruction(Benchmark):
     relit: list[Name] = Field(description="ways whose surfels are relit, beside those of photographs")
     splats: SplatSettings = Field(description="scans of plain splats, made and taken as captures")
     real_data: Path | None = Field(description="folder with captures/fox and hdri; null: no fox")
-    fox_downscale: PositiveFloat = Field(default=8, description="factor by which the photos are reduced")
+    fox_downscale: PositiveFloat = Field(default=4, description="factor by which the photos are reduced")
     fox: list[str] = Field(description="further arguments of tron-reconstruct for the fox")
     hdris: list[str] = Field(description="files of hdri under which the fox is relit")
     relight: list[str] = Field(description="arguments of tron-relight")
@@ -311,8 +309,8 @@ class Reconstruction(Benchmark):
                 f"scene={out / 'scene.ply'}",
                 f"environment={environment}",
                 f"cameras={cameras}",
-                f"width={camera.width * RELIT_ENLARGED}",
-                f"height={camera.height * RELIT_ENLARGED}",
+                f"width={camera.width}",
+                f"height={camera.height}",
                 *self.relight,
                 *self._variant(),
                 f"output_dir={frames}",

@@ -250,7 +250,7 @@ def test_every_scene_in_every_way_and_the_fox_are_run_once(stand_ins: Path, tmp_
     cameras = json.loads((out / "fox_cameras.json").read_text())
     assert [camera["width"] for camera in cameras] == [24, 24]
     assert f"scene={out / 'fox' / 'scene.ply'}" in commands[-1]
-    assert "width=48 height=64" in commands[-1]
+    assert "width=24 height=32" in commands[-1]
 
     results = Results.load(out / "results.json")
     prefixes = ("reconstruction", "reconstruction.depth_init")

@@ -12,6 +12,7 @@ import numpy as np
 
 from tron.cameras import Camera
 from tron.captures.capture import Capture
+from tron.captures.coverage import HALF, seen_from_deg
 from tron.captures.photos.image_folder import view_names
 from tron.captures.photos.photo_files import LINEAR_SUFFIXES, exposure_of, require_decoders
 from tron.captures.photos.photo_views import PhotoViews
@@ -60,17 +61,23 @@ def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> C
     _log_kinds(posed.source, made, sum(path.suffix.lower() in LINEAR_SUFFIXES for path in whole), settings)
     _log_reduced(posed.source, len(views), made.reduced, settings)
     ordered = tuple(views[name] for name in sorted(views))
-    up = (
-        estimate_up([view.camera for view in ordered])
-        if settings.up is None
-        else np.array(settings.up, float)
-    )
+    cameras = [view.camera for view in ordered]
+    up = estimate_up(cameras) if settings.up is None else np.array(settings.up, float)
+    up /= np.linalg.norm(up)
+    around = seen_from_deg(cameras, up)
+    if around is not None and around < HALF:
+        log.warning(
+            "%s: photos show it from %.0f degrees around alone: what faces away stays unknown, casts no "
+            "shadow, and light comes in from there",
+            posed.source,
+            around,
+        )
     return Capture(
         views=ordered,
         test=_held_out(splits, settings.test_every, posed.source),
         points=posed.points,
         point_colors=posed.point_colors,
-        up=up / np.linalg.norm(up),
+        up=up,
         transform=posed.transform,
         skipped=skipped,
         offset=offset,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -23,6 +23,7 @@ Pixels = np.ndarray | Callable[[], np.ndarray]
 _TOLERANCE = 1e-3
 _WHOLE = 0.99
 """A pixel of a reduced photo is believed if all of its pixels are."""
+_AGREED = 0.5  # length of a mean of unit normals
 _TABLE = 4096
 _AGX_STOPS = (-12.4, 4.0)  # within the range that AgX does not clip
 
@@ -122,6 +123,29 @@ class View:
         if value is None:
             raise TronError(f"the view has no {field} map", f"view {self.name}")
         return self._checked(field, np.asarray(value())) if callable(value) else value
+
+    def reduced(self, times: float) -> View:
+        """The same view with sides that are ``times`` smaller: each pixel is the mean of its area.
+
+        Maps are read when they are asked for. Display values are averaged as they are, as photos are reduced
+        when they are loaded. Normals are unit again, or zero where they contradict one another. Depth is left
+        out: its mean over an edge lies on no surface.
+        """
+        if times == 1:
+            return self
+        width, height = (max(round(side / times), 1) for side in (self.camera.width, self.camera.height))
+        maps = {name: partial(self._reduced, name, (width, height)) for name in MAPS if self.has(name)}
+        maps.pop("depth", None)
+        return View(self.name, self.camera.resized(width, height), space=self.space, **maps)
+
+    def _reduced(self, field: str, size: tuple[int, int]) -> np.ndarray:
+        import cv2
+
+        pixels = cv2.resize(self.read(field), size, interpolation=cv2.INTER_AREA)
+        if field != "normal":
+            return pixels
+        length = np.linalg.norm(pixels, axis=-1, keepdims=True)
+        return np.where(length > _AGREED, pixels / np.maximum(length, _AGREED), 0)
 
     def _checked(self, field: str, value: np.ndarray) -> np.ndarray:
         where, height, width = f"view {self.name}", self.camera.height, self.camera.width

@@ -30,7 +30,7 @@ from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
 from tron.metrics import LPIPS
 from tron.reconstruction.geometry.initial import Beginning, beginning, extent_of, place_of, source_of
-from tron.reconstruction.geometry.seen_space import enclosed
+from tron.reconstruction.geometry.room import closed_indoors
 from tron.reconstruction.geometry.surfels import LearntSurfels
 from tron.reconstruction.geometry.training import (
     Plan,
@@ -152,8 +152,8 @@ def reconstruct(
     surfels = run.stage(plan, taught.train_views, first)
     degree = settings.initial.kernel_degree
     scene = replace(surfels.scene(degree, capture.up), offset=capture.offset)
-    if settings.indoors and not run.past(plan.name):
-        scene = enclosed(scene, views, settings.seed, track)
+    if not run.past(plan.name):
+        scene = closed_indoors(scene, views, settings.indoors, settings.seed, track)
     scene = _with_baked_color(scene)
 
     def learn(names: Collection[str]) -> GaussianScene:
@@ -384,4 +384,4 @@ class Checkpoint:
         if stage.exposures is not None:
             stage.exposures.restore(self.tensors)
         if stage.fused is not None:
-            stage.fused.restore(self.tensors, stage.surfels.device)
+            stage.fused.restore(self.tensors, stage.surfels.device, stage.pictured())

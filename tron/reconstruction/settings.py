@@ -17,6 +17,8 @@ Model = TypeVar("Model", bound="Settings")
 
 Place = Literal["in place", "near", "anywhere"]
 """Place that surfels begin at: on the surface (depth maps), near it (stereo), or anywhere."""
+Indoors = bool | Literal["auto"]
+"""Whether photos were taken in a room; auto: what was found of it says."""
 
 _FASTER: dict[Place, tuple[float, float]] = {"in place": (0, 0), "near": (0.25, 0.5), "anywhere": (0.5, 0.5)}
 """Powers of the number of steps by which positions and rotations learn faster in fewer."""
@@ -29,6 +31,7 @@ class Settings(BaseModel):
 
 
 Smoothing = Annotated[float, Field(ge=0, description="Gaussian that smooths the fused field, voxels.")]
+Share = Annotated[float, Field(ge=0, le=1)]
 MostVoxels = Annotated[
     int, Field(ge=8, le=1024, description="Maximum number of voxels along the scene's longest side.")
 ]
@@ -167,6 +170,11 @@ class RadianceSettings(Settings):
     background: Literal["black", "white", "random"] = Field(
         default="black", description="Background behind surfels and masked subjects."
     )
+    coarse: tuple[Share, ...] = Field(
+        default=(),
+        description="Shares of the steps that see photos reduced, smallest first: [0.2, 0.3] takes a fifth "
+        "of them at a quarter of the size, then three tenths at half of it; [] takes all whole.",
+    )
     exposures: bool = Field(
         default=True,
         description="Find the exposure and white balance of each photo; false takes all as exposed alike.",
@@ -226,10 +234,11 @@ class ReconstructionSettings(Settings):
     initial: InitialSettings = Field(default=InitialSettings(), description="Source of the first surfels.")
     radiance: RadianceSettings = Field(default=RadianceSettings(), description="Stage 1.")
     materials: MaterialSettings = Field(default=MaterialSettings(), description="Stage 2.")
-    indoors: bool = Field(
-        default=False,
+    indoors: Indoors = Field(
+        default="auto",
         description="Photos taken in a room: where none shows what bounds it, such as a ceiling, surfels of "
-        "the colour near by close it, so that no light comes in.",
+        "the colour near by close it, so that no light comes in; auto: where surfaces stand around the "
+        "cameras on all sides and no photo shows an opening overhead.",
     )
     steps_scaler: float = Field(
         default=0.1,

@@ -58,10 +58,14 @@ VIEWS, SIDE, MOST_VOXELS, TRUNCATION, SIGMA, SURFELS = 64, 300, 256, 4.0, 1.0, 6
 has them, and most surfels. Coarser voxels leak, finer ones keep the scan's noise."""
 _LEAST_SIDE, _PIXELS_PER_SPLAT = 64, 2.0
 _SOLID = 0.5
+_SHARP = 2.0
+"""Pixels of lift at which a view's depth counts half: behind fog it lies too deep, and makes a pit."""
+_PITS = 2
+"""Voxels of half the width up to which a pit is closed."""
 _NEAR_VOXELS = 4.0
 """Voxels up to which light sees the proxy alone, and by which the proxy may lie behind the scan."""
 _GRAZING = 0.05
-_MADE = "of these views and voxels"
+_MADE = "of these views and voxels, closed"
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,15 +147,17 @@ def make_proxy(
     film = _film(scene, cameras, VIEWS, side)
     for number in track(range(len(film))):
         view = seen_by(tracer, film[number])
-        names = ("depth", "opacity", "base_color", "roughness", "metallic")
+        names = ("depth", "opacity", "lift", "base_color", "roughness", "metallic")
         images = view.images({name: getattr(view, name) for name in names})
         depth, subject = images.pop("depth"), images.pop("opacity") > _SOLID
-        maps.append(DepthMap(film[number], depth, subject & (depth > 0), empty_rays(subject)))
+        pixels = images.pop("lift") * film[number].fx / np.maximum(depth, 1e-9)
+        weight = (subject & (depth > 0)) / (1 + (pixels / _SHARP) ** 2)
+        maps.append(DepthMap(film[number], depth, weight, empty_rays(subject)))
         buffers.append(images)
     field = fuse(maps, pixel_footprint(maps), TRUNCATION, MOST_VOXELS)
     if field is None:
         return None
-    agreed = consensus(field, maps, SIGMA)
+    agreed = consensus(field.closed(_PITS), maps, SIGMA)
     if not any((depth > 0).any() for depth, _ in agreed):
         return None
     surfels = surfels_from_gbuffers(_layer(film, agreed, buffers), min(SURFELS, 2 * len(scene)))

@@ -9,13 +9,13 @@ One kernel runs over all voxels, and within each over the views: 64 views of 200
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.ndimage import gaussian_filter, grey_opening, maximum_filter
 
 from tron.cameras import Camera
 from tron.runtime import aligned, lanes
@@ -83,6 +83,14 @@ class DistanceField:
         known = weight > 1e-4
         value = np.where(known, value / np.where(known, weight, 1), 1).astype(np.float32)
         return DistanceField(self.low, self.voxel, self.reach, value, weight)
+
+    def closed(self, radius: int) -> DistanceField:
+        """Without pits, cracks and holes of no more than ``radius`` voxels to either side.
+
+        Morphological closing of what is solid, by a cube (Serra 1982), which leaves convex edges as they are.
+        """
+        value = grey_opening(self.value, 2 * radius + 1, mode="nearest")  # solid is negative
+        return replace(self, value=np.where(self.weight > 0, value, self.value))
 
     def sampler(self) -> Sampler:
         """The field on the device."""

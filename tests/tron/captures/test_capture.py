@@ -67,6 +67,35 @@ def test_a_map_that_is_absent_is_named() -> None:
         view().read("irradiance")
 
 
+@pytest.mark.parametrize(("size", "times"), [((24, 16), 2), ((24, 16), 4), ((25, 18), 2)])
+def test_a_reduced_view_shows_the_same_directions(size: tuple[int, int], times: int) -> None:
+    """A picture that is linear in the image plane is, at each centre of a larger pixel, what it was there."""
+
+    def shown(camera: Camera) -> np.ndarray:
+        local = camera.exact_rays() @ camera.world_to_camera[:3, :3].T
+        x, y = local[..., 0] / local[..., 2], local[..., 1] / local[..., 2]
+        return np.stack([0.5 + 0.3 * x, 0.5 - 0.2 * y, 0.5 + 0.1 * (x + y)], -1)
+
+    camera = Camera.look_at((3, 1, 2), (0, 0, 0), fov_deg=50, width=size[0], height=size[1])
+    view = View("a", camera, shown(camera), "display", depth=np.ones(size[::-1])).reduced(times)
+    assert (view.camera.width, view.camera.height) == tuple(max(round(side / times), 1) for side in size)
+    assert not view.has("depth")
+    # Pixels that are cut up are as even as one pixel: a small part of a pixel's difference.
+    whole = all(side % times == 0 for side in size)
+    np.testing.assert_allclose(view.read(), shown(view.camera), atol=1e-6 if whole else 2e-3)
+
+
+def test_a_reduced_view_believes_whole_pixels_and_has_unit_normals() -> None:
+    camera = Camera.look_at((0, 0, 5), (0, 0, 0), fov_deg=40, width=4, height=2, up=(0, 1, 0))
+    valid, normal = np.ones((2, 4)), np.zeros((2, 4, 3))
+    valid[0, 0] = 0
+    normal[:, 0], normal[:, 1] = (0, 0.6, 0.8), (0, -0.6, 0.8)  # they agree on (0, 0, 1)
+    normal[0, 2:], normal[1, 2:] = (1, 0, 0), (-1, 0, 0)
+    view = View("a", camera, np.zeros((2, 4, 3)), "display", valid=valid, normal=normal).reduced(2)
+    assert view.believed().tolist() == [[False, True]]
+    np.testing.assert_allclose(view.read("normal"), [[(0, 0, 1), (0, 0, 0)]], atol=1e-6)
+
+
 def test_views_are_split_by_name() -> None:
     capture = Capture((view("a"), view("b"), view("c")), test=frozenset({"b"}))
     assert [v.name for v in capture.train_views] == ["a", "c"]

@@ -163,6 +163,21 @@ def test_an_interrupted_run_is_the_uninterrupted_one_bit_by_bit(
     assert same(found.scene, whole.scene)
 
 
+@pytest.mark.parametrize("cut", [6, 9, 13], ids=["after a size's last step", "amid a size", "whole photos"])
+def test_a_run_from_coarse_to_fine_outlives_an_interruption_bit_by_bit(
+    painted_capture, one_thread, tmp_path: Path, cut: int
+) -> None:
+    """Sizes change before steps 5 and 10 (from 0) and a checkpoint comes every five: on their borders too."""
+    capture, prior = without(painted_capture, "normal"), GroundTruth()
+    fine = settings(radiance=settings().radiance.model_copy(update={"coarse": (5 / 14, 5 / 14)}))
+    undisturbed = reconstruct(capture, prior, fine)
+    path = tmp_path / "checkpoint.safetensors"
+    with pytest.raises(Cut):
+        reconstruct(capture, prior, fine, checkpoint=path, watch=CutAt("radiance", cut))
+    assert same(reconstruct(capture, prior, fine, checkpoint=path).scene, undisturbed.scene)
+    assert not same(undisturbed.scene, reconstruct(capture, prior, settings()).scene)
+
+
 @pytest.fixture(scope="module")
 def whole(painted_capture: Capture) -> Reconstruction:
     """The run that nobody interrupts, on one thread."""

@@ -173,3 +173,21 @@ def test_a_wide_scene_has_larger_voxels_and_no_more_of_them(ball_maps: BallMaps)
     field = fuse(ball_maps(), 1e-4, 4, 40)
     assert field is not None
     assert max(field.value.shape) <= 42
+
+
+def test_closing_fills_narrow_pits_and_leaves_wide_ones_and_edges() -> None:
+    """The block below z = 15 of 30 voxels, from x = 5 on, with pits five deep, four and twelve wide."""
+    x, y, z = np.meshgrid(*[np.arange(30.0)] * 3, indexing="ij")
+    block = np.maximum(z - 15, 5 - x)
+    for middle, half in ((10.5, 2.0), (21.5, 6.0)):
+        pit = np.maximum(np.maximum(np.abs(x - middle), np.abs(y - 15)) - half, 10 - z)
+        block = np.maximum(block, -pit)
+    value = np.clip(block / 4, -1, 1).astype(np.float32)
+    field = DistanceField(np.zeros(3), 1.0, 4.0, value, np.ones_like(value))
+    closed = field.closed(2).value
+    narrow, wide = (10, 15, 12), (21, 15, 12)
+    assert value[narrow] > 0 > closed[narrow]
+    assert closed[wide] > 0
+    assert np.array_equal(closed[3:8], value[3:8]), "the edge at x = 5 has moved"
+    unseen = replace(field, weight=np.zeros_like(value))
+    assert np.array_equal(unseen.closed(2).value, value)

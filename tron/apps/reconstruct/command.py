@@ -143,7 +143,7 @@ cli = command(
     main,
     examples=(
         "tron-reconstruct capture=photos output_dir=outputs/mine",
-        "tron-reconstruct experiment=photos capture=fox downscale=8 output_dir=outputs/fox",
+        "tron-reconstruct experiment=photos capture=fox output_dir=outputs/fox",
         "tron-reconstruct capture=scene prior=ground_truth initial.source=depth output_dir=out",
         "tron-reconstruct capture=scan.ply output_dir=outputs/relightable",
         "tron-reconstruct capture=garden prior=precomputed prior.folder=maps experiment=paper output_dir=out",

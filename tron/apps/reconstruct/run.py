@@ -19,6 +19,7 @@ from tron.apps.reconstruct.splat_capture import is_splats
 from tron.apps.relight.camera_files import write_cameras
 from tron.captures import Capture, View
 from tron.captures.capture import content_hash
+from tron.captures.coverage import seen_from_deg
 from tron.cli.progress import Progress, track, working
 from tron.errors import TronError
 from tron.metrics import LPIPS, capped_psnr
@@ -192,6 +193,7 @@ def _report(settings: Settings, capture: Capture, found: Reconstruction) -> dict
             "held_out": sorted(capture.test),
             "skipped": dict(capture.skipped),
             "up": capture.up.tolist(),
+            "seen_from_deg": seen_from_deg([view.camera for view in capture.views], capture.up),
             "transform": capture.transform.tolist(),
             "offset": capture.offset.tolist(),
             "content": shown_by(capture),

@@ -48,19 +48,17 @@ class FusedNormals:
 
     Args:
         settings: how often, how fine.
-        views: of the stage.
         kernel_degree: of the surfels.
     """
 
-    def __init__(self, settings: ConsistencySettings, views: Sequence[View], kernel_degree: int) -> None:
-        self.settings, self.views, self.kernel_degree = settings, views, kernel_degree
+    def __init__(self, settings: ConsistencySettings, kernel_degree: int) -> None:
+        self.settings, self.kernel_degree = settings, kernel_degree
         self._normals: dict[str, Tensor] = {}
         self._made_from: dict[str, Tensor] = {}
 
-    def before(self, surfels: LearntSurfels, step: int) -> None:
-        """Make them anew if that is due before ``step`` (from 0)."""
-        if step % self.settings.every == 0:
-            self._make({name: surfels[name].detach().clone() for name in _GEOMETRY})
+    def make(self, surfels: LearntSurfels, views: Sequence[View]) -> None:
+        """Make them anew, in the views' size."""
+        self._make({name: surfels[name].detach().clone() for name in _GEOMETRY}, views)
 
     def of(self, view: View) -> dict[str, Tensor]:
         """``fused_normal``, (H, W, 3) float32 unit, world, zero where unknown; empty where there is none."""
@@ -71,23 +69,22 @@ class FusedNormals:
         """The geometry that they were made from, for a checkpoint."""
         return {f"{_STATE}{name}": values for name, values in self._made_from.items()}
 
-    def restore(self, stored: Mapping[str, Tensor], device: torch.device) -> None:
-        """Inverse of :meth:`state`; before the first step there is none."""
+    def restore(self, stored: Mapping[str, Tensor], device: torch.device, views: Sequence[View]) -> None:
+        """Inverse of :meth:`state`, in the views' size; before the first step there is none."""
         if _STATE + _GEOMETRY[0] not in stored:
             return
-        self._make({name: stored[_STATE + name].to(device) for name in _GEOMETRY})
+        self._make({name: stored[_STATE + name].to(device) for name in _GEOMETRY}, views)
 
     @torch.no_grad()
-    def _make(self, tensors: Mapping[str, Tensor]) -> None:
+    def _make(self, tensors: Mapping[str, Tensor], views: Sequence[View]) -> None:
         self._made_from = dict(tensors)
-        maps = [self._depth_map(view) for view in self.views]
+        maps = [self._depth_map(view) for view in views]
         # Half precision is a hundredth of a degree, and half the memory of many large views.
         how = self.settings
         fused = fused_views(maps, how.truncation, how.sigma, how.most_voxels)
         device = tensors[_GEOMETRY[0]].device
         self._normals = {
-            view.name: torch.from_numpy(normal).half().to(device)
-            for view, (_, normal) in zip(self.views, fused)
+            view.name: torch.from_numpy(normal).half().to(device) for view, (_, normal) in zip(views, fused)
         }
 
     def _depth_map(self, view: View) -> DepthMap:

@@ -45,18 +45,12 @@ class Photograph:
     @staticmethod
     def of(view: View, most_side: int, device: str | torch.device) -> Photograph:
         """A view, reduced by area until its longer side has at most ``most_side`` pixels."""
-        camera = view.camera
+        view = view.reduced(max(max(view.camera.width, view.camera.height) / most_side, 1))
         image = torch.from_numpy(view.read("image")).movedim(-1, 0)
-        mask = torch.from_numpy(view.read("mask")) if view.has("mask") else torch.ones(image.shape[1:])
-        mask = mask * torch.from_numpy(view.believed())
-        shrink = most_side / max(camera.width, camera.height)
-        if shrink < 1:
-            width, height = (max(round(side * shrink), 1) for side in (camera.width, camera.height))
-            camera = camera.resized(width, height)
-            both = torch.cat([image, mask[None]])[None]
-            both = F.interpolate(both, (height, width), mode="area")[0]
-            image, mask = both[:3], both[3]
-        return Photograph(camera, image.to(device), (mask > _SUBJECT).to(device))
+        subject = view.believed()
+        if view.has("mask"):
+            subject &= view.read("mask") > _SUBJECT
+        return Photograph(view.camera, image.to(device), torch.from_numpy(subject).to(device))
 
     @property
     def rays(self) -> Tensor:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from typing import Literal
 
 import numpy as np
@@ -80,6 +81,7 @@ class Plan:
         density: makes and removes surfels; None leaves their number.
         exposures: curve of the photos whose exposures are found; None takes them as exposed alike.
         consistency: pulls normals to those that the views' depths agree on; None does not.
+        coarse: shares of the steps that see photos smaller by the powers of two down to 2, smallest first.
     """
 
     name: str
@@ -93,6 +95,12 @@ class Plan:
     density: DensityControl | None = None
     exposures: ToneCurve | None = None
     consistency: ConsistencySettings | None = None
+    coarse: tuple[float, ...] = ()
+
+    def smaller(self, step: int) -> int:
+        """How many times smaller than the photos are the pictures that step ``step`` (from 0) compares."""
+        ends = [round(share * self.steps) for share in accumulate(self.coarse)]
+        return 1 << sum(step < end for end in ends)
 
     def learning(self, names: Collection[str]) -> Plan:
         """The same plan, learning these parameters alone."""
@@ -138,6 +146,7 @@ def radiance_plan(
         density=DensityControl(settings.density, extent, seed),
         exposures=tone_curve if settings.exposures else None,
         consistency=settings.consistency if own else None,
+        coarse=settings.coarse,
     )
 
 
@@ -180,7 +189,8 @@ class Stage:
             self.exposures = PhotoExposures(views, plan.exposures, round(_EXPOSURES_FROM * plan.steps))
         self.fused: FusedNormals | None = None
         if plan.consistency is not None:
-            self.fused = FusedNormals(plan.consistency, views, kernel_degree)
+            self.fused = FusedNormals(plan.consistency, kernel_degree)
+        self._reduced: tuple[int, Sequence[View]] = (1, views)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
     def run(self, watch: Watch | None = None) -> None:
@@ -201,7 +211,8 @@ class Stage:
         view = self._view(self.step)
         target = targets(view, plan.weights.wanted(), surfels.device)
         if self.fused is not None:
-            self.fused.before(surfels, self.step)
+            if self.step % self.fused.settings.every == 0 or self._resized():
+                self.fused.make(surfels, self.pictured())
             target |= self.fused.of(view)
         self._set_rates()
         rendered = render(
@@ -226,7 +237,7 @@ class Stage:
             plan.density.observe(surfels, camera)
         surfels.step()
         if plan.density is not None:
-            plan.density.after(surfels, number)
+            plan.density.after(surfels, number, plan.smaller(self.step))
         self.step = number
         self._remember(rendered, target, background)
         seconds = time.perf_counter() - began
@@ -237,13 +248,24 @@ class Stage:
         """Degree of the harmonics that the next step learns."""
         return min(self.step // self.plan.sh_every, self.plan.sh_degree)
 
+    def pictured(self) -> Sequence[View]:
+        """The views as the next step sees them: in the size that the plan has for it."""
+        times = self.plan.smaller(self.step)
+        if times != self._reduced[0]:
+            self._reduced = (times, [view.reduced(times) for view in self.views])
+        return self._reduced[1]
+
+    def _resized(self) -> bool:
+        """Whether the next step is the first one of its size."""
+        return self.step > 0 and self.plan.smaller(self.step) != self.plan.smaller(self.step - 1)
+
     def _view(self, step: int) -> View:
         """Views in random order, each once before any comes again."""
         epoch, place = divmod(step, len(self.views))
         if self._order[0] != epoch:
             order = generator(self.seed, self.plan.name, "views", epoch).permutation(len(self.views))
             self._order = (epoch, order)
-        return self.views[self._order[1][place]]
+        return self.pictured()[self._order[1][place]]
 
     def _background(self) -> np.ndarray:
         if self.plan.background == "random":
@@ -327,11 +349,14 @@ class DensityControl:
         self.total = torch.zeros(len(surfels), device=surfels.device)
         self.seen = torch.zeros(len(surfels), device=surfels.device)
 
-    def after(self, surfels: LearntSurfels, step: int) -> None:
-        """Add, remove and reset surfels as is due once ``step`` (from 1) is done."""
+    def after(self, surfels: LearntSurfels, step: int, smaller: int = 1) -> None:
+        """Add, remove and reset surfels as is due once ``step`` (from 1) is done.
+
+        Pictures that are ``smaller`` than the photos by a factor have room for so many times fewer surfels.
+        """
         s = self.settings
         if s.start < step < s.end and step % s.every == 0:
-            self._add(surfels, step)
+            self._add(surfels, step, s.most // smaller)
         if step % s.prune_every == 0 and step < s.end:
             self._prune(surfels)
         if s.reset_every and step < s.end and step % s.reset_every == 0:
@@ -346,10 +371,10 @@ class DensityControl:
         if len(self.total) == len(kept):
             self.total, self.seen = self.total[kept], self.seen[kept]
 
-    def _add(self, surfels: LearntSurfels, step: int) -> None:
+    def _add(self, surfels: LearntSurfels, step: int, most: int) -> None:
         s = self.settings
         pull = self.total / self.seen.clamp(min=1)
-        capacity = max(s.most - len(surfels), 0)
+        capacity = max(most - len(surfels), 0)
         chosen = torch.nonzero(pull > s.threshold)[:, 0]
         if len(chosen) > capacity:  # a clone and a split both add one
             chosen = chosen[torch.topk(pull[chosen], capacity, sorted=False).indices].sort().values

@@ -45,6 +45,7 @@ _USUAL = 0.6
 Where few look, as at a table's edge, surfels face anywhere.
 """
 _METAL = 0.5  # metallic from here on: no diffuse part to speak of
+_MIRRORS = 0.05  # share of the surfels from which it is said that they change with the view
 _RAYS = 64  # shadow rays of a surfel
 _BACK = 0.5  # light of a back face as a share of what photos show of its front
 MIDDLE_GREY = 0.18
@@ -89,6 +90,7 @@ class JointFit:
         shown: (M, 3) linear light that leaves the surfels; where no photo shows one, its neighbours'.
         balance: (3,) factor on base color, and on light its reciprocal, by which mean irradiance over what is
             seen is grey and as bright as the meter has it; ones where that was not asked.
+        mirroring: share of what is seen that changes with the view, :meth:`SurfelColors.mirroring`.
     """
 
     scene: GaussianScene
@@ -97,6 +99,7 @@ class JointFit:
     colors: SurfelColors
     shown: np.ndarray
     balance: np.ndarray
+    mirroring: float
 
     def said(self) -> dict[str, Any]:
         """Plain values for a report."""
@@ -109,6 +112,7 @@ class JointFit:
                 "width_deg": round(float(np.degrees(sun.width)), 2),
             },
             "surfels_seen": round(float(self.colors.seen.mean()), 4),
+            "mirroring": round(self.mirroring, 4),
             "spread": round(float(np.median(self.colors.spread[self.colors.seen])), 4),
             "balance": [round(float(x), 4) for x in self.balance],
         }
@@ -144,6 +148,13 @@ def fit_jointly(
             mend="take larger pictures (max_side=) and more steps; cameras and masks must be the scene's",
         )
     shown = _everywhere(colors, scene)
+    mirroring = colors.mirroring(scene.means)
+    if mirroring >= _MIRRORS:
+        log.warning(
+            "%.0f %% of what is seen changes with the view as mirrors, polished metal, black gloss and glass "
+            "do: neither its shape nor its materials are to be relied on",
+            100 * mirroring,
+        )
     transport = relighter.transport
     bounced = photographed_bounces(transport, shown)
     sky = photographed_sky(
@@ -168,7 +179,7 @@ def fit_jointly(
         materials = replace(materials, base_color=materials.base_color * balance)
         sun = None if sun is None else replace(sun, strength=sun.strength / balance)
     environment = EnvironmentMap(environment.image / (balance * np.float32(capture.exposure)))
-    return JointFit(_with(scene, materials), environment, sun, colors, shown, balance)
+    return JointFit(_with(scene, materials), environment, sun, colors, shown, balance, mirroring)
 
 
 def metered_light(shown: float) -> float:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 NORMAL_POWER = 32
 PLANE_SPACINGS = 1.0
 """Distance from the pixel's plane, in surfel spacings, at which a neighbour's weight has fallen by e."""
+LOOSE, ALONE = 8.0, 12.0
+"""Times as far, for pixels whose neighbours have no more than this weight, of 220: leaves, wires, fringes."""
 
 
 def neighbourhood_mean(
@@ -82,10 +84,14 @@ def _means(
     def spline(offset: mi.Int) -> mi.Float:
         return dr.select(offset == 0, 6.0, dr.select(dr.abs(offset) == 1, 4.0, 1.0))
 
-    def added(sums: list[mi.Float], w: mi.Float, index: mi.UInt32, inside: mi.Bool) -> list[mi.Float]:
-        return [total + w * dr.gather(mi.Float, v, index, inside) for total, v in zip(sums, values)]
+    def read(index: mi.UInt32, inside: mi.Bool) -> list[mi.Float]:
+        return [dr.gather(mi.Float, value, index, inside) for value in values]
+
+    def added(sums: list[mi.Float], w: mi.Float, read: list[mi.Float]) -> list[mi.Float]:
+        return [total + w * value for total, value in zip(sums, read)]
 
     sums, weight = [mi.Float(0) for _ in values], mi.Float(0)
+    loose_sums, loose_weight = [mi.Float(0) for _ in values], mi.Float(0)
     tap = mi.Int(0)
     while tap < 25:
         dx, dy = tap % 5 - 2, tap // 5 - 2
@@ -97,10 +103,25 @@ def _means(
         agreement = dr.maximum(dr.dot(normal, at(normal, index, inside)), 0)
         off_plane = dr.dot(normal, at(position, index, inside) - position) / plane
         unlike = stop * (dr.gather(mi.Float, guide, index, inside) - guide)
-        w = spline(dx) * spline(dy) * agreement**NORMAL_POWER
-        w = dr.select(inside, w * dr.exp(-off_plane * off_plane - unlike * unlike), 0)
-        sums = added(sums, w, index, inside)
+        kernel = dr.select(inside, spline(dx) * spline(dy) * dr.exp(-unlike * unlike), 0)
+        w = kernel * agreement**NORMAL_POWER * dr.exp(-off_plane * off_plane)
+        far = off_plane / LOOSE
+        loose = kernel * agreement * dr.exp(-far * far)
+        there = read(index, inside)
+        sums = added(sums, w, there)
         weight += w
+        loose_sums = added(loose_sums, loose, there)
+        loose_weight += loose
         tap += 1
+    alone = weight < dr.select(own, 36.0 + ALONE, ALONE)
+    alone &= loose_weight > weight
+    weight = dr.select(alone, loose_weight, weight)
     found = weight > 0
-    return [dr.select(found, total / weight, 0) for total in sums], found
+    return _chosen(sums, loose_sums, alone, weight), found
+
+
+def _chosen(
+    strict: list[mi.Float], loose: list[mi.Float], alone: mi.Bool, weight: mi.Float
+) -> list[mi.Float]:
+    pairs = zip(strict, loose, strict=True)
+    return [dr.select(weight > 0, dr.select(alone, b, a) / weight, 0) for a, b in pairs]

@@ -181,7 +181,7 @@ def test_the_papers_schedule_to_the_step(monkeypatch: pytest.MonkeyPatch) -> Non
     paper = DensitySettings(end=15_000, every=300, reset_every=3000)
     surfels, density = surfels_of(2), DensityControl(paper, EXTENT, 0)
     added, pruned, reset = [], [], []
-    monkeypatch.setattr(density, "_add", lambda _, step: added.append(step))
+    monkeypatch.setattr(density, "_add", lambda _, step, most: added.append(step))
     step = 0
     monkeypatch.setattr(density, "_prune", lambda _: pruned.append(step))
     monkeypatch.setattr(surfels, "replace", lambda *_: reset.append(step))
@@ -218,3 +218,12 @@ def test_the_state_round_trip_decides_alike() -> None:
         each.after(surfels, 1)
     assert len(one) == 4 + 3
     np.testing.assert_array_equal(array(one, "means"), array(other, "means"))
+
+
+@pytest.mark.parametrize(("smaller", "count"), [(1, 10), (2, 10), (4, 8), (8, 6)])
+def test_smaller_pictures_have_room_for_fewer_surfels(smaller: int, count: int) -> None:
+    """Six surfels that all want to be two: 32 may be at most, divided by how much smaller pictures are."""
+    surfels, density = surfels_of(6), control(most=32)
+    observe(density, surfels, [0.9, 0.8, 0.7, 0.6, 0.2, 0.1])
+    density.after(surfels, 1, smaller)
+    assert len(surfels) == count

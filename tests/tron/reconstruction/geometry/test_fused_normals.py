@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from tron.captures import Capture
+from tron.captures import Capture, View
 from tron.gaussians import GaussianScene
 from tron.metrics import angular_error_deg
 from tron.reconstruction.geometry.fused_normals import FusedNormals, normal_consistency
@@ -39,9 +40,9 @@ def test_the_loss_is_the_weighted_turn_of_the_surfels_from_the_fused_normal() ->
 
 def test_fused_normals_are_the_surfaces(painted: GaussianScene, painted_capture: Capture) -> None:
     views = painted_capture.train_views
-    fused = FusedNormals(SETTINGS, views, painted.kernel_degree)
+    fused = FusedNormals(SETTINGS, painted.kernel_degree)
     assert fused.of(views[0]) == {}
-    fused.before(LearntSurfels.of_scene(painted, RATES), 0)
+    fused.make(LearntSurfels.of_scene(painted, RATES), views)
     for view in views:
         normal = fused.of(view)["fused_normal"].cpu().numpy()
         known = normal.any(-1) & (view.read("depth") > 0)
@@ -55,8 +56,8 @@ def test_masks_carve_surfels_that_no_photo_shows(painted: GaussianScene, painted
     known = []
     for masks in (True, False):
         shown = [view if masks else replace(view, mask=np.zeros((32, 32))) for view in views]
-        fused = FusedNormals(SETTINGS, shown, painted.kernel_degree)
-        fused.before(surfels, 0)
+        fused = FusedNormals(SETTINGS, painted.kernel_degree)
+        fused.make(surfels, shown)
         known.append(
             np.mean([fused.of(view)["fused_normal"].any(-1).float().mean().item() for view in shown])
         )
@@ -69,8 +70,8 @@ def test_surfels_that_are_turned_turn_back(painted: GaussianScene, painted_captu
     views = painted_capture.train_views
     turn = torch.from_numpy(0.15 * generator(0, "turned").normal(size=surfels["quats"].shape)).float()
     surfels.replace("quats", surfels["quats"].detach() + turn.to(surfels.device))
-    fused = FusedNormals(SETTINGS, views, painted.kernel_degree)
-    fused.before(surfels, 0)
+    fused = FusedNormals(SETTINGS, painted.kernel_degree)
+    fused.make(surfels, views)
     off = [error_of(surfels, painted, painted_capture)]
     for step in range(40):
         view = views[step % len(views)]
@@ -95,23 +96,41 @@ def error_of(surfels: LearntSurfels, scene: GaussianScene, capture: Capture) -> 
     return float(np.mean(errors))
 
 
-def test_they_are_made_anew_when_due_and_come_back_from_their_state(
+def test_they_are_those_of_when_they_were_made_and_come_back_from_their_state(
     painted: GaussianScene, painted_capture: Capture, one_thread
 ) -> None:
     views = painted_capture.train_views
     surfels = LearntSurfels.of_scene(painted, {"means": 1e-3})
-    fused = FusedNormals(SETTINGS, views, painted.kernel_degree)
-    fused.before(surfels, 0)
+    fused = FusedNormals(SETTINGS, painted.kernel_degree)
+    fused.make(surfels, views)
     first = fused.of(views[0])["fused_normal"]
     surfels.replace("means", surfels["means"].detach() * 1.2)
-    fused.before(surfels, 9)
     assert torch.equal(fused.of(views[0])["fused_normal"], first)
     kept = {name: values.clone() for name, values in fused.state().items()}
-    again = FusedNormals(SETTINGS, views, painted.kernel_degree)
-    again.restore(kept, surfels.device)
+    again = FusedNormals(SETTINGS, painted.kernel_degree)
+    again.restore(kept, surfels.device, views)
     assert torch.equal(again.of(views[0])["fused_normal"], first)
-    fused.before(surfels, 10)
+    fused.make(surfels, views)
     assert not torch.equal(fused.of(views[0])["fused_normal"], first)
+
+
+def test_a_stage_makes_them_when_they_are_due_and_when_its_pictures_grow(
+    painted: GaussianScene, painted_capture: Capture
+) -> None:
+    consistency = ConsistencySettings(every=4)
+    plan = radiance_plan(RadianceSettings(steps=10, consistency=consistency, coarse=(0.3, 0.4)), 4.0, 0)
+    surfels = LearntSurfels.of_scene(painted, plan.rates)
+    stage = Stage(plan, painted_capture.train_views, surfels, painted.kernel_degree, 0)
+    assert stage.fused is not None
+    make, made = stage.fused.make, []
+
+    def noted(surfels: LearntSurfels, views: Sequence[View]) -> None:
+        made.append((stage.step, views[0].camera.width))
+        make(surfels, views)
+
+    stage.fused.make = noted
+    stage.run()
+    assert made == [(0, 8), (3, 16), (4, 16), (7, 32), (8, 32)]
 
 
 def test_a_priors_normals_take_their_place(painted: GaussianScene, painted_capture: Capture) -> None:

@@ -28,6 +28,8 @@ from tron.reconstruction.geometry.stereo import (
 from tron.reconstruction.settings import InitialSettings, StereoSettings
 from tron.seeds import generator
 
+pytestmark = pytest.mark.usefixtures("variant")
+
 SIZE = 48
 SETTINGS = StereoSettings(planes=40, least_angle=2, angle=20, most_angle=50)
 

@@ -112,6 +112,28 @@ def test_photos_of_a_known_scene_pull_surfels_towards_it(painted, painted_captur
     assert stage.psnr > before + 4  # what progress tells lags behind, over the last fifty steps
 
 
+def test_pictures_grow_from_share_to_share(painted, painted_capture) -> None:
+    stage = stage_of(painted, painted_capture.train_views, radiance(10, coarse=(0.2, 0.3)))
+    widths = []
+    for _ in range(10):
+        widths.append(stage.pictured()[0].camera.width)
+        stage.advance()
+    assert widths == [8, 8, 16, 16, 16, 32, 32, 32, 32, 32]
+
+
+def test_surfels_show_what_a_reduced_photo_shows(painted, painted_capture) -> None:
+    """The picture of a reduced camera is the reduced picture, but for edges: no pixel is shifted."""
+    camera = painted_capture.train_views[0].camera.resized(128, 128)
+    surfels = LearntSurfels.of_scene(painted, {"means": 1e-3}).rendered()
+    with torch.no_grad():
+        image = render(surfels, camera)["rgb"].cpu().numpy().clip(0, 1)
+        half = View("half", camera, image, "display").reduced(2)
+        seen = render(surfels, half.camera)["rgb"].cpu().numpy()
+    assert psnr(seen, half.read()) > 30
+    shifted = np.roll(half.read(), 1, axis=1)
+    assert psnr(seen, half.read()) > psnr(seen, shifted) + 6
+
+
 def test_density_control_runs_along(painted, painted_capture) -> None:
     density = DensitySettings(
         start=0, end=30, every=5, threshold=1e-5, prune_every=5, reset_every=0, most=len(painted) + 200

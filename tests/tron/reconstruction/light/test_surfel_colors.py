@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from tron.cameras import Camera
-from tron.captures import Capture
+from tron.cameras import Camera, mitsuba_sensor
+from tron.captures import Capture, View
+from tron.color import to_display
 from tron.gaussians import GaussianScene
 from tron.reconstruction.light.surfel_colors import (
     Observations,
@@ -189,3 +191,43 @@ def test_what_is_masked_is_not_seen_and_white_is_marked(
         # Beside the border as beside a silhouette: one pixel of it is not seen.
         assert set(whole.surfel[place[whole.surfel] > 18]) <= set(seen)
         assert len(seen) > 0
+
+
+@pytest.mark.parametrize(
+    ("material", "least", "most"),
+    [
+        ({"type": "conductor", "material": "Ag"}, 0.2, 1.0),
+        ({"type": "dielectric"}, 0.08, 1.0),
+        ({"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.4}}, 0.0, 0.01),
+        ({"type": "roughplastic", "alpha": 0.1}, 0.0, 0.05),
+    ],
+    ids=["mirror", "glass", "matt", "gloss"],
+)
+def test_mirrors_and_glass_change_with_the_view(
+    dense_surfels, material: dict[str, Any], least: float, most: float
+) -> None:
+    """Balls in a light of stripes, path-traced by Mitsuba, on which the surfels lie exactly."""
+    import mitsuba as mi
+
+    ball = dense_surfels.sphere(spacing=0.09)
+    stripes = np.where(np.arange(64)[None, :, None] % 16 < 8, 3.0, 0.2) * np.ones((32, 1, 3))
+    light = {"type": "envmap", "bitmap": mi.Bitmap(stripes.astype(np.float32))}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 6},
+            "light": light,
+            "ball": {**ball.mitsuba, "bsdf": material},
+        }
+    )
+    views = []
+    for i in range(10):
+        eye = (4 * np.cos(0.63 * i), 4 * np.sin(0.63 * i), 1.0 + i % 3)
+        camera = Camera.look_at(eye, (0, 0, 0), fov_deg=35, width=48, height=48)
+        sensor = mi.load_dict(mitsuba_sensor(camera))
+        seen = np.array(mi.render(scene, sensor=sensor, spp=16, seed=i))[..., :3]
+        views.append(View(str(i), camera, to_display(seen, 0.5).astype(np.float32), "display"))
+    surfels = dense_surfels.scene(ball, spacing=0.09)
+    found = mean_colors(observe(SurfelTracer(surfels), views, 1.0, "agx"))
+    assert found.seen.mean() > 0.3
+    assert least <= found.mirroring(surfels.means) <= most

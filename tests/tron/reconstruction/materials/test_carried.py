@@ -72,7 +72,7 @@ def fit_of(scene: GaussianScene, shown: np.ndarray) -> JointFit:
     """A fit that found a scene's own materials."""
     count = len(scene)
     colors = SurfelColors(shown, np.zeros(count), np.ones(count, int), np.ones((1, 3)))
-    return JointFit(scene, EnvironmentMap.constant(1.0, 8), None, colors, shown, np.ones(3))
+    return JointFit(scene, EnvironmentMap.constant(1.0, 8), None, colors, shown, np.ones(3), 0.0)
 
 
 def test_a_known_shade_is_divided_out_and_all_else_stays(painted: GaussianScene) -> None:

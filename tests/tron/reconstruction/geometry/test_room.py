@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import drjit as dr
@@ -13,7 +13,7 @@ import pytest
 from tron.cameras import Camera
 from tron.captures import View
 from tron.gaussians import GaussianScene
-from tron.reconstruction.geometry.seen_space import enclosed
+from tron.reconstruction.geometry.room import bounds_of, closed_indoors
 from tron.seeds import generator
 from tron.tracing import SurfelTracer
 
@@ -49,6 +49,16 @@ def light_from(scene: GaussianScene, targets: np.ndarray) -> np.ndarray:
     return SurfelTracer(scene).transmittance(start, mi.Vector3f(ways.T.astype(np.float32))).numpy()
 
 
+def around_the_origin() -> list[View]:
+    views = []
+    for i in range(6):
+        turn = np.pi / 3 * i
+        eye = (2 * np.cos(turn), 2 * np.sin(turn), 0)
+        camera = Camera.look_at(eye, (0, 0, 0), fov_deg=5, width=8, height=8)
+        views.append(View(str(i), camera, np.zeros((8, 8, 3), np.float32), "display"))
+    return views
+
+
 def _some(value: Any, kept: np.ndarray) -> Any:
     return value[kept] if isinstance(value, np.ndarray) and len(value) == len(kept) else value
 
@@ -59,7 +69,7 @@ def over(low: tuple[float, ...], high: tuple[float, ...], count: int = 2000) -> 
 
 def test_a_ceiling_that_no_photo_shows_lets_no_light_in(dense_surfels, photos: list[View]) -> None:
     found = room(dense_surfels, ceiling=False)
-    closed = enclosed(found, photos, seed=0)
+    closed = closed_indoors(found, photos, True, 0)
     above = over((-0.95, -0.95, 1), (0.95, 0.95, 1))
     assert light_from(found, above).min() > 0.9
     assert light_from(closed, above).mean() < 0.01
@@ -76,7 +86,7 @@ def test_new_surfels_have_the_colours_near_by(dense_surfels, photos: list[View])
     right = found.means[:, 0] > 0
     found.base_color[:] = np.where(right[:, None], (0.1, 0.8, 0.1), (0.8, 0.1, 0.1))
     found.sh[:, 0] = found.base_color
-    closed = enclosed(found, photos, seed=0)
+    closed = closed_indoors(found, photos, True, 0)
     new = np.arange(len(found), len(closed))
     far = new[np.abs(closed.means[new, 0]) > 0.7]
     wanted = np.where(closed.means[far, :1] > 0, (0.1, 0.8, 0.1), (0.8, 0.1, 0.1))
@@ -88,7 +98,7 @@ def test_new_surfels_have_the_colours_near_by(dense_surfels, photos: list[View])
 def test_strays_outside_do_not_move_the_ceiling(dense_surfels, photos: list[View]) -> None:
     found = room(dense_surfels, ceiling=False)
     found.means[:10] += np.array([0, 0, 4], np.float32)
-    closed = enclosed(found, photos, seed=0)
+    closed = closed_indoors(found, photos, True, 0)
     assert len(closed) > len(found)
     assert closed.means[len(found) :, 2].max() < 1.2
 
@@ -98,7 +108,7 @@ def test_a_window_that_photos_show_stays_open(dense_surfels, photos: list[View])
     within = 0.9 * WINDOW
     window = over((1, -within, -within), (1, within, within))
     found = room(dense_surfels, ceiling=False)
-    closed = enclosed(found, photos, seed=0)
+    closed = closed_indoors(found, photos, True, 0)
     assert light_from(found, window).mean() - light_from(closed, window).mean() < 0.01
     assert light_from(closed, window).mean() > 0.95
 
@@ -109,7 +119,7 @@ def test_a_window_beside_what_is_closed_stays_open(dense_surfels, photos: list[V
     x, y = found.means.T[:2]
     kept = ~((x > 0.99) & (np.abs(y) < WINDOW))
     found = GaussianScene(**{f.name: _some(getattr(found, f.name), kept) for f in fields(GaussianScene)})
-    closed = enclosed(found, photos, seed=0)
+    closed = closed_indoors(found, photos, True, 0)
     shown = over((1, -0.9 * WINDOW, -0.65), (1, 0.9 * WINDOW, 0.65))
     assert len(closed) > len(found)
     assert light_from(closed, shown).mean() > 0.95
@@ -119,32 +129,68 @@ def test_a_window_that_no_photo_shows_is_taken_for_a_wall(dense_surfels, photos:
     """Nobody can know: the photos that look at it are those from the other side of the room."""
     away = [view for view in photos if view.camera.forward[0] < 0.2]
     assert 2 < len(away) < len(photos)
-    closed = enclosed(room(dense_surfels, ceiling=True), away, seed=0)
+    closed = closed_indoors(room(dense_surfels, ceiling=True), away, True, 0)
     within = 0.8 * WINDOW
     assert light_from(closed, over((1, -within, -within), (1, within, within))).mean() < 0.05
 
 
 def test_a_room_that_is_closed_stays_as_it_is(dense_surfels, photos: list[View]) -> None:
     found = room(dense_surfels, ceiling=True)
-    closed = enclosed(found, photos, seed=0)
+    closed = closed_indoors(found, photos, True, 0)
     assert len(closed) - len(found) < 20, "of 20,000 places asked"
 
 
 def test_photos_from_without_are_told_of(dense_surfels, caplog: pytest.LogCaptureFixture) -> None:
     ball = dense_surfels.scene(dense_surfels.sphere(radius=0.3))
-    views = []
-    for i in range(6):
-        turn = np.pi / 3 * i
-        camera = Camera.look_at(
-            (2 * np.cos(turn), 2 * np.sin(turn), 0), (0, 0, 0), fov_deg=5, width=8, height=8
-        )
-        views.append(View(str(i), camera, np.zeros((8, 8, 3), np.float32), "display"))
-    enclosed(ball, views, seed=0)
+    closed_indoors(ball, around_the_origin(), True, 0)
     assert "indoors=true is for photos from within one" in caplog.text
 
 
 def test_the_same_seed_gives_the_same_surfels(dense_surfels, photos: list[View]) -> None:
     found = room(dense_surfels, ceiling=False)
-    one, other, another = (enclosed(found, photos, seed) for seed in (3, 3, 4))
+    one, other, another = (closed_indoors(found, photos, True, seed) for seed in (3, 3, 4))
     assert np.array_equal(one.means, other.means)
     assert not np.array_equal(one.means, another.means)
+
+
+def test_photos_from_within_a_room_are_known(dense_surfels, photos: list[View]) -> None:
+    """With a ceiling that none shows; and the same room closed where indoors says nothing."""
+    found = room(dense_surfels, ceiling=False)
+    bounds = bounds_of(found, photos, seed=0)
+    assert bounds is not None
+    assert bounds.around > 0.9
+    assert bounds.overhead == 0
+    assert bounds.room is True
+    by_rule, asked = (closed_indoors(found, photos, indoors, 0) for indoors in ("auto", True))
+    assert np.array_equal(by_rule.means, asked.means)
+    assert closed_indoors(found, photos, False, 0) is found
+
+
+def test_a_yard_whose_sky_photos_show_is_no_room(dense_surfels, photos: list[View]) -> None:
+    found = room(dense_surfels, ceiling=False)
+    raised = []
+    for view in photos:
+        eye = view.camera.position
+        camera = Camera.look_at(eye, (-eye[0], -eye[1], 1.5), fov_deg=90, width=20, height=20)
+        raised.append(View("up" + view.name, camera, view.image, "display"))
+    assert closed_indoors(found, photos + raised, "auto", 0) is found
+
+
+def test_a_thing_that_cameras_surround_is_no_room(dense_surfels) -> None:
+    ball = dense_surfels.scene(dense_surfels.sphere(radius=0.3))
+    assert closed_indoors(ball, around_the_origin(), "auto", 0) is ball
+
+
+def test_a_room_with_one_wall_missing_is_asked_about(
+    dense_surfels, photos: list[View], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Two of four walls: nobody can tell a corner of a room from a house's; a mask says it is no room."""
+    found = room(dense_surfels, ceiling=False)
+    kept = found.means[:, 0] < 0.5
+    found = GaussianScene(**{f.name: _some(getattr(found, f.name), kept) for f in fields(GaussianScene)})
+    assert closed_indoors(found, photos, "auto", 0) is found
+    assert "indoors=true" in caplog.text
+    caplog.clear()
+    masked = [replace(view, mask=np.ones((20, 20), np.float32)) for view in photos]
+    assert closed_indoors(found, masked, "auto", 0) is found
+    assert not caplog.text

@@ -1,0 +1,198 @@
+"""Bounds of a room where no photo looked, and whether photos were taken in one.
+
+By a ceiling that nobody filmed a new light would shine in. The convex hull of surfels and cameras is
+sampled. A sample that a camera's position sees through no surfel, and that no photo has in its picture, is
+part of a wall that was not photographed; one that a photo does have in its picture is an opening, since
+surfels would be there otherwise. Nothing is known of such walls but that they are there: they get the mean
+colour of the surfels near by.
+
+Cameras are in a room where surfels stand around them on all sides and no photo shows an opening overhead.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.spatial import ConvexHull, KDTree
+
+from tron.captures import View
+from tron.gaussians.harmonics import SH_COUNT
+from tron.gaussians.scene import GaussianScene, quats_from_normals
+from tron.reconstruction.geometry.seen_space import even_directions, pixels_of
+from tron.reconstruction.progress import Track, untracked
+from tron.reconstruction.settings import Indoors
+from tron.runtime import lanes
+from tron.seeds import generator
+from tron.tracing import SurfelTracer
+
+log = logging.getLogger(__name__)
+POINTS = 20_000
+"""Samples of the hull."""
+AROUND, PERHAPS = 0.7, 0.45
+"""Share of the level directions that end on a surfel, in a room and in what may be one."""
+OVERHEAD = 0.4
+"""Share of the hull overhead that photos of a room may show to be open: windows, and what was not found."""
+_DIRECTIONS = 200
+_LEVEL, _RISING = np.sin(np.radians([15.0, 30.0]))
+"""Sines of the elevation up to which a direction is level, and from which it is overhead."""
+_PLACES = 12  # cameras that look around
+_WITHIN = 0.995  # share of the surfels in each of them that the hull is of: those beyond stray
+_SOLID = 0.5  # opacity of surfels that count
+_OPEN = 0.3  # transmittance from here on: no surface was found
+_MOST = 0.5  # share of the hull that is closed in silence
+_RADIUS = 0.8  # standard deviation of a new surfel, distances between samples: larger ones cover windows
+_NEAR = 32  # surfels that tell the colour
+_OPACITY_LOGIT = 6.0  # opacity 0.998
+_ROUGHNESS = 0.7  # of plaster and paint, nearly diffuse
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """N samples of what bounds the space that surfels and cameras lie in.
+
+    Attributes:
+        points: (N, 3) world.
+        normals: (N, 3) unit, inwards.
+        spacing: mean distance between them, world units.
+        lacking: (N,) bool, where a camera sees no surfel and no photo looks.
+        pictured: (N,) bool, openings that photos show.
+        around: share of the level directions from the cameras that end on a surfel.
+        overhead: share of the samples overhead that are such openings.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    spacing: float
+    lacking: np.ndarray
+    pictured: np.ndarray
+    around: float
+    overhead: float
+
+    @property
+    def room(self) -> bool | None:
+        """Whether these are the bounds of a room; None where nobody can tell."""
+        if self.overhead > OVERHEAD or self.around < PERHAPS:
+            return False
+        return True if self.around >= AROUND else None
+
+
+def closed_indoors(
+    scene: GaussianScene, views: Sequence[View], indoors: Indoors, seed: int, track: Track = untracked
+) -> GaussianScene:
+    """The scene (world frame and units), with surfels where a room is bounded and no view looks.
+
+    The new ones face inwards, are opaque and nearly diffuse; base color (linear) and the constant harmonic
+    (display) are means of what is near.
+
+    Args:
+        scene: surfels; those that are there stay, and come first.
+        views: cameras are looked at, not images.
+        indoors: whether they were taken in a room; auto: where :attr:`Bounds.room` says so, and no mask of
+            theirs says what is subject or sky.
+        seed: root of the random numbers.
+        track: wraps the loop over the views.
+    """
+    if not indoors or (indoors == "auto" and any(view.has("mask") or view.has("sky_mask") for view in views)):
+        return scene
+    bounds = bounds_of(scene, views, seed, track)
+    if bounds is None:
+        return scene
+    if indoors == "auto" and bounds.room is None:
+        log.warning(
+            "these may be photos of a room: surfaces stand on %.0f %% of all sides of the cameras; if it is "
+            "one, indoors=true closes what no photo shows, and if not, indoors=false says so",
+            100 * bounds.around,
+        )
+    return enclosed(scene, bounds) if indoors is True or bounds.room else scene
+
+
+def bounds_of(
+    scene: GaussianScene, views: Sequence[View], seed: int, track: Track = untracked
+) -> Bounds | None:
+    """Bounds of the space of surfels and cameras; None where there are next to no surfels."""
+    solid = scene.means[scene.opacities() > _SOLID].astype(np.float64)
+    if len(solid) < _NEAR:
+        return None
+    cameras = np.stack([view.camera.position for view in views])
+    points, normals, spacing = _hull(solid, cameras, seed)
+    tracer = SurfelTracer(scene)
+    free, pictured = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    for view in track(views, "photos of what bounds the space"):
+        through = _transmittance(tracer, view.camera.position, points) > _OPEN
+        free |= through
+        pictured |= through & pixels_of(view, points)[2]
+    rising = points - cameras.mean(0)
+    overhead = rising @ scene.up > _RISING * np.linalg.norm(rising, axis=1)
+    return Bounds(
+        points, normals, spacing, free & ~pictured, pictured, _around(tracer, cameras),
+        float(pictured[overhead].mean()) if overhead.any() else 0.0,
+    )  # fmt: skip
+
+
+def _around(tracer: SurfelTracer, cameras: np.ndarray) -> float:
+    """Share of the level directions from some of the cameras (V, 3) that end on a surfel."""
+    directions = even_directions(5 * _DIRECTIONS)
+    level = directions[np.abs(directions @ tracer.scene.up) < _LEVEL]
+    places = cameras[np.unique(np.linspace(0, len(cameras) - 1, _PLACES).astype(int))]
+    return float(np.mean([_transmittance(tracer, place, place + level) < _OPEN for place in places]))
+
+
+def enclosed(scene: GaussianScene, bounds: Bounds) -> GaussianScene:
+    """The scene with surfels where bounds are lacking; see :func:`closed_indoors`."""
+    lacking = bounds.lacking
+    count = int(lacking.sum())
+    log.info(
+        "indoors: %d surfels close %.0f %% of what bounds the room; %.0f %% are openings that photos show",
+        count, 100 * lacking.mean(), 100 * bounds.pictured.mean(),
+    )  # fmt: skip
+    if lacking.mean() > _MOST:
+        log.warning("photos show little of what bounds the room: indoors=true is for photos from within one")
+    if not count:
+        return scene
+    there = np.flatnonzero(scene.opacities() > _SOLID)
+    points = bounds.points[lacking]
+    near = there[KDTree(scene.means[there].astype(np.float64)).query(points, k=_NEAR)[1]]
+    sh = np.zeros((count, SH_COUNT, 3))
+    sh[:, 0] = scene.sh[near, 0].mean(1)
+    new = {
+        "means": points,
+        "quats": quats_from_normals(bounds.normals[lacking]),
+        "log_scales": np.full((count, 2), np.log(_RADIUS * bounds.spacing)),
+        "opacity_logits": np.full(count, _OPACITY_LOGIT),
+        "sh": sh,
+        "base_color": scene.base_color[near].mean(1),
+        "roughness": np.full(count, _ROUGHNESS),
+        "metallic": np.zeros(count),
+        "object_id": np.zeros(count),
+    }
+    return replace(scene, **{name: np.concatenate([getattr(scene, name), new[name]]) for name in new})
+
+
+def _hull(means: np.ndarray, cameras: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Points (N, 3) even over the hull of surfels and cameras, unit normals (N, 3) inwards, spacing."""
+    middle = cameras.mean(0)
+    kept = np.ones(len(means), bool)
+    for direction in even_directions(_DIRECTIONS):
+        along = means @ direction
+        kept &= along <= np.quantile(along, _WITHIN)
+    hull = ConvexHull(np.concatenate([means[kept], cameras]) - middle, qhull_options="QJ")
+    corners = hull.points[hull.simplices]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    rng = generator(seed, "reconstruction", "enclosure")
+    facet = rng.choice(len(area), POINTS, p=area / area.sum())
+    share = rng.dirichlet((1.0, 1.0, 1.0), POINTS)
+    points = middle + np.einsum("nk,nki->ni", share, corners[facet])
+    return points, -hull.equations[facet, :3], float(np.sqrt(area.sum() / POINTS))
+
+
+def _transmittance(tracer: SurfelTracer, origin: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(N,) from one position towards points (N, 3) and beyond."""
+    ways = points - origin
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    start = mi.Point3f(*(dr.full(mi.Float, float(x), len(points)) for x in origin))
+    return tracer.transmittance(start, lanes(mi.Vector3f, ways)).numpy()
