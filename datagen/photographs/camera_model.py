@@ -18,7 +18,7 @@ from datagen.dataset.records import Work
 from datagen.settings.captures import ViewSettings
 from datagen.settings.command import Settings
 from datagen.truth.build import Geometry
-from datagen.truth.pathtrace import metered, render_frames
+from datagen.truth.pathtrace import direct_irradiance, metered, render_frames
 from datagen.world.scene import SceneSpec
 from tron.cameras import Camera
 from tron.captures import Capture, View
@@ -36,8 +36,8 @@ CAPTURES, TRUTH = "captures", "truth"
 RELIT = "relit"
 """Folder of the held-out views under lights that the photos never saw: the truth of relighting.
 
-It holds a capture folder for each scene and light: linear radiance, coverage as the mask, and the light
-itself as environment.exr.
+It holds a capture folder for each scene and light: linear radiance, coverage as the mask, irradiance, and
+the light itself as environment.exr.
 """
 
 ENVIRONMENT_NAME = "environment.exr"
@@ -128,7 +128,7 @@ def write_relit(
     cameras: Mapping[str, Camera],
     settings: ViewSettings,
 ) -> None:
-    """Path-trace the views under each of the lights, and write a capture folder of each.
+    """Path-trace the views and their irradiance under each of the lights, and write a capture folder of each.
 
     Args:
         folder: the one that they share.
@@ -152,9 +152,13 @@ def write_relit(
             scene, list(cameras.values()), settings.relight_spp, seeds, spec.path_bounces, transparent=True
         )
         shots = [straightened(frame, f"{name} of {path.name}") for name, frame in zip(cameras, frames)]
+        direct = [
+            direct_irradiance(geometry, scene, camera, settings.relight_spp, seed).shadowed
+            for camera, seed in zip(cameras.values(), seeds)
+        ]
         views = [
-            View(name, camera, straight, "linear", mask=mask)
-            for (name, camera), (straight, mask) in zip(cameras.items(), shots)
+            View(name, camera, straight, "linear", mask=mask, irradiance=arriving)
+            for (name, camera), (straight, mask), arriving in zip(cameras.items(), shots, direct)
         ]
         exposure = shown_with(spec, environment, frames)
         capture = Capture(tuple(views), up=np.array([0.0, 0.0, 1.0]), exposure=exposure)

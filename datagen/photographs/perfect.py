@@ -37,7 +37,7 @@ from datagen.world.scene import SceneSpec
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder, write_capture
-from tron.color import to_display
+from tron.color import luminance, to_display
 from tron.errors import TronError
 from tron.gaussians.initialize import GBufferView
 from tron.io.images import encode_exr
@@ -53,6 +53,8 @@ MAPS = ("normal", "base_color", "roughness", "metallic", "irradiance", "depth")
 """Fields of a view (``tron.captures.View``) that :func:`true_maps` gives."""
 PHOTOGRAPHED = ("image", "mask")
 """Fields of a view that is a photograph: no map tells anyone more of it."""
+MIDDLE_GREY = 0.18
+METERED_VIEWS, METERED_SPP = 8, 16
 
 
 class PerfectCamera(CameraModel):
@@ -88,15 +90,18 @@ class PerfectCamera(CameraModel):
         wanted, spec, geometry = settings.capture, stage.spec, stage.geometry
         folder = settings.output_dir / CAPTURES / spec.name
         photographs = taken(spec, wanted)
+        environment, exposure = stage.environment, stage.environment.exposure()
+        if photographs:
+            environment, exposure = balanced(spec, geometry, environment, wanted)
         beside = {
             SPEC_NAME: spec.to_json().encode(),
-            ENVIRONMENT_NAME: encode_exr(stage.environment.image, half=False),
+            ENVIRONMENT_NAME: encode_exr(environment.image, half=False),
         }
         if photographs:
             text = json.dumps(described(list(photographs.items())), indent=1) + "\n"
             beside[PHOTOGRAPHS_NAME] = text.encode()
         write = partial(write_capture, folder, overwrite=True, beside=beside)
-        write(captured(spec, geometry, stage.environment, wanted, photographs))
+        write(captured(spec, geometry, environment, wanted, photographs, exposure))
         if wanted.points is not None:
             # Read back, for points have the colours of the pictures, and views are not held in memory.
             capture = read_capture_folder(folder)
@@ -125,22 +130,49 @@ def captured(
     environment: EnvironmentMap,
     settings: CaptureSettings,
     photographs: Mapping[str, Photograph] | None = None,
+    exposure: float | None = None,
 ) -> Capture:
     """The capture of a scene under a light; views are rendered when they are read, best in their order.
 
-    Images are AgX of straight (not premultiplied) radiance times the light's exposure, with anti-aliased
-    coverage as their mask; those that ``photographs`` names are what a camera made of that radiance, and no
-    map tells more of them. Maps are of the pixel centres, zero where there is no surface.
+    Images are AgX of straight (not premultiplied) radiance times the exposure (the light's own where none is
+    given), with anti-aliased coverage as their mask; those that ``photographs`` names are what a camera made
+    of that radiance, and no map tells more of them. Maps are of the pixel centres, zero where there is no
+    surface.
     """
     cameras = spec.views(settings.views, settings.width, settings.height)
-    shots = _Shots(spec, geometry, environment, cameras, settings, photographs or {})
+    exposure = environment.exposure() if exposure is None else exposure
+    shots = _Shots(spec, geometry, environment, cameras, settings, photographs or {}, exposure)
     views = []
     for number, (name, camera) in enumerate(zip(view_names(settings.views), cameras)):
         known = PHOTOGRAPHED if photographs and name in photographs else _Shots.FIELDS
         fields: dict[str, Any] = {field: partial(shots.read, number, field) for field in known}
         views.append(View(name, camera, space="display", **fields))
     test = frozenset(view.name for view in views[::HELD_OUT])
-    return Capture(tuple(views), test, up=np.array([0.0, 0.0, 1.0]), exposure=environment.exposure())
+    return Capture(tuple(views), test, up=np.array([0.0, 0.0, 1.0]), exposure=exposure)
+
+
+def balanced(
+    spec: SceneSpec, geometry: Geometry, environment: EnvironmentMap, settings: CaptureSettings
+) -> tuple[EnvironmentMap, float]:
+    """The light in the colours of a camera that balances white, and the exposure that its meter sets.
+
+    A phone takes the light that falls on what it sees for grey, and shows what comes back as middle grey in
+    the mean: dark things come out brighter than they are, white ones darker. Gains on channels of photos are
+    gains on the light.
+    """
+    cameras = spec.views(METERED_VIEWS, settings.width, settings.height)
+    scene = geometry.lit(environment)
+    seeds = [integer(spec.seed, spec.split, spec.index, "capture", "meter", n) for n in range(len(cameras))]
+    frames = render_frames(scene, cameras, METERED_SPP, seeds, spec.path_bounces, transparent=True)
+    arrived, returned = [], []
+    for camera, seed, frame, truth in zip(cameras, seeds, frames, gbuffers(geometry, cameras), strict=True):
+        direct = direct_irradiance(geometry, scene, camera, METERED_SPP, seed)
+        arrived.append(direct.shadowed[truth.valid])
+        returned.append(frame[frame[..., 3] >= 1][..., :3])
+    light, shown = np.concatenate(arrived).mean(axis=0), np.concatenate(returned).mean(axis=0)
+    gains = luminance(light) / light
+    exposure = MIDDLE_GREY / float(luminance(shown * gains))
+    return replace(environment, image=environment.image * gains.astype(np.float32)), exposure
 
 
 def surface_points(
@@ -180,11 +212,12 @@ class _Shots:
         cameras: list[Camera],
         settings: CaptureSettings,
         photographs: Mapping[str, Photograph],
+        exposure: float,
     ) -> None:
         self._spec, self._geometry, self._cameras, self._settings = spec, geometry, cameras, settings
         self._names, self._photographs = view_names(settings.views), photographs
         self._scene: mi.Scene = geometry.lit(environment)
-        self._exposure = environment.exposure()
+        self._exposure = exposure
         self._size = max(GROUP_PIXELS // (settings.width * settings.height), 1)
         self._group = -1
         self._rendered: list[dict[str, np.ndarray]] = []

@@ -88,7 +88,8 @@ class CaptureSettings(ViewSettings):
     photographs: bool = Field(
         default=False,
         description="Take training views as photographs, each with its own exposure, white balance and noise "
-        "by sensor; held-out views stay true renders, which reconstructions are judged by.",
+        "by sensor, by a camera that balances white for the light on what it sees and meters it as middle "
+        "grey; held-out views stay true renders in its colours, which reconstructions are judged by.",
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -62,6 +63,10 @@ class SplatSettings(BaseModel):
 
     scan: list[str] = Field(description="arguments of tron-reconstruct for what becomes the scan")
     reconstruct: list[str] = Field(description="arguments of tron-reconstruct for the scan as a capture")
+    thick: list[str] = Field(
+        description="arguments of tron-reconstruct for what becomes a thick scan, of photographs"
+    )
+    carry: list[str] = Field(description="those for the thick scan as a capture, whose surfels stay")
 
 
 class Reconstruction(Benchmark):
@@ -114,6 +119,7 @@ class Reconstruction(Benchmark):
         if "photos" in self.parts:
             runs += self._reconstruct_photos(stages, folder)
         scans = self._reconstruct_splats(stages, folder) if "splats" in self.parts else []
+        thick = self._reconstruct_thick(stages, folder) if "splats" in self.parts else []
         fox = self._reconstruct_fox(stages, folder) if "fox" in self.parts else None
         from tron.runtime import activate, set_torch_threads
 
@@ -121,6 +127,7 @@ class Reconstruction(Benchmark):
         set_torch_threads(1)  # as tron-reconstruct does: Dr.Jit has the cores
         self._collect_scenes(runs, found)
         self._collect_scans(scans, found)
+        self._collect_thick(thick, found)
         if fox is not None:
             self._collect_fox(fox, found)
         return found
@@ -187,6 +194,28 @@ class Reconstruction(Benchmark):
             made.append(Made(scene, "splats", scanned.capture, out, seconds))
         return made
 
+    def _reconstruct_thick(self, stages: Stages, folder: Path) -> list[Made]:
+        """A thick scan of the first scene's photographs, as it is and with materials."""
+        from eval.reconstruction.scans import write_scan
+        from tron.apps.relight.camera_files import CAMERAS
+        from tron.gaussians.scene import GaussianScene
+
+        dataset = self._photographs(stages, folder)
+        for scene in scene_names(dataset)[:1]:
+            capture, learnt = dataset / "captures" / scene, folder / "scenes" / scene / "thick"
+            learning = self._run(stages, f"{scene} thick", capture, self.splats.thick, learnt)
+            raw, out = folder / "scans" / f"{scene}-thick", folder / "scenes" / scene / "carried"
+            if not (raw / "scene.ply").is_file():
+                write_scan(raw / "scene.ply", GaussianScene.load(learnt / "scene.ply"), self.seed)
+            shutil.copy(learnt / CAMERAS, raw)
+            seconds = self._run(stages, f"{scene} carried", raw / "scene.ply", self.splats.carry, out)
+            return [
+                Made(scene, "raw_today", capture, raw, learning),
+                Made(scene, "raw", capture, raw, learning),
+                Made(scene, "carried", capture, out, seconds),
+            ]
+        return []
+
     def _run(
         self, stages: Stages, label: str, capture: Path, arguments: list[str], output_dir: Path
     ) -> float:
@@ -236,6 +265,19 @@ class Reconstruction(Benchmark):
             relit = {title: scan.relit for title, scan in titled.items()}
             title = f"Scene {name} under other lights"
             found.show("splats", f"{name}-splats-relit", relit_pictures(title, relit))
+
+    def _collect_thick(self, made: Sequence[Made], found: Outcome) -> None:
+        from eval.reconstruction.thick import collect_thick, thick_rows
+
+        truths = {each.scene: relit_truths(found.folder / PHOTOGRAPHS, each.scene) for each in made}
+        found.add(
+            thick_rows(
+                {
+                    each.way: collect_thick(each.way, each.folder, each.capture, truths[each.scene])
+                    for each in made
+                }
+            )
+        )
 
     def _collect_fox(self, made: FoxRun, found: Outcome) -> None:
         fox = collect_fox(made)

@@ -81,7 +81,7 @@ def relight(scene: Path, truths: Sequence[Path], estimation: Estimation = QUALIT
         name: _lit_views(relighter.under(EnvironmentMap.load(path / "environment.exr")), capture)
         for name, (path, capture) in captures.items()
     }
-    views = {name: _display(capture) for name, (_, capture) in captures.items()}
+    views = {name: display(capture) for name, (_, capture) in captures.items()}
     exposures = {name: capture.exposure for name, (_, capture) in captures.items()}
     factor = fitted_factor(
         [(pictures[name], exposures[name], truth, covered) for name, (truth, covered) in views.items()]
@@ -124,7 +124,7 @@ def _lit_views(light: Illumination, capture: Capture) -> np.ndarray:
     )
 
 
-def _display(capture: Capture) -> tuple[np.ndarray, np.ndarray]:
+def display(capture: Capture) -> tuple[np.ndarray, np.ndarray]:
     """True display values (K, H, W, 3), and where nothing but surfaces is seen (K, H, W) bool."""
     truth = np.stack([to_display(view.read(), capture.exposure) for view in capture.views])
     return truth, np.stack([view.read("mask") > COVERED for view in capture.views])

@@ -25,6 +25,7 @@ FIGURES = {
     "base_color_psnr": ("base_color_psnr", "dB"),
     "roughness_mae": ("roughness_mae", "1"),
     "metallic_mae": ("metallic_mae", "1"),
+    "metallic_wrong": ("metallic_wrong", "fraction"),
 }
 """Figure of metrics.json's held-out views -> its name in the rows, and its unit."""
 

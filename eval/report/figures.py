@@ -89,7 +89,7 @@ def interval_note(scenes: int, observed: str = "") -> str:
 
 
 _LISTED = re.compile(
-    r"(demo|surfels|guidance|irradiance|fox|step|reconstruction(\.(depth_init|photos|light))?|splats(\.raw)?)\.[a-z_]\w*"
+    r"(demo|surfels|guidance|irradiance|fox|step|reconstruction(\.(depth_init|photos|light))?|splats(\.raw|\.thick)?)\.[a-z_]\w*"
 )
 """Rows without a target that are listed all the same; rows of one scene end in another segment."""
 

@@ -177,7 +177,8 @@ def stand_ins(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     (made["tron-datagen"] / "relit").mkdir()
     for name in ("1_sun", "2_studio"):
         relit = made["tron-datagen"] / "relit" / f"{SCENE}_{name}"
-        views = [replace(view, space="linear") for view in small_capture().test_views]
+        even = np.full((32, 24, 3), 0.4, np.float32)
+        views = [replace(view, space="linear", irradiance=even) for view in small_capture().test_views]
         write_capture(relit, Capture(tuple(views)), beside=beside)
     write_capture(tmp_path / "real" / "captures" / "fox", small_capture())
     light.save(tmp_path / "real" / "noon.exr")
@@ -188,6 +189,7 @@ def stand_ins(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     folder.mkdir(parents=True)
     surfels(300, seed=0).save(folder / "scene.ply")
     light.save(folder / "environment.exr")
+    (folder / "cameras.json").write_text("[]")
     figures = {"psnr": 33.0, "ssim": 0.9, "normal_mae_deg": 4.0, "base_color_psnr": 31.0}
     metrics = {
         "capture": {"views": 9, "held_out": ["v0", "v8"], "skipped": {"v9": "image not found"}},
@@ -302,6 +304,12 @@ def test_photographs_and_scans_are_relit_and_have_rows(stand_ins: Path, tmp_path
     for prefix in ("splats", "splats.raw"):
         for name in ("normal_mae_deg", "normal_median_deg", "relight_psnr", "surfels", "seconds"):
             assert results.find(f"{prefix}.{name}") is not None
+    thick = [command for command in made.values() if command[1].endswith("-thick/scene.ply")]
+    assert [command[-1] for command in thick] == [f"output_dir={out / 'scenes' / SCENE / 'carried'}"]
+    for way in ("", "raw_", "raw_today_"):
+        for name in ("irradiance_psnr", "base_color_psnr", "half"):
+            assert results.find(f"splats.thick.{way}{name}") is not None
+    assert results.value("splats.thick.light_error") == pytest.approx(0, abs=1e-6)
     # The stand-in is the truth; 300 surfels are thick, so both are judged by the normals of their proxies.
     found, raw = (results.value(f"{way}.normal_mae_deg") for way in ("splats", "splats.raw"))
     assert found is not None
@@ -359,6 +367,8 @@ def test_the_whole_benchmark_with_the_real_commands(shared_data: Path, tmp_path:
                 f"benchmark.photos.photos=[{QUICK}]",
                 f'benchmark.splats.scan=[{QUICK},"initial.kernel_degree=2","light=null"]',
                 f"benchmark.splats.reconstruct=[{QUICK},{SPLATS}]",
+                f'benchmark.splats.thick=[{QUICK},"initial.kernel_degree=2","light=null"]',
+                f'benchmark.splats.carry=[{SPLATS},"report=null"]',
                 "benchmark.fox_downscale=32",
                 f"benchmark.fox=[{QUICK}]",
                 'benchmark.relight=["quality=preview"]',
@@ -372,6 +382,7 @@ def test_the_whole_benchmark_with_the_real_commands(shared_data: Path, tmp_path:
     assert {f"reconstruction.{name}" for name in SCENE_FIGURES} <= found
     assert {f"reconstruction.photos.{name}" for name in (*SCENE_FIGURES, "relight_psnr")} <= found
     assert {f"splats.{name}" for name in ("normal_mae_deg", "relight_psnr", "raw.relight_psnr")} <= found
+    assert {f"splats.thick.{name}" for name in ("relight_psnr", "raw_psnr", "raw_gain", "half")} <= found
     assert {"fox.test_psnr", "fox.seconds", "fox.ssim", "fox.surfels", "fox.relight_seconds"} <= found
     assert results.value("fox.views") == 50
     page = (tmp_path / "report.html").read_text()

@@ -60,7 +60,8 @@ def score_views(
 
     Figures: ``psnr``, ``ssim``, ``lpips`` of the whole frame; ``psnr_subject`` where the view has a mask;
     ``normal_mae_deg``, ``normal_median_deg``, ``base_color_psnr`` (linear, scaled), ``roughness_mae``,
-    ``metallic_mae`` where the view has the truth, over its subject. All are finite: a PSNR is at most
+    ``metallic_mae``, ``metallic_wrong`` (share of pixels on the wrong side of a half) where the view has the
+    truth, over its subject. All are finite: a PSNR is at most
     PSNR_CAP of :mod:`tron.metrics`.
 
     Args:
@@ -133,6 +134,9 @@ def _figures(
     for name in ("roughness", "metallic"):
         if view.has(name):
             yield f"{name}_mae", float(np.abs(buffers[name] - view.read(name))[subject].mean())
+    if view.has("metallic"):
+        wrong = (buffers["metallic"] > 0.5) != (view.read("metallic") > 0.5)
+        yield "metallic_wrong", float(wrong[subject].mean())
 
 
 def _distance(lpips: LPIPS, rendered: np.ndarray, wanted: np.ndarray) -> float:

@@ -16,8 +16,9 @@ from datagen.truth.build import build
 from datagen.truth.pathtrace import gbuffers, render_frames
 from datagen.world.scene import SceneSpec
 from tron.captures.folder import read_capture_folder
+from tron.captures.view import linear_light
 from tron.cli.recipes import check, compose_recipe
-from tron.color import to_display
+from tron.color import luminance, to_display
 from tron.seeds import generator
 from tron.shading.environments.environment import EnvironmentMap
 
@@ -119,7 +120,7 @@ def test_training_views_drift_by_what_the_file_says_and_held_out_views_do_not(ou
             assert render.has(field)
             assert photo.has(field) == held_out, "a photograph comes without truth"
         if held_out:
-            for field in ("image", "normal", "base_color", "depth", "irradiance"):
+            for field in ("normal", "base_color", "depth"):
                 np.testing.assert_array_equal(photo.read(field), render.read(field))
             continue
         # Inset by AgX's matrix grey stays grey: gains are read off the luminance's curve.
@@ -128,7 +129,26 @@ def test_training_views_drift_by_what_the_file_says_and_held_out_views_do_not(ou
             np.interp(x.mean(axis=-1)[inside], curve, levels) for x in (photo.read(), render.read())
         )
         found = np.log2(np.median(shown / np.maximum(was, 1e-6)))
-        assert found == pytest.approx(taken["exposure_stops"], abs=0.12)
+        metered = np.log2(photos.exposure / true.exposure)
+        assert found - metered == pytest.approx(taken["exposure_stops"], abs=0.12)
+
+
+def test_the_camera_balances_white_and_shows_the_mean_as_middle_grey(output, true_output):
+    folders = [where / "captures/test-000000" for where in (output, true_output)]
+    photos, true = (read_capture_folder(folder) for folder in folders)
+    ours, theirs = (EnvironmentMap.load(folder / "environment.exr").image for folder in folders)
+    gains = ours.mean(axis=(0, 1)) / theirs.mean(axis=(0, 1))
+    np.testing.assert_allclose(ours, gains * theirs, rtol=1e-4, atol=1e-6)
+    arrived, shown = [], []
+    for photo, render in zip(photos.test_views, true.test_views):
+        inside = photo.read("mask") == 1
+        irradiance = photo.read("irradiance")
+        np.testing.assert_allclose(irradiance, gains * render.read("irradiance"), rtol=2e-3, atol=1e-3)
+        arrived.append(irradiance[inside])
+        shown.append(linear_light(photo, photos.exposure, "agx")[inside])
+    light = np.concatenate(arrived).mean(axis=0)
+    np.testing.assert_allclose(light / light.mean(), 1, atol=0.05)  # two views of nine, eight others metered
+    assert luminance(np.concatenate(shown).mean(axis=0)) == pytest.approx(0.18, rel=0.3)
 
 
 def test_relit_views_are_path_traced_under_the_stored_light(output):

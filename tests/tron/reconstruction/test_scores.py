@@ -44,6 +44,7 @@ def test_a_perfect_scene_is_perfect(tracer, painted_capture, background: str) ->
     assert found["normal_mae_deg"] < 1e-3
     assert found["roughness_mae"] < 1e-6
     assert found["metallic_mae"] < 1e-6
+    assert found["metallic_wrong"] == 0
     assert "lpips" not in found
 
 

@@ -36,7 +36,7 @@ from tron.storage import write_atomic
 from tron.trajectories import turn_cameras
 
 TRUTH = ("normal", "base_color", "roughness", "metallic")
-SMALLER_IS_BETTER = ("lpips", "roughness_mae", "metallic_mae")
+SMALLER_IS_BETTER = ("lpips", "roughness_mae", "metallic_mae", "metallic_wrong")
 LEVEL = 0.95
 LEAST = 5
 """Views from which a range is printed."""
@@ -60,6 +60,7 @@ FIGURES = {
     ),
     "roughness_mae": ("Roughness, mean error", "1", "against the capture's own"),
     "metallic_mae": ("Metallic, mean error", "1", "against the capture's own"),
+    "metallic_wrong": ("Metallic, on the wrong side of a half", "1", "share of the pixels"),
 }  # fmt: skip
 """Figure of metrics.json -> its title, its unit, what it says."""
 

@@ -47,6 +47,9 @@ _PERCENTILE = 95
 _TURN = 0.01  # share of the scene's size that opposite normals count in the distance between points
 _MOST = 40  # points of a patch
 _FACING = 0.6  # least cosine between normals of one patch
+_WARM = (0.5, -0.87)
+"""Unit direction of black bodies of 3,000 to 15,000 K in log R / G and log B / G, linear BT.709."""
+_OFF_WARM = 3.0  # how much more a colour away from their line costs: light is warm or cool, rarely green
 
 
 class TooFewSeen(TronError):
@@ -260,8 +263,8 @@ class _Fit:
         off = (base[:, None] - base.index_select(0, self.partner).view(*self.weight.shape[:2], 3)).abs()
         loss = (self.weight * settings.robust * torch.log1p(off / settings.robust)).sum()
         loss = loss + settings.smooth * sum((z**2).mean() * 2.0**k for k, z in enumerate(self.grey[1:]))
-        loss = loss + settings.grey * sum((z**2).mean() for z in self.chroma[1:])
-        loss = loss + settings.grey * 0.05 * (self.chroma[0] ** 2).mean()
+        loss = loss + settings.grey * sum(_coloured(z) for z in self.chroma[1:])
+        loss = loss + settings.grey * 0.05 * _coloured(self.chroma[0])
         bright = torch.quantile(base.amax(1), _PERCENTILE / 100)
         loss = loss + settings.scale * (bright - float(np.log(settings.brightest))) ** 2
         brightness = light.mean(1)
@@ -283,6 +286,12 @@ class _Fit:
             texels = torch.exp(self.log_light()).cpu().numpy()
             sun = torch.exp(self.sun).cpu().numpy() if self.lobe is not None else np.zeros(3, np.float32)
         return Light(texels, sun, self.loss)
+
+
+def _coloured(chroma: Tensor) -> Tensor:
+    """Mean square of log colours (N, 2), those off the line of black bodies counted more."""
+    off = chroma @ chroma.new_tensor([-_WARM[1], _WARM[0]])
+    return (chroma**2).mean() + 0.5 * (_OFF_WARM**2 - 1) * (off**2).mean()
 
 
 def _composed(levels: list[Tensor], ups: list[Tensor]) -> Tensor:

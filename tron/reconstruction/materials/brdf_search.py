@@ -11,6 +11,9 @@ material, and how well it explains all photos says whether it is. A highlight th
 explained by a lobe of its width and by no other; a surfel that shows none is explained by all alike, and
 then its neighbours of like colour decide: losses are summed over them. Where they know nothing either, the
 material is what ``prior_roughness`` says, dielectric.
+
+Dark gloss shows what a dark mirror shows, but no metal is dark: iron, among the darkest, reflects 0.56. So
+a metal must be bright, in the unit in which mean irradiance over what is seen is 1.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import KDTree
 
+from tron.color import luminance
 from tron.gaussians import GaussianScene
 from tron.reconstruction.light.surfel_colors import FLOOR, Observations, SurfelColors, grouped_median
 from tron.runtime import aligned, lanes
@@ -40,6 +44,9 @@ _METAL_LOSS = 0.06  # loss of a polished metal: few things are one
 _ROUGH_METAL_LOSS = 5.0
 """Loss of a metal of roughness 1, over a polished one's: it looks like paint, and in a light that is somewhat
 wrong fur looks like it."""
+_METAL_LUMINANCE = 0.2  # a stop and a half below iron: cameras do not expose exactly
+_DARK_METAL_LOSS = 0.3
+"""Loss of a metal e times darker than that; it grows with the square of the logarithm."""
 
 
 @dataclass(frozen=True)
@@ -122,11 +129,17 @@ def materials_of(
             loss = np.bincount(surfel, np.log1p(off / _ROBUST), count)
             bases.append(base)
             losses.append(loss)
-    return choose(scene, colors, np.stack(bases), np.stack(losses), prior_roughness)
+    white = (received.direct + received.bounced)[colors.seen].mean(0)
+    return choose(scene, colors, np.stack(bases), np.stack(losses), prior_roughness, white)
 
 
 def choose(
-    scene: GaussianScene, colors: SurfelColors, bases: np.ndarray, losses: np.ndarray, prior_roughness: float
+    scene: GaussianScene,
+    colors: SurfelColors,
+    bases: np.ndarray,
+    losses: np.ndarray,
+    prior_roughness: float,
+    white: np.ndarray,
 ) -> Materials:
     """The materials of M surfels among K candidates, dielectrics of all roughnesses before metals.
 
@@ -136,6 +149,7 @@ def choose(
         bases: (K, M, 3) base color of each candidate.
         losses: (K, M) loss of each, summed over the surfel's photos.
         prior_roughness: where nothing is known.
+        white: (3,) mean irradiance / pi over what is seen.
     """
     seen = np.flatnonzero(colors.seen)
     log = np.log(np.maximum(colors.color, FLOOR))
@@ -152,7 +166,10 @@ def choose(
     metallic = np.repeat([0.0, 1.0], len(ROUGHNESSES))
     prior = _PRIOR * (roughness - prior_roughness) ** 2
     prior = prior + _METAL_LOSS * (1 + _ROUGH_METAL_LOSS * roughness**2) * metallic
+    bright = luminance(np.maximum(bases[metallic > 0] * white, FLOOR))[:, like].mean(-1)
+    dark = np.maximum(np.log(_METAL_LUMINANCE / bright), 0)
     score = mean + prior[:, None]
+    score[metallic > 0] += _DARK_METAL_LOSS * dark**2
     weight = np.exp(-(score - score.min(0)) / _CERTAIN)
     weight /= weight.sum(0)
     own = np.exp(-(prior - prior.min()) / _CERTAIN)

@@ -11,8 +11,8 @@ surfel's own colour, which keeps all of its detail. Of proxy surfel p and the su
 
 Photos do not tell bright paint in dim light from dim paint in bright light, nor the colour of either. A
 camera does: it balances white and exposes for what it sees. So mean irradiance over what is seen is held grey
-and at 1 in the scan's own linear unit, before base color is limited. That "the brightest surfaces are at 0.8"
-is false of a man in black leather.
+and as bright as its meter says (:func:`tron.reconstruction.materials.joint_fit.metered_light`), before base
+color is limited. That "the brightest surfaces are at 0.8" is false of a man in black leather.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ log = logging.getLogger(__name__)
 
 _SCALE = 1.0
 """Weight of how bright base color is, over the photos' 0.05, with which it ran to 1.36 and was clipped."""
+_GREY = 0.5
+"""Weight of grey light, over the photos' 0.05, with which a golden guitar came out green in a red light."""
 _DARKEST = 0.01
 _APART = 8.0
 """Largest factor between base colors of a surfel and of its proxy's."""
@@ -91,7 +93,7 @@ def carry_materials(
     if proxy is None:
         log.warning("views of the scan agree on no surface, so that its materials cannot be told")
         return None
-    light = settings.light.model_copy(update={"scale": _SCALE})
+    light = settings.light.model_copy(update={"scale": _SCALE, "grey": _GREY})
     held = {"light": light, "same_exposure": True, "neutral": True}
     try:
         fit = fit_jointly(capture, proxy.surfels, settings.model_copy(update=held), seed, track)

@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 
 from tron.captures import Capture
 from tron.captures.view import ToneCurve
+from tron.color import luminance
 from tron.estimation import Estimation
 from tron.gaussians import GaussianScene
 from tron.reconstruction.light.fit_pairs import Light, LightSettings, Points, TooFewSeen, fit_light
@@ -47,6 +48,9 @@ _METAL = 0.5  # metallic from here on: no diffuse part to speak of
 _MIRRORS = 0.05  # share of the surfels from which it is said that they change with the view
 _RAYS = 64  # shadow rays of a surfel
 _BACK = 0.5  # light of a back face as a share of what photos show of its front
+MIDDLE_GREY = 0.18
+_FILLED, _USUAL_ALBEDO, _WHITEST = 0.3, 0.25, 0.8
+"""Share of a photo that its subject fills, albedo of what is around it, highest mean albedo of a subject."""
 
 
 class JointSettings(Settings):
@@ -68,8 +72,8 @@ class JointSettings(Settings):
     rounds: int = Field(default=1, ge=1, description="Times that light and materials are found in turns.")
     neutral: bool = Field(
         default=False,
-        description="Mean irradiance over what the photos show is grey and as bright as white paper in them, "
-        "as of a camera that balances white and exposes for what it sees; false: as it was found.",
+        description="Mean irradiance over what the photos show is grey and as bright as a camera's meter "
+        "has it, which balances white and exposes for what it sees; false: as it was found.",
     )
     light: LightSettings = Field(default=LightSettings(), description="Fit of the light.")
 
@@ -84,8 +88,8 @@ class JointFit:
         sun: its part that is a lobe; None where no shadows tell of one.
         colors: what the photos agree on.
         shown: (M, 3) linear light that leaves the surfels; where no photo shows one, its neighbours'.
-        balance: (3,) mean irradiance / pi over what is seen that was moved from the light into base color,
-            in the unit of the photos; ones where nothing was.
+        balance: (3,) factor on base color, and on light its reciprocal, by which mean irradiance over what is
+            seen is grey and as bright as the meter has it; ones where that was not asked.
         mirroring: share of what is seen that changes with the view, :meth:`SurfelColors.mirroring`.
     """
 
@@ -170,11 +174,29 @@ def fit_jointly(
         metallic = materials.metallic
     balance = np.ones(3, np.float32)
     if prior.neutral:
-        balance = (received.direct + received.bounced)[colors.seen].mean(0).astype(np.float32)
+        arrived, left = (received.direct + received.bounced)[colors.seen], colors.color[colors.seen]
+        balance = (arrived.mean(0) / metered_light(float(luminance(left.mean(0))))).astype(np.float32)
         materials = replace(materials, base_color=materials.base_color * balance)
         sun = None if sun is None else replace(sun, strength=sun.strength / balance)
     environment = EnvironmentMap(environment.image / (balance * np.float32(capture.exposure)))
     return JointFit(_with(scene, materials), environment, sun, colors, shown, balance, mirroring)
+
+
+def metered_light(shown: float) -> float:
+    """Mean irradiance / pi over a subject, in the unit of its photos, by the camera that exposed them.
+
+    A meter sets what comes back from all that the camera sees to middle grey. Of that a subject of albedo a
+    is the share f, the rest is as bright as things are, b, in the same light:
+
+        E (f a + (1 - f) b) = 0.18,   shown = E a      so      E = (0.18 - f shown) / ((1 - f) b)
+
+    0.72 for a subject as bright as all else; 1 for one in black leather.
+
+    Args:
+        shown: mean linear light that the photos show of the subject; 1 is their white.
+    """
+    light = (MIDDLE_GREY - _FILLED * shown) / ((1 - _FILLED) * _USUAL_ALBEDO)
+    return max(light, shown / _WHITEST)
 
 
 class LightFinder:

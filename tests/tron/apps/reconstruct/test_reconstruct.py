@@ -169,7 +169,7 @@ def test_the_report_is_whole_and_strict_json(finished: Path):
     assert report["first_surfels"] == {"source": "depth", "stereo_confident": None}
     assert report["materials_learnt"] == ["base_color", "roughness", "metallic"]
     figures = {"psnr", "psnr_subject", "ssim", "normal_mae_deg", "normal_median_deg"}
-    figures |= {"base_color_psnr", "roughness_mae", "metallic_mae"}
+    figures |= {"base_color_psnr", "roughness_mae", "metallic_mae", "metallic_wrong"}
     assert set(report["test"]) == set(report["train"]) == figures | {"views"}
     assert (report["test"]["views"], report["train"]["views"]) == (3, 6)
     assert report["test"]["psnr"] > 18  # from depth maps: good before it begins

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tron.captures import Capture, View
+from tron.color import luminance
 from tron.estimation import Estimation
 from tron.gaussians import GaussianScene
 from tron.reconstruction import Joint
@@ -16,7 +17,12 @@ from tron.reconstruction.light.fit_pairs import LightSettings
 from tron.reconstruction.light.sky_visibility import _texel, cube_texels, photographed_sky
 from tron.reconstruction.light.surfel_colors import Observations, SurfelColors, mean_colors, observe
 from tron.reconstruction.materials.brdf_search import ROUGHNESSES, Materials, Received, choose, materials_of
-from tron.reconstruction.materials.joint_fit import fit_jointly, photographed_bounces, receive
+from tron.reconstruction.materials.joint_fit import (
+    fit_jointly,
+    metered_light,
+    photographed_bounces,
+    receive,
+)
 from tron.seeds import generator
 from tron.shading.bounces.bounce import BounceTransport
 from tron.shading.environments.cubemap import direction_face
@@ -86,6 +92,9 @@ def chosen(scene: GaussianScene, capture: Capture, lighting: Lighting) -> Chosen
     return Chosen(materials, colors, found, received, blank)
 
 
+WHITE = np.ones(3)
+
+
 def psnr(found: np.ndarray, truth: np.ndarray) -> float:
     return float(-10 * np.log10(((found - truth) ** 2).mean()))
 
@@ -105,12 +114,12 @@ def test_where_all_materials_explain_alike_the_prior_decides(scene: GaussianScen
     colors = chosen.colors
     kinds = 2 * len(ROUGHNESSES)
     bases = np.full((kinds, len(scene), 3), 0.5)
-    none = choose(scene, colors, bases, np.zeros((kinds, len(scene))), 0.35)
+    none = choose(scene, colors, bases, np.zeros((kinds, len(scene))), 0.35, WHITE)
     assert none.confidence.max() < 1e-6
     assert none.metallic.max() < 0.35
     told = np.zeros((kinds, len(scene)))
     told[1:] = colors.count  # the first, of the sharpest lobe, explains every photo
-    sharp = choose(scene, colors, bases, told, 0.35)
+    sharp = choose(scene, colors, bases, told, 0.35, WHITE)
     seen = colors.seen
     np.testing.assert_allclose(sharp.roughness[seen], ROUGHNESSES[0], atol=0.01)
     assert sharp.confidence[seen].min() > 0.5
@@ -124,9 +133,24 @@ def test_a_rough_metal_must_prove_itself_more(
     kinds = 2 * len(ROUGHNESSES)
     losses = np.full((kinds, len(scene)), 0.2) * chosen.colors.count
     losses[len(ROUGHNESSES) + list(ROUGHNESSES).index(roughness)] = 0
-    found = choose(scene, chosen.colors, np.full((kinds, len(scene), 3), 0.5), losses, 0.6)
+    found = choose(scene, chosen.colors, np.full((kinds, len(scene), 3), 0.5), losses, 0.6, WHITE)
     seen = chosen.colors.seen
     assert ((found.metallic[seen] > 0.5) == metal).all()
+
+
+@pytest.mark.parametrize(("brightness", "metal"), [(0.55, True), (0.02, False)])
+def test_no_metal_is_dark(scene: GaussianScene, chosen: Chosen, brightness: float, metal: bool) -> None:
+    """What explains all photos better, as a mirror, is metal if it is as bright as iron, and gloss if not."""
+    kinds = 2 * len(ROUGHNESSES)
+    losses = np.full((kinds, len(scene)), 0.3) * chosen.colors.count
+    losses[len(ROUGHNESSES)] = 0
+    bases = np.full((kinds, len(scene), 3), brightness)
+    seen = chosen.colors.seen
+    found = choose(scene, chosen.colors, bases, losses, 0.6, WHITE)
+    assert ((found.metallic[seen] > 0.5) == metal).all()
+    # The same colours under a fiftieth of the light are bright things.
+    dim = choose(scene, chosen.colors, 0.55 / brightness * bases, losses, 0.6, brightness / 0.55 * WHITE)
+    np.testing.assert_allclose(dim.metallic, found.metallic, atol=1e-6)
 
 
 def test_base_color_is_free_of_shadows_and_highlights(scene: GaussianScene, chosen: Chosen) -> None:
@@ -160,7 +184,7 @@ def test_what_no_photo_shows_takes_after_the_nearest_that_one_does(
     losses = np.ones((kinds, len(scene)))
     losses[1 + len(ROUGHNESSES)] = 0  # a metal
     losses[:, blind] = 7.0
-    found = choose(jittered, colors, bases, losses, 0.35)
+    found = choose(jittered, colors, bases, losses, 0.35, WHITE)
     apart = np.linalg.norm(jittered.means[blind][:, None] - jittered.means[~blind][None], axis=2)
     nearest = np.argsort(apart, axis=1)[:, :24]
     np.testing.assert_allclose(
@@ -227,7 +251,7 @@ def test_photos_alone_tell_light_and_materials(
     assert found.said()["surfels_seen"] == pytest.approx((found.colors.count > 0).mean(), abs=1e-4)
 
 
-def test_irradiance_is_held_grey_and_at_one(scene: GaussianScene, capture: Capture) -> None:
+def test_irradiance_is_held_grey_and_where_the_meter_has_it(scene: GaussianScene, capture: Capture) -> None:
     """Through whatever glass the photos were taken: what is moved from the light goes into base color."""
     glass = np.array([1.5, 1.0, 0.6], np.float32)
     tinted = [replace(view, image=view.read() * glass) for view in capture.views]
@@ -247,7 +271,18 @@ def test_irradiance_is_held_grey_and_at_one(scene: GaussianScene, capture: Captu
     bounced = photographed_bounces(transport, fits[1].shown) / balance
     light = EnvironmentMap(fits[1].environment.image * np.float32(capture.exposure))
     total = (receive(transport, Lighting(light), bounced, 0).direct + bounced)[fits[1].colors.seen].mean(0)
-    np.testing.assert_allclose(total, 1, atol=0.03)
+    colors = fits[1].colors
+    metered = metered_light(luminance(colors.color[colors.seen].mean(0)))
+    np.testing.assert_allclose(total / metered, 1, atol=0.03)
+
+
+def test_a_meter_shows_middle_grey_whatever_the_subject() -> None:
+    """Subject and surroundings in one light, exposed to 0.18 in the mean: the light is found again."""
+    for albedo in (0.02, 0.1, 0.25, 0.6):
+        light = 0.18 / (0.3 * albedo + 0.7 * 0.25)
+        assert metered_light(light * albedo) == pytest.approx(light)
+    assert metered_light(0.25 * 0.72) == pytest.approx(0.72)
+    assert metered_light(2.0) == pytest.approx(2.5)  # burnt out: nothing reflects more than 0.8
 
 
 def _texel_centres(resolution: int) -> np.ndarray:
