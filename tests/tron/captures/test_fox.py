@@ -26,7 +26,8 @@ def test_photos_that_are_absent_are_counted(folder: Path, caplog: pytest.LogCapt
     assert len(fox.views) == 50
     assert len(fox.skipped) == 17
     assert set(fox.skipped.values()) == {"image not found"}
-    (line,) = [record.getMessage() for record in caplog.records]
+    line, sides = [record.getMessage() for record in caplog.records]
+    assert "from 91 degrees around" in sides
     assert "17 of 67 photos skipped: 0005 (image not found)" in line
     assert "\n" not in line
 
