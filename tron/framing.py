@@ -101,7 +101,9 @@ def _joined(points: np.ndarray, core: np.ndarray, cell: float) -> np.ndarray:
     place = ((points - points.min(0)) / cell).astype(int)
     held = np.zeros(place.max(0) + 1, int)
     np.add.at(held, tuple(place.T), 1)
-    part = label(held >= _CROWD, np.ones((3, 3, 3)))[0][tuple(place.T)]
+    parts = np.empty(held.shape, int)
+    label(held >= _CROWD, np.ones((3, 3, 3)), output=parts)
+    part = parts[tuple(place.T)]
     return core | ((part > 0) & (part == np.bincount(part[core]).argmax()))
 
 
