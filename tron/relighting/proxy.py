@@ -58,10 +58,8 @@ VIEWS, SIDE, MOST_VOXELS, TRUNCATION, SIGMA, SURFELS = 64, 300, 256, 4.0, 1.0, 6
 has them, and most surfels. Coarser voxels leak, finer ones keep the scan's noise."""
 _LEAST_SIDE, _PIXELS_PER_SPLAT = 64, 2.0
 _SOLID = 0.5
-_SHARP = 2.0
-"""Pixels of lift at which a view's depth counts half: behind fog it lies too deep, and makes a pit."""
-_PITS = 2
-"""Voxels of half the width up to which a pit is closed."""
+_PITS = 3
+"""Voxels to either side up to which a pit is closed. Behind fog median depths lie too deep here and there."""
 _NEAR_VOXELS = 4.0
 """Voxels up to which light sees the proxy alone, and by which the proxy may lie behind the scan."""
 _GRAZING = 0.05
@@ -147,12 +145,10 @@ def make_proxy(
     film = _film(scene, cameras, VIEWS, side)
     for number in track(range(len(film))):
         view = seen_by(tracer, film[number])
-        names = ("depth", "opacity", "lift", "base_color", "roughness", "metallic")
+        names = ("depth", "opacity", "base_color", "roughness", "metallic")
         images = view.images({name: getattr(view, name) for name in names})
         depth, subject = images.pop("depth"), images.pop("opacity") > _SOLID
-        pixels = images.pop("lift") * film[number].fx / np.maximum(depth, 1e-9)
-        weight = (subject & (depth > 0)) / (1 + (pixels / _SHARP) ** 2)
-        maps.append(DepthMap(film[number], depth, weight, empty_rays(subject)))
+        maps.append(DepthMap(film[number], depth, subject & (depth > 0), empty_rays(subject)))
         buffers.append(images)
     field = fuse(maps, pixel_footprint(maps), TRUNCATION, MOST_VOXELS)
     if field is None:

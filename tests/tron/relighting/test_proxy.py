@@ -13,7 +13,6 @@ from tron.estimation import Estimation
 from tron.gaussians.edit import moved
 from tron.gaussians.scene import GaussianScene
 from tron.relighting import Guidance, Relighter, relighter
-from tron.relighting import proxy as proxies
 from tron.relighting.proxy import THICK, ProxiedTracer, Proxy, fingerprint, make_proxy, seen_by, thickness
 from tron.seeds import generator
 from tron.shading.environments.environment import EnvironmentMap
@@ -93,22 +92,6 @@ def test_the_proxy_is_one_layer_of_the_scans_surface_and_materials(proxy):
     level &= surfels.normals()[:, 2] > 0  # the fog is seen from below too
     assert np.median(surfels.normals()[level, 2]) > np.cos(np.radians(15))
     np.testing.assert_allclose(np.median(surfels.base_color[level], 0), 0.5, atol=0.02)
-
-
-def test_views_count_by_how_sharp_their_depths_are(fog, clean, monkeypatch):
-    """Where one surfel is the surface they count whole; behind fog of two pixels half, and less beyond."""
-    weights = []
-
-    def taken(maps, *others):
-        weights.append(np.concatenate([each.weight[each.depth > 0] for each in maps]))
-
-    monkeypatch.setattr(proxies, "fuse", taken)
-    monkeypatch.setattr(proxies, "VIEWS", 6)
-    for scan in (clean, fog):
-        assert make_proxy(SurfelTracer(scan)) is None
-    sharp, dull = weights
-    assert np.median(sharp) > 0.9
-    assert np.median(dull[dull > 0]) < 0.8
 
 
 def specks(frame: Guidance, truth: Guidance) -> float:

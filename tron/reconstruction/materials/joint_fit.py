@@ -70,10 +70,11 @@ class JointSettings(Settings):
         description="Share of the differences between neighbours that a sun must explain to be one; 1: none.",
     )  # fmt: skip
     rounds: int = Field(default=1, ge=1, description="Times that light and materials are found in turns.")
-    neutral: bool = Field(
-        default=False,
+    neutral: bool | None = Field(
+        default=None,
         description="Mean irradiance over what the photos show is grey and as bright as a camera's meter "
-        "has it, which balances white and exposes for what it sees; false: as it was found.",
+        "has it, which balances white and exposes for what it sees; false: as it was found; null: of photos "
+        "with a camera's display curve, srgb.",
     )
     light: LightSettings = Field(default=LightSettings(), description="Fit of the light.")
 
@@ -173,7 +174,7 @@ def fit_jointly(
         diffuse = materials.base_color * (received.direct + received.bounced)
         metallic = materials.metallic
     balance = np.ones(3, np.float32)
-    if prior.neutral:
+    if curve == "srgb" if prior.neutral is None else prior.neutral:
         arrived, left = (received.direct + received.bounced)[colors.seen], colors.color[colors.seen]
         balance = (arrived.mean(0) / metered_light(float(luminance(left.mean(0))))).astype(np.float32)
         materials = replace(materials, base_color=materials.base_color * balance)
