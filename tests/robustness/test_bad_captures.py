@@ -270,12 +270,16 @@ def test_nerfstudios_camera_path_is_called_what_it_is(tmp_path: Path, kind) -> N
     assert "transforms.json" in line
 
 
+ONE_SIDE = "photos show it from"
+"""What is told of these photos besides."""
+
+
 def test_photos_that_max_side_reduces_are_told_in_one_line(
     folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     Image.fromarray(pixels(48, 64)).save(folder / "images" / "2.png")
     load_capture(folder, LoadSettings(max_side=32))
-    [record] = caplog.records
+    [record] = [each for each in caplog.records if ONE_SIDE not in each.getMessage()]
     assert record.levelname == "WARNING"
     assert record.getMessage().endswith(
         "max_side=32 reduces 1 of 6 photos, 64 x 48 to 32 x 24; max_side=null keeps their size"
@@ -287,7 +291,7 @@ def test_nothing_is_told_of_sizes_that_are_kept_or_asked_for(
     folder: Path, settings: LoadSettings, caplog: pytest.LogCaptureFixture
 ) -> None:
     load_capture(folder, settings)
-    assert not caplog.records
+    assert [record for record in caplog.records if ONE_SIDE not in record.getMessage()] == []
 
 
 @pytest.mark.parametrize("kind", ["transforms", "colmap", "tensoir", "photos"])
