@@ -98,6 +98,8 @@ def _joined(points: np.ndarray, core: np.ndarray, cell: float) -> np.ndarray:
 
     A leaf or a hand that stands out holds fewer surfels than strays may, but no gap parts it from the rest.
     """
+    if not cell > 0:
+        return core
     place = ((points - points.min(0)) / cell).astype(int)
     held = np.zeros(place.max(0) + 1, int)
     np.add.at(held, tuple(place.T), 1)

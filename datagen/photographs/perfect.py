@@ -48,7 +48,7 @@ GROUP_PIXELS = 2**20
 """Pixels of the views that are rendered together: bounds memory."""
 
 PIXEL_BYTES = 4 + 2 * (3 + 3 + 1 + 1 + 3) + 4
-RELIT_PIXEL_BYTES = 2 * 4
+RELIT_PIXEL_BYTES = 2 * (4 + 3)
 MAPS = ("normal", "base_color", "roughness", "metallic", "irradiance", "depth")
 """Fields of a view (``tron.captures.View``) that :func:`true_maps` gives."""
 PHOTOGRAPHED = ("image", "mask")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from tron.estimation import FINAL, Diffuse, Estimation, Estimator
 
@@ -185,6 +185,13 @@ class RadianceSettings(Settings):
         description="Normals pulled to those that all views' depths agree on, where no prior gives any.",
     )
 
+    @field_validator("coarse")
+    @classmethod
+    def _some_are_whole(cls, shares: tuple[float, ...]) -> tuple[float, ...]:
+        if sum(shares) >= 1:
+            raise ValueError("shares of 1 and more leave no step for the photos as they are")
+        return shares
+
     def scaled(self, factor: float, place: Place = "anywhere") -> RadianceSettings:
         """The same schedule in ``factor`` times as many steps; a step number of 0 stays 0.
 
@@ -238,7 +245,7 @@ class ReconstructionSettings(Settings):
         default="auto",
         description="Photos taken in a room: where none shows what bounds it, such as a ceiling, surfels of "
         "the colour near by close it, so that no light comes in; auto: where surfaces stand around the "
-        "cameras on all sides and no photo shows an opening overhead.",
+        "cameras on all sides, and higher than trees or houses would.",
     )
     steps_scaler: float = Field(
         default=0.1,

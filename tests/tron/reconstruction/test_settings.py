@@ -137,3 +137,8 @@ def test_settings_neither_change_nor_take_what_they_do_not_know() -> None:
         RadianceSettings(stepz=3)  # pyright: ignore[reportCallIssue]
     with pytest.raises(ValidationError, match="scale_rate"):
         RadianceSettings(scale_rate=float("nan"))
+
+
+def test_some_steps_must_see_the_photos_as_they_are() -> None:
+    with pytest.raises(ValueError, match="leave no step"):
+        RadianceSettings(coarse=(0.6, 0.6))

@@ -193,7 +193,7 @@ def _report(settings: Settings, capture: Capture, found: Reconstruction) -> dict
             "held_out": sorted(capture.test),
             "skipped": dict(capture.skipped),
             "up": capture.up.tolist(),
-            "seen_from_deg": seen_from_deg([view.camera for view in capture.views], capture.up),
+            "seen_from_deg": seen_from_deg(capture.train_cameras, capture.up),
             "transform": capture.transform.tolist(),
             "offset": capture.offset.tolist(),
             "content": shown_by(capture),

@@ -6,7 +6,8 @@ part of a wall that was not photographed; one that a photo does have in its pict
 surfels would be there otherwise. Nothing is known of such walls but that they are there: they get the mean
 colour of the surfels near by.
 
-Cameras are in a room where surfels stand around them on all sides and no photo shows an opening overhead.
+Cameras are in a room where surfels stand around them on all sides, some of them overhead, and photos show few
+openings there. Of a place among trees that is filmed from above nobody can tell.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ AROUND, PERHAPS = 0.7, 0.45
 """Share of the level directions that end on a surfel, in a room and in what may be one."""
 OVERHEAD = 0.4
 """Share of the hull overhead that photos of a room may show to be open: windows, and what was not found."""
+OVER = 0.1
+"""Share of the rising directions that end on a surfel in a room, whose walls are higher than a hedge."""
 _DIRECTIONS = 200
 _LEVEL, _RISING = np.sin(np.radians([15.0, 30.0]))
 """Sines of the elevation up to which a direction is level, and from which it is overhead."""
@@ -47,6 +50,7 @@ _OPEN = 0.3  # transmittance from here on: no surface was found
 _MOST = 0.5  # share of the hull that is closed in silence
 _RADIUS = 0.8  # standard deviation of a new surfel, distances between samples: larger ones cover windows
 _NEAR = 32  # surfels that tell the colour
+_FEWEST = 10 * _NEAR  # surfels that bound anything
 _OPACITY_LOGIT = 6.0  # opacity 0.998
 _ROUGHNESS = 0.7  # of plaster and paint, nearly diffuse
 
@@ -62,6 +66,7 @@ class Bounds:
         lacking: (N,) bool, where a camera sees no surfel and no photo looks.
         pictured: (N,) bool, openings that photos show.
         around: share of the level directions from the cameras that end on a surfel.
+        over: the same of the rising ones.
         overhead: share of the samples overhead that are such openings.
     """
 
@@ -71,6 +76,7 @@ class Bounds:
     lacking: np.ndarray
     pictured: np.ndarray
     around: float
+    over: float
     overhead: float
 
     @property
@@ -78,7 +84,7 @@ class Bounds:
         """Whether these are the bounds of a room; None where nobody can tell."""
         if self.overhead > OVERHEAD or self.around < PERHAPS:
             return False
-        return True if self.around >= AROUND else None
+        return True if self.around >= AROUND and self.over >= OVER else None
 
 
 def closed_indoors(
@@ -108,6 +114,8 @@ def closed_indoors(
             "one, indoors=true closes what no photo shows, and if not, indoors=false says so",
             100 * bounds.around,
         )
+    if indoors == "auto" and bounds.room:
+        log.warning("taken for photos of a room, which is closed; indoors=false if it is none")
     return enclosed(scene, bounds) if indoors is True or bounds.room else scene
 
 
@@ -116,7 +124,7 @@ def bounds_of(
 ) -> Bounds | None:
     """Bounds of the space of surfels and cameras; None where there are next to no surfels."""
     solid = scene.means[scene.opacities() > _SOLID].astype(np.float64)
-    if len(solid) < _NEAR:
+    if len(solid) < _FEWEST:
         return None
     cameras = np.stack([view.camera.position for view in views])
     points, normals, spacing = _hull(solid, cameras, seed)
@@ -129,17 +137,18 @@ def bounds_of(
     rising = points - cameras.mean(0)
     overhead = rising @ scene.up > _RISING * np.linalg.norm(rising, axis=1)
     return Bounds(
-        points, normals, spacing, free & ~pictured, pictured, _around(tracer, cameras),
+        points, normals, spacing, free & ~pictured, pictured, *_bounded(tracer, cameras),
         float(pictured[overhead].mean()) if overhead.any() else 0.0,
     )  # fmt: skip
 
 
-def _around(tracer: SurfelTracer, cameras: np.ndarray) -> float:
-    """Share of the level directions from some of the cameras (V, 3) that end on a surfel."""
+def _bounded(tracer: SurfelTracer, cameras: np.ndarray) -> tuple[float, float]:
+    """Shares of level and of rising directions from some of the cameras (V, 3) that end on a surfel."""
     directions = even_directions(5 * _DIRECTIONS)
-    level = directions[np.abs(directions @ tracer.scene.up) < _LEVEL]
+    height = directions @ tracer.scene.up
     places = cameras[np.unique(np.linspace(0, len(cameras) - 1, _PLACES).astype(int))]
-    return float(np.mean([_transmittance(tracer, place, place + level) < _OPEN for place in places]))
+    met = np.mean([_transmittance(tracer, place, place + directions) < _OPEN for place in places], axis=0)
+    return float(met[np.abs(height) < _LEVEL].mean()), float(met[height > _RISING].mean())
 
 
 def enclosed(scene: GaussianScene, bounds: Bounds) -> GaussianScene:
@@ -151,7 +160,7 @@ def enclosed(scene: GaussianScene, bounds: Bounds) -> GaussianScene:
         count, 100 * lacking.mean(), 100 * bounds.pictured.mean(),
     )  # fmt: skip
     if lacking.mean() > _MOST:
-        log.warning("photos show little of what bounds the room: indoors=true is for photos from within one")
+        log.warning("photos show little of what bounds the room: indoors=false if they were taken elsewhere")
     if not count:
         return scene
     there = np.flatnonzero(scene.opacities() > _SOLID)

@@ -174,7 +174,8 @@ def fit_jointly(
         diffuse = materials.base_color * (received.direct + received.bounced)
         metallic = materials.metallic
     balance = np.ones(3, np.float32)
-    if curve == "srgb" if prior.neutral is None else prior.neutral:
+    photos = curve == "srgb" and capture.train_views[0].space == "display"
+    if photos if prior.neutral is None else prior.neutral:
         arrived, left = (received.direct + received.bounced)[colors.seen], colors.color[colors.seen]
         balance = (arrived.mean(0) / metered_light(float(luminance(left.mean(0))))).astype(np.float32)
         materials = replace(materials, base_color=materials.base_color * balance)

@@ -2,7 +2,8 @@
 
 A neighbour's weight is the B-spline kernel's (1 4 6 4 1), its taps ``step`` pixels apart (Dammertz et al.
 2010), times how far it lies on the same surface: its normal agrees and it is near the pixel's plane; on
-request also how alike a guide is there: exp(-(stop x difference)^2)."""
+request also how alike a guide is there: exp(-(stop x difference)^2). Pixels that have next to no neighbour on
+their surface, as of leaves and wires, take those that are near it (``LOOSE``, ``ALONE``)."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def test_a_room_that_is_closed_stays_as_it_is(dense_surfels, photos: list[View])
 def test_photos_from_without_are_told_of(dense_surfels, caplog: pytest.LogCaptureFixture) -> None:
     ball = dense_surfels.scene(dense_surfels.sphere(radius=0.3))
     closed_indoors(ball, around_the_origin(), True, 0)
-    assert "indoors=true is for photos from within one" in caplog.text
+    assert "indoors=false" in caplog.text
 
 
 def test_the_same_seed_gives_the_same_surfels(dense_surfels, photos: list[View]) -> None:
@@ -159,6 +159,7 @@ def test_photos_from_within_a_room_are_known(dense_surfels, photos: list[View]) 
     bounds = bounds_of(found, photos, seed=0)
     assert bounds is not None
     assert bounds.around > 0.9
+    assert 0.3 < bounds.over < 0.9
     assert bounds.overhead == 0
     assert bounds.room is True
     by_rule, asked = (closed_indoors(found, photos, indoors, 0) for indoors in ("auto", True))
@@ -194,3 +195,22 @@ def test_a_room_with_one_wall_missing_is_asked_about(
     masked = [replace(view, mask=np.ones((20, 20), np.float32)) for view in photos]
     assert closed_indoors(found, masked, "auto", 0) is found
     assert not caplog.text
+
+
+def test_a_garden_filmed_from_above_is_asked_about(dense_surfels, caplog: pytest.LogCaptureFixture) -> None:
+    """Ground and a hedge around it, no higher than 26 degrees; no photo looks up, so none shows a sky."""
+    ground = dense_surfels.plane(0.12, 2.0)
+    box = dense_surfels.box(0.12, half=2.0)
+    hedge = (np.abs(box.normals[:, 2]) < 0.5) & (np.abs(box.points[:, 2]) < 0.9) & (box.points[:, 2] > 0)
+    wall = type(box)(box.points[hedge], -box.normals[hedge], box.mitsuba)
+    garden = dense_surfels.scene(ground, wall, spacing=0.12)
+    views = []
+    for i in range(8):
+        eye = (0.8 * np.cos(0.25 * np.pi * i), 0.8 * np.sin(0.25 * np.pi * i), 0.5)
+        camera = Camera.look_at(eye, (0, 0, 0), fov_deg=50, width=20, height=20)
+        views.append(View(str(i), camera, np.full((20, 20, 3), 0.5, np.float32), "display"))
+    bounds = bounds_of(garden, views, 0)
+    assert bounds is not None
+    assert bounds.around > 0.7
+    assert closed_indoors(garden, views, "auto", 0) is garden
+    assert "indoors=true" in caplog.text
