@@ -21,6 +21,8 @@ AGX_INSET = (
     (0.0423756549057051, 0.0784336, 0.879142973793104),
 )
 """Rows give each channel that AgX's curve is applied to as a blend of linear BT.709 R, G, B."""
+MIDDLE_GREY = 0.18
+"""Linear reflectance that meters set their exposure by."""
 AGX_LOG2_RANGE = (-12.47393, 4.026069)
 """Base-2 logarithms that AgX's curve spans: 10 stops below and 6.5 above middle grey, 0.18."""
 _AGX_PIVOT = (10 / 16.5, 0.5)  # middle grey

@@ -37,7 +37,7 @@ from datagen.world.scene import SceneSpec
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder, write_capture
-from tron.color import luminance, to_display
+from tron.color import MIDDLE_GREY, luminance, to_display
 from tron.errors import TronError
 from tron.gaussians.initialize import GBufferView
 from tron.io.images import encode_exr
@@ -53,7 +53,6 @@ MAPS = ("normal", "base_color", "roughness", "metallic", "irradiance", "depth")
 """Fields of a view (``tron.captures.View``) that :func:`true_maps` gives."""
 PHOTOGRAPHED = ("image", "mask")
 """Fields of a view that is a photograph: no map tells anyone more of it."""
-MIDDLE_GREY = 0.18
 METERED_VIEWS, METERED_SPP = 8, 16
 
 

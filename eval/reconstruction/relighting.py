@@ -26,6 +26,7 @@ from tron.relighting import Illumination, Relighter
 from tron.report.page import Picture, Pictures
 from tron.seeds import integer
 from tron.shading.environments.environment import EnvironmentMap
+from tron.shading.guidance import Guidance
 
 COVERED = 0.999
 """Coverage from which a pixel shows nothing but surfaces."""
@@ -116,12 +117,15 @@ def fitted_factor(lights: Sequence[tuple[np.ndarray, float, np.ndarray, np.ndarr
     return float(np.exp2(fminbound(error, floor - step, floor + step)))
 
 
+def relit_frames(light: Illumination, capture: Capture) -> list[Guidance]:
+    """The surfels from the capture's views."""
+    seeds = [integer(0, "reconstruction", "relit", number) for number in range(len(capture.views))]
+    return [light.render(view.camera, seed) for view, seed in zip(capture.views, seeds, strict=True)]
+
+
 def _lit_views(light: Illumination, capture: Capture) -> np.ndarray:
     """(K, H, W, 3) linear radiance of the surfels from the capture's views."""
-    seeds = [integer(0, "reconstruction", "relit", number) for number in range(len(capture.views))]
-    return np.stack(
-        [light.render(view.camera, seed).lit for view, seed in zip(capture.views, seeds, strict=True)]
-    )
+    return np.stack([frame.lit for frame in relit_frames(light, capture)])
 
 
 def display(capture: Capture) -> tuple[np.ndarray, np.ndarray]:

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from eval.reconstruction.light import irradiance, light_errors, read_light
-from eval.reconstruction.relighting import display, fitted_factor
+from eval.reconstruction.relighting import display, fitted_factor, relit_frames
 from eval.results import Row
 from tron.apps.relight.settings import QUALITY
-from tron.captures import Capture, View
+from tron.captures import View
 from tron.captures.folder import read_capture_folder
 from tron.color import luminance, to_display
 from tron.gaussians.scene import GaussianScene
@@ -75,7 +75,7 @@ def relit_figures(relighter: Relighter, views: Sequence[View], truths: Sequence[
     pictures, found = [], []
     for path in truths:
         capture, light = read_capture_folder(path), EnvironmentMap.load(path / "environment.exr")
-        frames = _frames(relighter, light, capture)
+        frames = relit_frames(relighter.under(light), capture)
         pictures.append((np.stack([frame["lit"] for frame in frames]), capture.exposure, *display(capture)))
         for frame, view, known in zip(frames, capture.views, views, strict=True):
             found.append(dict(_of_shadows(frame, view, known.read("normal"), light, capture.exposure)))
@@ -108,12 +108,6 @@ def thick_rows(ways: Mapping[str, Mapping[str, float]]) -> Iterator[Row]:
             yield Row(metric=f"splats.thick.{gain}", value=value, unit=unit, n=1)
 
 
-def _frames(relighter: Relighter, light: EnvironmentMap, capture: Capture) -> list[Guidance]:
-    lit = relighter.under(light)
-    seeds = [integer(0, "reconstruction", "relit", number) for number in range(len(capture.views))]
-    return [lit.render(view.camera, seed) for view, seed in zip(capture.views, seeds, strict=True)]
-
-
 def _of_shadows(
     frame: Guidance, view: View, normal: np.ndarray, light: EnvironmentMap, exposure: float
 ) -> Iterator[tuple[str, float]]:
@@ -125,7 +119,7 @@ def _of_shadows(
     if not where.any():
         return
     yield "irradiance_psnr", capped_psnr(to_display(shown, exposure), to_display(arrived, exposure), where)
-    (open_,) = irradiance([light], normal[where])
+    open_ = open_[luminance(open_) > 1e-6]
     true, ours = luminance(arrived[where]), luminance(shown[where])
     share = ours / np.maximum(luminance(of[where]), 1e-9)
     lit, dark = true > LIT * luminance(open_), true < DARK * luminance(open_)

@@ -65,6 +65,11 @@ class Received:
     bounced: np.ndarray
     openness: np.ndarray
 
+    @property
+    def total(self) -> np.ndarray:
+        """(M, 3) all that arrives."""
+        return self.direct + self.bounced
+
 
 @dataclass(frozen=True)
 class Materials:
@@ -103,7 +108,7 @@ def materials_of(
     color = found.color / colors.gain[found.view]
     dark = _DARK * float(color.mean())
     surfel, count = found.surfel, found.surfels
-    total = (received.direct + received.bounced)[surfel]
+    total = received.total[surfel]
     share = np.clip(received.direct / np.maximum(received.unshadowed, 1e-6), 0, 1)
     normal = scene.normals()[surfel]
     cosine = np.einsum("nc,nc->n", normal, found.to_camera)
@@ -129,7 +134,7 @@ def materials_of(
             loss = np.bincount(surfel, np.log1p(off / _ROBUST), count)
             bases.append(base)
             losses.append(loss)
-    white = (received.direct + received.bounced)[colors.seen].mean(0)
+    white = received.total[colors.seen].mean(0)
     return choose(scene, colors, np.stack(bases), np.stack(losses), prior_roughness, white)
 
 

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from tron.captures import Capture
 from tron.captures.view import ToneCurve
-from tron.color import luminance
+from tron.color import MIDDLE_GREY, luminance
 from tron.estimation import Estimation
 from tron.gaussians import GaussianScene
 from tron.reconstruction.light.fit_pairs import Light, LightSettings, Points, TooFewSeen, fit_light
@@ -48,7 +48,6 @@ _METAL = 0.5  # metallic from here on: no diffuse part to speak of
 _MIRRORS = 0.05  # share of the surfels from which it is said that they change with the view
 _RAYS = 64  # shadow rays of a surfel
 _BACK = 0.5  # light of a back face as a share of what photos show of its front
-MIDDLE_GREY = 0.18
 _FILLED, _USUAL_ALBEDO, _WHITEST = 0.3, 0.25, 0.8
 """Share of a photo that its subject fills, albedo of what is around it, highest mean albedo of a subject."""
 
@@ -171,12 +170,12 @@ def fit_jointly(
         received = receive(transport, lighting, bounced, seed)
         materials = materials_of(scene, found, colors, lighting, received, prior.roughness)
         # What is left without highlights and metals tells of the light better.
-        diffuse = materials.base_color * (received.direct + received.bounced)
+        diffuse = materials.base_color * received.total
         metallic = materials.metallic
     balance = np.ones(3, np.float32)
     photos = curve == "srgb" and capture.train_views[0].space == "display"
     if photos if prior.neutral is None else prior.neutral:
-        arrived, left = (received.direct + received.bounced)[colors.seen], colors.color[colors.seen]
+        arrived, left = received.total[colors.seen], colors.color[colors.seen]
         balance = (arrived.mean(0) / metered_light(float(luminance(left.mean(0))))).astype(np.float32)
         materials = replace(materials, base_color=materials.base_color * balance)
         sun = None if sun is None else replace(sun, strength=sun.strength / balance)

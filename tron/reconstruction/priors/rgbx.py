@@ -29,7 +29,7 @@ from pydantic import Field
 
 from tron.captures import Capture, View
 from tron.captures.view import Pixels
-from tron.color import luminance
+from tron.color import MIDDLE_GREY, luminance
 from tron.errors import TronError
 from tron.reconstruction.priors.prior import CONFIG, MapPrior, Maps, resized, world_normals
 from tron.seeds import integer
@@ -56,7 +56,6 @@ WEIGHTED = ("unet", "vae", "text_encoder")
 NEEDED = ("diffusers", "transformers")
 
 _CURVE = 2.2  # the authors' display curve; not sRGB's, which the model was not trained with
-_MIDDLE_GREY = 0.18
 _SCHEDULE = 1000  # steps of noise that the model was trained with
 _MULTIPLE = 8  # pixels a latent
 
@@ -146,7 +145,7 @@ def linear_photo(view: View) -> np.ndarray:
     if view.space == "display":
         return image**_CURVE
     mean = np.exp(np.log(np.maximum(luminance(image), 1e-6)).mean())
-    return (image * (_MIDDLE_GREY / mean)).clip(0, 1)
+    return (image * (MIDDLE_GREY / mean)).clip(0, 1)
 
 
 def check_checkpoint(checkpoint: str | Path | None) -> Path:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from tron.cameras import Camera
 from tron.color import luminance
 from tron.estimation import Estimation
+from tron.runtime import aligned, lanes
+from tron.seeds import generator
 from tron.shading.direct.irradiance import irradiance, visible_share
+from tron.shading.direct.neighbours import neighbourhood_mean
 from tron.shading.direct.visibility import RATIO_FROM_RAYS, reaching_share, regressed_share
 from tron.shading.environments.environment import EnvironmentLight, EnvironmentMap
 from tron.shading.guidance import Lighting, render_guidance
@@ -101,3 +108,19 @@ def test_from_sixteen_rays_the_share_is_the_ratio(variant: str, sphere_over_plan
         found = irradiance(tracer, gbuffer, EnvironmentLight(sun_map), spp, 0)
         share = reaching_share(*found, gbuffer, lighting, tracer.scene.spacing, Estimation(rays=spp))
         assert (np.array(share) == np.array(visible_share(*found))).all() == same
+
+
+def test_pixels_that_agree_with_no_neighbour_are_averaged_with_those_near_them(
+    variant: str, sphere_over_plane
+) -> None:
+    """As on leaves and fringes: normals all over, so that two pixels in a hundred face alike."""
+    tracer, draw = sphere_over_plane(), generator(0, "tests", "fringes")
+    gbuffer = tracer.gbuffer(VIEW)
+    count = dr.width(gbuffer.opacity)
+    normals = draw.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    frayed = replace(gbuffer, normal=lanes(mi.Normal3f, normals.astype(np.float32)))
+    noise = mi.Float(aligned(draw.uniform(size=count).astype(np.float32)))
+    (mean,), _ = neighbourhood_mean([noise], frayed, tracer.scene.spacing)
+    surface = np.array(gbuffer.opacity) > 0.99
+    assert np.std(np.array(mean)[surface]) < 0.6 * np.std(np.array(noise)[surface])
