@@ -225,7 +225,7 @@ def test_mirrors_and_glass_change_with_the_view(
         eye = (4 * np.cos(0.63 * i), 4 * np.sin(0.63 * i), 1.0 + i % 3)
         camera = Camera.look_at(eye, (0, 0, 0), fov_deg=35, width=48, height=48)
         sensor = mi.load_dict(mitsuba_sensor(camera))
-        seen = np.array(mi.render(scene, sensor=sensor, spp=16, seed=i))[..., :3]
+        seen = np.array(mi.render(scene, sensor=sensor, spp=16, seed=mi.UInt32(i)))[..., :3]
         views.append(View(str(i), camera, to_display(seen, 0.5).astype(np.float32), "display"))
     surfels = dense_surfels.scene(ball, spacing=0.09)
     found = mean_colors(observe(SurfelTracer(surfels), views, 1.0, "agx"))
