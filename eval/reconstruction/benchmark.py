@@ -26,6 +26,8 @@ log = logging.getLogger("tron.eval")
 DEFAULT_VARIANT = "llvm_ad_rgb"
 PHOTOGRAPHS = "photographs"
 """Folder of the captures that are photographs, and of the truth of relighting."""
+SCANNED = "scanned"
+"""Folder of the photographs that the thick scan is learnt from, with truth of its own."""
 WAYS = {
     "random": "random points, true prior",
     "depth_init": "depth maps, true prior",
@@ -63,8 +65,11 @@ class SplatSettings(BaseModel):
 
     scan: list[str] = Field(description="arguments of tron-reconstruct for what becomes the scan")
     reconstruct: list[str] = Field(description="arguments of tron-reconstruct for the scan as a capture")
+    photographs: list[str] = Field(
+        description="arguments of tron-datagen, which makes photographs for a thick scan, and relights them"
+    )
     thick: list[str] = Field(
-        description="arguments of tron-reconstruct for what becomes a thick scan, of photographs"
+        description="arguments of tron-reconstruct for what becomes a thick scan, of these photographs"
     )
     carry: list[str] = Field(description="those for the thick scan as a capture, whose surfels stay")
 
@@ -195,12 +200,14 @@ class Reconstruction(Benchmark):
         return made
 
     def _reconstruct_thick(self, stages: Stages, folder: Path) -> list[Made]:
-        """A thick scan of the first scene's photographs, as it is and with materials."""
+        """A thick scan of the first scene of photographs of its own, as it is and with materials."""
         from eval.reconstruction.scans import write_scan
         from tron.apps.relight.camera_files import CAMERAS
         from tron.gaussians.scene import GaussianScene
 
-        dataset = self._photographs(stages, folder)
+        dataset = folder / SCANNED
+        arguments = [*self.splats.photographs, f"output_dir={dataset}"]
+        stages.run("photographs of a scan", [Child("photographs of a scan", "tron-datagen", arguments)])
         for scene in scene_names(dataset)[:1]:
             capture, learnt = dataset / "captures" / scene, folder / "scenes" / scene / "thick"
             learning = self._run(stages, f"{scene} thick", capture, self.splats.thick, learnt)
@@ -269,7 +276,7 @@ class Reconstruction(Benchmark):
     def _collect_thick(self, made: Sequence[Made], found: Outcome) -> None:
         from eval.reconstruction.thick import collect_thick, thick_rows
 
-        truths = {each.scene: relit_truths(found.folder / PHOTOGRAPHS, each.scene) for each in made}
+        truths = {each.scene: relit_truths(found.folder / SCANNED, each.scene) for each in made}
         found.add(
             thick_rows(
                 {

@@ -285,6 +285,7 @@ def test_photographs_and_scans_are_relit_and_have_rows(stand_ins: Path, tmp_path
     assert [command[1] for command in commands if command[0] == "tron-datagen"] == [
         "experiment=captures",
         "experiment=photographs",
+        "experiment=photographs",
     ]
     made = {command[-1].partition("=")[2]: command for command in commands}
     photos = made[str(out / "scenes" / SCENE / "photos")]
@@ -306,6 +307,9 @@ def test_photographs_and_scans_are_relit_and_have_rows(stand_ins: Path, tmp_path
             assert results.find(f"{prefix}.{name}") is not None
     thick = [command for command in made.values() if command[1].endswith("-thick/scene.ply")]
     assert [command[-1] for command in thick] == [f"output_dir={out / 'scenes' / SCENE / 'carried'}"]
+    learnt = made[str(out / "scenes" / SCENE / "thick")]
+    assert learnt[1] == f"capture={out / 'scanned' / 'captures' / SCENE}"
+    assert "initial.source=points" in learnt
     for way in ("", "raw_", "raw_today_"):
         for name in ("irradiance_psnr", "base_color_psnr", "half"):
             assert results.find(f"splats.thick.{way}{name}") is not None
@@ -346,7 +350,9 @@ CAPTURES = (
     '"capture.path_spp=4","capture.reference_spp=4","mesh_edge=0.2","environment_height=32","cluster=null"'
 )
 
-RELIT = '"capture.relight_spp=4"'
+PHOTOGRAPHS = CAPTURES.replace("captures", "photographs", 1) + ',"capture.relight_spp=4"'
+POINTS = '"capture.points=300"'
+THICK = '"initial.source=points","initial.kernel_degree=2","light=null"'
 SPLATS = '"up=[0,0,1]","splats.views=9","splats.side=32"'
 
 
@@ -363,11 +369,12 @@ def test_the_whole_benchmark_with_the_real_commands(shared_data: Path, tmp_path:
                 f"benchmark.datagen=[{CAPTURES}]",
                 f"benchmark.reconstruct=[{QUICK}]",
                 "~benchmark.ways.depth_init",
-                f"benchmark.photographs=[{CAPTURES.replace('captures', 'photographs', 1)},{RELIT}]",
+                f"benchmark.photographs=[{PHOTOGRAPHS}]",
                 f"benchmark.photos.photos=[{QUICK}]",
                 f'benchmark.splats.scan=[{QUICK},"initial.kernel_degree=2","light=null"]',
                 f"benchmark.splats.reconstruct=[{QUICK},{SPLATS}]",
-                f'benchmark.splats.thick=[{QUICK},"initial.kernel_degree=2","light=null"]',
+                f"benchmark.splats.photographs=[{PHOTOGRAPHS},{POINTS}]",
+                f"benchmark.splats.thick=[{QUICK},{THICK}]",
                 f'benchmark.splats.carry=[{SPLATS},"report=null"]',
                 "benchmark.fox_downscale=32",
                 f"benchmark.fox=[{QUICK}]",
