@@ -104,7 +104,7 @@ def box(variant: str, dense_surfels) -> Box:
     views = []
     for k, camera in enumerate(cameras):
         sensor = mi.load_dict(mitsuba_sensor(camera, spp=PATHS, pixel_format="rgba"))
-        frame = np.array(mi.render(built, sensor=sensor, integrator=integrator, seed=k, spp=PATHS))
+        frame = np.array(mi.render(built, sensor=sensor, integrator=integrator, seed=mi.UInt32(k), spp=PATHS))
         views.append(
             View(
                 f"{k:02d}", camera, np.maximum(frame[..., :3], 0), "linear", mask=np.clip(frame[..., 3], 0, 1)
