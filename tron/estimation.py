@@ -34,7 +34,8 @@ class Estimation(BaseModel):
     * ``bounces``: 1 / 2 / 4 / 6 are 0.76 / 0.93 / 0.99 / 0.998 of what bounces in scenes like the demo's;
       each takes 2 ms. Data are path-traced with 4.
     * ``filtered=True``: six passes over the image. It takes the error of 2 rays from 0.081 to 0.030 under a
-      sun, from 0.171 to 0.038 in soft light, and blurs more than it cleans at 64.
+      sun, from 0.171 to 0.038 in soft light. From 16 rays on it is another, which changes what is noisy alone
+      (:mod:`tron.shading.direct.noise`).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -48,7 +49,7 @@ class Estimation(BaseModel):
         default=True,
         description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
     )
-    filtered: bool = Field(default=False, description="edge-avoiding filter over the image, for few rays")
+    filtered: bool = Field(default=False, description="edge-avoiding filter over the image")
     diffuse: Diffuse = Field(
         default="principled",
         description="principled: the material that data are path-traced with, whose diffuse part depends on "
@@ -85,5 +86,5 @@ FINAL = Estimation()
 """That of a frame at one sample a pixel; the settings of the commands take their defaults from it."""
 PREVIEW = Estimation(rays=2, filtered=True)
 """``quality=preview`` of tron-relight, its default."""
-FINEST = Estimation(reflections=4, supersample=2)
+FINEST = Estimation(filtered=True, reflections=4, supersample=2)
 """``quality=final`` of tron-relight."""

@@ -28,6 +28,7 @@ from datagen.photographs.camera_model import (
     straightened,
     view_names,
 )
+from datagen.photographs.meter import balanced
 from datagen.photographs.phone import Photograph, described, drift
 from datagen.settings.captures import CaptureSettings
 from datagen.settings.command import Settings
@@ -37,13 +38,14 @@ from datagen.world.scene import SceneSpec
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import read_capture_folder, write_capture
-from tron.color import MIDDLE_GREY, luminance, to_display
+from tron.color import to_display
 from tron.errors import TronError
 from tron.gaussians.initialize import GBufferView
 from tron.io.images import encode_exr
 from tron.seeds import generator, integer
 from tron.shading.environments.environment import EnvironmentMap
 
+STREAM = "capture"
 GROUP_PIXELS = 2**20
 """Pixels of the views that are rendered together: bounds memory."""
 
@@ -53,7 +55,6 @@ MAPS = ("normal", "base_color", "roughness", "metallic", "irradiance", "depth")
 """Fields of a view (``tron.captures.View``) that :func:`true_maps` gives."""
 PHOTOGRAPHED = ("image", "mask")
 """Fields of a view that is a photograph: no map tells anyone more of it."""
-METERED_VIEWS, METERED_SPP = 8, 16
 
 
 class PerfectCamera(CameraModel):
@@ -91,7 +92,7 @@ class PerfectCamera(CameraModel):
         photographs = taken(spec, wanted)
         environment, exposure = stage.environment, stage.environment.exposure()
         if photographs:
-            environment, exposure = balanced(spec, geometry, environment, wanted)
+            environment, exposure = balanced(spec, geometry, environment, wanted, STREAM)
         beside = {
             SPEC_NAME: spec.to_json().encode(),
             ENVIRONMENT_NAME: encode_exr(environment.image, half=False),
@@ -119,7 +120,7 @@ def taken(spec: SceneSpec, settings: CaptureSettings) -> dict[str, Photograph]:
     if not settings.photographs:
         return {}
     names = [name for number, name in enumerate(view_names(settings.views)) if number % HELD_OUT]
-    path = (spec.split, spec.index, "capture")
+    path = (spec.split, spec.index, STREAM)
     return dict(zip(names, drift(len(names), settings.sensor, spec.seed, *path)))
 
 
@@ -150,30 +151,6 @@ def captured(
     return Capture(tuple(views), test, up=np.array([0.0, 0.0, 1.0]), exposure=exposure)
 
 
-def balanced(
-    spec: SceneSpec, geometry: Geometry, environment: EnvironmentMap, settings: CaptureSettings
-) -> tuple[EnvironmentMap, float]:
-    """The light in the colours of a camera that balances white, and the exposure that its meter sets.
-
-    A phone takes the light that falls on what it sees for grey, and shows what comes back as middle grey in
-    the mean: dark things come out brighter than they are, white ones darker. Gains on channels of photos are
-    gains on the light.
-    """
-    cameras = spec.views(METERED_VIEWS, settings.width, settings.height)
-    scene = geometry.lit(environment)
-    seeds = [integer(spec.seed, spec.split, spec.index, "capture", "meter", n) for n in range(len(cameras))]
-    frames = render_frames(scene, cameras, METERED_SPP, seeds, spec.path_bounces, transparent=True)
-    arrived, returned = [], []
-    for camera, seed, frame, truth in zip(cameras, seeds, frames, gbuffers(geometry, cameras), strict=True):
-        direct = direct_irradiance(geometry, scene, camera, METERED_SPP, seed)
-        arrived.append(direct.shadowed[truth.valid])
-        returned.append(frame[frame[..., 3] >= 1][..., :3])
-    light, shown = np.concatenate(arrived).mean(axis=0), np.concatenate(returned).mean(axis=0)
-    gains = luminance(light) / light
-    exposure = MIDDLE_GREY / float(luminance(shown * gains))
-    return replace(environment, image=environment.image * gains.astype(np.float32)), exposure
-
-
 def surface_points(
     capture: Capture, count: int, spec: SceneSpec, geometry: Geometry
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -181,7 +158,7 @@ def surface_points(
 
     Photographs have no map of depth: theirs is looked up in the meshes.
     """
-    rng = generator(spec.seed, spec.split, spec.index, "capture", "points")
+    rng = generator(spec.seed, spec.split, spec.index, STREAM, "points")
     views = capture.train_views
     points, colors = [], []
     for view, share in zip(views, np.diff(np.arange(len(views) + 1) * count // len(views))):
@@ -250,13 +227,13 @@ class _Shots:
         if photograph is None:
             shown = to_display(straight, self._exposure)
         else:
-            rng = generator(spec.seed, spec.split, spec.index, "capture", number, "noise")
+            rng = generator(spec.seed, spec.split, spec.index, STREAM, number, "noise")
             shown = to_display(photograph.take(self._exposure * straight, self._settings.sensor, rng), 1.0)
         return np.where(mask[..., None] > 0, shown, 0.0)
 
     def _seed(self, number: int, what: str) -> int:
         spec = self._spec
-        return integer(spec.seed, spec.split, spec.index, "capture", number, what)
+        return integer(spec.seed, spec.split, spec.index, STREAM, number, what)
 
 
 def true_depth(truth: GBufferView) -> np.ndarray:

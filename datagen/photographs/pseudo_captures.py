@@ -3,7 +3,8 @@
     captures/NAME    photos, poses a little off, sparse points, masks where they are asked for
                      (``datagen.photographs.pseudo_captures``); nothing else
     truth/NAME       the same views as a capture folder: true cameras, linear radiance with coverage as mask,
-                     true maps of the held-out views, environment.exr, spec.json, photographs.json
+                     true maps of the held-out views, environment.exr, spec.json, photographs.json; in the
+                     colours of a camera that balances white (``datagen.photographs.meter``)
     relit/NAME_K_L   the held-out views under other lights (``datagen.photographs.camera_model``)
 
 What is reconstructed from ``captures`` is judged by the others. A capture is finished when all of its folders
@@ -41,11 +42,12 @@ from datagen.photographs.camera_model import (
     Stage,
     straightened,
 )
+from datagen.photographs.meter import balanced
 from datagen.photographs.perfect import true_maps
 from datagen.photographs.phone import Phone, draw_phone
 from datagen.settings.captures import PseudoCaptureSettings
 from datagen.settings.command import Settings
-from datagen.truth.pathtrace import gbuffers, metered, render_frames
+from datagen.truth.pathtrace import gbuffers, render_frames
 from tron.cameras import Camera, opencv_to_opengl
 from tron.captures import Capture, LoadSettings, View, load_capture
 from tron.captures.folder import TRANSFORMS_NAME, encode_points, read_capture_folder, write_capture
@@ -104,13 +106,13 @@ class PhoneCamera(CameraModel):
         names, cameras = list(stage.cameras), list(stage.cameras.values())
         seeds = [integer(spec.seed, spec.split, spec.index, STREAM, name, "path") for name in names]
         spp = wanted.path_spp if wanted.indoor_spp is None or not spec.metered else wanted.indoor_spp
-        lit = stage.geometry.lit(stage.environment)
+        light, exposure = balanced(spec, stage.geometry, stage.environment, wanted, STREAM)
+        stage = replace(stage, environment=light)
+        lit = stage.geometry.lit(light)
         frames = render_frames(lit, cameras, spp, seeds, spec.path_bounces, transparent=True)
         buffers = dict(zip(names, gbuffers(stage.geometry, cameras)))
         shots = dict(zip(names, frames))
         phone = draw_phone(wanted, names, spec.seed, spec.split, spec.index, STREAM)
-        # A phone meters what it sees, outdoors as well.
-        exposure = metered(frames[..., :3], frames[..., 3] >= 1, stage.environment.exposure())
 
         true_capture = _true_capture(stage, shots, buffers, exposure, settings)
         told = {"exposure": exposure, **phone.described()}

@@ -138,11 +138,18 @@ def _finished(item: Work, settings: Settings, manifests: Mapping[Path, CaptureMa
     try:
         camera.require_whole(item.name, settings)
         relights = camera.settings(settings).relights
-        for relit in relit_folders(settings.output_dir / RELIT, item.name, relights):
-            read_capture_folder(relit)
+        relit = relit_folders(settings.output_dir / RELIT, item.name, relights)
+        older = [path for path in relit if not _has_irradiance(path)]
     except TronError:
         return False
-    return True
+    if older:
+        log.warning("%s: relit views lack irradiance, which older versions left out: made anew", item.name)
+    return not older
+
+
+def _has_irradiance(relit: Path) -> bool:
+    """Whether all relit views of a folder have maps of it; TronError where it cannot be read."""
+    return all(view.has("irradiance") for view in read_capture_folder(relit).views)
 
 
 def _record_relit(folder: Path, names: Sequence[str], families: Sequence[str]) -> None:

@@ -55,6 +55,9 @@ CAPTURED: dict[str, Any] = {
 }
 """Keys that decide what is in a capture."""
 
+METER = "balanced"
+"""Camera of pseudo-captures (``datagen.photographs.meter``); that of recipes without the key was not."""
+
 OF_CAPTURES = {"source", "captures", "captured"}
 """Keys of source=captured alone; the other source ignores ``captured``."""
 
@@ -409,7 +412,8 @@ class Settings(ScaleSettings):
         """Keys that decide a pseudo-capture's content, as plain values; of the splits that have scenes."""
         splits = dict.fromkeys(self.used_splits(), OF_A_SCENE)
         shared = {key: True for key in CAPTURED if key not in ("capture", "test")}
-        return self.model_dump(mode="json", include={**shared, **splits, "pseudo_capture": True})
+        values = self.model_dump(mode="json", include={**shared, **splits, "pseudo_capture": True})
+        return {**values, "meter": METER}
 
 
 class KeysOfSynthetic:

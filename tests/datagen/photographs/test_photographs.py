@@ -1,6 +1,8 @@
 """Photographs of a capture: drift that is centred, noise of the stated size, held-out views left true."""
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,17 +10,19 @@ import pytest
 from scipy.special import erf
 
 from datagen.photographs.camera_model import held_out, view_names
+from datagen.photographs.meter import balanced
 from datagen.photographs.phone import Blur, Photograph, drift, vignette
 from datagen.run.captures import make_captures
-from datagen.settings.captures import SensorSettings
+from datagen.settings.captures import CaptureSettings, SensorSettings
 from datagen.settings.command import Settings
 from datagen.truth.build import build
 from datagen.truth.pathtrace import gbuffers, render_frames
 from datagen.world.scene import SceneSpec
-from tron.captures.folder import read_capture_folder
+from tron.captures.folder import read_capture_folder, write_capture
 from tron.captures.view import linear_light
 from tron.cli.recipes import check, compose_recipe
 from tron.color import luminance, to_display
+from tron.errors import TronError
 from tron.seeds import generator
 from tron.shading.environments.environment import EnvironmentMap
 
@@ -170,6 +174,31 @@ def test_relit_views_are_path_traced_under_the_stored_light(output):
             assert abs((shown - expected).mean()) < 0.004
     own = EnvironmentMap.load(output / "captures/test-000000/environment.exr")
     assert all(not np.allclose(own.image, EnvironmentMap.load(f / "environment.exr").image) for f in folders)
+
+
+def test_captures_whose_relit_views_lack_irradiance_are_made_anew(output, tmp_path, files_of, caplog):
+    """Versions that did not path-trace it left such folders."""
+    copy = tmp_path / "copy"
+    shutil.copytree(output, copy)
+    assert make_captures(tiny(copy)) == 0
+    assert "made anew" not in caplog.text
+    relit = copy / "relit/test-000000_2_studio"
+    capture = read_capture_folder(relit)
+    views = tuple(
+        replace(view, image=view.read(), mask=view.read("mask"), irradiance=None) for view in capture.views
+    )
+    light = (relit / "environment.exr").read_bytes()
+    write_capture(relit, replace(capture, views=views), overwrite=True, beside={"environment.exr": light})
+    assert make_captures(tiny(copy)) == 0
+    assert "test-000000: relit views lack irradiance" in caplog.text
+    assert files_of(copy / "relit") == files_of(output / "relit")
+
+
+def test_a_scene_without_light_is_named(output, variant):
+    spec = SceneSpec.model_validate_json((output / "captures/test-000000/spec.json").read_text())
+    dark = EnvironmentMap(np.zeros((4, 8, 3), np.float32))
+    with pytest.raises(TronError, match=r"nothing can be metered: .* \(test-000000\)"):
+        balanced(spec, build(spec, edge=EDGE), dark, CaptureSettings(width=8, height=8), "capture")
 
 
 def test_further_lights_change_nothing_of_the_capture(output, true_output):

@@ -1,6 +1,7 @@
 """Pseudo-captures: blind folders, photos and poses as far off as asked for, truth beside."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -27,7 +28,7 @@ from tron.captures import LoadSettings, load_capture
 from tron.captures.folder import read_capture_folder
 from tron.captures.view import MAPS, inverse_agx
 from tron.cli.recipes import check, compose_recipe
-from tron.color import agx, linear_to_srgb, srgb_to_linear, to_display
+from tron.color import agx, linear_to_srgb, luminance, srgb_to_linear, to_display
 from tron.errors import TronError
 from tron.seeds import generator
 from tron.shading.environments.environment import EnvironmentMap
@@ -145,7 +146,6 @@ def test_truth_allows_to_judge_and_to_relight(output):
             SceneSpec.model_validate_json((folder / "spec.json").read_bytes()),
         )
         assert spec.name == name
-        assert EnvironmentMap.load(folder / "environment.exr").exposure() <= truth.exposure * (1 + 1e-6)
         for view, camera in zip(truth.views, spec.views(len(truth.views), 24, 24)):
             np.testing.assert_allclose(view.camera.world_to_camera, camera.world_to_camera, atol=1e-12)
             assert view.space == "linear"
@@ -158,6 +158,17 @@ def test_truth_allows_to_judge_and_to_relight(output):
         told = json.loads((folder / "photographs.json").read_text())
         assert told["exposure"] == pytest.approx(truth.exposure)
         assert list(told["photos"]) == [view.name for view in truth.views]
+
+
+def test_the_phone_balances_white_and_shows_the_mean_as_middle_grey(output):
+    for name in NAMES:
+        truth = read_capture_folder(output / "truth" / name)
+        inside = {view.name: view.read("mask") == 1 for view in truth.views}
+        arrived = [view.read("irradiance")[inside[view.name]] for view in truth.test_views]
+        light = np.concatenate(arrived).mean(axis=0)
+        np.testing.assert_allclose(light / light.mean(), 1, atol=0.05)  # two views; eight others were metered
+        shown = np.concatenate([view.read()[inside[view.name]] for view in truth.views]).mean(axis=0)
+        assert luminance(shown) * truth.exposure == pytest.approx(0.18, rel=0.15)
 
 
 @pytest.mark.parametrize("curve", ["agx", "srgb"])
@@ -390,6 +401,16 @@ def test_other_recipes_strangers_folders_and_those_in_use_are_refused(output, tm
     with pytest.raises(TronError, match="something else"):
         make_captures(tiny(tmp_path))
     assert not (tmp_path / "truth").exists()
+
+
+def test_captures_of_the_camera_that_balanced_no_white_are_refused(output, tmp_path):
+    """Their bytes are others, and nothing else in their recipe is."""
+    copy = tmp_path / "copy"
+    shutil.copytree(output, copy)
+    recipe = copy / "truth/config.yaml"
+    recipe.write_text(re.sub(r"^meter: .*\n", "", recipe.read_text(), flags=re.MULTILINE))
+    with pytest.raises(TronError, match="made with meter=None, not balanced"):
+        make_captures(tiny(copy))
 
 
 def test_more_scenes_may_be_added(output, tmp_path):

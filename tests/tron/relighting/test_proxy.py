@@ -94,6 +94,19 @@ def test_the_proxy_is_one_layer_of_the_scans_surface_and_materials(proxy):
     np.testing.assert_allclose(np.median(surfels.base_color[level], 0), 0.5, atol=0.02)
 
 
+@pytest.mark.usefixtures("short_film")
+def test_a_narrow_pit_is_closed(fog):
+    """Behind gloss splats lie too deep here and there; light would see a well with black walls."""
+    middle = np.array([1.0, 0.9])
+    pit = np.linalg.norm(fog.means[:, :2] - middle, axis=1) < 0.15
+    scan = replace(fog, means=fog.means - np.where(pit[:, None], [0, 0, 0.4], 0))
+    made = make_proxy(SurfelTracer(scan))
+    assert made is not None
+    beside = np.linalg.norm(made.surfels.means[:, :2] - middle, axis=1) < 0.08
+    assert beside.sum() > 3
+    assert np.median(made.surfels.means[beside, 2]) > -3 * SPACING, "not as deep as the fog around it"
+
+
 def specks(frame: Guidance, truth: Guidance) -> float:
     """Share of the pixels that truly get over 0.9 of their light which get under half."""
     solid = (frame.mask > 0.9) & (truth.mask > 0.9)

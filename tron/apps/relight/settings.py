@@ -92,8 +92,8 @@ class Settings(BaseModel):
     )
     quality: Literal["preview", "final"] = Field(
         "preview",
-        description="preview: 2 shadow rays per pixel, denoised; final: 64, over 2 x 2 sub-pixels, and 4 "
-        "rays that look for reflections of the scene in itself",
+        description="preview: 2 shadow rays per pixel; final: 64, over 2 x 2 sub-pixels, and 4 "
+        "rays that look for reflections of the scene in itself; both denoised",
     )
     bounces: int = Field(
         FINAL.bounces,
@@ -122,7 +122,7 @@ class Settings(BaseModel):
         description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
     )
     denoise: bool | None = Field(
-        None, description="edge-avoiding filter of the shadows; null: with quality=preview alone"
+        None, description="edge-avoiding filter of the shadows, by their noise; null: by quality, which is on"
     )
     frames: int = Field(60, ge=1, le=10_000, description="number of frames (those of `cameras` win)")
     width: Side | None = Field(

@@ -18,7 +18,7 @@ a metal must be bright, in the unit in which mean irradiance over what is seen i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -69,6 +69,10 @@ class Received:
     def total(self) -> np.ndarray:
         """(M, 3) all that arrives."""
         return self.direct + self.bounced
+
+    def balanced(self, balance: np.ndarray) -> Received:
+        """The same of an environment that is divided by ``balance`` (3,); what bounced stays."""
+        return replace(self, direct=self.direct / balance, unshadowed=self.unshadowed / balance)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from tron.gaussians import GaussianScene
 from tron.reconstruction.light.fit_pairs import Light, LightSettings, Points, TooFewSeen, fit_light
 from tron.reconstruction.light.sky_visibility import PhotographedSky, photographed_sky, sky_transport
 from tron.reconstruction.light.sun import Sun, SunSearch
-from tron.reconstruction.light.surfel_colors import SurfelColors, mean_colors, observe
+from tron.reconstruction.light.surfel_colors import FLOOR, SurfelColors, mean_colors, observe
 from tron.reconstruction.materials.brdf_search import Materials, Received, materials_of
 from tron.reconstruction.progress import Track, untracked
 from tron.reconstruction.settings import Settings
@@ -88,8 +88,8 @@ class JointFit:
         sun: its part that is a lobe; None where no shadows tell of one.
         colors: what the photos agree on.
         shown: (M, 3) linear light that leaves the surfels; where no photo shows one, its neighbours'.
-        balance: (3,) factor on base color, and on light its reciprocal, by which mean irradiance over what is
-            seen is grey and as bright as the meter has it; ones where that was not asked.
+        balance: (3,) factor by which the light was too bright when it was found (:func:`light_balance`), so
+            that ``environment`` and ``sun`` are divided by it; ones where that was not asked.
         mirroring: share of what is seen that changes with the view, :meth:`SurfelColors.mirroring`.
     """
 
@@ -162,25 +162,48 @@ def fit_jointly(
         prior.light.resolution, seed, track,
     )  # fmt: skip
     finder = LightFinder(tracer, colors, bounced, sky, prior, seed)
+    photos = curve == "srgb" and capture.train_views[0].space == "display"
+    neutral = photos if prior.neutral is None else prior.neutral
     diffuse, metallic = shown, np.zeros(len(scene), np.float32)
     for _ in range(prior.rounds):
         light, sun = finder.find(diffuse, metallic)
         environment = environment_of(light, sun)
-        lighting = Lighting(environment)
-        received = receive(transport, lighting, bounced, seed)
-        materials = materials_of(scene, found, colors, lighting, received, prior.roughness)
+        received = receive(transport, Lighting(environment), bounced, seed)
+        balance = light_balance(received, colors) if neutral else np.ones(3, np.float32)
+        environment, received = EnvironmentMap(environment.image / balance), received.balanced(balance)
+        sun = None if sun is None else replace(sun, strength=sun.strength / balance)
+        materials = materials_of(scene, found, colors, Lighting(environment), received, prior.roughness)
         # What is left without highlights and metals tells of the light better.
         diffuse = materials.base_color * received.total
         metallic = materials.metallic
-    balance = np.ones(3, np.float32)
-    photos = curve == "srgb" and capture.train_views[0].space == "display"
-    if photos if prior.neutral is None else prior.neutral:
-        arrived, left = received.total[colors.seen], colors.color[colors.seen]
-        balance = (arrived.mean(0) / metered_light(float(luminance(left.mean(0))))).astype(np.float32)
-        materials = replace(materials, base_color=materials.base_color * balance)
-        sun = None if sun is None else replace(sun, strength=sun.strength / balance)
-    environment = EnvironmentMap(environment.image / (balance * np.float32(capture.exposure)))
+    environment = EnvironmentMap(environment.image / np.float32(capture.exposure))
     return JointFit(_with(scene, materials), environment, sun, colors, shown, balance, mirroring)
+
+
+def light_balance(received: Received, colors: SurfelColors) -> np.ndarray:
+    """(3,) factor by which a found light is too bright for a camera that balances white and meters.
+
+    Photos show what bounces, I, in their own unit, whatever light was found. So only what comes straight from
+    the light, E, is scaled, until both together are what the meter says, W (:func:`metered_light`), in the
+    mean over what is seen:
+
+        E / b + I = W      so      b = E / (W - I)
+
+    In a closed place of albedo a, I is a (E + I). None is above 0.8, so I counts up to 0.8 W: where photos
+    show more, as in a red room its red, the light keeps a fifth.
+
+    Args:
+        received: what the found light gives the surfels.
+        colors: what photos show of them.
+    """
+    direct, bounced = (each[colors.seen].mean(0) for each in (received.direct, received.bounced))
+    wanted = metered_light(float(luminance(colors.color[colors.seen].mean(0))))
+    if (direct < FLOOR).any():
+        log.warning("no light reaches what photos show but by bounces: its brightness is as it was found")
+        return np.ones(3, np.float32)
+    if (bounced > _WHITEST * wanted).any():
+        log.warning("nearly all light that photos show has bounced: the brightness of its source is a guess")
+    return (direct / np.maximum(wanted - bounced, (1 - _WHITEST) * wanted)).astype(np.float32)
 
 
 def metered_light(shown: float) -> float:

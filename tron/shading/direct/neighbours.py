@@ -32,7 +32,7 @@ def neighbourhood_mean(
     *,
     step: int = 1,
     guide: mi.Float | None = None,
-    stop: float = 0.0,
+    stop: mi.Float | float = 0.0,
     own: bool = True,
 ) -> tuple[list[mi.Float], mi.Bool]:
     """Weighted means of ``values`` about each pixel, and where there was anything to average.
@@ -42,7 +42,8 @@ def neighbourhood_mean(
         gbuffer: positions, unit normals and opacity of the same pixels; those of opacity 0 do not count.
         spacing: the scene's surfel spacing, world units.
         step: distance of the taps, pixels.
-        guide: of each pixel; with ``stop``, in its inverse unit, unlike neighbours count less.
+        guide: of each pixel; with ``stop``, in its inverse unit, one for all or for each pixel, unlike
+            neighbours count less.
         own: whether the pixel itself counts.
 
     Returns:
@@ -56,7 +57,7 @@ def neighbourhood_mean(
         gbuffer,
         dr.opaque(mi.Int, step),
         dr.opaque(mi.Float, PLANE_SPACINGS * spacing),
-        dr.opaque(mi.Float, stop),
+        stop if isinstance(stop, mi.Float) else dr.opaque(mi.Float, stop),
         dr.opaque(mi.Bool, own),
     )
     dr.eval(means, found)

@@ -13,6 +13,7 @@ from tron.estimation import Estimation
 from tron.shading.burley import BurleySums, grey, mean_terms
 from tron.shading.direct.irradiance import Observer, Occluder, irradiance, visible_share
 from tron.shading.direct.neighbours import neighbourhood_mean
+from tron.shading.direct.noise import NoiseSums, without_noise
 from tron.shading.lighting import Lighting
 
 if TYPE_CHECKING:
@@ -49,12 +50,15 @@ def _visibility(
     seed: int,
     observers: Sequence[Observer],
 ) -> mi.Color3f:
-    occluder, narrow = tracer.sided(estimation.two_sided), None
-    if estimation.filtered:
-        narrow = NarrowSums.none(lighting.light, dr.width(gbuffer.opacity))
-        observers = [*observers, narrow]
+    occluder, lanes = tracer.sided(estimation.two_sided), dr.width(gbuffer.opacity)
+    narrow = noise = None
+    if estimation.filtered and of_many(estimation):
+        noise = NoiseSums.none(lanes)
+    elif estimation.filtered:
+        narrow = NarrowSums.none(lighting.light, lanes)
+    observers = [*observers, *(each for each in (narrow, noise) if each is not None)]
     found = irradiance(occluder, gbuffer, lighting.light, estimation.rays, seed, observers=observers)
-    return reaching_share(*found, gbuffer, lighting, occluder.scene.spacing, estimation, narrow)
+    return reaching_share(*found, gbuffer, lighting, occluder.scene.spacing, estimation, narrow, noise)
 
 
 def visibility_and_terms(
@@ -85,14 +89,18 @@ def reaching_share(
     spacing: float,
     estimation: Estimation,
     narrow: NarrowSums | None = None,
+    noise: NoiseSums | None = None,
 ) -> mi.Color3f:
     """The same from what the rays found: :func:`tron.shading.direct.irradiance`'s two estimates.
 
-    ``narrow`` of the same rays, for the filter; None: no light is narrow.
+    ``narrow`` and ``noise`` of the same rays, for the filters of few and of many rays; None: no light is
+    narrow, nothing is noisy.
     """
-    plain, many = estimation.estimator == "plain", estimation.rays >= RATIO_FROM_RAYS
-    if many and not (plain or estimation.filtered):
+    if of_many(estimation):
+        if noise is not None:
+            shadowed, unshadowed = without_noise(shadowed, unshadowed, noise, gbuffer, spacing)
         return visible_share(shadowed, unshadowed)
+    plain = estimation.estimator == "plain"
     known = lighting.split_sum.diffuse(shading_normal(gbuffer))
     if estimation.filtered or not plain:
         share = regressed_share(shadowed, unshadowed, known, gbuffer, spacing)
@@ -104,6 +112,11 @@ def reaching_share(
             detail = narrow.detail(all_rays, gbuffer, spacing)
         shadowed, unshadowed = atrous(shadowed, unshadowed, grey(share), gbuffer, spacing, detail)
     return visible_share(shadowed, known if plain else unshadowed)
+
+
+def of_many(estimation: Estimation) -> bool:
+    """Whether the rays of a pixel are many enough for their ratio."""
+    return estimation.estimator == "ratio" and estimation.rays >= RATIO_FROM_RAYS
 
 
 def shading_normal(surface: Surface) -> mi.Vector3f:
@@ -247,7 +260,7 @@ class NarrowSums:
 # say is taken off the guide before it is smoothed, and put back
 # after. Of bars 0.04 wide under a sun of 1 degree the deep shadow has 1.34, 1.20 and 1.10 of the reference at
 # 2, 4 and 8 rays; of 20k surfels all shadows have 1.04 of it or less, with a third less noise.
-# At 64 rays it blurs more than it cleans.
+# Of many rays it would blur more than it cleans: :mod:`tron.shading.direct.noise` is theirs.
 
 GUIDE_PASSES = ((1, 0.0), (1, 0.0), (2, 4.0))
 """Step in pixels and stop of each pass that smooths the guide; a stop is over the share of light, 0 to 1."""

@@ -1,0 +1,105 @@
+"""Filter for many rays: neighbours stand in for a pixel as far as its own noise lets them differ.
+
+With L_k the light of a pixel's rays, V_k the share of it that arrives and V = sum L_k V_k / sum L_k, the
+variance of V is
+
+    sum L_k^2 (V_k - V)^2 / (sum L_k)^2
+
+which strata make too large. Its mean over the neighbourhood sets how unlike a neighbour may be (Schied et al.
+2017, "Spatiotemporal Variance-Guided Filtering"). Where rays agree nothing changes: shadows' edges stay.
+
+Of 64 rays over 2 x 2 sub-pixels, against 2,048 and 1,024 (PSNR of irradiance, dB): a sun and a studio on
+clean surfels 42.8 to 48.3 and 41.5 to 44.6, leaves of a scan in a forest 30.2 to 37.5, as good as 256 rays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.shading.burley import grey
+from tron.shading.direct.neighbours import neighbourhood_mean
+
+if TYPE_CHECKING:
+    from tron.tracing import GBuffer
+
+PASSES = ((1, 3.0), (1, 2.0), (2, 1.0))
+"""Step in pixels and, over the noise, the difference at which weights have fallen, of each pass."""
+_LEAST = 1e-4
+"""Least such difference; shares are up to 1."""
+
+
+@dataclass
+class NoiseSums:
+    """Sums of luminance over rays, its squares, and those times the share that arrives, by pixel."""
+
+    light: mi.Float
+    squares: mi.Float
+    arriving: mi.Float
+    arriving_squares: mi.Float
+
+    @classmethod
+    def none(cls, lanes: int) -> NoiseSums:
+        """No rays yet."""
+        sums = cls(*(dr.zeros(mi.Float, lanes) for _ in range(4)))
+        dr.make_opaque(sums.light, sums.squares, sums.arriving, sums.arriving_squares)
+        return sums
+
+    def add(
+        self,
+        directions: Sequence[mi.Vector3f],  # noqa: ARG002 (an observer is told)
+        light: Sequence[mi.Color3f],
+        visible: Sequence[mi.Float],
+    ) -> None:
+        """Add rays: the linear light along them, and the share that arrives."""
+        for value, share in zip(light, visible, strict=True):
+            one = grey(value)
+            square = one * one
+            self.light += one
+            self.squares += square
+            self.arriving += square * share
+            self.arriving_squares += square * share * share
+        dr.eval(self.light, self.squares, self.arriving, self.arriving_squares)
+
+    def variance(self, share: mi.Float) -> mi.Float:
+        """Variance of the share of light that arrives, which is ``share``; 0 without light."""
+        total = self.arriving_squares - 2 * share * self.arriving + share * share * self.squares
+        light = dr.select(self.light > 0, self.light, 1)
+        return dr.maximum(total, 0) / (light * light)
+
+
+def without_noise(
+    shadowed: mi.Color3f, unshadowed: mi.Color3f, noise: NoiseSums, gbuffer: GBuffer, spacing: float
+) -> tuple[mi.Color3f, mi.Color3f]:
+    """Filter both estimates of irradiance / pi with common weights; where nothing is noisy they stay.
+
+    Args:
+        shadowed, unshadowed: linear, from the same rays.
+        noise: of these rays.
+        gbuffer: positions, unit normals and opacity of the same pixels.
+        spacing: the scene's surfel spacing, world units.
+    """
+
+    def share_of(values: list[mi.Float]) -> mi.Float:
+        light = grey(mi.Color3f(*values[3:]))
+        return dr.select(light > 0, grey(mi.Color3f(*values[:3])) / dr.select(light > 0, light, 1), 1)
+
+    values = [*shadowed, *unshadowed]
+    share = share_of(values)
+    variance = noise.variance(share)
+    dr.eval(share, variance)
+    (variance,), _ = neighbourhood_mean([variance], gbuffer, spacing)
+    deviation = dr.sqrt(variance)
+    dr.eval(deviation)
+    for step, times in PASSES:
+        stop = dr.rcp(dr.maximum(times * deviation, _LEAST))
+        dr.eval(stop)
+        means, found = neighbourhood_mean(values, gbuffer, spacing, step=step, guide=share, stop=stop)
+        values = [dr.select(found, mean, value) for mean, value in zip(means, values, strict=True)]
+        share = share_of(values)
+        dr.eval(values, share)
+    return mi.Color3f(*values[:3]), mi.Color3f(*values[3:])
