@@ -144,9 +144,11 @@ def reconstruct(
     fields = [name for name in FIELDS if name != "normal" or settings.radiance.normal > 0]
     taught = prior.teach(capture, fields, track)
     given = taught is not capture and any(view.has("normal") for view in taught.train_views)
-    most = settings.radiance.density.most
-    first = run.begin(lambda: beginning(taught, settings.initial, settings.seed, most, track))
-    radiance = settings.radiance.scaled(settings.steps_scaler, place_of(run.begun["source"]))
+    pixels = int(np.median([view.camera.width * view.camera.height for view in taught.train_views]))
+    density = settings.radiance.density.seen_in(pixels)
+    first = run.begin(lambda: beginning(taught, settings.initial, settings.seed, density.most, track))
+    radiance = settings.radiance.model_copy(update={"density": density})
+    radiance = radiance.scaled(settings.steps_scaler, place_of(run.begun["source"]))
     given &= settings.radiance.normal > 0
     plan = radiance_plan(radiance, extent, settings.seed, normals_given=given, tone_curve=capture.tone_curve)
     surfels = run.stage(plan, taught.train_views, first)

@@ -131,6 +131,18 @@ class DensitySettings(Settings):
         ge=4,
         description="Maximum number of surfels; those with the largest gradient come first.",
     )
+    per_pixel: float | None = Field(
+        default=None,
+        gt=0,
+        description="Maximum number of surfels over the pixels of a photo, where that is fewer: small photos "
+        "are learnt by heart by more; null: no such limit.",
+    )
+
+    def seen_in(self, pixels: int) -> DensitySettings:
+        """The same for photos of so many pixels."""
+        if self.per_pixel is None:
+            return self
+        return self.model_copy(update={"most": max(min(self.most, round(self.per_pixel * pixels)), 4)})
 
 
 class ConsistencySettings(FusionSettings):

@@ -191,6 +191,14 @@ def whole(painted_capture: Capture) -> Reconstruction:
     return found
 
 
+def test_small_photos_have_room_for_fewer_surfels(painted_capture, one_thread, whole: Reconstruction) -> None:
+    camera, base = painted_capture.train_views[0].camera, settings()
+    density = DENSITY.model_copy(update={"per_pixel": 310 / (camera.width * camera.height)})
+    radiance = base.radiance.model_copy(update={"density": density})
+    found = reconstruct(painted_capture, GroundTruth(), base.model_copy(update={"radiance": radiance}))
+    assert 290 < len(found.scene) <= 310 < len(whole.scene)
+
+
 def test_surfels_that_close_a_room_outlive_an_interruption(
     painted_capture, one_thread, tmp_path: Path, whole: Reconstruction
 ) -> None:
