@@ -51,7 +51,7 @@ WAYS = {
     "lit_64_rays": FINAL,
     "lit_16_rays": FINAL.model_copy(update={"rays": 16}),
     "lit_supersampled": FINAL.model_copy(update={"supersample": 2}),
-    "lit_with_reflections": FINEST,
+    "lit_with_reflections": FINEST.model_copy(update={"filtered": False}),
 }
 """Frames of ours that are judged; the first is tron-relight's default, which the target holds."""
 BEST = "lit_with_reflections"

@@ -3,6 +3,9 @@
 A phone takes the light that falls on what it sees for grey, and shows what comes back as middle grey in the
 mean: dark things come out brighter than they are, white ones darker. Gains on channels of photos are gains on
 the light, so the light is what changes: base color stays what it is in the camera's colours.
+
+Only light that comes straight from its source is held grey here, while the joint fit also counts what bounces
+(``tron.reconstruction.materials.joint_fit.light_balance``): in a red room they differ.
 """
 
 from __future__ import annotations
@@ -46,11 +49,13 @@ def balanced(
     for camera, seed, frame, truth in zip(cameras, seeds, frames, gbuffers(geometry, cameras), strict=True):
         direct = direct_irradiance(geometry, scene, camera, SPP, seed)
         arrived.append(direct.shadowed[truth.valid])
-        returned.append(frame[frame[..., 3] >= 1][..., :3])
+        returned.append(frame[(frame[..., 3] >= 1) & np.isfinite(frame).all(-1)][..., :3])
     seen = [np.concatenate(values) for values in (arrived, returned)]
     light, shown = (values.mean(axis=0) if len(values) else np.zeros(3) for values in seen)
     gains = luminance(light) / np.maximum(light, 1e-12)
     returns = float(luminance(shown * gains))
-    if not (light > 0).all() or not 0 < returns < np.inf:
+    if not (light > 0).all():
+        raise TronError("white cannot be balanced: a colour channel has no light", spec.name)
+    if not 0 < returns < np.inf:
         raise TronError("nothing can be metered: no light comes back from what the camera sees", spec.name)
     return replace(environment, image=environment.image * gains.astype(np.float32)), MIDDLE_GREY / returns

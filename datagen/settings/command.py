@@ -56,7 +56,8 @@ CAPTURED: dict[str, Any] = {
 """Keys that decide what is in a capture."""
 
 METER = "balanced"
-"""Camera of pseudo-captures (``datagen.photographs.meter``); that of recipes without the key was not."""
+"""What the camera of pseudo-captures does (``datagen.photographs.meter``); recipes without the key are of a
+camera that neither balanced white nor metered."""
 
 OF_CAPTURES = {"source", "captures", "captured"}
 """Keys of source=captured alone; the other source ignores ``captured``."""

@@ -134,8 +134,7 @@ class DensitySettings(Settings):
     per_pixel: float | None = Field(
         default=None,
         gt=0,
-        description="Maximum number of surfels over the pixels of a photo, where that is fewer: small photos "
-        "are learnt by heart by more; null: no such limit.",
+        description="Maximum number of surfels over the pixels of a photo, where that is fewer; null: none.",
     )
 
     def seen_in(self, pixels: int) -> DensitySettings:

@@ -93,7 +93,7 @@ class Settings(BaseModel):
     quality: Literal["preview", "final"] = Field(
         "preview",
         description="preview: 2 shadow rays per pixel; final: 64, over 2 x 2 sub-pixels, and 4 "
-        "rays that look for reflections of the scene in itself; both denoised",
+        "rays that look for reflections of the scene in itself; both filtered",
     )
     bounces: int = Field(
         FINAL.bounces,
@@ -121,9 +121,7 @@ class Settings(BaseModel):
         FINAL.two_sided,
         description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
     )
-    denoise: bool | None = Field(
-        None, description="edge-avoiding filter of the shadows, by their noise; null: by quality, which is on"
-    )
+    denoise: bool = Field(True, description="filter of the shadows' noise; false: as they are traced")
     frames: int = Field(60, ge=1, le=10_000, description="number of frames (those of `cameras` win)")
     width: Side | None = Field(
         None,

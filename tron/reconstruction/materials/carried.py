@@ -150,7 +150,8 @@ def _explained(
 
 def described(fit: JointFit, up: np.ndarray) -> str:
     """The light that was found, in words; ``up`` (3,) unit, world."""
-    red, green, blue = fit.balance / fit.balance.mean()
+    found = fit.environment.unoccluded(up) * fit.balance
+    red, green, blue = found / found.mean()
     warm = "neutral" if abs(np.log(red / blue)) < 0.1 else "warm" if red > blue else "cool"
     tint = f"{warm} before it was balanced (R, G, B {red:.2f}, {green:.2f}, {blue:.2f})"
     if fit.sun is None:

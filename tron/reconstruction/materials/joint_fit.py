@@ -20,7 +20,7 @@ from tron.gaussians import GaussianScene
 from tron.reconstruction.light.fit_pairs import Light, LightSettings, Points, TooFewSeen, fit_light
 from tron.reconstruction.light.sky_visibility import PhotographedSky, photographed_sky, sky_transport
 from tron.reconstruction.light.sun import Sun, SunSearch
-from tron.reconstruction.light.surfel_colors import FLOOR, SurfelColors, mean_colors, observe
+from tron.reconstruction.light.surfel_colors import SurfelColors, mean_colors, observe
 from tron.reconstruction.materials.brdf_search import Materials, Received, materials_of
 from tron.reconstruction.progress import Track, untracked
 from tron.reconstruction.settings import Settings
@@ -48,6 +48,7 @@ _METAL = 0.5  # metallic from here on: no diffuse part to speak of
 _MIRRORS = 0.05  # share of the surfels from which it is said that they change with the view
 _RAYS = 64  # shadow rays of a surfel
 _BACK = 0.5  # light of a back face as a share of what photos show of its front
+_LEAST_DIRECT = 1e-4  # of the metered light, by channel: from less nothing can be scaled
 _FILLED, _USUAL_ALBEDO, _WHITEST = 0.3, 0.25, 0.8
 """Share of a photo that its subject fills, albedo of what is around it, highest mean albedo of a subject."""
 
@@ -198,12 +199,13 @@ def light_balance(received: Received, colors: SurfelColors) -> np.ndarray:
     """
     direct, bounced = (each[colors.seen].mean(0) for each in (received.direct, received.bounced))
     wanted = metered_light(float(luminance(colors.color[colors.seen].mean(0))))
-    if (direct < FLOOR).any():
+    lit = direct > _LEAST_DIRECT * wanted
+    if not lit.all():
         log.warning("no light reaches what photos show but by bounces: its brightness is as it was found")
-        return np.ones(3, np.float32)
     if (bounced > _WHITEST * wanted).any():
         log.warning("nearly all light that photos show has bounced: the brightness of its source is a guess")
-    return (direct / np.maximum(wanted - bounced, (1 - _WHITEST) * wanted)).astype(np.float32)
+    factor = direct / np.maximum(wanted - bounced, (1 - _WHITEST) * wanted)
+    return np.where(lit, factor, 1).astype(np.float32)
 
 
 def metered_light(shown: float) -> float:

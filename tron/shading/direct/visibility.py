@@ -52,7 +52,7 @@ def _visibility(
 ) -> mi.Color3f:
     occluder, lanes = tracer.sided(estimation.two_sided), dr.width(gbuffer.opacity)
     narrow = noise = None
-    if estimation.filtered and of_many(estimation):
+    if estimation.filtered and estimation.rays >= RATIO_FROM_RAYS:
         noise = NoiseSums.none(lanes)
     elif estimation.filtered:
         narrow = NarrowSums.none(lighting.light, lanes)
@@ -96,13 +96,13 @@ def reaching_share(
     ``narrow`` and ``noise`` of the same rays, for the filters of few and of many rays; None: no light is
     narrow, nothing is noisy.
     """
-    if of_many(estimation):
-        if noise is not None:
-            shadowed, unshadowed = without_noise(shadowed, unshadowed, noise, gbuffer, spacing)
+    plain, many = estimation.estimator == "plain", estimation.rays >= RATIO_FROM_RAYS
+    if noise is not None:
+        shadowed, unshadowed = without_noise(shadowed, unshadowed, noise, estimation.rays, gbuffer, spacing)
+    if many and not plain:
         return visible_share(shadowed, unshadowed)
-    plain = estimation.estimator == "plain"
     known = lighting.split_sum.diffuse(shading_normal(gbuffer))
-    if estimation.filtered or not plain:
+    if not many and (estimation.filtered or not plain):
         share = regressed_share(shadowed, unshadowed, known, gbuffer, spacing)
         if not estimation.filtered:
             return share
@@ -112,11 +112,6 @@ def reaching_share(
             detail = narrow.detail(all_rays, gbuffer, spacing)
         shadowed, unshadowed = atrous(shadowed, unshadowed, grey(share), gbuffer, spacing, detail)
     return visible_share(shadowed, known if plain else unshadowed)
-
-
-def of_many(estimation: Estimation) -> bool:
-    """Whether the rays of a pixel are many enough for their ratio."""
-    return estimation.estimator == "ratio" and estimation.rays >= RATIO_FROM_RAYS
 
 
 def shading_normal(surface: Surface) -> mi.Vector3f:

@@ -53,9 +53,7 @@ class Box:
         found = Light(np.float32(factor) * texels, np.zeros(3, np.float32), 0.0), None
         patch.setattr(LightFinder, "find", lambda *_: found)
         count = len(self.scene)
-        blank = replace(
-            self.scene, base_color=np.full((count, 3), 0.5), roughness=np.full(count, 0.5)
-        )  # fmt: skip
+        blank = replace(self.scene, base_color=np.full((count, 3), 0.5), roughness=np.full(count, 0.5))
         return fit_jointly(self.capture, blank, Joint(light=LightSettings(points=200)), 0)
 
 
@@ -153,14 +151,14 @@ def fits(box: Box) -> dict[float, JointFit]:
 def test_light_paint_and_gloss_are_found_whatever_the_light_was_thought_to_be(
     box: Box, fits: dict[float, JointFit], factor: float
 ) -> None:
-    """With base color and light scaled by one factor, as before: |log| 0.25 on the ball, gloss 0.51."""
+    """Base color and light scaled by one factor (64 x 64 pixels): |log| 0.25 on the ball, gloss 0.51."""
     fit = fits[factor]
     light = fit.environment.image.mean((0, 1)) / box.light.image.mean((0, 1))
     np.testing.assert_allclose(light, 1, atol=0.18)
     seen = fit.colors.count >= 3
     off = np.abs(np.log(np.maximum(fit.scene.base_color, 1e-3) / box.scene.base_color)).mean(1)
-    assert np.median(off[seen & box.ball]) < 0.15
-    assert np.median(off[seen & ~box.ball]) < 0.15
+    assert np.median(off[seen & box.ball]) < 0.14
+    assert np.median(off[seen & ~box.ball]) < 0.13
     assert 0.2 < fit.scene.roughness[seen & box.ball].mean() < 0.4
 
 
