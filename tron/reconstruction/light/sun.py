@@ -30,6 +30,7 @@ _SAMPLES = 16
 _NEIGHBOURS = 12
 _RINGS = np.radians([9.0, 4.0, 1.6, 0.6])
 _STRENGTHS = np.array([0.3, 1.0, 3.0, 10.0, 30.0])
+_FINER = np.array([0.4, 0.6, 1.0, 1.6, 2.5])
 """Sun over the mean rest of the light, on a surface that faces it."""
 _BRIGHTEST = 2.0
 """Radiance of the rest of the light, at most, over its median."""
@@ -124,11 +125,18 @@ class SunSearch:
         few = self.points.taken(slice(None, None, stride))
         return SunSearch(self.tracer, few, self.soft, *self.settings)
 
-    def width(self, direction: np.ndarray, strength: float) -> float:
-        """The width, of ``WIDTHS``, whose shadows fit best."""
-        mean = strength * self.rest.mean()
-        losses = [self._loss(np.log(self.rest + mean * self.received(direction, w))) for w in WIDTHS]
-        return float(WIDTHS[int(np.argmin(losses))])
+    def width(self, direction: np.ndarray, strength: float) -> tuple[float, float]:
+        """The width, of ``WIDTHS``, and the strength near another, whose shadows fit best together.
+
+        A sun that is too strong would be taken for one that is too wide.
+        """
+        shares = [self.received(direction, width) * self.rest.mean() for width in WIDTHS]
+        tried = [
+            (self._loss(np.log(self.rest + finer * share)), float(width), float(finer))
+            for width, share in zip(WIDTHS, shares, strict=True)
+            for finer in strength * _FINER
+        ]
+        return min(tried)[1:]
 
     def received(self, direction: np.ndarray, width: float) -> np.ndarray:
         """(P,) share of a sun's irradiance that arrives at the patches, cosine included."""

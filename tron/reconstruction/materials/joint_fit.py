@@ -279,7 +279,7 @@ class LightFinder:
             return soft, None
         search = SunSearch(self.tracer, surfels, soft, radius, settings.robust, settings.alike, seed)
         direction, strength = search.find()
-        width = search.width(direction, strength)
+        width, strength = search.width(direction, strength)
         lit = replace(points, lobe=search.received(direction, width))
         begin = replace(soft, sun=np.full(3, strength * search.rest.mean(), np.float32))
         sunny = fit_light(lit, settings, seed, self.sky, begin)

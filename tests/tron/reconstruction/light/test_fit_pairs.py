@@ -179,7 +179,7 @@ def test_shadows_tell_where_the_sun_is(scene, transport) -> None:
     search = SunSearch(transport.tracer, points, soft, 0.0, QUICK.robust, QUICK.alike, 0)
     direction, strength = search.find()
     assert np.degrees(np.arccos(direction @ towards)) < 3
-    width = search.width(direction, strength)
+    width, strength = search.width(direction, strength)
     # A square of 8.6 degrees a side has a deviation of 2.5 degrees along each axis.
     assert width == WIDTHS[1]
     received = search.received(direction, width)
