@@ -54,8 +54,8 @@ def balanced(
     light, shown = (values.mean(axis=0) if len(values) else np.zeros(3) for values in seen)
     gains = luminance(light) / np.maximum(light, 1e-12)
     returns = float(luminance(shown * gains))
-    if not (light > 0).all():
-        raise TronError("white cannot be balanced: a colour channel has no light", spec.name)
     if not 0 < returns < np.inf:
         raise TronError("nothing can be metered: no light comes back from what the camera sees", spec.name)
+    if not (light > 0).all():
+        raise TronError("white cannot be balanced: a colour channel has no light", spec.name)
     return replace(environment, image=environment.image * gains.astype(np.float32)), MIDDLE_GREY / returns
