@@ -20,7 +20,7 @@ def require_bounces(bounces: int, reflections: int) -> None:
 
 
 class Estimation(BaseModel):
-    """Choices in estimating light (conventions.md, 10); by default those of final frames.
+    """Choices in estimating light (conventions.md, 10); by default 64 rays a pixel, unfiltered.
 
     The paper's are ``Estimation(estimator="plain", two_sided=False, bounces=0, diffuse="lambert")``. What
     each costs, on 10,000 to 20,000 surfels of scenes that no benchmark uses:

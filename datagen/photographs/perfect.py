@@ -46,6 +46,7 @@ from tron.seeds import generator, integer
 from tron.shading.environments.environment import EnvironmentMap
 
 STREAM = "capture"
+"""Name of the random streams of this camera."""
 GROUP_PIXELS = 2**20
 """Pixels of the views that are rendered together: bounds memory."""
 

@@ -113,9 +113,7 @@ def test_sharing_rays_makes_a_better_picture_than_either_estimate(
     assert ours.mean() == pytest.approx(truth.mean(), rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("light", "rays", "most"), [("sun", 2, 0.5), ("sun", 16, 1.0), ("soft", 16, 0.25), ("soft", 64, 0.4)]
-)
+@pytest.mark.parametrize(("light", "rays", "most"), [("sun", 2, 0.5), ("soft", 64, 0.4)])
 def test_the_filter_takes_noise_away_and_leaves_open_light_and_background_alone(
     variant: str, sphere_over_plane, camera, sun_map, light: str, rays: int, most: float
 ) -> None:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 PASSES = (3.0, 2.0)
 """Difference, in deviations, at which a neighbour's weight has fallen by e, of each pass over the image."""
 _RAYS = 16
+"""Rays a pixel that PASSES were chosen at."""
 _LEAST = 1e-4
 """Least such difference; shares are up to 1."""
 

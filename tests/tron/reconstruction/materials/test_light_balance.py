@@ -22,6 +22,7 @@ from tron.reconstruction.light.fit_pairs import Light, LightSettings
 from tron.reconstruction.light.sky_visibility import cube_texels
 from tron.reconstruction.light.surfel_colors import SurfelColors, observe
 from tron.reconstruction.materials.brdf_search import Received
+from tron.reconstruction.materials.carried import described
 from tron.reconstruction.materials.joint_fit import JointFit, LightFinder, fit_jointly, light_balance
 from tron.runtime import lanes
 from tron.seeds import generator
@@ -168,6 +169,16 @@ def test_the_brightness_that_the_fit_found_decides_nothing(fits: dict[float, Joi
     np.testing.assert_allclose(bright.environment.image, dim.environment.image, rtol=2e-3, atol=1e-4)
     for name in ("base_color", "roughness", "metallic"):
         np.testing.assert_allclose(getattr(bright.scene, name), getattr(dim.scene, name), atol=0.02)
+
+
+def test_the_tint_that_is_told_is_that_of_the_light_that_was_found(
+    box: Box, fits: dict[float, JointFit]
+) -> None:
+    """Not that of what bounced, which the balance takes into account."""
+    up = np.array([0.0, 0.0, 1.0])
+    light = box.light.unoccluded(up)
+    numbers = ", ".join(f"{x:.2f}" for x in light / light.mean())
+    assert {described(fit, up).split("R, G, B ")[1] for fit in fits.values()} == {f"{numbers})"}
 
 
 def test_what_nearly_all_bounced_leaves_the_light_a_fifth(caplog: pytest.LogCaptureFixture) -> None:
