@@ -21,7 +21,7 @@ from datagen.settings.captures import CapturedSettings, CaptureSettings, PseudoC
 from datagen.settings.split import SplitSettings, SurfelReconstruction, SurfelSources
 from datagen.world.lights import Family, LightChoice
 from tron.errors import TronError
-from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounces
+from tron.estimation import FINAL, FINEST, PREVIEW, Diffuse, Estimation, Estimator, require_bounces
 from tron.run_folder import leaves
 
 Mode = Literal["make", "plan", "validate", "merge", "captures", "pseudo_captures", "equal_error"]
@@ -41,6 +41,9 @@ OUTSIDE = {
 
 ESTIMATED = ("estimator", "two_sided", "diffuse", "bounces", "reflections", "supersample")
 """Keys that decide how light on the surfels is estimated, named as in Estimation."""
+
+OF_FRAMES = ("rays", "filtered", "reflections", "supersample")
+"""Those of an Estimation that a quality of tron-relight chooses."""
 
 OF_A_SCENE = {"style", "things", "materials", "frames"}
 """Keys of a split that decide what stands in a scene and along which path it is filmed."""
@@ -386,10 +389,14 @@ class Settings(ScaleSettings):
         """The settings of one split; of captures, how large and long its clips are."""
         return OF_SOURCE[self.source].split(self, name)
 
-    def estimation(self, split: str) -> Estimation:
-        """Estimation of the light on the surfels."""
+    def estimation(self, split: str, scene: int = 0, light: int = 0) -> Estimation:
+        """Estimation of the light on the surfels, of the clip of a scene under light number ``light``."""
         chosen = {name: getattr(self, name) for name in ESTIMATED}
-        return Estimation(rays=self.split(split).guidance_spp, **chosen)
+        rays = self.split(split).rays_of(scene, light)
+        if isinstance(rays, int):
+            return Estimation(rays=rays, **chosen)
+        quality = PREVIEW if rays == "preview" else FINEST
+        return Estimation.model_validate(chosen | {name: getattr(quality, name) for name in OF_FRAMES})
 
     def used_splits(self) -> list[Split]:
         """The splits that have scenes; of captures, those that may have some."""

@@ -14,11 +14,12 @@ from datagen.dataset.records import RECORD_NAME, Record, Refinement, Work, clear
 from datagen.dataset.spool import Frame, Spool, ViewSpool, stored_guidance, view_bytes, write_clips
 from datagen.dataset.variety import Histograms, frame_histograms, surface_members, total
 from datagen.files.sources import Sources
-from datagen.settings.command import SPLITS, Settings
+from datagen.settings.command import OF_FRAMES, SPLITS, Settings
 from datagen.settings.split import Source as SurfelSource
 from datagen.settings.split import SplitSettings
 from datagen.sources.reconstructed import reconstruct_surfels, refine_surfels
 from datagen.sources.source import CHECKPOINT_BYTES, SceneCost, Source, spooled_bytes
+from datagen.sources.windows import MARGIN, draw_windows
 from datagen.truth.build import FIRST_ID, Geometry, draw_and_build
 from datagen.truth.pathtrace import (
     LANES,
@@ -143,7 +144,7 @@ class SyntheticSource(Source):
         path = PATH * (SHARED_PATH if len(recipe.lights) >= 4 else 1)
         reference = FINER + REFERENCE_RAY * recipe.reference_spp if recipe.reference_buffers else 0
         whole = self.kept_bytes(settings, [item])
-        frame = pixels * (path * recipe.path_spp + RAY * recipe.guidance_spp + reference)
+        frame = pixels * (path * recipe.path_spp + RAY * _rays(settings, item) + reference)
         photographed = rebuilt * views * settings.surfel_reconstruction.path_spp * PATH
         step = STEP + STEP_PIXEL * settings.view_width * settings.view_height + STEP_SURFEL * settings.surfels
         surfels = VIEW * views + step * steps + photographed
@@ -168,6 +169,17 @@ class SyntheticSource(Source):
             rebuilt = pictures + settings.surfels * CHECKPOINT_BYTES
         made = refined if settings.refine_steps and shares.gbuffers else 0
         return max(made, rebuilt + max(judges if rebuilt else 0, spooled))
+
+
+def _rays(settings: Settings, item: Work) -> float:
+    """Shadow rays a pixel of guidance, margins of windows included, mean of a scene's clips."""
+    recipe = settings.split(item.split)
+    of_clips = [
+        settings.estimation(item.split, item.index, light).rays for light in range(len(recipe.lights))
+    ]
+    rays = sum(of_clips) / max(len(of_clips), 1)
+    margin = 2 * MARGIN if any(width > recipe.width for width in recipe.window_of) else 0
+    return rays * (1 + margin / recipe.width) * (1 + margin / recipe.height)
 
 
 @stage("surfels")
@@ -312,7 +324,8 @@ def _film(
 ) -> list[ClipMeta]:
     """Render the clips of lights that are filmed from the same places, frame by frame."""
     recipe = settings.split(spec.split)
-    cameras = spec.clip(group[0], recipe.frames, recipe.width, recipe.height)
+    windows = draw_windows(spec, geometry, recipe, group[0])
+    cameras = [window.camera for window in windows]
     still = spec.motion is None and not any(spec.turns_deg)
     maps = {
         number: spec.lights[number].bake(settings.environment_height, settings.environments)
@@ -321,7 +334,7 @@ def _film(
     now = _moment(spec, geometry, relighter, maps, settings, 0.0)
     first = now.lights
     poses, shown = [], []
-    for i, camera in enumerate(cameras):
+    for i, (window, camera) in enumerate(zip(windows, cameras)):
         time = i / max(len(cameras) - 1, 1)
         if i and not still:
             now = _moment(spec, geometry, relighter, maps, settings, time)
@@ -334,15 +347,16 @@ def _film(
             rgb = render_frames(now.scenes[0], [camera], spp, [seed], spec.path_bounces)
         else:
             rgb = render_lights(now.scenes[0], now.stacked, camera, spp, seed)
-        views = views_under([light.lit for light in now.lights], camera)
-        surfaces = now.relighter.surface_maps(camera)
+        wide = window.with_margin().camera
+        views = views_under([light.lit for light in now.lights], wide)
+        surfaces = now.relighter.surface_maps(camera, *(light.lit.estimation for light in now.lights))
         finer = [light.lit.framed(supersample=2) for light in now.lights if recipe.reference_buffers]
         fine = views_under(finer, camera) if finer else []
         for k, light in enumerate(now.lights):
             if spec.metered and i == 0:
                 first[k].exposure = metered(rgb[k], truth.valid, light.exposure)
-            guidance = light.lit.render(camera, light.seeds["guidance"][i], view=views[k])
-            frame = stored_guidance(guidance) | surfaces
+            guidance = light.lit.render(wide, light.seeds["guidance"][i], view=views[k])
+            frame = window.cut(stored_guidance(guidance)) | surfaces[k]
             frame |= {"rgb": rgb[k], "foreground": truth.valid.astype(np.float32)}
             if recipe.reference_buffers:
                 seed = light.seeds["reference"][i]
@@ -374,6 +388,8 @@ def _prepare(
     if shared:  # lights that are traced together have texels at the same places
         environment = environment.baked().resized(settings.environment_height)
     lit = relighter.under(environment, integer(spec.seed, spec.split, spec.index, "light", number, "bounce"))
+    frames = settings.estimation(spec.split, spec.index, number)
+    lit = lit.framed(**{name: getattr(frames, name) for name in OF_FRAMES})
     own = ("light", number, "frame")
     where = {"path": ("frame",) if shared else own, "guidance": own, "reference": own}
     seeds = {what: _seeds(spec, recipe.frames, what, *path) for what, path in where.items()}
@@ -388,8 +404,12 @@ def _meta(
     surfels_from: SurfelSource,
     motion: str,
 ) -> ClipMeta:
+    surfels = len(lit.lit.relighter.scene)
     light = spec.lights[lit.number]
-    spp = {"path": recipe.path_spp, "guidance": recipe.guidance_spp}
+    estimation = lit.lit.estimation
+    spp = {"path": recipe.path_spp, "guidance": estimation.rays}
+    if estimation.reflections:
+        spp["reflections"] = estimation.reflections
     if recipe.reference_buffers:
         spp["reference"] = recipe.reference_spp
     return ClipMeta(
@@ -413,6 +433,9 @@ def _meta(
             "contrast_share": contrast_share(lit.environment),
             "turn_deg": spec.turns_deg[lit.number] if spec.turns_deg else 0.0,
             "moving_object": spec.motion is not None,
+            "filtered": estimation.filtered,
+            "sub_pixels": estimation.supersample,
+            "surfels": surfels,
             MOTION: motion,
             "light_spec": light.model_dump_json(),  # text: families differ in their keys, and tables cannot
         },
