@@ -88,3 +88,8 @@ PREVIEW = Estimation(rays=2, filtered=True)
 """``quality=preview`` of tron-relight, its default."""
 FINEST = Estimation(filtered=True, reflections=4, supersample=2)
 """``quality=final`` of tron-relight."""
+
+OCTAVES = (-8.0, 4.0)
+"""Logarithms to base 2 of a pixel's footprint over the spacing of surfels that ``sampling`` tells apart."""
+MOST_RAYS = 10.0
+"""Logarithm to base 2 of the shadow rays a pixel that ``sampling`` has as 1."""

@@ -32,7 +32,7 @@ import numpy as np
 
 from tron.cameras import Camera
 from tron.color import Look, to_display
-from tron.estimation import FINAL, Diffuse, Estimation
+from tron.estimation import FINAL, MOST_RAYS, OCTAVES, Diffuse, Estimation
 from tron.io.images import write_image
 from tron.metering import incident_exposure
 from tron.shading.bounces.bounce import BouncedLight
@@ -331,12 +331,6 @@ SUB_PIXELS = 2
 """Sub-pixels along a pixel's side."""
 
 
-OCTAVES = (-8.0, 4.0)
-"""Logarithms to base 2 of a pixel's footprint over the spacing of surfels that ``sampling`` tells apart."""
-MOST_RAYS = 10.0
-"""Logarithm to base 2 of the shadow rays a pixel that ``sampling`` has as 1."""
-
-
 def surface_maps(
     tracer: ViewTracer, camera: Camera, estimations: Sequence[Estimation]
 ) -> list[dict[str, np.ndarray]]:
@@ -347,8 +341,8 @@ def surface_maps(
         albedo      linear base color
         surface     |n . v| of the unit normal and the unit direction to the camera, roughness, metallic
         sampling    a third if filtered and two if of sub-pixels; log2 of the shadow rays a pixel over
-                    :data:`MOST_RAYS`; log2 of the pixel's footprint, distance / fx, over the scene's surfel
-                    spacing, :data:`OCTAVES` as 0 to 1
+                    MOST_RAYS of tron.estimation; log2 of the pixel's footprint, distance / fx, over the
+                    scene's surfel spacing, OCTAVES of tron.estimation as 0 to 1
 
     With ``sampling`` a network knows what the light's noise and the surfels' blur are like.
     """

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tron.estimation import FINAL, FINEST
-from tron.shading.guidance import MOST_RAYS, OCTAVES, surface_maps
+from tron.estimation import FINAL, FINEST, MOST_RAYS, OCTAVES
+from tron.shading.guidance import surface_maps
 from tron.shards.schema import surface_members
 
 
