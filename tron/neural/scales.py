@@ -12,10 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
-from tron.estimation import MOST_RAYS, OCTAVES
-
-OF_HALF = (0.0, 2 * 2 / MOST_RAYS, 2 * 1 / (OCTAVES[1] - OCTAVES[0]))
-"""What half the size adds to ``sampling``, as networks see it: four times the rays, an octave wider."""
+from tron.estimation import of_wider_pixels
 
 
 def halved(buffers: Mapping[str, Tensor]) -> list[Tensor]:
@@ -45,5 +42,5 @@ def _mean(video: Tensor) -> Tensor:
 
 def _told(sampling: Tensor) -> Tensor:
     mean = _mean(sampling)
-    change = torch.tensor(OF_HALF, dtype=mean.dtype, device=mean.device)[:, None, None, None]
-    return torch.where(mean > -1, (mean + change).clamp(max=1), mean)
+    more = 2 * torch.tensor(of_wider_pixels(2), dtype=mean.dtype, device=mean.device)  # [-1, 1] is 2 wide
+    return torch.where(mean > -1, (mean + more[:, None, None, None]).clamp(max=1), mean)
