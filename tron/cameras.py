@@ -186,6 +186,10 @@ class Camera:
             height=height,
         )
 
+    def window(self, x: int, y: int, width: int, height: int) -> Camera:
+        """Part of the view, its upper left pixel at (x, y) of this one's: the principal point moves."""
+        return replace(self, cx=self.cx - x, cy=self.cy - y, width=width, height=height)
+
     def rays(self) -> np.ndarray:
         """Unit world directions (height, width, 3) float32 through the pixel centres, from ``position``."""
         return self.exact_rays().astype(np.float32)
