@@ -90,6 +90,7 @@ def card_text(
         schema=SCHEMA_VERSION,
         splits=[_split_row(split, by_split[split], settings) for split in clips],
         command=command_line(settings, "DIR", machine=False),
+        made_of=_made_of(settings),
         refined=_refined(made),
         rebuilt=_rebuilt([each.reconstruction for each in made if each.reconstruction is not None]),
         packages={name: packages[name] for name in PACKAGES if name in packages},
@@ -115,6 +116,17 @@ def _split_row(split: str, found: Sequence[ClipRow], settings: Settings) -> list
         ", ".join(f"{count} {family}" for family, count in sorted(families.items())),
         kinds if len(styles) > 1 else next(iter(styles)),
     ]
+
+
+def _made_of(settings: Settings) -> str:
+    """About how many surfels scenes have and from how many views, over all splits that have some."""
+    budgets = [settings.surfel_budget(split) for split in settings.used_splits()]
+
+    def between(numbers: Sequence[int]) -> str:
+        return " to ".join(f"{number:,}" for number in sorted({min(numbers), max(numbers)}))
+
+    surfels, views = between([each.surfels for each in budgets]), between([each.views for each in budgets])
+    return f"about {surfels} surfels a scene, from {views} views"
 
 
 def _refined(made: Sequence[Record]) -> dict[str, Any] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     BaseModel,
@@ -19,6 +19,7 @@ from pydantic import (
 from datagen.settings import SettingsModel
 from datagen.settings.captures import CapturedSettings, CaptureSettings, PseudoCaptureSettings
 from datagen.settings.split import SplitSettings, SurfelReconstruction, SurfelSources
+from datagen.settings.surfels import AUTO, Auto, SurfelBudget, surfels_by_pixels
 from datagen.world.lights import Family, LightChoice
 from tron.errors import TronError
 from tron.estimation import FINAL, FINEST, PREVIEW, Diffuse, Estimation, Estimator, require_bounces
@@ -61,6 +62,10 @@ CAPTURED: dict[str, Any] = {
 METER = "balanced"
 """What the camera of pseudo-captures does (``datagen.photographs.meter``); recipes without the key are of a
 camera that neither balanced white nor metered."""
+
+FIT = "windows"
+"""How surfels are fitted to their views (``datagen.sources.refinement``); recipes without the key compared
+whole views by structural similarity too."""
 
 OF_CAPTURES = {"source", "captures", "captured"}
 """Keys of source=captured alone; the other source ignores ``captured``."""
@@ -198,15 +203,25 @@ class Settings(ScaleSettings):
         "low from every family but hdri.",
         examples=["[sun,overcast]"],
     )
-    views: int = Field(64, ge=1, description="Views whose G-buffers the surfels are made from.")
-    view_width: int = Field(256, ge=8, le=8192, description="Width of those views in pixels.")
-    view_height: int = Field(256, ge=8, le=8192, description="Height of those views in pixels.")
-    surfels: int = Field(60_000, ge=100, description="Approximate number of surfels of a scene.")
-    refine_steps: int = Field(
-        200,
-        ge=0,
-        le=100_000,
-        description="Optimisation steps that fit a scene's surfels to its G-buffers; 0 takes them as made.",
+    views: Annotated[int, Field(ge=1)] | Auto = Field(
+        AUTO, description="Views whose G-buffers the surfels are made from; auto: as surfels."
+    )
+    view_width: Annotated[int, Field(ge=8, le=8192)] | Auto = Field(
+        AUTO, description="Width of those views in pixels; auto: as surfels."
+    )
+    view_height: Annotated[int, Field(ge=8, le=8192)] | Auto = Field(
+        AUTO, description="Height of those views in pixels; auto: as surfels."
+    )
+    surfels: Annotated[int, Field(ge=100)] | Auto = Field(
+        AUTO,
+        description="Approximate number of surfels of a scene; auto: as suits the split's frames, with "
+        "their views and steps: 20,000 from 32 views of 192 x 192 in 100 steps for frames of 128 x 128; "
+        "100,000 from 384 x 384 in 400 for 512 x 512.",
+    )
+    refine_steps: Annotated[int, Field(ge=0, le=100_000)] | Auto = Field(
+        AUTO,
+        description="Optimisation steps that fit a scene's surfels to its G-buffers; 0 takes them as made; "
+        "auto: as surfels.",
     )
     surfels_from: SurfelSources = Field(
         SurfelSources(),
@@ -398,6 +413,13 @@ class Settings(ScaleSettings):
         quality = PREVIEW if rays == "preview" else FINEST
         return Estimation.model_validate(chosen | {name: getattr(quality, name) for name in OF_FRAMES})
 
+    def surfel_budget(self, split: str) -> SurfelBudget:
+        """Surfels of a split's scenes and their views in numbers: those given, else what suits its frames."""
+        frames = self.split(split)
+        given = {name: getattr(self, name) for name in SurfelBudget._fields}
+        chosen = {name: value for name, value in given.items() if value != AUTO}
+        return surfels_by_pixels(frames.width * frames.height)._replace(**chosen)
+
     def used_splits(self) -> list[Split]:
         """The splits that have scenes; of captures, those that may have some."""
         return OF_SOURCE[self.source].used_splits(self)
@@ -470,16 +492,19 @@ class KeysOfSynthetic:
         return [name for name in SPLITS if self.split(settings, name).scenes]
 
     def recipe(self, settings: Settings) -> dict[str, Any]:
-        """All keys but those of captures and of the run; of the splits that have scenes."""
-        values, used = (
-            settings.model_dump(mode="json", exclude=OUTSIDE | OF_CAPTURES),
-            self.used_splits(settings),
-        )
+        """All keys but those of captures and of the run; of the splits that have scenes.
+
+        Surfels and their views are numbers, split by split: another law of them is another recipe.
+        """
+        values = settings.model_dump(mode="json", exclude=OUTSIDE | OF_CAPTURES | {*SurfelBudget._fields})
+        used = self.used_splits(settings)
         for name in SPLITS:
             if name in used:
                 del values[name]["scenes"]
+                values[name] |= settings.surfel_budget(name)._asdict()
             else:
                 del values[name]
+        values["fit"] = FIT
         if "test" in values:
             values["test"]["lights"] = self.split(settings, "test").lights
         return values

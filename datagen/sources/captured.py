@@ -115,7 +115,7 @@ class CapturedSource(Source):
         """Frames of those."""
         return photo_clips(item, settings) * settings.captured.frames + item.relit
 
-    def surfels(self, settings: Settings) -> int:
+    def surfels(self, item: Work, settings: Settings) -> int:  # noqa: ARG002 as all sources
         """As many as the reconstruction may have."""
         return settings.captured.reconstruction.radiance.density.most
 
@@ -133,7 +133,7 @@ class CapturedSource(Source):
     def scratch_bytes(self, item: Work, settings: Settings) -> int:
         """Its checkpoint, and frames of all its photos, until its clips are written."""
         frame = settings.captured.width * settings.captured.height * spooled_bytes(settings, item.split)
-        return self.surfels(settings) * CHECKPOINT_BYTES + item.photos * frame
+        return self.surfels(item, settings) * CHECKPOINT_BYTES + item.photos * frame
 
 
 def photo_clips(item: Work, settings: Settings) -> int:

@@ -81,7 +81,7 @@ class Source(Protocol):
         """Frames of all its clips, about."""
         ...
 
-    def surfels(self, settings: Settings) -> int:
+    def surfels(self, item: Work, settings: Settings) -> int:
         """Surfels of a scene, at the most."""
         ...
 
@@ -106,7 +106,8 @@ class Source(Protocol):
             frame = recipe.width * recipe.height * pixel + 16_384
             stored = self.frames(item, settings) * frame if shards else 0
             previews = preview_bytes(recipe.width, recipe.height, recipe.frames, len(members))
-            total += stored + self.clips(item, settings) * previews + self.surfels(settings) * SURFEL_BYTES
+            surfels = self.surfels(item, settings) * SURFEL_BYTES
+            total += stored + self.clips(item, settings) * previews + surfels
         return total
 
 

@@ -17,7 +17,8 @@ from datagen.files.sources import Sources
 from datagen.settings.command import OF_FRAMES, SPLITS, Settings
 from datagen.settings.split import Source as SurfelSource
 from datagen.settings.split import SplitSettings
-from datagen.sources.reconstructed import reconstruct_surfels, refine_surfels
+from datagen.sources.reconstructed import reconstruct_surfels
+from datagen.sources.refinement import WINDOW, refine_surfels
 from datagen.sources.source import CHECKPOINT_BYTES, SceneCost, Source, spooled_bytes
 from datagen.sources.windows import MARGIN, draw_windows
 from datagen.truth.build import FIRST_ID, Geometry, draw_and_build
@@ -55,10 +56,11 @@ REFERENCE_REFLECTIONS = 16
 
 # Processor seconds of one core of a Xeon with kernels compiled, measured stage by stage on twelve scenes of
 # five recipes (2026-11-25; 96 x 96 to 192 x 192 pixels, 20,000 to 60,000 surfels): the sum was 0.67 to 1.46
-# of what eleven took and 0.47 of a room.
+# of what eleven took and 0.47 of a room. The fit was measured on 2026-11-26: 20,000 to 100,000 surfels.
 BUILD = 1.5  # meshes, textures, scenes of Mitsuba
 VIEW = 2.0e-6  # a pixel of the views that surfels are made from
-STEP, STEP_PIXEL, STEP_SURFEL = 0.006, 5e-7, 1e-6  # an optimisation step, its view's pixels, its surfels
+FIT, FIT_PIXEL, FIT_SURFEL = 0.005, 6.5e-7, 2.5e-7  # a step of the fit, its window's pixels, its surfels
+STEP, STEP_PIXEL, STEP_SURFEL = 0.006, 5e-7, 1e-6  # likewise a step of a reconstruction, on whole views
 PATH = 1.0e-6  # a path of one light
 SHARED_PATH = 0.53  # share of it where four lights or more have their paths in common
 LIGHT = 0.9  # a light made ready, its bounces baked
@@ -127,29 +129,30 @@ class SyntheticSource(Source):
         """Frames of those."""
         return self.clips(item, settings) * settings.split(item.split).frames
 
-    def surfels(self, settings: Settings) -> int:
-        """As many as are asked for."""
-        return settings.surfels
+    def surfels(self, item: Work, settings: Settings) -> int:
+        """As many as are asked for, or as suit the frames."""
+        return settings.surfel_budget(item.split).surfels
 
     def cost(self, item: Work, settings: Settings) -> SceneCost:
         """By the table above."""
-        recipe = settings.split(item.split)
+        recipe, made = settings.split(item.split), settings.surfel_budget(item.split)
         pixels, frames = recipe.width * recipe.height, self.frames(item, settings)
-        views = settings.views * settings.view_width * settings.view_height
+        views = made.views * made.view_pixels
         shares = settings.surfels_from
         rebuilt = shares.reconstruction / (shares.gbuffers + shares.reconstruction)
         both_stages = RadianceSettings().steps + MaterialSettings().steps
         whole_steps = round(both_stages * settings.surfel_reconstruction.steps_scaler)
-        steps = (1 - rebuilt) * settings.refine_steps + rebuilt * whole_steps
         path = PATH * (SHARED_PATH if len(recipe.lights) >= 4 else 1)
         reference = FINER + REFERENCE_RAY * recipe.reference_spp if recipe.reference_buffers else 0
         whole = self.kept_bytes(settings, [item])
         frame = pixels * (path * recipe.path_spp + RAY * _rays(settings, item) + reference)
         photographed = rebuilt * views * settings.surfel_reconstruction.path_spp * PATH
-        step = STEP + STEP_PIXEL * settings.view_width * settings.view_height + STEP_SURFEL * settings.surfels
-        surfels = VIEW * views + step * steps + photographed
+        step = STEP + STEP_PIXEL * made.view_pixels + STEP_SURFEL * made.surfels
+        window = min(made.view_width, WINDOW) * min(made.view_height, WINDOW)
+        fit = (FIT + FIT_PIXEL * window + FIT_SURFEL * made.surfels) * made.refine_steps
+        surfels = VIEW * views + (1 - rebuilt) * fit + rebuilt * step * whole_steps + photographed
         seconds = BUILD + surfels + LIGHT * len(recipe.lights) + frames * frame + WRITTEN * whole
-        gathered = sample_bytes(settings.surfels, views) + 2 * LANES * VIEW_BYTES
+        gathered = sample_bytes(made.surfels, views) + 2 * LANES * VIEW_BYTES
         lanes = min(LANES, pixels * recipe.path_spp)
         # One frame's buffers under every light, and a clip's encoded files until they are in the shard.
         held = len(recipe.lights) * pixels * FRAME_BYTES + whole / max(self.clips(item, settings), 1)
@@ -157,18 +160,18 @@ class SyntheticSource(Source):
 
     def scratch_bytes(self, item: Work, settings: Settings) -> int:
         """Views that surfels are fitted to, or pictures and a checkpoint; then frames of clips."""
-        recipe = settings.split(item.split)
-        views = settings.views + (-(-settings.views // 2) if recipe.moving_objects else 0)
+        recipe, made = settings.split(item.split), settings.surfel_budget(item.split)
+        views = made.views + (-(-made.views // 2) if recipe.moving_objects else 0)
         clip = recipe.frames * recipe.width * recipe.height * spooled_bytes(settings, item.split)
         judges = view_bytes(recipe.frames, recipe.width, recipe.height)
-        refined = view_bytes(views, settings.view_width, settings.view_height) + judges
-        pictures = settings.views * settings.view_width * settings.view_height * PICTURE_BYTES
+        refined = view_bytes(views, made.view_width, made.view_height) + judges
+        pictures = made.views * made.view_pixels * PICTURE_BYTES
         spooled = clip * (len(recipe.lights) if recipe.lights_share_path else 1)
         shares, rebuilt = settings.surfels_from, 0
         if shares.reconstruction:  # it lies there until the clips are written
-            rebuilt = pictures + settings.surfels * CHECKPOINT_BYTES
-        made = refined if settings.refine_steps and shares.gbuffers else 0
-        return max(made, rebuilt + max(judges if rebuilt else 0, spooled))
+            rebuilt = pictures + made.surfels * CHECKPOINT_BYTES
+        fitted = refined if made.refine_steps and shares.gbuffers else 0
+        return max(fitted, rebuilt + max(judges if rebuilt else 0, spooled))
 
 
 def _rays(settings: Settings, item: Work) -> float:
@@ -190,19 +193,20 @@ def make_surfels(
 
     They are judged by the cameras of the first clip, which are not among those.
     """
-    seen = _seen(spec, geometry, spec.views(settings.views, settings.view_width, settings.view_height))
-    if not settings.refine_steps:
-        return surfels_from_gbuffers(seen, count=settings.surfels), None
+    made = settings.surfel_budget(spec.split)
+    seen = _seen(spec, geometry, spec.views(made.views, made.view_width, made.view_height))
+    if not made.refine_steps:
+        return surfels_from_gbuffers(seen, count=made.surfels), None
     recipe = settings.split(spec.split)
     folder = scene_folder(settings.output_dir, spec.name)
     seed = integer(spec.seed, spec.split, spec.index, "refinement")
     with ViewSpool(folder) as shown, ViewSpool(folder) as judges:
-        surfels = surfels_from_gbuffers(shown.passing(seen), count=settings.surfels)
+        surfels = surfels_from_gbuffers(shown.passing(seen), count=made.surfels)
         cameras = spec.clip(0, recipe.frames, recipe.width, recipe.height)
         for _ in judges.passing(stream_gbuffers(geometry, cameras)):
             pass
         views, held_out = shown.views(), judges.views()
-        return refine_surfels(surfels, views, held_out, settings.refine_steps, seed)
+        return refine_surfels(surfels, views, held_out, made.refine_steps, seed)
 
 
 def _seen(spec: SceneSpec, geometry: Geometry, cameras: Sequence[Camera]) -> Iterator[GBufferView]:

@@ -430,13 +430,13 @@ def most_texels(spec: SceneSpec, settings: Settings) -> int:
 
 def _cameras(spec: SceneSpec, settings: Settings) -> list[list[Camera]]:
     """Some cameras of each path that pictures are taken from."""
-    recipe = settings.split(spec.split)
     captures = {"captures": settings.capture, "pseudo_captures": settings.pseudo_capture}
     if settings.mode in captures:
         capture = captures[settings.mode]
         return [spec.views(PATH_SAMPLES, capture.width, capture.height)]
+    recipe, made = settings.split(spec.split), settings.surfel_budget(spec.split)
     return [
-        spec.views(PATH_SAMPLES, settings.view_width, settings.view_height),
+        spec.views(PATH_SAMPLES, made.view_width, made.view_height),
         spec.cameras.film.cameras(PATH_SAMPLES, recipe.width, recipe.height),
     ]
 

@@ -71,7 +71,7 @@ def test_the_benchmark_is_tron_synth(datagen: DatagenSettings) -> None:
     overrides = ["experiment=tron_synth", "output_dir=out"]
     synth = check(compose_recipe("conf.datagen", DatagenSettings, overrides), DatagenSettings)
     assert datagen.test == synth.test
-    for key in ("path_frames", "views", "view_width", "view_height", "surfels", "environment_height"):
+    for key in ("path_frames", "environment_height"):
         assert getattr(datagen, key) == getattr(synth, key)
 
 

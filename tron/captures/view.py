@@ -138,6 +138,15 @@ class View:
         maps.pop("depth", None)
         return View(self.name, self.camera.resized(width, height), space=self.space, **maps)
 
+    def window(self, x: int, y: int, width: int, height: int) -> View:
+        """Part of the view, its upper left pixel at (x, y) of this one's; maps are read when asked for."""
+
+        def part(field: str) -> np.ndarray:
+            return self.read(field)[y : y + height, x : x + width]
+
+        maps = {name: partial(part, name) for name in MAPS if self.has(name)}
+        return View(self.name, self.camera.window(x, y, width, height), space=self.space, **maps)
+
     def _reduced(self, field: str, size: tuple[int, int]) -> np.ndarray:
         import cv2
 

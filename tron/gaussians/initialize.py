@@ -35,7 +35,8 @@ _SAMPLE_BYTES = 200
 _OBJECTS = 2**20
 # Looked at to find three that face the same way.
 _NEIGHBOURS = 12
-_BISECTIONS = 24
+_TRIALS = 24
+_BY_AREA = 6  # of those trials, the first ones
 _CLOSE_ENOUGH = 0.005
 
 _CHANNELS = {"position": 3, "normal": 3, "base_color": 3, "roughness": 1, "metallic": 1, "rgb": 3}
@@ -230,16 +231,22 @@ def _samples(view: GBufferView, index: int) -> _Samples:
 
 
 def _cell_size(samples: _Samples, count: int) -> float:
-    """The cell size, world units, for which about `count` cells are occupied; bisection of its logarithm."""
+    """The cell size, world units, for which about `count` cells are occupied.
+
+    A surface occupies cells in proportion to the inverse square of their size: the next size follows from
+    the number at the last one, in four or five trials; where it does not, the logarithm is bisected.
+    """
     extent = _extent(samples.values["position"]) or 1.0
     # Below the first the integer keys could overflow; above the second everything is one cell.
     low, high = np.log(extent * 1e-4), np.log(extent * 4)
-    for _ in range(_BISECTIONS):
-        middle = (low + high) / 2
+    middle = np.log(extent / np.sqrt(count))
+    for trial in range(_TRIALS):
+        middle = middle if trial <= _BY_AREA and low < middle < high else (low + high) / 2
         occupied = len(np.unique(samples.keys(np.exp(middle))))
         if abs(occupied - count) <= _CLOSE_ENOUGH * count:
             return float(np.exp(middle))
         low, high = (middle, high) if occupied > count else (low, middle)
+        middle += np.log(occupied / count) / 2
     return float(np.exp(high))
 
 

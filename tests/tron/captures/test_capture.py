@@ -96,6 +96,18 @@ def test_a_reduced_view_believes_whole_pixels_and_has_unit_normals() -> None:
     np.testing.assert_allclose(view.read("normal"), [[(0, 0, 1), (0, 0, 0)]], atol=1e-6)
 
 
+def test_a_window_of_a_view_shows_what_the_view_shows_there() -> None:
+    camera = Camera.look_at((3, 1, 2), (0, 0, 0), fov_deg=50, width=24, height=16)
+    rays = camera.exact_rays()
+    whole = View("a", camera, 0.5 + 0.5 * rays, "display", depth=rays[..., 0] + 2)
+    part = whole.window(5, 3, 8, 6)
+    assert (part.camera.width, part.camera.height) == (8, 6)
+    np.testing.assert_allclose(part.camera.exact_rays(), rays[3:9, 5:13], atol=1e-12)
+    np.testing.assert_array_equal(part.read(), whole.read()[3:9, 5:13])
+    np.testing.assert_array_equal(part.read("depth"), whole.read("depth")[3:9, 5:13])
+    assert not part.has("normal")
+
+
 def test_views_are_split_by_name() -> None:
     capture = Capture((view("a"), view("b"), view("c")), test=frozenset({"b"}))
     assert [v.name for v in capture.train_views] == ["a", "c"]

@@ -82,6 +82,8 @@ class Plan:
         exposures: curve of the photos whose exposures are found; None takes them as exposed alike.
         consistency: pulls normals to those that the views' depths agree on; None does not.
         coarse: shares of the steps that see photos smaller by the powers of two down to 2, smallest first.
+        window: side in pixels of the square window of a view, at a random place, that a step compares; views
+            that are no larger are compared whole. None: all are. Not with consistency, whose maps are whole.
     """
 
     name: str
@@ -96,6 +98,7 @@ class Plan:
     exposures: ToneCurve | None = None
     consistency: ConsistencySettings | None = None
     coarse: tuple[float, ...] = ()
+    window: int | None = None
 
     def smaller(self, step: int) -> int:
         """How many times smaller than the photos are the pictures that step ``step`` (from 0) compares."""
@@ -265,7 +268,14 @@ class Stage:
         if self._order[0] != epoch:
             order = generator(self.seed, self.plan.name, "views", epoch).permutation(len(self.views))
             self._order = (epoch, order)
-        return self.pictured()[self._order[1][place]]
+        view = self.pictured()[self._order[1][place]]
+        return view if self.plan.window is None else self._window(view, self.plan.window, step)
+
+    def _window(self, view: View, side: int, step: int) -> View:
+        sides = (view.camera.width, view.camera.height)
+        free = np.maximum(np.array(sides) - side, 0)
+        x, y = generator(self.seed, self.plan.name, "window", step).integers(0, free + 1).tolist()
+        return view.window(x, y, min(side, sides[0]), min(side, sides[1]))
 
     def _background(self) -> np.ndarray:
         if self.plan.background == "random":

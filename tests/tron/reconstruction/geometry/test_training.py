@@ -79,6 +79,34 @@ def test_each_view_comes_once_before_any_comes_again(painted, painted_capture) -
     assert read[:5] != read[5:]
 
 
+def test_a_step_compares_a_window_of_a_view_anywhere_in_it(painted, painted_capture, monkeypatch) -> None:
+    """Each pixel is seen in the long run; the same seed gives the same places, a larger window the view."""
+    made, whole = [], View.window
+
+    def window(view: View, x: int, y: int, width: int, height: int) -> View:
+        made.append((view.name, x, y, width, height))
+        return whole(view, x, y, width, height)
+
+    monkeypatch.setattr(View, "window", window)
+    views, materials = painted_capture.train_views[:2], materials_plan(MaterialSettings(steps=60))
+    runs = []
+    for seed in (0, 0, 1):
+        made.clear()
+        stage_of(painted, views, replace(materials, window=12), seed).run()
+        runs.append(list(made))
+    assert runs[0] == runs[1] != runs[2]
+    seen = {view.name: np.zeros((32, 32), bool) for view in views}
+    for name, x, y, width, height in runs[0]:
+        assert (width, height) == (12, 12)
+        assert 0 <= x <= 20
+        assert 0 <= y <= 20
+        seen[name][y : y + 12, x : x + 12] = True
+    assert min(each.mean() for each in seen.values()) > 0.8
+    made.clear()
+    stage_of(painted, views, replace(materials, window=99)).run()
+    assert {each[1:] for each in made} == {(0, 0, 32, 32)}
+
+
 def test_the_rate_of_the_positions_falls_log_linearly_to_its_last_value(painted, painted_capture) -> None:
     stage = stage_of(painted, painted_capture.train_views, radiance(5))
     rates = []
