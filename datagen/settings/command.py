@@ -24,6 +24,7 @@ from datagen.world.lights import Family, LightChoice
 from tron.errors import TronError
 from tron.estimation import FINAL, FINEST, PREVIEW, Diffuse, Estimation, Estimator, require_bounces
 from tron.run_folder import leaves
+from tron.seeds import generator
 
 Mode = Literal["make", "plan", "validate", "merge", "captures", "pseudo_captures", "equal_error"]
 Split = Literal["train", "train_b", "validation", "test"]
@@ -413,12 +414,21 @@ class Settings(ScaleSettings):
         quality = PREVIEW if rays == "preview" else FINEST
         return Estimation.model_validate(chosen | {name: getattr(quality, name) for name in OF_FRAMES})
 
-    def surfel_budget(self, split: str) -> SurfelBudget:
-        """Surfels of a split's scenes and their views in numbers: those given, else what suits its frames."""
-        frames = self.split(split)
+    def surfel_budgets(self, split: str) -> list[SurfelBudget]:
+        """Surfels of a split's scenes and their views: numbers given, else by each size of pictures."""
         given = {name: getattr(self, name) for name in SurfelBudget._fields}
         chosen = {name: value for name, value in given.items() if value != AUTO}
-        return surfels_by_pixels(frames.width * frames.height)._replace(**chosen)
+        pictures = self.split(split).pictures
+        return [surfels_by_pixels(width * height)._replace(**chosen) for width, height in pictures]
+
+    def surfel_budget(self, split: str, scene: int = 0) -> SurfelBudget:
+        """That of one scene, which draws one of the sizes.
+
+        Its surfels are then larger than the pixels of some windows and smaller than those of others.
+        """
+        budgets = self.surfel_budgets(split)
+        drawn = int(generator(self.seed, split, scene, "surfels").integers(len(budgets)))
+        return budgets[drawn]
 
     def used_splits(self) -> list[Split]:
         """The splits that have scenes; of captures, those that may have some."""
@@ -501,7 +511,12 @@ class KeysOfSynthetic:
         for name in SPLITS:
             if name in used:
                 del values[name]["scenes"]
-                values[name] |= settings.surfel_budget(name)._asdict()
+                budgets = settings.surfel_budgets(name)
+                values[name] |= (
+                    budgets[0]._asdict()
+                    if len(budgets) == 1
+                    else {"surfel_budgets": [each._asdict() for each in budgets]}
+                )
             else:
                 del values[name]
         values["fit"] = FIT

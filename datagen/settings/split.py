@@ -116,6 +116,11 @@ class SplitSettings(SettingsModel):
             raise ValueError(f"a picture of {min(value)} pixels has no window of width={width}")
         return value
 
+    @property
+    def pictures(self) -> list[tuple[int, int]]:
+        """Width and height, pixels, of the pictures that frames are windows of; of the frames without."""
+        return [(width, round(width * self.height / self.width)) for width in self.window_of or [self.width]]
+
     def rays_of(self, scene: int, light: int) -> Rays:
         """What ``guidance_spp`` says of the clip of a scene under light number ``light``."""
         if not isinstance(self.guidance_spp, list):

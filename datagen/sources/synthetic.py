@@ -131,11 +131,11 @@ class SyntheticSource(Source):
 
     def surfels(self, item: Work, settings: Settings) -> int:
         """As many as are asked for, or as suit the frames."""
-        return settings.surfel_budget(item.split).surfels
+        return settings.surfel_budget(item.split, item.index).surfels
 
     def cost(self, item: Work, settings: Settings) -> SceneCost:
         """By the table above."""
-        recipe, made = settings.split(item.split), settings.surfel_budget(item.split)
+        recipe, made = settings.split(item.split), settings.surfel_budget(item.split, item.index)
         pixels, frames = recipe.width * recipe.height, self.frames(item, settings)
         views = made.views * made.view_pixels
         shares = settings.surfels_from
@@ -160,7 +160,7 @@ class SyntheticSource(Source):
 
     def scratch_bytes(self, item: Work, settings: Settings) -> int:
         """Views that surfels are fitted to, or pictures and a checkpoint; then frames of clips."""
-        recipe, made = settings.split(item.split), settings.surfel_budget(item.split)
+        recipe, made = settings.split(item.split), settings.surfel_budget(item.split, item.index)
         views = made.views + (-(-made.views // 2) if recipe.moving_objects else 0)
         clip = recipe.frames * recipe.width * recipe.height * spooled_bytes(settings, item.split)
         judges = view_bytes(recipe.frames, recipe.width, recipe.height)
@@ -193,7 +193,7 @@ def make_surfels(
 
     They are judged by the cameras of the first clip, which are not among those.
     """
-    made = settings.surfel_budget(spec.split)
+    made = settings.surfel_budget(spec.split, spec.index)
     seen = _seen(spec, geometry, spec.views(made.views, made.view_width, made.view_height))
     if not made.refine_steps:
         return surfels_from_gbuffers(seen, count=made.surfels), None
@@ -252,7 +252,13 @@ def make_clips(
     """
     with stage("guidance"):
         seed = integer(spec.seed, spec.split, spec.index, "bounce")
-        relighter = Relighter(surfels, settings.estimation(spec.split), seed, proxy="never").prepare()
+        source = settings.surfels_from.of(spec.seed, spec.split, spec.index)
+        made = settings.surfel_budget(spec.split, spec.index)
+        relighter = Relighter(
+            surfels, settings.estimation(spec.split), seed,
+            proxy="auto" if source == "reconstruction" else "never",  # what is made of G-buffers is one layer
+            cameras=spec.views(made.views, made.view_width, made.view_height),
+        ).prepare()  # fmt: skip
     folder = scene_folder(settings.output_dir, spec.name)
     for group in spec.groups():
         with Spool(folder, len(group)) as spool:
@@ -440,6 +446,7 @@ def _meta(
             "filtered": estimation.filtered,
             "sub_pixels": estimation.supersample,
             "surfels": surfels,
+            "proxy": lit.lit.relighter.proxy is not None,
             MOTION: motion,
             "light_spec": light.model_dump_json(),  # text: families differ in their keys, and tables cannot
         },

@@ -73,15 +73,15 @@ def draw_windows(spec: SceneSpec, geometry: Geometry, recipe: SplitSettings, lig
         recipe: of its split.
         light: number of the first of the lights that the clip is filmed under.
     """
-    sides = recipe.window_of or [recipe.width]
     windows: list[Window] = []
     for i in range(recipe.frames):
         draw = generator(spec.seed, spec.split, spec.index, "window", light, i)
         if windows and recipe.window_each == "clip":
-            width, first = windows[0].picture.width, windows[0]
+            first = windows[0]
+            width, height = first.picture.width, first.picture.height
         else:
-            width, first = sides[int(draw.integers(len(sides)))], None
-        height = round(width * recipe.height / recipe.width)
+            first = None
+            width, height = recipe.pictures[int(draw.integers(len(recipe.pictures)))]
         picture = spec.clip(light, recipe.frames, width, height)[i]
         if first is not None:
             x, y = first.x, first.y
