@@ -19,6 +19,7 @@ from tron.neural.configs import MEAN, BackboneConfig, RendererConfig, UNetConfig
 from tron.neural.networks.unet import UNet
 from tron.neural.protocols import Codec, Renderer
 from tron.neural.scales import halved, with_coarse
+from tron.neural.tiles import drawn_in_tiles
 
 if TYPE_CHECKING:
     from tron.neural.networks.backbone import Backbone
@@ -28,6 +29,8 @@ log = logging.getLogger(__name__)
 PLAIN_TIMESTEP = 0.2  # what the tiny transformer is told; any constant will do
 BLUR_SIDE = 5
 """Pixels of the square that skip_blur gathers from; skip_kernel has its own."""
+REACH = 96
+"""Pixels that a change of guidance reaches in the U-Net's picture, to a 255th of white."""
 HARDLY = -7.0
 """Logarithm of what a new kernel with holes has of each neighbour, over what it has of the pixel itself."""
 
@@ -62,6 +65,21 @@ class NeuralRenderer(Renderer):
         # In this order: what a wider network adds comes last (tron.neural.weights.widened).
         self._predicted = [channels, taps, detail, taps if self.config.skip_holes else 0]
         self.backbone: Backbone | UNet = _backbone(shape, latents * channels, sum(self._predicted))
+
+    @property
+    def reach(self) -> int | None:
+        """As Renderer.reach: of U-Nets on pixels, whose layers see farther than it matters."""
+        shape = self.config.backbone
+        if not isinstance(shape, UNetConfig) or shape.attention or self.config.codec != "pixels":
+            return None
+        return REACH * self.config.scales
+
+    @property
+    def stride(self) -> int:
+        """As Renderer.stride."""
+        return (
+            self.backbone.stride * self.config.scales if isinstance(self.backbone, UNet) else self.space_block
+        )
 
     def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:
         """As Renderer.forward, with 1 + temporal_factor * n frames of any H and W.
@@ -261,7 +279,7 @@ def render_frames(
                 unknown.update({name: int((~np.isfinite(shown[name])).sum()) for name in wanted})
                 given[index] = {name: to_tensor(shown[name][None]).to(device) for name in wanted}
             with torch.no_grad():
-                drawn = renderer(_joined([given[index] for index in this.frames]), weights)
+                drawn = drawn_in_tiles(renderer, _joined([given[index] for index in this.frames]), weights)
             display = to_display_array(drawn)
             for index in this.kept:
                 frame = display[index - this.frames.start]
