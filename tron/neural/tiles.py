@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
+import torch
 from torch import Tensor
 
 from tron.neural.protocols import Renderer
@@ -33,18 +34,16 @@ def drawn_in_tiles(
     if reach is None or max(height, width) <= side + reach:
         return renderer(buffers, weights)
     side, margin = (-(-pixels // stride) * stride for pixels in (side, reach))
-    drawn: Tensor | None = None
+    drawn: list[Tensor] = []
     for rows, seen_rows in _spans(height, side, margin):
+        across = []
         for columns, seen_columns in _spans(width, side, margin):
             seen = {name: buffer[..., seen_rows, seen_columns] for name, buffer in buffers.items()}
-            tile = renderer(seen, weights)
-            if drawn is None:
-                drawn = tile.new_empty((*tile.shape[:-2], height, width))
             top, left = rows.start - seen_rows.start, columns.start - seen_columns.start
-            inner = tile[..., top : top + rows.stop - rows.start, left : left + columns.stop - columns.start]
-            drawn[..., rows, columns] = inner
-    assert drawn is not None
-    return drawn
+            tall, wide = rows.stop - rows.start, columns.stop - columns.start
+            across.append(renderer(seen, weights)[..., top : top + tall, left : left + wide])
+        drawn.append(torch.cat(across, -1))
+    return torch.cat(drawn, -2)
 
 
 def _spans(length: int, side: int, margin: int) -> Iterator[tuple[slice, slice]]:
