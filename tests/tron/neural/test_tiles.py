@@ -1,5 +1,7 @@
 """Pictures drawn in tiles are those of one pass."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
@@ -49,7 +51,7 @@ def test_without_the_margin_they_are_not(monkeypatch):
 
 
 @pytest.mark.parametrize("scales", [1, 2])
-def test_tiles_begin_where_the_strides_of_the_whole_do(scales: int):
+def test_tiles_begin_where_the_strides_of_the_whole_do(scales: Literal[1, 2]):
     """Of a network whose reach is within the margin, exactly."""
     shape = UNetConfig(widths=(6, 8), blocks=(1, 1), blocks_up=(1,), temporal=False)
     config = RendererConfig(
