@@ -11,15 +11,19 @@ from tron.io.images import write_image
 from tron.shards.reader import read_clips
 
 chosen = arguments(__doc__, "dataset")
-side, surfels, rays = (24, 1500, 4) if chosen.small else (96, 20_000, 64)
+side, rays = (24, 4) if chosen.small else (96, 64)
 every = ["lights=[sun,studio,overcast]", "frames=2", f"width={side}", f"height={side}"]
 every += [f"path_spp={rays}", f"guidance_spp={rays}", f"reference_spp={rays}"]
 scenes = {"train": 4, "train_b": 1, "validation": 1, "test": 2}
 settings = cli.compose(
     *(f"{split}.{setting}" for split in scenes for setting in every),
     *(f"{split}.scenes={min(count // 2, 1) if chosen.small else count}" for split, count in scenes.items()),
-    *("path_frames=8", "views=24", f"view_width={side}", f"view_height={side}", f"surfels={surfels}"),
-    *("refine_steps=10", "mesh_edge=0.1", "environment_height=64", "cluster=none"),
+    *(
+        ("views=24", "view_width=24", "view_height=24", "surfels=1500", "refine_steps=10")
+        if chosen.small
+        else ()
+    ),
+    *("path_frames=8", "mesh_edge=0.1", "environment_height=64", "cluster=none"),
     f"output_dir={chosen.output}",
 )
 if main(settings) != 0:
