@@ -23,18 +23,18 @@ from tron.tracing import SurfelTracer
 WINDOW = 0.3
 
 
-def room(dense: Any, ceiling: bool) -> GaussianScene:
+def room(dense: Any, ceiling: bool, window: bool = True) -> GaussianScene:
     """The inside of the cube of side 2 about the origin, with a window in the wall at x = 1."""
     box = dense.box(half=1.0)
-    kept = ~through_the_window(box.points)
+    kept = ~(through_the_window(box.points) & window)
     if not ceiling:
         kept &= box.points[:, 2] < 0.99
     sheet = type(box)(box.points[kept], -box.normals[kept], box.mitsuba)
     return dense.scene(sheet)
 
 
-GREY, SKY = 0.5, 0.98
-"""Display values of the walls, as surfels are made, and of what is outside the window."""
+GREY, DULL, SKY = 0.5, 0.75, 0.98
+"""Display values of the walls, as surfels are made, and of skies 2.4 and 4.5 times as bright."""
 
 
 def through_the_window(points: np.ndarray) -> np.ndarray:
@@ -163,53 +163,51 @@ def test_a_window_beside_what_is_closed_stays_open(dense_surfels) -> None:
     assert light_from(closed, shown).mean() > 0.95
 
 
-def sealed(dense: Any) -> tuple[GaussianScene, np.ndarray]:
-    """The closed cube, whose surfels show the sky where its window is, and which they are."""
-    box = dense.box(half=1.0)
-    found = dense.scene(type(box)(box.points, -box.normals, box.mitsuba))
-    window = through_the_window(found.means)
-    return painted(found, window, SKY), window
+def sealed(dense: Any) -> GaussianScene:
+    """The closed cube, whose surfels show the sky where its window is."""
+    found = room(dense, ceiling=True, window=False)
+    return painted(found, through_the_window(found.means), DULL)
 
 
-@pytest.mark.parametrize("gain", [0.6, 1.0, 1.5])
-def test_sky_that_surfels_show_in_a_window_is_taken_out(
-    dense_surfels, photos: list[View], gain: float
-) -> None:
-    """However every second photo is exposed. Walls stay as they are."""
-    found, window = sealed(dense_surfels)
+def _rows(points: np.ndarray) -> set[tuple[float, ...]]:
+    return set(map(tuple, points.tolist()))
+
+
+@pytest.mark.parametrize("gain", [0.6, 1.0, 2.1])
+def test_sky_that_surfels_show_in_a_window_is_taken_out(dense_surfels, gain: float) -> None:
+    """A dull sky, however the photos are exposed: as they are, walls or windows may pass for the other."""
+    found = sealed(dense_surfels)
     exposed = [
         replace(view, image=encoded(gain * decoded(view.image, "srgb"), "srgb"))
-        if int(view.name) % 2
-        else view
-        for view in photos
+        for view in photographed({through_the_window: DULL})
     ]
     closed = closed_indoors(found, exposed, True, 0)
     within = 0.8 * WINDOW
     assert light_from(found, over((1, -within, -within), (1, within, within))).max() < 0.1
     assert light_from(closed, over((1, -within, -within), (1, within, within))).mean() > 0.95
-    walls = found.means[~window]
-    clear = np.abs(walls - (1, 0, 0)).max(1) > 1.3 * WINDOW
-    assert np.isin(walls[clear], closed.means).all()
+    clear = np.abs(found.means - (1, 0, 0)).max(1) > 1.3 * WINDOW
+    assert _rows(found.means[clear]) <= _rows(closed.means), "a wall is gone"
 
 
 def test_the_sun_on_a_floor_and_a_lamp_are_no_windows(dense_surfels) -> None:
-    """A floor that is as bright as the sky; a white ball in the middle of the room."""
+    """A floor as bright as what is outside the window; a white ball in the middle of the room."""
 
     def sunny(points: np.ndarray) -> np.ndarray:
         return (points[:, 2] < -0.99) & (np.abs(points[:, :2]) < 0.5).all(1)
 
     box, lamp = dense_surfels.box(half=1.0), dense_surfels.sphere(radius=0.12)
-    found = dense_surfels.scene(type(box)(box.points, -box.normals, box.mitsuba), lamp)
+    kept = ~through_the_window(box.points)
+    found = dense_surfels.scene(type(box)(box.points[kept], -box.normals[kept], box.mitsuba), lamp)
     bright = sunny(found.means) | (np.linalg.norm(found.means, axis=1) < 0.2)
     found, views = painted(found, bright, SKY), []
     for view in photographed({sunny: SKY}):
         eye = view.camera.position
         camera = Camera.look_at(eye, (-eye[0], -eye[1], -0.8), fov_deg=80, width=40, height=40)
-        image = picture(camera, {sunny: SKY})
+        image = picture(camera, {sunny: SKY, through_the_window: SKY})
         image[SurfelTracer(found).gbuffer(camera).numpy()["depth"] < 0.75] = SKY
         views.append(View(view.name, camera, image, "display"))
     closed = closed_indoors(found, views, True, 0)
-    assert np.isin(found.means, closed.means).all()
+    assert _rows(found.means) <= _rows(closed.means)
 
 
 def test_a_hole_that_photos_show_dark_is_closed_in_their_colour(dense_surfels) -> None:
