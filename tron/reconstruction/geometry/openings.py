@@ -15,14 +15,12 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from tron.captures import View
-from tron.captures.view import ToneCurve, decoded, linear_light
+from tron.captures.view import CLIPPED, FLOOR, ToneCurve, decoded, linear_light
 from tron.color import luminance
 from tron.gaussians.fields import FIELDS
 from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
-from tron.reconstruction.geometry.seen_space import pixels_of
-from tron.reconstruction.light.surface_points import OPAQUE
-from tron.reconstruction.light.surfel_colors import CLIPPED, FLOOR
+from tron.reconstruction.geometry.seen_space import OPAQUE, pixels_of
 from tron.reconstruction.progress import Track, untracked
 from tron.tracing import SurfelTracer
 

@@ -178,7 +178,7 @@ def test_sky_that_surfels_show_in_a_window_is_taken_out(dense_surfels, gain: flo
     """A dull sky, however the photos are exposed: as they are, walls or windows may pass for the other."""
     found = sealed(dense_surfels)
     exposed = [
-        replace(view, image=encoded(gain * decoded(view.image, "srgb"), "srgb"))
+        replace(view, image=encoded(gain * decoded(view.read(), "srgb"), "srgb"))
         for view in photographed({through_the_window: DULL})
     ]
     closed = closed_indoors(found, exposed, True, 0)
