@@ -77,7 +77,7 @@ def test_the_benchmark_is_tron_synth(datagen: DatagenSettings) -> None:
 
 def test_shadows_take_2_rays_for_a_preview_and_64_in_the_end(datagen: DatagenSettings) -> None:
     assert (QUALITY["preview"].rays, QUALITY["final"].rays) == (2, 64)
-    assert {datagen.split(name).guidance_spp for name in datagen.used_splits()} == {64}
+    assert all(datagen.split(name).guidance_spp == 64 for name in datagen.used_splits())
 
 
 def test_the_curriculum_has_three_stages_of_32000_steps(train: TrainSettings) -> None:
