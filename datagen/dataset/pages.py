@@ -120,7 +120,7 @@ def _split_row(split: str, found: Sequence[ClipRow], settings: Settings) -> list
 
 def _made_of(settings: Settings) -> str:
     """About how many surfels scenes have and from how many views, over all splits that have some."""
-    budgets = [settings.surfel_budget(split) for split in settings.used_splits()]
+    budgets = [each for split in settings.used_splits() for each in settings.surfel_budgets(split)]
 
     def between(numbers: Sequence[int]) -> str:
         return " to ".join(f"{number:,}" for number in sorted({min(numbers), max(numbers)}))

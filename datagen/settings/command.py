@@ -22,8 +22,9 @@ from datagen.settings.split import SplitSettings, SurfelReconstruction, SurfelSo
 from datagen.settings.surfels import AUTO, Auto, SurfelBudget, surfels_by_pixels
 from datagen.world.lights import Family, LightChoice
 from tron.errors import TronError
-from tron.estimation import FINAL, Diffuse, Estimation, Estimator, require_bounces
+from tron.estimation import FINAL, FINEST, PREVIEW, Diffuse, Estimation, Estimator, require_bounces
 from tron.run_folder import leaves
+from tron.seeds import generator
 
 Mode = Literal["make", "plan", "validate", "merge", "captures", "pseudo_captures", "equal_error"]
 Split = Literal["train", "train_b", "validation", "test"]
@@ -42,6 +43,9 @@ OUTSIDE = {
 
 ESTIMATED = ("estimator", "two_sided", "diffuse", "bounces", "reflections", "supersample")
 """Keys that decide how light on the surfels is estimated, named as in Estimation."""
+
+OF_FRAMES = ("rays", "filtered", "reflections", "supersample")
+"""Those of an Estimation that a quality of tron-relight chooses."""
 
 OF_A_SCENE = {"style", "things", "materials", "frames"}
 """Keys of a split that decide what stands in a scene and along which path it is filmed."""
@@ -401,17 +405,30 @@ class Settings(ScaleSettings):
         """The settings of one split; of captures, how large and long its clips are."""
         return OF_SOURCE[self.source].split(self, name)
 
-    def estimation(self, split: str) -> Estimation:
-        """Estimation of the light on the surfels."""
+    def estimation(self, split: str, scene: int = 0, light: int = 0) -> Estimation:
+        """Estimation of the light on the surfels, of the clip of a scene under light number ``light``."""
         chosen = {name: getattr(self, name) for name in ESTIMATED}
-        return Estimation(rays=self.split(split).guidance_spp, **chosen)
+        rays = self.split(split).rays_of(scene, light)
+        if isinstance(rays, int):
+            return Estimation(rays=rays, **chosen)
+        quality = PREVIEW if rays == "preview" else FINEST
+        return Estimation.model_validate(chosen | {name: getattr(quality, name) for name in OF_FRAMES})
 
-    def surfel_budget(self, split: str) -> SurfelBudget:
-        """Surfels of a split's scenes and their views in numbers: those given, else what suits its frames."""
-        frames = self.split(split)
+    def surfel_budgets(self, split: str) -> list[SurfelBudget]:
+        """Surfels of a split's scenes and their views: numbers given, else by each size of pictures."""
         given = {name: getattr(self, name) for name in SurfelBudget._fields}
         chosen = {name: value for name, value in given.items() if value != AUTO}
-        return surfels_by_pixels(frames.width * frames.height)._replace(**chosen)
+        pictures = self.split(split).pictures
+        return [surfels_by_pixels(width * height)._replace(**chosen) for width, height in pictures]
+
+    def surfel_budget(self, split: str, scene: int = 0) -> SurfelBudget:
+        """That of one scene, which draws one of the sizes.
+
+        Its surfels are then larger than the pixels of some windows and smaller than those of others.
+        """
+        budgets = self.surfel_budgets(split)
+        drawn = int(generator(self.seed, split, scene, "surfels").integers(len(budgets)))
+        return budgets[drawn]
 
     def used_splits(self) -> list[Split]:
         """The splits that have scenes; of captures, those that may have some."""
@@ -494,7 +511,12 @@ class KeysOfSynthetic:
         for name in SPLITS:
             if name in used:
                 del values[name]["scenes"]
-                values[name] |= settings.surfel_budget(name)._asdict()
+                budgets = settings.surfel_budgets(name)
+                values[name] |= (
+                    budgets[0]._asdict()
+                    if len(budgets) == 1
+                    else {"surfel_budgets": [each._asdict() for each in budgets]}
+                )
             else:
                 del values[name]
         values["fit"] = FIT

@@ -14,6 +14,8 @@ from datagen.world.shapes import ThingName
 from datagen.world.styles import STYLES, StyleChoice
 from tron.seeds import generator
 
+Rays = Annotated[int, Field(ge=2, multiple_of=2)] | Literal["preview", "final"]
+
 
 class SplitSettings(SettingsModel):
     """One split: how many scenes of which kind, and how they are rendered."""
@@ -79,8 +81,23 @@ class SplitSettings(SettingsModel):
         ge=1,
         description="Paths per pixel of path-traced frames; rounded up to a product of near numbers.",
     )
-    guidance_spp: int = Field(
-        default=64, ge=2, multiple_of=2, description="Shadow rays per pixel of the surfels' irradiance, even."
+    window_of: list[Annotated[int, Field(ge=8, le=8192)]] = Field(
+        default=[],
+        description="Widths, in pixels, of pictures that frames are windows of, width x height pixels about "
+        "something that is seen: many scales for the price of small frames. [] takes whole pictures.",
+        examples=["[128,256,512,1024]"],
+    )
+    window_each: Literal["clip", "frame"] = Field(
+        default="clip",
+        description="What draws a size and a place of window_of: a clip, whose frames are neighbours, or "
+        "each of its frames, where they are none.",
+    )
+    guidance_spp: Rays | Annotated[list[Rays], Field(min_length=1)] = Field(
+        default=64,
+        description="Shadow rays per pixel of the surfels' irradiance, even; preview or final are the rays, "
+        "the filter, the sub-pixels and the reflections of that quality of tron-relight. Of a list each clip "
+        "of a scene has one in turn.",
+        examples=["[preview,8,32,final]"],
     )
     reference_buffers: bool = Field(
         default=False,
@@ -90,6 +107,25 @@ class SplitSettings(SettingsModel):
     reference_spp: int = Field(
         default=128, ge=2, description="Shadow rays per pixel of Mitsuba's direct irradiance."
     )
+
+    @field_validator("window_of")
+    @classmethod
+    def _holds_the_frame(cls, value: list[int], info: ValidationInfo) -> list[int]:
+        width = info.data.get("width")
+        if width is not None and any(side < width for side in value):
+            raise ValueError(f"a picture of {min(value)} pixels has no window of width={width}")
+        return value
+
+    @property
+    def pictures(self) -> list[tuple[int, int]]:
+        """Width and height, pixels, of the pictures that frames are windows of; of the frames without."""
+        return [(width, round(width * self.height / self.width)) for width in self.window_of or [self.width]]
+
+    def rays_of(self, scene: int, light: int) -> Rays:
+        """What ``guidance_spp`` says of the clip of a scene under light number ``light``."""
+        if not isinstance(self.guidance_spp, list):
+            return self.guidance_spp
+        return self.guidance_spp[(scene + light) % len(self.guidance_spp)]
 
     @field_validator("style", mode="before")
     @classmethod

@@ -176,7 +176,8 @@ class LitSurfels:
 
     def frame(self, guidance: Guidance, camera: Camera) -> Frame:
         """Members of one view that surfels give, with the guidance that :meth:`view` gave of it."""
-        return stored_guidance(guidance) | self.light.relighter.surface_maps(camera)
+        (maps,) = self.light.relighter.surface_maps(camera, self.light.estimation)
+        return stored_guidance(guidance) | maps
 
     def meta(
         self,

@@ -66,7 +66,7 @@ def reconstruct_surfels(
     wanted = settings.surfel_reconstruction
     folder = scene_folder(settings.output_dir, spec.name) / WORK
     capture = _pictures(spec, geometry, settings, folder)
-    joint, most = wanted.prior == "joint", settings.surfel_budget(spec.split).surfels
+    joint, most = wanted.prior == "joint", settings.surfel_budget(spec.split, spec.index).surfels
     prior = Joint(same_exposure=True) if joint else GroundTruth()
     recipe = ReconstructionSettings(
         radiance=RadianceSettings(density=DensitySettings(most=most)),
@@ -95,7 +95,7 @@ def _pictures(spec: SceneSpec, geometry: Geometry, settings: Settings, folder: P
         shutil.rmtree(folder, ignore_errors=True)  # half a capture
         light = spec.lights[light_of_pictures(spec)]
         environment = light.bake(settings.environment_height, settings.environments).baked()
-        made = settings.surfel_budget(spec.split)
+        made = settings.surfel_budget(spec.split, spec.index)
         shots = CaptureSettings(
             views=max(made.views, 2),
             width=made.view_width,
@@ -112,7 +112,7 @@ def _base_colors(
     spec: SceneSpec, geometry: Geometry, settings: Settings
 ) -> Iterator[tuple[Camera, np.ndarray, np.ndarray]]:
     """Camera, true base color and mask of some of the views."""
-    made = settings.surfel_budget(spec.split)
+    made = settings.surfel_budget(spec.split, spec.index)
     cameras = spec.views(max(made.views, 2), made.view_width, made.view_height)
     for seen in stream_gbuffers(geometry, cameras[:: -(-len(cameras) // SCALED_BY)]):
         yield seen.camera, seen.base_color, seen.valid
@@ -122,7 +122,7 @@ def _with_objects(
     surfels: GaussianScene, spec: SceneSpec, geometry: Geometry, settings: Settings
 ) -> GaussianScene:
     """The surfels with the ids of the objects that they lie on, which no picture tells."""
-    made = settings.surfel_budget(spec.split)
+    made = settings.surfel_budget(spec.split, spec.index)
     cameras = spec.views(made.views, made.view_width, made.view_height)
     truth = surfels_from_gbuffers(stream_gbuffers(geometry, cameras), count=made.surfels)
     _, nearest = KDTree(truth.means).query(surfels.means)

@@ -14,12 +14,13 @@ from datagen.dataset.records import RECORD_NAME, Record, Refinement, Work, clear
 from datagen.dataset.spool import Frame, Spool, ViewSpool, stored_guidance, view_bytes, write_clips
 from datagen.dataset.variety import Histograms, frame_histograms, surface_members, total
 from datagen.files.sources import Sources
-from datagen.settings.command import SPLITS, Settings
+from datagen.settings.command import OF_FRAMES, SPLITS, Settings
 from datagen.settings.split import Source as SurfelSource
 from datagen.settings.split import SplitSettings
 from datagen.sources.reconstructed import reconstruct_surfels
 from datagen.sources.refinement import WINDOW, refine_surfels
 from datagen.sources.source import CHECKPOINT_BYTES, SceneCost, Source, spooled_bytes
+from datagen.sources.windows import MARGIN, draw_windows
 from datagen.truth.build import FIRST_ID, Geometry, draw_and_build
 from datagen.truth.pathtrace import (
     LANES,
@@ -130,11 +131,11 @@ class SyntheticSource(Source):
 
     def surfels(self, item: Work, settings: Settings) -> int:
         """As many as are asked for, or as suit the frames."""
-        return settings.surfel_budget(item.split).surfels
+        return settings.surfel_budget(item.split, item.index).surfels
 
     def cost(self, item: Work, settings: Settings) -> SceneCost:
         """By the table above."""
-        recipe, made = settings.split(item.split), settings.surfel_budget(item.split)
+        recipe, made = settings.split(item.split), settings.surfel_budget(item.split, item.index)
         pixels, frames = recipe.width * recipe.height, self.frames(item, settings)
         views = made.views * made.view_pixels
         shares = settings.surfels_from
@@ -144,7 +145,7 @@ class SyntheticSource(Source):
         path = PATH * (SHARED_PATH if len(recipe.lights) >= 4 else 1)
         reference = FINER + REFERENCE_RAY * recipe.reference_spp if recipe.reference_buffers else 0
         whole = self.kept_bytes(settings, [item])
-        frame = pixels * (path * recipe.path_spp + RAY * recipe.guidance_spp + reference)
+        frame = pixels * (path * recipe.path_spp + RAY * _rays(settings, item) + reference)
         photographed = rebuilt * views * settings.surfel_reconstruction.path_spp * PATH
         step = STEP + STEP_PIXEL * made.view_pixels + STEP_SURFEL * made.surfels
         window = min(made.view_width, WINDOW) * min(made.view_height, WINDOW)
@@ -159,7 +160,7 @@ class SyntheticSource(Source):
 
     def scratch_bytes(self, item: Work, settings: Settings) -> int:
         """Views that surfels are fitted to, or pictures and a checkpoint; then frames of clips."""
-        recipe, made = settings.split(item.split), settings.surfel_budget(item.split)
+        recipe, made = settings.split(item.split), settings.surfel_budget(item.split, item.index)
         views = made.views + (-(-made.views // 2) if recipe.moving_objects else 0)
         clip = recipe.frames * recipe.width * recipe.height * spooled_bytes(settings, item.split)
         judges = view_bytes(recipe.frames, recipe.width, recipe.height)
@@ -173,6 +174,17 @@ class SyntheticSource(Source):
         return max(fitted, rebuilt + max(judges if rebuilt else 0, spooled))
 
 
+def _rays(settings: Settings, item: Work) -> float:
+    """Shadow rays a pixel of guidance, margins of windows included, mean of a scene's clips."""
+    recipe = settings.split(item.split)
+    of_clips = [
+        settings.estimation(item.split, item.index, light).rays for light in range(len(recipe.lights))
+    ]
+    rays = sum(of_clips) / max(len(of_clips), 1)
+    margin = 2 * MARGIN if any(width > recipe.width for width in recipe.window_of) else 0
+    return rays * (1 + margin / recipe.width) * (1 + margin / recipe.height)
+
+
 @stage("surfels")
 def make_surfels(
     spec: SceneSpec, geometry: Geometry, settings: Settings
@@ -181,7 +193,7 @@ def make_surfels(
 
     They are judged by the cameras of the first clip, which are not among those.
     """
-    made = settings.surfel_budget(spec.split)
+    made = settings.surfel_budget(spec.split, spec.index)
     seen = _seen(spec, geometry, spec.views(made.views, made.view_width, made.view_height))
     if not made.refine_steps:
         return surfels_from_gbuffers(seen, count=made.surfels), None
@@ -240,7 +252,13 @@ def make_clips(
     """
     with stage("guidance"):
         seed = integer(spec.seed, spec.split, spec.index, "bounce")
-        relighter = Relighter(surfels, settings.estimation(spec.split), seed, proxy="never").prepare()
+        source = settings.surfels_from.of(spec.seed, spec.split, spec.index)
+        made = settings.surfel_budget(spec.split, spec.index)
+        relighter = Relighter(
+            surfels, settings.estimation(spec.split), seed,
+            proxy="auto" if source == "reconstruction" else "never",  # what is made of G-buffers is one layer
+            cameras=spec.views(made.views, made.view_width, made.view_height),
+        ).prepare()  # fmt: skip
     folder = scene_folder(settings.output_dir, spec.name)
     for group in spec.groups():
         with Spool(folder, len(group)) as spool:
@@ -316,7 +334,8 @@ def _film(
 ) -> list[ClipMeta]:
     """Render the clips of lights that are filmed from the same places, frame by frame."""
     recipe = settings.split(spec.split)
-    cameras = spec.clip(group[0], recipe.frames, recipe.width, recipe.height)
+    windows = draw_windows(spec, geometry, recipe, group[0])
+    cameras = [window.camera for window in windows]
     still = spec.motion is None and not any(spec.turns_deg)
     maps = {
         number: spec.lights[number].bake(settings.environment_height, settings.environments)
@@ -325,7 +344,7 @@ def _film(
     now = _moment(spec, geometry, relighter, maps, settings, 0.0)
     first = now.lights
     poses, shown = [], []
-    for i, camera in enumerate(cameras):
+    for i, (window, camera) in enumerate(zip(windows, cameras)):
         time = i / max(len(cameras) - 1, 1)
         if i and not still:
             now = _moment(spec, geometry, relighter, maps, settings, time)
@@ -338,15 +357,16 @@ def _film(
             rgb = render_frames(now.scenes[0], [camera], spp, [seed], spec.path_bounces)
         else:
             rgb = render_lights(now.scenes[0], now.stacked, camera, spp, seed)
-        views = views_under([light.lit for light in now.lights], camera)
-        surfaces = now.relighter.surface_maps(camera)
+        wide = window.with_margin().camera
+        views = views_under([light.lit for light in now.lights], wide)
+        surfaces = now.relighter.surface_maps(camera, *(light.lit.estimation for light in now.lights))
         finer = [light.lit.framed(supersample=2) for light in now.lights if recipe.reference_buffers]
         fine = views_under(finer, camera) if finer else []
         for k, light in enumerate(now.lights):
             if spec.metered and i == 0:
                 first[k].exposure = metered(rgb[k], truth.valid, light.exposure)
-            guidance = light.lit.render(camera, light.seeds["guidance"][i], view=views[k])
-            frame = stored_guidance(guidance) | surfaces
+            guidance = light.lit.render(wide, light.seeds["guidance"][i], view=views[k])
+            frame = window.cut(stored_guidance(guidance)) | surfaces[k]
             frame |= {"rgb": rgb[k], "foreground": truth.valid.astype(np.float32)}
             if recipe.reference_buffers:
                 seed = light.seeds["reference"][i]
@@ -378,6 +398,8 @@ def _prepare(
     if shared:  # lights that are traced together have texels at the same places
         environment = environment.baked().resized(settings.environment_height)
     lit = relighter.under(environment, integer(spec.seed, spec.split, spec.index, "light", number, "bounce"))
+    frames = settings.estimation(spec.split, spec.index, number)
+    lit = lit.framed(**{name: getattr(frames, name) for name in OF_FRAMES})
     own = ("light", number, "frame")
     where = {"path": ("frame",) if shared else own, "guidance": own, "reference": own}
     seeds = {what: _seeds(spec, recipe.frames, what, *path) for what, path in where.items()}
@@ -392,8 +414,12 @@ def _meta(
     surfels_from: SurfelSource,
     motion: str,
 ) -> ClipMeta:
+    surfels = len(lit.lit.relighter.scene)
     light = spec.lights[lit.number]
-    spp = {"path": recipe.path_spp, "guidance": recipe.guidance_spp}
+    estimation = lit.lit.estimation
+    spp = {"path": recipe.path_spp, "guidance": estimation.rays}
+    if estimation.reflections:
+        spp["reflections"] = estimation.reflections
     if recipe.reference_buffers:
         spp["reference"] = recipe.reference_spp
     return ClipMeta(
@@ -417,6 +443,10 @@ def _meta(
             "contrast_share": contrast_share(lit.environment),
             "turn_deg": spec.turns_deg[lit.number] if spec.turns_deg else 0.0,
             "moving_object": spec.motion is not None,
+            "filtered": estimation.filtered,
+            "sub_pixels": estimation.supersample,
+            "surfels": surfels,
+            "proxy": lit.lit.relighter.proxy is not None,
             MOTION: motion,
             "light_spec": light.model_dump_json(),  # text: families differ in their keys, and tables cannot
         },

@@ -434,10 +434,10 @@ def _cameras(spec: SceneSpec, settings: Settings) -> list[list[Camera]]:
     if settings.mode in captures:
         capture = captures[settings.mode]
         return [spec.views(PATH_SAMPLES, capture.width, capture.height)]
-    recipe, made = settings.split(spec.split), settings.surfel_budget(spec.split)
+    recipe, made = settings.split(spec.split), settings.surfel_budget(spec.split, spec.index)
     return [
         spec.views(PATH_SAMPLES, made.view_width, made.view_height),
-        spec.cameras.film.cameras(PATH_SAMPLES, recipe.width, recipe.height),
+        spec.cameras.film.cameras(PATH_SAMPLES, *max(recipe.pictures)),
     ]
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from tron.color import linear_to_srgb, srgb_to_linear
 from tron.errors import TronError
+from tron.estimation import of_wider_pixels
 from tron.shards.schema import MEMBERS, TARGET, Clip
 
 Size = tuple[int, int]
@@ -87,11 +88,15 @@ def _averaged(video: Tensor, axis: int, length: int) -> Tensor:
     return total
 
 
-def _covering(video: Tensor, size: Size, display: bool) -> Tensor:
+def _covering(name: str, video: Tensor, size: Size, display: bool) -> Tensor:
+    """Frames (3, K, H, W) of one buffer, as small as just covers a size."""
     height, width = video.shape[-2:]
     covering = covering_size((width, height), size)
     if covering == (width, height):
         return video
+    if name == "sampling":
+        video, more = area_resized(video, covering), torch.tensor(of_wider_pixels(width / covering[0]))
+        return torch.where(video > 0, (video + more[:, None, None, None]).clamp(max=1), video)
     if display:
         return linear_to_srgb(area_resized(srgb_to_linear(video), covering)).clamp(0, 1)
     return area_resized(video, covering)
@@ -123,7 +128,7 @@ def sized(sample: Sample, size: Size | None, random: np.random.Generator) -> Sam
     corner = tuple(random_start(random, side, crop) for side, crop in zip(covering, size))
     return Sample(
         {
-            name: _cut(_covering(video, size, name in sample.display), size, (corner[0], corner[1]))
+            name: _cut(_covering(name, video, size, name in sample.display), size, (corner[0], corner[1]))
             for name, video in sample.buffers.items()
         },
         sample.display,
@@ -138,9 +143,9 @@ def centred(clip: Clip, size: Size | None) -> Clip:
     corner = (width - size[0]) // 2, (height - size[1]) // 2
 
     def shown(name: str, frames: np.ndarray) -> np.ndarray:
-        video = torch.from_numpy(np.moveaxis(frames, -1, 1))
+        video = torch.from_numpy(np.moveaxis(frames, -1, 0))
         display = clip.is_display(name) and MEMBERS[name].color_space is not None
-        return np.moveaxis(_cut(_covering(video, size, display), size, corner).numpy(), 1, -1)
+        return np.moveaxis(_cut(_covering(name, video, size, display), size, corner).numpy(), 0, -1)
 
     meta = clip.meta.model_copy(update={"width": size[0], "height": size[1]})
     return Clip(meta, {name: shown(name, frames) for name, frames in clip.frames.items()})

@@ -20,6 +20,10 @@ ToneCurve = Literal["srgb", "agx"]
 
 Pixels = np.ndarray | Callable[[], np.ndarray]
 """An array, or what reads one when it is asked for, such as ``partial(read_image, path)``."""
+FLOOR = 2e-3
+"""Linear light below which 8 bits hold no colour."""
+CLIPPED = 0.985
+"""Display values from here on hold no radiance: the photo's white."""
 _TOLERANCE = 1e-3
 _WHOLE = 0.99
 """A pixel of a reduced photo is believed if all of its pixels are."""

@@ -208,6 +208,18 @@ class RendererConfig(GuidedConfig):
         description="Member of guidance, such as albedo, whose detail is given back to the start: what those "
         "kernels take from it, each pixel and channel in a share that the network predicts, 0 at first.",
     )
+    skip_holes: int = Field(
+        default=0,
+        ge=0,
+        le=8,
+        description="Pixels between the points of a second predicted kernel of that side, which filters what "
+        "the first left and begins as nothing: noise that is wider than the first. 0: none.",
+    )
+    scales: Literal[1, 2] = Field(
+        default=1,
+        description="2: the network draws the picture at half its size too, and what is coarse is taken from "
+        "there. The same weights; for codec=pixels.",
+    )
     sigma: float | None = Field(
         default=None,
         gt=0,
@@ -237,6 +249,10 @@ class RendererConfig(GuidedConfig):
             raise ValueError("skip_blur filters one buffer: skip=mean has none, name one of guidance")
         if self.skip_kernel and (self.codec != "pixels" or not self.skip_blur):
             raise ValueError("skip_kernel goes with codec=pixels and a skip_blur above 0, which it begins as")
+        if self.skip_holes and not self.skip_kernel:
+            raise ValueError("skip_holes are those of a second kernel: they go with a skip_kernel")
+        if self.scales == 2 and self.codec != "pixels":
+            raise ValueError("scales=2 goes with codec=pixels")
         if self.skip_detail is not None and not self.skip_kernel:
             raise ValueError("skip_detail is what kernels take from a buffer: it goes with a skip_kernel")
         if self.skip_detail is not None and self.skip_detail not in self.guidance:

@@ -45,6 +45,16 @@ class Renderer(nn.Module):
     space_block: int = 1
     """Pixels that both sides of a training crop must be multiples of; other frames are padded."""
 
+    @property
+    def reach(self) -> int | None:
+        """Pixels around a pixel that it depends on to speak of; None: all of the picture."""
+        return None
+
+    @property
+    def stride(self) -> int:
+        """Pixels between the places at which a part of a picture is drawn as in the whole."""
+        return self.space_block
+
     def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:
         """Guidance by name, each (B, 3, K, H, W) display-encoded in [-1, 1] -> the same shape, not clamped.
 

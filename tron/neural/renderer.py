@@ -18,6 +18,8 @@ from tron.neural.codecs.registry import CODECS
 from tron.neural.configs import MEAN, BackboneConfig, RendererConfig, UNetConfig, check_weights
 from tron.neural.networks.unet import UNet
 from tron.neural.protocols import Codec, Renderer
+from tron.neural.scales import halved, with_coarse
+from tron.neural.tiles import drawn_in_tiles
 
 if TYPE_CHECKING:
     from tron.neural.networks.backbone import Backbone
@@ -27,6 +29,10 @@ log = logging.getLogger(__name__)
 PLAIN_TIMESTEP = 0.2  # what the tiny transformer is told; any constant will do
 BLUR_SIDE = 5
 """Pixels of the square that skip_blur gathers from; skip_kernel has its own."""
+REACH = 96
+"""Pixels that a change of guidance reaches in the U-Net's picture, to a 255th of white."""
+HARDLY = -7.0
+"""Logarithm of what a new kernel with holes has of each neighbour, over what it has of the pixel itself."""
 
 
 def _backbone(shape: UNetConfig | BackboneConfig, given: int, predicted: int) -> Backbone | UNet:
@@ -55,8 +61,25 @@ class NeuralRenderer(Renderer):
         latents = len(self.config.guidance) if self.config.fusion == "concat" else 1
         shape = self.config.backbone
         detail = 0 if self.config.skip_detail is None else channels
-        self._predicted = [channels, self.config.skip_kernel**2, detail]
+        taps = self.config.skip_kernel**2
+        # In this order: what a wider network adds comes last (tron.neural.weights.widened).
+        self._predicted = [channels, taps, detail, taps if self.config.skip_holes else 0]
         self.backbone: Backbone | UNet = _backbone(shape, latents * channels, sum(self._predicted))
+
+    @property
+    def reach(self) -> int | None:
+        """As Renderer.reach: of U-Nets on pixels, whose layers see farther than it matters."""
+        shape = self.config.backbone
+        if not isinstance(shape, UNetConfig) or shape.attention or self.config.codec != "pixels":
+            return None
+        return REACH * self.config.scales
+
+    @property
+    def stride(self) -> int:
+        """As Renderer.stride."""
+        return (
+            self.backbone.stride * self.config.scales if isinstance(self.backbone, UNet) else self.space_block
+        )
 
     def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:
         """As Renderer.forward, with 1 + temporal_factor * n frames of any H and W.
@@ -68,7 +91,14 @@ class NeuralRenderer(Renderer):
         videos = [self._padded(video) for video in self.stacked(buffers)]
         height, width = next(iter(buffers.values())).shape[-2:]
         check_frames(videos[0].shape[2], self.temporal_factor)
-        scales = self._scales(weights)
+        drawn = self._drawn(videos, self._scales(weights))
+        if self.config.scales == 2:
+            coarse = self._drawn(halved(dict(zip(self.config.guidance, videos))), self._scales(weights))
+            drawn = with_coarse(drawn, coarse)
+        return self.codec.decode(drawn)[..., :height, :width]
+
+    def _drawn(self, videos: list[Tensor], scales: list[float]) -> Tensor:
+        """Latents of the picture, drawn at one scale."""
         latents = [self.codec.encode(video) for video in videos]
         weighed = [z if scale == 1 else scale * z for scale, z in zip(scales, latents)]
         mean = torch.stack(weighed).mean(0)
@@ -78,17 +108,16 @@ class NeuralRenderer(Renderer):
             change = self.backbone(fused, PLAIN_TIMESTEP)
         else:
             change = -t * self.backbone((1 - t) * fused, t).float()
-        change, kernels, shares = change.split(self._predicted, 1)
+        change, kernels, shares, wide = change.split(self._predicted, 1)
         if self.config.skip == MEAN:
             start = mean
         elif self.config.skip_kernel:
-            start = self._refiltered(videos, kernels, shares)
+            start = self._refiltered(videos, kernels, shares, wide)
         else:
             index = self.config.guidance.index(self.config.skip)
             start = self._blurred(videos[index]) if self.config.skip_blur else latents[index]
         # The difference of two nearly equal numbers in bf16 would lose the picture: in float32 there.
-        drawn = start + change if t is None else (1 - t) * start.float() + change
-        return self.codec.decode(drawn)[..., :height, :width]
+        return start + change if t is None else (1 - t) * start.float() + change
 
     def check_weights(self, weights: Mapping[str, float] | None) -> None:
         """As Renderer.check_weights: one number >= 0 for each buffer of the guidance, not all of them 0."""
@@ -125,17 +154,20 @@ class NeuralRenderer(Renderer):
         blur = gaussian_logits(self.config.skip_blur, BLUR_SIDE).to(video)
         return self.codec.encode(filtered(video, blur.softmax(0)))
 
-    def _refiltered(self, videos: list[Tensor], kernels: Tensor, shares: Tensor) -> Tensor:
+    def _refiltered(self, videos: list[Tensor], kernels: Tensor, shares: Tensor, wide: Tensor) -> Tensor:
         """The start, filtered by kernels that the backbone changes the Gaussian to, and detail given back."""
         names, config = self.config.guidance, self.config
         start = videos[names.index(config.skip)]
+        sharp = start[:, :0] if config.skip_detail is None else videos[names.index(config.skip_detail)]
         blur = gaussian_logits(config.skip_blur, config.skip_kernel).to(start)
-        weights = (blur[:, None, None, None] + kernels).softmax(1)
-        if config.skip_detail is None:
-            return filtered(start, weights)
-        sharp = videos[names.index(config.skip_detail)]
-        smooth, blunt = filtered(torch.cat([start, sharp], 1), weights).chunk(2, 1)
-        return smooth + shares * (sharp - blunt)
+        both = filtered(torch.cat([start, sharp], 1), (blur[:, None, None, None] + kernels).softmax(1))
+        if config.skip_holes:
+            alone = torch.full((config.skip_kernel**2,), HARDLY).to(start)
+            alone[len(alone) // 2] = 0
+            weights = (alone[:, None, None, None] + wide).softmax(1)
+            both = filtered(both, weights, 1 + config.skip_holes)
+        smooth, blunt = both.split([start.shape[1], sharp.shape[1]], 1)
+        return smooth if config.skip_detail is None else smooth + shares * (sharp - blunt)
 
     def _padded(self, video: Tensor) -> Tensor:
         block = self.codec.space_block
@@ -247,7 +279,7 @@ def render_frames(
                 unknown.update({name: int((~np.isfinite(shown[name])).sum()) for name in wanted})
                 given[index] = {name: to_tensor(shown[name][None]).to(device) for name in wanted}
             with torch.no_grad():
-                drawn = renderer(_joined([given[index] for index in this.frames]), weights)
+                drawn = drawn_in_tiles(renderer, _joined([given[index] for index in this.frames]), weights)
             display = to_display_array(drawn)
             for index in this.kept:
                 frame = display[index - this.frames.start]
@@ -288,23 +320,24 @@ def gaussian_logits(deviation: float, side: int) -> Tensor:
     return (-squares / (2 * deviation**2)).flatten()
 
 
-def filtered(video: Tensor, weights: Tensor) -> Tensor:
+def filtered(video: Tensor, weights: Tensor, step: int = 1) -> Tensor:
     """Weighted sum of each pixel's neighbours; beyond the border the edge goes on.
 
     Args:
         video: (B, C, K, H, W).
         weights: of the neighbours, rows first: (side^2,), or (B, side^2, K, H, W) for kernels of their own.
+        step: pixels from one neighbour to the next.
 
     Returns:
         (B, C, K, H, W).
     """
     count = weights.shape[0] if weights.ndim == 1 else weights.shape[1]
     side = round(count**0.5)
-    reach, (height, width) = side // 2, video.shape[-2:]
+    reach, (height, width) = side // 2 * step, video.shape[-2:]
     wide = pad(video, (reach, reach, reach, reach, 0, 0), mode="replicate")
     result = torch.zeros_like(video)
     for k in range(count):
         y, x = divmod(k, side)
         weight = weights[k] if weights.ndim == 1 else weights[:, k : k + 1]
-        result = result + weight * wide[..., y : y + height, x : x + width]
+        result = result + weight * wide[..., y * step : y * step + height, x * step : x * step + width]
     return result

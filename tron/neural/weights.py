@@ -203,8 +203,8 @@ def _widened(weight: Tensor, latents: int, config: BackboneConfig, codec: Codec)
 
 
 # What is added begins at zero: columns of the first layer for the new buffers, and rows of the last for
-# shares of detail. So the wider network draws exactly what the other did, and learns from there what the
-# new buffers are worth.
+# shares of detail and kernels with holes. So the wider network draws what the other did (with kernels with
+# holes nearly so), and learns from there what the new is worth.
 
 FIRST, LAST = "backbone.embed.weight", ("backbone.out.weight", "backbone.out.bias")
 
@@ -212,16 +212,19 @@ FIRST, LAST = "backbone.embed.weight", ("backbone.out.weight", "backbone.out.bia
 def widened(state: dict[str, Tensor], narrow: RendererConfig, wide: NeuralRenderer) -> dict[str, Tensor]:
     """The state of a U-Net of configuration ``narrow`` as one of ``wide``.
 
-    The same state where the two do not differ in their guidance alone, or in a ``skip_detail`` that is new.
+    The same state where they differ in more than guidance, scales, and a ``skip_detail`` or ``skip_holes``
+    that is new.
     """
     config, shape = wide.config, wide.config.backbone
-    added = {"guidance": narrow.guidance, "skip_detail": narrow.skip_detail, "window": narrow.window}
+    may_differ = ("guidance", "skip_detail", "skip_holes", "scales", "window")
+    added = {name: getattr(narrow, name) for name in may_differ}
     if (
         not isinstance(shape, UNetConfig)
         or config.fusion != "concat"
         or config.model_copy(update=added).model_dump() != narrow.model_dump()
-        or not set(narrow.guidance) < set(config.guidance)
+        or not set(narrow.guidance) <= set(config.guidance)
         or narrow.skip_detail not in (None, config.skip_detail)
+        or narrow.skip_holes not in (0, config.skip_holes)
     ):
         return state
     channels, area = wide.codec.latent_channels, shape.patch**2

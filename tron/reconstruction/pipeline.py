@@ -43,7 +43,7 @@ from tron.reconstruction.geometry.training import (
 from tron.reconstruction.materials.carried import Carried
 from tron.reconstruction.priors.prior import FIELDS, Light, Prior, Surfels
 from tron.reconstruction.progress import Track, untracked
-from tron.reconstruction.scores import Seen, ViewScore, score_views
+from tron.reconstruction.scores import LOOKS, Seen, ViewScore, score_views
 from tron.reconstruction.settings import FitSettings, ReconstructionSettings
 from tron.relighting import Relighter
 from tron.relighting.proxy import Proxy
@@ -68,7 +68,8 @@ class Reconstruction:
     Attributes:
         scene: surfels with radiance and materials.
         light: None where none was asked for or none could be found, which the log says.
-        scores: figures of each held-out view ("test") and of at most TRAIN_VIEWS_SCORED others ("train").
+        scores: figures of each held-out view ("test") and of at most TRAIN_VIEWS_SCORED others ("train");
+            those of a room's pictures are of the surfels before windows were opened.
         learnt: the materials that were found; the others are what surfels begin with.
         gains: (V, 3) linear exposure and white balance of the training photos, where the prior finds them.
         source: of the first surfels.
@@ -155,7 +156,13 @@ def reconstruct(
     degree = settings.initial.kernel_degree
     scene = replace(surfels.scene(degree, capture.up), offset=capture.offset)
     if not run.past(plan.name):
-        scene = closed_indoors(scene, views, settings.indoors, settings.seed, track)
+        closed = closed_indoors(scene, views, settings.indoors, settings.seed, capture.tone_curve, track)
+        if closed is not scene:
+            # Windows show whatever light there is from now on, not the photos'.
+            run.begun["looks"] = _looks(
+                _scores(SurfelTracer(scene.validate()), capture, settings, lpips, track)
+            )
+        scene = closed
     scene = _with_baked_color(scene)
 
     def learn(names: Collection[str]) -> GaussianScene:
@@ -173,7 +180,10 @@ def reconstruct(
         lit = found.light or prior.find_light(frozen, tracer, light)
     seconds["light"] = time.perf_counter() - started
     scores = _scores(tracer, capture, settings, lpips, track)
-    return Reconstruction(found.scene, lit, scores, found.learnt, found.gains, seconds=seconds, **run.begun)
+    begun = dict(run.begun)
+    if looks := begun.pop("looks", None):
+        scores = _as_they_looked(scores, looks)
+    return Reconstruction(found.scene, lit, scores, found.learnt, found.gains, seconds=seconds, **begun)
 
 
 def _scores(
@@ -183,6 +193,27 @@ def _scores(
     judged = {"test": capture.test_views, "train": views[:: max(1, len(views) // TRAIN_VIEWS_SCORED)]}
     background = settings.radiance.background
     return {which: score_views(seen, some, background, lpips, track) for which, some in judged.items()}
+
+
+def _looks(scores: Mapping[str, Sequence[ViewScore]]) -> dict[str, dict[str, dict[str, float]]]:
+    """Figures of pictures by set and view, as plain values."""
+    return {
+        which: {
+            score.view: {name: score.figures[name] for name in LOOKS if name in score.figures}
+            for score in some
+        }
+        for which, some in scores.items()
+    }
+
+
+def _as_they_looked(
+    scores: Mapping[str, Sequence[ViewScore]], looks: Mapping[str, Mapping[str, Mapping[str, float]]]
+) -> dict[str, list[ViewScore]]:
+    """Scores with figures of pictures from :func:`_looks`."""
+    return {
+        which: [ViewScore(score.view, {**score.figures, **looks[which][score.view]}) for score in some]
+        for which, some in scores.items()
+    }
 
 
 def _kept(

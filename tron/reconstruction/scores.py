@@ -21,6 +21,8 @@ from tron.metrics import LPIPS, angular_errors_deg, capped_psnr, scale_albedo, s
 from tron.reconstruction.progress import Track, untracked
 from tron.tracing import GBuffer
 
+LOOKS = ("psnr", "ssim", "lpips", "psnr_subject")
+"""Figures of pictures alone, not of maps."""
 _SUBJECT = 0.5
 BACKGROUND = {"black": 0.0, "white": 1.0, "random": 0.0}
 _LPIPS_LEAST_SIDE = 16

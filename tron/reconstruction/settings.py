@@ -255,8 +255,9 @@ class ReconstructionSettings(Settings):
     indoors: Indoors = Field(
         default="auto",
         description="Photos taken in a room: where none shows what bounds it, such as a ceiling, surfels of "
-        "the colour near by close it, so that no light comes in; auto: where surfaces stand around the "
-        "cameras on all sides, and higher than trees or houses would.",
+        "the colour near by close it, so that no light comes in, and surfels that show the sky in windows "
+        "are taken out, so that it does there; auto: where surfaces stand around the cameras on all sides, "
+        "and higher than trees or houses would.",
     )
     steps_scaler: float = Field(
         default=0.1,

@@ -172,9 +172,9 @@ class Relighter:
         """What a camera sees; ``values`` of the surfels that light sees are composited too."""
         return self.tracer(camera).gbuffer(camera, values)
 
-    def surface_maps(self, camera: Camera) -> dict[str, np.ndarray]:
-        """:func:`tron.shading.guidance.surface_maps` of a view: what no light changes."""
-        return surface_maps(self.tracer(camera), camera)
+    def surface_maps(self, camera: Camera, *estimations: Estimation) -> list[dict[str, np.ndarray]]:
+        """:func:`tron.shading.guidance.surface_maps` of a view, for frames of some estimations."""
+        return surface_maps(self.tracer(camera), camera, estimations)
 
     @cached_property
     def transport(self) -> BounceTransport:
@@ -320,7 +320,11 @@ class TracedFrame:
 
 
 def views_under(lights: Sequence[Illumination], camera: Camera) -> list[GBuffer]:
-    """What a camera sees under each of several lights of one relighter and estimation, traced once."""
-    first = lights[0]
-    bounces = [light.bounced for light in lights]
-    return trace_views(first.relighter.tracer(camera), camera, first.estimation, bounces)
+    """What a camera sees under each light of one relighter; once for as many sub-pixels."""
+    tracer = lights[0].relighter.tracer(camera)
+    views: dict[int, GBuffer] = {}
+    for times in {light.estimation.supersample for light in lights}:
+        alike = [k for k, light in enumerate(lights) if light.estimation.supersample == times]
+        bounces = [lights[k].bounced for k in alike]
+        views |= zip(alike, trace_views(tracer, camera, lights[alike[0]].estimation, bounces), strict=True)
+    return [views[k] for k in range(len(lights))]

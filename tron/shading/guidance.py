@@ -32,7 +32,7 @@ import numpy as np
 
 from tron.cameras import Camera
 from tron.color import Look, to_display
-from tron.estimation import FINAL, Diffuse, Estimation
+from tron.estimation import FINAL, MOST_RAYS, OCTAVES, Diffuse, Estimation
 from tron.io.images import write_image
 from tron.metering import incident_exposure
 from tron.shading.bounces.bounce import BouncedLight
@@ -331,11 +331,20 @@ SUB_PIXELS = 2
 """Sub-pixels along a pixel's side."""
 
 
-def surface_maps(tracer: ViewTracer, camera: Camera) -> dict[str, np.ndarray]:
-    """Members ``albedo`` and ``surface`` of one view, (H, W, 3) float32 in [0, 1], 0 where no surfels are.
+def surface_maps(
+    tracer: ViewTracer, camera: Camera, estimations: Sequence[Estimation]
+) -> list[dict[str, np.ndarray]]:
+    """Members that no light changes of one view, one set an estimation of the light.
 
-    ``albedo`` is linear base color; the channels of ``surface`` are |n . v| of the unit normal and the unit
-    direction to the camera, roughness and metallic. Each sub-pixel counts by its opacity.
+    Each is (H, W, 3) float32 in [0, 1], 0 where no surfels are, and every sub-pixel counts by its opacity:
+
+        albedo      linear base color
+        surface     |n . v| of the unit normal and the unit direction to the camera, roughness, metallic
+        sampling    a third if filtered and two if of sub-pixels; log2 of the shadow rays a pixel over
+                    MOST_RAYS of tron.estimation; log2 of the pixel's footprint, distance / fx, over the
+                    scene's surfel spacing, OCTAVES of tron.estimation as 0 to 1
+
+    With ``sampling`` a network knows what the light's noise and the surfels' blur are like.
     """
     fine = camera.resized(SUB_PIXELS * camera.width, SUB_PIXELS * camera.height)
     seen = tracer.gbuffer(fine).numpy()
@@ -345,4 +354,18 @@ def surface_maps(tracer: ViewTracer, camera: Camera) -> dict[str, np.ndarray]:
         "surface": np.stack([facing, seen["roughness"], seen["metallic"]], axis=-1),
     }
     opacity = seen["opacity"][..., None]
-    return {name: averaged(np.clip(image, 0, 1) * opacity, SUB_PIXELS) for name, image in maps.items()}
+    maps = {name: averaged(np.clip(image, 0, 1) * opacity, SUB_PIXELS) for name, image in maps.items()}
+    footprint = np.maximum(seen["depth"], 1e-30) / (camera.fx * tracer.scene.spacing)
+    low, high = OCTAVES
+    octaves = averaged(
+        np.clip((np.log2(footprint) - low) / (high - low), 0, 1)[..., None] * opacity, SUB_PIXELS
+    )
+    covered = averaged(opacity, SUB_PIXELS)
+    return [maps | {"sampling": _sampling(estimation, octaves, covered)} for estimation in estimations]
+
+
+def _sampling(estimation: Estimation, octaves: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """Channels of ``sampling`` from those of the footprint and of opacity, (H, W, 1) each."""
+    kind = (estimation.filtered + 2 * (estimation.supersample > 1)) / 3
+    rays = min(np.log2(estimation.rays) / MOST_RAYS, 1)
+    return np.concatenate([kind * covered, rays * covered, octaves], axis=-1).astype(np.float32)

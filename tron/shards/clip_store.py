@@ -92,7 +92,10 @@ class ClipStore:
         """Metadata of a clip; TronError where they are missing, damaged or of another clip."""
         if number not in self._metas:
             key = self.key(number)
-            meta = decode_meta(self._files(number, [META_SUFFIX])[META_SUFFIX])
+            files = self._files(number, [META_SUFFIX])
+            if META_SUFFIX not in files:  # the shard ends within the clip
+                raise TronError(f"clip {key} has no {META_SUFFIX}", self._where(number), DAMAGED)
+            meta = decode_meta(files[META_SUFFIX])
             if meta.key != key:
                 raise TronError(f"clip {key} has the metadata of {meta.key}", self._where(number))
             while len(self._metas) >= MOST_METAS:

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from tron.color import agx, linear_to_srgb
 from tron.errors import TronError
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 
 ColorSpace = Literal["linear", "display", "reflectance"]
 """linear light; display values in [0, 1]; linear base color in [0, 1], which is under no light."""
@@ -81,6 +81,9 @@ MEMBERS: dict[str, Member] = {
     ),
     "surface": Member(
         "exr", 3, 2, None, "all", "cosine of normal and view, roughness, metallic of the surfels, likewise"
+    ),
+    "sampling": Member(
+        "exr", 3, 2, None, "all", "filtered and sub-pixels, rays, footprint of a pixel over surfel spacing"
     ),
     "mask": _scalar("opacity of the surfels in [0, 1]", "all"),
     "foreground": Member("png", 1, 1, None, "all", "1 where the pixel-centre ray meets true geometry"),

@@ -205,6 +205,9 @@ def test_surfels_that_close_a_room_outlive_an_interruption(
     closed = reconstruct(painted_capture, GroundTruth(), settings(indoors=True))
     assert len(closed.scene) > len(whole.scene)
     assert np.array_equal(closed.scene.means[: len(whole.scene)], whole.scene.means)
+    for which, before in whole.scores.items():
+        for score, other in zip(closed.scores[which], before, strict=True):
+            assert score.figures["psnr"] == other.figures["psnr"], "judged as it was learnt"
     for cut in (("radiance", 13), ("materials", 5)):
         path = tmp_path / f"{cut[0]}.safetensors"
         with pytest.raises(Cut):
@@ -213,6 +216,7 @@ def test_surfels_that_close_a_room_outlive_an_interruption(
             )
         again = reconstruct(painted_capture, GroundTruth(), settings(indoors=True), checkpoint=path)
         assert same(again.scene, closed.scene)
+        assert again.scores == closed.scores
 
 
 def test_a_finished_run_is_not_trained_again(painted_capture, tmp_path: Path) -> None:

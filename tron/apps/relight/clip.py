@@ -212,7 +212,7 @@ def trace(
     if not all(clip.folder.finished(index) for clip in clips for index in range(len(cameras))):
         relighter.prepare()
     for index, camera in enumerate(track(cameras, "guidance")):
-        surfaces = cache(partial(relighter.surface_maps, camera))  # alike under all lights
+        surfaces = cache(partial(relighter.surface_maps, camera, estimation))  # alike under all lights
         for clip in clips:
             if not clip.folder.finished(index) or not clip.metered:
                 started = time.perf_counter()
@@ -231,7 +231,7 @@ def _shade(
     camera: Camera,
     seed: int,
     names: Sequence[str],
-    surfaces: Callable[[], dict[str, np.ndarray]],
+    surfaces: Callable[[], list[dict[str, np.ndarray]]],
 ) -> tuple[Guidance, dict[str, np.ndarray]]:
     """One frame and its buffers ``names``; ``surfaces`` gives those that no light shines on."""
     from tron.shading.composition import background_share
@@ -244,7 +244,7 @@ def _shade(
     share = averaged(background_share(transmittance), light.estimation.supersample)
     made = guidance.gbuffer | vars(guidance) | {"share": share.astype(np.float32)}
     if not set(names).isdisjoint(surface_members()):
-        made |= surfaces()
+        made |= surfaces()[0]
     if "foreground" in names:
         made["foreground"] = surfels_alone(frame.shade((0, 0, 0)).lit, made["share"])
     return guidance, {name: made[name] for name in names}

@@ -33,6 +33,11 @@ class PixelMLP(Renderer):
         nn.init.zeros_(last.bias)
         self.layers = nn.Sequential(*layers, last)
 
+    @property
+    def reach(self) -> int:
+        """As Renderer.reach: none."""
+        return 0
+
     def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:
         """As Renderer.forward."""
         self.check_weights(weights)

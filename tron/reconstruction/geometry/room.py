@@ -1,10 +1,10 @@
 """Bounds of a room where no photo looked, and whether photos were taken in one.
 
-By a ceiling that nobody filmed a new light would shine in. The convex hull of surfels and cameras is
-sampled. A sample that a camera's position sees through no surfel, and that no photo has in its picture, is
-part of a wall that was not photographed; one that a photo does have in its picture is an opening, since
-surfels would be there otherwise. Nothing is known of such walls but that they are there: they get the mean
-colour of the surfels near by.
+By a ceiling that nobody filmed a new light would shine in, and windows in which surfels show the sky keep it
+out. The convex hull of surfels and cameras is sampled. What photos show there brighter than all that is lit
+is a window (:mod:`tron.reconstruction.geometry.openings`): its surfels go. Where a camera's position sees
+through no surfel, and its photo shows no window either, there is a wall. It gets the colour that photos show,
+or where none looks the mean colour of the surfels near by.
 
 Cameras are in a room where surfels stand around them on all sides, some of them overhead, and photos show few
 openings there. Of a place among trees that is filmed from above nobody can tell.
@@ -22,8 +22,11 @@ import numpy as np
 from scipy.spatial import ConvexHull, KDTree
 
 from tron.captures import View
-from tron.gaussians.harmonics import SH_COUNT
+from tron.captures.view import ToneCurve, encoded
+from tron.color import luminance
+from tron.gaussians.harmonics import SH_C0, SH_COUNT
 from tron.gaussians.scene import GaussianScene, quats_from_normals
+from tron.reconstruction.geometry.openings import opened, shining, shown_at, towards, usual_luminance
 from tron.reconstruction.geometry.seen_space import even_directions, pixels_of
 from tron.reconstruction.progress import Track, untracked
 from tron.reconstruction.settings import Indoors
@@ -48,6 +51,8 @@ _WITHIN = 0.995  # share of the surfels in each of them that the hull is of: tho
 _SOLID = 0.5  # opacity of surfels that count
 _OPEN = 0.3  # transmittance from here on: no surface was found
 _MOST = 0.5  # share of the hull that is closed in silence
+_ROUNDS = 4  # of looking for windows: sky that surfels showed outside of one bent the hull
+_FEW = 0.01  # share of the surfels from which on another round is worth its while
 _RADIUS = 0.8  # standard deviation of a new surfel, distances between samples: larger ones cover windows
 _NEAR = 32  # surfels that tell the colour
 _FEWEST = 10 * _NEAR  # surfels that bound anything
@@ -64,10 +69,12 @@ class Bounds:
         normals: (N, 3) unit, inwards.
         spacing: mean distance between them, world units.
         lacking: (N,) bool, where a camera sees no surfel and no photo looks.
-        pictured: (N,) bool, openings that photos show.
+        pictured: (N,) bool, where a camera sees no surfel and its photo has it in the picture.
+        shown: (N, 3) linear light that photos show there; NaN where none does.
+        shines: (N,) bool, where that is light from without.
         around: share of the level directions from the cameras that end on a surfel.
         over: the same of the rising ones.
-        overhead: share of the samples overhead that are such openings.
+        overhead: share of the samples overhead that are pictured, as bright as the surfels at least.
     """
 
     points: np.ndarray
@@ -75,6 +82,8 @@ class Bounds:
     spacing: float
     lacking: np.ndarray
     pictured: np.ndarray
+    shown: np.ndarray
+    shines: np.ndarray
     around: float
     over: float
     overhead: float
@@ -88,24 +97,31 @@ class Bounds:
 
 
 def closed_indoors(
-    scene: GaussianScene, views: Sequence[View], indoors: Indoors, seed: int, track: Track = untracked
+    scene: GaussianScene,
+    views: Sequence[View],
+    indoors: Indoors,
+    seed: int,
+    curve: ToneCurve = "srgb",
+    track: Track = untracked,
 ) -> GaussianScene:
-    """The scene (world frame and units), with surfels where a room is bounded and no view looks.
+    """The scene (world frame and units), with surfels where a room is bounded and none in its windows.
 
     The new ones face inwards, are opaque and nearly diffuse; base color (linear) and the constant harmonic
-    (display) are means of what is near.
+    (display) are those of photos, and means of what is near where no photo looks.
 
     Args:
-        scene: surfels; those that are there stay, and come first.
-        views: cameras are looked at, not images.
+        scene: surfels; those that stay come first.
+        views: photos.
         indoors: whether they were taken in a room; auto: where :attr:`Bounds.room` says so, and no mask of
             theirs says what is subject or sky.
         seed: root of the random numbers.
+        curve: of the photos.
         track: wraps the loop over the views.
     """
     if not indoors or (indoors == "auto" and any(view.has("mask") or view.has("sky_mask") for view in views)):
         return scene
-    bounds = bounds_of(scene, views, seed, track)
+    usual = usual_luminance(scene, curve)
+    bounds = bounds_of(scene, views, seed, curve, track, usual)
     if bounds is None:
         return scene
     if indoors == "auto" and bounds.room is None:
@@ -116,13 +132,36 @@ def closed_indoors(
         )
     if indoors == "auto" and bounds.room:
         log.warning("taken for photos of a room, which is closed; indoors=false if it is none")
-    return enclosed(scene, bounds) if indoors is True or bounds.room else scene
+    if not (indoors is True or bounds.room):
+        return scene
+    for _ in range(_ROUNDS):
+        before = len(scene)
+        scene = opened(scene, views, bounds.points, bounds.shines, usual, curve)
+        if len(scene) == before:
+            break
+        log.info("indoors: %d surfels stood in windows", before - len(scene))
+        bounds = bounds_of(scene, views, seed, curve, track, usual)
+        if bounds is None:
+            return scene
+        if before - len(scene) < _FEW * before:
+            break
+    return enclosed(scene, bounds, curve)
 
 
 def bounds_of(
-    scene: GaussianScene, views: Sequence[View], seed: int, track: Track = untracked
+    scene: GaussianScene,
+    views: Sequence[View],
+    seed: int,
+    curve: ToneCurve = "srgb",
+    track: Track = untracked,
+    usual: float | None = None,
 ) -> Bounds | None:
-    """Bounds of the space of surfels and cameras; None where there are next to no surfels."""
+    """Bounds of the space of surfels and cameras; None where there are next to no surfels.
+
+    Args:
+        scene, views, seed, curve, track: as of :func:`closed_indoors`.
+        usual: luminance that a window's is told by; None: that of these surfels.
+    """
     solid = scene.means[scene.opacities() > _SOLID].astype(np.float64)
     if len(solid) < _FEWEST:
         return None
@@ -130,15 +169,19 @@ def bounds_of(
     points, normals, spacing = _hull(solid, cameras, seed)
     tracer = SurfelTracer(scene)
     free, pictured = np.zeros(len(points), bool), np.zeros(len(points), bool)
-    for view in track(views, "photos of what bounds the space"):
+    for view in track(views, "what bounds the space"):
         through = _transmittance(tracer, view.camera.position, points) > _OPEN
         free |= through
         pictured |= through & pixels_of(view, points)[2]
     rising = points - cameras.mean(0)
     overhead = rising @ scene.up > _RISING * np.linalg.norm(rising, axis=1)
+    shown = shown_at(scene, views, points, curve, track)
+    usual = usual_luminance(scene, curve) if usual is None else usual
+    sky = pictured & (luminance(shown) > usual)
     return Bounds(
-        points, normals, spacing, free & ~pictured, pictured, *_bounded(tracer, cameras),
-        float(pictured[overhead].mean()) if overhead.any() else 0.0,
+        points, normals, spacing, free & ~pictured, pictured, shown,
+        shining(points, normals, shown, usual, scene.up), *_bounded(tracer, cameras),
+        float(sky[overhead].mean()) if overhead.any() else 0.0,
     )  # fmt: skip
 
 
@@ -151,13 +194,14 @@ def _bounded(tracer: SurfelTracer, cameras: np.ndarray) -> tuple[float, float]:
     return float(met[np.abs(height) < _LEVEL].mean()), float(met[height > _RISING].mean())
 
 
-def enclosed(scene: GaussianScene, bounds: Bounds) -> GaussianScene:
+def enclosed(scene: GaussianScene, bounds: Bounds, curve: ToneCurve) -> GaussianScene:
     """The scene with surfels where bounds are lacking; see :func:`closed_indoors`."""
-    lacking = bounds.lacking
+    unfound = bounds.pictured & ~bounds.shines & np.isfinite(bounds.shown[:, 0])
+    lacking = bounds.lacking | unfound
     count = int(lacking.sum())
     log.info(
         "indoors: %d surfels close %.0f %% of what bounds the room; %.0f %% are openings that photos show",
-        count, 100 * lacking.mean(), 100 * bounds.pictured.mean(),
+        count, 100 * lacking.mean(), 100 * (bounds.pictured & ~unfound).mean(),
     )  # fmt: skip
     if lacking.mean() > _MOST:
         log.warning("photos show little of what bounds the room: indoors=false if they were taken elsewhere")
@@ -166,15 +210,18 @@ def enclosed(scene: GaussianScene, bounds: Bounds) -> GaussianScene:
     there = np.flatnonzero(scene.opacities() > _SOLID)
     points = bounds.points[lacking]
     near = there[KDTree(scene.means[there].astype(np.float64)).query(points, k=_NEAR)[1]]
-    sh = np.zeros((count, SH_COUNT, 3))
+    photographed, shown = unfound[lacking], bounds.shown[unfound]
+    sh, base_color = np.zeros((count, SH_COUNT, 3)), scene.base_color[near].mean(1)
     sh[:, 0] = scene.sh[near, 0].mean(1)
+    sh[photographed, 0] = (encoded(shown, curve) - 0.5) / SH_C0
+    base_color[photographed] = np.clip(shown, 0, 1)
     new = {
         "means": points,
         "quats": quats_from_normals(bounds.normals[lacking]),
         "log_scales": np.full((count, 2), np.log(_RADIUS * bounds.spacing)),
         "opacity_logits": np.full(count, _OPACITY_LOGIT),
         "sh": sh,
-        "base_color": scene.base_color[near].mean(1),
+        "base_color": base_color,
         "roughness": np.full(count, _ROUGHNESS),
         "metallic": np.zeros(count),
         "object_id": np.zeros(count),
@@ -201,7 +248,6 @@ def _hull(means: np.ndarray, cameras: np.ndarray, seed: int) -> tuple[np.ndarray
 
 def _transmittance(tracer: SurfelTracer, origin: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(N,) from one position towards points (N, 3) and beyond."""
-    ways = points - origin
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    ways = towards(origin, points)
     start = mi.Point3f(*(dr.full(mi.Float, float(x), len(points)) for x in origin))
     return tracer.transmittance(start, lanes(mi.Vector3f, ways)).numpy()

@@ -11,6 +11,8 @@ from tron.captures import Capture, View
 from tron.errors import TronError
 from tron.seeds import generator
 
+OPAQUE = 0.5
+"""Less opaque pixels have no median depth, hence no surface point (conventions.md, 7)."""
 _DRAWS = 64
 _DRAWS_OF_BOX = 16
 _LEAST_SHARE = 0.25

@@ -34,9 +34,9 @@ from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from tron.captures.view import FLOOR
 from tron.errors import TronError
 from tron.reconstruction.light.sky_visibility import PhotographedSky, cube_texels
-from tron.reconstruction.light.surfel_colors import FLOOR
 from tron.reconstruction.settings import Settings
 from tron.runtime import torch_device
 from tron.seeds import generator

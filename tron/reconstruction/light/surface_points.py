@@ -12,13 +12,12 @@ import numpy as np
 
 from tron.captures import View
 from tron.errors import TronError
+from tron.reconstruction.geometry.seen_space import OPAQUE
 from tron.reconstruction.progress import Track, untracked
 from tron.runtime import aligned
 from tron.seeds import generator
 from tron.shading.guidance import ViewTracer
 
-OPAQUE = 0.5
-"""Less opaque pixels have no median depth, hence no surface point (conventions.md, 7)."""
 SKY = 0.5
 """Where the sky mask is at least this, the pixel is sky."""
 

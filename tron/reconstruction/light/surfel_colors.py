@@ -17,18 +17,14 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import KDTree
 
 from tron.captures import View
-from tron.captures.view import ToneCurve, linear_light
+from tron.captures.view import CLIPPED, FLOOR, ToneCurve, linear_light
+from tron.reconstruction.geometry.seen_space import OPAQUE
 from tron.reconstruction.light.fit_environment import reduced
-from tron.reconstruction.light.surface_points import OPAQUE
 from tron.reconstruction.progress import Track, untracked
 from tron.shading.guidance import ViewTracer
 
-FLOOR = 2e-3
-"""Linear light below which 8 bits hold no colour."""
 _ROUNDS = 6
 _TRUSTED = 20.0  # observations that a photo's exposure needs to be half believed
-CLIPPED = 0.985
-"""Display values from here on hold no radiance: the photo's white."""
 _REGION = 24  # surfels whose median spread tells a mirror from a wrong depth here and there
 _CHANGES = 0.3  # spread from which it does: a factor of 1.35
 _FACING = 0.2  # least n.v: flatter views show too few pixels of a surfel

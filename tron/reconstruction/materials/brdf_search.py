@@ -25,9 +25,10 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import KDTree
 
+from tron.captures.view import FLOOR
 from tron.color import luminance
 from tron.gaussians import GaussianScene
-from tron.reconstruction.light.surfel_colors import FLOOR, Observations, SurfelColors, grouped_median
+from tron.reconstruction.light.surfel_colors import Observations, SurfelColors, grouped_median
 from tron.runtime import aligned, lanes
 from tron.shading.brdf_table import BrdfTable
 from tron.shading.lighting import Lighting

@@ -25,13 +25,12 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from tron.captures import Capture
-from tron.captures.view import ToneCurve, decoded, encoded
+from tron.captures.view import FLOOR, ToneCurve, decoded, encoded
 from tron.estimation import Estimation
 from tron.gaussians.harmonics import dc_to_rgb
 from tron.gaussians.scene import GaussianScene
 from tron.metrics import capped_psnr
 from tron.reconstruction.light.fit_pairs import TooFewSeen
-from tron.reconstruction.light.surfel_colors import FLOOR
 from tron.reconstruction.materials.joint_fit import JointFit, JointSettings, fit_jointly
 from tron.reconstruction.progress import Track, untracked
 from tron.relighting import Relighter

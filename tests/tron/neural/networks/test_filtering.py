@@ -85,6 +85,17 @@ def test_detail_of_a_buffer_is_given_back_in_the_share_that_the_network_predicts
     torch.testing.assert_close(made(given), filtered(given["lit"], blur) + detail)
 
 
+def test_a_kernel_with_holes_brings_what_lies_beyond_the_first():
+    """All of it on the neighbour above: two holes between make that three pixels."""
+    made, given = renderer(skip_blur=0.6, skip_kernel=3, skip_holes=2), buffers()
+    start = filtered(given["lit"], gaussian_logits(0.6, 3).softmax(0))
+    torch.testing.assert_close(made(given), start, atol=0.05, rtol=0, msg="next to nothing at first")
+    bias = made.backbone.get_parameter("out.bias").data.view(4, 3 + 9 + 9)
+    bias[:, 12 + 1] = 30.0
+    above = torch.cat([start[..., :1, :]] * 3 + [start[..., :-3, :]], -2)
+    torch.testing.assert_close(made(given), above, atol=1e-4, rtol=0)
+
+
 def test_kernels_do_not_see_other_frames():
     made, given = renderer(skip_blur=0.6, skip_kernel=3), buffers(2)
     torch.nn.init.normal_(made.backbone.get_parameter("out.weight"), std=0.1)

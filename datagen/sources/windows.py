@@ -1,0 +1,114 @@
+"""Frames that are windows of larger pictures: many scales for the price of small frames.
+
+A window is a camera with another principal point. Where it lies follows from a seed and from what the picture
+shows, so that none is empty. Filters of guidance look beyond a window's edge as they do in the picture:
+it is traced with a margin, and cut.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from datagen.dataset.spool import Frame
+from datagen.settings.split import SplitSettings
+from datagen.truth.build import FIRST_ID, Geometry
+from datagen.truth.pathtrace import gbuffers
+from datagen.world.scene import SceneSpec
+from tron.cameras import Camera
+from tron.seeds import generator
+
+MARGIN = 16
+"""Pixels around a window that the widest filter of guidance reaches (:mod:`tron.shading.direct`)."""
+OF_OBJECTS = 0.5
+"""Share of the windows that are about an object."""
+COARSE = 64
+"""Width, in pixels, of the view that tells where a picture shows something."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """Part of a picture, in its pixels.
+
+    Attributes:
+        picture: camera of the whole.
+        x, y: upper left pixel. width, height: of the part.
+    """
+
+    picture: Camera
+    x: int
+    y: int
+    width: int
+    height: int
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the part."""
+        return self.picture.window(self.x, self.y, self.width, self.height)
+
+    def with_margin(self) -> Window:
+        """The part and what lies within :data:`MARGIN` of it, as far as the picture goes."""
+        left, top = max(self.x - MARGIN, 0), max(self.y - MARGIN, 0)
+        right = min(self.x + self.width + MARGIN, self.picture.width)
+        bottom = min(self.y + self.height + MARGIN, self.picture.height)
+        return Window(self.picture, left, top, right - left, bottom - top)
+
+    def cut(self, frame: Frame) -> Frame:
+        """Images (H, W, ...) of :meth:`with_margin`, without the margin."""
+        wide = self.with_margin()
+        rows = slice(self.y - wide.y, self.y - wide.y + self.height)
+        columns = slice(self.x - wide.x, self.x - wide.x + self.width)
+        return {name: image[rows, columns] for name, image in frame.items()}
+
+
+def draw_windows(spec: SceneSpec, geometry: Geometry, recipe: SplitSettings, light: int) -> list[Window]:
+    """The windows of a clip, one a frame; whole pictures where the recipe asks for no windows.
+
+    Frames that are neighbours of one clip have their windows at one place of pictures of one size
+    (``window_each=clip``), else each frame draws its own.
+
+    Args:
+        spec, geometry: the scene, its objects where they are at first.
+        recipe: of its split.
+        light: number of the first of the lights that the clip is filmed under.
+    """
+    windows: list[Window] = []
+    for i in range(recipe.frames):
+        draw = generator(spec.seed, spec.split, spec.index, "window", light, i)
+        if windows and recipe.window_each == "clip":
+            first = windows[0]
+            width, height = first.picture.width, first.picture.height
+        else:
+            first = None
+            width, height = recipe.pictures[int(draw.integers(len(recipe.pictures)))]
+        picture = spec.clip(light, recipe.frames, width, height)[i]
+        if first is not None:
+            x, y = first.x, first.y
+        else:
+            x, y = _place(picture, geometry, len(spec.surroundings), recipe, draw)
+        windows.append(Window(picture, x, y, recipe.width, recipe.height))
+    return windows
+
+
+def _place(
+    picture: Camera, geometry: Geometry, surroundings: int, recipe: SplitSettings, draw: np.random.Generator
+) -> tuple[int, int]:
+    """Upper left pixel of a window about some pixel of the picture that shows a surface.
+
+    Half of the windows are about an object where one is seen: floors and skies teach little.
+    """
+    room = np.array([picture.width - recipe.width, picture.height - recipe.height])
+    if not room.any():
+        return 0, 0
+    (seen,) = gbuffers(geometry, [picture.resized(COARSE, round(COARSE * picture.height / picture.width))])
+    objects = seen.valid & (seen.object_id >= FIRST_ID + surroundings)
+    wanted = objects if draw.random() < OF_OBJECTS and objects.any() else seen.valid
+    rows, columns = np.nonzero(wanted)
+    middle = np.array([picture.width, picture.height]) / 2
+    if len(rows):
+        k = int(draw.integers(len(rows)))
+        middle = (np.array([columns[k], rows[k]]) + draw.random(2)) * picture.width / COARSE
+    corner = np.round(middle - np.array([recipe.width, recipe.height]) / 2).astype(int)
+    x, y = np.clip(corner, 0, room).tolist()
+    return x, y
