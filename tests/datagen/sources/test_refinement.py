@@ -8,6 +8,7 @@ from datagen.sources import refinement
 from datagen.sources.refinement import WINDOW, refine_surfels
 from tron.cameras import Camera
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
+from tron.reconstruction.geometry import training
 
 SIDE = 224  # larger than a window
 SQUARE = 0.22
@@ -84,8 +85,16 @@ def test_a_fit_repeats_bit_by_bit(spooled, one_thread) -> None:
 
 def test_windows_gain_more_than_whole_views_of_as_many_pixels(spooled, one_thread, monkeypatch) -> None:
     surfels, seen, others = spooled
-    after = []
+    after, pixels, whole = [], [], training.render
+
+    def counted(tensors, camera: Camera, **more):
+        pixels[-1] += camera.width * camera.height
+        return whole(tensors, camera, **more)
+
+    monkeypatch.setattr(training, "render", counted)
     for side, steps in ((SIDE // 2, 60), (SIDE, 15)):
         monkeypatch.setattr(refinement, "WINDOW", side)
+        pixels.append(0)
         after.append(refine_surfels(surfels, seen, others, steps, SEED)[1].after.base_color_psnr)
+    assert pixels[0] == pixels[1] == 15 * SIDE**2
     assert after[0] > after[1] + 0.5

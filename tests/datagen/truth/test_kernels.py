@@ -133,7 +133,10 @@ def test_another_light_of_a_family_is_baked_by_the_same_kernels(variant, family)
 
 @pytest.mark.parametrize("shared", [False, True], ids=["own paths", "shared path"])
 def test_a_second_scene_of_a_split_brings_no_kernel(variant, shared, tmp_path: Path):
-    """Surfels, their refinement, guidance, frames, references: all of a scene."""
+    """Surfels, their refinement, guidance, frames, references: all of a scene.
+
+    Both scenes have an even number of surfels: an odd one brings three small kernels.
+    """
     tiny = [f"test.{key}" for key in ("frames=2", "width=16", "height=16", "path_spp=4", "reference_spp=4")]
     tiny += [
         f"test.lights_share_path={shared}",
@@ -143,7 +146,7 @@ def test_a_second_scene_of_a_split_brings_no_kernel(variant, shared, tmp_path: P
         "cluster=null",
         "path_frames=8",
     ]
-    tiny += ["views=6", "view_width=32", "view_height=32", "surfels=1500", "refine_steps=6", "mesh_edge=0.2"]
+    tiny += ["views=6", "view_width=32", "view_height=32", "surfels=1400", "refine_steps=6", "mesh_edge=0.2"]
     tiny += ["environment_height=16", "objects=[2,2]", f"output_dir={tmp_path}"]
     settings = check(compose_recipe("conf.datagen", Settings, tiny), Settings)
 
