@@ -21,7 +21,7 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 - ``lit_bilateral``: D(L) by a cross-bilateral filter (:mod:`eval.relighting.bilateral`).
 - ``lit_blended``: an affine blend of G(D(L)), G(D(B)), G(D(E)), G(S(A)) and S(A), weights and deviation by
   the mean PSNR of training frames (`PsnrAffineFit`).
-- ``lit_oidn``: D of L through Open Image Denoise, where pyoidn is installed.
+- ``lit_oidn``: D of L through Open Image Denoise with base color and normals, where pyoidn is installed.
 - ``affine_filtered``, ``affine_ratio_filtered``, ``affine_lit_filtered``: the blends of images so filtered.
 - ``pixel_mlp``, ``pixel_mlp_lit``: 1x1 convolutions on D(B) and D(E), or on these and D(L).
 
@@ -41,14 +41,15 @@ A new baseline is one more entry of BASELINES: scores, tables and pictures itera
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterable, Mapping
+import time
+from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from eval.relighting.bilateral import BilateralFit
-from eval.relighting.buffers import Buffers, Region, region_mask
+from eval.relighting.buffers import SURFELS_NORMAL, Buffers, Region, region_mask
 from eval.relighting.fits import (
     AffineFit,
     FilteredAffineFit,
@@ -64,7 +65,7 @@ from eval.relighting.fits import (
 from tron.color import to_display
 from tron.errors import TronError
 from tron.seeds import generator
-from tron.shards.schema import Clip
+from tron.shards.schema import Clip, guidance_members
 
 RATIO_FLOOR = 1e-4
 """Exposed unshadowed irradiance under which no ratio is formed: AgX is black below 2e-4."""
@@ -114,19 +115,20 @@ def show_oidn(buffers: Buffers) -> np.ndarray:
     """Displayed ``lit`` of whole clips (K, H, W, 3), denoised frame by frame by Intel's Open Image Denoise.
 
     A network that nobody here trained. The filter is that of path tracers' linear pictures; it is given
-    ``lit``, exposed, and base color, a mean over sub-pixels, as its clean albedo
-    (https://www.openimagedenoise.org/documentation.html).
+    ``lit``, exposed, base color, a mean over sub-pixels, as its clean albedo, and the surfels' normals where
+    the clip holds them (https://www.openimagedenoise.org/documentation.html).
     """
     from pyoidn import denoise  # pyright: ignore
 
+    lit, albedo = buffers["lit"] * buffers.exposure, np.clip(buffers["albedo"], 0, 1)
+    normals = buffers.images.get(SURFELS_NORMAL, [None] * len(lit))
     frames = [
         denoise(
-            np.ascontiguousarray(lit * buffers.exposure, np.float32),
-            np.ascontiguousarray(np.clip(albedo, 0, 1), np.float32),
+            *(None if each is None else np.ascontiguousarray(each, np.float32) for each in images),
             hdr=True,
             clean_aux=True,
         )
-        for lit, albedo in zip(buffers["lit"], buffers["albedo"])
+        for images in zip(lit, albedo, normals)
     ]
     return to_display(np.stack(frames), 1.0)
 
@@ -179,7 +181,7 @@ NETWORKS = (NEURAL_LIT, NEURAL)
 OIDN = Baseline(
     "lit_oidn",
     "lit, Open Image Denoise",
-    "Intel's denoiser on linear lit with base color",
+    "Intel's denoiser on linear lit with base color and normals",
     show_oidn,
     groups=(ON_LIT,),
     pictured=False,
@@ -378,12 +380,15 @@ def fit_baselines(clips: Iterable[Clip], seed: int) -> dict[str, Fitted]:
     return {name: fit.solve() for name, fit in fits.items()}
 
 
-def predictions(clip: Clip, methods: Mapping[str, Show]) -> dict[Region, dict[str, np.ndarray]]:
+def predictions(
+    clip: Clip, methods: Mapping[str, Show], seconds: MutableMapping[str, list[float]] | None = None
+) -> dict[Region, dict[str, np.ndarray]]:
     """Pictures of a clip by every method that needs neither fit nor weights and by the ``methods`` given.
 
     Args:
         clip: with the members MEMBERS.
         methods: name -> fitted baseline or network.
+        seconds: method name -> takes what a frame of this clip took, AgX of the buffers not counted.
 
     Returns:
         Region -> method name -> (K, H, W, 3) display float32 in [0, 1]. The regions differ only for baselines
@@ -395,7 +400,15 @@ def predictions(clip: Clip, methods: Mapping[str, Show]) -> dict[Region, dict[st
         for each in (*BASELINES, *FINER)
         if each.show and (each.needs is None or each.needs in clip.frames)
     }
-    foreground = {name: show(buffers) for name, show in {**plain, **methods}.items()}
+    if seconds is not None:
+        for name in guidance_members():
+            buffers.displayed(name)
+    foreground = {}
+    for name, show in {**plain, **methods}.items():
+        begun = time.perf_counter()
+        foreground[name] = show(buffers)
+        if seconds is not None:
+            seconds.setdefault(name, []).append((time.perf_counter() - begun) / clip.meta.frames)
     surfaces = {baseline.name for baseline in BASELINES if baseline.surfaces}
     opacity, pbr = buffers["mask"], buffers.displayed("pbr")
     frame = {

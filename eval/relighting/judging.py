@@ -14,7 +14,7 @@ from eval.relighting.gallery import Example, middle_frame
 from eval.relighting.scores import Scores, Where
 from tron.shards.dataset_folder import Place
 from tron.shards.reader import read_clips
-from tron.shards.schema import Clip
+from tron.shards.schema import TARGET, Clip
 
 log = logging.getLogger("tron.eval")
 
@@ -24,6 +24,8 @@ class Judged(NamedTuple):
 
     scores: Scores
     examples: list[Example]
+    seconds: dict[str, list[float]]
+    """Method name -> those of a frame, clip by clip."""
 
 
 def judge(
@@ -34,6 +36,7 @@ def judge(
     scores: Scores,
     members: Sequence[str] | None = None,
     look: Callable[[Clip], object] = lambda _: None,
+    truth: Callable[[Clip], np.ndarray] = lambda clip: clip.displayed(TARGET),
 ) -> Judged:
     """Score every frame; a second pass makes the pictures.
 
@@ -43,17 +46,19 @@ def judge(
         scores: that the clips join.
         members: of the clips, all by default.
         look: called with every clip besides.
+        truth: of a clip, (K, H, W, 3) display values.
     """
+    seconds: dict[str, list[float]] = {}
     for clip in read_clips(dataset, split, members):
-        scores.add(clip, predictions(clip, methods(clip.meta.scene)), clip.displayed("rgb"))
+        scores.add(clip, predictions(clip, methods(clip.meta.scene), seconds), truth(clip))
         look(clip)
         log.info("scored clip %s (%s, %s)", clip.meta.key, clip.meta.light, clip.meta.light_family)
     keys, found = choose_clips(scores, pictures), {}
     for clip in read_clips(dataset, split, members) if keys else ():
         if clip.meta.key in keys:
             shown = predictions(clip, methods(clip.meta.scene))["frame"]
-            found[clip.meta.key] = middle_frame(clip, shown, clip.displayed("rgb"))
-    return Judged(scores, [found[key] for key in keys])
+            found[clip.meta.key] = middle_frame(clip, shown, truth(clip))
+    return Judged(scores, [found[key] for key in keys], seconds)
 
 
 def choose_clips(scores: Scores, count: int) -> list[str]:

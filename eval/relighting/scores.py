@@ -65,6 +65,7 @@ METRICS = (
     ),
     Metric("ssim", "SSIM ↑", "1", metrics.ssim, "SSIM compares structure; 1 is identical."),
 )
+UNITS = {metric.name: metric.unit for metric in METRICS}
 BEST_OF_ALL = "best_of_all"
 """Group of everything but the networks that are judged, dearer forms of lit included: the best is of those
 that were scored, whatever was not given."""
@@ -185,28 +186,34 @@ class Scores:
 
     def psnr(self, method: str, where: Where = ALL) -> float | None:
         """Mean PSNR over frames in dB; None where nothing was scored."""
+        return self.mean(method, where)
+
+    def mean(self, method: str, where: Where = ALL, figure: str = "psnr") -> float | None:
+        """Mean of a metric over frames, in its unit; None where nothing was scored."""
         scores = self.of(method, where)
-        return float(np.mean([score.figures["psnr"] for score in scores])) if scores else None
+        return float(np.mean([score.figures[figure] for score in scores])) if scores else None
 
     @property
     def network(self) -> Method | None:
         """The network that the report is about: that which sees lit, if it was scored."""
         return next((method for method in self.methods if method in NETWORKS), None)
 
-    def best(self, methods: Sequence[str], where: Where = ALL) -> str | None:
-        """The method with the highest mean PSNR; None unless all were scored that are not OPTIONAL.
+    def best(self, methods: Sequence[str], where: Where = ALL, figure: str = "psnr") -> str | None:
+        """The method with the highest mean of a metric; None unless all were scored that are not OPTIONAL.
 
         Of all methods (BEST_OF_ALL) it is the best of those that were scored.
         """
-        means = {method: self.psnr(method, where) for method in methods}
+        means = {method: self.mean(method, where, figure) for method in methods}
         known = {method: mean for method, mean in means.items() if mean is not None}
         missing = set() if methods == GROUPS[BEST_OF_ALL] else means.keys() - known.keys() - OPTIONAL
         return max(known, key=known.__getitem__) if known and not missing else None
 
-    def gain(self, method: str, over: Sequence[str], where: Where = ALL) -> float | None:
-        """Mean PSNR of a method minus that of the best of others, in dB; None where one is not known."""
-        ours, best = self.psnr(method, where), self.best(over, where)
-        reached = None if best is None else self.psnr(best, where)
+    def gain(
+        self, method: str, over: Sequence[str], where: Where = ALL, figure: str = "psnr"
+    ) -> float | None:
+        """Mean of a metric of a method minus that of the best of others; None where one is not known."""
+        ours, best = self.mean(method, where, figure), self.best(over, where, figure)
+        reached = None if best is None else self.mean(best, where, figure)
         return None if ours is None or reached is None else ours - reached
 
     def rows(self, seed: int = 0) -> Iterator[Row]:
@@ -230,29 +237,54 @@ class Scores:
                         yield row
 
     def gain_row(
-        self, metric: str, method: str, over: Sequence[str], where: Where = ALL, seed: int = 0
+        self,
+        metric: str,
+        method: str,
+        over: Sequence[str],
+        where: Where = ALL,
+        seed: int = 0,
+        figure: str = "psnr",
     ) -> Row | None:
         """Gain of a method over the best of others as a row of that name; None where one is not known."""
-        gain = self.gain(method, over, where)
+        gain = self.gain(method, over, where, figure)
         if gain is None:
             return None
-        row = Row(metric=metric, value=gain, unit="dB", n=len(self.of(method, where)))
-        return self._with_ranges(row, method, over, where, seed)
+        row = Row(metric=metric, value=gain, unit=UNITS[figure], n=len(self.of(method, where)))
+        return self._with_ranges(row, method, over, where, seed, figure)
 
-    def psnr_row(self, metric: str, method: str, where: Where = ALL, seed: int = 0) -> Row | None:
-        """Mean PSNR of a method as a row of that name; None where nothing was scored."""
-        found = [(score.scene, score.figures["psnr"]) for score in self.of(method, where)]
-        return mean_row(metric, "dB", found, seed) if found else None
+    def mean_row(
+        self, metric: str, method: str, where: Where = ALL, seed: int = 0, figure: str = "psnr"
+    ) -> Row | None:
+        """Mean of a metric of a method as a row of that name; None where nothing was scored."""
+        found = [(score.scene, score.figures[figure]) for score in self.of(method, where)]
+        return mean_row(metric, UNITS[figure], found, seed) if found else None
 
-    def _with_ranges(self, row: Row, method: str, over: Sequence[str], where: Where, seed: int) -> Row:
+    def scene_gains(self, method: str, over: Sequence[str], where: Where = ALL) -> dict[str, float]:
+        """Scene -> mean PSNR of a method minus that of the best of others in that very scene, dB."""
+        means: dict[str, dict[str, float]] = {}
+        for name in (method, *over):
+            by_scene = defaultdict[str, list[float]](list)
+            for score in self.of(name, where):
+                by_scene[score.scene].append(score.figures["psnr"])
+            for scene, found in by_scene.items():
+                means.setdefault(scene, {})[name] = float(np.mean(found))
+        return {
+            scene: found.pop(method) - max(found.values())
+            for scene, found in means.items()
+            if method in found and len(found) > 1
+        }
+
+    def _with_ranges(
+        self, row: Row, method: str, over: Sequence[str], where: Where, seed: int, figure: str
+    ) -> Row:
         """The gain with its interval, in each resample over the one of the others that is the best there.
 
         Likewise where one scene is left out.
         """
         by_method = [scores for name in (method, *over) if (scores := self.of(name, where))]
-        psnr = [[score.figures["psnr"] for score in scores] for scores in by_method]
+        found = [[score.figures[figure] for score in scores] for scores in by_method]
         scenes = [score.scene for score in by_method[0]]
-        per_scene = scene_sums(scenes, np.array([*psnr, [1.0] * len(scenes)]).T)
+        per_scene = scene_sums(scenes, np.array([*found, [1.0] * len(scenes)]).T)
 
         def gain(sums: np.ndarray) -> np.ndarray:
             ours, others, frames = sums[..., 0], sums[..., 1:-1], sums[..., -1]

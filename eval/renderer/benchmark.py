@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -11,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from eval.relighting.baselines import fit_baselines
-from eval.relighting.buffers import MEMBERS
+from eval.relighting.baselines import BASELINES, NEURAL_LIT, OIDN, fit_baselines
+from eval.relighting.buffers import MEMBERS, SURFELS_NORMAL
 from eval.relighting.fits import Show
 from eval.relighting.judging import Judged, judge
 from eval.relighting.networks import Network, load_networks
@@ -24,12 +25,14 @@ from eval.renderer.datasets import (
     TEST,
     TEST_RELIT,
     Datasets,
+    Quality,
     RendererSettings,
     require_data,
 )
-from eval.renderer.gains import gain_rows, over_lit
+from eval.renderer.gains import between, everywhere, gain_rows, over_lit, time_rows
 from eval.renderer.pictures import comparison, sweep_pictures
 from eval.renderer.shadows import measure_shadows
+from eval.renderer.truths import TRUTH, Truths
 from eval.report.outcome import Outcome
 from eval.results import Row
 from eval.stages import script_path
@@ -41,12 +44,20 @@ from tron.shards.manifest import Manifest
 from tron.shards.reader import read_clips
 from tron.storage import sha256
 
+log = logging.getLogger("tron.eval")
+
 KINDS = {"neural_lit": "lit", "neural": "pair"}
 """Method -> what its rows call it."""
 FOLDS = 4
 """Groups of scenes, each judged by fits on the others: a quarter of the scenes is left out of a fit."""
 WARM_UP = 1
 """Rounds of throughput that do not count."""
+CORES = 2
+"""Threads of the network's share of a frame, in seconds."""
+PREFIX: dict[Quality, str] = {"preview": "ood_", "final": "final_"}
+"""Quality of real models' frames -> beginning of its rows."""
+FEW = "few_"
+"""Before that, where the surfels are few."""
 
 
 class Renderer(RendererSettings):
@@ -59,6 +70,8 @@ class Renderer(RendererSettings):
             script_path(name)
         require_data(self)
         load_networks("neural", self.weights())
+        if OIDN not in BASELINES:
+            log.warning("Open Image Denoise is not installed: no rows of it; pip install pyoidn")
 
     def run(self, output_dir: Path) -> Outcome:
         """Measure part after part; one line on stderr for each figure.
@@ -77,6 +90,7 @@ class Renderer(RendererSettings):
         if run.gains:
             worst = min(run.gains, key=lambda row: row.value)
             run.outcome.add([worst.model_copy(update={"metric": "renderer.lit.worst_family_gain_db"})])
+        run.outcome.add([*everywhere(run.outcome.rows)])
         run.outcome.inputs |= {
             f"{KINDS[name]}_sha256": sha256(each.path) for name, each in run.networks.items()
         }
@@ -110,9 +124,39 @@ class Run:
                 self.outcome.show("sweep", name, group)
 
     def models(self) -> None:
-        """Gains on real models."""
-        sizes = {size: self.datasets.models(size) for size in self.settings.models}
-        self._judge("models", "ood_", {size: each for size, each in sizes.items() if each}, TEST, FIT)
+        """Gains on real models at every size and quality; of the largest frames also with few surfels."""
+        largest, scores = max(self.settings.models), dict[bool, Scores]()
+        for size in self.settings.models:
+            made: dict[tuple[bool, Quality], Path] = {
+                (few, quality): dataset
+                for few in (False, True)
+                for quality in self.settings.qualities
+                if not few or (size == largest and self.settings.few_surfels is not None)
+                if (dataset := self.datasets.models(size, quality, few))
+            }
+            truths = Truths.of(made.values(), TEST)
+            for (few, quality), dataset in made.items():
+                judged = self._models_of(size, quality, few, dataset, truths)
+                if size == largest and quality == "preview":
+                    scores[few] = judged.scores
+        if len(scores) == 2:
+            name = f"renderer.preview_gain_db.{largest}"
+            row = between(name, NEURAL_LIT.name, scores[False], scores[True], self.settings.seed)
+            self.outcome.add([row] if row else [])
+
+    def _models_of(self, size: int, quality: Quality, few: bool, dataset: Path, truths: Truths) -> Judged:
+        """Rows of one size, quality and number of surfels; pictures of the largest as they are by default."""
+        first = size == min(self.settings.models) and quality == "preview"
+        judged = self._judged(dataset, TEST, FIT, truths, per_pixel=first)
+        prefix = (FEW if few else "") + PREFIX[quality]
+        self._add(prefix, {size: judged}, every_size=True)
+        clips = read_clips(dataset, TEST, ("foreground",))
+        self.outcome.add(truths.rows(clips, f"renderer.{prefix}psnr.{TRUTH}", f".{size}", self.settings.seed))
+        if first:
+            self.gains += over_lit(judged.scores, self.settings.seed)
+        if size == max(self.settings.models) and not few:
+            self._show(f"models-{quality}", size, judged, "models")
+        return judged
 
     def captures(self) -> None:
         """Gains on captures, reconstructed and relit."""
@@ -149,6 +193,22 @@ class Run:
                 metric = f"{'renderer' if kind == 'lit' else f'renderer.{kind}'}.{way}.{size}"
                 value = 1 / statistics.median(rounds)
                 self.outcome.add([Row(metric=metric, value=value, unit="frames/s", n=len(rounds))])
+        self._network_seconds(max(self.settings.sizes))
+
+    def _network_seconds(self, size: int) -> None:
+        """The network's share of a frame on CORES threads, whatever the benchmark's are."""
+        set_torch_threads(CORES)
+        for kind, network in self._by_kind().items():
+            rounds = []
+            draw = passes(network, size, self.settings.seed)["frames_per_second"]
+            for _ in range(self.settings.rounds + WARM_UP):
+                begun = time.perf_counter()
+                draw()
+                rounds.append(time.perf_counter() - begun)
+            metric = f"renderer.{'' if kind == 'lit' else f'{kind}.'}network_seconds.{size}"
+            value, count = statistics.median(rounds[WARM_UP:]), self.settings.rounds
+            self.outcome.add([Row(metric=metric, value=value, unit="s", n=count)])
+        set_torch_threads(self.settings.threads)
 
     def _by_kind(self) -> dict[str, Network]:
         return {kind: self.networks[name] for name, kind in KINDS.items() if name in self.networks}
@@ -156,22 +216,50 @@ class Run:
     def _judge(self, name: str, prefix: str, sizes: Mapping[int, Path], split: str, fit_split: str) -> None:
         """Gains on one distribution; figures without a size are of the first, pictures of the largest."""
         judged = {size: self._judged(dataset, split, fit_split) for size, dataset in sizes.items()}
-        scores = {size: each.scores for size, each in judged.items()}
-        self.outcome.add(gain_rows(prefix, scores, self.settings.seed))
-        if judged:
-            self.gains += over_lit(next(iter(scores.values())), self.settings.seed)
-            for example in judged[max(judged)].examples:
-                file = f"renderer-{name}-{max(judged)}-{example.meta.key}"
-                self.outcome.show(name, file, comparison(example))
+        self._add(prefix, judged)
+        self.gains += over_lit(next(iter(judged.values())).scores, self.settings.seed)
+        self._show(name, max(judged), judged[max(judged)], name)
 
-    def _judged(self, dataset: Path, split: str, fit_split: str) -> Judged:
-        trained = [
-            load_networks("pixel_mlp", [path]) for path in self.datasets.pixel_mlps(dataset, fit_split)
-        ]
+    def _add(self, prefix: str, judged: Mapping[int, Judged], every_size: bool = False) -> None:
+        """Rows of one distribution; every_size: as of `gain_rows`."""
+        scores = {size: each.scores for size, each in judged.items()}
+        self.outcome.add(gain_rows(prefix, scores, self.settings.seed, every_size))
+        for size, each in judged.items():
+            self.outcome.add(time_rows(prefix, each.seconds, size))
+
+    def _show(self, name: str, size: int, judged: Judged, section: str) -> None:
+        for example in judged.examples:
+            self.outcome.show(section, f"renderer-{name}-{size}-{example.meta.key}", comparison(example))
+
+    def _judged(
+        self,
+        dataset: Path,
+        split: str,
+        fit_split: str,
+        truths: Truths | None = None,
+        per_pixel: bool = True,
+    ) -> Judged:
+        """Every method on one data set; truths: its mean; per_pixel: whether per-pixel networks learn it."""
+        paths = self.datasets.pixel_mlps(dataset, fit_split) if per_pixel else []
+        trained = [load_networks("pixel_mlp", [path]) for path in paths]
         shown = {name: net.show for nets in (*trained, self.networks) for name, net in nets.items()}
         fits = fitted(dataset, split, fit_split, self.settings.seed)
-        pictures = self.settings.pictures
-        return judge(dataset, split, lambda scene: {**fits[scene], **shown}, pictures, Scores(), MEMBERS)
+        truth = {} if truths is None else {"truth": truths.displayed}
+        return judge(
+            dataset,
+            split,
+            lambda scene: {**fits[scene], **shown},
+            self.settings.pictures,
+            Scores(),
+            judged_members(dataset, split),
+            **truth,
+        )
+
+
+def judged_members(dataset: Path, split: str) -> tuple[str, ...]:
+    """Members that methods see: MEMBERS, and the surfels' normals where the split has reference members."""
+    meta = next(iter(read_clips(dataset, split, ()))).meta
+    return (*MEMBERS, SURFELS_NORMAL) if "reference" in meta.spp else MEMBERS
 
 
 def fitted(dataset: Path, split: str, fit_split: str, seed: int) -> dict[str, dict[str, Show]]:

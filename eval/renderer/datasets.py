@@ -33,6 +33,7 @@ Recipe = list[str]
 """Arguments of tron-datagen or tron-train, but for what it reads and where it writes."""
 Sizes = Annotated[dict[PositiveInt, Recipe], Field(min_length=1)]
 Part = Literal["synthetic", "models", "captures", "clips", "shadows", "throughput"]
+Quality = Literal["preview", "final"]
 
 
 class CaptureRecipes(BaseModel):
@@ -60,11 +61,21 @@ class RendererSettings(Benchmark):
     data: dict[str, Path] = Field(
         default={},
         description="data sets that are there already, by the names that this benchmark gives its own: "
-        "synthetic_128, models_128, captures, shadows",
+        "synthetic_128, models_128_preview, models_512_few_final, captures, shadows",
     )
     synthetic: Sizes = Field(description="width of a frame -> recipe of held-out scenes and lights")
     real_data: Path | None = Field(description="folder with assets and hdri; null: no models")
     models: Sizes = Field(description="width of a frame -> recipe of scenes of those models")
+    qualities: dict[Quality, Recipe] = Field(
+        description="quality of tron-relight -> what it adds to the recipes of models; each has another "
+        "path_spp, so that the truth is rendered twice",
+        min_length=1,
+    )
+    few_surfels: Recipe | None = Field(
+        default=None,
+        description="what is added to that for the largest frames, made again with as few surfels as small "
+        "frames have; null: without them",
+    )
     captures: CaptureRecipes = Field(description="held-out captures")
     shadows: Recipe = Field(description="clips in which an occluder moves")
     pixel_mlp: Recipe | None = Field(
@@ -104,15 +115,17 @@ class Datasets:
         """Held-out scenes and lights."""
         return self._made(f"synthetic_{size}", self.settings.synthetic[size])
 
-    def models(self, size: int) -> Path | None:
-        """Scenes of the user's models; None where there are none."""
-        name, data = f"models_{size}", self.settings.real_data
+    def models(self, size: int, quality: Quality, few: bool = False) -> Path | None:
+        """Scenes of the user's models; None where there are none. few: of few surfels."""
+        name, data = models_name(size, quality, few), self.settings.real_data
         if name in self.settings.data:
             return self.settings.data[name]
         if data is None or not all((data / kind).is_dir() for kind in ("assets", "hdri")):
             log.warning("no assets and hdri in %s: no models", data)
             return None
-        return self._made(name, [*self.settings.models[size], *model_arguments(data)])
+        recipe = [*self.settings.models[size], *self.settings.qualities[quality]]
+        recipe += (self.settings.few_surfels or ()) if few else ()
+        return self._made(name, [*recipe, *model_arguments(data)])
 
     def captures(self) -> Path:
         """Held-out captures, reconstructed and relit."""
@@ -152,10 +165,20 @@ class Datasets:
         return output
 
 
+def models_name(size: int, quality: Quality, few: bool) -> str:
+    """Name of a data set of models."""
+    return f"models_{size}{'_few' if few else ''}_{quality}"
+
+
 def require_data(settings: RendererSettings) -> None:
     """TronError unless every folder that was given holds a data set, and is given for one that is made."""
     known = [f"synthetic_{size}" for size in settings.synthetic]
-    known += [f"models_{size}" for size in settings.models]
+    known += [
+        models_name(size, quality, few)
+        for size in settings.models
+        for few in (False, True)
+        for quality in settings.qualities
+    ]
     known += ["captures", "shadows"]
     for name, folder in settings.data.items():
         if name not in known:

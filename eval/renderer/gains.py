@@ -8,12 +8,17 @@ against lit and all fits on it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+import numpy as np
+
+from eval.confidence import quotient, scene_sums, without_one
 from eval.relighting.baselines import DIRECT, NEURAL, NEURAL_LIT, ON_LIT
 from eval.relighting.buffers import REGIONS
 from eval.relighting.scores import GROUPS, Scores, Where
-from eval.results import Row
+from eval.results import Row, mean_row
+from tron.errors import TronError
 
 TWO_BUFFERS = ["pbr", "pbr_x_irradiance", "affine", "affine_filtered", "pixel_mlp"]
 """Baselines that see pbr and irradiance, and nothing else."""
@@ -31,20 +36,26 @@ LIT_RIVALS: dict[str, list[str]] = {
 }
 RIVALS = {NEURAL.name: ("renderer", PAIR_RIVALS), NEURAL_LIT.name: ("renderer.lit", LIT_RIVALS)}
 """Method -> beginning of its rows, and what its gains are over by the end of their names."""
+INPUT = {NEURAL.name: "pbr", NEURAL_LIT.name: "lit"}
+"""Method -> what it starts from."""
+WORST, WORST_OVER_INPUT, KEPT = "worst_scene_gain_db", "worst_scene_over_input_db", "gain_kept"
+"""Ends of the names of rows on single scenes; see :func:`scene_rows`."""
 
 
-def gain_rows(prefix: str, sizes: Mapping[int, Scores], seed: int) -> Iterator[Row]:
-    """Gains and PSNRs, overall and by family and style, of the foreground and of full frames.
+def gain_rows(prefix: str, sizes: Mapping[int, Scores], seed: int, every_size: bool = False) -> Iterator[Row]:
+    """Gains, PSNRs and SSIMs, overall and by family and style, of the foreground and of full frames.
 
     Args:
-        prefix: before the word gain in names of rows: "", "ood_" or "capture_".
-        sizes: width of a frame -> scores; figures without a size are of the first.
+        prefix: before the word gain in names of rows: "", "ood_", "final_" or "capture_".
+        sizes: width of a frame -> scores.
         seed: draws the scenes of the intervals.
+        every_size: whether all names hold their size; otherwise those of the first do not.
     """
     for size, scores in sizes.items():
         known = {each.name for each in scores.methods}  # per-pixel networks are not always trained
+        of_size = f".{size}" if every_size or size != next(iter(sizes)) else ""
         for where in places(scores):
-            tail = where.tail_after("" if size == next(iter(sizes)) else f".{size}")
+            tail = where.tail_after(of_size)
             for method, (start, rivals) in RIVALS.items():
                 for end, over in rivals.items():
                     name = f"{start}.{prefix}{end}{tail}"
@@ -53,8 +64,89 @@ def gain_rows(prefix: str, sizes: Mapping[int, Scores], seed: int) -> Iterator[R
                         yield row
             for method in (each.name for each in scores.methods):
                 name = f"renderer.{prefix}psnr.{method.replace('.', '_')}{tail}"
-                if row := scores.psnr_row(name, method, where, seed):
+                if row := scores.mean_row(name, method, where, seed):
                     yield row
+        yield from scene_rows(prefix, scores, of_size, seed)
+        yield from ssim_rows(prefix, scores, of_size, seed)
+
+
+def scene_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row]:
+    """What single scenes make of the gain over the best rival, foreground.
+
+    The gain without the scene that raises it most, and the share of it that this keeps (0 where there is no
+    gain); the least gain of a scene over the rival that is the best there, and over what the network starts
+    from.
+    """
+    for method, (start, rivals) in RIVALS.items():
+        known = {each.name for each in scores.methods}
+        over = [each for each in rivals["gain_db"] if each in known]
+        name = f"{start}.{prefix}"
+        gain = scores.gain_row(f"{name}gain_leave_one_out_db{tail}", method, over, seed=seed)
+        if gain is None:
+            continue
+        if gain.without_one is not None:
+            left, count = gain.without_one[0], gain.n
+            yield Row(metric=gain.metric, value=left, unit="dB", n=count)
+            kept = left / gain.value if gain.value > 0 else 0.0
+            yield Row(metric=f"{name}{KEPT}{tail}", value=kept, unit="fraction", n=count)
+        for end, others in ((WORST, over), (WORST_OVER_INPUT, [INPUT[method]])):
+            by_scene = scores.scene_gains(method, others)
+            if by_scene:
+                value, count = min(by_scene.values()), len(by_scene)
+                yield Row(metric=f"{name}{end}{tail}", value=value, unit="dB", n=count)
+
+
+def ssim_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row]:
+    """SSIM, which does not pay for blur as PSNR does: of every method, and gains over the best by it."""
+    known = {each.name for each in scores.methods}
+    for method in (each.name for each in scores.methods):
+        name = f"renderer.{prefix}ssim.{method.replace('.', '_')}{tail}"
+        if row := scores.mean_row(name, method, seed=seed, figure="ssim"):
+            yield row
+    for method, (start, rivals) in RIVALS.items():
+        there = [each for each in rivals["gain_db"] if each in known]
+        if row := scores.gain_row(
+            f"{start}.{prefix}ssim_gain{tail}", method, there, seed=seed, figure="ssim"
+        ):
+            yield row
+
+
+def between(metric: str, method: str, scores: Scores, other: Scores, seed: int) -> Row | None:
+    """PSNR of a method minus that of the same on other data of the same frames; None where not scored.
+
+    Raises:
+        TronError: the frames differ.
+    """
+    ours, theirs = (
+        [(each.clip, each.scene, each.figures["psnr"]) for each in of.of(method, Where())]
+        for of in (scores, other)
+    )
+    if not ours or not theirs:
+        return None
+    if [each[:2] for each in ours] != [each[:2] for each in theirs]:
+        raise TronError(f"{metric}: the data sets do not hold the same clips", mend="make both by one recipe")
+    scenes = [scene for _, scene, _ in ours]
+    gains = [mine[2] - yours[2] for mine, yours in zip(ours, theirs)]
+    per_scene = scene_sums(scenes, np.stack([gains, np.ones(len(gains))], axis=1))
+    row = mean_row(metric, "dB", zip(scenes, gains), seed)
+    return row.model_copy(update={"without_one": without_one(per_scene, quotient)})
+
+
+def time_rows(prefix: str, seconds: Mapping[str, Sequence[float]], size: int) -> Iterator[Row]:
+    """Median seconds of a frame by every method that was timed, guidance given."""
+    for method, found in seconds.items():
+        name = f"renderer.{prefix}seconds.{method.replace('.', '_')}.{size}"
+        yield Row(metric=name, value=float(np.median(found)), unit="s", n=len(found))
+
+
+def everywhere(rows: Iterable[Row]) -> Iterator[Row]:
+    """The least of each row on single scenes of the network that starts from lit, of all that was judged."""
+    found = list(rows)
+    for end in (WORST, WORST_OVER_INPUT, KEPT):
+        pattern = re.compile(rf"renderer\.lit\.([a-z]+_)*{end}(\.\d+)?")
+        if there := [row for row in found if pattern.fullmatch(row.metric)]:
+            least = min(there, key=lambda row: row.value)
+            yield least.model_copy(update={"metric": f"renderer.lit.everywhere.{end}"})
 
 
 def over_lit(scores: Scores, seed: int) -> list[Row]:

@@ -29,12 +29,13 @@ COLUMNS = (
     ("irradiance", "irradiance (guidance)"),
     (NEURAL.name, "network of pbr and irradiance"),
     ("lit", "lit (guidance)"),
+    ("lit_filtered", "lit, best Gaussian"),
     (NEURAL_LIT.name, "network that starts from lit"),
 )
 
 
 def comparison(example: Example) -> Pictures:
-    """Guidance, lit, the networks and the truth of one frame, each above its inset."""
+    """Guidance, lit, its best Gaussian, the networks and the truth of one frame, each above its inset."""
     where = f"scene {example.meta.scene} under light {example.meta.light}"
     images = {**example.methods, "irradiance": example.irradiance}
     shown = [(name, title) for name, title in COLUMNS if name in images]

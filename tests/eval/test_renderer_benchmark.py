@@ -10,6 +10,7 @@ from eval.cli import cli
 from eval.results import Results
 from tron.io.images import read_image
 
+QUALITIES = ("preview", "final")
 TINY = [
     *("train_b.scenes=0", "validation.scenes=0", "train.scenes=0", "test.scenes=2", "test.style=table"),
     *("test.lights=[sun]", "test.frames=5", "test.moving_objects=1", "test.still_camera=true"),
@@ -61,12 +62,13 @@ def test_untrained_networks_gain_nothing_over_the_buffer_that_they_start_from(
     for end in ("_full", "_full.256", ".256.sun", ".studio"):
         assert results.find(f"renderer.lit.gain_db{end}") is not None
     assert (results.value("renderer.training_frames_per_second.16") or 0) > 0
+    assert (results.value("renderer.network_seconds.16") or 0) > 0
     page = (tmp_path / "report.html").read_text()
     for section in ("families", "synthetic", "sweep", "throughput"):
         assert f'<section id="{section}">' in page
     strips = sorted((tmp_path / "pictures").glob("renderer-synthetic-256-*.png"))
     assert len(strips) == 2
-    assert read_image(strips[0]).shape == (256 + 4 + 256, 6 * 256, 3)
+    assert read_image(strips[0]).shape == (256 + 4 + 256, 7 * 256, 3)
 
 
 def test_models_and_captures_are_judged_on_their_own_splits(
@@ -74,21 +76,33 @@ def test_models_and_captures_are_judged_on_their_own_splits(
 ):
     """Untrained networks: gains over what they start from are zero."""
     captures = write_dataset(tmp_path / "captures", frames=1, scenes=3, judged="test_relit")
+    names = [f"models_{size}_{quality}" for size in ("128", "256", "512", "512_few") for quality in QUALITIES]
+    made = ",".join(f"{name}: {dataset}" for name in names)
     code = run(
         f"output_dir={tmp_path / 'out'}",
         "benchmark.parts=[models,captures]",
-        f"benchmark.models={{128: {listed(['unused'])}}}",
-        f"benchmark.data={{models_128: {dataset},captures: {captures}}}",
+        f"benchmark.data={{{made},captures: {captures}}}",
         *checkpoints(weights),
         *("benchmark.pixel_mlp=null", "benchmark.pictures=1"),
     )
     assert code == 0
     results = Results.load(tmp_path / "out" / "results.json")
-    for name in ("ood_gain_over_pbr_db", "capture_gain_over_pbr_db", "lit.ood_gain_over_lit_db"):
+    zeros = ["capture_gain_over_pbr_db", "preview_gain_db.512", "lit.everywhere.worst_scene_over_input_db"]
+    for prefix, size in (("ood", 128), ("final", 256), ("few_ood", 512), ("few_final", 512)):
+        zeros += [f"{prefix}_gain_over_pbr_db.{size}", f"lit.{prefix}_gain_over_lit_db.{size}"]
+    for name in zeros:
         assert results.value(f"renderer.{name}") == pytest.approx(0, abs=1e-3)
     row = results.find("renderer.lit.capture_gain_over_lit_db")
     assert row is not None
     assert (row.n, row.scenes) == (9, 3)
+    gain = results.find("renderer.lit.capture_gain_db")
+    assert gain is not None
+    assert gain.without_one is not None
+    assert results.value("renderer.lit.capture_gain_leave_one_out_db") == gain.without_one[0]
+    assert results.value("renderer.lit.everywhere.gain_kept") == 0, "there is no gain"
+    for name in ("ood_ssim.lit_filtered.128", "final_seconds.neural_lit.256", "lit.few_final_ssim_gain.512"):
+        assert results.find(f"renderer.{name}") is not None
+    assert results.find("renderer.ood_psnr.truth.128") is None, "two data sets that are one hold one truth"
     page = (tmp_path / "out" / "report.html").read_text()
     for section in ("models", "captures"):
         assert f'<section id="{section}">' in page

@@ -8,9 +8,10 @@ import pytest
 
 from datagen.files.assets import find_assets
 from datagen.settings.command import Settings as DatagenSettings
+from datagen.settings.surfels import SurfelBudget
 from eval.cli import Settings as EvalSettings
 from eval.renderer.benchmark import Renderer
-from eval.renderer.datasets import Datasets, model_names
+from eval.renderer.datasets import Datasets, Quality, model_names
 from eval.stages import Child
 from train.examples.splits import Splits
 from train.settings import Settings as TrainSettings
@@ -51,16 +52,52 @@ def test_the_commands_accept_every_recipe_and_no_data_share_a_seed(asked: dict[s
         made.synthetic(size)
     for make_it in (made.captures, made.shadows):
         make_it()
-    made.models(128)
-    assert asked["models_128"].allow_unlicensed == ["chess-board", "night_1k"]
+    for size in (128, 256, 512):
+        for quality in ("preview", "final"):
+            made.models(size, quality)
+    made.models(512, "final", few=True)
+    assert asked["models_128_preview"].allow_unlicensed == ["chess-board", "night_1k"]
     assert asked["captures"].captures == tmp_path / "out" / "captures_views" / "captures"
     assert asked["captures"].captured.split_by_name
-    seeds = [asked[name].seed for name in ("synthetic_128", "models_128", "captures_views", "shadows")]
+    seeds = [
+        asked[name].seed for name in ("synthetic_128", "models_128_preview", "captures_views", "shadows")
+    ]
     for learnt_from in ("renderer_train", "pseudo_captures"):
         typed = [f"experiment={learnt_from}", f"output_dir={tmp_path}"]
         composed = compose_recipe("conf.datagen", DatagenSettings, typed)
         seeds.append(check(composed, DatagenSettings).seed)
     assert len(set(seeds)) == len(seeds)
+
+
+def test_qualities_and_surfels_show_the_same_scenes_and_path_trace_them_anew(
+    asked: dict[str, Any], tmp_path: Path
+):
+    """All but guidance, surfels and paths is alike, so frames are; other numbers of paths are other noise."""
+    for kind in ("assets", "hdri"):
+        (tmp_path / kind).mkdir()
+        (tmp_path / kind / ("cup.glb" if kind == "assets" else "night.hdr")).touch()
+    made = datasets(tmp_path / "out", f"benchmark.real_data={tmp_path}")
+    kinds: list[tuple[Quality, bool]] = [
+        ("preview", False),
+        ("final", False),
+        ("preview", True),
+        ("final", True),
+    ]
+    for quality, few in kinds:
+        made.models(512, quality, few)
+    names = [f"models_512{'_few' if few else ''}_{quality}" for quality, few in kinds]
+    recipes = [asked[name].recipe() for name in names]
+    budgets = [asked[name].surfel_budget("test").surfels for name in names]
+    assert budgets == [100_000, 100_000, 20_000, 20_000]
+    assert [each["test"].pop("path_spp") for each in recipes] == [100, 110, 90, 90]
+    assert [each["test"].pop("guidance_spp") for each in recipes] == [quality for quality, _ in kinds]
+    for each in recipes:
+        for name in ("train", "test"):
+            for of_surfels in SurfelBudget._fields:
+                del each[name][of_surfels]
+        for name in ("guidance_spp", "path_spp"):
+            each["train"].pop(name, None)
+    assert all(each == recipes[0] for each in recipes)
 
 
 def test_models_of_one_file_name_and_with_spaces_are_called_as_tron_datagen_calls_them(
@@ -79,8 +116,8 @@ def test_models_of_one_file_name_and_with_spaces_are_called_as_tron_datagen_call
     names = model_names(tmp_path)
     assert sorted(names) == ["chess board", "cup/scene", "jar/scene"]
     assert {each.id for each in find_assets(tmp_path / "assets", allow_unlicensed=names)} == set(names)
-    datasets(tmp_path / "out", f"benchmark.real_data={tmp_path}").models(128)
-    assert asked["models_128"].allow_unlicensed == [*names, "2024", "o'clock"]
+    datasets(tmp_path / "out", f"benchmark.real_data={tmp_path}").models(128, "final")
+    assert asked["models_128_final"].allow_unlicensed == [*names, "2024", "o'clock"]
 
 
 def test_threads_and_seed_of_the_command_are_those_of_the_benchmark(tmp_path: Path):

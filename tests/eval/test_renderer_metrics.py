@@ -1,6 +1,7 @@
 """Laws of the renderer benchmark's figures: flicker, moving shadows, folds, insets, paired differences."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ import pytest
 from eval.relighting.scores import Score, Scores
 from eval.renderer.benchmark import fold
 from eval.renderer.clips import ClipScore, Flicker, clip_rows, flicker, steps
-from eval.renderer.gains import gain_rows, over_lit
+from eval.renderer.gains import between, everywhere, gain_rows, over_lit
 from eval.renderer.pictures import busiest_square, with_inset
 from eval.renderer.shadows import change_sums, correlation, slope, stayed
+from eval.renderer.truths import Truths
 from eval.results import Row
 from tron.cameras import Camera
 from tron.errors import TronError
@@ -178,6 +180,80 @@ def test_gains_are_over_the_best_of_the_group_and_paired_by_scene():
         pytest.approx(1.0),
         pytest.approx(0.5),
     ]  # studio, sun
+
+
+def test_a_gain_that_one_scene_carries_is_seen_without_it():
+    scores = scored(lit=30.0, affine_lit=29.0, neural_lit=31.0)
+    for region in ("foreground", "frame"):
+        for method, psnr in (("lit", 20.0), ("affine_lit", 22.0), ("neural_lit", 28.0)):
+            scores.kept[method, region].append(Score("sun", "s2", "s2-sun", {"psnr": psnr, "ssim": 0.5}))
+    rows = values(gain_rows("ood_", {512: scores}, 0, every_size=True))
+    # Means: lit 28, affine_lit 27.6, the network 30.2; without s2 30, 29 and 30.75.
+    gain = rows["renderer.lit.ood_gain_db.512"]
+    assert gain.value == pytest.approx(2.2)
+    assert rows["renderer.lit.ood_gain_leave_one_out_db.512"].value == pytest.approx(0.75)
+    assert rows["renderer.lit.ood_gain_kept.512"].value == pytest.approx(0.75 / 2.2)
+    assert rows["renderer.lit.ood_worst_scene_gain_db.512"].value == pytest.approx(0.75), "6 in s2"
+    assert rows["renderer.lit.ood_worst_scene_over_input_db.512"].value == pytest.approx(0.75), "8 in s2"
+    found = {row.metric: row.value for row in everywhere(rows.values())}
+    assert found == {
+        "renderer.lit.everywhere.worst_scene_gain_db": pytest.approx(0.75),
+        "renderer.lit.everywhere.worst_scene_over_input_db": pytest.approx(0.75),
+        "renderer.lit.everywhere.gain_kept": pytest.approx(0.75 / 2.2),
+    }
+
+
+def test_the_best_by_ssim_is_not_the_best_by_psnr():
+    """A blurred picture leads by PSNR; the network is held against what has most of the structure."""
+    scores = Scores()
+    for method, psnr, ssim in (("lit", 28.0, 0.9), ("lit_filtered", 31.0, 0.7), ("neural_lit", 30.0, 0.95)):
+        scores.kept[method, "foreground"].append(Score("sun", "a", "a0", {"psnr": psnr, "ssim": ssim}))
+    rows = values(gain_rows("", {128: scores}, 0))
+    assert rows["renderer.lit.gain_db"].value == pytest.approx(-1.0)
+    assert rows["renderer.lit.ssim_gain"].value == pytest.approx(0.05)
+    assert rows["renderer.ssim.lit_filtered"].value == pytest.approx(0.7)
+
+
+def test_two_data_sets_are_compared_frame_by_frame():
+    ours, theirs = scored(neural_lit=31.0), scored(neural_lit=28.5)
+    row = between("renderer.preview_gain_db.512", "neural_lit", ours, theirs, 0)
+    assert row is not None
+    assert row.value == pytest.approx(2.5)
+    assert (row.low, row.scenes) == (pytest.approx(2.5), 2), "scenes differ, their gains do not"
+    assert between("renderer.preview_gain_db.512", "neural", ours, theirs, 0) is None
+    theirs.kept["neural_lit", "foreground"].pop()
+    with pytest.raises(TronError, match="not hold the same clips"):
+        between("renderer.preview_gain_db.512", "neural_lit", ours, theirs, 0)
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_the_noise_that_is_left_in_the_truth_is_what_its_mean_is_off(
+    count: int, drawn_clip: Callable[..., Clip]
+):
+    """Renders of known noise: the estimate, which sees no more than they do, is their mean's true PSNR."""
+    clip = drawn_clip(size=96)
+    clean, key = clip.frames["rgb"], clip.meta.key
+    rng = generator(4, "truth", count)
+    renders = [
+        (clean * (1 + 0.1 * rng.standard_normal(clean.shape))).astype(np.float32) for _ in range(count)
+    ]
+    truths = Truths({key: renders})
+    inside = clip.frames["foreground"][..., 0] > 0.5
+    off = np.square(truths.displayed(clip) - clip.displayed("rgb"))[inside].mean()
+    rows = values(truths.rows([clip], "renderer.psnr.truth", ".96", 0))
+    assert rows["renderer.psnr.truth.96"].value == pytest.approx(-10 * np.log10(off), abs=0.15)
+    assert rows["renderer.psnr.truth_full.96"].n == 2
+    assert Truths({key: renders[:1]}).rows([clip], "renderer.psnr.truth", "", 0) == []
+
+
+def test_truths_of_other_frames_are_refused(
+    write_dataset: Callable[..., Path], tmp_path: Path, dataset: Path
+):
+    other = write_dataset(tmp_path / "other", frames=3)
+    found = Truths.of([dataset, dataset], "test")
+    assert {len(each) for each in found.renders.values()} == {1}, "a truth that is read twice counts once"
+    with pytest.raises(TronError, match="shows other frames"):
+        Truths.of([dataset, other], "test")
 
 
 def test_sizes_after_the_first_stand_in_the_names_of_their_rows():
