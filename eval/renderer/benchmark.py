@@ -33,6 +33,7 @@ from eval.renderer.gains import between, everywhere, gain_rows, over_lit, time_r
 from eval.renderer.pictures import comparison, sweep_pictures
 from eval.renderer.shadows import measure_shadows
 from eval.renderer.truths import TRUTH, Truths
+from eval.renderer.validation import validation_rows
 from eval.report.outcome import Outcome
 from eval.results import Row
 from eval.stages import script_path
@@ -173,6 +174,13 @@ class Run:
         """Whether shadows move as the truth's do."""
         dataset = self.datasets.shadows()
         measure_shadows(dataset, TEST, self._by_kind(), self.settings.seed, self.outcome)
+
+    def validation(self) -> None:
+        """Gains that checkpoint=auto goes by, of the network that starts from lit."""
+        if network := self.networks.get(NEURAL_LIT.name):
+            for size in self.settings.validation:
+                dataset = self.datasets.validation(size)
+                self.outcome.add(validation_rows(dataset, TEST, network, size, self.settings.seed))
 
     def throughput(self) -> None:
         """Frames a second of every checkpoint at every size, rendering and in training, by medians."""

@@ -32,7 +32,7 @@ BASELINE_BUFFERS = {
 Recipe = list[str]
 """Arguments of tron-datagen or tron-train, but for what it reads and where it writes."""
 Sizes = Annotated[dict[PositiveInt, Recipe], Field(min_length=1)]
-Part = Literal["synthetic", "models", "captures", "clips", "shadows", "throughput"]
+Part = Literal["synthetic", "models", "captures", "clips", "shadows", "throughput", "validation"]
 Quality = Literal["preview", "final"]
 
 
@@ -78,6 +78,9 @@ class RendererSettings(Benchmark):
     )
     captures: CaptureRecipes = Field(description="held-out captures")
     shadows: Recipe = Field(description="clips in which an occluder moves")
+    validation: Sizes = Field(
+        description="width of a frame -> recipe of scenes that checkpoint=auto of tron-relight goes by"
+    )
     pixel_mlp: Recipe | None = Field(
         default=None,
         description="arguments of tron-train for the per-pixel baselines, trained on the training split of "
@@ -140,6 +143,10 @@ class Datasets:
         """Clips in which an occluder moves."""
         return self._made("shadows", self.settings.shadows)
 
+    def validation(self, size: int) -> Path:
+        """Scenes that nothing is judged by."""
+        return self._made(f"validation_{size}", self.settings.validation[size])
+
     def pixel_mlps(self, dataset: Path, split: str) -> list[Path]:
         """Weights of per-pixel baselines trained on a split; none where they are not asked for."""
         recipe = self.settings.pixel_mlp
@@ -179,6 +186,7 @@ def require_data(settings: RendererSettings) -> None:
         for few in (False, True)
         for quality in settings.qualities
     ]
+    known += [f"validation_{size}" for size in settings.validation]
     known += ["captures", "shadows"]
     for name, folder in settings.data.items():
         if name not in known:

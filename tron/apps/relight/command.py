@@ -28,6 +28,7 @@ from tron.apps.relight.camera_files import (
     stated,
 )
 from tron.apps.relight.clip import DEPTH, Clip, trace
+from tron.apps.relight.network_gains import expected_gain, quality_of
 from tron.apps.relight.scan_materials import with_materials
 from tron.apps.relight.settings import Settings
 from tron.apps.relit import RelitPicture
@@ -309,9 +310,9 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
 
     A checkpoint that was asked for has to fit. That of checkpoint=auto gives way with a line in the log:
     where the libraries of networks or its file are not installed; where nothing bounces and it is given lit;
-    where radiance is asked for, which a network does not draw; and where lit has sub-pixels or rays for
-    reflections (quality=final), for it learnt from single samples and makes finer pictures worse
-    (dev/LOG.md). Where window, overlap, reproject or weights are chosen, it has to fit too.
+    where radiance is asked for, which a network does not draw; and where it gains nothing at that size and
+    quality (:mod:`tron.apps.relight.network_gains`). Where window, overlap, reproject or weights are chosen,
+    it has to fit too.
 
     Raises:
         TronError: the checkpoint is missing, damaged, or does not fit the settings.
@@ -323,14 +324,19 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     try:
         if "relit" in settings.buffers:
             raise TronError("buffers ask for relit.exr, and a network draws display values")
-        estimation = settings.estimation()
-        if estimation.supersample > 1 or estimation.reflections > 0:
+        estimation, (width, height) = settings.estimation(), settings.size
+        quality = quality_of(estimation.supersample, estimation.reflections)
+        gain = expected_gain(quality, width, height)
+        said = f"{gain:+.1f} dB on validation scenes, {quality} at {width} x {height}"
+        if gain <= 0:
             raise TronError(
-                f"{DEFAULT} learnt from single samples a pixel, and this picture is better without it",
+                f"pictures are better without {DEFAULT}: {said}",
                 mend=f"give checkpoint={DEFAULT} to have it all the same",
             )
         settings = settings.model_copy(update={"checkpoint": Path(DEFAULT)})
-        return settings, _loaded(settings)
+        loaded = _loaded(settings)
+        log.info("%s draws the pictures: %s", DEFAULT, said)
+        return settings, loaded
     except TronError as error:
         if settings.tuned:
             raise

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from tron.apps.relight import network_gains
 from tron.apps.relight.clip import Clip
 from tron.apps.relight.settings import Settings
 from tron.io.images import read_image
@@ -18,6 +19,8 @@ from tron.neural.renderer import NeuralRenderer
 from tron.neural.weights import save_renderer
 from tron.storage import sha256
 
+GAINS = {"preview": {16: 2.0, 64: -0.1}, "final": {128: -0.4}}
+"""In place of those of the shipped network, which change with it."""
 SMALL = UNetConfig(widths=(4, 6), blocks=(1, 1), blocks_up=(1,))
 
 
@@ -140,9 +143,10 @@ def test_a_shipped_checkpoint_is_given_by_name(run, checkpoints, tmp_path, monke
         (("bounces=0",), "no bounced light with bounces=0"),
         (("fidelity=paper",), "no bounced light with bounces=0"),
         (("buffers=[relit]",), "buffers ask for relit.exr"),
-        (("quality=final",), "learnt from single samples"),
-        (("supersample=2",), "learnt from single samples"),
-        (("reflections=2",), "learnt from single samples"),
+        (("quality=final",), "better without surfaces: -0.4 dB on validation scenes, final at 16 x 16"),
+        (("supersample=2",), "final at 16 x 16"),
+        (("reflections=2",), "final at 16 x 16"),
+        (("width=64", "height=64"), "-0.1 dB on validation scenes, preview at 64 x 64"),
         ((), "this installation has no checkpoint 'surfaces'"),
     ],
 )
@@ -150,6 +154,7 @@ def test_the_default_checkpoint_gives_way_where_it_does_not_fit(
     run, checkpoints, tmp_path, monkeypatch, caplog, settings, words
 ):
     monkeypatch.setattr(shipped, "FOLDER", checkpoints if settings else tmp_path)
+    monkeypatch.setattr(network_gains, "GAINS", GAINS)
     with caplog.at_level("INFO"):
         assert run(tmp_path / "out", "checkpoint=auto", "frames=1", *settings) == 0
     assert words in caplog.text
@@ -171,9 +176,14 @@ def test_the_default_checkpoint_does_not_give_way_where_something_is_asked_of_it
     assert not (tmp_path / "out").exists()
 
 
-def test_the_default_checkpoint_draws_where_it_fits(run, checkpoints, tmp_path, monkeypatch):
+def test_the_default_checkpoint_draws_where_it_gains_and_says_so(
+    run, checkpoints, tmp_path, monkeypatch, caplog
+):
     monkeypatch.setattr(shipped, "FOLDER", checkpoints)
-    assert run(tmp_path, "checkpoint=auto") == 0
+    monkeypatch.setattr(network_gains, "GAINS", GAINS)
+    with caplog.at_level("INFO"):
+        assert run(tmp_path, "checkpoint=auto") == 0
+    assert "surfaces draws the pictures: +2.0 dB on validation scenes, preview at 16 x 16" in caplog.text
     report = json.loads((tmp_path / "relight.json").read_text())
     assert report["relit"] == "neural"
     assert report["network"]["checkpoint"] == "surfaces"

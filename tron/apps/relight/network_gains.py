@@ -1,0 +1,37 @@
+"""Where ``checkpoint=auto`` takes the network: where it gains on validation scenes, by size and quality.
+
+GAINS are foreground PSNR of ``surfaces`` less that of ``lit``, means of procedural scenes that neither trained
+nor judge it: ``tron-eval benchmark=renderer benchmark.parts=[validation]`` measures them anew, and whoever
+ships another checkpoint writes what it says here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+
+Quality = Literal["preview", "final"]
+
+GAINS: Mapping[Quality, Mapping[int, float]] = {
+    "preview": {128: 0.0, 256: 0.0, 512: 0.0},
+    "final": {128: 0.0, 256: 0.0, 512: 0.0},
+}
+"""Quality -> width of square frames, pixels -> dB."""
+
+
+def quality_of(supersample: int, reflections: int) -> Quality:
+    """The one of the two that a frame is like: final where it has sub-pixels, or rays for reflections."""
+    return "final" if supersample > 1 or reflections > 0 else "preview"
+
+
+def expected_gain(quality: Quality, width: int, height: int) -> float:
+    """What the network gains over lit at a size, dB, between those of GAINS by the logarithm of the side.
+
+    The side is that of a square of as many pixels. Beyond the sizes that were measured the nearest holds.
+    """
+    known = GAINS[quality]
+    side = math.log2(math.sqrt(width * height))
+    return float(np.interp(side, [math.log2(each) for each in known], list(known.values())))
