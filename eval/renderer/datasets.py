@@ -68,7 +68,7 @@ class RendererSettings(Benchmark):
     models: Sizes = Field(description="width of a frame -> recipe of scenes of those models")
     qualities: dict[Quality, Recipe] = Field(
         description="quality of tron-relight -> what it adds to the recipes of models; each has another "
-        "path_spp, so that the truth is rendered twice",
+        "path_spp, with other passes, so that the truth is rendered twice",
         min_length=1,
     )
     few_surfels: Recipe | None = Field(

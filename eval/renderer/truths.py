@@ -1,9 +1,9 @@
 """Path-traced truth that was rendered more than once: its mean, and how much noise that has left.
 
-Data sets of one recipe at two qualities hold the same frames. Where they differ in ``path_spp`` each has
-paths of its own (errors of 90, 100 and 110 paths correlate by 0.0 to 0.13), so that both renders together are
-a better truth than either, and their differences say how far from the expectation their mean still is. A
-perfect picture scores no more than that.
+Data sets of one recipe at two qualities hold the same frames. Where they differ in the paths of a pass each
+has paths of its own (errors of 90, 100 and 110 paths in one pass correlate by 0.0 to 0.13), so that both
+renders together are a better truth than either, and their differences say how far from the expectation their
+mean still is. A perfect picture scores no more than that.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""What tron-relight's ``checkpoint=auto`` goes by: gains over ``lit`` on validation scenes, by size and quality.
+"""What tron-relight's ``checkpoint=auto`` goes by: gains over ``lit`` on validation scenes.
 
-No figure of the benchmark is judged on these scenes. The gains stand in :mod:`tron.apps.relight.network_gains`.
+They are measured by size and quality, on scenes by which no figure of the benchmark is judged, and stand in
+:mod:`tron.apps.relight.network_gains`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from tron.shards.schema import TARGET
 def validation_rows(dataset: Path, split: str, network: Network, size: int, seed: int) -> Iterator[Row]:
     """Mean gain of a network over lit of the clips of each quality, foreground, dB.
 
-    ``seed`` draws the scenes of the intervals.
+    checkpoint=auto goes by the lower end of its interval. ``seed`` draws the scenes of that.
     """
     found: dict[str, list[tuple[str, float]]] = defaultdict(list)
     for clip in read_clips(dataset, split, MEMBERS):

@@ -55,7 +55,6 @@ def draw_frame(size: int, seed: int, light: str, frame: int = 0) -> dict[str, np
         "lit": over(base * irradiance * (1 + 0.2 * base) + gloss),
         "albedo": np.where(solid, np.clip(base, 0, 1), 0).astype(np.float32),
         "surface": np.where(solid, np.abs(normal[..., 1:2]) * [1, 0.4, 0.4], 0).astype(np.float32),
-        "sampling": np.where(solid, [0.0, 0.25, 0.5], 0).astype(np.float32),
         "mask": solid.astype(np.float32),
         "foreground": solid.astype(np.float32),
         "sampling": np.broadcast_to(np.float32([0, 0.6, 0.5]), base.shape),

@@ -89,7 +89,7 @@ def test_qualities_and_surfels_show_the_same_scenes_and_path_trace_them_anew(
     recipes = [asked[name].recipe() for name in names]
     budgets = [asked[name].surfel_budget("test").surfels for name in names]
     assert budgets == [100_000, 100_000, 20_000, 20_000]
-    assert [each["test"].pop("path_spp") for each in recipes] == [100, 110, 90, 90]
+    assert [each["test"].pop("path_spp") for each in recipes] == [64, 60, 36, 36]
     assert [each["test"].pop("guidance_spp") for each in recipes] == [quality for quality, _ in kinds]
     for each in recipes:
         for name in ("train", "test"):
@@ -98,6 +98,21 @@ def test_qualities_and_surfels_show_the_same_scenes_and_path_trace_them_anew(
         for name in ("guidance_spp", "path_spp"):
             each["train"].pop(name, None)
     assert all(each == recipes[0] for each in recipes)
+
+
+@pytest.mark.parametrize("size", [128, 256, 512])
+def test_no_two_truths_share_the_paths_of_a_pass(size: int):
+    """Passes of as many paths begin with one seed: their renders would be the same in part."""
+    from datagen.truth.pathtrace import LANES, near_product
+
+    recipes = compose_recipe("conf.eval", EvalSettings, ["benchmark=renderer"])["benchmark"]
+    kinds = [*recipes["qualities"].values(), recipes["few_surfels"]]
+    paths = [
+        int(typed.split("=")[1]) for each in kinds for typed in each if typed.startswith("test.path_spp")
+    ]
+    passes = [-(-spp // max(LANES // size**2, 1)) for spp in paths]
+    parts = [near_product(-(-spp // count)) for spp, count in zip(paths, passes)]
+    assert len(set(parts)) == len(parts) == 3
 
 
 def test_models_of_one_file_name_and_with_spaces_are_called_as_tron_datagen_calls_them(

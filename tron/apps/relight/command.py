@@ -310,9 +310,9 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
 
     A checkpoint that was asked for has to fit. That of checkpoint=auto gives way with a line in the log:
     where the libraries of networks or its file are not installed; where nothing bounces and it is given lit;
-    where radiance is asked for, which a network does not draw; and where it gains nothing at that size and
-    quality (:mod:`tron.apps.relight.network_gains`). Where window, overlap, reproject or weights are chosen,
-    it has to fit too.
+    where radiance is asked for, which a network does not draw; and where it does not surely gain at that
+    size and quality (:mod:`tron.apps.relight.network_gains`). Where window, overlap, reproject or weights are
+    chosen, it has to fit too.
 
     Raises:
         TronError: the checkpoint is missing, damaged, or does not fit the settings.
@@ -327,10 +327,10 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
         estimation, (width, height) = settings.estimation(), settings.size
         quality = quality_of(estimation.supersample, estimation.reflections)
         gain = expected_gain(quality, width, height)
-        said = f"{gain:+.1f} dB on validation scenes, {quality} at {width} x {height}"
+        said = f"{gain:+.1f} dB at least on validation scenes, {quality} at {width} x {height}"
         if gain <= 0:
             raise TronError(
-                f"pictures are better without {DEFAULT}: {said}",
+                f"{DEFAULT} gains nothing for sure: {said}",
                 mend=f"give checkpoint={DEFAULT} to have it all the same",
             )
         settings = settings.model_copy(update={"checkpoint": Path(DEFAULT)})
