@@ -29,7 +29,7 @@ def quality_of(supersample: int, reflections: int) -> Quality:
 
 
 def expected_gain(quality: Quality, width: int, height: int) -> float:
-    """What the network gains over lit at a size at least, dB, between those of GAINS by the logarithm of the side.
+    """What the network gains over lit at least, dB, between the sizes of GAINS by the logarithm of the side.
 
     The side is that of a square of as many pixels. Beyond the sizes that were measured the nearest holds.
     """
