@@ -327,7 +327,7 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
         estimation, (width, height) = settings.estimation(), settings.size
         quality = quality_of(estimation.supersample, estimation.reflections)
         gain = expected_gain(quality, width, height)
-        said = f"{gain:+.1f} dB at least on validation scenes, {quality} at {width} x {height}"
+        said = f"{gain:+.2f} dB at least on validation scenes, {quality} at {width} x {height}"
         if gain <= 0:
             raise TronError(
                 f"{DEFAULT} gains nothing for sure: {said}",

@@ -145,11 +145,11 @@ def test_a_shipped_checkpoint_is_given_by_name(run, checkpoints, tmp_path, monke
         (("buffers=[relit]",), "buffers ask for relit.exr"),
         (
             ("quality=final",),
-            "surfaces gains nothing for sure: -0.4 dB at least on validation scenes, final at 16 x 16",
+            "surfaces gains nothing for sure: -0.40 dB at least on validation scenes, final at 16 x 16",
         ),
         (("supersample=2",), "final at 16 x 16"),
         (("reflections=2",), "final at 16 x 16"),
-        (("width=64", "height=64"), "-0.1 dB at least on validation scenes, preview at 64 x 64"),
+        (("width=64", "height=64"), "-0.10 dB at least on validation scenes, preview at 64 x 64"),
         ((), "this installation has no checkpoint 'surfaces'"),
     ],
 )
@@ -187,7 +187,7 @@ def test_the_default_checkpoint_draws_where_it_gains_and_says_so(
     with caplog.at_level("INFO"):
         assert run(tmp_path, "checkpoint=auto") == 0
     assert (
-        "surfaces draws the pictures: +2.0 dB at least on validation scenes, preview at 16 x 16"
+        "surfaces draws the pictures: +2.00 dB at least on validation scenes, preview at 16 x 16"
         in caplog.text
     )
     report = json.loads((tmp_path / "relight.json").read_text())
