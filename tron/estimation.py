@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -94,9 +93,3 @@ OCTAVES = (-8.0, 4.0)
 """Logarithms to base 2 of a pixel's footprint over the spacing of surfels that ``sampling`` tells apart."""
 MOST_RAYS = 10.0
 """Logarithm to base 2 of the shadow rays a pixel that ``sampling`` has as 1."""
-
-
-def of_wider_pixels(times: float) -> tuple[float, float, float]:
-    """What the channels of ``sampling`` gain where a pixel is the mean of ``times`` x ``times``."""
-    octaves = math.log2(times)
-    return 0.0, 2 * octaves / MOST_RAYS, octaves / (OCTAVES[1] - OCTAVES[0])

@@ -139,7 +139,8 @@ def _refined(made: Sequence[Record]) -> dict[str, Any] | None:
         names = Figures.model_fields
         return [statistics.fmean(getattr(getattr(each, when), name) for each in found) for name in names]
 
-    return {"steps": found[0].steps, "before": means("before"), "after": means("after")}
+    steps = sorted({min(each.steps for each in found), max(each.steps for each in found)})
+    return {"steps": " to ".join(map(str, steps)), "before": means("before"), "after": means("after")}
 
 
 def _rebuilt(found: Sequence[Figures]) -> dict[str, Any] | None:

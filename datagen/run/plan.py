@@ -15,7 +15,6 @@ import yaml
 
 from datagen.dataset.records import CONFIG_NAME, Work
 from datagen.settings.command import SPLITS, Settings
-from datagen.settings.surfels import SurfelBudget
 from datagen.sources import source_of
 from tron.cli.recipes import model_defaults
 from tron.errors import TronError
@@ -89,14 +88,6 @@ def require_adoptable(settings: Settings) -> None:
             before, scenes, schema = dict(old["recipe"]), dict(old["scenes"]), old["schema"]
         except (KeyError, TypeError, ValueError) as error:
             raise TronError("config.yaml is damaged", run.record, CHOOSE_ANOTHER) from error
-        for split in SPLITS:  # until 2026-11-26 null was the default, and meant true for every style there is
-            if before.get(split, {}).get("lights_share_path", True) is None:
-                before[split] = before[split] | {"lights_share_path": True}
-        # Until then, too, every split had the same surfels.
-        shared = {key: before.pop(key) for key in SurfelBudget._fields if key in before}
-        for split in SPLITS:
-            if split in before:
-                before[split] = shared | before[split]
         require_schema(schema, settings.output_dir)
         _require_same_part(old.get("shard"), scenes, settings)
         then, asked = ({"source": each.get("source", "synthetic")} for each in (before, settings.recipe()))

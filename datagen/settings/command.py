@@ -135,6 +135,10 @@ class EqualErrorSettings(SettingsModel):
     rounds: int = Field(default=3, ge=1, le=100, description="Times that each frame is rendered, in turns.")
 
 
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
+
+
 class Settings(ScaleSettings):
     """Settings of ``tron-datagen``."""
 
@@ -399,6 +403,12 @@ class Settings(ScaleSettings):
     def _consistent(self) -> Settings:
         OF_SOURCE[self.source].require(self)
         require_bounces(self.bounces, self.reflections)
+        wanted = [getattr(self.split(name), "guidance_spp", None) for name in self.used_splits()]
+        named = {"preview", "final"} & {rays for each in wanted for rays in _listed(each)}
+        if named and (self.reflections or self.supersample != 1):
+            raise ValueError(f"guidance_spp={min(named)} has reflections and sub-pixels of its own")
+        if "final" in named and not self.bounces:
+            raise ValueError("guidance_spp=final shows light that bounces: give bounces=4 or the like")
         return self
 
     def split(self, name: str) -> SplitSettings:
@@ -408,7 +418,7 @@ class Settings(ScaleSettings):
     def estimation(self, split: str, scene: int = 0, light: int = 0) -> Estimation:
         """Estimation of the light on the surfels, of the clip of a scene under light number ``light``."""
         chosen = {name: getattr(self, name) for name in ESTIMATED}
-        rays = self.split(split).rays_of(scene, light)
+        rays = self.split(split).rays_of(light, generator(self.seed, split, scene, "rays").permutation)
         if isinstance(rays, int):
             return Estimation(rays=rays, **chosen)
         quality = PREVIEW if rays == "preview" else FINEST

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -121,11 +122,17 @@ class SplitSettings(SettingsModel):
         """Width and height, pixels, of the pictures that frames are windows of; of the frames without."""
         return [(width, round(width * self.height / self.width)) for width in self.window_of or [self.width]]
 
-    def rays_of(self, scene: int, light: int) -> Rays:
-        """What ``guidance_spp`` says of the clip of a scene under light number ``light``."""
+    def rays_of(self, light: int, order: Callable[[int], Sequence[int]]) -> Rays:
+        """What ``guidance_spp`` says of the clip under light number ``light``.
+
+        Args:
+            order: a number of things -> an order of theirs that the scene drew, so that neither its style
+                nor the place of a light in the list goes with a quality.
+        """
         if not isinstance(self.guidance_spp, list):
             return self.guidance_spp
-        return self.guidance_spp[(scene + light) % len(self.guidance_spp)]
+        count = len(self.guidance_spp)
+        return self.guidance_spp[order(count)[light % count]]
 
     @field_validator("style", mode="before")
     @classmethod
@@ -208,6 +215,11 @@ class SurfelReconstruction(SettingsModel):
         gt=0,
         le=100,
         description="Factor on the steps of its stages: 0.1 takes 3,000 + 700, 1 the paper's 30,000 + 7,000.",
+    )
+    proxy: Literal["auto", "always", "never"] = Field(
+        default="auto",
+        description="Whether light sees a proxy of such surfels, as in tron-relight: where they are thick, "
+        "always, or never. Scenes in which things move have none.",
     )
     path_spp: int = Field(default=64, ge=1, description="Paths per pixel of the views.")
     reference_spp: int = Field(

@@ -20,7 +20,7 @@ from datagen.settings.split import SplitSettings
 from datagen.sources.reconstructed import reconstruct_surfels
 from datagen.sources.refinement import WINDOW, refine_surfels
 from datagen.sources.source import CHECKPOINT_BYTES, SceneCost, Source, spooled_bytes
-from datagen.sources.windows import MARGIN, draw_windows
+from datagen.sources.windows import MARGIN, Window, draw_windows
 from datagen.truth.build import FIRST_ID, Geometry, draw_and_build
 from datagen.truth.pathtrace import (
     LANES,
@@ -42,7 +42,7 @@ from tron.gaussians.edit import moved
 from tron.gaussians.initialize import GBufferView, sample_bytes, surfels_from_gbuffers
 from tron.gaussians.scene import GaussianScene
 from tron.reconstruction.settings import MaterialSettings, RadianceSettings
-from tron.relighting import EnvironmentMap, Guidance, Illumination, Relighter, views_under
+from tron.relighting import EnvironmentMap, Illumination, Relighter, views_under
 from tron.run_folder import CHOOSE_ANOTHER, RunFolder
 from tron.runtime import activate
 from tron.seeds import integer
@@ -51,6 +51,10 @@ from tron.shards.moving import Moving
 from tron.shards.schema import ClipMeta, color_spaces
 from tron.storage import write_atomic
 
+OF_SURFELS = ("base_color", "normal", "depth", "roughness", "metallic")
+"""Members of the surfels that reference members are the truth of."""
+METER_WIDTH, METER_SPP = 48, 16
+"""Width and paths a pixel of the whole picture that windows of a room are exposed by."""
 REFERENCE_REFLECTIONS = 16
 """Rays a pixel of the member lit_reflections."""
 
@@ -202,7 +206,9 @@ def make_surfels(
     seed = integer(spec.seed, spec.split, spec.index, "refinement")
     with ViewSpool(folder) as shown, ViewSpool(folder) as judges:
         surfels = surfels_from_gbuffers(shown.passing(seen), count=made.surfels)
-        cameras = spec.clip(0, recipe.frames, recipe.width, recipe.height)
+        # Judged at the size that they are made for, which windows show a part of.
+        side = made.view_width if recipe.window_of else recipe.width
+        cameras = spec.clip(0, recipe.frames, side, round(side * recipe.height / recipe.width))
         for _ in judges.passing(stream_gbuffers(geometry, cameras)):
             pass
         views, held_out = shown.views(), judges.views()
@@ -253,10 +259,12 @@ def make_clips(
     with stage("guidance"):
         seed = integer(spec.seed, spec.split, spec.index, "bounce")
         source = settings.surfels_from.of(spec.seed, spec.split, spec.index)
+        rebuilt = source == "reconstruction" and spec.motion is None
         made = settings.surfel_budget(spec.split, spec.index)
         relighter = Relighter(
             surfels, settings.estimation(spec.split), seed,
-            proxy="auto" if source == "reconstruction" else "never",  # what is made of G-buffers is one layer
+            # What G-buffers make is one layer; where things move, a proxy would be made anew each frame.
+            proxy=settings.surfel_reconstruction.proxy if rebuilt else "never",
             cameras=spec.views(made.views, made.view_width, made.view_height),
         ).prepare()  # fmt: skip
     folder = scene_folder(settings.output_dir, spec.name)
@@ -352,26 +360,24 @@ def _film(
         if spec.motion is not None:
             poses.append(_pose(spec, time).matrix())
             shown.append(truth.valid & (truth.object_id == _moving_id(spec)))
-        spp, seed = recipe.path_spp, first[0].seeds["path"][i]
-        if now.stacked is None:
-            rgb = render_frames(now.scenes[0], [camera], spp, [seed], spec.path_bounces)
-        else:
-            rgb = render_lights(now.scenes[0], now.stacked, camera, spp, seed)
+        seed = first[0].seeds["path"][i]
+        rgb = _path_traced(now, camera, recipe.path_spp, seed, spec.path_bounces)
+        if spec.metered and i == 0:
+            _meter(now, window, rgb, truth, geometry, seed, spec.path_bounces)
         wide = window.with_margin().camera
         views = views_under([light.lit for light in now.lights], wide)
         surfaces = now.relighter.surface_maps(camera, *(light.lit.estimation for light in now.lights))
         finer = [light.lit.framed(supersample=2) for light in now.lights if recipe.reference_buffers]
         fine = views_under(finer, camera) if finer else []
         for k, light in enumerate(now.lights):
-            if spec.metered and i == 0:
-                first[k].exposure = metered(rgb[k], truth.valid, light.exposure)
             guidance = light.lit.render(wide, light.seeds["guidance"][i], view=views[k])
             frame = window.cut(stored_guidance(guidance)) | surfaces[k]
             frame |= {"rgb": rgb[k], "foreground": truth.valid.astype(np.float32)}
             if recipe.reference_buffers:
                 seed = light.seeds["reference"][i]
                 direct = direct_irradiance(geometry, now.scenes[k], camera, recipe.reference_spp, seed)
-                frame |= _reference(camera, truth, guidance, direct, light.environment)
+                own = window.cut({name: guidance.gbuffer[name] for name in OF_SURFELS})
+                frame |= _reference(camera, truth, direct, light.environment) | own
                 seed, mirrors = light.seeds["guidance"][i], finer[k].estimation.bounces > 0
                 mirrored = finer[k].framed(reflections=REFERENCE_REFLECTIONS * mirrors)
                 frame["lit_supersampled"] = finer[k].render(camera, seed, view=fine[k]).lit
@@ -382,6 +388,32 @@ def _film(
     source = settings.surfels_from.of(spec.seed, spec.split, spec.index)
     motion = Moving(np.stack(poses), np.stack(shown)).text() if poses else ""
     return [_meta(spec, light, cameras, recipe, source, motion) for light in first]
+
+
+def _path_traced(now: _Moment, camera: Camera, spp: int, seed: int, bounces: int) -> Sequence[np.ndarray]:
+    """(H, W, 3) linear radiance under each light of a moment."""
+    if now.stacked is None:
+        return render_frames(now.scenes[0], [camera], spp, [seed], bounces)
+    return render_lights(now.scenes[0], now.stacked, camera, spp, seed)
+
+
+def _meter(
+    now: _Moment,
+    window: Window,
+    rgb: Sequence[np.ndarray],
+    truth: GBufferView,
+    geometry: Geometry,
+    seed: int,
+    bounces: int,
+) -> None:
+    """Expose each light's clip for the whole of its first picture, not for the part that a window shows."""
+    valid, picture = truth.valid, window.picture
+    if (picture.width, picture.height) != (window.width, window.height):
+        small = picture.resized(METER_WIDTH, max(1, round(METER_WIDTH * picture.height / picture.width)))
+        rgb = _path_traced(now, small, METER_SPP, seed, bounces)
+        valid = gbuffers(geometry, [small])[0].valid
+    for light, seen in zip(now.lights, rgb):
+        light.exposure = metered(seen, valid, light.exposure)
 
 
 def _prepare(
@@ -460,7 +492,6 @@ def _seeds(spec: SceneSpec, frames: int, what: str, *path: str | int) -> list[in
 def _reference(
     camera: Camera,
     truth: GBufferView,
-    guidance: Guidance,
     direct: DirectIrradiance,
     environment: EnvironmentMap,
 ) -> Frame:
@@ -475,11 +506,9 @@ def _reference(
         "roughness": truth.roughness,
         "metallic": truth.metallic,
     }
-    return (
-        {f"{name}_ref": np.where(seen, image, behind) for name, image in light.items()}
-        | {f"{name}_ref": np.where(seen, np.atleast_3d(image), 0.0) for name, image in surface.items()}
-        | {name: guidance.gbuffer[name] for name in surface}
-    )
+    return {f"{name}_ref": np.where(seen, image, behind) for name, image in light.items()} | {
+        f"{name}_ref": np.where(seen, np.atleast_3d(image), 0.0) for name, image in surface.items()
+    }
 
 
 def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:

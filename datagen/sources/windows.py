@@ -1,7 +1,7 @@
 """Frames that are windows of larger pictures: many scales for the price of small frames.
 
 A window is a camera with another principal point. Where it lies follows from a seed and from what the picture
-shows, so that none is empty. Filters of guidance look beyond a window's edge as they do in the picture:
+shows. Filters of guidance look beyond a window's edge as they do in the picture:
 it is traced with a margin, and cut.
 """
 
@@ -18,9 +18,10 @@ from datagen.truth.pathtrace import gbuffers
 from datagen.world.scene import SceneSpec
 from tron.cameras import Camera
 from tron.seeds import generator
+from tron.shading.direct.visibility import FILTER_REACH
 
-MARGIN = 16
-"""Pixels around a window that the widest filter of guidance reaches (:mod:`tron.shading.direct`)."""
+MARGIN = FILTER_REACH
+"""Pixels around a window that guidance is traced of too."""
 OF_OBJECTS = 0.5
 """Share of the windows that are about an object."""
 COARSE = 64
@@ -65,8 +66,8 @@ class Window:
 def draw_windows(spec: SceneSpec, geometry: Geometry, recipe: SplitSettings, light: int) -> list[Window]:
     """The windows of a clip, one a frame; whole pictures where the recipe asks for no windows.
 
-    Frames that are neighbours of one clip have their windows at one place of pictures of one size
-    (``window_each=clip``), else each frame draws its own.
+    Frames that are neighbours of one clip (``window_each=clip``) follow one point of the scene in pictures of
+    one size, as far as the picture goes; else each frame draws its own.
 
     Args:
         spec, geometry: the scene, its objects where they are at first.
@@ -74,41 +75,35 @@ def draw_windows(spec: SceneSpec, geometry: Geometry, recipe: SplitSettings, lig
         light: number of the first of the lights that the clip is filmed under.
     """
     windows: list[Window] = []
+    width, height, point = recipe.width, recipe.height, None
     for i in range(recipe.frames):
         draw = generator(spec.seed, spec.split, spec.index, "window", light, i)
-        if windows and recipe.window_each == "clip":
-            first = windows[0]
-            width, height = first.picture.width, first.picture.height
-        else:
-            first = None
+        drawn = i == 0 or recipe.window_each == "frame"
+        if drawn:
             width, height = recipe.pictures[int(draw.integers(len(recipe.pictures)))]
         picture = spec.clip(light, recipe.frames, width, height)[i]
-        if first is not None:
-            x, y = first.x, first.y
-        else:
-            x, y = _place(picture, geometry, len(spec.surroundings), recipe, draw)
+        if drawn and (width, height) != (recipe.width, recipe.height):
+            point = _point(picture, geometry, len(spec.surroundings), draw)
+        middle = np.array([width, height]) / 2
+        if point is not None:
+            places, depths = picture.project(point[None])
+            middle = places[0] if depths[0] > 0 else middle
+        corner = np.round(middle - np.array([recipe.width, recipe.height]) / 2)
+        x, y = np.clip(corner, 0, [width - recipe.width, height - recipe.height]).astype(int).tolist()
         windows.append(Window(picture, x, y, recipe.width, recipe.height))
     return windows
 
 
-def _place(
-    picture: Camera, geometry: Geometry, surroundings: int, recipe: SplitSettings, draw: np.random.Generator
-) -> tuple[int, int]:
-    """Upper left pixel of a window about some pixel of the picture that shows a surface.
+def _point(
+    picture: Camera, geometry: Geometry, surroundings: int, draw: np.random.Generator
+) -> np.ndarray | None:
+    """Some point (3,), world, of what the picture shows; None where it shows no surface.
 
-    Half of the windows are about an object where one is seen: floors and skies teach little.
+    Half of them lie on an object where one is seen: floors and skies teach little.
     """
-    room = np.array([picture.width - recipe.width, picture.height - recipe.height])
-    if not room.any():
-        return 0, 0
-    (seen,) = gbuffers(geometry, [picture.resized(COARSE, round(COARSE * picture.height / picture.width))])
+    rows = max(1, round(COARSE * picture.height / picture.width))
+    (seen,) = gbuffers(geometry, [picture.resized(COARSE, rows)])
     objects = seen.valid & (seen.object_id >= FIRST_ID + surroundings)
     wanted = objects if draw.random() < OF_OBJECTS and objects.any() else seen.valid
-    rows, columns = np.nonzero(wanted)
-    middle = np.array([picture.width, picture.height]) / 2
-    if len(rows):
-        k = int(draw.integers(len(rows)))
-        middle = (np.array([columns[k], rows[k]]) + draw.random(2)) * picture.width / COARSE
-    corner = np.round(middle - np.array([recipe.width, recipe.height]) / 2).astype(int)
-    x, y = np.clip(corner, 0, room).tolist()
-    return x, y
+    points = seen.position[wanted]
+    return points[int(draw.integers(len(points)))] if len(points) else None

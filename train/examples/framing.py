@@ -17,7 +17,7 @@ from torch import Tensor
 
 from tron.color import linear_to_srgb, srgb_to_linear
 from tron.errors import TronError
-from tron.estimation import of_wider_pixels
+from tron.neural.scales import of_wider_pixels
 from tron.shards.schema import MEMBERS, TARGET, Clip
 
 Size = tuple[int, int]
@@ -95,8 +95,7 @@ def _covering(name: str, video: Tensor, size: Size, display: bool) -> Tensor:
     if covering == (width, height):
         return video
     if name == "sampling":
-        video, more = area_resized(video, covering), torch.tensor(of_wider_pixels(width / covering[0]))
-        return torch.where(video > 0, (video + more[:, None, None, None]).clamp(max=1), video)
+        return of_wider_pixels(area_resized(video, covering), width / covering[0])
     if display:
         return linear_to_srgb(area_resized(srgb_to_linear(video), covering)).clamp(0, 1)
     return area_resized(video, covering)

@@ -30,7 +30,7 @@ PLAIN_TIMESTEP = 0.2  # what the tiny transformer is told; any constant will do
 BLUR_SIDE = 5
 """Pixels of the square that skip_blur gathers from; skip_kernel has its own."""
 REACH = 96
-"""Pixels that a change of guidance reaches in the U-Net's picture, to a 255th of white."""
+"""Pixels that a change of guidance reaches in the pictures of the shipped U-Nets, to a 255th of white."""
 HARDLY = -7.0
 """Logarithm of what a new kernel with holes has of each neighbour, over what it has of the pixel itself."""
 
@@ -41,6 +41,13 @@ def _backbone(shape: UNetConfig | BackboneConfig, given: int, predicted: int) ->
     from tron.neural.networks.backbone import Backbone  # diffusers, which the shipped networks do without
 
     return Backbone(shape, given, predicted)
+
+
+def predicted(config: RendererConfig, channels: int) -> list[int]:
+    """Numbers a pixel that the backbone predicts: colour, kernel, shares of detail, kernel with holes."""
+    taps = config.skip_kernel**2
+    detail = 0 if config.skip_detail is None else channels
+    return [channels, taps, detail, taps if config.skip_holes else 0]
 
 
 class NeuralRenderer(Renderer):
@@ -60,10 +67,7 @@ class NeuralRenderer(Renderer):
         channels = self.codec.latent_channels
         latents = len(self.config.guidance) if self.config.fusion == "concat" else 1
         shape = self.config.backbone
-        detail = 0 if self.config.skip_detail is None else channels
-        taps = self.config.skip_kernel**2
-        # In this order: what a wider network adds comes last (tron.neural.weights.widened).
-        self._predicted = [channels, taps, detail, taps if self.config.skip_holes else 0]
+        self._predicted = predicted(self.config, channels)
         self.backbone: Backbone | UNet = _backbone(shape, latents * channels, sum(self._predicted))
 
     @property
@@ -72,7 +76,8 @@ class NeuralRenderer(Renderer):
         shape = self.config.backbone
         if not isinstance(shape, UNetConfig) or shape.attention or self.config.codec != "pixels":
             return None
-        return REACH * self.config.scales
+        kernels = self.config.skip_kernel // 2 * (2 + self.config.skip_holes if self.config.skip_holes else 1)
+        return (REACH + kernels) * self.config.scales
 
     @property
     def stride(self) -> int:

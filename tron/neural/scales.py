@@ -6,26 +6,42 @@ what was learnt.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
-from tron.estimation import of_wider_pixels
+from tron.estimation import MOST_RAYS, OCTAVES
 
 
 def halved(buffers: Mapping[str, Tensor]) -> list[Tensor]:
-    """Guidance by name, (B, 3, K, H, W) in [-1, 1], at half its size: means of 2 x 2 pixels.
+    """Guidance by name, (B, 3, K, H, W) in [-1, 1], at half its size: means of 2 x 2 display values.
 
-    An odd side's last pixel counts twice. ``sampling`` says how the larger pixels were sampled, where
-    surfels are.
+    An odd side's last pixel counts twice. ``sampling`` says how the larger pixels were sampled.
     """
-    return [_told(video) if name == "sampling" else _mean(video) for name, video in buffers.items()]
+    halves = {name: _mean(video) for name, video in buffers.items()}
+    if "sampling" in halves:
+        halves["sampling"] = of_wider_pixels(halves["sampling"], 2, least=-1)
+    return list(halves.values())
+
+
+def of_wider_pixels(sampling: Tensor, times: float, least: float = 0.0) -> Tensor:
+    """``sampling`` (..., 3, K, H, W) of means of ``times`` x ``times`` pixels: as many more rays, wider.
+
+    What lies partly beyond the surfels is off by a part of that.
+
+    Args:
+        least: value of black, where white is 1.
+    """
+    octaves = math.log2(times)
+    more = torch.tensor([0.0, 2 * octaves / MOST_RAYS, octaves / (OCTAVES[1] - OCTAVES[0])])
+    return (sampling + (1 - least) * more.to(sampling)[:, None, None, None]).clamp(max=1)
 
 
 def with_coarse(fine: Tensor, coarse: Tensor) -> Tensor:
-    """A picture (B, C, K, H, W) whose means of 2 x 2 pixels are moved to those of ``coarse``."""
+    """A picture (B, C, K, H, W) plus, enlarged bilinearly, ``coarse`` less its means of 2 x 2."""
     height, width = fine.shape[-2:]
     frames = (coarse - _mean(fine)).transpose(1, 2).flatten(0, 1)
     wide = interpolate(frames, scale_factor=2, mode="bilinear", align_corners=False)[..., :height, :width]
@@ -38,9 +54,3 @@ def _mean(video: Tensor) -> Tensor:
     if height % 2 or width % 2:
         frames = pad(frames, (0, width % 2, 0, height % 2), mode="replicate")
     return avg_pool2d(frames, 2).unflatten(0, (-1, video.shape[2])).transpose(1, 2)
-
-
-def _told(sampling: Tensor) -> Tensor:
-    mean = _mean(sampling)
-    more = 2 * torch.tensor(of_wider_pixels(2), dtype=mean.dtype, device=mean.device)  # [-1, 1] is 2 wide
-    return torch.where(mean > -1, (mean + more[:, None, None, None]).clamp(max=1), mean)

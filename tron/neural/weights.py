@@ -35,7 +35,7 @@ from tron.neural.configs import (
 )
 from tron.neural.networks.pixel_mlp import PixelMLP
 from tron.neural.protocols import Codec, Renderer
-from tron.neural.renderer import NeuralRenderer
+from tron.neural.renderer import NeuralRenderer, predicted
 from tron.storage import write_atomic
 
 log = logging.getLogger(__name__)
@@ -95,14 +95,26 @@ def restore_renderer(path: str | Path, renderer: Renderer) -> None:
     if isinstance(renderer, NeuralRenderer) and (given := _config(metadata)) is not None:
         wider = widened(state, given, renderer)
         if wider is not state:
-            new = [name for name in renderer.config.guidance if name not in given.guidance]
-            log.info("%s was not given %s: their weights start from zero", path, ", ".join(new))
+            log.info(
+                "%s was without %s: their weights start from zero", path, ", ".join(_new(given, renderer))
+            )
+        elif given.skip_holes not in (0, renderer.config.skip_holes):
+            holes = f"{given.skip_holes}, not {renderer.config.skip_holes}"
+            raise TronError(f"weights of skip_holes={holes}", str(path), "give the network as many")
         state = wider
     temporal = renderer.temporal_weights()
     if temporal and not set(temporal) & set(state):
         log.info("%s was trained on single frames: the paths between frames start from zero", path)
         state |= {name: parameter.detach() for name, parameter in temporal.items()}
     load_strictly(renderer, state, path)
+
+
+def _new(given: RendererConfig, renderer: NeuralRenderer) -> list[str]:
+    """What a network has that the one of configuration ``given`` had not."""
+    config = renderer.config
+    parts = ("skip_detail", "skip_holes")
+    new = [name for name in config.guidance if name not in given.guidance]
+    return new + [name for name in parts if getattr(config, name) and not getattr(given, name)]
 
 
 def _config(metadata: Mapping[str, str]) -> RendererConfig | None:
@@ -212,8 +224,8 @@ FIRST, LAST = "backbone.embed.weight", ("backbone.out.weight", "backbone.out.bia
 def widened(state: dict[str, Tensor], narrow: RendererConfig, wide: NeuralRenderer) -> dict[str, Tensor]:
     """The state of a U-Net of configuration ``narrow`` as one of ``wide``.
 
-    The same state where they differ in more than guidance, scales, and a ``skip_detail`` or ``skip_holes``
-    that is new.
+    The same state where nothing is added, or where they differ in more than guidance, scales, and a
+    ``skip_detail`` or ``skip_holes`` that is new.
     """
     config, shape = wide.config, wide.config.backbone
     may_differ = ("guidance", "skip_detail", "skip_holes", "scales", "window")
@@ -225,12 +237,14 @@ def widened(state: dict[str, Tensor], narrow: RendererConfig, wide: NeuralRender
         or not set(narrow.guidance) <= set(config.guidance)
         or narrow.skip_detail not in (None, config.skip_detail)
         or narrow.skip_holes not in (0, config.skip_holes)
+        or (narrow.guidance, predicted(narrow, 1)) == (config.guidance, predicted(config, 1))
     ):
         return state
     channels, area = wide.codec.latent_channels, shape.patch**2
     columns, rows = area * len(narrow.guidance) * channels, wide.state_dict()
+    parts = predicted(narrow, channels)
     whole = {FIRST, *LAST} <= state.keys() and state[FIRST].shape == (rows[FIRST].shape[0], columns)
-    if not whole or any(state[name].shape[0] % area for name in LAST):
+    if not whole or any(state[name].shape[0] != area * sum(parts) for name in LAST):
         return state  # damaged: whoever loads it says where
     # Columns and rows of each pixel of a patch lie together: of a column block for each buffer, in order.
     old = state[FIRST].unflatten(1, (area, len(narrow.guidance), channels))
@@ -240,7 +254,10 @@ def widened(state: dict[str, Tensor], narrow: RendererConfig, wide: NeuralRender
     grown = {FIRST: new.flatten(1)}
     for name in LAST:
         old = state[name].unflatten(0, (area, -1))
-        new = old.new_zeros(area, rows[name].shape[0] // area, *old.shape[2:])
-        new[:, : old.shape[1]] = old
-        grown[name] = new.flatten(0, 1)
+        # What the old one predicts, each in its place; a part that is new is 0.
+        blocks = [
+            before if before.shape[1] == size else old.new_zeros(area, size, *old.shape[2:])
+            for before, size in zip(old.split(parts, 1), predicted(config, channels), strict=True)
+        ]
+        grown[name] = torch.cat(blocks, 1).flatten(0, 1)
     return state | grown

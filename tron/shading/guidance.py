@@ -336,13 +336,13 @@ def surface_maps(
 ) -> list[dict[str, np.ndarray]]:
     """Members that no light changes of one view, one set an estimation of the light.
 
-    Each is (H, W, 3) float32 in [0, 1], 0 where no surfels are, and every sub-pixel counts by its opacity:
+    Each is (H, W, 3) float32 in [0, 1], a mean over sub-pixels:
 
-        albedo      linear base color
-        surface     |n . v| of the unit normal and the unit direction to the camera, roughness, metallic
+        albedo      linear base color, by opacity: 0 where no surfels are
+        surface     likewise |n . v| of unit normal and direction to the camera, roughness, metallic
         sampling    a third if filtered and two if of sub-pixels; log2 of the shadow rays a pixel over
                     MOST_RAYS of tron.estimation; log2 of the pixel's footprint, distance / fx, over the
-                    scene's surfel spacing, OCTAVES of tron.estimation as 0 to 1
+                    scene's surfel spacing, OCTAVES of tron.estimation as 0 to 1, and 1 where no surfels are
 
     With ``sampling`` a network knows what the light's noise and the surfels' blur are like.
     """
@@ -355,17 +355,17 @@ def surface_maps(
     }
     opacity = seen["opacity"][..., None]
     maps = {name: averaged(np.clip(image, 0, 1) * opacity, SUB_PIXELS) for name, image in maps.items()}
-    footprint = np.maximum(seen["depth"], 1e-30) / (camera.fx * tracer.scene.spacing)
+    distance = np.linalg.norm(seen["position"] - camera.position, axis=-1, keepdims=True)
+    footprint = np.maximum(distance, 1e-30) / (camera.fx * tracer.scene.spacing)
     low, high = OCTAVES
-    octaves = averaged(
-        np.clip((np.log2(footprint) - low) / (high - low), 0, 1)[..., None] * opacity, SUB_PIXELS
-    )
-    covered = averaged(opacity, SUB_PIXELS)
-    return [maps | {"sampling": _sampling(estimation, octaves, covered)} for estimation in estimations]
+    octaves = np.clip((np.log2(footprint) - low) / (high - low), 0, 1)
+    octaves = averaged(opacity * octaves + 1 - opacity, SUB_PIXELS)
+    return [maps | {"sampling": _sampling(estimation, octaves)} for estimation in estimations]
 
 
-def _sampling(estimation: Estimation, octaves: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """Channels of ``sampling`` from those of the footprint and of opacity, (H, W, 1) each."""
+def _sampling(estimation: Estimation, octaves: np.ndarray) -> np.ndarray:
+    """``sampling`` from its last channel, (H, W, 1)."""
     kind = (estimation.filtered + 2 * (estimation.supersample > 1)) / 3
     rays = min(np.log2(estimation.rays) / MOST_RAYS, 1)
-    return np.concatenate([kind * covered, rays * covered, octaves], axis=-1).astype(np.float32)
+    told = np.broadcast_to([kind, rays], (*octaves.shape[:2], 2))
+    return np.concatenate([told, octaves], axis=-1).astype(np.float32)

@@ -282,14 +282,3 @@ def test_kill_9_of_a_cluster_and_again_gives_the_same_bytes(tiny, dataset, files
         time.sleep(2.0)  # orphaned workers notice and go
     assert make(tiny(output)) == 0
     assert files_of(output) == files_of(dataset)
-
-
-def test_a_dataset_of_when_null_meant_that_lights_share_a_path_goes_on(tiny, tmp_path):
-    adopt(tiny(tmp_path))
-    config = tmp_path / "config.yaml"
-    held = yaml.safe_load(config.read_text())
-    held["recipe"]["train"]["lights_share_path"] = None
-    config.write_text(yaml.safe_dump(held))
-    adopt(tiny(tmp_path))
-    with pytest.raises(TronError, match=r"train\.lights_share_path"):
-        adopt(tiny(tmp_path, "train.lights_share_path=false"))

@@ -80,19 +80,12 @@ def test_a_dataset_of_another_law_is_refused(tmp_path, small_settings, monkeypat
         adopt(small_settings(tmp_path, *words))
 
 
-def test_a_dataset_of_when_all_splits_had_the_same_surfels_is_refused_for_its_fit_alone(
-    tmp_path, small_settings
-):
-    adopt(small_settings(tmp_path))
-    config = tmp_path / planning.CONFIG_NAME
-    held = yaml.safe_load(config.read_text())
-    for name in SurfelBudget._fields:
-        values = [held["recipe"][split].pop(name) for split in ("train", "train_b", "test")]
-        held["recipe"][name] = values[0]
-    config.write_text(yaml.safe_dump(held))
+def test_a_dataset_of_other_surfels_or_another_fit_is_refused_by_name(tmp_path, small_settings):
     adopt(small_settings(tmp_path))
     with pytest.raises(TronError, match=r"train\.surfels=1500, not 1600"):
         adopt(small_settings(tmp_path, "surfels=1600"))
+    config = tmp_path / planning.CONFIG_NAME
+    held = yaml.safe_load(config.read_text())
     del held["recipe"]["fit"]
     config.write_text(yaml.safe_dump(held))
     with pytest.raises(TronError, match=r"made with fit=None, not"):

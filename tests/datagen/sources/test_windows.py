@@ -15,7 +15,7 @@ from datagen.truth.pathtrace import gbuffers
 from tron.cameras import Camera
 from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
-from tron.estimation import FINEST, PREVIEW
+from tron.estimation import FINEST
 from tron.relighting import Relighter
 
 TINY = [
@@ -56,11 +56,11 @@ def test_a_window_has_the_rays_of_its_pixels():
 
 
 def test_a_margin_ends_with_the_picture_and_is_cut_off_again():
-    picture = Camera.look_at((3, 1, 2), (0, 0, 0), fov_deg=40, width=60, height=40)
-    window = Window(picture, x=4, y=20, width=24, height=16)
+    picture = Camera.look_at((3, 1, 2), (0, 0, 0), fov_deg=40, width=90, height=78)
+    window = Window(picture, x=4, y=58, width=24, height=16)
     wide = window.with_margin()
-    assert (wide.x, wide.y) == (0, 20 - MARGIN)
-    assert (wide.width, wide.height) == (4 + 24 + MARGIN, MARGIN + 16 + 4)
+    assert (wide.x, wide.y) == (0, 58 - MARGIN)
+    assert (wide.width, wide.height) == (4 + 24 + MARGIN, MARGIN + 16 + min(MARGIN, 78 - 58 - 16))
     cut = window.cut({"rays": wide.camera.exact_rays()})
     np.testing.assert_allclose(cut["rays"], window.camera.exact_rays(), atol=1e-12)
 
@@ -87,7 +87,8 @@ def test_frames_of_windows_are_parts_of_whole_pictures(windowed):
 def test_neighbours_share_a_place_and_single_frames_do_not(windowed):
     spec, geometry, _, settings, _ = windowed
     clip = draw_windows(spec, geometry, settings.test, 0)
-    assert len({(w.x, w.y, w.picture.width) for w in clip}) == 1
+    assert {w.picture.width for w in clip} == {96}
+    assert max(np.ptp([(w.x, w.y) for w in clip], axis=0)) < 24
     recipe = settings.test.model_copy(update={"window_each": "frame", "window_of": [24, 48, 96]})
     single = [window for light in range(8) for window in draw_windows(spec, geometry, recipe, light)]
     assert {w.picture.width for w in single} == {24, 48, 96}
@@ -109,16 +110,58 @@ def test_every_other_window_is_about_an_object(windowed):
     assert about[True] >= 0.4 * about.total()
 
 
+def test_neighbours_follow_a_point(windowed):
+    """Of a walk as long as the picture: the window moves with what it was about."""
+    spec, geometry, _, settings, _ = windowed
+    recipe = settings.test.model_copy(update={"frames": 8, "window_of": [384]})
+    start = spec.cameras.model_copy(update={"first_frame": 0})
+    moving = spec.model_copy(update={"cameras": start})
+    windows = draw_windows(moving, geometry, recipe, 0)
+    (seen,) = gbuffers(geometry, [windows[0].camera])
+    point = seen.position[8, 12]
+    for window in windows:
+        (place,), _ = window.camera.project(point[None])
+        inside = 0 < window.x < 384 - 24 and 0 < window.y < 256 - 16
+        assert not inside or np.abs(place - (12, 8)).max() < 4
+    assert len({(w.x, w.y) for w in windows}) > 1
+
+
 def test_clips_take_qualities_in_turn_and_say_so(windowed):
-    _, _, _, settings, clips = windowed
-    assert [meta.spp["guidance"] for meta, _ in clips] == [2, 8, 64]
-    assert [meta.extra["filtered"] for meta, _ in clips] == [True, False, True]
-    assert [meta.extra["sub_pixels"] for meta, _ in clips] == [1, 1, 2]
-    assert clips[2][0].spp["reflections"] == FINEST.reflections
-    assert settings.estimation("test", scene=1, light=2).rays == PREVIEW.rays  # scenes begin elsewhere
-    for (_, frames), kind, rays in zip(clips, (1 / 3, 0, 1), (0.1, 0.3, 0.6), strict=True):
-        assert frames[0]["sampling"][..., 0].max() == pytest.approx(kind, rel=0.02)
-        assert frames[0]["sampling"][..., 1].max() == pytest.approx(rays, rel=0.02)
+    *_, clips = windowed
+    found = {meta.spp["guidance"]: meta for meta, _ in clips}
+    assert {rays: meta.extra["filtered"] for rays, meta in found.items()} == {2: True, 8: False, 64: True}
+    assert {rays: meta.extra["sub_pixels"] for rays, meta in found.items()} == {2: 1, 8: 1, 64: 2}
+    assert found[64].spp["reflections"] == FINEST.reflections
+    told = {2: (1 / 3, 0.1), 8: (0, 0.3), 64: (1, 0.6)}
+    for meta, frames in clips:
+        kind_and_rays = frames[0]["sampling"][..., :2].reshape(-1, 2)
+        np.testing.assert_allclose(
+            kind_and_rays, [told[meta.spp["guidance"]]] * len(kind_and_rays), atol=2e-3
+        )
+
+
+def test_no_quality_goes_with_a_light_or_a_scene(windowed):
+    """Of 64 scenes each light of a list has each quality about as often."""
+    _, _, _, settings, _ = windowed
+    counts = Counter(
+        (light, settings.estimation("test", k, light).rays) for k in range(64) for light in (0, 1, 2)
+    )
+    assert len(counts) == 9
+    assert min(counts.values()) > 8
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["bounces=0"], "guidance_spp=final shows light that bounces"),
+        (["supersample=2"], "guidance_spp=final has reflections and sub-pixels of its own"),
+        (["test.guidance_spp=fast"], "preview"),
+        (["surfels=some"], "auto"),
+    ],
+)
+def test_what_does_not_go_together_is_said_before_anything_is_made(tmp_path, words, said):
+    with pytest.raises(TronError, match=said):
+        check(compose_recipe("conf.datagen", Settings, [*TINY, *words, f"output_dir={tmp_path}"]), Settings)
 
 
 def test_a_picture_smaller_than_its_window_is_refused(tmp_path):

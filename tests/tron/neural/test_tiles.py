@@ -85,4 +85,4 @@ def test_clips_larger_than_a_tile_are_drawn_in_tiles(monkeypatch):
     given = picture(names, 24, 2 * SIDE)
     shown = {name: (image[0].permute(1, 2, 3, 0).numpy() + 1) / 2 for name, image in given.items()}
     assert render_clip(renderer, shown).shape == (1, 24, 2 * SIDE, 3)
-    assert widest <= SIDE + 2 * 112
+    assert widest <= SIDE + 2 * 128

@@ -45,8 +45,11 @@ def test_surfels_count_by_their_opacity(variant: str, sphere_over_plane, camera)
             return replace(seen, opacity=0.25 * seen.opacity)
 
     thin, solid = (surface_maps(each(), camera, [FINAL])[0] for each in (Thin, sphere_over_plane))
-    for name in solid:
+    for name in ("albedo", "surface"):
         np.testing.assert_allclose(thin[name], 0.25 * solid[name], atol=1e-6)
+    np.testing.assert_array_equal(thin["sampling"][..., :2], solid["sampling"][..., :2])
+    beyond = 1 - solid["sampling"][..., 2]  # 1 is nothing there
+    np.testing.assert_allclose(1 - thin["sampling"][..., 2], 0.25 * beyond, atol=1e-6)
 
 
 def test_sampling_tells_rays_and_footprints(variant: str, sphere_over_plane, camera) -> None:

@@ -260,6 +260,8 @@ class NarrowSums:
 GUIDE_PASSES = ((1, 0.0), (1, 0.0), (2, 4.0))
 """Step in pixels and stop of each pass that smooths the guide; a stop is over the share of light, 0 to 1."""
 FILTER_PASSES = ((1, 4.0), (2, 8.0), (4, 12.0))
+FILTER_REACH = 2 * (1 + 1 + sum(step for step, _ in GUIDE_PASSES) + sum(step for step, _ in FILTER_PASSES))
+"""Pixels that filtered light depends on around one: two taps a pass, of narrow lights, guide and filter."""
 
 
 def atrous(

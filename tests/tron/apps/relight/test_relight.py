@@ -56,7 +56,7 @@ def test_writes_frames_videos_sheet_and_report(relight, scene_path, light_path, 
 
 
 def test_every_buffer_of_the_help_is_made_and_all_guidance_is_written_by_default():
-    shaded = {"foreground", "share", "relit", "albedo", "surface"}
+    shaded = {"foreground", "share", "relit", "albedo", "surface", "sampling"}
     assert set(BUFFERS) <= {field.name for field in fields(Surface)} | set(Guidance.BUFFERS) | shaded
     assert set(Guidance.BUFFERS) <= set(DEFAULT_BUFFERS)
     assert all(name in (Settings.model_fields["buffers"].description or "") for name in BUFFERS)

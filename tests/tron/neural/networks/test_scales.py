@@ -25,18 +25,18 @@ def test_half_the_size_is_means_of_four_pixels_and_odd_sides_keep_their_last():
 
 
 def test_sampling_of_half_the_size_is_that_of_pixels_twice_as_wide():
-    """Eight rays and a footprint of a spacing become 32 and two; none stay none."""
+    """Eight rays and a footprint of a spacing become 32 and two; white stays white."""
     low, high = OCTAVES
 
     def seen(rays: float, footprint: float) -> torch.Tensor:
         display = torch.tensor([1 / 3, rays / MOST_RAYS, (footprint - low) / (high - low)])
         return display * 2 - 1
 
-    given = torch.full((1, 3, 1, 4, 4), -1.0)
+    given = torch.ones(1, 3, 1, 4, 4)
     given[..., 2:] = seen(3, 0)[None, :, None, None, None]
     (half,) = halved({"sampling": given})
     torch.testing.assert_close(half[0, :, 0, 0, 1], seen(5, 1))
-    assert bool((half[..., 0] == -1).all())
+    assert bool((half[..., 0] == 1).all())
 
 
 @pytest.mark.parametrize("size", [(8, 10), (7, 9)])
@@ -45,6 +45,17 @@ def test_means_become_the_coarse_pictures_and_a_fine_one_that_agrees_stays(size:
     (own,) = halved({"lit": fine})
     torch.testing.assert_close(with_coarse(fine, own), fine)
     torch.testing.assert_close(with_coarse(fine, own + 0.25), fine + 0.25)
+
+
+def test_what_is_coarse_is_enlarged_bilinearly():
+    """Of a slope each fine pixel has its own height, but for the outermost."""
+    fine = video(8, 12)
+    (own,) = halved({"lit": fine})
+    slope = 0.1 * torch.arange(6.0) + 0.05 * torch.arange(4.0)[:, None]  # at the middles of 2 x 2 pixels
+    height = 0.1 * (torch.arange(12.0) - 0.5) / 2 + 0.05 * (torch.arange(8.0)[:, None] - 0.5) / 2
+    drawn = with_coarse(fine, own + slope) - fine
+    inner = (slice(None), slice(None), slice(None), slice(1, -1), slice(1, -1))
+    torch.testing.assert_close(drawn[inner], height.expand_as(drawn)[inner])
 
 
 def test_a_network_of_two_scales_corrects_what_is_wider_than_its_reach():

@@ -187,7 +187,7 @@ def test_more_buffers_start_from_the_weights_of_fewer(tmp_path, caplog):
     renderer = shaken(NeuralRenderer(config))
     with caplog.at_level(logging.INFO):
         restore_renderer(tmp_path / "fewer.safetensors", renderer)
-    assert "not given albedo, surface" in caplog.text
+    assert "was without albedo, surface, skip_detail" in caplog.text
     random = torch.Generator().manual_seed(3)
     given = {name: torch.rand(2, 3, 1, 16, 16, generator=random) * 2 - 1 for name in names}
     torch.testing.assert_close(renderer(given), saved(given), atol=1e-5, rtol=0)
@@ -197,6 +197,39 @@ def test_more_buffers_start_from_the_weights_of_fewer(tmp_path, caplog):
         restore_renderer(tmp_path / "damaged.safetensors", renderer)
     renderer(given).square().mean().backward()
     assert all((renderer.get_parameter(name).grad != 0).any() for name in (FIRST, *LAST))
+
+
+PARTS = {"skip_detail": "albedo", "skip_holes": 1}
+
+
+@pytest.mark.parametrize("had", [[], ["skip_detail"], ["skip_holes"]])
+@pytest.mark.parametrize("has", [["skip_detail"], ["skip_holes"], ["skip_detail", "skip_holes"]])
+def test_whatever_is_added_the_picture_stays(tmp_path, caplog, had: list[str], has: list[str]):
+    """In any order; a new kernel with holes takes a fiftieth from its neighbours at first."""
+    filtering = {"codec": "pixels", "backbone": SMALL, "skip_blur": 0.6, "skip_kernel": 3}
+    names = ("lit", "albedo")
+    before = RendererConfig(guidance=names, **filtering, **{name: PARTS[name] for name in had})
+    saved = shaken(NeuralRenderer(before))
+    save_renderer(tmp_path / "less.safetensors", saved)
+    after = before.model_copy(update={name: PARTS[name] for name in {*had, *has}})
+    renderer = shaken(NeuralRenderer(after))
+    with caplog.at_level(logging.INFO):
+        restore_renderer(tmp_path / "less.safetensors", renderer)
+    added = [name for name in PARTS if name in has and name not in had]
+    assert ("was without" in caplog.text) == bool(added)
+    assert all(name in caplog.text for name in added)
+    random = torch.Generator().manual_seed(3)
+    given = {name: torch.rand(2, 3, 1, 16, 16, generator=random) * 2 - 1 for name in names}
+    atol = 0.05 if "skip_holes" in added else 1e-5
+    torch.testing.assert_close(renderer(given), saved(given), atol=atol, rtol=0)
+
+
+def test_other_holes_are_refused(tmp_path):
+    filtering = {"codec": "pixels", "backbone": SMALL, "skip_blur": 0.6, "skip_kernel": 3}
+    save_renderer(tmp_path / "r.safetensors", NeuralRenderer(RendererConfig(skip_holes=1, **filtering)))
+    other = NeuralRenderer(RendererConfig(skip_holes=2, **filtering))
+    with pytest.raises(TronError, match="weights of skip_holes=1, not 2"):
+        restore_renderer(tmp_path / "r.safetensors", other)
 
 
 def test_the_rest_of_a_warm_start_is_strict(tmp_path):

@@ -16,7 +16,13 @@ from tron.runtime import aligned, lanes
 from tron.seeds import generator
 from tron.shading.direct.irradiance import irradiance, visible_share
 from tron.shading.direct.neighbours import neighbourhood_mean
-from tron.shading.direct.visibility import RATIO_FROM_RAYS, reaching_share, regressed_share
+from tron.shading.direct.visibility import (
+    FILTER_REACH,
+    RATIO_FROM_RAYS,
+    atrous,
+    reaching_share,
+    regressed_share,
+)
 from tron.shading.environments.environment import EnvironmentLight, EnvironmentMap
 from tron.shading.guidance import Lighting, render_guidance
 
@@ -124,3 +130,25 @@ def test_pixels_that_agree_with_no_neighbour_are_averaged_with_those_near_them(
     (mean,), _ = neighbourhood_mean([noise], frayed, tracer.scene.spacing)
     surface = np.array(gbuffer.opacity) > 0.99
     assert np.std(np.array(mean)[surface]) < 0.6 * np.std(np.array(noise)[surface])
+
+
+def test_a_pixel_changes_none_beyond_the_reach_of_the_filter(variant: str, sphere_over_plane):
+    """Windows of larger pictures are given that many pixels more on each side."""
+    above = Camera.look_at((0, 0.01, 4), (0, 0, 0), fov_deg=40, width=96, height=96)
+    tracer = sphere_over_plane(sphere=False)
+    gbuffer = tracer.gbuffer(above)
+    count = dr.width(gbuffer.opacity)
+    order = gbuffer.images({"lane": mi.Float(dr.arange(mi.Float, count))})["lane"].astype(int)
+    light = generator(0, "reach").uniform(0.4, 0.6, count).astype(np.float32)
+
+    def filtered(values: np.ndarray) -> np.ndarray:
+        share = mi.Float(aligned(values))
+        shadowed, _ = atrous(mi.Color3f(share), mi.Color3f(1), share, gbuffer, tracer.scene.spacing)
+        return np.array(shadowed[0])[order]
+
+    other = light.copy()
+    other[order[48, 48]] = 1
+    rows, columns = np.nonzero(filtered(other) != filtered(light))
+    farthest = max(np.abs(rows - 48).max(), np.abs(columns - 48).max())
+    of_narrow_lights_and_terms = 2 * (1 + 1)
+    assert 16 < farthest <= FILTER_REACH - of_narrow_lights_and_terms
