@@ -67,7 +67,7 @@ def picture(camera: Camera, shown: dict[Any, Any]) -> np.ndarray:
     image = np.full((len(rays), 3), GREY, np.float32)
     for where, value in shown.items():
         there = where(left)
-        image[there] = value(rays[there])[:, None] if callable(value) else value
+        image[there] = np.asarray(value(rays[there]))[:, None] if callable(value) else value
     return image.reshape(camera.height, camera.width, 3)
 
 
