@@ -77,6 +77,7 @@ class Reconstruction:
             stereo was not asked.
         seconds: of surfels with materials, those before an interruption included, and of the light.
         proxy: what light sees of a scan that was kept; None where surfels are new.
+        opened: surfels that showed the sky in a room's windows and were taken out.
     """
 
     scene: GaussianScene
@@ -88,6 +89,7 @@ class Reconstruction:
     confident: float | None
     seconds: dict[str, float]
     proxy: Proxy | None = None
+    opened: int = 0
 
 
 def reconstruct(
@@ -156,12 +158,15 @@ def reconstruct(
     degree = settings.initial.kernel_degree
     scene = replace(surfels.scene(degree, capture.up), offset=capture.offset)
     if not run.past(plan.name):
-        closed = closed_indoors(scene, views, settings.indoors, settings.seed, capture.tone_curve, track)
+        closed, opened = closed_indoors(
+            scene, views, settings.indoors, settings.seed, capture.tone_curve, track
+        )
         if closed is not scene:
             # Windows show whatever light there is from now on, not the photos'.
             run.begun["looks"] = _looks(
                 _scores(SurfelTracer(scene.validate()), capture, settings, lpips, track)
             )
+            run.begun["opened"] = opened
         scene = closed
     scene = _with_baked_color(scene)
 

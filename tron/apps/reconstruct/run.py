@@ -200,6 +200,7 @@ def _report(settings: Settings, capture: Capture, found: Reconstruction) -> dict
         },
         "surfels": len(found.scene),
         "first_surfels": {"source": found.source, "stereo_confident": found.confident},
+        "opened": found.opened,
         "materials_learnt": list(found.learnt),
         "test": mean_figures(test) if test else None,
         "train": mean_figures(train),

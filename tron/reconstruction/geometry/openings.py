@@ -1,15 +1,17 @@
 """Windows of a room, by what photos show where its bounds are.
 
-A window of radiance L lights a wall beside it with at most half of L, and none of the wall's albedo is above
-0.8: whatever L lights is less than 0.4 L. So what is several times as bright as the surfels that photos show
-is the light itself. A floor is not, however the sun shines on it.
+What a window lights is darker than the window, but a white ceiling under which all else is grey, or the sun
+on a wall, may be as bright as what is outside. Photos tell them apart in two ways. What lies far behind the
+bounds moves over them as the camera does (parallax): photos agree by direction, not by place. And the sky is
+white in photos that are exposed for a room. What is bright and neither moves nor is white is taken for a
+wall: a wall lost is worse than a window shut.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -20,18 +22,47 @@ from tron.color import luminance
 from tron.gaussians.fields import FIELDS
 from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
-from tron.reconstruction.geometry.seen_space import OPAQUE, pixels_of
+from tron.reconstruction.geometry.seen_space import OPAQUE, even_directions, pixels_of
 from tron.reconstruction.progress import Track, untracked
 from tron.tracing import SurfelTracer
 
 SHINES = 2.0
-"""Luminance of a window, in medians of the surfels."""
+"""Least luminance of a window, in medians of the surfels."""
+HALF_A_SIDE = 0.5
+"""Share of a side that white photos may open: more is an overexposed wall, for all one knows."""
 _REGION = 24  # neighbours whose median luminance counts: windows are larger than a surfel
+_AROUND = 200  # neighbours whose parallax counts: an edge of what is outside is in sight
+_FAR = 0.9  # of the disagreement by place, that by direction of what is far
+_STILL = 0.1  # disagreement by place, in log luminance, of what does not move
+_PAIRS = 20  # samples with both disagreements that tell anything
+_SAME_WAY = 0.03  # radians within which two photos look the same way
+_WAYS = 8  # directions of other photos that are compared at most
+_PHOTOS = 48  # that are compared at most
 _FLOOR = 0.7  # least cosine between the inward normal and up, of a floor
+_SIDES, _FACING = 50, 0.7  # directions whose sides are looked at, and least cosine to a side's normals
+_ITS_EDGES = 0.4  # the same with the edges that round it off
+_LEAST_SIDE = 0.1  # share of the samples that make a side
 _BEFORE = 0.8  # share of the way from the camera from which on surfels may be the bounds themselves
 _NEARLY = 0.7  # of a window's least luminance, from which on surfels before it show it
 _OUTSIDE = 1.03  # of a camera's distance to a window, from which on surfels lie behind it
 _ENOUGH = 50  # pixels that tell a photo's exposure
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What V photos show at N points.
+
+    Attributes:
+        light: (V, N, 3) linear, exposure and white balance divided out; NaN where a photo does not show it.
+        white: (V, N) bool, where the photo is white in all channels.
+        sky: (N,) bool, where most sky masks of photos that show it say so.
+        color: (N, 3) median of ``light`` over the photos; NaN where none shows it.
+    """
+
+    light: np.ndarray
+    white: np.ndarray
+    sky: np.ndarray
+    color: np.ndarray
 
 
 def radiance_of(scene: GaussianScene, curve: ToneCurve) -> np.ndarray:
@@ -39,52 +70,128 @@ def radiance_of(scene: GaussianScene, curve: ToneCurve) -> np.ndarray:
     return decoded(np.clip(SH_C0 * scene.sh[:, 0] + 0.5, 0, 1), curve)
 
 
-def shown_at(
-    scene: GaussianScene,
-    views: Sequence[View],
-    points: np.ndarray,
-    curve: ToneCurve,
-    track: Track = untracked,
-) -> np.ndarray:
-    """(N, 3) linear light that photos show at points (N, 3); NaN where none does.
-
-    Medians over the photos, each divided by its exposure and white balance: the median ratio of its pixels to
-    what the surfels show there.
-    """
+def gbuffers_of(
+    scene: GaussianScene, views: Sequence[View], curve: ToneCurve, track: Track = untracked
+) -> list[dict[str, np.ndarray]]:
+    """Opacity and depth (H, W) of each view, and as base color (H, W, 3) the light of the surfels, linear."""
     tracer = SurfelTracer(replace(scene, base_color=radiance_of(scene, curve).astype(np.float32)))
-    colors = np.full((len(views), len(points), 3), np.nan, np.float32)
-    for color, view in zip(colors, track(views, "photos of what bounds the space"), strict=True):
-        seen, light = tracer.gbuffer(view.camera).numpy(), linear_light(view, 1.0, curve)
-        solid, believed = seen["opacity"] > OPAQUE, view.believed()
-        told = solid & believed & (view.read().max(-1) < CLIPPED)
+    found = []
+    for view in track(views, "what surfels hide"):
+        maps = tracer.gbuffer(view.camera).numpy()
+        found.append({name: maps[name] for name in ("opacity", "depth", "base_color")})
+    return found
+
+
+def shown_at(
+    views: Sequence[View], seen: Sequence[Mapping[str, np.ndarray]], points: np.ndarray, curve: ToneCurve
+) -> Shown:
+    """What photos show at points (N, 3), each divided by its exposure and white balance.
+
+    These are the median ratio of its pixels to what the surfels show there.
+
+    Args:
+        views: photos. seen: :func:`gbuffers_of` them. points: world. curve: of the photos.
+    """
+    light = np.full((len(views), len(points), 3), np.nan, np.float32)
+    white, sky = (np.zeros((len(views), len(points)), bool) for _ in range(2))
+    for i, (view, maps) in enumerate(zip(views, seen, strict=True)):
+        image, decoded_image = view.read(), linear_light(view, 1.0, curve)
+        solid, believed = maps["opacity"] > OPAQUE, view.believed()
+        told = solid & believed & (image.max(-1) < CLIPPED)
         if told.sum() >= _ENOUGH:
-            pair = (np.log(np.maximum(image[told], FLOOR)) for image in (light, seen["base_color"]))
-            light = light / np.exp(np.median(np.subtract(*pair), 0))
+            pair = (np.log(np.maximum(pixels[told], FLOOR)) for pixels in (decoded_image, maps["base_color"]))
+            decoded_image = decoded_image / np.exp(np.median(np.subtract(*pair), 0))
         column, row, _ = pixels_of(view, points)
-        there = visible_in(view, seen, points) & believed[row, column]
-        color[there] = light[row[there], column[there]]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of points that no photo shows
-        return np.nanmedian(colors, axis=0)
+        there = visible_in(view, maps, points) & believed[row, column]
+        row, column = row[there], column[there]
+        light[i, there], white[i, there] = decoded_image[row, column], image[row, column].min(-1) >= CLIPPED
+        if view.has("sky_mask"):
+            sky[i, there] = view.read("sky_mask")[row, column] > 0.5
+    color = _medians(np.moveaxis(light, 0, -1))
+    return Shown(light, white, 2 * sky.sum(0) > np.isfinite(light[..., 0]).sum(0), color)
 
 
 def shining(
-    points: np.ndarray, normals: np.ndarray, shown: np.ndarray, usual: float, up: np.ndarray
-) -> np.ndarray:
-    """(N,) bool: samples of a room's bounds through which light comes in.
+    points: np.ndarray,
+    normals: np.ndarray,
+    eyes: np.ndarray,
+    shown: Shown,
+    usual: float,
+    up: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) bool: samples of a room's bounds through which light comes in, and those as bright that stay shut.
 
     Args:
         points, normals: (N, 3), normals unit, inwards.
-        shown: (N, 3) of :func:`shown_at`.
+        eyes: (V, 3) positions of the cameras.
+        shown: what their photos show at the points.
         usual: :func:`usual_luminance` of the room's surfels.
         up: (3,) unit.
     """
-    found = np.zeros(len(points), bool)
-    known = np.flatnonzero(np.isfinite(shown[:, 0]))
+    bright = np.zeros(len(points), bool)
+    known = np.flatnonzero(np.isfinite(shown.color[:, 0]))
     if len(known) >= _REGION:
         near = KDTree(points[known]).query(points[known], k=_REGION)[1]
-        found[known] = np.median(luminance(shown[known])[near], 1) > SHINES * usual
-    return found & (normals @ up < _FLOOR)
+        bright[known] = np.median(luminance(shown.color[known])[near], 1) > SHINES * usual
+    bright &= normals @ up < _FLOOR
+    moves, white = bright.copy(), bright.copy()
+    if bright.any():
+        few = np.unique(np.linspace(0, len(eyes) - 1, _PHOTOS).astype(int))
+        tree = KDTree(points[bright])
+        near = tree.query(points[bright], k=min(_REGION, int(bright.sum())))[1].reshape(bright.sum(), -1)
+        showing = np.isfinite(shown.light[:, bright, 0]).sum(0)
+        white[bright] = (2 * shown.white[:, bright].sum(0) > showing)[near].mean(1) > 0.5
+        light = np.log(np.maximum(luminance(shown.light[few][:, bright]), FLOOR))
+        # Edges of a wall lie a pixel to either side in each photo, which is no parallax.
+        even = np.where(np.isfinite(light), [_medians(photo[near]) for photo in light], np.nan)
+        moves[bright] = _moves(points[bright], eyes[few], even, shown.white[few][:, bright])
+    for axis in even_directions(_SIDES):
+        side = normals @ axis > _FACING
+        if side.mean() > _LEAST_SIDE and (white & ~moves)[side].mean() > HALF_A_SIDE:
+            white &= normals @ axis <= _ITS_EDGES
+    open_ = moves | white | shown.sky
+    return open_, bright & ~open_
+
+
+def _medians(values: np.ndarray) -> np.ndarray:
+    """(...) medians of rows (..., K) without their NaN."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of rows of NaN
+        return np.nanmedian(values, axis=-1)
+
+
+def _moves(points: np.ndarray, eyes: np.ndarray, light: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """(N,) bool: points (N, 3) around which photos agree by direction, not by place.
+
+    Args:
+        eyes: (V, 3). light: (V, N) log luminance, NaN where a photo does not show it. white: (V, N) bool;
+            two of those are alike.
+    """
+    ways = np.stack([towards(eye, points) for eye in eyes])
+    shows = np.isfinite(light)
+    apart = np.zeros((3, len(points)))  # by place, by direction, photos with both
+    for i in range(len(eyes)):
+        here, others = np.flatnonzero(shows[i]), np.arange(len(eyes)) != i
+        theirs = others[:, None] & shows
+        if not len(here) or not theirs.any():
+            continue
+        own, own_white = light[i, here], white[i, here]
+        by_place = np.where(white[:, here] & own_white, 0, np.abs(light[:, here] - own))
+        near, j = KDTree(ways[theirs]).query(
+            ways[i, here], k=np.arange(1, min(_WAYS, int(theirs.sum())) + 1), distance_upper_bound=_SAME_WAY
+        )
+        close = np.isfinite(near)
+        j = np.where(close, j, 0)
+        by_way = np.abs(light[theirs][j] - own[:, None])
+        by_way = np.where(white[theirs][j] & own_white[:, None], 0, by_way)
+        also, alike = theirs[:, here].sum(0), close.sum(1)
+        both = (also > 0) & (alike > 0)
+        place = np.where(theirs[:, here], by_place, 0).sum(0)[both] / also[both]
+        way = np.where(close, by_way, 0).sum(1)[both] / alike[both]
+        apart[:, here[both]] += np.stack([place, way, np.ones(both.sum())])
+    region = KDTree(points).query(points, k=np.arange(1, min(_AROUND, len(points)) + 1))[1]
+    place, way, pairs = apart[:, region].sum(2)
+    return (pairs >= _PAIRS) & (place > _STILL * pairs) & (way < _FAR * place)
 
 
 def usual_luminance(scene: GaussianScene, curve: ToneCurve) -> float:
@@ -95,6 +202,7 @@ def usual_luminance(scene: GaussianScene, curve: ToneCurve) -> float:
 def opened(
     scene: GaussianScene,
     views: Sequence[View],
+    seen: Sequence[Mapping[str, np.ndarray]],
     points: np.ndarray,
     shines: np.ndarray,
     usual: float,
@@ -108,6 +216,7 @@ def opened(
     Args:
         scene: surfels.
         views: photos; their cameras are looked at.
+        seen: :func:`gbuffers_of` them.
         points: (N, 3) samples of the bounds.
         shines: (N,) bool, of :func:`shining`.
         usual: :func:`usual_luminance` of the room's surfels.
@@ -115,15 +224,15 @@ def opened(
     """
     if not shines.any():
         return scene
-    tracer, bright = SurfelTracer(scene), luminance(radiance_of(scene, curve))
+    bright = luminance(radiance_of(scene, curve))
     before, visible = np.zeros(len(scene), int), np.zeros(len(scene), int)
-    for view in views:
-        seen = np.flatnonzero(visible_in(view, tracer.gbuffer(view.camera).numpy(), scene.means))
-        eye, means = view.camera.position, scene.means[seen]
+    for view, maps in zip(views, seen, strict=True):
+        there = np.flatnonzero(visible_in(view, maps, scene.means))
+        eye, means = view.camera.position, scene.means[there]
         behind = KDTree(towards(eye, points)).query(towards(eye, means))[1]
         outside = distances(eye, means) > _OUTSIDE * distances(eye, points)[behind]
-        before[seen] += shines[behind] & (outside | (bright[seen] > _NEARLY * SHINES * usual))
-        visible[seen] += 1
+        before[there] += shines[behind] & (outside | (bright[there] > _NEARLY * SHINES * usual))
+        visible[there] += 1
     kept = ~(2 * before > visible)
     return replace(scene, **{name: getattr(scene, name)[kept] for name in FIELDS})
 

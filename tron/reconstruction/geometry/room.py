@@ -1,7 +1,7 @@
 """Bounds of a room where no photo looked, and whether photos were taken in one.
 
 By a ceiling that nobody filmed a new light would shine in, and windows in which surfels show the sky keep it
-out. The convex hull of surfels and cameras is sampled. What photos show there brighter than all that is lit
+out. The convex hull of surfels and cameras is sampled. What photos show there bright, and far away or white,
 is a window (:mod:`tron.reconstruction.geometry.openings`): its surfels go. Where a camera's position sees
 through no surfel, and its photo shows no window either, there is a wall. It gets the colour that photos show,
 or where none looks the mean colour of the surfels near by.
@@ -15,6 +15,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -26,7 +27,14 @@ from tron.captures.view import ToneCurve, encoded
 from tron.color import luminance
 from tron.gaussians.harmonics import SH_C0, SH_COUNT
 from tron.gaussians.scene import GaussianScene, quats_from_normals
-from tron.reconstruction.geometry.openings import opened, shining, shown_at, towards, usual_luminance
+from tron.reconstruction.geometry.openings import (
+    gbuffers_of,
+    opened,
+    shining,
+    shown_at,
+    towards,
+    usual_luminance,
+)
 from tron.reconstruction.geometry.seen_space import even_directions, pixels_of
 from tron.reconstruction.progress import Track, untracked
 from tron.reconstruction.settings import Indoors
@@ -52,12 +60,20 @@ _SOLID = 0.5  # opacity of surfels that count
 _OPEN = 0.3  # transmittance from here on: no surface was found
 _MOST = 0.5  # share of the hull that is closed in silence
 _ROUNDS = 4  # of looking for windows: sky that surfels showed outside of one bent the hull
-_FEW = 0.01  # share of the surfels from which on another round is worth its while
+_FEW = 0.01  # share of surfels from which on another round is worth its while, of the hull that is told of
 _RADIUS = 0.8  # standard deviation of a new surfel, distances between samples: larger ones cover windows
 _NEAR = 32  # surfels that tell the colour
 _FEWEST = 10 * _NEAR  # surfels that bound anything
 _OPACITY_LOGIT = 6.0  # opacity 0.998
 _ROUGHNESS = 0.7  # of plaster and paint, nearly diffuse
+_SIDE = 256  # pixels of the longer side of photos that are looked at: samples lie no closer
+
+
+class Enclosed(NamedTuple):
+    """A room with its bounds, and how many surfels were taken out of its windows."""
+
+    scene: GaussianScene
+    opened: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +88,8 @@ class Bounds:
         pictured: (N,) bool, where a camera sees no surfel and its photo has it in the picture.
         shown: (N, 3) linear light that photos show there; NaN where none does.
         shines: (N,) bool, where that is light from without.
+        shut: (N,) bool, where it is as bright, and nothing says that it is light from without.
+        seen: what surfels show and hide in each photo, of :func:`gbuffers_of`.
         around: share of the level directions from the cameras that end on a surfel.
         over: the same of the rising ones.
         overhead: share of the samples overhead that are pictured, as bright as the surfels at least.
@@ -84,6 +102,8 @@ class Bounds:
     pictured: np.ndarray
     shown: np.ndarray
     shines: np.ndarray
+    shut: np.ndarray
+    seen: list[dict[str, np.ndarray]]
     around: float
     over: float
     overhead: float
@@ -103,7 +123,7 @@ def closed_indoors(
     seed: int,
     curve: ToneCurve = "srgb",
     track: Track = untracked,
-) -> GaussianScene:
+) -> Enclosed:
     """The scene (world frame and units), with surfels where a room is bounded and none in its windows.
 
     The new ones face inwards, are opaque and nearly diffuse; base color (linear) and the constant harmonic
@@ -119,11 +139,15 @@ def closed_indoors(
         track: wraps the loop over the views.
     """
     if not indoors or (indoors == "auto" and any(view.has("mask") or view.has("sky_mask") for view in views)):
-        return scene
+        return Enclosed(scene, 0)
+    cameras = np.stack([view.camera.position for view in views])
+    if indoors == "auto" and _bounded(SurfelTracer(scene), cameras)[0] < PERHAPS:
+        return Enclosed(scene, 0)
+    views = [_small(view) for view in views]
     usual = usual_luminance(scene, curve)
     bounds = bounds_of(scene, views, seed, curve, track, usual)
     if bounds is None:
-        return scene
+        return Enclosed(scene, 0)
     if indoors == "auto" and bounds.room is None:
         log.warning(
             "these may be photos of a room: surfaces stand on %.0f %% of all sides of the cameras; if it is "
@@ -133,19 +157,37 @@ def closed_indoors(
     if indoors == "auto" and bounds.room:
         log.warning("taken for photos of a room, which is closed; indoors=false if it is none")
     if not (indoors is True or bounds.room):
-        return scene
+        return Enclosed(scene, 0)
+    learnt = len(scene)
     for _ in range(_ROUNDS):
         before = len(scene)
-        scene = opened(scene, views, bounds.points, bounds.shines, usual, curve)
+        scene = opened(scene, views, bounds.seen, bounds.points, bounds.shines, usual, curve)
         if len(scene) == before:
             break
-        log.info("indoors: %d surfels stood in windows", before - len(scene))
         bounds = bounds_of(scene, views, seed, curve, track, usual)
         if bounds is None:
-            return scene
+            return Enclosed(scene, learnt - len(scene))
         if before - len(scene) < _FEW * before:
             break
-    return enclosed(scene, bounds, curve)
+    if len(scene) < learnt:
+        log.info(
+            "indoors: %d surfels that showed the sky were taken out of windows; pictures are judged before",
+            learnt - len(scene),
+        )
+    if bounds.shut.mean() > _FEW:
+        log.warning(
+            "%.0f %% of what bounds the room is bright as a window and taken for white walls or the sun on "
+            "them, as no photo shows it far away or white; a sky_mask of the photos and indoors=true open it",
+            100 * bounds.shut.mean(),
+        )
+    return Enclosed(enclosed(scene, bounds, curve), learnt - len(scene))
+
+
+def _small(view: View) -> View:
+    """The view with all that is looked at read, and reduced."""
+    small = view.reduced(max(max(view.camera.width, view.camera.height) / _SIDE, 1))
+    maps = {name: small.read(name) for name in ("image", "valid", "sky_mask") if small.has(name)}
+    return View(small.name, small.camera, space=small.space, **maps)
 
 
 def bounds_of(
@@ -175,12 +217,13 @@ def bounds_of(
         pictured |= through & pixels_of(view, points)[2]
     rising = points - cameras.mean(0)
     overhead = rising @ scene.up > _RISING * np.linalg.norm(rising, axis=1)
-    shown = shown_at(scene, views, points, curve, track)
+    seen = gbuffers_of(scene, views, curve, track)
+    shown = shown_at(views, seen, points, curve)
     usual = usual_luminance(scene, curve) if usual is None else usual
-    sky = pictured & (luminance(shown) > usual)
+    sky = pictured & (luminance(shown.color) > usual)
     return Bounds(
-        points, normals, spacing, free & ~pictured, pictured, shown,
-        shining(points, normals, shown, usual, scene.up), *_bounded(tracer, cameras),
+        points, normals, spacing, free & ~pictured, pictured, shown.color,
+        *shining(points, normals, cameras, shown, usual, scene.up), seen, *_bounded(tracer, cameras),
         float(sky[overhead].mean()) if overhead.any() else 0.0,
     )  # fmt: skip
 

@@ -187,6 +187,18 @@ def test_a_page_without_light_films_or_held_out_views_says_so(variant, ball_on_f
     assert json.dumps(described)  # nothing of what was given changed into something else
 
 
+@pytest.mark.parametrize("opened", [0, 1234])
+def test_a_page_of_a_room_says_that_pictures_are_judged_with_its_windows_shut(
+    variant, ball_on_floor, described, tmp_path, opened: int
+):
+    scene = ball_on_floor(spacing=0.12)
+    settings = SMALL.model_copy(update={"frames": 0})
+    described["opened"] = opened
+    write_page(tmp_path / "r.html", settings, described, scene, capture_of(around(9, 360), scene), None)
+    said = "1,234 surfels that showed the sky" in (tmp_path / "r.html").read_text()
+    assert said == (opened > 0)
+
+
 def test_a_page_of_a_scan_does_not_speak_of_photos(variant, ball_on_floor, described, tmp_path):
     scene = ball_on_floor(spacing=0.12)
     capture = replace(capture_of(around(9, 360), scene, frozenset({"v0", "v4"})), skipped={})

@@ -1,4 +1,7 @@
-"""Laws of a room's bounds: what no photo shows is closed, and so is what one shows dark; windows are open."""
+"""Laws of a room's bounds: what no photo shows is closed, and so is what one shows dark; windows are open.
+
+A window is what moves over the bounds as cameras do, or is white in photos; a white ceiling is none.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,8 @@ from tron.captures.view import decoded, encoded
 from tron.color import srgb_to_linear
 from tron.gaussians import GaussianScene
 from tron.gaussians.harmonics import SH_C0
-from tron.reconstruction.geometry.room import bounds_of, closed_indoors
+from tron.reconstruction.geometry import room as rooms
+from tron.reconstruction.geometry.room import bounds_of
 from tron.seeds import generator
 from tron.tracing import SurfelTracer
 
@@ -33,8 +37,17 @@ def room(dense: Any, ceiling: bool, window: bool = True) -> GaussianScene:
     return dense.scene(sheet)
 
 
-GREY, DULL, SKY = 0.5, 0.75, 0.98
-"""Display values of the walls, as surfels are made, and of skies 2.4 and 4.5 times as bright."""
+GREY, DULL, SKY, WHITE = 0.5, 0.75, 0.98, 1.0
+"""Display values of the walls, as surfels are made, of what is 2.4 and 4.5 times as bright, of white."""
+
+
+def closed_indoors(*args: Any) -> GaussianScene:
+    return rooms.closed_indoors(*args).scene
+
+
+def outdoors(rays: np.ndarray) -> np.ndarray:
+    """(N,) display values far outside, by directions (N, 3): a house before half of the sky."""
+    return np.where(rays[:, 1] > 0.05 * np.abs(rays[:, 0]), SKY, DULL)
 
 
 def through_the_window(points: np.ndarray) -> np.ndarray:
@@ -43,18 +56,22 @@ def through_the_window(points: np.ndarray) -> np.ndarray:
     return (x > 0.99) & (np.abs(y) < WINDOW) & (np.abs(z) < WINDOW)
 
 
-def picture(camera: Camera, shown: dict[Any, float | tuple[float, ...]]) -> np.ndarray:
-    """What a camera within the empty cube sees of its faces: display values by where rays leave it."""
+def picture(camera: Camera, shown: dict[Any, Any]) -> np.ndarray:
+    """What a camera within the empty cube sees of its faces: display values by where rays leave it.
+
+    Or functions of the rays.
+    """
     rays = camera.rays().reshape(-1, 3)
     way = ((np.sign(rays) - camera.position) / rays).min(1)
     left = camera.position + way[:, None] * rays
     image = np.full((len(rays), 3), GREY, np.float32)
     for where, value in shown.items():
-        image[where(left)] = value
+        there = where(left)
+        image[there] = np.asarray(value(rays[there]))[:, None] if callable(value) else value
     return image.reshape(camera.height, camera.width, 3)
 
 
-def photographed(shown: dict[Any, float | tuple[float, ...]]) -> list[View]:
+def photographed(shown: dict[Any, Any]) -> list[View]:
     """From a circle at half the height, across the room; the ceiling is above all of them."""
     views = []
     for i in range(10):
@@ -66,7 +83,7 @@ def photographed(shown: dict[Any, float | tuple[float, ...]]) -> list[View]:
 
 @pytest.fixture(scope="module")
 def photos() -> list[View]:
-    return photographed({through_the_window: SKY})
+    return photographed({through_the_window: WHITE})
 
 
 def painted(scene: GaussianScene, where: np.ndarray, display: float) -> GaussianScene:
@@ -157,7 +174,7 @@ def test_a_window_beside_what_is_closed_stays_open(dense_surfels) -> None:
     found = room(dense_surfels, ceiling=True)
     kept = ~slit(found.means)
     found = GaussianScene(**{f.name: _some(getattr(found, f.name), kept) for f in fields(GaussianScene)})
-    closed = closed_indoors(found, photographed({slit: SKY}), True, 0)
+    closed = closed_indoors(found, photographed({slit: WHITE}), True, 0)
     shown = over((1, -0.9 * WINDOW, -0.65), (1, 0.9 * WINDOW, 0.65))
     assert len(closed) > len(found)
     assert light_from(closed, shown).mean() > 0.95
@@ -175,11 +192,11 @@ def _rows(points: np.ndarray) -> set[tuple[float, ...]]:
 
 @pytest.mark.parametrize("gain", [0.6, 1.0, 2.1])
 def test_sky_that_surfels_show_in_a_window_is_taken_out(dense_surfels, gain: float) -> None:
-    """A dull sky, however the photos are exposed: as they are, walls or windows may pass for the other."""
+    """A house outside, however photos are exposed: as they are, walls or windows may pass for the other."""
     found = sealed(dense_surfels)
     exposed = [
         replace(view, image=encoded(gain * decoded(view.read(), "srgb"), "srgb"))
-        for view in photographed({through_the_window: DULL})
+        for view in photographed({through_the_window: outdoors})
     ]
     closed = closed_indoors(found, exposed, True, 0)
     within = 0.8 * WINDOW
@@ -208,6 +225,67 @@ def test_the_sun_on_a_floor_and_a_lamp_are_no_windows(dense_surfels) -> None:
         views.append(View(view.name, camera, image, "display"))
     closed = closed_indoors(found, views, True, 0)
     assert _rows(found.means) <= _rows(closed.means)
+
+
+def upper(points: np.ndarray) -> np.ndarray:
+    return points[:, 2] > 0.99
+
+
+def far_wall(points: np.ndarray) -> np.ndarray:
+    return points[:, 0] > 0.99
+
+
+def patch(points: np.ndarray) -> np.ndarray:
+    return far_wall(points) & (np.abs(points[:, 1:]) < 0.4).all(1)
+
+
+def all_around(shown: dict[Any, Any]) -> list[View]:
+    """From a circle, level and upwards: photos show the ceiling too."""
+    views = photographed(shown)
+    for view in photographed(shown):
+        eye = view.camera.position
+        camera = Camera.look_at(eye, (-eye[0], -eye[1], 0.9), fov_deg=80, width=40, height=40)
+        views.append(View("up" + view.name, camera, picture(camera, shown), "display"))
+    return views
+
+
+@pytest.mark.parametrize(("where", "display"), [(upper, DULL), (far_wall, DULL), (patch, SKY)])
+def test_a_white_ceiling_a_white_wall_and_the_sun_on_a_wall_are_no_windows(
+    dense_surfels, caplog: pytest.LogCaptureFixture, where: Any, display: float
+) -> None:
+    """As bright as windows are, but on the walls in all photos, and not white in them."""
+    found = room(dense_surfels, ceiling=True, window=False)
+    found = painted(found, where(found.means), display)
+    closed = closed_indoors(found, all_around({where: display}), True, 0)
+    assert _rows(found.means) <= _rows(closed.means)
+    assert "taken for white walls" in caplog.text
+
+
+def test_a_window_in_a_white_wall_is_opened_alone(dense_surfels) -> None:
+    """A white sky; the wall around it is 2.4 times as bright as the others."""
+    found = room(dense_surfels, ceiling=True, window=False)
+    found = painted(found, far_wall(found.means), DULL)
+    found = painted(found, through_the_window(found.means), WHITE)
+    closed = closed_indoors(found, all_around({far_wall: DULL, through_the_window: WHITE}), True, 0)
+    within = 0.8 * WINDOW
+    assert light_from(closed, over((1, -within, -within), (1, within, within))).mean() > 0.95
+    clear = np.abs(found.means - (1, 0, 0)).max(1) > 1.3 * WINDOW
+    assert _rows(found.means[clear]) <= _rows(closed.means), "a wall is gone"
+
+
+def test_a_wall_that_is_overexposed_is_no_window(dense_surfels, caplog: pytest.LogCaptureFixture) -> None:
+    """All of it but its edge, white in photos; sky masks, if there are, say that it is a glass front."""
+    found = room(dense_surfels, ceiling=True, window=False)
+    found, views = painted(found, far_wall(found.means), WHITE), all_around({far_wall: WHITE})
+    closed = closed_indoors(found, views, True, 0)
+    inner = far_wall(found.means) & (np.abs(found.means[:, 1:]) < 0.75).all(1)
+    assert _rows(found.means[inner]) <= _rows(closed.means)
+    assert light_from(closed, over((1, -0.75, -0.75), (1, 0.75, 0.75))).mean() < 0.01
+    assert "sky_mask" in caplog.text
+    masked = [replace(view, sky_mask=(view.read().min(-1) > 0.99).astype(np.float32)) for view in views]
+    front = rooms.closed_indoors(found, masked, True, 0)
+    assert light_from(front.scene, over((1, -0.7, -0.7), (1, 0.7, 0.7))).mean() > 0.95
+    assert front.opened > 0.6 * far_wall(found.means).sum()
 
 
 def test_a_hole_that_photos_show_dark_is_closed_in_their_colour(dense_surfels) -> None:
@@ -276,6 +354,29 @@ def test_a_yard_whose_sky_photos_show_is_no_room(dense_surfels, photos: list[Vie
         image = picture(camera, {lambda points: points[:, 2] > 0.99: GREY + 0.05})
         raised.append(View("up" + view.name, camera, image, "display"))
     assert closed_indoors(found, photos + raised, "auto", 0) is found
+
+
+def test_photos_of_what_is_no_room_are_not_read(dense_surfels) -> None:
+    def unread() -> np.ndarray:
+        raise AssertionError("a photo was read")
+
+    views = [replace(view, image=unread) for view in around_the_origin()]
+    ball = dense_surfels.scene(dense_surfels.sphere(radius=0.3))
+    assert closed_indoors(ball, views, "auto", 0) is ball
+
+
+def test_photos_of_a_room_are_read_once(dense_surfels, photos: list[View]) -> None:
+    times = dict.fromkeys([view.name for view in photos], 0)
+
+    def counted(view: View) -> View:
+        def read() -> np.ndarray:
+            times[view.name] += 1
+            return np.asarray(view.image)
+
+        return replace(view, image=read)
+
+    closed_indoors(sealed(dense_surfels), [counted(view) for view in photos], True, 0)
+    assert set(times.values()) == {1}
 
 
 def test_a_thing_that_cameras_surround_is_no_room(dense_surfels) -> None:
