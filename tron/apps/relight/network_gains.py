@@ -17,7 +17,7 @@ import numpy as np
 Quality = Literal["preview", "final"]
 
 GAINS: Mapping[Quality, Mapping[int, float]] = {
-    "preview": {128: 0.96, 256: 0.52, 512: 0.04},
+    "preview": {128: 0.96, 256: 0.52, 512: -1.17},
     "final": {128: -0.38, 256: -1.91, 512: -0.06},
 }
 """Quality -> width of square frames, pixels -> dB."""
