@@ -418,7 +418,8 @@ class Settings(ScaleSettings):
     def estimation(self, split: str, scene: int = 0, light: int = 0) -> Estimation:
         """Estimation of the light on the surfels, of the clip of a scene under light number ``light``."""
         chosen = {name: getattr(self, name) for name in ESTIMATED}
-        rays = self.split(split).rays_of(light, generator(self.seed, split, scene, "rays").permutation)
+        draw = generator(self.seed, split, scene, "rays")
+        rays = self.split(split).rays_of(light, lambda count: draw.permutation(count))
         if isinstance(rays, int):
             return Estimation(rays=rays, **chosen)
         quality = PREVIEW if rays == "preview" else FINEST

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -122,7 +122,7 @@ class SplitSettings(SettingsModel):
         """Width and height, pixels, of the pictures that frames are windows of; of the frames without."""
         return [(width, round(width * self.height / self.width)) for width in self.window_of or [self.width]]
 
-    def rays_of(self, light: int, order: Callable[[int], Sequence[int]]) -> Rays:
+    def rays_of(self, light: int, order: Callable[[int], np.ndarray]) -> Rays:
         """What ``guidance_spp`` says of the clip under light number ``light``.
 
         Args:

@@ -390,8 +390,8 @@ def _film(
     return [_meta(spec, light, cameras, recipe, source, motion) for light in first]
 
 
-def _path_traced(now: _Moment, camera: Camera, spp: int, seed: int, bounces: int) -> Sequence[np.ndarray]:
-    """(H, W, 3) linear radiance under each light of a moment."""
+def _path_traced(now: _Moment, camera: Camera, spp: int, seed: int, bounces: int) -> np.ndarray:
+    """(lights, H, W, 3) linear radiance under each light of a moment."""
     if now.stacked is None:
         return render_frames(now.scenes[0], [camera], spp, [seed], bounces)
     return render_lights(now.scenes[0], now.stacked, camera, spp, seed)
@@ -400,7 +400,7 @@ def _path_traced(now: _Moment, camera: Camera, spp: int, seed: int, bounces: int
 def _meter(
     now: _Moment,
     window: Window,
-    rgb: Sequence[np.ndarray],
+    rgb: np.ndarray,
     truth: GBufferView,
     geometry: Geometry,
     seed: int,

@@ -57,7 +57,7 @@ def draw_frame(size: int, seed: int, light: str, frame: int = 0) -> dict[str, np
         "surface": np.where(solid, np.abs(normal[..., 1:2]) * [1, 0.4, 0.4], 0).astype(np.float32),
         "mask": solid.astype(np.float32),
         "foreground": solid.astype(np.float32),
-        "sampling": np.broadcast_to(np.float32([0, 0.6, 0.5]), base.shape),
+        "sampling": np.broadcast_to(np.array([0, 0.6, 0.5], np.float32), base.shape),
         "lit_supersampled": over(base * irradiance * (1 + 0.22 * base) + gloss),
         "lit_reflections": over(base * irradiance * (1 + 0.24 * base) + gloss * visible),
         "irradiance_ref": over(irradiance * (1 + 0.05 * noise.standard_normal(irradiance.shape))),

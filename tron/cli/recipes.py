@@ -346,7 +346,7 @@ def _one_line(error: pydantic.ValidationError, values: Any, settings: type[pydan
         return TronError(f"wrong value for '{key}'", shown, as_list if plain else f"{reason}; {as_list}")
     if first["type"] == "missing" or first["input"] is None:
         return _required(key)
-    words = [each["ctx"]["expected"] for each in same if each["type"] == "literal_error"]
+    words = [each.get("ctx", {}).get("expected") for each in same if each["type"] == "literal_error"]
     if words and first["type"] != "literal_error":  # a number, or one of some words
         reason += f"; or give {words[0]}"
     return TronError(f"wrong value for '{key}'", where=shown, mend=reason)
