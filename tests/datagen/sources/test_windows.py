@@ -17,22 +17,12 @@ from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
 from tron.estimation import FINEST
 from tron.relighting import Relighter
+from tron.shards.schema import clip_members
 
 TINY = [
-    *(
-        f"test.{key}"
-        for key in ("frames=2", "width=24", "height=16", "path_spp=4", "reference_buffers=false")
-    ),
+    *("test.frames=2", "test.width=24", "test.height=16", "test.path_spp=4", "test.reference_spp=4"),
     *("test.lights=[studio,overcast,sun]", "test.window_of=[96]", "test.guidance_spp=[preview,8,final]"),
-    *(
-        "cluster=null",
-        "path_frames=8",
-        "views=8",
-        "view_width=48",
-        "view_height=48",
-        "surfels=3000",
-        "seed=11",
-    ),
+    *("cluster=null", "path_frames=8", "views=8", "view_width=48", "view_height=48", "surfels=3000"),
     *("refine_steps=0", "mesh_edge=0.2", "environment_height=16", "objects=[2,2]", "seed=11"),
 ]
 
@@ -67,9 +57,10 @@ def test_a_margin_ends_with_the_picture_and_is_cut_off_again():
 
 def test_frames_of_windows_are_parts_of_whole_pictures(windowed):
     spec, geometry, surfels, settings, clips = windowed
-    meta, frames = clips[1]  # eight rays, unfiltered
-    relighter = Relighter(surfels, settings.estimation("test", 0, 1), proxy="never")
-    light = relighter.under(spec.lights[1].bake(16).baked())
+    number = [meta.spp["guidance"] for meta, _ in clips].index(8)  # one sample a pixel
+    meta, frames = clips[number]
+    relighter = Relighter(surfels, settings.estimation("test", 0, number), proxy="never")
+    light = relighter.under(spec.lights[number].bake(16).baked())
     for window, camera, frame in zip(
         draw_windows(spec, geometry, settings.test, 0), meta.cameras, frames, strict=True
     ):
@@ -82,6 +73,10 @@ def test_frames_of_windows_are_parts_of_whole_pictures(windowed):
         (maps,) = relighter.surface_maps(window.picture, relighter.estimation)
         np.testing.assert_allclose(frame["albedo"], maps["albedo"][rows, columns], atol=2e-3)
         assert frame["foreground"].mean() > 0
+        gbuffer = relighter.gbuffer(window.picture).numpy()
+        np.testing.assert_allclose(frame["base_color"], gbuffer["base_color"][rows, columns], atol=2e-3)
+        for name in clip_members(reference=True):
+            assert frame[name].shape[:2] == (16, 24), name
 
 
 def test_neighbours_share_a_place_and_single_frames_do_not(windowed):
