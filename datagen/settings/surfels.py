@@ -1,7 +1,8 @@
 """Surfels by pixels: how many a scene has, and what they are made from, by the frames that are made of it.
 
 What surfels blur is most of a large frame's error, not noise: with 20,000 of them no denoiser brings a frame
-of 512 x 512 beyond 31.1 dB; with 60,000 fitted to larger views it is 32.4 (2026-11-26, six scenes).
+of 512 x 512 beyond 31.1 dB; with 60,000 it is 32.4 (a prototype on six scenes at b7bbe91). What this law
+gains stands in dev/LOG.md, 2026-11-26.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Large pictures in tiles: a network draws each with what lies around it, and memory stays small.
 
 A pixel depends on those within the network's reach. Tiles begin at multiples of its stride and are given the
-reach as margin, so that they draw what one pass over the whole draws, to within 1/255.
+reach as margin, so that they draw what one pass over the whole draws; the shipped ones do within 1/255.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 from tron.neural.protocols import Renderer
 
 SIDE = 1024
-"""Side of a tile without its margin, pixels: the network then holds about 1 GB."""
+"""Side of a tile without its margin, pixels."""
 
 
 def drawn_in_tiles(
