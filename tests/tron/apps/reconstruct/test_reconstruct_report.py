@@ -111,12 +111,13 @@ def test_films_hold_every_frame_and_differ_between_lights(variant, ball_on_floor
     scene = ball_on_floor(spacing=0.12)
     films = showcase_films(scene, capture_of(around(9, 360), scene), 4, 32)
     means = []
-    for video in films.values():
+    for name, video in films.items():
         with av.open(io.BytesIO(video), "r") as container:
             frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
         assert len(frames) == 4
         assert frames[0].shape == (26, 32, 3)
-        assert np.abs(frames[0].astype(float) - frames[2]).mean() > 1
+        if name != "cloudy sky":  # it is alike all around, and so is a ball
+            assert np.abs(frames[0].astype(float) - frames[2]).mean() > 5
         means.append(np.mean(frames, axis=0))
     assert len(films) == 3
     assert np.abs(means[0] - means[1]).mean() > 3
