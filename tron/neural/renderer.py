@@ -16,6 +16,7 @@ from tron.errors import TronError
 from tron.neural.clips import Motion, Overlap, averaged_frames, check_frames, windows
 from tron.neural.codecs.registry import CODECS
 from tron.neural.configs import MEAN, BackboneConfig, RendererConfig, UNetConfig, check_weights
+from tron.neural.kernels import filtered, gaussian_logits
 from tron.neural.networks.unet import UNet
 from tron.neural.protocols import Codec, Renderer
 from tron.neural.scales import halved, with_coarse
@@ -305,44 +306,3 @@ def render_frames(
 def _joined(frames: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     """Frames (1, 3, 1, H, W) by name, one after another: (1, 3, K, H, W)."""
     return {name: torch.cat([frame[name] for frame in frames], 2) for name in frames[0]}
-
-
-# Guidance is sampled once in a pixel, a photograph is a mean over it: whatever starts from a buffer of
-# guidance does well to filter it first. Kernels that a network predicts are those of Bako et al.,
-# "Kernel-Predicting Convolutional Networks for Denoising Monte Carlo Renderings" (2017), sec. 4.1: a
-# softmax over the neighbours.
-
-
-def gaussian_logits(deviation: float, side: int) -> Tensor:
-    """Logarithms of a Gaussian's weights at the centres of ``side`` x ``side`` pixels: (side^2,).
-
-    Args:
-        deviation: in pixels, above 0.
-        side: odd; rows first.
-    """
-    steps = torch.arange(side) - side // 2
-    squares = steps[:, None] ** 2 + steps**2
-    return (-squares / (2 * deviation**2)).flatten()
-
-
-def filtered(video: Tensor, weights: Tensor, step: int = 1) -> Tensor:
-    """Weighted sum of each pixel's neighbours; beyond the border the edge goes on.
-
-    Args:
-        video: (B, C, K, H, W).
-        weights: of the neighbours, rows first: (side^2,), or (B, side^2, K, H, W) for kernels of their own.
-        step: pixels from one neighbour to the next.
-
-    Returns:
-        (B, C, K, H, W).
-    """
-    count = weights.shape[0] if weights.ndim == 1 else weights.shape[1]
-    side = round(count**0.5)
-    reach, (height, width) = side // 2 * step, video.shape[-2:]
-    wide = pad(video, (reach, reach, reach, reach, 0, 0), mode="replicate")
-    result = torch.zeros_like(video)
-    for k in range(count):
-        y, x = divmod(k, side)
-        weight = weights[k] if weights.ndim == 1 else weights[:, k : k + 1]
-        result = result + weight * wide[..., y * step : y * step + height, x * step : x * step + width]
-    return result

@@ -7,7 +7,8 @@ import torch
 from pydantic import ValidationError
 
 from tron.neural.configs import RendererConfig, UNetConfig
-from tron.neural.renderer import NeuralRenderer, filtered, gaussian_logits
+from tron.neural.kernels import filtered, gaussian_logits
+from tron.neural.renderer import NeuralRenderer
 from tron.neural.weights import load_renderer, save_renderer
 
 UNET = UNetConfig(widths=(6, 8), blocks=(1, 1), blocks_up=(1,))
@@ -50,6 +51,16 @@ def test_each_pixel_has_its_own_kernel():
 def test_the_edge_goes_on_beyond_the_border():
     flat = torch.full((1, 3, 1, 4, 5), 0.7)
     torch.testing.assert_close(filtered(flat, gaussian_logits(1.0, 5).softmax(0)), flat)
+
+
+@pytest.mark.parametrize("step", [1, 2])
+def test_gradients_are_those_of_finite_differences(step: int):
+    def wanted(*shape: int) -> torch.Tensor:
+        return torch.rand(shape, dtype=torch.float64, requires_grad=True)
+
+    video = wanted(2, 3, 2, 5, 6)
+    for weights in (wanted(9), wanted(2, 9, 2, 5, 6)):
+        assert torch.autograd.gradcheck(lambda v, w: filtered(v, w, step), (video, weights))
 
 
 @pytest.mark.parametrize("kernel", [0, 5])
