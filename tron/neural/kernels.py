@@ -50,7 +50,7 @@ class _Gathering(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, wide: Tensor, weights: Tensor, step: int) -> Tensor:
-        """``wide``: padded by the reach. ``weights``: (B, side^2, K, H, W), where sides of 1 stand for all."""
+        """``wide`` is padded; ``weights``: (B, side^2, K, H, W), of which sides of 1 stand for all."""
         ctx.save_for_backward(wide, weights)
         ctx.step = step
         shape = _inner(wide, weights, step)
