@@ -20,6 +20,9 @@ from tron.errors import TronError
 STRAYS = 0.01
 # Empty border around the subject, as a fraction of the image's sides.
 BORDER = 0.06
+LOWEST = 0.002
+"""Share of the opaque surfels that may lie below what a scene stands on: strays."""
+_OPAQUE_LOGIT = 0.0
 # A floor is flat: its surfels look up within this cosine and lie within this many spacings of one height.
 _LEVEL_COSINE = 0.95
 _FLOOR_SPACINGS = 3.0
@@ -107,6 +110,17 @@ def _joined(points: np.ndarray, core: np.ndarray, cell: float) -> np.ndarray:
     label(held >= _CROWD, np.ones((3, 3, 3)), output=parts)
     part = parts[tuple(place.T)]
     return core | ((part > 0) & (part == np.bincount(part[core]).argmax()))
+
+
+def foot_height(heights: np.ndarray, opacity_logits: np.ndarray) -> float:
+    """Height that a thing stands at: that of its lowest opaque surfels, strays apart.
+
+    Args:
+        heights: (M,) of the surfels' centres along up, world units.
+        opacity_logits: (M,) of the surfels; where none is opaque, all count.
+    """
+    solid = opacity_logits > _OPAQUE_LOGIT
+    return float(np.quantile(heights[solid if solid.any() else slice(None)], LOWEST))
 
 
 def has_floor(scene: Surfels) -> bool:

@@ -25,9 +25,22 @@ COMPLETE = {
     "tron-train": ["dataset={inputs}/empty"],
     "tron-eval": ["dataset={inputs}/empty", "renderer={inputs}/text.safetensors"],
     "tron-relight": ["scene={inputs}/good.ply", "environment={inputs}/good.exr"],
+    "tron-edit": ["scene={inputs}/good.ply", "edits={inputs}/good.yaml"],
 }
+WRITES = {"tron-edit": "output=out.ply"}
+"""Of commands that write no folder."""
 
 BAD_FILES = [
+    ("tron-edit", ["scene={inputs}/absent.ply"], ["file not found", "absent.ply"]),
+    ("tron-edit", ["scene={inputs}/text.ply"], ["text.ply"]),
+    ("tron-edit", ["scene={inputs}/cat.splat"], ["antimatter15", "splat-transform cat.splat cat.ply"]),
+    ("tron-edit", ["edits={inputs}/text.ply"], ["no edits found", "text.ply"]),
+    ("tron-edit", ["edits={inputs}/empty"], ["is a folder", "empty"]),
+    ("tron-edit", ["edits={inputs}/walk.yaml"], ["edit 1: remove", "there is no object 9"]),
+    ("tron-edit", ["edits=[{inputs}/good.yaml,{inputs}/good.yaml]"], ["object 0 is named by both lists"]),
+    ("tron-edit", ["cameras={inputs}/text.hdr"], ["text.hdr"]),
+    ("tron-edit", ["output={inputs}/good.ply"], ["output is the scene itself"]),
+    ("tron-edit", ["output=cut.obj"], ["output is no PLY", "cut.obj"]),
     ("tron-relight", ["scene={inputs}/empty"], ["empty"]),
     ("tron-relight", ["scene={inputs}/text.ply"], ["text.ply"]),
     ("tron-relight", ["scene={inputs}/points.ply"], ["points.ply"]),
@@ -63,6 +76,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     body = "end_header\n" + 8 * "x"
     (folder / "cat.compressed.ply").write_text(f"ply\nformat binary_little_endian 1.0\n{packed}{body}")
     one_surfel().save(folder / "good.ply")
+    (folder / "good.yaml").write_text("- {action: material, select: {object: 0}, metallic: 1}\n")
+    (folder / "walk.yaml").write_text("- {action: remove, select: {object: 9}}\n")
     EnvironmentMap.constant(1.0).save(folder / "good.exr")
     return folder
 
@@ -84,14 +99,15 @@ def one_surfel() -> GaussianScene:
 
 @pytest.fixture
 def run(inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch):
-    """Runs a command in an empty folder with output_dir=out; returns the one line it must have printed."""
+    """Runs a command in an empty folder, to write out; returns the one line it must have printed."""
     monkeypatch.chdir(tmp_path)
 
     def run(name: str, *arguments: str) -> str:
         cli = get_object(SCRIPTS[name].replace(":", "."))
         capsys.readouterr()
+        asked = [each.format(inputs=inputs) for each in arguments]
         with pytest.raises(SystemExit) as stop:
-            cli([*(each.format(inputs=inputs) for each in arguments), "output_dir=out"])
+            cli([WRITES.get(name, "output_dir=out"), *asked])
         out, err = capsys.readouterr()
         assert stop.value.code == 2, err
         assert out == ""
@@ -107,7 +123,9 @@ def run(inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkey
 def test_every_command_goes_through_the_one_door(run):
     """What that says of a mistake is in tests/tron/cli/test_command_line.py."""
     for name in sorted(SCRIPTS):
-        assert "'outptu_dir': did you mean 'output_dir'?" in run(name, *COMPLETE[name], "outptu_dir=x")
+        key = WRITES.get(name, "output_dir=out").partition("=")[0]
+        mistyped = key.replace("put", "ptu")
+        assert f"'{mistyped}': did you mean '{key}'?" in run(name, *COMPLETE[name], f"{mistyped}=x")
 
 
 @pytest.mark.parametrize(

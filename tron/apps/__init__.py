@@ -1,1 +1,1 @@
-"""Commands of the library: tron-relight and tron-reconstruct, with what belongs to one of them."""
+"""Commands of the library: tron-relight, tron-edit and tron-reconstruct, with what belongs to one of them."""

@@ -124,14 +124,16 @@ class ConsoleScript:
     """A command as its script starts it: checked first, imported then.
 
     Attributes:
-        name: as typed. Its extra is named as it is: `tron-train` needs `train`.
+        name: as typed.
         module: holds the command as `cli`.
         named: what its recipes name by `_target_` and the module does not import by itself.
+        of_extra: the extra that it needs; None: that of its name, `train` for `tron-train`.
     """
 
     name: str
     module: str
     named: tuple[str, ...] = ()
+    of_extra: str | None = None
 
     def load(self) -> Any:
         """The command itself, a tron.cli.command_line.Command."""
@@ -139,7 +141,7 @@ class ConsoleScript:
 
     def __call__(self, arguments: Sequence[str] | None = None) -> NoReturn:
         """Run on `arguments`, those of the process where None; ends in `SystemExit`."""
-        extra = self.name.removeprefix("tron-")
+        extra = self.of_extra or self.name.removeprefix("tron-")
         asked = sys.argv[1:] if arguments is None else arguments
         try:
             require_own_packages("conf", self.module)
@@ -168,6 +170,7 @@ class ConsoleScript:
 
 
 relight = ConsoleScript("tron-relight", "tron.apps.relight.command")
+edit = ConsoleScript("tron-edit", "tron.apps.edit", of_extra="relight")
 reconstruct = ConsoleScript("tron-reconstruct", "tron.apps.reconstruct.command", ("tron.reconstruction",))
 datagen = ConsoleScript("tron-datagen", "datagen.cli")
 train = ConsoleScript("tron-train", "train.cli")

@@ -1,4 +1,7 @@
-"""Editing a scene: a part of its surfels, and some of them moved as a rigid body."""
+"""Editing a scene: parts of it taken out, put in, moved as rigid bodies and scaled.
+
+What the edits of :mod:`tron.editing` are made of.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,56 @@ def subset(scene: GaussianScene, which: np.ndarray) -> GaussianScene:
     selected = _selection(which, len(scene))
     arrays = {name: getattr(scene, name)[selected] for name in FIELDS}
     return replace(scene, **arrays, spacing=measure_spacing(arrays["means"]))
+
+
+def removed(scene: GaussianScene, which: np.ndarray) -> GaussianScene:
+    """The scene without the surfels ``which``, (M,) bool or indices; all else, spacing included, stays.
+
+    Raises:
+        TronError: nothing is selected, or what there is not, or everything.
+    """
+    kept = ~_selection(which, len(scene))
+    if not kept.any():
+        raise TronError("no surfel is left", mend="select fewer")
+    return replace(scene, **{name: getattr(scene, name)[kept] for name in FIELDS})
+
+
+def joined(scene: GaussianScene, other: GaussianScene) -> GaussianScene:
+    """Both scenes' surfels, those of ``other`` last, so that numbers of surfels stay.
+
+    What belongs to a whole scene (spacing, up, offset) is that of ``scene``.
+
+    Raises:
+        TronError: kernels of different degrees.
+    """
+    if other.kernel_degree != scene.kernel_degree:
+        what = f"kernels of degree {scene.kernel_degree} and {other.kernel_degree} cannot stand in one scene"
+        raise TronError(what, mend="give the other scene the same kernel")
+    return replace(
+        scene, **{name: np.concatenate([getattr(scene, name), getattr(other, name)]) for name in FIELDS}
+    )
+
+
+def scaled(scene: GaussianScene, which: np.ndarray, factor: float, pivot: np.ndarray) -> GaussianScene:
+    """The scene with some surfels larger by a factor: their distances from ``pivot`` and their sizes.
+
+    Args:
+        scene: the surfels.
+        which: (M,) bool, or indices of surfels.
+        factor: above 0.
+        pivot: (3,), world, stays where it is.
+
+    Raises:
+        TronError: nothing is selected, or what there is not; the factor is not a positive number.
+    """
+    selected = _selection(which, len(scene))
+    if not (np.isfinite(factor) and factor > 0):
+        raise TronError(f"factor is {factor}", mend="give a number above 0")
+    about = _vector("pivot", pivot)
+    means, log_scales = scene.means.copy(), scene.log_scales.copy()
+    means[selected] = (means[selected].astype(np.float64) - about) * factor + about
+    log_scales[selected] += np.float32(np.log(factor))
+    return replace(scene, means=means, log_scales=log_scales)
 
 
 def moved(

@@ -20,17 +20,13 @@ import numpy as np
 
 from tron.cameras import Camera
 from tron.estimation import Estimation
-from tron.framing import find_subject, has_floor
+from tron.framing import find_subject, foot_height, has_floor
 from tron.gaussians.scene import GaussianScene
 from tron.seeds import integer
 from tron.shading.direct.visibility import Shadows, visibility
 from tron.shading.lighting import Lighting
 from tron.tracing import GBuffer
 
-LOWEST = 0.002
-"""Share of the opaque surfels that may lie below the ground: strays."""
-
-_OPAQUE_LOGIT = 0.0
 _LEAST_EYE = 0.3
 """Least height from which the map is projected, in radii of the subject: from lower, all is horizon."""
 
@@ -58,8 +54,7 @@ class Ground:
         """
         subject = find_subject(scene)
         if height is None:
-            solid = scene.opacity_logits > _OPAQUE_LOGIT
-            height = float(np.quantile(scene.means[solid if solid.any() else slice(None), 2], LOWEST))
+            height = foot_height(scene.means[:, 2], scene.opacity_logits)
         rise = max(float(camera.position[2]) - height, _LEAST_EYE * subject.radius)
         return cls(height, (float(subject.centre[0]), float(subject.centre[1]), height + rise))
 

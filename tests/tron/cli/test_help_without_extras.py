@@ -43,7 +43,7 @@ metadata.version = installed_version
 from tron.cli import installation
 
 pages = {}
-for command in ("relight", "reconstruct", "datagen", "train", "evaluate"):
+for command in ("relight", "edit", "reconstruct", "datagen", "train", "evaluate"):
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         getattr(installation, command)(["--help"])
@@ -62,12 +62,13 @@ def pages(*extras: str) -> dict[str, list[str]]:
 
 def test_the_base_alone_shows_every_command_and_names_its_extra():
     shown = pages()
-    for command, key in {"relight": "scene", "reconstruct": "capture", "datagen": "train.scenes",
-                         "train": "stages", "evaluate": "benchmark.*"}.items():  # fmt: skip
-        extra = "eval" if command == "evaluate" else command
+    for command, key in {"relight": "scene", "edit": "edits", "reconstruct": "capture",
+                         "datagen": "train.scenes", "train": "stages", "evaluate": "benchmark.*"}.items():  # fmt: skip
+        name = "eval" if command == "evaluate" else command
+        extra = "relight" if command == "edit" else name
         head, *page = shown[command]
         assert head.startswith(f"needs pip install 'tron-relight[{extra}]'; not installed here: ")
-        assert f"usage: tron-{extra} [key=value ...] [group=option ...]" in page
+        assert f"usage: tron-{name} [key=value ...] [group=option ...]" in page
         assert any(line.startswith(f"  {key}") for line in page), page
 
 

@@ -1,0 +1,129 @@
+"""tron-edit from end to end: the file it writes is what the edits say, or there is none."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from examples.stage import BALL, FLOOR, RING, make_scene
+from tron.apps.edit import cli
+from tron.cameras import Camera
+from tron.editing import EditList, Remove, Selection, Views
+from tron.gaussians.scene import GaussianScene
+from tron.io.images import write_image
+
+TOP = Camera.look_at((0.1, -0.45, 4), (0.1, -0.4, 0), fov_deg=50, width=64, height=64)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    make_scene(0.08).save(tmp_path / "scene.ply")
+    return tmp_path
+
+
+def edit(folder: Path, edits: str, *arguments: str) -> int:
+    (folder / "edits.yaml").write_text(edits)
+    with pytest.raises(SystemExit) as stop:
+        cli(
+            [
+                f"scene={folder}/scene.ply",
+                f"edits={folder}/edits.yaml",
+                f"output={folder}/out.ply",
+                *arguments,
+            ]
+        )
+    return int(stop.value.code or 0)
+
+
+def test_the_file_is_what_python_makes(folder, caplog):
+    with caplog.at_level("INFO"):
+        assert edit(folder, "- {action: remove, select: {object: 3}}") == 0
+    scene = GaussianScene.load(folder / "scene.ply")
+    Remove(select=Selection(object=RING)).apply(scene, Views()).save(folder / "python.ply")
+    assert (folder / "out.ply").read_bytes() == (folder / "python.ply").read_bytes()
+    assert "object 3: 440 surfels from [-0.4" in caplog.text
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "edits.yaml",
+        "out.ply",
+        "python.ply",
+        "scene.ply",
+    ]
+
+
+def test_insert_then_remove_gives_the_scene_back(folder):
+    """What is inserted is found from the folder of the list, wherever the command runs."""
+    insert = (
+        "- {action: insert, file: scene.ply, at: [9, 0, 0], standing: false, take: {object: 2}, object: 5}\n"
+    )
+    assert edit(folder, insert + "- {action: remove, select: {object: 5}}") == 0
+    assert (folder / "out.ply").read_bytes() == (folder / "scene.ply").read_bytes()
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("beside", [True, False], ids=["beside-the-scene", "named"])
+def test_masks_and_clicks_find_their_views(folder, beside):
+    """A camera above: a mask of the ball's outline, a click on the ball, by name and by number."""
+    path = folder / ("cameras.json" if beside else "views.json")
+    path.write_text(json.dumps({"names": ["top.jpg"], "cameras": [TOP.to_dict()]}))
+    pixels, _ = TOP.project(np.array([[0.1, -0.4, 0.8], [1.0, 1.0, 0.0]]))
+    (ball, floor) = pixels.tolist()
+    outline = np.linalg.norm(np.indices((64, 64))[::-1].transpose(1, 2, 0) + 0.5 - ball, axis=-1) < 6
+    write_image(folder / "mask.png", outline.astype(np.float32)[..., None])
+    clicks = f"{{view: 0, inside: [{ball}], outside: [{floor}]}}"
+    edits = f"""
+- {{action: material, select: {{masks: {{top.jpg: mask.png}}}}, roughness: 0.9}}
+- {{action: remove, select: {{object: [1, 2], clicks: {clicks}}}}}
+"""
+    assert edit(folder, edits, *([] if beside else [f"cameras={path}"])) == 0
+    out = GaussianScene.load(folder / "out.ply")
+    assert set(np.unique(out.object_id)) == {FLOOR, RING}
+    before = GaussianScene.load(folder / "scene.ply")
+    masked = EditList.of([{"action": "remove", "select": {"masks": {"0": "mask.png"}}}], folder)
+    left = masked.apply(before, Views([TOP]))
+    gone = len(before) - len(left)
+    assert 20 < gone == (before.object_id == BALL).sum() - (left.object_id == BALL).sum()
+
+
+def test_up_of_a_scan_that_does_not_say_is_kept(folder):
+    scene = GaussianScene.load(folder / "scene.ply")
+    scene.up, scene.up_guessed = np.array([0.0, -1.0, 0.0]), True
+    scene.save(folder / "scene.ply")
+    assert edit(folder, "- {action: move, select: {object: 2}, turn: 90}", "up=[0,0,2]") == 0
+    out = GaussianScene.load(folder / "out.ply")
+    np.testing.assert_array_equal(out.up, [0, 0, 1])
+    assert not out.up_guessed
+    np.testing.assert_allclose(out.means[:, 2], scene.means[:, 2], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("edits", "said"),
+    [
+        ("- {action: remove, select: {sphere: {center: [9, 9, 9], radius: 1}}}", "no surfel is selected"),
+        ("- {action: remove, select: {object: [3, 3]}}", "object 3 is named twice"),
+        ("- {action: duplicate, select: {object: 3}, object: 2}", "there is an object 2 already"),
+        ("- {action: remove, select: {object: 8}}", "there is no object 8"),
+        ("- {action: remove, slect: {object: 3}}", "unknown key 'slect'"),
+        ("- {action: move, select: {object: 3}, by: [.nan, 0, 0]}", "'by.0': nan"),
+        ("- {action: remove, select: {box: {low: [1, 0, 0], high: [0, 1, 1]}}}", "box is inverted: x goes"),
+        ("- {action: remove, select: {grow: {view: 0, at: [[3, 3]]}}}", "give the cameras too"),
+        ("- {action: insert, file: nowhere.ply, at: [0, 0, 0]}", "nowhere.ply"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_the_last_output_as_it_was(folder, capsys, edits, said):
+    (folder / "out.ply").write_text("of the last run")
+    assert edit(folder, "- {action: material, select: {object: 2}, hue: 9}\n" + edits) == 2
+    lines = capsys.readouterr().err.splitlines()
+    errors = [line for line in lines if line.startswith("tron-edit: ")]
+    assert len(errors) == 1
+    assert said in errors[0]
+    assert "edit 2" in errors[0] or "nowhere" in said
+    assert (folder / "out.ply").read_text() == "of the last run"
+
+
+def test_guessed_materials_are_not_edited_in_silence(folder, caplog):
+    scene = GaussianScene.load(folder / "scene.ply")
+    scene.materials_guessed = True
+    scene.save(folder / "scene.ply")
+    assert edit(folder, "- {action: material, select: {object: 2}, hue: 9}") == 0
+    assert "materials=as_is" in caplog.text

@@ -1,0 +1,189 @@
+"""tron-edit: a scene with edits done to it, as another file."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from tron.apps.relight.camera_files import CAMERAS, cameras_of, in_frame_of
+from tron.cli.command_line import command
+from tron.cli.progress import working
+from tron.editing import Edit, EditList, Insert, Material, Views
+from tron.errors import TronError
+from tron.gaussians.foreign_files import refuse_foreign
+from tron.gaussians.ply import check_header
+from tron.gaussians.scene import GaussianScene
+
+log = logging.getLogger(__name__)
+
+SHOWN_OBJECTS = 20
+
+
+class Settings(BaseModel):
+    """Everything that tron-edit can be told."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    scene: Path = Field(
+        description="PLY of the scene: TRON's, or a plain 3DGS or 2DGS file; it stays as it is"
+    )
+    edits: Path | Annotated[tuple[Path, ...], Field(min_length=1)] = Field(
+        description="YAML with a list of edits, done in their order; several files, [a.yaml,b.yaml], are "
+        "merged where no object is named in two",
+        examples=["[a.yaml,b.yaml]"],
+    )
+    output: Path = Field(description="PLY to write, or to replace; not the scene's own")
+    cameras: Path | None = Field(
+        None,
+        description="JSON of the views that edits pick pixels or give masks in, as tron-relight takes it; "
+        "null: cameras.json beside the scene",
+    )
+    up: tuple[float, float, float] | None = Field(
+        None,
+        description="up direction of the scene, such as [0,0,1]; null: the file's own, -y where it has none",
+        examples=["[0,0,1]"],
+    )
+    seed: int = Field(0, description="root of all random numbers: of the rays that find what a pixel shows")
+
+    @field_validator("up")
+    @classmethod
+    def _is_a_direction(cls, up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if up is not None and not 0 < math.hypot(*up) < math.inf:
+            raise ValueError("a direction has a length: give three numbers that are not all 0")
+        return up
+
+
+def main(settings: Settings) -> None:
+    """Remove, move, duplicate, insert or repaint parts of a scene, as a list of edits says.
+
+    The YAML is a list; each edit has an action and says what it selects:
+
+    [{action: remove, select: {object: 3}},
+
+    {action: move, select: {box: {low: [0,0,0], high: [1,1,1]}}, by: [0,0,1], turn: 30, scale: 2},
+
+    {action: duplicate, select: {sphere: {center: [0,0,1], radius: 0.5}}, by: [2,0,0], object: 9},
+
+    {action: insert, file: cat.ply, at: [1,0,2], turn: 90},
+
+    {action: material, select: {object: 2}, hue: 200, roughness: {scale: 0.5}, metallic: 1}]
+
+    What else selects: material (ranges), grow (from a picked surfel or pixel), clicks (inside and outside),
+    masks (of views). Several together hold at once; any joins selections, but_not takes one away.
+
+    Writes the scene with the edits done, or nothing. The same is in Python: tron.editing.
+    """
+    _check_paths(settings)
+    edits, where = _read(settings)
+    with working("reading the scene"):
+        scene = GaussianScene.load(settings.scene)
+    if settings.up is not None:
+        scene.up, scene.up_guessed = np.array(settings.up) / np.linalg.norm(settings.up), False
+    _describe(scene)
+    if scene.offset.any():
+        log.info("coordinates of edits are about %s", scene.offset.tolist())
+    if scene.materials_guessed and any(isinstance(each, Insert | Material) for each in edits):
+        log.warning(
+            "%s has no materials of its own: tron-relight would find them anew and undo these edits; edit "
+            "%s, which it keeps, or give it materials=as_is", settings.scene,
+            settings.scene.with_suffix(".materials.ply").name,
+        )  # fmt: skip
+    edited = edits.apply(scene, _views(settings, scene), where, _said)
+    edited.save(settings.output)
+    _describe(edited)
+    log.info("%d surfels, now %d: %s", len(scene), len(edited), settings.output)
+
+
+def _check_paths(settings: Settings) -> None:
+    for path in (settings.scene, *_files(settings), settings.cameras):
+        if path is not None and not path.is_file():
+            if path.is_dir():
+                raise TronError("cannot read: is a folder", path, "give one file of it")
+            raise TronError("file not found", path)
+    if settings.output.suffix.lower() != ".ply":
+        raise TronError("output is no PLY", settings.output, "give it a name that ends with .ply")
+    if settings.output.is_dir():
+        raise TronError("output is a folder", settings.output, "give a file in it")
+    if settings.output.exists() and settings.output.samefile(settings.scene):
+        raise TronError("output is the scene itself", settings.output, "give another name")
+    refuse_foreign(settings.scene)
+    check_header(settings.scene)
+
+
+def _files(settings: Settings) -> tuple[Path, ...]:
+    return (settings.edits,) if isinstance(settings.edits, Path) else settings.edits
+
+
+def _read(settings: Settings) -> tuple[EditList, str]:
+    """All edits, and what messages call them."""
+    first, *others = _files(settings)
+    edits = EditList.read(first)
+    for path in others:
+        edits = edits.merged(EditList.read(path))
+    return edits, " and ".join(map(str, _files(settings)))
+
+
+def _views(settings: Settings, scene: GaussianScene) -> Views:
+    path = settings.cameras or settings.scene.with_name(CAMERAS)
+    if settings.cameras is None and not path.is_file():
+        return Views(seed=settings.seed)
+    try:
+        cameras = in_frame_of(scene.offset, cameras_of(path), path)
+    except TronError as error:
+        if settings.cameras is not None:
+            raise
+        log.warning("%s; edits name no view without it", error)
+        return Views(seed=settings.seed)
+    return Views(cameras, _names(path, len(cameras)), settings.seed)
+
+
+def _names(path: Path, count: int) -> list[str]:
+    """Names of a file's cameras: those of cameras.json, or of the photos of a transforms.json."""
+    content = json.loads(path.read_text("utf-8"))
+    if isinstance(content, list):
+        found = [each.get("img_name") for each in content]
+    else:
+        found = content.get("names") or [each.get("file_path") for each in content.get("frames", ())]
+    whole = len(found) == count and all(isinstance(each, str) for each in found)
+    return [str(each) for each in found] if whole else []
+
+
+def _said(edits: Iterable[Edit]) -> Iterator[Edit]:
+    edits = list(edits)
+    for n, edit in enumerate(edits, 1):
+        log.info("edit %d of %d: %s", n, len(edits), edit.action)
+        yield edit
+
+
+def _describe(scene: GaussianScene) -> None:
+    """Say which objects there are, so that edits can name them."""
+    ids, counts = np.unique(scene.object_id, return_counts=True)
+    for number, count in list(zip(ids, counts))[:SHOWN_OBJECTS]:
+        means = scene.means[scene.object_id == number]
+        low, high = (", ".join(f"{value:.3g}" for value in corner) for corner in (means.min(0), means.max(0)))
+        log.info("object %d: %d surfels from [%s] to [%s]", number, count, low, high)
+    if len(ids) > SHOWN_OBJECTS:
+        log.info("and %d objects more", len(ids) - SHOWN_OBJECTS)
+
+
+cli = command(
+    "tron-edit",
+    "conf.edit",
+    Settings,
+    main,
+    examples=(
+        "tron-edit scene=surfels.ply edits=edits.yaml output=edited.ply",
+        "tron-edit scene=scan.ply edits=clicks.yaml cameras=capture/transforms.json output=cut.ply",
+        "tron-edit scene=surfels.ply edits=[mine.yaml,yours.yaml] output=ours.ply",
+    ),
+)
+
+if __name__ == "__main__":
+    cli()

@@ -1,0 +1,29 @@
+"""Change a scene: selections and edits as data, to be stored, replayed, undone and merged.
+
+    from tron.editing import Material, Remove, Selection, Session
+
+A mesh model joins as one more kind of edit (:mod:`tron.editing.edits`), once it can be made of surfels.
+"""
+
+from tron.editing.edit_list import EditList, Session
+from tron.editing.edits import Duplicate, Edit, Insert, Material, Move, Remove
+from tron.editing.selections import Box, Clicks, Grown, MaterialRange, Selection, Sphere
+from tron.editing.views import Views
+
+__all__ = [
+    "EditList",
+    "Session",
+    "Edit",
+    "Remove",
+    "Move",
+    "Duplicate",
+    "Insert",
+    "Material",
+    "Selection",
+    "Box",
+    "Sphere",
+    "MaterialRange",
+    "Grown",
+    "Clicks",
+    "Views",
+]

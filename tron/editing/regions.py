@@ -1,0 +1,134 @@
+"""Regions of a scene, found along its surface: from a few surfels on, over neighbours that are alike.
+
+A graph joins each surfel to its nearest neighbours. :func:`grown` takes what hangs together with the seeds
+over small steps; :func:`parted` lets clicks inside and outside compete: every surfel goes to the seed that is
+nearer along the surface. The second needs no threshold that would have to fit the scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import KDTree
+
+from tron.errors import TronError
+from tron.gaussians.scene import GaussianScene
+
+NEIGHBOURS = 12
+LEAST_OPACITY = 0.05
+"""Fainter surfels join nothing."""
+REACH = 3.0
+"""Neighbours are joined up to so many times the distance to their three nearest."""
+# Cost of a step between neighbours: of its length in spacings, of the bend of the normal, of the change of
+# colour. Of the prototype, on three scans; factors from 5 to 60 changed its selections by 7 %.
+_STEP, _BEND, _TINT = 0.05, 20.0, 20.0
+
+
+@dataclass(frozen=True)
+class _Graph:
+    """Edges between the surfels that can be seen.
+
+    Attributes:
+        seen: (N,) numbers of those surfels. back: (M,) their place in ``seen``, -1 of the others.
+        start, end: (E,) places in ``seen`` that an edge joins.
+        length: (E,) world units. local: (N,) mean distance to the three nearest.
+        bend: (E,) 1 - cosine between normals. tint: (E,) distance of colours.
+        color: (N, 3) cube roots of the base color, about as even as lightness.
+    """
+
+    seen: np.ndarray
+    back: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
+    length: np.ndarray
+    local: np.ndarray
+    bend: np.ndarray
+    tint: np.ndarray
+    color: np.ndarray
+
+    @classmethod
+    def of(cls, scene: GaussianScene) -> _Graph:
+        seen = np.flatnonzero(scene.opacities() > LEAST_OPACITY)
+        if len(seen) < 2:
+            raise TronError("fewer than two surfels of the scene can be seen")
+        points = scene.means[seen].astype(np.float64)
+        count = min(NEIGHBOURS, len(seen) - 1)
+        distances, nearest = map(np.asarray, KDTree(points).query(points, k=count + 1))
+        length, end = distances[:, 1:], nearest[:, 1:].ravel()
+        start = np.repeat(np.arange(len(seen)), count)
+        normals, color = scene.normals()[seen], np.cbrt(np.clip(scene.base_color[seen], 0, 1))
+        cosine = np.einsum("ei,ei->e", normals[start], normals[end])
+        back = np.full(len(scene), -1)
+        back[seen] = np.arange(len(seen))
+        return cls(
+            seen, back, start, end, length.ravel(), length[:, :3].mean(1),
+            1 - (cosine if scene.oriented else np.abs(cosine)),
+            np.linalg.norm(color[start] - color[end], axis=1), color,
+        )  # fmt: skip
+
+    def places(self, surfels: np.ndarray) -> np.ndarray:
+        """Places of surfels in the graph; TronError where none of them can be seen."""
+        places = self.back[np.unique(surfels)]
+        if not (places >= 0).any():
+            raise TronError("no surfel that was picked can be seen", mend="pick others")
+        return places[places >= 0]
+
+    def selection(self, chosen: np.ndarray) -> np.ndarray:
+        """(M,) bool of (N,) bool."""
+        selected = np.zeros(len(self.back), bool)
+        selected[self.seen[chosen]] = True
+        return selected
+
+
+def grown(scene: GaussianScene, seeds: np.ndarray, angle_deg: float, color: float) -> np.ndarray:
+    """(M,) bool: surfels that hang together with the seeds over neighbours that are alike.
+
+    Args:
+        scene: the surfels.
+        seeds: numbers of surfels.
+        angle_deg: most angle between the normals of two neighbours.
+        color: most distance between the cube roots of their base colors.
+
+    Raises:
+        TronError: no seed can be seen.
+    """
+    graph = _Graph.of(scene)
+    places = graph.places(seeds)
+    near = graph.length <= REACH * np.maximum(graph.local[graph.start], graph.local[graph.end])
+    alike = near & (graph.bend <= 1 - np.cos(np.radians(angle_deg)) + 1e-6) & (graph.tint <= color)
+    edges = graph.start[alike], graph.end[alike]
+    count = len(graph.seen)
+    joined = coo_matrix((np.ones(alike.sum(), bool), edges), shape=(count, count))
+    part = connected_components(joined, directed=False)[1]
+    return graph.selection(np.isin(part, part[places]))
+
+
+def parted(scene: GaussianScene, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
+    """(M,) bool: surfels nearer to a seed inside than to one outside, along the surface.
+
+    Shortest paths on the graph of neighbours (Dijkstra's algorithm, from all seeds at once); a step costs the
+    more the longer it is, the more the normal bends and the more the base color changes.
+
+    Args:
+        scene: the surfels.
+        inside, outside: numbers of surfels.
+
+    Raises:
+        TronError: no seed of either kind can be seen, or one is of both kinds.
+    """
+    graph = _Graph.of(scene)
+    within, without = graph.places(inside), graph.places(outside)
+    if len(np.intersect1d(within, without)):
+        raise TronError("a surfel was picked both inside and outside", mend="move one of the two clicks")
+    cost = (graph.length / scene.spacing + _STEP) * (
+        1 + _BEND * np.maximum(graph.bend, 0) + _TINT * graph.tint
+    )
+    count = len(graph.seen)
+    one_way = coo_matrix((cost, (graph.start, graph.end)), shape=(count, count)).tocsr()
+    both_ways = one_way.maximum(one_way.T)
+    seeds = np.concatenate([within, without])
+    nearest = dijkstra(both_ways, indices=seeds, min_only=True, return_predecessors=True)[2]
+    return graph.selection(np.isin(nearest, within))
