@@ -121,6 +121,7 @@ PAPER = {
     },
     "train": {"renderer.config.guidance": ["pbr", "irradiance"]},
     "eval": {},
+    "edit": {},
 }
 
 

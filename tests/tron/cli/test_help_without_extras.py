@@ -63,7 +63,8 @@ def pages(*extras: str) -> dict[str, list[str]]:
 def test_the_base_alone_shows_every_command_and_names_its_extra():
     shown = pages()
     for command, key in {"relight": "scene", "edit": "edits", "reconstruct": "capture",
-                         "datagen": "train.scenes", "train": "stages", "evaluate": "benchmark.*"}.items():  # fmt: skip
+                         "datagen": "train.scenes", "train": "stages",
+                         "evaluate": "benchmark.*"}.items():  # fmt: skip
         name = "eval" if command == "evaluate" else command
         extra = "relight" if command == "edit" else name
         head, *page = shown[command]

@@ -88,6 +88,24 @@ def test_growth_stops_at_edges_of_colour_and_of_normals(scene):
     assert flat.sum() > 0.99 * (scene.object_id == FLOOR).sum()
 
 
+def test_a_border_between_clicks_lies_where_the_colour_changes(scene):
+    """On the flat floor, between a click far from a tile's edge and one just beyond it."""
+    means, white = scene.means, scene.base_color[:, 0] > 0.4
+
+    def nearest(x: float, y: float) -> int:
+        return int(np.linalg.norm(means - [x, y, 0], axis=1).argmin())
+
+    tile = (np.abs(means - [1.125, 1.125, 0]) < [0.125, 0.125, 0.01]).all(1)
+    beyond = (np.abs(means - [0.875, 1.125, 0]) < [0.125, 0.125, 0.01]).all(1)
+    inside, outside = nearest(1.22, 1.125), nearest(0.97, 1.125)
+    assert white[inside] != white[outside]
+    selected = Selection(clicks=Clicks(inside=(inside,), outside=(outside,))).of(scene)
+    middle = (means[inside] + means[outside]) / 2
+    assert (tile & (means[:, 0] < middle[0])).any(), "by distance alone some of the tile is lost"
+    assert selected[tile & (white == white[inside])].all()
+    assert not selected[beyond & (white == white[outside])].any()
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [
