@@ -109,7 +109,8 @@ class Views:
         found = surfels != NOTHING
         if 2 * found.sum() < PICK_RAYS:
             return np.empty(0, int), 0.0
-        middle = float(np.median(distances[found]))
+        # One that was met: the mean of the two in the middle may lie between two layers.
+        middle = float(np.quantile(distances[found], 0.5, method="lower"))
         near = found & (np.abs(distances - middle) <= THICKNESS * scene.spacing)
         return np.unique(surfels[near]).astype(int), middle
 

@@ -128,6 +128,19 @@ def test_what_lies_below_a_point_is_found(scene, views):
         surface_below(scene, views, np.array([9.0, 0, 3]))
 
 
+def test_behind_half_a_layer_one_of_both_is_met(dense_surfels):
+    """A sheet that stops about half of all rays hangs one unit above another: never what lies between."""
+    floor = dense_surfels.plane(half=0.5)
+    scene = dense_surfels.scene(floor, replace(floor, points=floor.points + [0, 0, 1]))
+    upper = scene.means[:, 2] > 0.5
+    scene = replace(scene, opacity_logits=np.where(upper, np.float32(-1.3), scene.opacity_logits))
+    heights = []
+    for seed in range(12):
+        heights.append(surface_below(scene, Views(seed=seed), np.array([0.01, 0.02, 3.0]))[2])
+    assert {round(height) for height in heights} == {0, 1}, "both are met"
+    np.testing.assert_allclose(heights, np.round(heights), atol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("pick", "said"),
     [
