@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from examples.stage import BALL, FLOOR, RING
+from examples.stage import BALL, FLOOR, RING, make_scene
 from tron.color import linear_to_srgb
 from tron.editing import Box, Clicks, Grown, MaterialRange, Selection, Sphere
 from tron.errors import TronError
@@ -139,3 +139,20 @@ def test_what_selects_nothing_that_is_meant_is_refused(given, said):
 def test_what_the_scene_does_not_have_is_named(scene, selection, said):
     with pytest.raises(TronError, match=said):
         selection.of(scene)
+
+
+@pytest.mark.parametrize("spacing", [0.08, 0.04])
+def test_three_random_clicks_inside_and_five_outside_find_a_thing(spacing):
+    """Intersection over union with the true object, the mean of 30 draws: 0.99 and, of finer surfels, 0.94.
+
+    What is missed are draws without a click on the third thing.
+    """
+    scene, rng = make_scene(spacing), generator(0, "test", "clicks")
+    found = []
+    for which in (BALL, RING, FLOOR) * 10:
+        truth = scene.object_id == which
+        inside = tuple(rng.choice(np.flatnonzero(truth), 3, replace=False).tolist())
+        outside = tuple(rng.choice(np.flatnonzero(~truth), 5, replace=False).tolist())
+        selected = Selection(clicks=Clicks(inside=inside, outside=outside)).of(scene)
+        found.append((selected & truth).sum() / (selected | truth).sum())
+    assert np.mean(found) > 0.92
