@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 MODULES = {
     "Scenes and cameras": ["tron.cameras", "tron.trajectories", "tron.gaussians"],
     "Light": ["tron.relighting", "tron.shading", "tron.estimation"],
+    "Editing": ["tron.editing"],
     "Rays": ["tron.tracing", "tron.tracing.torch_bridge", "tron.integrators"],
     "Captures and reconstruction": ["tron.captures", "tron.reconstruction", "tron.reconstruction.priors"],
     "Neural renderer": ["tron.neural.renderer", "tron.neural.weights", "tron.neural.shipped"],

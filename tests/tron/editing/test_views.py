@@ -131,7 +131,7 @@ def test_what_lies_below_a_point_is_found(scene, views):
 def test_behind_half_a_layer_one_of_both_is_met(dense_surfels):
     """A sheet that stops about half of all rays hangs one unit above another: never what lies between."""
     floor = dense_surfels.plane(half=0.5)
-    scene = dense_surfels.scene(floor, replace(floor, points=floor.points + [0, 0, 1]))
+    scene = dense_surfels.scene(floor, replace(floor, points=floor.points + np.array([0, 0, 1])))
     upper = scene.means[:, 2] > 0.5
     scene = replace(scene, opacity_logits=np.where(upper, np.float32(-1.3), scene.opacity_logits))
     heights = []
