@@ -16,6 +16,8 @@ from tron.io.images import read_image
 from tron.seeds import integer
 
 if TYPE_CHECKING:
+    from tron.relighting import Relighter
+    from tron.relighting.proxy import ProxiedTracer
     from tron.tracing import SurfelTracer
 
 PICK_RAYS = 32
@@ -39,7 +41,7 @@ class Views:
     cameras: Sequence[Camera] = ()
     names: Sequence[str] = ()
     seed: int = 0
-    _kept: list[SurfelTracer] = field(default_factory=list, init=False, repr=False, compare=False)
+    _kept: list[Relighter] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def __getitem__(self, name: str | int) -> Camera:
         """The camera of a name, or at a place; TronError where there is none."""
@@ -72,21 +74,17 @@ class Views:
         if not (0 <= x < camera.width and 0 <= y < camera.height):
             size = f"{camera.width} x {camera.height} pixels"
             raise TronError(f"pixel {list(pixel)} is outside view {view}", mend=f"it has {size}")
-        direction = camera.window(x, y, 1, 1).rays()[0, 0]
-        surfels, _ = self.met(scene, camera.position, direction)
+        surfels, _ = self.met(scene, camera.window(x, y, 1, 1))
         if not len(surfels):
             raise TronError(f"pixel {list(pixel)} of view {view} shows nothing", mend="pick another")
         return surfels
 
-    def met(
-        self, scene: GaussianScene, origin: np.ndarray, direction: np.ndarray
-    ) -> tuple[np.ndarray, float]:
-        """Surfels that are seen from a point in a direction, and their distance; none where it is empty.
+    def met(self, scene: GaussianScene, pixel: Camera) -> tuple[np.ndarray, float]:
+        """Surfels that a camera of one pixel sees, and their distance; none where it is empty.
 
         Args:
-            scene: the surfels; where normals have no sign, they are turned to the origin.
-            origin: (3,), world.
-            direction: (3,) unit, world.
+            scene: the surfels; where normals have no sign, they are turned to the camera.
+            pixel: the camera.
 
         Returns:
             Numbers of the surfels that rays meet within two spacings of the median, and the median distance,
@@ -95,13 +93,16 @@ class Views:
         import drjit as dr
         import mitsuba as mi
 
-        tracer = self._tracer(scene, origin)
+        tracer = self._tracer(scene, pixel)
         from tron.tracing.hierarchy.first_hit import NOTHING, ray_seeds
 
         lane = dr.arange(mi.UInt32, PICK_RAYS)
         root = dr.opaque(mi.UInt32, integer(self.seed, "editing", "pick"))
-        start = mi.Point3f(*(dr.full(mi.Float, float(value), PICK_RAYS) for value in origin))
-        along = mi.Vector3f(*(dr.full(mi.Float, float(value), PICK_RAYS) for value in direction))
+        start, along = (
+            [dr.full(mi.Float, float(value), PICK_RAYS) for value in vector]
+            for vector in (pixel.position, pixel.rays()[0, 0])
+        )
+        start, along = mi.Point3f(*start), mi.Vector3f(*along)
         dr.make_opaque(start, along)
         seeds = ray_seeds(root, lane, dr.opaque(mi.UInt32, 0))
         (hit,) = tracer.first_hits(start, [along], [dr.full(mi.Bool, True, PICK_RAYS)], [seeds])
@@ -136,7 +137,7 @@ class Views:
                 what = f"the mask has {width} x {height} pixels, view {view} {camera.width} x {camera.height}"
                 raise TronError(what, path, "give it the view's shape")
             camera = camera.resized(width, height)
-            depth = self._tracer(scene, camera.position).gbuffer(camera).numpy()["depth"]
+            depth = self._tracer(scene, camera).gbuffer(camera).numpy()["depth"]
             pixels, before = camera.project(scene.means)
             towards = camera.position - scene.means
             distance = np.linalg.norm(towards, axis=1)
@@ -150,17 +151,10 @@ class Views:
             votes[framed] += np.where(mask[y, x], 1, -1) * seen * cosine[framed]
         return votes > 0
 
-    def _tracer(self, scene: GaussianScene, origin: np.ndarray) -> SurfelTracer:
-        """A tracer whose rays meet what a camera at the origin sees."""
-        import mitsuba as mi
-
-        from tron.runtime import activate
-
-        if mi.variant() is None:
-            activate()
-        from tron.tracing import SurfelTracer
+    def _tracer(self, scene: GaussianScene, camera: Camera) -> SurfelTracer | ProxiedTracer:
+        """A tracer whose rays meet what the camera sees: the scene itself, and no back face."""
+        from tron.relighting import Estimation, Relighter
 
         if not self._kept or self._kept[0].scene is not scene:
-            self._kept[:] = [SurfelTracer(scene).sided(False)]
-        (tracer,) = self._kept
-        return tracer if scene.oriented else tracer.turned_over(scene.looks_away(origin))
+            self._kept[:] = [Relighter(scene, Estimation(two_sided=False), self.seed, proxy="never")]
+        return self._kept[0].tracer(camera)
