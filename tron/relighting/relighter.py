@@ -19,7 +19,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -197,6 +197,10 @@ class Relighter:
         baked, seed = None, self.seed if seed is None else seed
         if self.estimation.bounces:
             baked = self.transport.bake(lighting, self.estimation, seed=seed)
+            if (
+                self._proxied is None and not self.scene.oriented
+            ):  # a camera may see the side that was not baked
+                baked = replace(baked, reaching=None)
         return Illumination(self, lighting, self.estimation, seed, baked)
 
     def changed(self, scene: GaussianScene) -> Relighter:
@@ -320,11 +324,12 @@ class TracedFrame:
 
 
 def views_under(lights: Sequence[Illumination], camera: Camera) -> list[GBuffer]:
-    """What a camera sees under each light of one relighter; once for as many sub-pixels."""
+    """What a camera sees under each light of one relighter; once for those that see alike."""
     tracer = lights[0].relighter.tracer(camera)
     views: dict[int, GBuffer] = {}
-    for times in {light.estimation.supersample for light in lights}:
-        alike = [k for k, light in enumerate(lights) if light.estimation.supersample == times]
+    seeing = [(light.estimation.supersample, light.estimation.rays > 0) for light in lights]
+    for kind in dict.fromkeys(seeing):
+        alike = [k for k, other in enumerate(seeing) if other == kind]
         bounces = [lights[k].bounced for k in alike]
         views |= zip(alike, trace_views(tracer, camera, lights[alike[0]].estimation, bounces), strict=True)
     return [views[k] for k in range(len(lights))]
