@@ -92,8 +92,9 @@ class Settings(BaseModel):
     )
     quality: Literal["preview", "final"] = Field(
         "preview",
-        description="preview: shadows of 32 rays from each surfel, once a light, and none from pixels; final: 64 "
-        "a pixel, over 2 x 2 sub-pixels, filtered, and 4 rays that look for reflections of the scene in itself",
+        description="preview: shadows of 32 rays from each surfel, once a light, and none from pixels; "
+        "final: 64 a pixel, over 2 x 2 sub-pixels, filtered, and 4 rays that look for reflections of the "
+        "scene in itself",
     )
     bounces: int = Field(
         FINAL.bounces,
