@@ -1,7 +1,7 @@
 """Surfels that lend each other what few rays of each have found.
 
 A surfel of 32 shadow rays is a little noisier than a picture may be. Its neighbours on the same surface see
-next to the same light, so each takes the mean of its own share and of theirs, by a Gaussian of their distance.
+next to the same light, so each takes the mean of its own share and of theirs, by a Gaussian of distance.
 """
 
 from __future__ import annotations
