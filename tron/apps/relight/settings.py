@@ -122,7 +122,12 @@ class Settings(BaseModel):
         FINAL.two_sided,
         description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
     )
-    denoise: bool = Field(True, description="filter of the shadows' noise; false: as they are traced")
+    denoise: bool | Literal["oidn"] = Field(
+        True,
+        description="filter of the shadows' noise; false: as they are traced; oidn: filtered, and the relit "
+        "picture besides by Intel's Open Image Denoise, led by base color, in place of a network "
+        "(pip install 'tron-relight[oidn]')",
+    )
     frames: int = Field(60, ge=1, le=10_000, description="number of frames (those of `cameras` win)")
     width: Side | None = Field(
         None,
@@ -226,6 +231,14 @@ class Settings(BaseModel):
         return self
 
     @model_validator(mode="after")
+    def _drawn_by_one(self) -> Settings:
+        if self.denoise == "oidn" and self.checkpoint is not None and not self.takes_default:
+            raise ValueError(
+                "denoise=oidn and a checkpoint would both draw the picture: leave one of the two out"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _reflects_something(self) -> Settings:
         require_bounces(self.bounces, self.reflections or 0)
         return self
@@ -233,7 +246,7 @@ class Settings(BaseModel):
     def estimation(self) -> Estimation:
         """Estimation of the light: what quality says, unless the settings do."""
         said = {
-            "filtered": self.denoise,
+            "filtered": self.denoise is not False,
             "reflections": self.reflections if self.bounces else 0,
             "supersample": self.supersample,
             **self.model_dump(include={"estimator", "two_sided", "bounces", "diffuse"}),
