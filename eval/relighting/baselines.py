@@ -21,7 +21,8 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 - ``lit_bilateral``: D(L) by a cross-bilateral filter (:mod:`eval.relighting.bilateral`).
 - ``lit_blended``: an affine blend of G(D(L)), G(D(B)), G(D(E)), G(S(A)) and S(A), weights and deviation by
   the mean PSNR of training frames (`PsnrAffineFit`).
-- ``lit_oidn``: D of L through Open Image Denoise with base color and normals, where pyoidn is installed.
+- ``lit_oidn``: D of L through Open Image Denoise with ``albedo`` (:mod:`tron.denoising`), where pyoidn is
+  installed.
 - ``affine_filtered``, ``affine_ratio_filtered``, ``affine_lit_filtered``: the blends of images so filtered.
 - ``pixel_mlp``, ``pixel_mlp_lit``: 1x1 convolutions on D(B) and D(E), or on these and D(L).
 
@@ -49,7 +50,7 @@ from functools import partial
 import numpy as np
 
 from eval.relighting.bilateral import BilateralFit
-from eval.relighting.buffers import SURFELS_NORMAL, Buffers, Region, region_mask
+from eval.relighting.buffers import Buffers, Region, region_mask
 from eval.relighting.fits import (
     AffineFit,
     FilteredAffineFit,
@@ -63,6 +64,7 @@ from eval.relighting.fits import (
     remodulated,
 )
 from tron.color import to_display
+from tron.denoising import denoised
 from tron.errors import TronError
 from tron.seeds import generator
 from tron.shards.schema import Clip, guidance_members
@@ -112,25 +114,8 @@ def show_shadow_ratio(buffers: Buffers) -> np.ndarray:
 
 
 def show_oidn(buffers: Buffers) -> np.ndarray:
-    """Displayed ``lit`` of whole clips (K, H, W, 3), denoised frame by frame by Intel's Open Image Denoise.
-
-    A network that nobody here trained. The filter is that of path tracers' linear pictures; it is given
-    ``lit``, exposed, base color, a mean over sub-pixels, as its clean albedo, and the surfels' normals where
-    the clip holds them (https://www.openimagedenoise.org/documentation.html).
-    """
-    from pyoidn import denoise  # pyright: ignore
-
-    lit, albedo = buffers["lit"] * buffers.exposure, np.clip(buffers["albedo"], 0, 1)
-    normals = buffers.images.get(SURFELS_NORMAL, [None] * len(lit))
-    frames = [
-        denoise(
-            *(None if each is None else np.ascontiguousarray(each, np.float32) for each in images),
-            hdr=True,
-            clean_aux=True,
-        )
-        for images in zip(lit, albedo, normals)
-    ]
-    return to_display(np.stack(frames), 1.0)
+    """Displayed ``lit`` of whole clips (K, H, W, 3), denoised frame by frame (:mod:`tron.denoising`)."""
+    return to_display(np.stack([*map(denoised, buffers["lit"], buffers["albedo"])]), buffers.exposure)
 
 
 @dataclass(frozen=True)
@@ -181,7 +166,7 @@ NETWORKS = (NEURAL_LIT, NEURAL)
 OIDN = Baseline(
     "lit_oidn",
     "lit, Open Image Denoise",
-    "Intel's denoiser on linear lit with base color and normals",
+    "Intel's denoiser on linear lit, led by base color",
     show_oidn,
     groups=(ON_LIT,),
     pictured=False,

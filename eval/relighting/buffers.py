@@ -19,8 +19,6 @@ Region = Literal["foreground", "frame"]
 REGIONS: tuple[Region, Region] = ("foreground", "frame")
 MEMBERS = (*guidance_members(), TARGET, "mask", "foreground")
 """Members of a clip that predictions and their scores need."""
-SURFELS_NORMAL = "normal"
-"""Member of reference clips that Open Image Denoise is given besides."""
 SURFELS_DEPTH = "depth"
 """Member that motion is known by where a clip is rendered: the surfels', not the truth's."""
 PAIRS = 64

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from eval.relighting.baselines import BASELINES, NEURAL_LIT, OIDN, fit_baselines
-from eval.relighting.buffers import MEMBERS, SURFELS_NORMAL
+from eval.relighting.buffers import MEMBERS
 from eval.relighting.fits import Show
 from eval.relighting.judging import Judged, judge
 from eval.relighting.networks import Network, load_networks
@@ -72,7 +72,7 @@ class Renderer(RendererSettings):
         require_data(self)
         load_networks("neural", self.weights())
         if OIDN not in BASELINES:
-            log.warning("Open Image Denoise is not installed: no rows of it; pip install pyoidn")
+            log.warning("no rows of Open Image Denoise: it wants pip install 'tron-relight[oidn]'")
 
     def run(self, output_dir: Path) -> Outcome:
         """Measure part after part; one line on stderr for each figure.
@@ -259,15 +259,9 @@ class Run:
             lambda scene: {**fits[scene], **shown},
             self.settings.pictures,
             Scores(),
-            judged_members(dataset, split),
+            MEMBERS,
             **truth,
         )
-
-
-def judged_members(dataset: Path, split: str) -> tuple[str, ...]:
-    """Members that methods see: MEMBERS, and the surfels' normals where the split has reference members."""
-    meta = next(iter(read_clips(dataset, split, ()))).meta
-    return (*MEMBERS, SURFELS_NORMAL) if "reference" in meta.spp else MEMBERS
 
 
 def fitted(dataset: Path, split: str, fit_split: str, seed: int) -> dict[str, dict[str, Show]]:

@@ -302,17 +302,3 @@ def test_open_image_denoise_takes_noise_away_where_it_is_installed():
     shown = show_oidn(clip_of(lit))
     assert shown.shape == lit.shape
     assert shown.std() < 0.5 * to_display(lit, 1.0).std()
-
-
-def test_open_image_denoise_keeps_an_edge_that_normals_alone_show():
-    """Two walls of one color under two lights: noise hides the step, and normals say where it is."""
-    pytest.importorskip("pyoidn")
-    right = np.arange(64)[None, None, :, None] >= 32
-    truth = np.broadcast_to(np.where(right, 0.5, 0.3), (1, 64, 64, 3)).astype(np.float32)
-    lit = truth * generator(3, "walls").uniform(0.2, 1.8, truth.shape).astype(np.float32)
-    normal = np.where(right, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]) * np.ones(truth.shape)
-    errors = [
-        float(np.square(show_oidn(clip_of(lit, **given)) - to_display(truth, 1.0)).mean())
-        for given in ({}, {"normal": normal.astype(np.float32)})
-    ]
-    assert errors[1] < 0.7 * errors[0]

@@ -37,11 +37,13 @@ class RelitPicture:
         background: behind the surfels: "environment", "transparent" or a display colour, see above.
         source: the picture of the surfels: a network's, or a buffer of guidance.
         look: of the picture (:data:`tron.color.LOOKS`).
+        denoised: whether the buffer is through Open Image Denoise.
     """
 
     background: Background
     source: Literal["neural", "lit", "shadowed"]
     look: Look = "none"
+    denoised: bool = False
 
     @property
     def neural(self) -> bool:
@@ -63,6 +65,7 @@ class RelitPicture:
             "lit": "light with its bounces (lit; no checkpoint)",
             "shadowed": "direct light alone (shadowed; no checkpoint)",
         }[self.source]
+        made += ", through Open Image Denoise" if self.denoised else ""
         behind = {"environment": "over the environment", "transparent": "with alpha"}
         shown = behind.get(str(self.background)) or f"over the colour {list(self.background)}"
         return f"relit pictures: {made}, {shown}"

@@ -19,15 +19,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mitsuba as mi
 import numpy as np
 
 from tron.cameras import Camera
+from tron.denoising import denoised
 from tron.errors import TronError
 from tron.estimation import FINAL, Estimation
 from tron.gaussians.edit import subset
@@ -197,6 +198,10 @@ class Relighter:
         baked, seed = None, self.seed if seed is None else seed
         if self.estimation.bounces:
             baked = self.transport.bake(lighting, self.estimation, seed=seed)
+            if (
+                self._proxied is None and not self.scene.oriented
+            ):  # a camera may see the side that was not baked
+                baked = replace(baked, reaching=None)
         return Illumination(self, lighting, self.estimation, seed, baked)
 
     def changed(self, scene: GaussianScene) -> Relighter:
@@ -288,6 +293,7 @@ class Illumination:
         seed: int = 0,
         background: Sequence[float] | None = None,
         view: GBuffer | None = None,
+        denoise: Literal["oidn"] | None = None,
     ) -> Guidance:
         """All buffers of one frame, linear.
 
@@ -296,8 +302,12 @@ class Illumination:
             seed: root of the random numbers of its rays.
             background: linear RGB radiance behind the surfels; None: the environment.
             view: what the camera sees, where it is traced already (:func:`views_under`).
+            denoise: "oidn": as :meth:`TracedFrame.denoised`.
         """
-        return self.trace(camera, seed, view).shade(background)
+        frame = self.trace(camera, seed, view)
+        if denoise is not None:
+            frame = frame.denoised(self.relighter.surface_maps(camera, self.estimation)[0]["albedo"])
+        return frame.shade(background)
 
 
 @dataclass(frozen=True)
@@ -307,24 +317,47 @@ class TracedFrame:
     Attributes:
         view: what the camera sees, of sub-pixels, if so.
         arriving: the light that reaches it.
+        noise: (H, W, 3) radiance that is taken away from ``lit``, 0 where no surfel is; None: nothing.
     """
 
     lighting: Lighting
     estimation: Estimation
     view: GBuffer
     arriving: Arriving
+    noise: np.ndarray | None = None
 
     def shade(self, background: Sequence[float] | None = None) -> Guidance:
         """The frame; ``background`` as of :meth:`Illumination.render`."""
-        return shade(self.view, self.arriving, self.lighting, background, self.estimation)
+        frame = shade(self.view, self.arriving, self.lighting, background, self.estimation)
+        if self.noise is None:
+            return frame
+        lit = np.maximum(frame.lit - self.noise, 0)
+        return replace(frame, lit=lit, shadowed=frame.shadowed if self.estimation.bounces else lit)
+
+    def denoised(self, albedo: np.ndarray) -> TracedFrame:
+        """The frame whose ``lit`` is through Open Image Denoise (:mod:`tron.denoising`).
+
+        So is ``shadowed`` where nothing bounces; the other buffers are as they were, and so is what stands
+        behind the surfels, which has no noise but for shadows on a ground.
+
+        Args:
+            albedo: (H, W, 3) member of :func:`tron.shading.guidance.surface_maps` of the view.
+
+        Raises:
+            TronError: pyoidn is not there.
+        """
+        over_black = replace(self, noise=None).shade((0, 0, 0))
+        noise = over_black.lit - denoised(over_black.lit, albedo)
+        return replace(self, noise=np.where(over_black.mask[..., None] > 0, noise, 0))
 
 
 def views_under(lights: Sequence[Illumination], camera: Camera) -> list[GBuffer]:
-    """What a camera sees under each light of one relighter; once for as many sub-pixels."""
+    """What a camera sees under each light of one relighter; once for those that see alike."""
     tracer = lights[0].relighter.tracer(camera)
     views: dict[int, GBuffer] = {}
-    for times in {light.estimation.supersample for light in lights}:
-        alike = [k for k, light in enumerate(lights) if light.estimation.supersample == times]
+    seeing = [(light.estimation.supersample, light.estimation.rays > 0) for light in lights]
+    for kind in dict.fromkeys(seeing):
+        alike = [k for k, other in enumerate(seeing) if other == kind]
         bounces = [lights[k].bounced for k in alike]
         views |= zip(alike, trace_views(tracer, camera, lights[alike[0]].estimation, bounces), strict=True)
     return [views[k] for k in range(len(lights))]

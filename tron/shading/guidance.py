@@ -35,7 +35,7 @@ from tron.color import Look, to_display
 from tron.estimation import FINAL, MOST_RAYS, OCTAVES, Diffuse, Estimation
 from tron.io.images import write_image
 from tron.metering import incident_exposure
-from tron.shading.bounces.bounce import BouncedLight
+from tron.shading.bounces.bounce import EVEN, SHOWN_RAYS, BouncedLight
 from tron.shading.composition import Bounced, Response, evenly_bounced, over_background
 from tron.shading.direct.irradiance import Occluder
 from tron.shading.direct.visibility import Shadows, visibility_and_terms
@@ -194,7 +194,7 @@ def trace_views(
 ) -> list[GBuffer]:
     """:func:`trace_view` under many lights, traced once: they differ in the values of their ``bounces``."""
     times = estimation.supersample
-    values = [bounce.values() if bounce and estimation.bounces else [] for bounce in bounces]
+    values = [bounce.values(estimation.rays) if bounce and estimation.bounces else [] for bounce in bounces]
     view = camera if times == 1 else camera.resized(times * camera.width, times * camera.height)
     every = [value for own in values for value in own]
     gbuffer = tracer.gbuffer(view, every) if every else tracer.gbuffer(view)
@@ -212,8 +212,11 @@ def arriving_light(
 ) -> Arriving:
     """Light that reaches the pixels of :func:`trace_view`; arguments as of :func:`render_guidance`."""
     estimation = estimation.of_sub_pixel()
-    share, terms = visibility_and_terms(tracer, gbuffer, lighting, estimation, seed)
-    arriving = Arriving(share, terms=terms)
+    if estimation.rays == 0 and len(gbuffer.values) > EVEN:
+        arriving = Arriving(mi.Color3f(*gbuffer.values[EVEN:]))
+    else:
+        share, terms = visibility_and_terms(tracer, gbuffer, lighting, estimation, seed)
+        arriving = Arriving(share, terms=terms)
     if bounce is not None and estimation.bounces and estimation.reflections:
         occluder = tracer.sided(estimation.two_sided)
         arriving.mirror = reflections(
@@ -263,7 +266,7 @@ def shade_surface(
 def _bounced(surface: Surface, arriving: Arriving) -> Bounced | None:
     if not surface.values:
         return None
-    indirect, openness = mi.Color3f(*surface.values[:3]), surface.values[3]
+    indirect, openness = mi.Color3f(*surface.values[:3]), surface.values[EVEN - 1]
     if arriving.mirror is None:
         even = evenly_bounced(indirect, openness, arriving.visibility, surface.roughness)
         return even if arriving.metals is None else with_metals(even, arriving.metals, surface)
@@ -366,6 +369,6 @@ def surface_maps(
 def _sampling(estimation: Estimation, octaves: np.ndarray) -> np.ndarray:
     """``sampling`` from its last channel, (H, W, 1)."""
     kind = (estimation.filtered + 2 * (estimation.supersample > 1)) / 3
-    rays = min(np.log2(estimation.rays) / MOST_RAYS, 1)
+    rays = min(np.log2(estimation.rays or SHOWN_RAYS) / MOST_RAYS, 1)
     told = np.broadcast_to([kind, rays], (*octaves.shape[:2], 2))
     return np.concatenate([told, octaves], axis=-1).astype(np.float32)

@@ -249,3 +249,32 @@ def test_frames_are_written_as_pictures_and_as_light(light, scene, tmp_path):
     np.testing.assert_allclose(shown.reshape(32, 32, -1)[..., 0], frame.mask, atol=0.5 / 255 + 1e-6)
     with pytest.raises(KeyError):
         frame.write(tmp_path / "none.png", "none")
+
+
+def test_a_denoised_frame_is_nearer_to_many_rays_and_keeps_what_has_no_noise(light, scene):
+    pytest.importorskip("pyoidn", reason="pip install 'tron-relight[oidn]'")
+    lit = Relighter(scene, Estimation(rays=2)).under(light)
+    camera = VIEWS[0].resized(96, 96)
+    truth, noisy = lit.framed(rays=512, supersample=2).render(camera, 1), lit.render(camera)
+    clean = lit.render(camera, denoise="oidn")
+    for name in set(Guidance.BUFFERS) - {"lit"}:
+        np.testing.assert_array_equal(clean[name], noisy[name], err_msg=name)
+    empty = noisy.mask == 0
+    assert empty.any()
+    np.testing.assert_array_equal(clean.lit[empty], noisy.lit[empty])
+    shown = [to_display(frame.lit, 1.0)[noisy.mask > 0.9] for frame in (clean, noisy, truth)]
+    errors = [np.square(each - shown[2]).mean() for each in shown]
+    assert errors[0] < 0.3 * errors[1]
+    assert_same(lit.render(camera, denoise="oidn"), clean)
+    over_black = lit.render(camera, background=(0, 0, 0), denoise="oidn")
+    behind = noisy.lit - lit.render(camera, background=(0, 0, 0)).lit
+    np.testing.assert_allclose(clean.lit, over_black.lit + behind, atol=1e-5)
+
+
+def test_without_bounces_shadowed_is_denoised_too(light, scene):
+    """Then it is the relit picture, and the same as lit."""
+    pytest.importorskip("pyoidn", reason="pip install 'tron-relight[oidn]'")
+    lit = Relighter(scene, Estimation(rays=2, bounces=0)).under(light)
+    clean = lit.render(VIEWS[0], denoise="oidn")
+    np.testing.assert_array_equal(clean.shadowed, clean.lit)
+    assert np.abs(clean.lit - lit.render(VIEWS[0]).lit).max() > 0.01

@@ -217,7 +217,7 @@ def trace(
             if not clip.folder.finished(index) or not clip.metered:
                 started = time.perf_counter()
                 light, ray_seed = clip.light(relighter, index), seeds.integer(seed, "relight", index)
-                frame, buffers = _shade(light, camera, ray_seed, clip.folder.buffers, surfaces)
+                frame, buffers = _shade(light, camera, ray_seed, clip, surfaces)
                 clip.seconds.append(time.perf_counter() - started)
                 if not clip.metered:
                     clip.meter(frame)
@@ -230,14 +230,17 @@ def _shade(
     light: Illumination,
     camera: Camera,
     seed: int,
-    names: Sequence[str],
+    clip: Clip,
     surfaces: Callable[[], list[dict[str, np.ndarray]]],
 ) -> tuple[Guidance, dict[str, np.ndarray]]:
-    """One frame and its buffers ``names``; ``surfaces`` gives those that no light shines on."""
+    """One frame and its buffers in the clip; ``surfaces`` gives those that no light shines on."""
     from tron.shading.composition import background_share
     from tron.shading.guidance import averaged
 
+    names = clip.folder.buffers
     frame = light.trace(camera, seed)
+    if clip.picture.denoised:
+        frame = frame.denoised(surfaces()[0]["albedo"])
     guidance = frame.shade()
     # The share is no linear function of opacity: a pixel has the mean of those of its sub-pixels.
     transmittance = 1 - frame.view.images({"opacity": frame.view.opacity})["opacity"]

@@ -38,6 +38,7 @@ from tron.cli.command_line import command
 from tron.cli.installation import require_extra
 from tron.cli.progress import working
 from tron.cli.recipes import model_defaults
+from tron.denoising import require_oidn
 from tron.errors import TronError, located
 from tron.framing import upright
 from tron.gaussians.foreign_files import refuse_foreign
@@ -74,6 +75,8 @@ def main(settings: Settings) -> None:
     )
 
     clock = _Clock()
+    if settings.denoise == "oidn":
+        require_oidn("denoise=oidn")
     _check_paths(settings, settings.by_light())
     settings = settings.shaped()
     lights = settings.by_light()
@@ -232,7 +235,7 @@ def _load_scene(settings: Settings) -> GaussianScene:
 def _clip(
     light: Settings, environment: EnvironmentMap, frames: int, guidance: Sequence[str], averaged: bool
 ) -> Clip:
-    picture = RelitPicture(light.background, light.source, light.look)
+    picture = RelitPicture(light.background, light.source, light.look, light.denoise == "oidn")
     needed = (*guidance, *picture.buffers, *light.buffers, *([DEPTH] if averaged else []))
     buffers = [name for name in needed if name != "relit"]
     return Clip(
@@ -274,6 +277,7 @@ def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> 
         "up": [round(float(value), 6) for value in turn[2]],
         **light.model_dump(mode="json", include=keys),
         **light.estimation().model_dump(mode="json"),
+        **({"denoise": light.denoise} if light.denoise == "oidn" else {}),  # else `filtered` says it
         "version": tron.__version__,
     }
 
@@ -310,9 +314,9 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
 
     A checkpoint that was asked for has to fit. That of checkpoint=auto gives way with a line in the log:
     where the libraries of networks or its file are not installed; where nothing bounces and it is given lit;
-    where radiance is asked for, which a network does not draw; and where it does not surely gain at that
-    size and quality (:mod:`tron.apps.relight.network_gains`). Where window, overlap, reproject or weights are
-    chosen, it has to fit too.
+    where radiance is asked for, which a network does not draw; where Open Image Denoise is; and where it does
+    not surely gain at that size and quality (:mod:`tron.apps.relight.network_gains`). Where window, overlap,
+    reproject or weights are chosen, it has to fit too.
 
     Raises:
         TronError: the checkpoint is missing, damaged, or does not fit the settings.
@@ -322,6 +326,8 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     if not settings.takes_default:
         return settings, _loaded(settings)
     try:
+        if settings.denoise == "oidn":
+            raise TronError("denoise=oidn draws the pictures")
         if "relit" in settings.buffers:
             raise TronError("buffers ask for relit.exr, and a network draws display values")
         estimation, (width, height) = settings.estimation(), settings.size

@@ -92,8 +92,9 @@ class Settings(BaseModel):
     )
     quality: Literal["preview", "final"] = Field(
         "preview",
-        description="preview: 2 shadow rays per pixel; final: 64, over 2 x 2 sub-pixels, and 4 "
-        "rays that look for reflections of the scene in itself; both filtered",
+        description="preview: shadows of 32 rays from each surfel, once a light, and none from pixels; "
+        "final: 64 a pixel, over 2 x 2 sub-pixels, filtered, and 4 rays that look for reflections of the "
+        "scene in itself",
     )
     bounces: int = Field(
         FINAL.bounces,
@@ -121,7 +122,12 @@ class Settings(BaseModel):
         FINAL.two_sided,
         description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
     )
-    denoise: bool = Field(True, description="filter of the shadows' noise; false: as they are traced")
+    denoise: bool | Literal["oidn"] = Field(
+        True,
+        description="filter of the shadows' noise; false: as they are traced; oidn: filtered, and the relit "
+        "picture besides by Intel's Open Image Denoise, led by base color, in place of a network "
+        "(pip install 'tron-relight[oidn]')",
+    )
     frames: int = Field(60, ge=1, le=10_000, description="number of frames (those of `cameras` win)")
     width: Side | None = Field(
         None,
@@ -225,6 +231,14 @@ class Settings(BaseModel):
         return self
 
     @model_validator(mode="after")
+    def _drawn_by_one(self) -> Settings:
+        if self.denoise == "oidn" and self.checkpoint is not None and not self.takes_default:
+            raise ValueError(
+                "denoise=oidn and a checkpoint would both draw the picture: leave one of the two out"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _reflects_something(self) -> Settings:
         require_bounces(self.bounces, self.reflections or 0)
         return self
@@ -232,7 +246,7 @@ class Settings(BaseModel):
     def estimation(self) -> Estimation:
         """Estimation of the light: what quality says, unless the settings do."""
         said = {
-            "filtered": self.denoise,
+            "filtered": self.denoise is not False,
             "reflections": self.reflections if self.bounces else 0,
             "supersample": self.supersample,
             **self.model_dump(include={"estimator", "two_sided", "bounces", "diffuse"}),

@@ -39,7 +39,7 @@ def visibility(
         estimation: how.
         seed: root of the shadow rays' random numbers.
     """
-    return _visibility(tracer, gbuffer, lighting, estimation, seed, [])
+    return _visibility(tracer, gbuffer, lighting, estimation.of_pixels(), seed, [])
 
 
 def _visibility(
@@ -68,6 +68,7 @@ def visibility_and_terms(
 
     Those of a pixel's few rays are averaged over its neighbours; None where the material has none.
     """
+    estimation = estimation.of_pixels()
     if estimation.diffuse == "lambert":
         return visibility(tracer, gbuffer, lighting, estimation, seed), None
     sums = BurleySums.none(gbuffer)
