@@ -196,11 +196,21 @@ def test_a_command_whose_extra_is_missing_says_so(smallest: Path, tmp_path: Path
 def test_help_lists_every_key_without_the_extra_and_names_it(smallest: Path, tmp_path: Path, command: str):
     shown = start(smallest, command, "--help", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
-    extra = f"tron-relight[{command.removeprefix('tron-')}]"
-    installed = command == "tron-relight"  # the one whose libraries this environment has
+    installed = command in ("tron-relight", "tron-edit")  # whose libraries this environment has
+    extra = f"tron-relight[{'relight' if installed else command.removeprefix('tron-')}]"
     first = f"of {extra}, which is installed" if installed else f"needs pip install '{extra}'"
     assert shown.stdout.startswith(first)
-    assert "\n  output_dir=" in shown.stdout
+    assert "\n  output" in shown.stdout
+
+
+def test_a_scene_is_edited_without_torch(smallest: Path, tmp_path: Path):
+    make_ball().save(tmp_path / "ball.ply")
+    insert = "- {action: insert, file: ball.ply, at: [0, 0, 3], object: 5}\n"
+    (tmp_path / "edits.yaml").write_text(insert + "- {action: remove, select: {object: 5}}\n")
+    asked = ("scene=ball.ply", "edits=edits.yaml", "output=edited.ply")
+    done = start(smallest, "tron-edit", *asked, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "edited.ply").read_bytes() == (tmp_path / "ball.ply").read_bytes()
 
 
 def make_ball() -> GaussianScene:

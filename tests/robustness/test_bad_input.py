@@ -39,6 +39,7 @@ BAD_FILES = [
     ("tron-edit", ["edits={inputs}/walk.yaml"], ["edit 1: remove", "there is no object 9"]),
     ("tron-edit", ["edits=[{inputs}/good.yaml,{inputs}/good.yaml]"], ["object 0 is named by both lists"]),
     ("tron-edit", ["cameras={inputs}/text.hdr"], ["text.hdr"]),
+    ("tron-edit", ["cameras={inputs}/empty"], ["no cameras.json and no transforms.json", "empty"]),
     ("tron-edit", ["output={inputs}/good.ply"], ["output is the scene itself"]),
     ("tron-edit", ["output=cut.obj"], ["output is no PLY", "cut.obj"]),
     ("tron-relight", ["scene={inputs}/empty"], ["empty"]),

@@ -23,6 +23,7 @@ from tron.gaussians.scene import GaussianScene
 
 log = logging.getLogger(__name__)
 
+CAMERAS_FILES = (CAMERAS, "transforms.json")
 SHOWN_OBJECTS = 20
 
 
@@ -42,8 +43,8 @@ class Settings(BaseModel):
     output: Path = Field(description="PLY to write, or to replace; not the scene's own")
     cameras: Path | None = Field(
         None,
-        description="JSON of the views that edits pick pixels or give masks in, as tron-relight takes it; "
-        "null: cameras.json beside the scene",
+        description="JSON of the views that edits pick pixels or give masks in, as tron-relight takes it, or "
+        "a folder with a cameras.json or transforms.json; null: cameras.json beside the scene",
     )
     up: tuple[float, float, float] | None = Field(
         None,
@@ -102,7 +103,7 @@ def main(settings: Settings) -> None:
 
 
 def _check_paths(settings: Settings) -> None:
-    for path in (settings.scene, *_files(settings), settings.cameras):
+    for path in (settings.scene, *_files(settings), _cameras_file(settings)):
         if path is not None and not path.is_file():
             if path.is_dir():
                 raise TronError("cannot read: is a folder", path, "give one file of it")
@@ -115,6 +116,18 @@ def _check_paths(settings: Settings) -> None:
         raise TronError("output is the scene itself", settings.output, "give another name")
     refuse_foreign(settings.scene)
     check_header(settings.scene)
+
+
+def _cameras_file(settings: Settings) -> Path | None:
+    """The file of cameras that was asked for: of a folder, the one in it."""
+    path = settings.cameras
+    if path is None or not path.is_dir():
+        return path
+    for name in CAMERAS_FILES:
+        if (path / name).is_file():
+            return path / name
+    mend = "give the cameras.json that tron-reconstruct writes beside its scene"
+    raise TronError(f"the folder holds no {' and no '.join(CAMERAS_FILES)}", path, mend)
 
 
 def _files(settings: Settings) -> tuple[Path, ...]:
@@ -131,7 +144,7 @@ def _read(settings: Settings) -> tuple[EditList, str]:
 
 
 def _views(settings: Settings, scene: GaussianScene) -> Views:
-    path = settings.cameras or settings.scene.with_name(CAMERAS)
+    path = _cameras_file(settings) or settings.scene.with_name(CAMERAS)
     if settings.cameras is None and not path.is_file():
         return Views(seed=settings.seed)
     try:

@@ -61,10 +61,11 @@ def test_insert_then_remove_gives_the_scene_back(folder):
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.parametrize("beside", [True, False], ids=["beside-the-scene", "named"])
-def test_masks_and_clicks_find_their_views(folder, beside):
+@pytest.mark.parametrize("named", [None, "views.json", "capture"])
+def test_masks_and_clicks_find_their_views(folder, named):
     """A camera above: a mask of the ball's outline, a click on the ball, by name and by number."""
-    path = folder / ("cameras.json" if beside else "views.json")
+    (folder / "capture").mkdir()
+    path = folder / {None: "cameras.json", "capture": "capture/cameras.json"}.get(named, "views.json")
     path.write_text(json.dumps({"names": ["top.jpg"], "cameras": [TOP.to_dict()]}))
     pixels, _ = TOP.project(np.array([[0.1, -0.4, 0.8], [1.0, 1.0, 0.0]]))
     (ball, floor) = pixels.tolist()
@@ -75,7 +76,7 @@ def test_masks_and_clicks_find_their_views(folder, beside):
 - {{action: material, select: {{masks: {{top.jpg: mask.png}}}}, roughness: 0.9}}
 - {{action: remove, select: {{object: [1, 2], clicks: {clicks}}}}}
 """
-    assert edit(folder, edits, *([] if beside else [f"cameras={path}"])) == 0
+    assert edit(folder, edits, *([] if named is None else [f"cameras={folder / named}"])) == 0
     out = GaussianScene.load(folder / "out.ply")
     assert set(np.unique(out.object_id)) == {FLOOR, RING}
     before = GaussianScene.load(folder / "scene.ply")
