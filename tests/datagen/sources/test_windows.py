@@ -124,10 +124,10 @@ def test_neighbours_follow_a_point(windowed):
 def test_clips_take_qualities_in_turn_and_say_so(windowed):
     *_, clips = windowed
     found = {meta.spp["guidance"]: meta for meta, _ in clips}
-    assert {rays: meta.extra["filtered"] for rays, meta in found.items()} == {2: True, 8: False, 64: True}
-    assert {rays: meta.extra["sub_pixels"] for rays, meta in found.items()} == {2: 1, 8: 1, 64: 2}
+    assert {rays: meta.extra["filtered"] for rays, meta in found.items()} == {0: True, 8: False, 64: True}
+    assert {rays: meta.extra["sub_pixels"] for rays, meta in found.items()} == {0: 1, 8: 1, 64: 2}
     assert found[64].spp["reflections"] == FINEST.reflections
-    told = {2: (1 / 3, 0.1), 8: (0, 0.3), 64: (1, 0.6)}
+    told = {0: (1 / 3, 0.5), 8: (0, 0.3), 64: (1, 0.6)}
     for meta, frames in clips:
         kind_and_rays = frames[0]["sampling"][..., :2].reshape(-1, 2)
         np.testing.assert_allclose(
