@@ -17,11 +17,11 @@ import numpy as np
 Quality = Literal["preview", "final"]
 
 GAINS: Mapping[Quality, Mapping[int, float]] = {
-    "preview": {128: 0.96, 256: 0.52, 512: -1.17},
-    "final": {128: -0.38, 256: -1.91, 512: -0.06},
+    "preview": {128: 0.95, 256: -0.36, 512: -1.22},
+    "final": {128: -0.38, 256: -1.91, 512: -0.07},
 }
-"""Quality -> width of square frames, pixels -> dB. Those at 128 are the less of two draws of which clip has
-which quality: the other gave 1.01 and 0.09 (dev/LOG.md)."""
+"""Quality -> width of square frames, pixels -> dB. Those of final are the least of two or three draws of which
+clip has which quality (dev/LOG.md)."""
 
 
 def quality_of(supersample: int, reflections: int) -> Quality:
