@@ -36,6 +36,58 @@ def burley_terms(normal: mi.Vector3f, along: mi.Vector3f, light: mi.Vector3f) ->
     )
 
 
+def even_terms(normal: mi.Vector3f, along: mi.Vector3f) -> mi.Vector3f:
+    """Means of the terms over even light: Beta integrals of 2 c (1 - c)^5 over the cosine c of n and l."""
+    cosine = -dr.dot(normal, along)
+    away = _schlick(cosine)
+    return mi.Vector3f(
+        41 / 42 * (1 - away / 2),
+        (1 - away) * (1 / 21 + cosine / 84) + away * (1 + EVEN_LENGTH * cosine),
+        away * (1 / 21 + cosine / 42 + cosine * cosine / 252 + (1 - cosine * cosine) * 11 / 504),
+    )
+
+
+EVEN_LENGTH = 2 / 3
+"""Length of the mean direction that even light arrives from; of a single direction it is 1."""
+
+
+def terms_of_mean(normal: mi.Vector3f, along: mi.Vector3f, mean: mi.Vector3f) -> mi.Vector3f:
+    """Terms of light whose mean direction is known alone, as of even light and a single direction besides.
+
+    With k the part of that direction u, ``mean`` is k u + (1 - k) 2/3 n, which has one solution in [0, 1].
+    """
+    beyond = mean - EVEN_LENGTH * normal
+    b, c, a = EVEN_LENGTH * dr.dot(beyond, normal), dr.squared_norm(beyond), 1 - EVEN_LENGTH**2
+    part = dr.clip((b + dr.sqrt(b * b + a * c)) / a, 0, 1)
+    single = dr.normalize(dr.select(part > 1e-3, beyond + part * EVEN_LENGTH * normal, normal))
+    return dr.lerp(even_terms(normal, along), burley_terms(normal, along, single), part)
+
+
+@dataclass
+class DirectionSums:
+    """Sum of the directions that light arrives from, and of its luminance; one lane a point."""
+
+    directions: mi.Vector3f
+    weight: mi.Float
+
+    @classmethod
+    def none(cls, lanes: int) -> DirectionSums:
+        """Nothing has arrived yet."""
+        sums = cls(dr.zeros(mi.Vector3f, lanes), dr.zeros(mi.Float, lanes))
+        dr.make_opaque(sums.directions, sums.weight)
+        return sums
+
+    def add(
+        self, directions: Sequence[mi.Vector3f], light: Sequence[mi.Color3f], visible: Sequence[mi.Float]
+    ) -> None:
+        """Add rays, as :meth:`BurleySums.add`."""
+        for direction, value, share in zip(directions, light, visible, strict=True):
+            weight = grey(value) * share
+            self.directions += weight * direction
+            self.weight += weight
+        dr.eval(self.directions, self.weight)
+
+
 @dataclass
 class BurleySums:
     """Sums of the terms over the light that arrives, and of its luminance; one lane a pixel."""

@@ -36,9 +36,10 @@ from tron.estimation import FINAL, MOST_RAYS, OCTAVES, Diffuse, Estimation
 from tron.io.images import write_image
 from tron.metering import incident_exposure
 from tron.shading.bounces.bounce import EVEN, SHOWN_RAYS, BouncedLight
+from tron.shading.burley import terms_of_mean
 from tron.shading.composition import Bounced, Response, evenly_bounced, over_background
 from tron.shading.direct.irradiance import Occluder
-from tron.shading.direct.visibility import Shadows, visibility_and_terms
+from tron.shading.direct.visibility import Shadows, shading_normal, visibility_and_terms
 from tron.shading.lighting import Lighting
 from tron.shading.reflections import Mirror, metal_reflections, reflections, with_metals
 
@@ -213,7 +214,11 @@ def arriving_light(
     """Light that reaches the pixels of :func:`trace_view`; arguments as of :func:`render_guidance`."""
     estimation = estimation.of_sub_pixel()
     if estimation.rays == 0 and len(gbuffer.values) > EVEN:
-        arriving = Arriving(mi.Color3f(*gbuffer.values[EVEN:]))
+        *share, x, y, z = gbuffer.values[EVEN:]
+        terms = None
+        if estimation.diffuse != "lambert":
+            terms = terms_of_mean(shading_normal(gbuffer), gbuffer.direction, mi.Vector3f(x, y, z))
+        arriving = Arriving(mi.Color3f(*share), terms=terms)
     else:
         share, terms = visibility_and_terms(tracer, gbuffer, lighting, estimation, seed)
         arriving = Arriving(share, terms=terms)

@@ -10,7 +10,7 @@ import pytest
 from tron.cameras import Camera
 from tron.estimation import Estimation
 from tron.seeds import generator
-from tron.shading.burley import burley_factor, burley_terms
+from tron.shading.burley import burley_factor, burley_terms, even_terms, terms_of_mean
 from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Lighting, render_guidance
 
@@ -57,3 +57,26 @@ def test_a_floor_under_a_low_sun_has_the_factor_of_its_direction(
     other = render_guidance(sphere_over_plane(sphere=False, base_color=0.0), view, lighting, estimation)
     diffuse = (found.shadowed - other.shadowed)[..., 0] / (0.5 * found.irradiance[..., 0])
     np.testing.assert_allclose(np.median(diffuse), factor[0], rtol=0.03)
+
+
+def test_terms_of_even_light_are_means_of_those_of_single_directions(variant: str) -> None:
+    count, up = 1 << 18, mi.Vector3f(0, 0, 1)
+    square = generator(0, "tests", "even").random((2, count), np.float32)
+    light = mi.warp.square_to_cosine_hemisphere(mi.Point2f(square))
+    for cosine in (0.05, 0.3, 0.9):
+        along = mi.Vector3f(0, float(np.sqrt(1 - cosine**2)), -cosine)
+        means = np.array(burley_terms(up, along, light)).mean(axis=1)
+        np.testing.assert_allclose(np.array(even_terms(up, along)).ravel(), means, rtol=0.01, atol=1e-4)
+
+
+def test_terms_of_a_mean_direction_are_exact_for_one_direction_and_for_even_light(variant: str) -> None:
+    light, view, up = upper(200, "light"), upper(200, "view"), mi.Vector3f(0, 0, 1)
+    even, single = even_terms(up, -view), burley_terms(up, -view, light)
+    for found, expected in (
+        (terms_of_mean(up, -view, light), single),
+        (terms_of_mean(up, -view, dr.zeros(mi.Vector3f, 200) + up * (2 / 3)), even),
+        (terms_of_mean(up, -view, 0.5 * light + up / 3), 0.5 * single + 0.5 * even),
+    ):
+        np.testing.assert_allclose(np.array(found), np.array(expected), atol=2e-4)
+    nothing = terms_of_mean(up, -view, dr.zeros(mi.Vector3f, 200))
+    assert np.isfinite(np.array(nothing)).all()

@@ -20,8 +20,8 @@ GAINS: Mapping[Quality, Mapping[int, float]] = {
     "preview": {128: 0.95, 256: -0.36, 512: -1.22},
     "final": {128: -0.38, 256: -1.91, 512: -0.07},
 }
-"""Quality -> width of square frames, pixels -> dB. Those of final are the least of two or three draws of which
-clip has which quality (dev/LOG.md)."""
+"""Quality -> width of square frames, pixels -> dB. Those of final are the least of two or three draws of
+which clip has which quality (dev/LOG.md)."""
 
 
 def quality_of(supersample: int, reflections: int) -> Quality:

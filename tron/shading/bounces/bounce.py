@@ -30,7 +30,7 @@ from tron.seeds import integer
 from tron.shading.bounces.bounce_rays import Part, SurfelRays, parts
 from tron.shading.bounces.lending import Lending
 from tron.shading.brdf_table import BrdfTable
-from tron.shading.direct.visibility import visibility
+from tron.shading.direct.visibility import visibility, visibility_and_directions
 from tron.shading.lighting import Lighting
 from tron.shading.reflectance import bounce_albedo
 from tron.tracing.hierarchy.first_hit import NOTHING
@@ -59,8 +59,9 @@ class BouncedLight:
         behind: mi.Color3f, radiance that its back sends out, likewise: by light of its own where rays of
             surfels meet it, else by the indirect light of its front.
         openness: mi.Float in [0, 1], share of the surfel's rays that meet nothing.
-        reaching: gives mi.Color3f, the share of the unshadowed irradiance that reaches the surfel, lent among
-            neighbours (:mod:`tron.shading.bounces.lending`); None where that is not known.
+        reaching: gives the share of the unshadowed irradiance that reaches the surfel, by channel, and the
+            mean direction (3 numbers) that it comes from, lent among neighbours
+            (:mod:`tron.shading.bounces.lending`); None where that is not known.
     """
 
     direct: mi.Color3f
@@ -68,15 +69,15 @@ class BouncedLight:
     outgoing: mi.Color3f
     behind: mi.Color3f
     openness: mi.Float
-    reaching: Callable[[], mi.Color3f] | None = None
+    reaching: Callable[[], list[mi.Float]] | None = None
 
     def values(self, rays: int = FINAL.rays) -> list[mi.Float]:
         """What ``SurfelTracer.gbuffer`` composites, for frames of ``rays`` shadow rays a pixel.
 
-        Indirect light and openness, four numbers a surfel; for frames without rays what reaches, three more.
+        Indirect light and openness, four numbers a surfel; for frames without rays what reaches, six more.
         """
-        share = [] if rays or self.reaching is None else [*self.reaching()]
-        return [*self.indirect, self.openness, *share]
+        reaching = [] if rays or self.reaching is None else self.reaching()
+        return [*self.indirect, self.openness, *reaching]
 
 
 class BounceTransport:
@@ -243,10 +244,24 @@ class BounceTransport:
         shown = at_surfels(estimation).model_copy(update={"rays": SHOWN_RAYS})
 
         @cache
-        def reaching() -> mi.Color3f:
-            return self._lending.lent(self.visible(lighting, shown, integer(seed, "shown")))
+        def reaching() -> list[mi.Float]:
+            return self._reaching(lighting, shown, integer(seed, "shown"))
 
         return replace(baked, reaching=reaching)
+
+    def _reaching(self, lighting: Lighting, estimation: Estimation, seed: int) -> list[mi.Float]:
+        """What :class:`BouncedLight` calls so."""
+        found = [dr.zeros(mi.Float, len(self.tracer.scene)) for _ in range(7)]
+        for part in parts(self.tracer):
+            root = integer(seed, "bounce", "direct", part.first)
+            share, sums = visibility_and_directions(self.tracer, part.gbuffer, lighting, estimation, root)
+            for target, value in zip(found, [*share, *sums.directions, sums.weight], strict=True):
+                dr.scatter(target, value, part.surfel, part.gbuffer.opacity > 0)
+            dr.eval(found)
+        *share, x, y, z, weight = self._lending.lent(found)
+        mean = mi.Vector3f(x, y, z) * dr.select(weight > 0, dr.rcp(weight), 0)
+        dr.eval(mean)
+        return [*share, *mean]
 
     @cached_property
     def _lending(self) -> Lending:

@@ -6,6 +6,7 @@ next to the same light, so each takes the mean of its own share and of theirs, b
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -45,10 +46,10 @@ class Lending:
             [mi.Float(aligned(each.astype(np.float32))) for each in weight.T],
         )
 
-    def lent(self, color: mi.Color3f) -> mi.Color3f:
-        """(M,) means of colours of surfels, evaluated."""
-        dr.eval(color)
+    def lent(self, values: Sequence[mi.Float]) -> list[mi.Float]:
+        """(M,) means of each of the values of surfels, evaluated."""
+        dr.eval(values)
         pairs = list(zip(self.lender, self.weight, strict=True))
-        found = mi.Color3f(*(sum(w * dr.gather(mi.Float, c, j) for j, w in pairs) for c in color))
+        found = [sum((w * dr.gather(mi.Float, c, j) for j, w in pairs), mi.Float(0)) for c in values]
         dr.eval(found)
         return found

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.estimation import Estimation
-from tron.shading.burley import BurleySums, grey, mean_terms
+from tron.shading.burley import BurleySums, DirectionSums, grey, mean_terms
 from tron.shading.direct.irradiance import Observer, Occluder, irradiance, visible_share
 from tron.shading.direct.neighbours import neighbourhood_mean
 from tron.shading.direct.noise import NoiseSums, without_noise
@@ -59,6 +59,14 @@ def _visibility(
     observers = [*observers, *(each for each in (narrow, noise) if each is not None)]
     found = irradiance(occluder, gbuffer, lighting.light, estimation.rays, seed, observers=observers)
     return reaching_share(*found, gbuffer, lighting, occluder.scene.spacing, estimation, narrow, noise)
+
+
+def visibility_and_directions(
+    tracer: Shadows, gbuffer: GBuffer, lighting: Lighting, estimation: Estimation, seed: int
+) -> tuple[mi.Color3f, DirectionSums]:
+    """:func:`visibility`, and where the light that arrives comes from."""
+    sums = DirectionSums.none(dr.width(gbuffer.opacity))
+    return _visibility(tracer, gbuffer, lighting, estimation.of_pixels(), seed, [sums]), sums
 
 
 def visibility_and_terms(
