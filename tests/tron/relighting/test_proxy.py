@@ -11,9 +11,18 @@ import pytest
 from tron.cameras import Camera
 from tron.estimation import Estimation
 from tron.gaussians.edit import moved
-from tron.gaussians.scene import GaussianScene
+from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.relighting import Guidance, Relighter, relighter
-from tron.relighting.proxy import THICK, ProxiedTracer, Proxy, fingerprint, make_proxy, seen_by, thickness
+from tron.relighting.proxy import (
+    THICK,
+    ProxiedTracer,
+    Proxy,
+    evened,
+    fingerprint,
+    make_proxy,
+    seen_by,
+    thickness,
+)
 from tron.seeds import generator
 from tron.shading.environments.environment import EnvironmentMap
 from tron.tracing import SurfelTracer
@@ -112,6 +121,19 @@ def specks(frame: Guidance, truth: Guidance) -> float:
     solid = (frame.mask > 0.9) & (truth.mask > 0.9)
     share, true = ((each.irradiance / each.unshadowed).mean(-1) for each in (frame, truth))
     return float((share[solid & (true > 0.9)] < 0.5).mean())
+
+
+def test_normals_that_wander_are_evened_and_edges_stay(dense_surfels):
+    """On a cube: a third of the noise is left, and no face leans towards its neighbour."""
+    box = dense_surfels.scene(dense_surfels.box())
+    noise = generator(0, "tests", "wander").normal(0, 0.15, (len(box), 3))
+    noisy = box.normals() + noise
+    noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
+    even = evened(replace(box, quats=quats_from_normals(noisy))).normals()
+    error = [np.degrees(np.arccos(np.clip((n * box.normals()).sum(1), -1, 1))).mean() for n in (noisy, even)]
+    assert error[1] < error[0] / 3
+    beside = np.sort(np.abs(box.means), axis=1)[:, 1] > 0.65  # of 0.7, where two faces meet
+    assert np.degrees(np.arccos((even * box.normals()).sum(1)[beside])).mean() < error[0] / 2
 
 
 @pytest.mark.usefixtures("short_film")
