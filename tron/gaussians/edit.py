@@ -16,6 +16,12 @@ from tron.gaussians.scene import GaussianScene, measure_spacing, quats_from_matr
 
 _TOLERANCE = 1e-4
 
+KERNEL_WIDTHS = 1.5
+"""A kernel of degree 2 with so many times the scales stands for one of degree 4.
+
+Of a prototype on one scene, drawn with degree 2: 21.3 dB as it is, 27.8 at 1.3, 29.7 at 1.5, 28.8 at 1.7.
+"""
+
 
 def subset(scene: GaussianScene, which: np.ndarray) -> GaussianScene:
     """The surfels ``which``, (M,) bool or indices, alone; their spacing is measured anew.
@@ -54,6 +60,15 @@ def joined(scene: GaussianScene, other: GaussianScene) -> GaussianScene:
     return replace(
         scene, **{name: np.concatenate([getattr(scene, name), getattr(other, name)]) for name in FIELDS}
     )
+
+
+def with_kernel(scene: GaussianScene, degree: int) -> GaussianScene:
+    """The scene with kernels of a degree, 2 or 4; where it is another, surfels get :data:`KERNEL_WIDTHS`."""
+    if scene.kernel_degree == degree:
+        return scene
+    widths = KERNEL_WIDTHS if degree == 2 else 1 / KERNEL_WIDTHS
+    log_scales = scene.log_scales + np.float32(np.log(widths))
+    return replace(scene, log_scales=log_scales, kernel_degree=degree)
 
 
 def scaled(scene: GaussianScene, which: np.ndarray, factor: float, pivot: np.ndarray) -> GaussianScene:
