@@ -163,7 +163,9 @@ def _names(path: Path, count: int) -> list[str]:
     if isinstance(content, list):
         found = [each.get("img_name") for each in content]
     else:
-        found = content.get("names") or [each.get("file_path") for each in content.get("frames", ())]
+        frames = content.get("frames")  # of relight.json their number
+        frames = frames if isinstance(frames, list) else []
+        found = content.get("names") or [each.get("file_path") for each in frames]
     whole = len(found) == count and all(isinstance(each, str) for each in found)
     return [str(each) for each in found] if whole else []
 

@@ -196,7 +196,8 @@ def _one_line(error: ValidationError, where: str) -> TronError:
         return TronError(unknown, where, f"give one of {', '.join(_ACTIONS)}")
     key = ".".join(str(part) for part in first["loc"][1:] if _is_key(part))
     if first["type"] == "extra_forbidden":
-        near = get_close_matches(str(first["loc"][-1]), sorted(_KEYS), n=1)
+        key_given = str(first["loc"][-1])
+        near = get_close_matches(key_given, sorted(_KEYS - {key_given}), n=1)
         return TronError(f"unknown key '{key}'", where, f"did you mean '{near[0]}'?" if near else None)
     reason = first["msg"].removeprefix("Value error, ")
     if first["type"] == "value_error":

@@ -61,12 +61,13 @@ def test_insert_then_remove_gives_the_scene_back(folder):
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.parametrize("named", [None, "views.json", "capture"])
+@pytest.mark.parametrize("named", [None, "views.json", "capture", "relight.json"])
 def test_masks_and_clicks_find_their_views(folder, named):
     """A camera above: a mask of the ball's outline, a click on the ball, by name and by number."""
     (folder / "capture").mkdir()
-    path = folder / {None: "cameras.json", "capture": "capture/cameras.json"}.get(named, "views.json")
-    path.write_text(json.dumps({"names": ["top.jpg"], "cameras": [TOP.to_dict()]}))
+    path = folder / {None: "cameras.json", "capture": "capture/cameras.json"}.get(named, str(named))
+    # relight.json of tron-relight has the number of its frames, too.
+    path.write_text(json.dumps({"names": ["top.jpg"], "cameras": [TOP.to_dict()], "frames": 1}))
     pixels, _ = TOP.project(np.array([[0.1, -0.4, 0.8], [1.0, 1.0, 0.0]]))
     (ball, floor) = pixels.tolist()
     outline = np.linalg.norm(np.indices((64, 64))[::-1].transpose(1, 2, 0) + 0.5 - ball, axis=-1) < 6

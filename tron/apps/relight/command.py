@@ -97,7 +97,7 @@ def main(settings: Settings) -> None:
     scene = surrounded.shown
     filmed = filmed_with(settings.scene, turn, offset)
     if scene.materials_guessed and settings.materials == "auto":
-        scene = with_materials(scene, settings.scene, filmed, settings.seed, surrounded.backdrop)
+        scene = with_materials(scene, settings.scene, filmed, settings.seed, surrounded.backdrop, turn)
     if given is not None:
         cameras = turn_cameras(given, turn)
     else:

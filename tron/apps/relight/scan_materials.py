@@ -30,6 +30,7 @@ def with_materials(
     filmed: Sequence[Camera] | None,
     seed: int,
     backdrop: np.ndarray | None = None,
+    turn: np.ndarray | None = None,
 ) -> GaussianScene:
     """The scan with materials, free of the light it was captured in; as it is where none can be told.
 
@@ -41,6 +42,7 @@ def with_materials(
         filmed: cameras that the scan was filmed with, in its world; None: around it.
         seed: root of the random numbers.
         backdrop: (M,) bool, surfels that are in no light's way, which stay as they are.
+        turn: (3, 3) that the file's scene was turned by; what is kept beside it stands as it does.
     """
     from tron.relighting.proxy import fingerprint  # Mitsuba: not for --help
 
@@ -57,7 +59,7 @@ def with_materials(
                 "%s: they are guessed from its colours, which keep the light it was captured in", error
             )
             return scene
-        found = _found(content, path, kept, made_from, filmed, seed)
+        found = _found(content, path, kept, made_from, filmed, seed, turn)
         if found is None:
             return scene
     values = {name: getattr(found, name) for name in MATERIALS}
@@ -85,6 +87,7 @@ def _found(
     made_from: str,
     filmed: Sequence[Camera] | None,
     seed: int,
+    turn: np.ndarray | None,
 ) -> GaussianScene | None:
     from tron.reconstruction.film import film_of_scan
     from tron.reconstruction.materials.carried import carry_materials
@@ -98,7 +101,8 @@ def _found(
         return None
     scene = carried.scene
     try:
-        write_ply(kept, vars(scene) | {"normals": scene.normals()}, [f"materials {made_from}"])
+        own = scene if turn is None or np.allclose(turn, np.eye(3)) else scene.rotated(turn.T)
+        write_ply(kept, vars(own) | {"normals": own.normals()}, [f"materials {made_from}"])
         carried.proxy.save(path.with_suffix(".proxy.ply"), fingerprint(scene, filmed))
         log.info("they are kept in %s", kept)
     except TronError as error:

@@ -55,6 +55,18 @@ def test_materials_are_found_once_and_kept_until_the_scan_changes(asked, plain, 
     assert asked == [4, 4]
 
 
+def test_what_is_kept_stands_as_the_scan_does(asked, plain, tmp_path):
+    """Cameras and edits of one are right for the other."""
+    lying = plain.rotated(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    scene = with_materials(lying.rotated(turn), tmp_path / "scan.ply", None, 0, None, turn)
+    kept = GaussianScene.load(tmp_path / "scan.materials.ply")
+    np.testing.assert_allclose(kept.means, lying.means, atol=1e-5)
+    np.testing.assert_allclose(kept.up, lying.up, atol=1e-6)
+    np.testing.assert_array_equal(kept.base_color, scene.base_color)
+    np.testing.assert_allclose(scene.up, [0, 0, 1], atol=1e-6)
+
+
 def test_the_proxy_that_they_were_found_on_is_the_one_that_light_sees(asked, plain, tmp_path, caplog):
     from tron.relighting import Relighter
 
