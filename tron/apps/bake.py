@@ -104,7 +104,7 @@ def main(settings: Settings) -> None:
     scene = surrounded.shown
     filmed = filmed_with(settings.scene, turn, offset)
     if scene.materials_guessed and settings.materials == "auto":
-        scene = with_materials(scene, settings.scene, filmed, settings.seed, surrounded.backdrop)
+        scene = with_materials(scene, settings.scene, filmed, settings.seed, surrounded.backdrop, turn)
     relighter = Relighter(
         scene, PREVIEW, settings.seed, backdrop=surrounded.backdrop, proxy=settings.proxy,
         cameras=filmed, proxy_file=settings.scene.with_suffix(".proxy.ply"),

@@ -108,6 +108,23 @@ def test_a_scene_without_signs_of_normals_is_baked_too(scene, sun):
     assert np.sqrt((difference**2).mean()) < 0.06
 
 
+def test_from_behind_shows_what_lies_beyond_where_cameras_see_through(dense_surfels):
+    """A red sheet before a blue one, seen from the red one's back: other viewers draw that."""
+    red, blue = dense_surfels.plane(0.1, 1.0), dense_surfels.plane(0.1, 1.0)
+    blue = replace(blue, points=blue.points + np.array([0, 0, 0.5]), normals=-blue.normals)
+    color = np.repeat([[0.8, 0.05, 0.05], [0.05, 0.05, 0.8]], len(red.points), axis=0)
+    sheets = dense_surfels.scene(red, blue, spacing=0.1, base_color=color)
+    middle = np.flatnonzero(np.abs(red.points).max(axis=1) < 0.4)
+    for oriented in (True, False):
+        scene = replace(sheets, oriented=oriented)
+        light = Relighter(scene, PREVIEW, proxy="never").under(EnvironmentMap.constant(1.0))
+        sh = baked(light, 1.0).sh[middle]
+        r, _, b = eval_sh(sh, np.array([0.0, 0.0, 1.0])).mean(axis=0)
+        assert (b > r) == oriented
+        r, _, b = eval_sh(sh, np.array([0.0, 0.0, -1.0])).mean(axis=0)
+        assert r > b
+
+
 def test_light_that_does_not_bounce_is_refused(scene, sun):
     with pytest.raises(TronError, match="bounces=1"):
         baked(Relighter(scene, Estimation(bounces=0)).under(sun), 1.0)
