@@ -122,6 +122,7 @@ PAPER = {
     "train": {"renderer.config.guidance": ["pbr", "irradiance"]},
     "eval": {},
     "edit": {},
+    "bake": {},
 }
 
 

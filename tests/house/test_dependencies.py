@@ -72,7 +72,7 @@ def imports() -> grimp.ImportGraph:
 
 def reached(imports: grimp.ImportGraph, command: str) -> set[str]:
     """Distributions that a command may import, through our modules and their packages' __init__.py."""
-    start = f"tron.apps.{command}" if command in ("relight", "edit", "reconstruct") else command
+    start = f"tron.apps.{command}" if command in ("relight", "edit", "bake", "reconstruct") else command
     own = {name for name in imports.modules if name.partition(".")[0] in PACKAGES}
     todo, foreign = {start} | ({each for each in own if each.startswith(f"{start}.")}), set()
     if command == "reconstruct":  # chosen by prior=NAME
@@ -130,8 +130,9 @@ def test_a_commands_extra_holds_what_it_imports_and_nothing_else(imports: grimp.
         assert installed - BASE - used - UNSEEN == set()
 
 
-def test_edits_need_no_more_than_relighting(imports: grimp.ImportGraph):
-    used = reached(imports, "edit")
+@pytest.mark.parametrize("command", ["edit", "bake"])
+def test_edits_and_bakes_need_no_more_than_relighting(imports: grimp.ImportGraph, command: str):
+    used = reached(imports, command)
     assert "plyfile" in used
     assert used - PEERS <= BASE | names(EXTRAS["relight"])
 

@@ -196,7 +196,7 @@ def test_a_command_whose_extra_is_missing_says_so(smallest: Path, tmp_path: Path
 def test_help_lists_every_key_without_the_extra_and_names_it(smallest: Path, tmp_path: Path, command: str):
     shown = start(smallest, command, "--help", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
-    installed = command in ("tron-relight", "tron-edit")  # whose libraries this environment has
+    installed = command in ("tron-relight", "tron-edit", "tron-bake")  # whose libraries this environment has
     extra = f"tron-relight[{'relight' if installed else command.removeprefix('tron-')}]"
     first = f"of {extra}, which is installed" if installed else f"needs pip install '{extra}'"
     assert shown.stdout.startswith(first)

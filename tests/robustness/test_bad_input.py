@@ -26,8 +26,9 @@ COMPLETE = {
     "tron-eval": ["dataset={inputs}/empty", "renderer={inputs}/text.safetensors"],
     "tron-relight": ["scene={inputs}/good.ply", "environment={inputs}/good.exr"],
     "tron-edit": ["scene={inputs}/good.ply", "edits={inputs}/good.yaml"],
+    "tron-bake": ["scene={inputs}/good.ply", "environment={inputs}/good.exr"],
 }
-WRITES = {"tron-edit": "output=out.ply"}
+WRITES = dict.fromkeys(("tron-edit", "tron-bake"), "output=out.ply")
 """Of commands that write no folder."""
 
 BAD_FILES = [
@@ -42,6 +43,12 @@ BAD_FILES = [
     ("tron-edit", ["cameras={inputs}/empty"], ["no cameras.json and no transforms.json", "empty"]),
     ("tron-edit", ["output={inputs}/good.ply"], ["output is the scene itself"]),
     ("tron-edit", ["output=cut.obj"], ["output is no PLY", "cut.obj"]),
+    ("tron-bake", ["scene={inputs}/absent.ply"], ["file not found", "absent.ply"]),
+    ("tron-bake", ["scene={inputs}/text.ply"], ["text.ply"]),
+    ("tron-bake", ["environment={inputs}/text.hdr"], ["text.hdr"]),
+    ("tron-bake", ["environment={inputs}/empty"], ["is a folder", "empty"]),
+    ("tron-bake", ["output={inputs}/good.ply"], ["output is the scene itself"]),
+    ("tron-bake", ["output=cut.splat"], ["output is no PLY", "cut.splat"]),
     ("tron-relight", ["scene={inputs}/empty"], ["empty"]),
     ("tron-relight", ["scene={inputs}/text.ply"], ["text.ply"]),
     ("tron-relight", ["scene={inputs}/points.ply"], ["points.ply"]),

@@ -1,1 +1,1 @@
-"""Commands of the library: tron-relight, tron-edit and tron-reconstruct, with what belongs to one of them."""
+"""Commands of the library, with what belongs to one: tron-relight, tron-edit, tron-bake, tron-reconstruct."""

@@ -16,6 +16,14 @@ from tron.gaussians.scene import GaussianScene, measure_spacing, quats_from_matr
 
 _TOLERANCE = 1e-4
 
+KERNEL_WIDTHS = 1.4
+"""A kernel of degree 2 with so many times the scales stands for one of degree 4.
+
+Between 1.37, of equal volume, and 1.59, of equal width at half height. Baked light of three development
+scenes at 1.3, 1.4 and 1.5: 31.0, 31.0, 30.7 dB through a rasteriser of 3DGS, drawn by TRON with degree 2
+31.9, 32.8, 32.9; with degree 4 33.9.
+"""
+
 
 def subset(scene: GaussianScene, which: np.ndarray) -> GaussianScene:
     """The surfels ``which``, (M,) bool or indices, alone; their spacing is measured anew.
@@ -54,6 +62,15 @@ def joined(scene: GaussianScene, other: GaussianScene) -> GaussianScene:
     return replace(
         scene, **{name: np.concatenate([getattr(scene, name), getattr(other, name)]) for name in FIELDS}
     )
+
+
+def with_kernel(scene: GaussianScene, degree: int) -> GaussianScene:
+    """The scene with kernels of a degree, 2 or 4; where it is another, surfels get :data:`KERNEL_WIDTHS`."""
+    if scene.kernel_degree == degree:
+        return scene
+    widths = KERNEL_WIDTHS if degree == 2 else 1 / KERNEL_WIDTHS
+    log_scales = scene.log_scales + np.float32(np.log(widths))
+    return replace(scene, log_scales=log_scales, kernel_degree=degree)
 
 
 def scaled(scene: GaussianScene, which: np.ndarray, factor: float, pivot: np.ndarray) -> GaussianScene:

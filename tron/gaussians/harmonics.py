@@ -81,20 +81,19 @@ def dc_to_rgb(dc: np.ndarray) -> np.ndarray:
 
 
 def rotate_sh(sh: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Coefficients of the radiance field turned with its Gaussian by a (3, 3) rotation.
+    """Coefficients of the radiance field turned with its Gaussian by (..., 3, 3) rotations.
 
     sh (..., 16, 3) -> the same shape; eval_sh(rotate_sh(sh, R), R d) = eval_sh(sh, d). Each degree is closed
     under rotation, so a projection through more directions than functions is exact up to rounding.
     """
-    directions = _spread_directions(64)
+    directions = spread_directions(64)
+    before = sh_matrix(directions @ np.asarray(rotation, np.float64))  # rows are R^T d
     # Columns: coefficients, in the turned frame, of each basis function.
-    turn = np.linalg.lstsq(sh_matrix(directions @ np.asarray(rotation).T), sh_matrix(directions), rcond=None)[
-        0
-    ]
-    return np.einsum("jk,...kc->...jc", turn, sh).astype(np.asarray(sh).dtype)
+    turn = np.linalg.pinv(sh_matrix(directions)) @ before
+    return (turn @ sh).astype(np.asarray(sh).dtype)
 
 
-def _spread_directions(count: int) -> np.ndarray:
+def spread_directions(count: int) -> np.ndarray:
     """(count, 3) unit directions of a Fibonacci spiral: even over the sphere, without a random number."""
     z = 1 - (2 * np.arange(count) + 1) / count
     azimuth = math.pi * (3 - math.sqrt(5)) * np.arange(count)

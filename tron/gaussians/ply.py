@@ -81,10 +81,16 @@ _TYPE_BYTES = {
 _EXPORT = "is it a Gaussian scene? export it as an uncompressed 3DGS or 2DGS PLY"
 
 
-def write_ply(path: str | Path, scene: Mapping[str, Any], comments: Sequence[str] = ()) -> None:
+def write_ply(
+    path: str | Path, scene: Mapping[str, Any], comments: Sequence[str] = (), plain: bool = False
+) -> None:
     """Write what a valid scene holds, by the names of GaussianScene's attributes, and its ``normals`` (M, 3).
 
-    Other ``comments`` stand in the header, after those of the scene.
+    Args:
+        path: the file.
+        scene: its values.
+        comments: that stand in the header, after those of the scene.
+        plain: the properties of 3DGS alone, without materials and objects.
 
     Raises:
         TronError: the file cannot be written.
@@ -102,10 +108,10 @@ def write_ply(path: str | Path, scene: Mapping[str, Any], comments: Sequence[str
     add(FIELDS["opacity_logits"].properties, scene["opacity_logits"])
     add(FIELDS["log_scales"].properties, log_scales)
     add([THIRD_SCALE], log_scales.min(axis=1) + np.float32(np.log(FLATNESS)))
-    for name in ("quats", *MATERIALS, "object_id"):
+    for name in ("quats", *(() if plain else (*MATERIALS, "object_id"))):
         add(FIELDS[name].properties, scene[name])
     kinds = {name: "<f8" if values.dtype == np.float64 else "<f4" for name, values in columns.items()}
-    rows = np.empty(len(sh), dtype=list((kinds | {"object_id": "<i4"}).items()))
+    rows = np.empty(len(sh), dtype=list((kinds if plain else kinds | {"object_id": "<i4"}).items()))
     for name, values in columns.items():
         rows[name] = values
     element = plyfile.PlyElement.describe(rows, "vertex")

@@ -1,6 +1,7 @@
 """Light a scene of surfels: one object that owns tracers, sides, bounces, and what to redo after a change."""
 
 from tron.estimation import Estimation
+from tron.relighting.baking import baked
 from tron.relighting.relighter import Illumination, Relighter, TracedFrame, views_under
 from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Guidance
@@ -12,5 +13,6 @@ __all__ = [
     "Illumination",
     "Relighter",
     "TracedFrame",
+    "baked",
     "views_under",
 ]

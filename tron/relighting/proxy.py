@@ -44,6 +44,7 @@ from tron.runtime import aligned
 from tron.tracing import GBuffer, SurfelTracer
 from tron.tracing.fusion import DepthMap, consensus, empty_rays, fuse, pixel_footprint
 from tron.tracing.hierarchy.first_hit import FirstHit
+from tron.tracing.surface import Surface, centres
 from tron.trajectories import film_around, film_with
 
 log = logging.getLogger(__name__)
@@ -246,7 +247,7 @@ class ProxiedTracer:
 
     def gbuffer(self, camera: Camera, values: Sequence[mi.Float] = ()) -> GBuffer:
         """What the camera sees of the scan, where light falls on it; ``values`` of the proxy's surfels."""
-        carried = [dr.gather(mi.Float, value, self._nearest) for value in values]
+        carried = self._carried(values)
         scan = self._scan.gbuffer(camera, [*carried, *self._normals])
         proxy = self.light.gbuffer(camera, values)
         eye, near = mi.Point3f(*(float(v) for v in camera.position)), dr.opaque(mi.Float, self._near)
@@ -264,6 +265,14 @@ class ProxiedTracer:
         )
         dr.eval(merged)
         return merged
+
+    def surfels(self, values: Sequence[mi.Float] = ()) -> Surface:
+        """The scan's surfels at their centres, with the normals and ``values`` of the proxy's nearest."""
+        found = centres(self._scan.records, dr.arange(mi.UInt32, len(self._scan.scene)))
+        return replace(found, normal=mi.Normal3f(*self._normals), values=self._carried(values))
+
+    def _carried(self, values: Sequence[mi.Float]) -> list[mi.Float]:
+        return [dr.gather(mi.Float, value, self._nearest) for value in values]
 
     def first_hits(
         self,

@@ -24,6 +24,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -42,6 +43,7 @@ from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Arriving, Guidance, arriving_light, shade, surface_maps, trace_views
 from tron.shading.lighting import Lighting
 from tron.tracing import GBuffer, SurfelTracer
+from tron.tracing.surface import Surface, centres
 
 log = logging.getLogger(__name__)
 
@@ -168,6 +170,13 @@ class Relighter:
         if self._proxied is not None:
             return self._proxied.light
         return self._tracer if self.scene.oriented else self._tracer.turned_over(self._outward)
+
+    def surfels(self, values: Sequence[mi.Float] = ()) -> Surface:
+        """(M,) the scene's surfels at their centres, facing as light sees them, with ``values`` of a bake."""
+        if self._proxied is not None:
+            return self._proxied.surfels(values)
+        found = centres(self._light.records, dr.arange(mi.UInt32, len(self.scene)))
+        return replace(found, values=list(values))
 
     def gbuffer(self, camera: Camera, values: Sequence[mi.Float] = ()) -> GBuffer:
         """What a camera sees; ``values`` of the surfels that light sees are composited too."""

@@ -43,7 +43,7 @@ metadata.version = installed_version
 from tron.cli import installation
 
 pages = {}
-for command in ("relight", "edit", "reconstruct", "datagen", "train", "evaluate"):
+for command in ("relight", "edit", "bake", "reconstruct", "datagen", "train", "evaluate"):
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         getattr(installation, command)(["--help"])
@@ -62,11 +62,11 @@ def pages(*extras: str) -> dict[str, list[str]]:
 
 def test_the_base_alone_shows_every_command_and_names_its_extra():
     shown = pages()
-    for command, key in {"relight": "scene", "edit": "edits", "reconstruct": "capture",
+    for command, key in {"relight": "scene", "edit": "edits", "bake": "rotation", "reconstruct": "capture",
                          "datagen": "train.scenes", "train": "stages",
                          "evaluate": "benchmark.*"}.items():  # fmt: skip
         name = "eval" if command == "evaluate" else command
-        extra = "relight" if command == "edit" else name
+        extra = "relight" if command in ("edit", "bake") else name
         head, *page = shown[command]
         assert head.startswith(f"needs pip install 'tron-relight[{extra}]'; not installed here: ")
         assert f"usage: tron-{name} [key=value ...] [group=option ...]" in page

@@ -21,7 +21,6 @@ import tron
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.relight.camera_files import (
     CAMERAS,
-    filmed_cameras,
     filmed_orbit,
     in_frame_of,
     read_cameras,
@@ -30,6 +29,7 @@ from tron.apps.relight.camera_files import (
 from tron.apps.relight.clip import DEPTH, Clip, trace
 from tron.apps.relight.network_gains import expected_gain, quality_of
 from tron.apps.relight.scan_materials import with_materials
+from tron.apps.relight.scene_file import filmed_with, load_scene
 from tron.apps.relight.settings import Settings
 from tron.apps.relit import RelitPicture
 from tron.apps.surroundings import treat_surroundings
@@ -86,7 +86,7 @@ def main(settings: Settings) -> None:
         activate(settings.variant, settings.threads)
         settings, renderer = chosen_network(settings)
         lights = settings.by_light()
-        scene = _load_scene(settings)
+        scene = load_scene(settings.scene, settings.up, settings.materials)
     offset = scene.offset
     if given is not None and settings.cameras is not None:
         given = in_frame_of(offset, given, settings.cameras)
@@ -95,7 +95,7 @@ def main(settings: Settings) -> None:
     with working("looking for surroundings"):
         surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
     scene = surrounded.shown
-    filmed = _filmed(settings.scene, turn, offset)
+    filmed = filmed_with(settings.scene, turn, offset)
     if scene.materials_guessed and settings.materials == "auto":
         scene = with_materials(scene, settings.scene, filmed, settings.seed, surrounded.backdrop, turn)
     if given is not None:
@@ -155,16 +155,6 @@ def _ground(
     return ground
 
 
-def _filmed(path: Path, turn: np.ndarray, offset: np.ndarray) -> list[Camera] | None:
-    """Cameras that a scene was filmed with, in the world turned by ``turn``; None where none lie beside."""
-    try:
-        filmed = filmed_cameras(path, offset)
-    except TronError as error:
-        log.warning("%s; the scene is filmed and orbited without it", error)
-        return None
-    return None if filmed is None else turn_cameras(filmed, turn)
-
-
 def _planned(settings: Settings, scene: GaussianScene, filmed: list[Camera] | None) -> list[Camera]:
     """The camera path that the settings name, between the cameras that the scene was filmed with if any."""
     view = {
@@ -211,25 +201,6 @@ def _check_paths(settings: Settings, lights: Sequence[Settings]) -> None:
         raise TronError("output_dir is a file", settings.output_dir, "give a folder, which need not exist")
     refuse_foreign(settings.scene)
     check_header(settings.scene)
-
-
-def _load_scene(settings: Settings) -> GaussianScene:
-    scene = GaussianScene.load(settings.scene)
-    if scene.materials_guessed and settings.materials == "as_is":
-        log.warning(
-            "%s has no materials%s: they are guessed from its colours, which keep the light that it was "
-            "captured in",
-            settings.scene, "" if scene.oriented else " and normals without a sign",
-        )  # fmt: skip
-    if settings.up is not None:
-        scene.up = np.array(settings.up) / np.linalg.norm(settings.up)
-    elif scene.up_guessed:
-        log.warning(
-            "%s does not say which way is up: -y is taken, as in most 3DGS files; if the picture lies on its "
-            "side, give up=[0,0,1] or another direction",
-            settings.scene,
-        )
-    return scene
 
 
 def _clip(

@@ -245,12 +245,14 @@ class BounceTransport:
 
         @cache
         def reaching() -> list[mi.Float]:
-            return self._reaching(lighting, shown, integer(seed, "shown"))
+            return self.reaching(lighting, shown, integer(seed, "shown"), lent=True)
 
         return replace(baked, reaching=reaching)
 
-    def _reaching(self, lighting: Lighting, estimation: Estimation, seed: int) -> list[mi.Float]:
-        """What :class:`BouncedLight` calls so."""
+    def reaching(
+        self, lighting: Lighting, estimation: Estimation, seed: int = 0, *, lent: bool
+    ) -> list[mi.Float]:
+        """(M,) the six numbers that :class:`BouncedLight` calls so, of a surfel's own rays or lent."""
         found = [dr.zeros(mi.Float, len(self.tracer.scene)) for _ in range(7)]
         for part in parts(self.tracer):
             root = integer(seed, "bounce", "direct", part.first)
@@ -258,7 +260,7 @@ class BounceTransport:
             for target, value in zip(found, [*share, *sums.directions, sums.weight], strict=True):
                 dr.scatter(target, value, part.surfel, part.gbuffer.opacity > 0)
             dr.eval(found)
-        *share, x, y, z, weight = self._lending.lent(found)
+        *share, x, y, z, weight = self._lending.lent(found) if lent else found
         mean = mi.Vector3f(x, y, z) * dr.select(weight > 0, dr.rcp(weight), 0)
         dr.eval(mean)
         return [*share, *mean]

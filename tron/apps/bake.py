@@ -1,0 +1,176 @@
+"""tron-bake: a scene under a light as a plain 3DGS file, which every splat viewer draws."""
+
+from __future__ import annotations
+
+import logging
+import math
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from tron.apps.relight.camera_files import filmed_orbit
+from tron.apps.relight.scan_materials import with_materials
+from tron.apps.relight.scene_file import filmed_with, load_scene
+from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
+from tron.cameras import Camera
+from tron.cli.command_line import command
+from tron.cli.progress import track, working
+from tron.color import Look
+from tron.errors import TronError
+from tron.estimation import PREVIEW
+from tron.framing import upright
+from tron.gaussians.edit import with_kernel
+from tron.gaussians.foreign_files import refuse_foreign
+from tron.gaussians.ply import check_header, write_ply
+from tron.gaussians.scene import GaussianScene
+from tron.runtime import activate
+from tron.trajectories import plan_cameras
+
+log = logging.getLogger(__name__)
+
+SIDE = 256
+"""Pixels of the frame that exposure is metered in."""
+MIRRORING = 0.5
+"""Roughness below which lobes are narrower than harmonics of degree 3 can show."""
+
+
+class Settings(BaseModel):
+    """Everything that tron-bake can be told."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    scene: Path = Field(description="PLY of the scene: TRON's, or a plain 3DGS or 2DGS file")
+    environment: Path = Field(
+        description="lat-long environment map, .hdr or .exr (.png and .jpg are clipped)"
+    )
+    output: Path = Field(description="PLY to write, or to replace; not the scene's own")
+    rotation: float = Field(
+        0.0, description="turn of the environment about up, degrees, counter-clockwise seen from above"
+    )
+    exposure: Literal["auto"] | Annotated[float, Field(gt=0)] = Field(
+        "auto",
+        description="factor before the tone curve; auto: metered as by tron-relight, which the log says",
+    )
+    look: Look = Field("photograph", description="tone: AgX with the contrast that photographs have, or none")
+    surroundings: Treatment = Field("drop", description=DESCRIPTION)
+    proxy: Literal["auto", "always", "never"] = Field(
+        "auto", description="what light sees of a scan, as of tron-relight"
+    )
+    materials: Literal["auto", "as_is"] = Field(
+        "auto", description="of a scan without any, as of tron-relight: found and kept, or guessed"
+    )
+    up: tuple[float, float, float] | None = Field(
+        None,
+        description="up direction of the scene, such as [0,0,1]; null: the file's own, -y where it has none",
+        examples=["[0,0,1]"],
+    )
+    seed: int = Field(0, description="root of all random numbers")
+    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = Field(
+        "llvm_ad_rgb", description="Mitsuba variant: processor or NVIDIA GPU"
+    )
+    threads: int | None = Field(None, ge=1, description="threads of the renderer; null: all")
+
+    @field_validator("up")
+    @classmethod
+    def _is_a_direction(cls, up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if up is not None and not 0 < math.hypot(*up) < math.inf:
+            raise ValueError("a direction has a length: give three numbers that are not all 0")
+        return up
+
+
+def main(settings: Settings) -> None:
+    """Light a Gaussian scene and write what it looks like as a plain 3DGS PLY, for any splat viewer.
+
+    Shadows, bounced light and rough reflections are in the file's spherical harmonics (degree 3), as display
+    values: viewers show them as they are. Reflections sharper than harmonics are blurred. The file has 3DGS'
+    kernel and properties, in the scene's own frame; materials stay in the scene.
+    """
+    # Mitsuba: not for --help or a mistyped key
+    from tron.relighting.baking import baked
+    from tron.relighting.relighter import Relighter
+    from tron.shading.environments.environment import EnvironmentMap
+
+    _check_paths(settings)
+    with working("reading the light and the scene"):
+        environment = EnvironmentMap.load(settings.environment)
+        activate(settings.variant, settings.threads)
+        scene = load_scene(settings.scene, settings.up, settings.materials)
+    turn, offset = upright(scene.up), scene.offset
+    scene = scene.upright()  # +z is up in environment maps
+    surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
+    scene = surrounded.shown
+    filmed = filmed_with(settings.scene, turn, offset)
+    if scene.materials_guessed and settings.materials == "auto":
+        scene = with_materials(scene, settings.scene, filmed, settings.seed, surrounded.backdrop, turn)
+    relighter = Relighter(
+        scene, PREVIEW, settings.seed, backdrop=surrounded.backdrop, proxy=settings.proxy,
+        cameras=filmed, proxy_file=settings.scene.with_suffix(".proxy.ply"),
+        track=partial(track, label="light between surfels"), filming=partial(track, label="filming the scan"),
+    )  # fmt: skip
+    light = relighter.under(environment.rotated(settings.rotation))
+    exposure = settings.exposure
+    if exposure == "auto":
+        camera = _front(surrounded.content, filmed)
+        exposure = light.render(camera, settings.seed).exposure(settings.look)
+        log.info(
+            "exposure %.4g, metered; exposure=%.4g keeps it, twice as much is a stop brighter",
+            exposure, exposure,
+        )  # fmt: skip
+    lit = baked(light, exposure, settings.look, partial(track, label="baking"))
+    if not np.allclose(turn, np.eye(3)):
+        lit = lit.rotated(turn.T)
+    plain = with_kernel(lit, 2)
+    write_ply(
+        settings.output,
+        vars(plain) | {"normals": plain.normals(), "materials_guessed": True},
+        plain=True,
+    )
+    smooth = float((scene.roughness < MIRRORING).mean())
+    if smooth > 0:
+        log.info(
+            "%.0f %% of the surfels have a roughness below %.1f: their reflections are blurred, since "
+            "harmonics of degree 3 hold nothing sharper", 100 * smooth, MIRRORING,
+        )  # fmt: skip
+    log.info("%d splats, for any 3DGS viewer: %s", len(plain), settings.output)
+
+
+def _front(scene: GaussianScene, filmed: list[Camera] | None) -> Camera:
+    """The first view of tron-relight's orbit, of a scene with z up."""
+    view = {"width": SIDE, "height": SIDE, "fov_deg": filmed[0].fov_deg if filmed else 40.0}
+    if filmed:
+        return filmed_orbit(filmed, 1, up=scene.up, distance=1.0, **view)[0]
+    return plan_cameras(scene, "orbit", 1, **view)[0]
+
+
+def _check_paths(settings: Settings) -> None:
+    for path in (settings.scene, settings.environment):
+        if not path.is_file():
+            if path.is_dir():
+                raise TronError("cannot read: is a folder", path, "give one file of it")
+            raise TronError("file not found", path)
+    if settings.output.suffix.lower() != ".ply":
+        raise TronError("output is no PLY", settings.output, "give it a name that ends with .ply")
+    if settings.output.is_dir():
+        raise TronError("output is a folder", settings.output, "give a file in it")
+    if settings.output.exists() and settings.output.samefile(settings.scene):
+        raise TronError("output is the scene itself", settings.output, "give another name")
+    refuse_foreign(settings.scene)
+    check_header(settings.scene)
+
+
+cli = command(
+    "tron-bake",
+    "conf.bake",
+    Settings,
+    main,
+    examples=(
+        "tron-bake scene=surfels.ply environment=studio.hdr output=relit.ply",
+        "tron-bake scene=scan.ply environment=sunset.hdr rotation=90 up=[0,0,1] output=evening.ply",
+    ),
+)
+
+if __name__ == "__main__":
+    cli()
