@@ -28,7 +28,7 @@ COMPLETE = {
     "tron-edit": ["scene={inputs}/good.ply", "edits={inputs}/good.yaml"],
     "tron-bake": ["scene={inputs}/good.ply", "environment={inputs}/good.exr"],
 }
-WRITES = dict.fromkeys(("tron-edit", "tron-bake"), "output=out.ply")
+WRITES: dict[str, str] = dict.fromkeys(("tron-edit", "tron-bake"), "output=out.ply")
 """Of commands that write no folder."""
 
 BAD_FILES = [
