@@ -31,10 +31,10 @@ from tron.gaussians.harmonics import SH_COUNT, eval_sh, rotate_sh, sh_matrix, sp
 from tron.gaussians.scene import GaussianScene
 from tron.relighting.relighter import Illumination
 from tron.seeds import integer
-from tron.shading.bounces.bounce import EVEN, at_surfels
-from tron.shading.burley import terms_of_mean
-from tron.shading.composition import Response, evenly_bounced
+from tron.shading.bounces.bounce import at_surfels
+from tron.shading.composition import Response
 from tron.shading.direct.irradiance import ORIGIN_OFFSET
+from tron.shading.guidance import arrived, bounced_light
 from tron.tracing.hierarchy.first_hit import NOTHING, ray_seeds
 from tron.tracing.surface import Surface
 
@@ -68,14 +68,14 @@ def baked(
     Raises:
         TronError: nothing bounces in the estimation of ``light``.
     """
-    surface, share, mean = _arriving(light)
+    surface = _surfels(light)
     local = mi.Frame3f(mi.Vector3f(surface.normal))
     dr.eval(local)
     front, _, fit, fit_back = _fit()
     sh = np.zeros((len(light.relighter.scene), SH_COUNT, 3), np.float32)
     for number in track(range(DIRECTIONS)):
         surface.direction = _turned(local, front[number])
-        radiance = _radiance(light, surface, share, mean)
+        radiance = _radiance(light, surface)
         display = np.asarray(to_display(radiance, np.float32(exposure), look=look))
         mirrored = fit[:, number] + fit_back[:, number]
         sh += mirrored[:, None] * (display[:, None] - np.float32(0.5))
@@ -123,8 +123,8 @@ def _turned_sh(sh: np.ndarray, frames: np.ndarray) -> np.ndarray:
     return np.concatenate([rotate_sh(sh[part], frames[part]) for part in parts])
 
 
-def _arriving(light: Illumination) -> tuple[Surface, mi.Color3f, mi.Vector3f]:
-    """The surfels with what has bounced, the share of the light that reaches each, and its mean direction."""
+def _surfels(light: Illumination) -> Surface:
+    """The surfels with all values of a bake: what has bounced, and what reaches each by rays of its own."""
     bounced = light.bounced
     if bounced is None:
         raise TronError("a light that does not bounce cannot be baked", mend="give bounces=1 or more")
@@ -132,20 +132,17 @@ def _arriving(light: Illumination) -> tuple[Surface, mi.Color3f, mi.Vector3f]:
     seed = integer(light.seed, "baking")
     reaching = light.relighter.transport.reaching(light.lighting, estimation, seed, lent=False)
     surface = light.relighter.surfels([*bounced.indirect, bounced.openness, *reaching])
-    *share, x, y, z = surface.values[EVEN:]
     dr.eval(surface)
-    return surface, mi.Color3f(*share), mi.Vector3f(x, y, z)
+    return surface
 
 
-def _radiance(light: Illumination, surface: Surface, share: mi.Color3f, mean: mi.Vector3f) -> np.ndarray:
+def _radiance(light: Illumination, surface: Surface) -> np.ndarray:
     """(M, 3) linear radiance of the surfels along ``surface.direction``, as frames without rays have it."""
-    diffuse, normal = light.estimation.diffuse, mi.Vector3f(surface.normal)
-    terms = None if diffuse == "lambert" else terms_of_mean(normal, surface.direction, mean)
-    response = Response.of(surface, light.lighting.split_sum, diffuse, terms)
-    bounced = evenly_bounced(
-        mi.Color3f(*surface.values[:3]), surface.values[EVEN - 1], share, surface.roughness
-    )
-    radiance = response.lit(response.unshadowed * share, bounced)
+    arriving, diffuse = arrived(surface, light.estimation.diffuse), light.estimation.diffuse
+    response = Response.of(surface, light.lighting.split_sum, diffuse, arriving.terms)
+    bounced = bounced_light(surface, arriving)
+    assert bounced is not None
+    radiance = response.lit(response.unshadowed * arriving.visibility, bounced)
     dr.eval(radiance)
     return np.array(radiance).T
 

@@ -36,8 +36,15 @@ def burley_terms(normal: mi.Vector3f, along: mi.Vector3f, light: mi.Vector3f) ->
     )
 
 
+EVEN_LENGTH = 2 / 3
+"""Length of the mean direction that even light arrives from; of a single direction it is 1."""
+
+
 def even_terms(normal: mi.Vector3f, along: mi.Vector3f) -> mi.Vector3f:
-    """Means of the terms over even light: Beta integrals of 2 c (1 - c)^5 over the cosine c of n and l."""
+    """Means of the terms over even light: Beta integrals of 2 c (1 - c)^5 over the cosine c of n and l.
+
+    Arguments as of :func:`burley_terms`. The table's D is what :func:`burley_factor` makes of them.
+    """
     cosine = -dr.dot(normal, along)
     away = _schlick(cosine)
     return mi.Vector3f(
@@ -47,14 +54,14 @@ def even_terms(normal: mi.Vector3f, along: mi.Vector3f) -> mi.Vector3f:
     )
 
 
-EVEN_LENGTH = 2 / 3
-"""Length of the mean direction that even light arrives from; of a single direction it is 1."""
-
-
 def terms_of_mean(normal: mi.Vector3f, along: mi.Vector3f, mean: mi.Vector3f) -> mi.Vector3f:
     """Terms of light whose mean direction is known alone, as of even light and a single direction besides.
 
     With k the part of that direction u, ``mean`` is k u + (1 - k) 2/3 n, which has one solution in [0, 1].
+
+    Args:
+        normal, along: as of :func:`burley_terms`.
+        mean: of the unit world directions to the light, by luminance; no longer than 1.
     """
     beyond = mean - EVEN_LENGTH * normal
     b, c, a = EVEN_LENGTH * dr.dot(beyond, normal), dr.squared_norm(beyond), 1 - EVEN_LENGTH**2
@@ -65,47 +72,15 @@ def terms_of_mean(normal: mi.Vector3f, along: mi.Vector3f, mean: mi.Vector3f) ->
 
 @dataclass
 class DirectionSums:
-    """Sum of the directions that light arrives from, and of its luminance; one lane a point."""
+    """Sums of the unit world directions that light arrives from, by luminance, and of that; one a lane."""
 
-    directions: mi.Vector3f
+    total: mi.Vector3f
     weight: mi.Float
 
     @classmethod
-    def none(cls, lanes: int) -> DirectionSums:
+    def none(cls, surface: Surface) -> DirectionSums:
         """Nothing has arrived yet."""
-        sums = cls(dr.zeros(mi.Vector3f, lanes), dr.zeros(mi.Float, lanes))
-        dr.make_opaque(sums.directions, sums.weight)
-        return sums
-
-    def add(
-        self, directions: Sequence[mi.Vector3f], light: Sequence[mi.Color3f], visible: Sequence[mi.Float]
-    ) -> None:
-        """Add rays, as :meth:`BurleySums.add`."""
-        for direction, value, share in zip(directions, light, visible, strict=True):
-            weight = grey(value) * share
-            self.directions += weight * direction
-            self.weight += weight
-        dr.eval(self.directions, self.weight)
-
-
-@dataclass
-class BurleySums:
-    """Sums of the terms over the light that arrives, and of its luminance; one lane a pixel."""
-
-    normal: mi.Vector3f
-    along: mi.Vector3f
-    terms: mi.Vector3f
-    weight: mi.Float
-
-    @classmethod
-    def none(cls, surface: Surface) -> BurleySums:
-        """Nothing has arrived yet."""
-        lanes = dr.width(surface.opacity)
-        normal, along = dr.detach(mi.Vector3f(surface.normal)), dr.detach(surface.direction)
-        sums = cls(normal, along, dr.zeros(mi.Vector3f, lanes), dr.zeros(mi.Float, lanes))
-        dr.eval(normal, along)
-        dr.make_opaque(sums.terms, sums.weight)
-        return sums
+        return cls(*_nothing(surface))
 
     def add(
         self, directions: Sequence[mi.Vector3f], light: Sequence[mi.Color3f], visible: Sequence[mi.Float]
@@ -113,15 +88,43 @@ class BurleySums:
         """Add rays: unit world directions, the linear light along them, and the share that arrives."""
         for direction, value, share in zip(directions, light, visible, strict=True):
             weight = grey(value) * share
-            self.terms += weight * burley_terms(self.normal, self.along, direction)
+            self.total += weight * self._of(direction)
             self.weight += weight
-        dr.eval(self.terms, self.weight)
+        dr.eval(self.total, self.weight)
+
+    def _of(self, direction: mi.Vector3f) -> mi.Vector3f:
+        return direction
 
 
-def mean_terms(sums: mi.Vector3f, weight: mi.Float) -> mi.Vector3f:
-    """Means of terms, from sums of them by ``weight``; 0 of no weight."""
+@dataclass
+class BurleySums(DirectionSums):
+    """The same of the terms in place of the directions; one lane a pixel."""
+
+    normal: mi.Vector3f
+    along: mi.Vector3f
+
+    @classmethod
+    def none(cls, surface: Surface) -> BurleySums:
+        """Nothing has arrived yet."""
+        normal, along = dr.detach(mi.Vector3f(surface.normal)), dr.detach(surface.direction)
+        dr.eval(normal, along)
+        return cls(*_nothing(surface), normal, along)
+
+    def _of(self, direction: mi.Vector3f) -> mi.Vector3f:
+        return burley_terms(self.normal, self.along, direction)
+
+
+def _nothing(surface: Surface) -> tuple[mi.Vector3f, mi.Float]:
+    lanes = dr.width(surface.opacity)
+    total, weight = dr.zeros(mi.Vector3f, lanes), dr.zeros(mi.Float, lanes)
+    dr.make_opaque(total, weight)
+    return total, weight
+
+
+def weighed_mean(total: mi.Vector3f, weight: mi.Float) -> mi.Vector3f:
+    """Means of terms or directions, from sums of them by ``weight``; 0 of no weight."""
     there = weight > 0
-    return dr.select(there, sums / dr.select(there, weight, 1), 0)
+    return dr.select(there, total / dr.select(there, weight, 1), 0)
 
 
 def burley_factor(terms: mi.Vector3f, roughness: mi.Float, otherwise: mi.Float) -> mi.Float:

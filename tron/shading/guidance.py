@@ -35,7 +35,7 @@ from tron.color import Look, to_display
 from tron.estimation import FINAL, MOST_RAYS, OCTAVES, Diffuse, Estimation
 from tron.io.images import write_image
 from tron.metering import incident_exposure
-from tron.shading.bounces.bounce import EVEN, SHOWN_RAYS, BouncedLight
+from tron.shading.bounces.bounce import BOUNCED_VALUES, SHOWN_RAYS, BouncedLight
 from tron.shading.burley import terms_of_mean
 from tron.shading.composition import Bounced, Response, evenly_bounced, over_background
 from tron.shading.direct.irradiance import Occluder
@@ -213,12 +213,8 @@ def arriving_light(
 ) -> Arriving:
     """Light that reaches the pixels of :func:`trace_view`; arguments as of :func:`render_guidance`."""
     estimation = estimation.of_sub_pixel()
-    if estimation.rays == 0 and len(gbuffer.values) > EVEN:
-        *share, x, y, z = gbuffer.values[EVEN:]
-        terms = None
-        if estimation.diffuse != "lambert":
-            terms = terms_of_mean(shading_normal(gbuffer), gbuffer.direction, mi.Vector3f(x, y, z))
-        arriving = Arriving(mi.Color3f(*share), terms=terms)
+    if estimation.rays == 0 and len(gbuffer.values) > BOUNCED_VALUES:
+        arriving = arrived(gbuffer, estimation.diffuse)
     else:
         share, terms = visibility_and_terms(tracer, gbuffer, lighting, estimation, seed)
         arriving = Arriving(share, terms=terms)
@@ -231,6 +227,15 @@ def arriving_light(
         occluder = tracer.sided(estimation.two_sided)
         arriving.metals = metal_reflections(occluder, gbuffer, lighting, bounce, estimation, seed)
     return arriving
+
+
+def arrived(surface: Surface, diffuse: Diffuse) -> Arriving:
+    """Light that has reached surfels, of a ``surface`` with all values of a bake: found without a ray."""
+    *share, x, y, z = surface.values[BOUNCED_VALUES:]
+    terms = None
+    if diffuse != "lambert":
+        terms = terms_of_mean(shading_normal(surface), surface.direction, mi.Vector3f(x, y, z))
+    return Arriving(mi.Color3f(*share), terms=terms)
 
 
 def shade_surface(
@@ -247,7 +252,7 @@ def shade_surface(
     """
     response = Response.of(surface, lighting.split_sum, diffuse, arriving.terms)
     irradiance = response.unshadowed * arriving.visibility
-    bounced = _bounced(surface, arriving)
+    bounced = bounced_light(surface, arriving)
     if background is None and arriving.behind is not None:
         behind = arriving.behind
     elif background is None:
@@ -268,10 +273,11 @@ def shade_surface(
     return buffers
 
 
-def _bounced(surface: Surface, arriving: Arriving) -> Bounced | None:
+def bounced_light(surface: Surface, arriving: Arriving) -> Bounced | None:
+    """Light that has met the scene, of a surface with the values of a bake; None without."""
     if not surface.values:
         return None
-    indirect, openness = mi.Color3f(*surface.values[:3]), surface.values[EVEN - 1]
+    indirect, openness = mi.Color3f(*surface.values[:3]), surface.values[BOUNCED_VALUES - 1]
     if arriving.mirror is None:
         even = evenly_bounced(indirect, openness, arriving.visibility, surface.roughness)
         return even if arriving.metals is None else with_metals(even, arriving.metals, surface)

@@ -10,6 +10,7 @@ import pytest
 from tron.cameras import Camera
 from tron.estimation import Estimation
 from tron.seeds import generator
+from tron.shading.brdf_table import BrdfTable
 from tron.shading.burley import burley_factor, burley_terms, even_terms, terms_of_mean
 from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Lighting, render_guidance
@@ -66,7 +67,12 @@ def test_terms_of_even_light_are_means_of_those_of_single_directions(variant: st
     for cosine in (0.05, 0.3, 0.9):
         along = mi.Vector3f(0, float(np.sqrt(1 - cosine**2)), -cosine)
         means = np.array(burley_terms(up, along, light)).mean(axis=1)
-        np.testing.assert_allclose(np.array(even_terms(up, along)).ravel(), means, rtol=0.01, atol=1e-4)
+        found = even_terms(up, along)
+        np.testing.assert_allclose(np.array(found).ravel(), means, rtol=0.01, atol=1e-4)
+        for roughness in (0.2, 1.0):  # the table is of Mitsuba's material
+            _, _, factor, _ = BrdfTable.load()(mi.Float(roughness), mi.Float(cosine))
+            ours = burley_factor(found, mi.Float(roughness), mi.Float(0))
+            np.testing.assert_allclose(np.array(ours), np.array(factor), rtol=0.01)
 
 
 def test_terms_of_a_mean_direction_are_exact_for_one_direction_and_for_even_light(variant: str) -> None:

@@ -30,6 +30,7 @@ from tron.seeds import integer
 from tron.shading.bounces.bounce_rays import Part, SurfelRays, parts
 from tron.shading.bounces.lending import Lending
 from tron.shading.brdf_table import BrdfTable
+from tron.shading.burley import weighed_mean
 from tron.shading.direct.visibility import visibility, visibility_and_directions
 from tron.shading.lighting import Lighting
 from tron.shading.reflectance import bounce_albedo
@@ -42,7 +43,7 @@ DIRECT = Estimation(rays=8)
 """Direct light at a surfel: more than 8 rays gain nothing, 32 are worth 0.02 dB."""
 SHOWN_RAYS = 32
 """Shadow rays of a surfel for frames that trace none; of 8 they are 0.4 dB worse."""
-EVEN = 4
+BOUNCED_VALUES = 4
 """Values of a bake at a surfel that every frame has: indirect light and openness."""
 FEWEST = 2
 """Rays that meet the back of a surfel which counts."""
@@ -169,14 +170,12 @@ class BounceTransport:
         Surfels that are neighbours in the hierarchy share out the strata of their shadow rays, and lend each
         other theirs, as pixels do.
         """
-        found = dr.zeros(mi.Color3f, len(self.tracer.scene))
-        for part in parts(self.tracer):
+
+        def of(part: Part) -> mi.Color3f:
             root = integer(seed, "bounce", "direct", part.first)
-            share = visibility(self.tracer, part.gbuffer, lighting, estimation, root)
-            for target, value in zip(found, share, strict=True):
-                dr.scatter(target, value, part.surfel, part.gbuffer.opacity > 0)
-            dr.eval(found)
-        return found
+            return visibility(self.tracer, part.gbuffer, lighting, estimation, root)
+
+        return mi.Color3f(*_of_parts(parts(self.tracer), len(self.tracer.scene), 3, of))
 
     def indirect(
         self, direct: mi.Color3f | Sequence[mi.Color3f], albedo: mi.Color3f, bounces: int = FINAL.bounces
@@ -252,16 +251,19 @@ class BounceTransport:
     def reaching(
         self, lighting: Lighting, estimation: Estimation, seed: int = 0, *, lent: bool
     ) -> list[mi.Float]:
-        """(M,) the six numbers that :class:`BouncedLight` calls so, of a surfel's own rays or lent."""
-        found = [dr.zeros(mi.Float, len(self.tracer.scene)) for _ in range(7)]
-        for part in parts(self.tracer):
+        """(M,) the six numbers that :class:`BouncedLight` calls so, of a surfel's own rays or lent.
+
+        Arguments as of :meth:`visible`.
+        """
+
+        def of(part: Part) -> list[mi.Float]:
             root = integer(seed, "bounce", "direct", part.first)
             share, sums = visibility_and_directions(self.tracer, part.gbuffer, lighting, estimation, root)
-            for target, value in zip(found, [*share, *sums.directions, sums.weight], strict=True):
-                dr.scatter(target, value, part.surfel, part.gbuffer.opacity > 0)
-            dr.eval(found)
+            return [*share, *sums.total, sums.weight]
+
+        found = _of_parts(parts(self.tracer), len(self.tracer.scene), 7, of)
         *share, x, y, z, weight = self._lending.lent(found) if lent else found
-        mean = mi.Vector3f(x, y, z) * dr.select(weight > 0, dr.rcp(weight), 0)
+        mean = weighed_mean(mi.Vector3f(x, y, z), weight)
         dr.eval(mean)
         return [*share, *mean]
 
@@ -294,11 +296,21 @@ def at_surfels(estimation: Estimation) -> Estimation:
 
 def _visible_behind(behind: Undersides, lighting: Lighting, estimation: Estimation, seed: int) -> mi.Color3f:
     """(B,) as :meth:`BounceTransport.visible`, of undersides."""
-    found = dr.zeros(mi.Color3f, dr.width(behind.surfel))
-    for part in behind.parts():
+
+    def of(part: Part) -> mi.Color3f:
         root = integer(seed, "bounce", "direct", "undersides", part.first)
-        share = visibility(behind.tracer, part.gbuffer, lighting, estimation, root)
-        for target, value in zip(found, share, strict=True):
+        return visibility(behind.tracer, part.gbuffer, lighting, estimation, root)
+
+    return mi.Color3f(*_of_parts(behind.parts(), dr.width(behind.surfel), 3, of))
+
+
+def _of_parts(
+    every: Iterable[Part], count: int, values: int, of: Callable[[Part], Iterable[mi.Float]]
+) -> list[mi.Float]:
+    """``values`` numbers of each of ``count`` faces, found part after part."""
+    found = [dr.zeros(mi.Float, count) for _ in range(values)]
+    for part in every:
+        for target, value in zip(found, of(part), strict=True):
             dr.scatter(target, value, part.surfel, part.gbuffer.opacity > 0)
         dr.eval(found)
     return found

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.estimation import Estimation
-from tron.shading.burley import BurleySums, DirectionSums, grey, mean_terms
+from tron.shading.burley import BurleySums, DirectionSums, grey, weighed_mean
 from tron.shading.direct.irradiance import Observer, Occluder, irradiance, visible_share
 from tron.shading.direct.neighbours import neighbourhood_mean
 from tron.shading.direct.noise import NoiseSums, without_noise
@@ -64,8 +64,8 @@ def _visibility(
 def visibility_and_directions(
     tracer: Shadows, gbuffer: GBuffer, lighting: Lighting, estimation: Estimation, seed: int
 ) -> tuple[mi.Color3f, DirectionSums]:
-    """:func:`visibility`, and where the light that arrives comes from."""
-    sums = DirectionSums.none(dr.width(gbuffer.opacity))
+    """:func:`visibility`, and sums of the directions that the light which arrives comes from."""
+    sums = DirectionSums.none(gbuffer)
     return _visibility(tracer, gbuffer, lighting, estimation.of_pixels(), seed, [sums]), sums
 
 
@@ -81,11 +81,11 @@ def visibility_and_terms(
         return visibility(tracer, gbuffer, lighting, estimation, seed), None
     sums = BurleySums.none(gbuffer)
     share = _visibility(tracer, gbuffer, lighting, estimation, seed, [sums])
-    terms, weight, spacing = sums.terms, sums.weight, tracer.sided(estimation.two_sided).scene.spacing
+    terms, weight, spacing = sums.total, sums.weight, tracer.sided(estimation.two_sided).scene.spacing
     if estimation.rays < RATIO_FROM_RAYS:
         for step in (1, 2) if estimation.filtered else (1,):
             (*terms, weight), _ = neighbourhood_mean([*terms, weight], gbuffer, spacing, step=step)
-    terms = mean_terms(mi.Vector3f(terms), weight)
+    terms = weighed_mean(mi.Vector3f(terms), weight)
     dr.eval(terms)
     return share, terms
 
