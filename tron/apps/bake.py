@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import logging
-import math
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field
 
-from tron.apps.relight.camera_files import filmed_orbit
+from tron.apps.relight.camera_files import filmed_orbit, filmed_with
 from tron.apps.relight.scan_materials import with_materials
-from tron.apps.relight.scene_file import filmed_with, load_scene
+from tron.apps.scene_file import Up, check_scene_files, load_scene
 from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
 from tron.cameras import Camera
 from tron.cli.command_line import command
 from tron.cli.progress import track, working
 from tron.color import Look
-from tron.errors import TronError
 from tron.estimation import PREVIEW
 from tron.framing import upright
 from tron.gaussians.edit import with_kernel
-from tron.gaussians.foreign_files import refuse_foreign
-from tron.gaussians.ply import check_header, write_ply
+from tron.gaussians.ply import write_ply
 from tron.gaussians.scene import GaussianScene
 from tron.runtime import activate
 from tron.trajectories import plan_cameras
@@ -62,23 +59,12 @@ class Settings(BaseModel):
     materials: Literal["auto", "as_is"] = Field(
         "auto", description="of a scan without any, as of tron-relight: found and kept, or guessed"
     )
-    up: tuple[float, float, float] | None = Field(
-        None,
-        description="up direction of the scene, such as [0,0,1]; null: the file's own, -y where it has none",
-        examples=["[0,0,1]"],
-    )
+    up: Up = None
     seed: int = Field(0, description="root of all random numbers")
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = Field(
         "llvm_ad_rgb", description="Mitsuba variant: processor or NVIDIA GPU"
     )
     threads: int | None = Field(None, ge=1, description="threads of the renderer; null: all")
-
-    @field_validator("up")
-    @classmethod
-    def _is_a_direction(cls, up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
-        if up is not None and not 0 < math.hypot(*up) < math.inf:
-            raise ValueError("a direction has a length: give three numbers that are not all 0")
-        return up
 
 
 def main(settings: Settings) -> None:
@@ -93,7 +79,7 @@ def main(settings: Settings) -> None:
     from tron.relighting.relighter import Relighter
     from tron.shading.environments.environment import EnvironmentMap
 
-    _check_paths(settings)
+    check_scene_files(settings.scene, settings.output, settings.environment)
     with working("reading the light and the scene"):
         environment = EnvironmentMap.load(settings.environment)
         activate(settings.variant, settings.threads)
@@ -143,22 +129,6 @@ def _front(scene: GaussianScene, filmed: list[Camera] | None) -> Camera:
     if filmed:
         return filmed_orbit(filmed, 1, up=scene.up, distance=1.0, **view)[0]
     return plan_cameras(scene, "orbit", 1, **view)[0]
-
-
-def _check_paths(settings: Settings) -> None:
-    for path in (settings.scene, settings.environment):
-        if not path.is_file():
-            if path.is_dir():
-                raise TronError("cannot read: is a folder", path, "give one file of it")
-            raise TronError("file not found", path)
-    if settings.output.suffix.lower() != ".ply":
-        raise TronError("output is no PLY", settings.output, "give it a name that ends with .ply")
-    if settings.output.is_dir():
-        raise TronError("output is a folder", settings.output, "give a file in it")
-    if settings.output.exists() and settings.output.samefile(settings.scene):
-        raise TronError("output is the scene itself", settings.output, "give another name")
-    refuse_foreign(settings.scene)
-    check_header(settings.scene)
 
 
 cli = command(

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 from tron.apps.relight.camera_files import CAMERAS, cameras_of, in_frame_of
+from tron.apps.scene_file import Up, check_scene_files
 from tron.cli.command_line import command
 from tron.cli.progress import working
 from tron.editing import Edit, EditList, Insert, Material, Views
 from tron.errors import TronError
-from tron.gaussians.foreign_files import refuse_foreign
-from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
 
 log = logging.getLogger(__name__)
@@ -46,19 +44,8 @@ class Settings(BaseModel):
         description="JSON of the views that edits pick pixels or give masks in, as tron-relight takes it, or "
         "a folder with a cameras.json or transforms.json; null: cameras.json beside the scene",
     )
-    up: tuple[float, float, float] | None = Field(
-        None,
-        description="up direction of the scene, such as [0,0,1]; null: the file's own, -y where it has none",
-        examples=["[0,0,1]"],
-    )
+    up: Up = None
     seed: int = Field(0, description="root of all random numbers: of the rays that find what a pixel shows")
-
-    @field_validator("up")
-    @classmethod
-    def _is_a_direction(cls, up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
-        if up is not None and not 0 < math.hypot(*up) < math.inf:
-            raise ValueError("a direction has a length: give three numbers that are not all 0")
-        return up
 
 
 def main(settings: Settings) -> None:
@@ -81,7 +68,7 @@ def main(settings: Settings) -> None:
 
     Writes the scene with the edits done, or nothing. The same is in Python: tron.editing.
     """
-    _check_paths(settings)
+    check_scene_files(settings.scene, settings.output, *_files(settings), _cameras_file(settings))
     edits, where = _read(settings)
     with working("reading the scene"):
         scene = GaussianScene.load(settings.scene)
@@ -100,22 +87,6 @@ def main(settings: Settings) -> None:
     edited.save(settings.output)
     _describe(edited)
     log.info("%d surfels, now %d: %s", len(scene), len(edited), settings.output)
-
-
-def _check_paths(settings: Settings) -> None:
-    for path in (settings.scene, *_files(settings), _cameras_file(settings)):
-        if path is not None and not path.is_file():
-            if path.is_dir():
-                raise TronError("cannot read: is a folder", path, "give one file of it")
-            raise TronError("file not found", path)
-    if settings.output.suffix.lower() != ".ply":
-        raise TronError("output is no PLY", settings.output, "give it a name that ends with .ply")
-    if settings.output.is_dir():
-        raise TronError("output is a folder", settings.output, "give a file in it")
-    if settings.output.exists() and settings.output.samefile(settings.scene):
-        raise TronError("output is the scene itself", settings.output, "give another name")
-    refuse_foreign(settings.scene)
-    check_header(settings.scene)
 
 
 def _cameras_file(settings: Settings) -> Path | None:

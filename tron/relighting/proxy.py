@@ -38,6 +38,7 @@ from tron.cameras import Camera
 from tron.errors import TronError
 from tron.gaussians.fields import FIELDS
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
+from tron.gaussians.neighbours import alike_neighbours
 from tron.gaussians.ply import header_comments, write_ply
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.runtime import aligned
@@ -64,9 +65,9 @@ _PITS = 3
 _NEAR_VOXELS = 4.0
 """Voxels up to which light sees the proxy alone, and by which the proxy may lie behind the scan."""
 _GRAZING = 0.05
-_EVENED, _ALIKE, _MOST_EVENED, _AT_ONCE = 6.0, 0.8, 200, 8192
-"""Deviation in spacings of the Gaussian that normals are evened by, least cosine of those that count, how
-many neighbours at most, and surfels at a time."""
+_EVENED, _ALIKE, _MOST_EVENED = 6.0, 0.8, 200
+"""Deviation in spacings of the Gaussian that normals are evened by, least cosine of those that count, and how
+many neighbours at most."""
 _MADE = "of these views and voxels, closed, normals evened"
 
 
@@ -171,15 +172,8 @@ def evened(surfels: GaussianScene) -> GaussianScene:
     Splats of something smooth and plain, such as a white pot, lie at depths that wander, and light would show
     each wave. Edges stay.
     """
-    tree, normals = KDTree(surfels.means), surfels.normals()
-    even, count = np.empty_like(normals), min(_MOST_EVENED, len(normals))
-    for first in range(0, len(normals), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        found = tree.query(surfels.means[part], k=count)
-        distance, nearest = (np.reshape(each, (-1, count)) for each in found)
-        cosine = np.einsum("mi,mki->mk", normals[part], normals[nearest])
-        weight = np.exp(-0.5 * (distance / (_EVENED * surfels.spacing)) ** 2) * (cosine > _ALIKE)
-        even[part] = np.einsum("mk,mki->mi", weight, normals[nearest])
+    numbers, weights = alike_neighbours(surfels, _MOST_EVENED, _EVENED, _ALIKE)
+    even = np.einsum("mk,mki->mi", weights, surfels.normals()[numbers])
     even /= np.linalg.norm(even, axis=1, keepdims=True)
     return replace(surfels, quats=quats_from_normals(even).astype(np.float32))
 

@@ -8,6 +8,7 @@ Either the cameras or the scene may have had its large coordinates taken away: :
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -23,10 +24,12 @@ from tron.io.local_frame import ORIGIN, moved_cameras
 from tron.io.recognised import refuse_by_sight
 from tron.io.transforms_json import cameras_of_transforms
 from tron.storage import write_atomic
-from tron.trajectories import keyframed
+from tron.trajectories import keyframed, turn_cameras
 
 if TYPE_CHECKING:
     from tron.captures import View
+
+log = logging.getLogger(__name__)
 
 _MEND = (
     'give a list, {"cameras": [...]} as in relight.json, cameras.json of a 3DGS model, a transforms.json, or '
@@ -193,6 +196,16 @@ def filmed_cameras(scene: Path, offset: np.ndarray = ORIGIN) -> list[Camera] | N
     """
     path = scene.with_name(CAMERAS)
     return in_frame_of(offset, cameras_of(path), path) if path.is_file() else None
+
+
+def filmed_with(path: Path, turn: np.ndarray, offset: np.ndarray) -> list[Camera] | None:
+    """Cameras that a scene was filmed with, in the world turned by ``turn``; None where none lie beside."""
+    try:
+        filmed = filmed_cameras(path, offset)
+    except TronError as error:
+        log.warning("%s; the scene is filmed and orbited without it", error)
+        return None
+    return None if filmed is None else turn_cameras(filmed, turn)
 
 
 def filmed_orbit(

@@ -22,6 +22,7 @@ from tron.apps.frame_folder import FrameFolder
 from tron.apps.relight.camera_files import (
     CAMERAS,
     filmed_orbit,
+    filmed_with,
     in_frame_of,
     read_cameras,
     stated,
@@ -29,9 +30,9 @@ from tron.apps.relight.camera_files import (
 from tron.apps.relight.clip import DEPTH, Clip, trace
 from tron.apps.relight.network_gains import expected_gain, quality_of
 from tron.apps.relight.scan_materials import with_materials
-from tron.apps.relight.scene_file import filmed_with, load_scene
 from tron.apps.relight.settings import Settings
 from tron.apps.relit import RelitPicture
+from tron.apps.scene_file import load_scene
 from tron.apps.surroundings import treat_surroundings
 from tron.cameras import Camera
 from tron.cli.command_line import command

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -10,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from tron.apps.relight.camera_files import CAMERAS, cameras_of, frame_size
 from tron.apps.relit import Background
+from tron.apps.scene_file import Up
 from tron.apps.surroundings import DESCRIPTION, Treatment
 from tron.color import Look
 from tron.errors import TronError
@@ -149,11 +149,7 @@ class Settings(BaseModel):
         "photograph",
         description="tone of the relit picture: AgX with the contrast that photographs have, or none",
     )
-    up: tuple[float, float, float] | None = Field(
-        None,
-        description="up direction of the scene, such as [0,0,1]; null: the file's own, -y where it has none",
-        examples=["[0,0,1]"],
-    )
+    up: Up = None
     checkpoint: Path | None = Field(
         Path(AUTO),
         description="renderer.safetensors, or the name of a checkpoint that comes with the package "
@@ -199,13 +195,6 @@ class Settings(BaseModel):
         "llvm_ad_rgb", description="Mitsuba variant: processor or NVIDIA GPU"
     )
     threads: int | None = Field(None, ge=1, description="threads of renderer and network; null: all")
-
-    @field_validator("up")
-    @classmethod
-    def _is_a_direction(cls, up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
-        if up is not None and not 0 < math.hypot(*up) < math.inf:
-            raise ValueError("a direction has a length: give three numbers that are not all 0")
-        return up
 
     @model_validator(mode="after")
     def _has_radiance(self) -> Settings:

@@ -1,0 +1,90 @@
+"""A scene's file as commands take and write it: its up, and what is guessed."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from tron.errors import TronError
+from tron.gaussians.foreign_files import refuse_foreign
+from tron.gaussians.ply import check_header
+from tron.gaussians.scene import GaussianScene
+
+log = logging.getLogger(__name__)
+
+
+def _has_a_length(up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+    if up is not None and not 0 < math.hypot(*up) < math.inf:
+        raise ValueError("a direction has a length: give three numbers that are not all 0")
+    return up
+
+
+Up = Annotated[
+    tuple[float, float, float] | None,
+    AfterValidator(_has_a_length),
+    Field(
+        description="up direction of the scene, such as [0,0,1]; null: the file's own, -y where it has none",
+        examples=["[0,0,1]"],
+    ),
+]
+"""Setting of a direction of any length, in the frame of the scene's file."""
+
+
+def check_scene_files(scene: Path, output: Path, *read: Path | None) -> None:
+    """What a command that makes a PLY of a scene needs is there, and what it writes is another file.
+
+    Args:
+        scene: PLY that is read.
+        output: PLY that is written.
+        read: other files that are read, where they are given.
+
+    Raises:
+        TronError: it is not so.
+    """
+    for path in (scene, *read):
+        if path is not None and not path.is_file():
+            if path.is_dir():
+                raise TronError("cannot read: is a folder", path, "give one file of it")
+            raise TronError("file not found", path)
+    if output.suffix.lower() != ".ply":
+        raise TronError("output is no PLY", output, "give it a name that ends with .ply")
+    if output.is_dir():
+        raise TronError("output is a folder", output, "give a file in it")
+    if output.exists() and output.samefile(scene):
+        raise TronError("output is the scene itself", output, "give another name")
+    refuse_foreign(scene)
+    check_header(scene)
+
+
+def load_scene(
+    path: Path, up: Sequence[float] | None, materials: Literal["auto", "as_is"] = "auto"
+) -> GaussianScene:
+    """The scene of a file, with a line in the log where its materials or which way is up are guessed.
+
+    Args:
+        path: the PLY.
+        up: direction of any length, in the file's frame; None: the file's own.
+        materials: that are guessed are not looked for (as_is).
+    """
+    scene = GaussianScene.load(path)
+    if scene.materials_guessed and materials == "as_is":
+        log.warning(
+            "%s has no materials%s: they are guessed from its colours, which keep the light that it was "
+            "captured in",
+            path, "" if scene.oriented else " and normals without a sign",
+        )  # fmt: skip
+    if up is not None:
+        scene.up = np.array(up) / np.linalg.norm(up)
+    elif scene.up_guessed:
+        log.warning(
+            "%s does not say which way is up: -y is taken, as in most 3DGS files; if the picture lies on its "
+            "side, give up=[0,0,1] or another direction",
+            path,
+        )
+    return scene
