@@ -7,8 +7,10 @@ import pytest
 from tron.cameras import Camera
 from tron.estimation import PREVIEW, Estimation
 from tron.relighting import Relighter
-from tron.seeds import generator
+from tron.seeds import generator, integer
+from tron.shading.bounces.bounce import BOUNCED_VALUES, SHOWN_RAYS, at_surfels
 from tron.shading.bounces.lending import Lending
+from tron.shading.environments.environment import EnvironmentMap
 from tron.tracing import SurfelTracer
 
 VIEW = Camera.look_at((1.5, -2.5, 2.0), (0, 0, 0.2), fov_deg=45, width=64, height=64)
@@ -35,7 +37,7 @@ def test_neighbours_lend_what_is_alike_and_nothing_across_an_edge(dense_surfels)
 @pytest.mark.parametrize("light", ["sun", "sky"])
 def test_light_of_surfels_is_that_of_many_rays_from_pixels(scene, sun_map, light):
     """As near to 1,024 rays a pixel as two filtered ones, but for the edge of a hard shadow."""
-    environment = sun_map if light == "sun" else type(sun_map).constant(1.0)
+    environment = sun_map if light == "sun" else EnvironmentMap.constant(1.0)
     lit = Relighter(scene, PREVIEW).under(environment)
     frames = {
         rays: lit.framed(rays=rays, filtered=rays == 2).render(VIEW).irradiance for rays in (0, 2, 1024)
@@ -46,11 +48,36 @@ def test_light_of_surfels_is_that_of_many_rays_from_pixels(scene, sun_map, light
     assert frames[0][shade].mean() == pytest.approx(frames[1024][shade].mean(), rel=0.25)
 
 
-def test_a_preview_traces_no_shadow_ray(scene, sun_map, monkeypatch):
-    lit = Relighter(scene, PREVIEW).under(sun_map)
+@pytest.mark.parametrize("supersample", [1, 2])
+def test_a_preview_traces_no_shadow_ray(scene, sun_map, monkeypatch, supersample):
+    lit = Relighter(scene, PREVIEW).under(sun_map).framed(supersample=supersample)
     first = lit.render(VIEW)
     monkeypatch.setattr(SurfelTracer, "transmittances", None)
     np.testing.assert_array_equal(lit.render(VIEW).lit, first.lit)
+
+
+def test_what_frames_are_given_is_lent(scene, sun_map):
+    lit = Relighter(scene, PREVIEW).under(sun_map)
+    transport, seed = lit.relighter.transport, integer(lit.seed, "shown")
+    shown = at_surfels(PREVIEW).model_copy(update={"rays": SHOWN_RAYS})
+    own = transport.reaching(lit.lighting, shown, seed, lent=False)
+    given = lit.bounced.values(0)[BOUNCED_VALUES:]
+    np.testing.assert_array_equal(np.stack(given[:3]), np.stack(Lending.among(scene).lent(own[:3])))
+    assert np.abs(np.stack(given[:3]) - np.stack(own[:3])).max() > 0.01
+
+
+@pytest.mark.parametrize("behind", [True, False])
+def test_a_rough_floor_under_a_low_sun_knows_where_its_light_comes_from(dense_surfels, behind):
+    """Even light's factor would be 1.2 times and 0.7 times that of rays from pixels."""
+    floor = dense_surfels.plane(half=1.0)
+    rough = dense_surfels.scene(floor, roughness=np.ones(len(floor.points)))
+    image = np.zeros((128, 256, 3), np.float32)
+    image[55, 126:130] = 1000.0  # 12 degrees up, along -y
+    view = Camera.look_at((0, -6 if behind else 6, 2), (0, 0, 0), fov_deg=8, width=24, height=24)
+    lit = Relighter(rough, PREVIEW).under(EnvironmentMap(image))
+    ours, rays = (lit.framed(rays=n, filtered=False).render(view, background=(0, 0, 0)) for n in (0, 64))
+    solid = rays.mask > 0.99
+    assert ours.lit[solid].mean() == pytest.approx(rays.lit[solid].mean(), rel=0.03)
 
 
 def test_where_nothing_is_baked_pixels_have_two_rays(scene, sun_map):
