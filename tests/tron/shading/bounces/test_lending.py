@@ -61,6 +61,7 @@ def test_what_frames_are_given_is_lent(scene, sun_map):
     transport, seed = lit.relighter.transport, integer(lit.seed, "shown")
     shown = at_surfels(PREVIEW).model_copy(update={"rays": SHOWN_RAYS})
     own = transport.reaching(lit.lighting, shown, seed, lent=False)
+    assert lit.bounced is not None
     given = lit.bounced.values(0)[BOUNCED_VALUES:]
     np.testing.assert_array_equal(np.stack(given[:3]), np.stack(Lending.among(scene).lent(own[:3])))
     assert np.abs(np.stack(given[:3]) - np.stack(own[:3])).max() > 0.01
