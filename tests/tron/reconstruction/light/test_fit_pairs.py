@@ -202,10 +202,12 @@ def test_a_sun_is_told_from_a_soft_light_and_metals_do_not_count(scene, transpor
         assert (finder.find(shown, np.zeros(len(scene)))[1] is not None) == sun
     metallic = (generator(0, "tests", "metal").random(len(scene)) < 0.3).astype(np.float32)
     soft = LightFinder(transport.tracer, colors, bounced, nothing, prior.model_copy(update={"sun": 1.0}), 0)
-    lights = [
-        soft.find(np.where(metallic[:, None] > 0.5, other, shown), metallic)[0] for other in (0.01, 5.0)
-    ]
-    np.testing.assert_array_equal(lights[0].texels, lights[1].texels)
+    first, again, other = (
+        soft.find(np.where(metallic[:, None] > 0.5, value, shown), metallic)[0].texels
+        for value in (0.01, 0.01, 5)
+    )
+    # On a GPU sums run in another order each time; on LLVM both are 0.
+    assert np.linalg.norm(other - first) <= 2 * np.linalg.norm(again - first)
 
 
 def test_surfels_that_no_photo_shows_look_like_the_nearest_four(scene) -> None:

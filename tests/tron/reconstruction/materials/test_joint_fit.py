@@ -264,7 +264,8 @@ def test_irradiance_is_held_grey_and_where_the_meter_has_it(scene: GaussianScene
     ]
     np.testing.assert_array_equal(fits[0].balance, 1)
     balance = fits[1].balance
-    np.testing.assert_allclose(fits[1].environment.image, fits[0].environment.image / balance, rtol=1e-5)
+    # Two fits: on a GPU their sums run in another order (0.1 % was seen).
+    np.testing.assert_allclose(fits[1].environment.image, fits[0].environment.image / balance, rtol=3e-3)
     transport = BounceTransport.trace(SurfelTracer(scene), seed=0)
     bounced = photographed_bounces(transport, fits[1].shown)
     light = EnvironmentMap(fits[1].environment.image * np.float32(capture.exposure))
