@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from datagen.settings import SettingsModel
+from datagen.settings.split import Rays
 from datagen.world.lights import LightChoice
 from tron.captures.load import CaptureSettings as PhotoSettings
 from tron.reconstruction.settings import FitSettings, ReconstructionSettings
@@ -241,8 +242,9 @@ class CapturedSettings(SettingsModel):
         "through (sRGB; of path-traced ones AgX): training and evaluation then show them through AgX, like "
         "all other data. false: display values, with the looks of their own curve.",
     )
-    guidance_spp: int = Field(
-        default=64, ge=2, multiple_of=2, description="Shadow rays per pixel of the surfels' irradiance, even."
+    guidance_spp: Rays = Field(
+        default=64,
+        description="Shadow rays per pixel of the surfels' irradiance, even; preview or final as of splits.",
     )
     photos: PhotoSettings = Field(
         default_factory=lambda: PhotoSettings(test_every=0),

@@ -199,8 +199,11 @@ class LitSurfels:
             display: whether its photos are display values.
             extra: what else is said of it.
         """
-        item, wanted = self.item, self.settings.captured
+        item, wanted, estimation = self.item, self.settings.captured, self.light.estimation
         contrast, share = self.contrast
+        spp = {"guidance": estimation.rays}
+        if estimation.reflections:
+            spp["reflections"] = estimation.reflections
         return ClipMeta(
             key=f"{item.name}-l{light}-c{clip:04d}",
             scene=item.name,
@@ -214,12 +217,14 @@ class LitSurfels:
             exposure=exposure,
             color_space={**color_spaces(reference=False), TARGET: "display" if display else "linear"},
             seeds={"root": self.settings.seed},
-            spp={"guidance": wanted.guidance_spp},
+            spp=spp,
             extra={
                 "style": "captured",
                 "capture": item.capture,
                 "contrast": contrast,
                 "contrast_share": share,
+                "filtered": estimation.filtered,
+                "sub_pixels": estimation.supersample,
                 **extra,
             },
         )

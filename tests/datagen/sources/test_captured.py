@@ -37,6 +37,7 @@ from tron.captures import Capture, View, load_capture
 from tron.cli.recipes import check, compose_recipe
 from tron.color import agx, linear_to_srgb, srgb_to_linear
 from tron.errors import TronError
+from tron.estimation import FINEST
 from tron.io.images import encode_png
 from tron.seeds import generator
 from tron.shards.manifest import Manifest
@@ -103,6 +104,17 @@ def test_clips_hold_neighbouring_photos_as_display_values_and_all_guidance(pairs
                 camera = Camera.from_dict(clip.meta.cameras[k])
                 np.testing.assert_allclose(camera.position, views[name].camera.position, atol=1e-9)
                 assert (camera.width, camera.height) == (20, 16)
+
+
+def test_captures_are_lit_at_a_quality_of_tron_relight(recipe: Recipe, pairs: Path, tmp_path: Path):
+    wanted = recipe(tmp_path / "final", "captured.guidance_spp=final", f"captured.reconstructed={pairs}")
+    assert make(wanted) == 0
+    final = next(read_clips(tmp_path / "final", "test"))
+    assert final.meta.spp == {"guidance": FINEST.rays, "reflections": FINEST.reflections}
+    assert final.meta.extra["sub_pixels"] == FINEST.supersample
+    even = next(clip for clip in read_clips(pairs, "test") if clip.meta.key == final.meta.key)
+    assert even.meta.spp == {"guidance": 2}
+    assert (final.frames["sampling"] > even.frames["sampling"]).any()
 
 
 def test_guidance_times_exposure_is_as_bright_as_the_photos(pairs: Path):
