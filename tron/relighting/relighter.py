@@ -196,22 +196,48 @@ class Relighter:
         _ = self.transport if self.estimation.bounces else self.proxy
         return self
 
-    def under(self, light: Light, seed: int | None = None) -> Illumination:
+    def under(self, light: Light, seed: int | None = None, *, quick: bool = False) -> Illumination:
         """Let one environment, at one turn, bounce in the scene.
 
         Args:
             light: an environment, or one that is prepared; this one's gradients end at the bake.
             seed: root of the shadow rays of surfels; None: the relighter's.
+            quick: with few rays of surfels, for frames that are looked at while something moves.
         """
         lighting = light if isinstance(light, Lighting) else Lighting(light)
         baked, seed = None, self.seed if seed is None else seed
         if self.estimation.bounces:
-            baked = self.transport.bake(lighting, self.estimation, seed=seed)
-            if (
-                self._proxied is None and not self.scene.oriented
-            ):  # a camera may see the side that was not baked
-                baked = replace(baked, reaching=None)
+            bake = self.transport.bake_quickly if quick else self.transport.bake
+            baked = self._seen(bake(lighting, self.estimation, seed=seed))
         return Illumination(self, lighting, self.estimation, seed, baked)
+
+    def _seen(self, baked: BouncedLight) -> BouncedLight:
+        if self._proxied is None and not self.scene.oriented:  # a camera may see the side that was not baked
+            return replace(baked, reaching=None)
+        return baked
+
+    def still_under(self, before: Illumination) -> Illumination:
+        """:meth:`under` the light of a scene whose materials alone were others: its shadows stay, to the bit.
+
+        Where more than that differs, or light sees a proxy, all is baked anew.
+        """
+        baked = before.bounced
+        if baked is None or not self._stands_like(before.relighter):
+            return self.under(before.lighting, before.seed)
+        baked = self._seen(self.transport.rebaked(baked, self.estimation))
+        return Illumination(self, before.lighting, self.estimation, before.seed, baked)
+
+    def _stands_like(self, other: Relighter) -> bool:
+        """Whether surfels and the light's rays among them are those of another relighter."""
+        traced = (self._tracer.bvh.order, self.estimation, self.seed)
+        others = (other._tracer.bvh.order, other.estimation, other.seed)
+        return self.stands_as(other.scene) and traced[0] is others[0] and traced[1:] == others[1:]
+
+    def stands_as(self, scene: GaussianScene) -> bool:
+        """Whether a scene is this one but for materials and radiance; False where light sees a proxy."""
+        if self.proxy is not None or len(scene) != len(self.scene):
+            return False
+        return _same(self.scene, scene, (*REACH, "means", "quats"))
 
     def changed(self, scene: GaussianScene) -> Relighter:
         """The relighter of another scene, which shares what stays the same; this one goes on as it is.
@@ -229,8 +255,7 @@ class Relighter:
         if self._backdrop is not None and len(scene) != len(self._backdrop):
             raise TronError("surfels have come or gone before a backdrop", mend="make a new Relighter")
         proxy: Choice = "never" if self.proxy is None else "always"
-        reaches = all(np.array_equal(getattr(scene, name), getattr(before, name)) for name in REACH)
-        if not reaches or self.proxy is not None:
+        if not _same(scene, before, REACH) or self.proxy is not None:
             return Relighter(
                 scene, self.estimation, self.seed, backdrop=self._backdrop, track=self._track,
                 proxy=proxy, cameras=self._cameras, filming=self._filming, ground=self.ground,
@@ -358,6 +383,10 @@ class TracedFrame:
         over_black = replace(self, noise=None).shade((0, 0, 0))
         noise = over_black.lit - denoised(over_black.lit, albedo)
         return replace(self, noise=np.where(over_black.mask[..., None] > 0, noise, 0))
+
+
+def _same(scene: GaussianScene, other: GaussianScene, names: Iterable[str]) -> bool:
+    return all(np.array_equal(getattr(scene, name), getattr(other, name)) for name in names)
 
 
 def views_under(lights: Sequence[Illumination], camera: Camera) -> list[GBuffer]:

@@ -218,6 +218,39 @@ def test_a_changed_scene_is_lit_as_if_it_were_new(light, scene, change, signed):
     assert_same(before.under(light).render(VIEWS[1]), first)
 
 
+def test_other_materials_stand_under_the_light_that_was_baked_as_if_it_were_baked_anew(light, scene):
+    """Bitwise: no shadow ray knows a material."""
+    before = Relighter(scene, Estimation(rays=0, filtered=True))
+    baked = before.under(light)
+    painted = replace(scene, base_color=0.5 * scene.base_color, metallic=1 - scene.metallic)
+    found, anew = (
+        before.changed(painted).still_under(baked),
+        Relighter(painted, before.estimation).under(light),
+    )
+    assert found.bounced is not None
+    assert anew.bounced is not None
+    for name in ("direct", "indirect", "outgoing", "behind", "openness"):
+        np.testing.assert_array_equal(getattr(found.bounced, name), getattr(anew.bounced, name))
+    np.testing.assert_array_equal(found.render(VIEWS[0]).lit, anew.render(VIEWS[0]).lit)
+    assert np.abs(found.render(VIEWS[0]).lit - baked.render(VIEWS[0]).lit).max() > 0.05
+
+
+def test_surfels_that_have_moved_are_baked_anew(light, scene):
+    before = Relighter(scene, Estimation(rays=0))
+    other = before.changed(moved(scene, scene.object_id == BALL, None, (0.3, 0, 0)))
+    found, anew = other.still_under(before.under(light)), other.under(light)
+    np.testing.assert_array_equal(found.render(VIEWS[0]).lit, anew.render(VIEWS[0]).lit)
+
+
+def test_a_quick_bake_is_the_same_light_with_more_noise(light, scene):
+    relighter = Relighter(scene, Estimation(rays=0, filtered=True))
+    full, quick = (relighter.under(light, quick=each).render(VIEWS[0]) for each in (False, True))
+    exposure = full.exposure()
+    one, other = (to_display(each.lit, exposure)[full.mask > 0.5] for each in (full, quick))
+    assert 30 < -10 * np.log10(np.square(one - other).mean()) < 60
+    np.testing.assert_allclose(other.mean(), one.mean(), rtol=0.02)
+
+
 def test_a_backdrop_stays_in_no_light_s_way_when_things_move(light, scene):
     behind = np.zeros(len(scene), bool)
     behind[scene.object_id == 0] = True

@@ -1,0 +1,315 @@
+"""What is wished for, and one thread that draws it: the only one that touches Dr.Jit.
+
+Callers on any thread say what is to be seen (:meth:`Studio.wish`, :meth:`Studio.look`). The thread compares
+that with what it has done and does the next piece of work towards it:
+
+    while a hand moves    the light that reached the surfels, by few rays, no shadow ray of a pixel; smaller
+                          where that takes long
+    at rest               the same of all rays, at full size
+    then                  four passes of 16 shadow rays a pixel, each on a sub-pixel of its own, averaged
+
+A pass is given up, between two bands of the picture, as soon as it is of a wish that is past. Pictures at
+rest are handed out only while they are of the wish of the moment; the last of them is the same, to the bit
+with one thread of Dr.Jit, whatever was wished for before.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from tron.cameras import Camera
+from tron.errors import TronError
+from tron.gaussians.scene import GaussianScene
+from tron.runtime import activate
+from tron.shading.environments.environment import EnvironmentMap
+from tron.view.stage import SUB_PIXELS, Stage, Wish
+
+log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+REST_SECONDS = 0.25
+"""Since the last input, from which on nothing moves: inputs of a hand come faster, 20 a second."""
+MOVING_SECONDS = 0.11
+"""Time that a picture may take while a hand moves, before the next ones are made smaller."""
+SMALLEST = 0.3
+"""Side of the smallest of them, of the full size."""
+BAND_PIXELS = 24_000
+"""Of a part of a pass: 0.1 seconds on one core with 16 rays among 50,000 surfels."""
+LAST = 2 + len(SUB_PIXELS)
+"""Level of a view that is done: 0 of nothing, 1 of a rough picture, 2 of one at rest, then one a pass."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a view shows.
+
+    Attributes:
+        image: (H, W, 3) uint8.
+        wish: that it is of.
+        camera: likewise, up is +z; its size is that of the view, the image's may be smaller.
+        refined: 0 while something moves, above 0 at rest, 1 when nothing is left to do.
+        seconds: that its last piece took.
+    """
+
+    image: np.ndarray
+    wish: Wish
+    camera: Camera
+    refined: float
+    seconds: float
+
+
+@dataclass
+class _View:
+    camera: Camera
+    level: int = 0
+    scale: float = 0.5
+    drawn: float = 0.0
+    passes: np.ndarray | None = field(default=None, repr=False)
+
+
+class _Outdated(Exception):
+    """What was under way is of a wish that is past."""
+
+
+class Studio:
+    """A scene to be looked at and changed; closed by :meth:`close`, or as a context.
+
+    Args:
+        scene: valid, in the frame of its file.
+        lights: lights by name, or the files that hold them.
+        home: camera that exposure is metered in, in the frame where up is +z.
+        show: called with the number of a view and its next picture, on the studio's thread.
+        notice: called with a line for the user where a wish cannot be fulfilled: it is taken back.
+        seed: root of all random numbers.
+        variant: of Mitsuba.
+        threads: of Dr.Jit; None: as it is.
+    """
+
+    def __init__(
+        self,
+        scene: GaussianScene,
+        lights: Mapping[str, EnvironmentMap | Path],
+        home: Camera,
+        show: Callable[[int, Picture], None],
+        notice: Callable[[str], None] = log.warning,
+        *,
+        seed: int = 0,
+        variant: str = "llvm_ad_rgb",
+        threads: int | None = None,
+    ) -> None:
+        if not lights:
+            raise TronError("there is no light", mend="give one at least")
+        self._make = lambda: Stage(scene, lights, home, seed, self._watch)
+        self._machine = variant, threads
+        self._show, self._notice = show, notice
+        self._changed = threading.Condition()
+        self._wish, self._done = Wish(next(iter(lights))), None
+        self._refused: Wish | None = None
+        self._views: dict[int, _View] = {}
+        self._asked: deque[tuple[Callable[[Stage], Any], Future[Any]]] = deque()
+        self._closing, self._version, self._began = False, 0, 0
+        self._moved = -np.inf
+        self._thread = threading.Thread(target=self._run, name="studio", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Studio:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def wished(self) -> Wish:
+        """The wish of the moment."""
+        with self._changed:
+            return self._wish
+
+    def wish(self, **changes: Any) -> Wish:
+        """Change what is to be seen: attributes of :class:`Wish`. Returns the wish."""
+        with self._changed:
+            return self._want(replace(self._wish, **changes))
+
+    def change(self, of: Callable[[Wish], Wish]) -> Wish:
+        """The same where the new wish depends on the old one; nothing comes between them."""
+        with self._changed:
+            return self._want(of(self._wish))
+
+    def look(self, view: int, camera: Camera | None) -> None:
+        """Say what a view looks from, up being +z; None: nobody looks any more."""
+        with self._changed:
+            if camera is None:
+                self._views.pop(view, None)
+                return
+            known = self._views.get(view)
+            scale, drawn = (known.scale, known.drawn) if known else (0.5, 0.0)
+            self._views[view] = _View(camera, scale=scale, drawn=drawn)
+            self._moved = time.perf_counter()
+            self._version += 1
+            if self._refused == self._done:  # it is the view that could not be drawn
+                self._refused = None
+            self._changed.notify()
+
+    def ask(self, question: Callable[[Stage], T]) -> Future[T]:
+        """Let the studio's thread answer a question between two pieces, the wish of the moment done."""
+        answer: Future[T] = Future()
+        with self._changed:
+            if self._closing:
+                answer.cancel()
+            else:
+                self._asked.append((question, answer))
+                self._version += 1  # a pass that is under way is given up
+                self._changed.notify()
+        return answer
+
+    def close(self) -> None:
+        """End the thread; what is under way is given up. Safe to repeat."""
+        with self._changed:
+            self._closing = True
+            self._version += 1
+            self._changed.notify()
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def _want(self, wish: Wish) -> Wish:
+        if wish == self._wish:
+            return wish
+        self._wish, self._moved = wish, time.perf_counter()
+        self._version += 1
+        self._refused = None
+        for view in self._views.values():
+            view.level = 0
+        self._changed.notify()
+        return wish
+
+    def _run(self) -> None:
+        stage: Stage | None = None
+        while True:
+            with self._changed:
+                self._wait()
+                if self._closing:
+                    for _, answer in self._asked:
+                        answer.cancel()
+                    return
+                self._began, wish = self._version, self._wish
+                rough = time.perf_counter() - self._moved < REST_SECONDS
+            try:
+                if stage is None:
+                    activate(*self._machine)
+                    stage = self._make()
+                self._work(stage, wish, rough)
+            except _Outdated:
+                pass
+            except Exception as error:
+                if not isinstance(error, TronError):
+                    log.exception("drawing failed")
+                self._refuse(wish, str(error) or type(error).__name__)
+
+    def _wait(self) -> None:
+        """Until there is something to do; holds the lock."""
+        while not self._closing and not self._asked:
+            left = self._moved + REST_SECONDS - time.perf_counter()
+            levels = [view.level for view in self._views.values()]
+            if self._wish == self._refused or not levels or min(levels) == LAST:
+                self._changed.wait()
+            elif min(levels) > 0 and left > 0:
+                self._changed.wait(left)
+            else:
+                return
+
+    def _work(self, stage: Stage, wish: Wish, rough: bool) -> None:
+        """The next piece of work: questions first, then a picture of the view that has least."""
+        if wish != self._refused:
+            stage.bring(wish, rough)
+            self._done = wish
+        with self._changed:
+            asked = list(self._asked)
+            self._asked.clear()
+            open_ones = [(view.level, view.drawn, number) for number, view in self._views.items()]
+        for question, answer in asked:
+            try:
+                answer.set_result(question(stage))
+            except Exception as error:
+                answer.set_exception(error)
+        if not open_ones or wish == self._refused:
+            return
+        level, _, number = min(open_ones)
+        if level < LAST and (level == 0 or not rough):
+            self._draw(stage, wish, number, rough)
+
+    def _draw(self, stage: Stage, wish: Wish, number: int, rough: bool) -> None:
+        with self._changed:
+            view = self._views.get(number)
+            if view is None:
+                return
+            level, camera, scale = view.level, view.camera, view.scale
+        began = time.perf_counter()
+        if rough or level < 2:
+            seen = camera
+            if rough:
+                size = (max(16, round(scale * side)) for side in (camera.width, camera.height))
+                seen = camera.resized(*size)
+            image = stage.linear(wish.buffer, seen)
+            view.passes = None
+            reached = 1 if rough else 2
+        else:
+            found = self._refined(stage, wish, view)
+            view.passes = found if view.passes is None else view.passes + found
+            image = view.passes / np.float32(level - 1)
+            reached = level + 1
+        shown = stage.display(wish, image)
+        seconds = time.perf_counter() - began
+        refined = 0.0 if rough else (reached - 1) / (LAST - 1)
+        picture = Picture(shown, wish, camera, refined, seconds)
+        with self._changed:
+            still = self._views.get(number) is view and self._wish == wish and not self._closing
+            if not (rough or still):
+                raise _Outdated
+            now = self._views.get(number)
+            if now is not None:
+                now.drawn = time.perf_counter()
+                if rough:
+                    factor = np.clip((MOVING_SECONDS / max(seconds, 1e-3)) ** 0.5, 0.8, 1.15)
+                    now.scale = float(np.clip(scale * factor, SMALLEST, 1.0))
+            if still:
+                view.level = reached
+        if now is not None:
+            self._show(number, picture)
+
+    def _refined(self, stage: Stage, wish: Wish, view: _View) -> np.ndarray:
+        """One pass over a picture, given up between two bands once it is out of date."""
+        camera = view.camera
+        rows = max(1, BAND_PIXELS // camera.width)
+        bands = []
+        for band, y in enumerate(range(0, camera.height, rows)):
+            self._watch()
+            window = camera.window(0, y, camera.width, min(rows, camera.height - y))
+            bands.append(stage.linear(wish.buffer, window, view.level - 2, band))
+        return np.concatenate(bands)
+
+    def _watch(self) -> None:
+        """Raise _Outdated where a wish, a view or a question has come since the piece of work began."""
+        with self._changed:
+            if self._version != self._began:
+                raise _Outdated
+
+    def _refuse(self, wish: Wish, why: str) -> None:
+        """Go back to what could be done last, and say so."""
+        with self._changed:
+            if self._wish == wish and self._done is not None and self._done != wish:
+                self._want(self._done)
+            else:
+                self._refused = wish
+            asked, self._asked = list(self._asked), deque()
+        for _, answer in asked:
+            answer.set_exception(TronError(why))
+        self._notice(why)
