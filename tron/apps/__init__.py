@@ -1,1 +1,1 @@
-"""Commands of the library, with what belongs to one: tron-relight, tron-edit, tron-bake, tron-reconstruct."""
+"""Commands of the library, with what belongs to one: tron-relight, -edit, -bake, -view, -reconstruct."""

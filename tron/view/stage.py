@@ -38,6 +38,8 @@ RAYS = 16
 """Shadow rays of a pixel in each pass; with one that finds what glossy surfaces mirror."""
 SUB_PIXELS = ((-0.25, -0.25), (0.25, 0.25), (0.25, -0.25), (-0.25, 0.25))
 """Place of each pass within the pixel, from its centre."""
+THUMBNAIL = 80, 280
+"""Height and width of a light's picture, pixels."""
 METERED = 128
 """Pixels of the frame that a light's exposure is metered in."""
 
@@ -53,6 +55,7 @@ class Wish:
         buffer: what is shown.
         edits: done to the scene in their order.
         hidden: objects that are not there, after all edits.
+        before: whether the scene is seen as it was before them.
     """
 
     light: str
@@ -61,6 +64,7 @@ class Wish:
     buffer: Buffer = "lit"
     edits: tuple[Edit, ...] = ()
     hidden: frozenset[int] = frozenset()
+    before: bool = False
 
 
 class Stage:
@@ -175,6 +179,18 @@ class Stage:
         ids, counts = np.unique(self.session.scene.object_id, return_counts=True)
         return dict(zip(ids.tolist(), counts.tolist()))
 
+    def thumbnail(self, name: str) -> np.ndarray:
+        """:data:`THUMBNAIL` uint8 of a light's map before it turns: the middle of its height.
+
+        Raises:
+            TronError: the light cannot be read.
+        """
+        environment, (height, width) = self._lighting(name)[0].environment, THUMBNAIL
+        first = (width // 2 - height) // 2
+        image = environment.resized(width // 2, width).image[first : first + height]
+        shown = to_display(image, environment.exposure(), look="photograph")
+        return (255 * np.asarray(shown) + 0.5).astype(np.uint8)
+
     def _lighting(self, name: str) -> tuple[Lighting, float]:
         if name not in self._prepared:
             light = self._lights[name]
@@ -190,14 +206,14 @@ class Stage:
     def _scene(self, wish: Wish) -> GaussianScene:
         """The scene after the wish's edits, without what is hidden, +z up."""
         done = self.session.edits.edits
-        common = next(
-            (n for n, (a, b) in enumerate(zip(done, wish.edits)) if a is not b and a != b),
-            min(len(done), len(wish.edits)),
-        )
+        pairs = enumerate(zip(done, wish.edits))
+        common = next((n for n, (a, b) in pairs if a != b), min(len(done), len(wish.edits)))
         for _ in done[common:]:
             self.session.undo()
         for edit in wish.edits[common:]:
             self.session.do(edit)
+        if wish.before:
+            return self._base.scene
         scene = self.session.scene
         if self._shown is None or self._shown[0] is not scene or self._shown[1] != wish.hidden:
             which = np.isin(scene.object_id, list(wish.hidden))
