@@ -123,6 +123,7 @@ PAPER = {
     "eval": {},
     "edit": {},
     "bake": {},
+    "view": {},
 }
 
 

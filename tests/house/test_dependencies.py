@@ -48,6 +48,7 @@ DEV, CLUSTER = (names(EXTRAS[extra]) for extra in ("dev", "cluster"))
 PEERS = set().union(
     *(names(EXTRAS[extra]) for extra in ("gpu-peers", "heic", "ktx2", "loggers", "oidn", "rgbx"))
 )
+PEERS |= names(EXTRAS["view"]) - names(EXTRAS["relight"])
 # Networks are loaded where a checkpoint is given; the extras `network` and `rgbx` are asked for then.
 ASKED_FOR = {
     ("tron.apps.relight.command", "tron.neural.weights"),
@@ -72,7 +73,9 @@ def imports() -> grimp.ImportGraph:
 
 def reached(imports: grimp.ImportGraph, command: str) -> set[str]:
     """Distributions that a command may import, through our modules and their packages' __init__.py."""
-    start = f"tron.apps.{command}" if command in ("relight", "edit", "bake", "reconstruct") else command
+    start = (
+        f"tron.apps.{command}" if command in ("relight", "edit", "bake", "view", "reconstruct") else command
+    )
     own = {name for name in imports.modules if name.partition(".")[0] in PACKAGES}
     todo, foreign = {start} | ({each for each in own if each.startswith(f"{start}.")}), set()
     if command == "reconstruct":  # chosen by prior=NAME
@@ -135,6 +138,12 @@ def test_edits_and_bakes_need_no_more_than_relighting(imports: grimp.ImportGraph
     used = reached(imports, command)
     assert "plyfile" in used
     assert used - PEERS <= BASE | names(EXTRAS["relight"])
+
+
+def test_the_viewer_needs_what_relighting_does_and_viser(imports: grimp.ImportGraph):
+    used = reached(imports, "view")
+    assert "viser" in used
+    assert used <= BASE | names(EXTRAS["view"])
 
 
 def test_the_base_is_what_all_commands_share(imports: grimp.ImportGraph):

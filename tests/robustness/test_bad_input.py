@@ -27,6 +27,7 @@ COMPLETE = {
     "tron-relight": ["scene={inputs}/good.ply", "environment={inputs}/good.exr"],
     "tron-edit": ["scene={inputs}/good.ply", "edits={inputs}/good.yaml"],
     "tron-bake": ["scene={inputs}/good.ply", "environment={inputs}/good.exr"],
+    "tron-view": ["scene={inputs}/good.ply", "environments={inputs}/good.exr"],
 }
 WRITES: dict[str, str] = dict.fromkeys(("tron-edit", "tron-bake"), "output=out.ply")
 """Of commands that write no folder."""
@@ -49,6 +50,12 @@ BAD_FILES = [
     ("tron-bake", ["environment={inputs}/empty"], ["is a folder", "empty"]),
     ("tron-bake", ["output={inputs}/good.ply"], ["output is the scene itself"]),
     ("tron-bake", ["output=cut.splat"], ["output is no PLY", "cut.splat"]),
+    ("tron-view", ["scene={inputs}/text.ply"], ["text.ply"]),
+    ("tron-view", ["environments={inputs}/empty"], ["holds no environment map", "empty"]),
+    ("tron-view", ["environments={inputs}/absent"], ["there is no such folder", "absent"]),
+    ("tron-view", ["environments={inputs}/text.hdr"], ["text.hdr"]),
+    ("tron-view", ["models={inputs}/empty"], ["holds no PLY", "empty"]),
+    ("tron-view", ["output_dir={inputs}/good.ply"], ["output_dir is a file"]),
     ("tron-relight", ["scene={inputs}/empty"], ["empty"]),
     ("tron-relight", ["scene={inputs}/text.ply"], ["text.ply"]),
     ("tron-relight", ["scene={inputs}/points.ply"], ["points.ply"]),

@@ -57,7 +57,9 @@ def main(settings: Settings) -> None:
     those of tron-edit: they are undone one by one and saved as its YAML. "Film" saves the view and says the
     tron-relight command line that films it. Ends with Ctrl-C.
     """
-    from tron.view.window import Window, require_free_port  # viser and Mitsuba: not for --help
+    # viser and Mitsuba: not for --help
+    from tron.shading.environments.environment import EnvironmentMap
+    from tron.view.window import Window, require_free_port
 
     output = settings.output_dir
     if output.exists() and not output.is_dir():
@@ -65,6 +67,7 @@ def main(settings: Settings) -> None:
     check_scene_files(settings.scene, output / "scene.ply")
     lights = _files(settings.environments, LIGHTS, "environment map")
     models = {} if settings.models is None else _files(settings.models, (".ply",), "PLY")
+    EnvironmentMap.load(next(iter(lights.values())))  # others are read, or refused, when they are chosen
     require_free_port(settings.host, settings.port)
     logging.getLogger("websockets").setLevel(logging.WARNING)  # it says who comes and goes
     activate(settings.variant, settings.threads)

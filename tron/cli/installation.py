@@ -172,7 +172,7 @@ class ConsoleScript:
 relight = ConsoleScript("tron-relight", "tron.apps.relight.command")
 edit = ConsoleScript("tron-edit", "tron.apps.edit", of_extra="relight")
 bake = ConsoleScript("tron-bake", "tron.apps.bake", of_extra="relight")
-view = ConsoleScript("tron-view", "tron.apps.view", ("tron.view.window",))
+view = ConsoleScript("tron-view", "tron.apps.view")
 reconstruct = ConsoleScript("tron-reconstruct", "tron.apps.reconstruct.command", ("tron.reconstruction",))
 datagen = ConsoleScript("tron-datagen", "datagen.cli")
 train = ConsoleScript("tron-train", "train.cli")

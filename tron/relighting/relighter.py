@@ -239,7 +239,7 @@ class Relighter:
             return False
         return _same(self.scene, scene, (*REACH, "means", "quats"))
 
-    def changed(self, scene: GaussianScene) -> Relighter:
+    def changed(self, scene: GaussianScene, *, quick: bool = False) -> Relighter:
         """The relighter of another scene, which shares what stays the same; this one goes on as it is.
 
         Where surfels have moved or have other materials, the hierarchy is refitted and only rays that have
@@ -247,6 +247,10 @@ class Relighter:
         refitted one keeps, so that what has moved has other noise than in a new ``Relighter``. Where sizes or
         opacities differ, surfels come or go, or light sees a proxy, all is made anew. Whether there is a
         proxy stays as it was.
+
+        Args:
+            scene: the other scene.
+            quick: rays between surfels are not traced again, for ``under(quick=True)`` while something moves.
 
         Raises:
             TronError: another number of surfels than the backdrop has.
@@ -267,7 +271,8 @@ class Relighter:
         # hierarchy that was sorted anew.
         kept = other._tracer.bvh.order is self._tracer.bvh.order and self._backdrop is None
         if traced is not None and kept:
-            other.__dict__["transport"] = traced.moved(other._light)
+            carried = traced.carried if quick else traced.moved
+            other.__dict__["transport"] = carried(other._light)
         return other
 
 

@@ -235,7 +235,7 @@ class Stage:
         elif stays and (rough or self._fresh) and scene is not self._relighter.scene:
             self._relighter = self._relighter.changed(scene)
         elif rough and len(scene) == len(self._relighter.scene):
-            self._relighter, self._fresh = self._relighter.changed(scene), False
+            self._relighter, self._fresh = self._relighter.changed(scene, quick=True), False
         else:
             proxy = "never" if self._base.proxy is None else "always"
             self._relighter = Relighter(scene, PREVIEW, self._seed, proxy=proxy, track=self._watched)

@@ -97,6 +97,7 @@ class Window:
         self._undone: list[Edit] = []
         self._numbers: dict[str, int] = {}  # of the objects, by their label
         self._chosen: int | None = None
+        self._moving = False  # whether the arrows have moved the object since they were placed
         self._clicked: np.ndarray | None = None  # in the frame of the file
         self._of_client: dict[int, tuple[Any, viser.GuiMarkdownHandle]] = {}
         self._last: dict[int, Picture] = {}
@@ -206,6 +207,8 @@ class Window:
         self._before.value = False
         self.studio.change(lambda wish: replace(with_it(wish), before=False))
         self._refresh()
+        if self._moving and not isinstance(edit, Move):  # the arrows count from where the object stands now
+            self._place_arrows()
 
     def _edit_chosen(self, made: Any, replaced: type[Edit] | None = None) -> None:
         if self._chosen is not None:
@@ -277,6 +280,7 @@ class Window:
 
     def _place_arrows(self) -> None:
         """The gizmo at the foot of the chosen object, where it is wanted."""
+        self._moving = False
         if self._gizmo is not None:
             self._gizmo.remove()
             self._gizmo = None
@@ -300,7 +304,6 @@ class Window:
             "/move", scale=max(0.6 * size, 1e-6), depth_test=False, disable_sliders=True,
             position=tuple(turn @ centre), line_width=3.0,
         )  # fmt: skip
-        done_before = len(self.studio.wished.edits)
 
         def moved(_: Any) -> None:
             by = turn.T @ np.array(gizmo.position) - centre
@@ -311,8 +314,8 @@ class Window:
             words: dict[str, Any] = {"by": tuple(map(float, by)), "about": tuple(map(float, centre))}
             if angle > 1e-3:
                 words |= {"turn": angle, "axis": tuple(map(float, vector))}
-            again = len(self.studio.wished.edits) > done_before
-            self._edit_chosen(lambda of: Move(select=of, **words), Move if again else None)
+            self._edit_chosen(lambda of: Move(select=of, **words), Move if self._moving else None)
+            self._moving = True
 
         gizmo.on_update(moved)
         self._gizmo = gizmo

@@ -43,7 +43,7 @@ metadata.version = installed_version
 from tron.cli import installation
 
 pages = {}
-for command in ("relight", "edit", "bake", "reconstruct", "datagen", "train", "evaluate"):
+for command in ("relight", "edit", "bake", "view", "reconstruct", "datagen", "train", "evaluate"):
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         getattr(installation, command)(["--help"])
@@ -62,7 +62,8 @@ def pages(*extras: str) -> dict[str, list[str]]:
 
 def test_the_base_alone_shows_every_command_and_names_its_extra():
     shown = pages()
-    for command, key in {"relight": "scene", "edit": "edits", "bake": "rotation", "reconstruct": "capture",
+    for command, key in {"relight": "scene", "edit": "edits", "bake": "rotation", "view": "port",
+                         "reconstruct": "capture",
                          "datagen": "train.scenes", "train": "stages",
                          "evaluate": "benchmark.*"}.items():  # fmt: skip
         name = "eval" if command == "evaluate" else command
@@ -75,7 +76,7 @@ def test_the_base_alone_shows_every_command_and_names_its_extra():
 
 @pytest.mark.long
 def test_no_environment_shows_less_than_another():
-    whole = pages("eval")
+    whole = pages("eval", "view")
     assert all(page[0].endswith(", which is installed") for page in whole.values())
     for extras in ((), ("relight",), ("train",), ("datagen",)):
         shown = pages(*extras)

@@ -251,6 +251,17 @@ def test_a_quick_bake_is_the_same_light_with_more_noise(light, scene):
     np.testing.assert_allclose(other.mean(), one.mean(), rtol=0.02)
 
 
+def test_what_moves_quickly_is_lit_where_it_is_and_traces_no_bounce(light, scene, monkeypatch):
+    before = Relighter(scene, Estimation(rays=0, filtered=True)).prepare()
+    there = moved(scene, scene.object_id == BALL, None, (0.3, 0, 0))
+    exact = before.changed(there).under(light, quick=True).render(VIEWS[0])
+    monkeypatch.setattr(BounceTransport, "moved", None)
+    quick = before.changed(there, quick=True).under(light, quick=True).render(VIEWS[0])
+    one, other = (to_display(each.lit, exact.exposure())[exact.mask > 0.5] for each in (exact, quick))
+    np.testing.assert_array_equal(quick.gbuffer["position"], exact.gbuffer["position"])
+    assert -10 * np.log10(np.square(one - other).mean()) > 30
+
+
 def test_a_backdrop_stays_in_no_light_s_way_when_things_move(light, scene):
     behind = np.zeros(len(scene), bool)
     behind[scene.object_id == 0] = True
