@@ -40,7 +40,15 @@ from tron.runtime import activate
 from tron.shading.bounces.bounce import BouncedLight, BounceTransport
 from tron.shading.environments.cubemap import CubemapLight
 from tron.shading.environments.environment import EnvironmentMap
-from tron.shading.guidance import Arriving, Guidance, arriving_light, shade, surface_maps, trace_views
+from tron.shading.guidance import (
+    Arriving,
+    Guidance,
+    arriving_light,
+    shade,
+    shade_surface,
+    surface_maps,
+    trace_views,
+)
 from tron.shading.lighting import Lighting
 from tron.tracing import GBuffer, SurfelTracer
 from tron.tracing.surface import Surface, centres
@@ -372,6 +380,11 @@ class TracedFrame:
             return frame
         lit = np.maximum(frame.lit - self.noise, 0)
         return replace(frame, lit=lit, shadowed=frame.shadowed if self.estimation.bounces else lit)
+
+    def image(self, name: str) -> np.ndarray:
+        """(H, W, 3) one buffer of :meth:`shade` alone, of a frame without sub-pixels and not denoised."""
+        colors = shade_surface(self.view, self.arriving, self.lighting, None, self.estimation.diffuse)
+        return self.view.image(colors[name])
 
     def denoised(self, albedo: np.ndarray) -> TracedFrame:
         """The frame whose ``lit`` is through Open Image Denoise (:mod:`tron.denoising`).

@@ -111,27 +111,27 @@ class Stage:
         """
         lighting, _ = self._lighting(wish.light)
         self._yields = not rough and self._illumination is not None
-        before = self._relighter
         self._relight(self._scene(wish), rough)
-        light = wish.light, wish.turn % 360
-        same_light = self._light == light and self._illumination is not None
-        if same_light and self._relighter is before and (rough or self._settled):
-            return
-        if same_light and self._relighter is not before and self._settled and self._fresh:
-            assert self._illumination is not None
-            found = self._relighter.still_under(self._illumination)
-        else:
-            found = self._relighter.under(lighting.turned_to(wish.turn), self._seed, quick=rough)
-            self._settled = not rough
-        self._illumination, self._light = found, light
+        now, light = self._illumination, (wish.light, wish.turn % 360)
+        if now is not None and self._light == light and (rough or self._settled):
+            if now.relighter is self._relighter:
+                return
+            if self._relighter.stands_as(now.relighter.scene):
+                self._illumination = self._relighter.still_under(now)
+                return
+        self._illumination = self._relighter.under(lighting.turned_to(wish.turn), self._seed, quick=rough)
+        self._light, self._settled = light, not rough
 
-    def linear(self, buffer: Buffer, camera: Camera, number: int = -1, band: int = 0) -> np.ndarray:
+    def linear(
+        self, buffer: Buffer, camera: Camera, number: int = -1, band: int = 0, *, rough: bool = False
+    ) -> np.ndarray:
         """(H, W, 3) linear radiance, or values in [0, 1], as a camera sees them.
 
         Args:
             buffer: what is shown.
             camera: in the frame where up is +z.
             number: of the pass; -1: the light that reached the surfels, found without a shadow ray.
+            rough: whether metals mirror no surfel, which takes a ray.
             band: number of the part of the picture that the camera sees, for its random numbers.
         """
         light = self._illumination
@@ -140,10 +140,11 @@ class Stage:
             dx, dy = SUB_PIXELS[number]
             camera = replace(camera, cx=camera.cx + dx, cy=camera.cy + dy)
             light = light.framed(rays=RAYS, filtered=False, reflections=1)
+        elif rough:
+            light = light.framed(filtered=False)
         if buffer not in EXPOSED:
             return self._surface(buffer, camera)
-        frame = light.render(camera, integer(self._seed, "view", number + 1, band))
-        return frame[buffer]
+        return light.trace(camera, integer(self._seed, "view", number + 1, band)).image(buffer)
 
     def display(self, wish: Wish, image: np.ndarray) -> np.ndarray:
         """(H, W, 3) uint8 of :meth:`linear`."""
@@ -231,7 +232,7 @@ class Stage:
             return
         stays = self._relighter.stands_as(scene)
         if scene is self._base.scene:
-            self._relighter, self._fresh, self._settled = self._base, True, False
+            self._relighter, self._fresh = self._base, True
         elif stays and (rough or self._fresh) and scene is not self._relighter.scene:
             self._relighter = self._relighter.changed(scene)
         elif rough and len(scene) == len(self._relighter.scene):

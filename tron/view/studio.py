@@ -258,7 +258,7 @@ class Studio:
             if rough:
                 size = (max(16, round(scale * side)) for side in (camera.width, camera.height))
                 seen = camera.resized(*size)
-            image = stage.linear(wish.buffer, seen)
+            image = stage.linear(wish.buffer, seen, rough=rough)
             view.passes = None
             reached = 1 if rough else 2
         else:

@@ -262,6 +262,14 @@ def test_what_moves_quickly_is_lit_where_it_is_and_traces_no_bounce(light, scene
     assert -10 * np.log10(np.square(one - other).mean()) > 30
 
 
+def test_one_buffer_alone_is_that_of_the_frame(light, scene):
+    lit = Relighter(scene, Estimation(rays=0, filtered=True)).under(light)
+    frame = lit.trace(VIEWS[0], 3)
+    whole = frame.shade()
+    for name in ("lit", "irradiance", "indirect"):
+        np.testing.assert_array_equal(frame.image(name), whole[name])
+
+
 def test_a_backdrop_stays_in_no_light_s_way_when_things_move(light, scene):
     behind = np.zeros(len(scene), bool)
     behind[scene.object_id == 0] = True

@@ -138,6 +138,8 @@ class BounceTransport:
         if len(tracer.scene) != len(self.tracer.scene):
             raise TronError("surfels have come or gone", mend="trace the rays of the new scene")
         rays = self.rays.after(tracer)
+        if rays.met is self.rays.met and "_lending" in self.__dict__:  # materials alone
+            return self.carried(tracer)
         return BounceTransport(rays, Undersides.of(rays))
 
     def carried(self, tracer: SurfelTracer) -> BounceTransport:
