@@ -262,7 +262,7 @@ class Studio:
             view.passes = None
             reached = 1 if rough else 2
         else:
-            found = self._refined(stage, wish, view)
+            found = self._refined(stage, wish, camera, level - 2)
             view.passes = found if view.passes is None else view.passes + found
             image = view.passes / np.float32(level - 1)
             reached = level + 1
@@ -285,15 +285,14 @@ class Studio:
         if now is not None:
             self._show(number, picture)
 
-    def _refined(self, stage: Stage, wish: Wish, view: _View) -> np.ndarray:
+    def _refined(self, stage: Stage, wish: Wish, camera: Camera, number: int) -> np.ndarray:
         """One pass over a picture, given up between two bands once it is out of date."""
-        camera = view.camera
         rows = max(1, BAND_PIXELS // camera.width)
         bands = []
         for band, y in enumerate(range(0, camera.height, rows)):
             self._watch()
             window = camera.window(0, y, camera.width, min(rows, camera.height - y))
-            bands.append(stage.linear(wish.buffer, window, view.level - 2, band))
+            bands.append(stage.linear(wish.buffer, window, number, band))
         return np.concatenate(bands)
 
     def _watch(self) -> None:

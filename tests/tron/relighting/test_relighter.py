@@ -237,7 +237,7 @@ def test_other_materials_stand_under_the_light_that_was_baked_as_if_it_were_bake
 
 def test_surfels_that_have_moved_are_baked_anew(light, scene):
     before = Relighter(scene, Estimation(rays=0))
-    other = before.changed(moved(scene, scene.object_id == BALL, None, (0.3, 0, 0)))
+    other = before.changed(moved(scene, scene.object_id == BALL, None, np.array([0.3, 0, 0])))
     found, anew = other.still_under(before.under(light)), other.under(light)
     np.testing.assert_array_equal(found.render(VIEWS[0]).lit, anew.render(VIEWS[0]).lit)
 
@@ -253,7 +253,7 @@ def test_a_quick_bake_is_the_same_light_with_more_noise(light, scene):
 
 def test_what_moves_quickly_is_lit_where_it_is_and_traces_no_bounce(light, scene, monkeypatch):
     before = Relighter(scene, Estimation(rays=0, filtered=True)).prepare()
-    there = moved(scene, scene.object_id == BALL, None, (0.3, 0, 0))
+    there = moved(scene, scene.object_id == BALL, None, np.array([0.3, 0, 0]))
     exact = before.changed(there).under(light, quick=True).render(VIEWS[0])
     monkeypatch.setattr(BounceTransport, "moved", None)
     quick = before.changed(there, quick=True).under(light, quick=True).render(VIEWS[0])

@@ -11,7 +11,7 @@ from examples.stage import BALL, FLOOR, RING
 from tron.cameras import Camera
 from tron.editing import Insert, Material, Move, Remove, Selection
 from tron.seeds import generator
-from tron.view.stage import BUFFERS, Wish
+from tron.view.stage import BUFFERS, Stage, Wish
 from tron.view.studio import REST_SECONDS
 
 EDITS = (
@@ -34,63 +34,88 @@ def random_change(rng: np.random.Generator) -> dict[str, object]:
     ][rng.integers(6)]
 
 
+def baked(stage: Stage) -> np.ndarray:
+    """Direct and indirect light at the surfels."""
+    light = stage._illumination
+    assert light is not None
+    assert light.bounced is not None
+    return np.concatenate([np.array(light.bounced.direct), np.array(light.bounced.indirect)])
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("root", [1, 2, 3])
-def test_the_last_picture_is_that_of_a_fresh_studio(open_studio, camera, root):
+@pytest.mark.parametrize("edits", [EDITS[:1], EDITS[:2], EDITS[1:]], ids=["paint", "move", "remove"])
+def test_the_last_picture_is_that_of_a_fresh_studio(open_studio, camera, edits):
     """Bitwise, whatever was wished for before, in whatever haste."""
-    rng = generator(root, "wishes")
+    rng = generator(len(edits), "wishes")
     with open_studio(threads=1) as (studio, shown):
         studio.look(0, camera)
-        for _ in range(30):
+        for _ in range(20):
             studio.wish(**random_change(rng))
             time.sleep(float(rng.uniform(0, 2 * REST_SECONDS)) * float(rng.integers(2)))
-        used = shown.final(studio, camera)
+        for wish in ({"buffer": "lit", "hidden": frozenset()}, {"edits": edits}, {"turn": 30.0}):
+            before = len(shown.pictures)
+            studio.wish(**wish)
+            shown.until(lambda before=before: len(shown.pictures) > before)
+        used, bake = shown.final(studio, camera), studio.ask(baked).result(60)
     with open_studio(threads=1) as (fresh, other):
         fresh.change(lambda _: used.wish)
         fresh.look(0, camera)
-        expected = other.final(fresh, camera)
+        expected, anew = other.final(fresh, camera), fresh.ask(baked).result(60)
     assert used.wish == expected.wish
+    assert any(each.refined == 0 and each.wish == used.wish for each in shown.pictures), "rough at first"
+    np.testing.assert_array_equal(bake, anew)
     np.testing.assert_array_equal(used.image, expected.image)
 
 
-def test_pictures_are_of_the_wish_of_the_moment_once_at_rest(open_studio, camera):
+def test_pictures_are_of_the_wish_of_the_moment_once_at_rest(open_studio, scene):
     """Refinement grows from 0 to 1 for each wish, and never shows a wish that is past."""
-    wished: list[Wish] = []
+    camera, rng = Camera.around(scene, azimuth_deg=30, width=320, height=240), generator(1, "haste")
+    past: list[Wish] = []
     with open_studio() as (studio, shown):
-        ordinary = shown.show
 
         def show(view, picture):
-            if picture.refined > 0:
-                wished.append(studio.wished)
-                assert picture.wish == studio.wished
-            ordinary(view, picture)
+            if picture.refined > 0 and picture.wish != studio.wished:
+                past.append(picture.wish)
+            shown.show(view, picture)
 
         studio._show = show
         studio.look(0, camera)
-        for turn in range(0, 50, 10):
+        for turn in range(20):
             studio.wish(turn=float(turn))
-            time.sleep(0.05)
+            time.sleep(float(rng.uniform(0.2, 0.8)))
+        studio.wish(turn=40.0)
         shown.final(studio, camera)
         of_last = [each.refined for each in shown.pictures if each.wish.turn == 40 and each.refined > 0]
     assert of_last == sorted(of_last)
     assert of_last[-1] == 1
     assert len(of_last) == 5
-    assert wished
+    assert past == []
 
 
-def test_a_wish_in_the_middle_of_a_pass_is_shown_soon(open_studio, scene):
-    """A picture of the new wish comes long before the pass could have ended."""
-    large = Camera.around(scene, azimuth_deg=30, width=960, height=640)
+def test_a_wish_in_the_middle_of_a_pass_is_drawn_next(open_studio, scene, monkeypatch):
+    """The band that is under way ends, and no other begins."""
+    drawn: list[int] = []
+    one_in_a_pass = threading.Event()
+    linear = Stage.linear
+
+    def noted(stage, buffer, camera, number=-1, band=0, **more):
+        drawn.append(number)
+        if number >= 0 and band == 3:
+            one_in_a_pass.set()
+        return linear(stage, buffer, camera, number, band, **more)
+
+    monkeypatch.setattr(Stage, "linear", noted)
+    large = Camera.around(scene, azimuth_deg=30, width=640, height=480)
     with open_studio() as (studio, shown):
         studio.look(0, large)
-        shown.until(lambda: any(each.refined > 0.3 for each in shown.pictures))
-        passes = [each.seconds for each in shown.pictures if each.refined > 0.3]
-        time.sleep(0.3 * passes[0])  # in the second pass
-        before = time.perf_counter()
-        studio.wish(turn=50.0)
-        shown.until(lambda: shown.pictures[-1].wish.turn == 50)
-        assert time.perf_counter() - before < 0.5 * passes[0]
-        assert not any(each.wish.turn != 50 and each.refined > 0.5 for each in shown.pictures)
+        for turn in (50.0, 70.0, 90.0):
+            assert one_in_a_pass.wait(60)
+            begun = len(drawn)
+            studio.wish(turn=turn)
+            shown.until(lambda turn=turn: shown.pictures[-1].wish.turn == turn)
+            after = drawn[begun:]
+            assert sum(number >= 0 for number in after[: after.index(-1)]) <= 1
+            one_in_a_pass.clear()
 
 
 @pytest.mark.parametrize(
