@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import Annotated, Literal
+from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from tron.errors import TronError
 from tron.neural.clips import TEMPORAL_FACTOR
@@ -55,24 +55,12 @@ class Stage(BaseModel):
         default=0.0, ge=0, le=1, description="Fraction of samples that come from rehearsal_split."
     )
 
-    train_only: Literal["all", "temporal"] = Field(
-        default="all",
-        description="Weights that learn: all, or those of the paths between frames alone, so that single "
-        "frames stay as the stage before left them.",
-    )
-
     @field_validator("frames")
     @classmethod
     def _codec_frames(cls, value: int) -> int:
         if (value - 1) % TEMPORAL_FACTOR:
             raise ValueError("frames must be 1 + 4n: 1, 5, 9, ...")
         return value
-
-    @model_validator(mode="after")
-    def _clips_for_temporal_weights(self) -> Stage:
-        if self.train_only == "temporal" and (self.frames == 1 or self.still_ratio > 0):
-            raise ValueError("train_only=temporal learns from clips: frames above 1, still_ratio 0")
-        return self
 
     def frames_of(self, step: int) -> int:
         """Frames K of the batch at a step: single frames are spread evenly among a video stage's batches."""

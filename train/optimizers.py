@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any, Literal
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -34,22 +33,6 @@ def make_optimizer(renderer: Renderer, settings: OptimizerSettings) -> torch.opt
         adjust_lr_fn="original",
     )
     return CombinedOptimizer([muon, _adamw([p for p in trained if id(p) not in chosen], settings)])
-
-
-@contextmanager
-def learning(renderer: Renderer, which: Literal["all", "temporal"]) -> Iterator[None]:
-    """Freeze, for the block, the weights that a stage does not train; `temporal`: all but those paths'."""
-    kept = {id(weight) for weight in renderer.temporal_weights().values()}
-    frozen = [
-        p for p in renderer.parameters() if which == "temporal" and p.requires_grad and id(p) not in kept
-    ]
-    for parameter in frozen:
-        parameter.requires_grad = False
-    try:
-        yield
-    finally:
-        for parameter in frozen:
-            parameter.requires_grad = True
 
 
 def _adamw(parameters: list[nn.Parameter], settings: OptimizerSettings) -> torch.optim.AdamW:

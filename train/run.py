@@ -40,7 +40,6 @@ from train.examples.requirements import require_renderer
 from train.examples.splits import manifest_hash, split_hashes
 from train.loggers import RunLoggers
 from train.module import RendererModule
-from train.optimizers import learning
 from train.processes import Processes, launch
 from train.settings import Settings
 from train.sharding import ShardedModule, ShardedStrategy, require_shardable
@@ -220,8 +219,7 @@ def _run_stage(
     data.begin(stage, position.step)
     trainer = make_trainer(settings, position, clock, data, processes, loggers, kept)
     try:
-        with learning(trained.renderer, stage.train_only):
-            trainer.fit(trained, datamodule=data, ckpt_path=position.checkpoint, weights_only=True)
+        trainer.fit(trained, datamodule=data, ckpt_path=position.checkpoint, weights_only=True)
     except Stopped as stopped:
         if stopped.signum == signal.SIGINT:
             raise KeyboardInterrupt from stopped

@@ -166,7 +166,7 @@ class Run:
         self._judge("captures", "capture_", {width: dataset}, TEST_RELIT, FIT_RELIT)
 
     def clips(self) -> None:
-        """Flicker of windows of frames over single ones."""
+        """Flicker of averages along the motion over single frames."""
         dataset = self.datasets.synthetic(next(iter(self.settings.synthetic)))
         measure_clips(dataset, TEST, self._by_kind(), self.settings.seed, self.outcome)
 

@@ -1,4 +1,4 @@
-"""Clips: what averaging along the motion, and windows of several frames, bring: flicker and PSNR."""
+"""Clips: what averaging along the motion brings: flicker and PSNR."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from tron.shards.schema import Clip
 log = logging.getLogger("tron.eval")
 
 TRUTH, LIT, LIT_AVERAGED = "truth", "lit_buffer", "lit_buffer_averaged"
-SINGLE, AVERAGED, WINDOWS = "k1", "averaged", "anchor"
-"""Single frames; the same averaged along their motion; windows of frames, as tron-relight's overlap."""
+SINGLE, AVERAGED = "k1", "averaged"
+"""Single frames; the same averaged along their motion, as tron-relight draws films."""
 PLAIN = {TRUTH: "path-traced truth", LIT: "lit, no network", LIT_AVERAGED: "lit, no network, averaged alike"}
-WAYS = {SINGLE: "K = 1", AVERAGED: "K = 1, five frames averaged", WINDOWS: "K = 5"}
+WAYS = {SINGLE: "single frames", AVERAGED: "five frames averaged"}
 WINDOW = 5
-"""Frames of a pass, as the paper's."""
+"""Frames that are averaged, as many as a pass of the paper's has."""
 FILM_FPS = 10.0
 DEPTH = "depth_ref"
 """Member that the flow needs, with the foreground."""
@@ -57,10 +57,10 @@ Scored = Mapping[str, Sequence[ClipScore]]
 
 
 def clip_rows(scores: Scored, kinds: Sequence[str], seed: int) -> Iterator[Row]:
-    """Root mean squared flicker of every method; ratios and gains of each way over single frames.
+    """Root mean squared flicker of every method; ratios and gains of averages over single frames.
 
-    Figures without a checkpoint's name are of that which starts from lit, the default of tron-relight; those
-    without a way's are of windows. Windows of that one are compared with lit that is averaged alike, too.
+    Figures without a checkpoint's name are of that which starts from lit, the default of tron-relight, whose
+    averages are compared with lit that is averaged alike, too.
     """
     for method, found in scores.items():
         mean = sum(each.flicker.squared for each in found) / sum(each.flicker.pixels for each in found)
@@ -69,14 +69,12 @@ def clip_rows(scores: Scored, kinds: Sequence[str], seed: int) -> Iterator[Row]:
         )
     for kind in kinds:
         single = scores[f"{kind}.{SINGLE}"]
-        names = {f"renderer.{kind}.{{}}.{way}": way for way in (AVERAGED, WINDOWS)}
-        names["renderer.{}" if kind == "lit" else f"renderer.{kind}.{{}}"] = WINDOWS
-        for name, way in names.items():
-            yield _ratio(name.format("warp_error_ratio"), scores[f"{kind}.{way}"], single, seed)
-            yield _gain(name.format("clip_gain_db"), scores[f"{kind}.{way}"], single, seed)
+        averaged, prefix = scores[f"{kind}.{AVERAGED}"], "renderer" if kind == "lit" else f"renderer.{kind}"
+        yield _ratio(f"{prefix}.warp_error_ratio", averaged, single, seed)
+        yield _gain(f"{prefix}.clip_gain_db", averaged, single, seed)
     if "lit" in kinds:
-        windows = scores[f"lit.{WINDOWS}"]
-        yield _gain("renderer.lit.clip_gain_over_lit_db", windows, scores[LIT_AVERAGED], seed)
+        averaged = scores[f"lit.{AVERAGED}"]
+        yield _gain("renderer.lit.clip_gain_over_lit_db", averaged, scores[LIT_AVERAGED], seed)
 
 
 def _ratio(metric: str, many: Sequence[ClipScore], single: Sequence[ClipScore], seed: int) -> Row:
@@ -99,10 +97,10 @@ def _gain(metric: str, many: Sequence[ClipScore], single: Sequence[ClipScore], s
 def measure_clips(
     dataset: Path, split: str, networks: Mapping[str, Network], seed: int, outcome: Outcome
 ) -> None:
-    """Render every clip by single frames and by windows; films are of the one that flickers most.
+    """Render every clip by single frames, averaged too; films are of the one that flickers most.
 
     Raises:
-        TronError: no clip is as long as a window, or clips hold no true depth.
+        TronError: no clip has as many frames as are averaged, or clips hold no true depth.
     """
     scores: defaultdict[str, list[ClipScore]] = defaultdict(list)
     worst, films = 0.0, None
@@ -118,7 +116,6 @@ def measure_clips(
         for kind, network in networks.items():
             single = network.show(buffers)
             shown |= {f"{kind}.{SINGLE}": single, f"{kind}.{AVERAGED}": _averaged(single, buffers)}
-            shown[f"{kind}.{WINDOWS}"] = network.show(buffers, WINDOW)
         for method, frames in shown.items():
             psnr = [
                 metrics.capped_psnr(image, target, mask)
@@ -130,7 +127,7 @@ def measure_clips(
             if films is None or scores[f"{kind}.{SINGLE}"][-1].flicker.mean > worst:
                 worst = scores[f"{kind}.{SINGLE}"][-1].flicker.mean
                 films = _films(f"Scene {clip.meta.scene}, light {clip.meta.light}", kind, shown)
-        log.info("clip %s by windows of %d frames", clip.meta.key, WINDOW)
+        log.info("clip %s", clip.meta.key)
     if not scores:
         raise TronError(f"no clip of {WINDOW} frames whose surface is seen twice", dataset)
     outcome.add(clip_rows(scores, list(networks), seed))
@@ -141,14 +138,14 @@ def measure_clips(
 def _averaged(frames: np.ndarray, buffers: Buffers) -> np.ndarray:
     """Pictures averaged along the motion of their clip, as tron-relight does."""
     assert buffers.motion is not None  # the clip was read with the depth of its surfels
-    return np.stack(list(averaged_frames(frames, len(frames), WINDOW, buffers.motion, WINDOWS)))
+    return np.stack(list(averaged_frames(frames, len(frames), WINDOW, buffers.motion, "anchor")))
 
 
 def _films(title: str, kind: str, shown: Mapping[str, np.ndarray]) -> Films:
-    """A clip by lit, by a network's single frames and windows, and its truth."""
+    """A clip by lit, by a network's single frames and their averages, and its truth."""
     words = PLAIN | {f"{kind}.{way}": f"{KIND_TITLES[kind]}, {said}" for way, said in WAYS.items()}
     films = []
-    for method in (LIT, f"{kind}.{SINGLE}", f"{kind}.{WINDOWS}", TRUTH):
+    for method in (LIT, f"{kind}.{SINGLE}", f"{kind}.{AVERAGED}", TRUTH):
         frames = shown[method]
         scale = -(-LEAST_WIDTH // frames.shape[2])
         size = frames.shape[2] * scale, frames.shape[1] * scale

@@ -79,12 +79,12 @@ def test_a_clip_without_true_depth_is_refused(drawn_clip: Callable[..., Clip]):
 
 
 def test_ratios_are_of_mean_squares_and_gains_of_the_same_frames():
-    psnr = {"lit_buffer_averaged": 30.0, "lit.k1": 30.0, "lit.averaged": 30.0, "lit.anchor": 30.5}
+    psnr = {"lit_buffer_averaged": 30.0, "lit.k1": 30.0, "lit.averaged": 30.5}
     scores: dict[str, list[ClipScore]] = {name: [] for name in ("truth", *psnr)}
     for scene, single, many in (("a", (8.0, 100), (4.0, 100)), ("b", (2.0, 50), (1.5, 50))):
         scores["truth"].append(ClipScore(scene, Flicker(0.5, single[1]), [100.0, 100.0]))
         for name, first in psnr.items():
-            of = Flicker(*(many if name == "lit.anchor" else single))
+            of = Flicker(*(many if name == "lit.averaged" else single))
             scores[name].append(ClipScore(scene, of, [first, first + 1]))
     rows = values(clip_rows(scores, ["lit"], 0))
     assert rows["renderer.warp_error_ratio"].value == pytest.approx(5.5 / 10)

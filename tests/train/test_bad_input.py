@@ -137,13 +137,6 @@ def test_the_papers_recipe_asks_for_the_lpips_weights(capsys, dataset, tmp_path)
     assert not (tmp_path / "out").exists()
 
 
-def test_clips_alone_teach_temporal_weights():
-    wrong = {"frames": 1}, {"frames": 5, "still_ratio": 0.5}
-    for change in wrong:
-        with pytest.raises(ValidationError, match="train_only=temporal learns from clips"):
-            Stage.model_validate(STAGE | {"train_only": "temporal"} | change)
-
-
 def test_settings_out_of_range_are_refused(make_settings):
     plain = make_settings("a", "b")
     wrong = {"logger": ["mlflow"], "data": {"exposure": -1}, "optimizer": {"betas": 1}, "devices": 0}

@@ -13,7 +13,6 @@ from train.module import RendererModule
 from train.settings import Settings
 from tron.errors import TronError
 from tron.neural import shipped
-from tron.neural.networks.pixel_mlp import PixelMLP
 
 PIXELS = {"_target_": "tron.neural.networks.pixel_mlp.PixelMLP"}
 STAGES = [
@@ -120,22 +119,6 @@ def test_a_stage_ends_with_averaged_weights_and_the_next_begins_with_them(train,
         assert (ended[name] - begun["one"][name]).norm() < (plain[name] - begun["one"][name]).norm()
 
 
-@pytest.mark.parametrize("optimizer", [{}, {"ema_decay": 0.5}, {"muon_learning_rate": 0.02}])
-def test_a_stage_may_train_temporal_weights_alone(train, monkeypatch, tmp_path, optimizer):
-    """The others stay as the stage before left them, to the last bit, averaged or not."""
-    named = {name for name, _ in PixelMLP().named_parameters()}
-    chosen = {sorted(named)[0]}
-
-    def temporal(self):
-        return {name: weight for name, weight in self.named_parameters() if name in chosen}
-
-    monkeypatch.setattr(PixelMLP, "temporal_weights", temporal)
-    stages = [STAGES[0], STAGES[1] | {"train_only": "temporal"}]
-    found = train(tmp_path, renderer=PIXELS, stages=stages, optimizer={"warmup_steps": 0, **optimizer})
-    before = load_file(tmp_path / "checkpoints" / "1-one.safetensors")
-    assert {name for name in found if not torch.equal(found[name], before[name])} == chosen
-
-
 def test_constants_stay_under_the_average_to_the_last_bit():
     """Which Lightning's own formula would not grant."""
     layer = torch.nn.Linear(64, 64)
@@ -146,9 +129,3 @@ def test_constants_stay_under_the_average_to_the_last_bit():
             averaged._average_model.update_parameters(layer)
         (weight, _) = averaged._average_model.module.parameters()
         assert torch.equal(weight, layer.weight)
-
-
-def test_a_renderer_without_temporal_weights_is_refused_in_one_line(train, tmp_path):
-    stages = [STAGES[1] | {"train_only": "temporal"}]
-    with pytest.raises(TronError, match="stage two trains temporal weights alone"):
-        train(tmp_path, renderer=PIXELS, stages=stages)

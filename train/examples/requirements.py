@@ -99,8 +99,3 @@ def require_renderer(stage: Stage, renderer: Renderer) -> None:
                 f"stage {stage.name} has a {key} of {odd[0]} pixels, the renderer takes multiples of {block}",
                 mend=f"give it {max(block, odd[0] // block * block)}",
             )
-    if stage.train_only == "temporal" and not renderer.temporal_weights():
-        raise TronError(
-            f"stage {stage.name} trains temporal weights alone, and this renderer has none",
-            mend="leave train_only at all, or choose a renderer with temporal paths",
-        )

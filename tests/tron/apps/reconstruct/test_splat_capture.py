@@ -10,8 +10,15 @@ import plyfile
 import pytest
 
 from tron.apps.reconstruct.command import cli
-from tron.apps.reconstruct.splat_capture import SplatSettings, film_splats, is_splats, virtual_cameras
+from tron.apps.reconstruct.splat_capture import (
+    SplatSettings,
+    film_splats,
+    is_splats,
+    keeps_surfels,
+    virtual_cameras,
+)
 from tron.errors import TronError
+from tron.gaussians.fields import FIELDS
 from tron.gaussians.ply import MATERIAL_PROPERTIES
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.reconstruction.progress import untracked
@@ -175,6 +182,20 @@ def test_the_command_makes_a_plain_file_relightable(variant, plain, tmp_path):
     assert scene.up.tolist() == [0, -1, 0]
 
 
+def test_a_thin_scan_is_learnt_anew_and_a_thick_one_keeps_its_surfels(variant, plain, caplog):
+    caplog.set_level("INFO")
+    thin = GaussianScene.load(plain)
+    layers = {name: np.concatenate([getattr(thin, name)] * 12) for name in FIELDS}
+    depths = np.repeat(np.arange(12) - 6, len(thin)) * thin.spacing
+    layers["means"] = layers["means"] - depths[:, None] * np.tile(thin.normals(), (12, 1))
+    fog = replace(thin, **layers | {"opacity_logits": np.full(12 * len(thin), -0.5)})
+    assert [keeps_surfels(each, "auto", None) for each in (thin, fog)] == [False, True]
+    assert "splats.geometry=scan keeps its own" in caplog.messages[0]
+    assert "splats.geometry=new learns others" in caplog.messages[1]
+    assert keeps_surfels(thin, "scan", None)
+    assert not keeps_surfels(fog, "new", None)
+
+
 @pytest.fixture
 def few_views(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"VIEWS": 12, "SIDE": 64}.items():
@@ -195,7 +216,7 @@ def test_the_command_keeps_every_surfel_and_finds_the_light(plain, tmp_path, cap
     with pytest.raises(SystemExit) as end:
         cli([f"capture={scan}", "up=[0,0,1]", "splats.views=12", "splats.side=48", "threads=1",
              "report.frames=0", "prior.light.points=300", "prior.light.steps=20",
-             f"output_dir={out}"])  # fmt: skip
+             "splats.geometry=scan", f"output_dir={out}"])  # fmt: skip
     assert end.value.code == 0
     found, before = GaussianScene.load(out / "scene.ply"), GaussianScene.load(scan)
     for name in ("means", "log_scales", "opacity_logits", "sh"):
