@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from tron.apps.machine import Threads, Variant
 from tron.apps.relight.camera_files import filmed_orbit, filmed_with
 from tron.apps.relight.scan_materials import with_materials
 from tron.apps.scene_file import Up, check_scene_files, load_scene
@@ -61,10 +62,8 @@ class Settings(BaseModel):
     )
     up: Up = None
     seed: int = Field(0, description="root of all random numbers")
-    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = Field(
-        "llvm_ad_rgb", description="Mitsuba variant: processor or NVIDIA GPU"
-    )
-    threads: int | None = Field(None, ge=1, description="threads of the renderer; null: all")
+    variant: Variant = "llvm_ad_rgb"
+    threads: Threads = None
 
 
 def main(settings: Settings) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 import time
 from pathlib import Path
-from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from tron.apps.machine import Threads, Variant
 from tron.apps.scene_file import Up, check_scene_files, load_scene
 from tron.cameras import Camera
 from tron.cli.command_line import command
@@ -44,10 +44,8 @@ class Settings(BaseModel):
     port: int = Field(8080, ge=1, le=65535, description="port to listen on")
     up: Up = None
     seed: int = Field(0, description="root of all random numbers")
-    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = Field(
-        "llvm_ad_rgb", description="Mitsuba variant: processor or NVIDIA GPU"
-    )
-    threads: int | None = Field(None, ge=1, description="threads of the renderer; null: all")
+    variant: Variant = "llvm_ad_rgb"
+    threads: Threads = None
 
 
 def main(settings: Settings) -> None:

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from tron.cameras import Camera
 from tron.color import linear_to_srgb, srgb_to_linear
-from tron.editing import Edit, EditList, Insert, Material, Move, Remove, Selection
+from tron.editing import Edit, Insert, Material, Move, Remove, Selection
 from tron.errors import TronError
 from tron.framing import find_subject
 from tron.gaussians.scene import GaussianScene, rotation_matrices
@@ -377,41 +377,43 @@ class Window:
             with self._lock:
                 what = event.target.value
                 if what == "Scene":
-                    paths = self._save_scene()
+                    said = _listed(*self._save_scene())
                 else:
                     picture = self._last.get(event.client_id)
                     if picture is None:
                         raise TronError("there is no picture yet")
-                    paths = [self._save_picture(picture)] if what == "Picture" else self._film(picture)
+                    said = self._film(picture) if what == "Film" else _listed(self._save_picture(picture))
         except (TronError, OSError) as error:
             self._say(str(error))
             return
-        self._saved.content = "\n\n".join(paths)
+        self._saved.content = said
 
-    def _save_picture(self, picture: Picture) -> str:
+    def _save_picture(self, picture: Picture) -> Path:
         path = self._path("picture", ".png")
         write_image(path, picture.image)
-        return f"`{path}`"
+        return path
 
-    def _save_scene(self) -> list[str]:
+    def _save_scene(self) -> list[Path]:
+        """The scene of the moment, and the edits that made it where there are any."""
         path = self._path("scene", ".ply")
-        scene = self.studio.ask(lambda stage: stage.session.scene).result(PATIENCE_SECONDS)
+        scene, edits = self.studio.ask(lambda stage: (stage.session.scene, stage.session.edits)).result(
+            PATIENCE_SECONDS
+        )
         scene.save(path)
-        edits = self.studio.wished.edits
-        if not edits:
-            return [f"`{path}`"]
+        if not edits.edits:
+            return [path]
         listed = self._path("edits", ".yaml")
-        EditList(edits).write(listed)
-        return [f"`{path}`", f"`{listed}`"]
+        edits.write(listed)
+        return [path, listed]
 
-    def _film(self, picture: Picture) -> list[str]:
-        """What tron-relight needs to film the view, and its command line."""
+    def _film(self, picture: Picture) -> str:
+        """Save what tron-relight needs to film the view; its command line, as Markdown."""
         wish, scene = picture.wish, self._file
         turn, exposure = self.studio.ask(lambda stage: (stage.turn, stage.exposure(wish))).result(
             PATIENCE_SECONDS
         )
         if wish.edits and not wish.before:
-            scene = Path(self._save_scene()[0].strip("`"))
+            scene = self._save_scene()[0]
         (camera,) = turn_cameras([picture.camera], turn.T)
         path = self._path("view", ".json")
         content = {"offset": self._offset.tolist(), "cameras": [camera.to_dict()]}
@@ -423,7 +425,7 @@ class Window:
         ]
         line = " ".join(map(shlex.quote, words))
         log.info("%s", line)
-        return [f"```\n{line}\n```"]
+        return f"```\n{line}\n```"
 
     # Pictures: of the studio's thread.
 
@@ -500,6 +502,11 @@ def _camera_of(handle: viser.CameraHandle) -> Camera | None:
         return Camera(focal, focal, width / 2, height / 2, width, height, matrix)
     except TronError:  # a client may send anything
         return None
+
+
+def _listed(*paths: Path) -> str:
+    """Paths as Markdown, one below another."""
+    return "\n\n".join(f"`{path}`" for path in paths)
 
 
 def _said(edit: Edit) -> str:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from tron.apps.machine import Variant
 from tron.apps.reconstruct.splat_capture import SplatSettings
 from tron.captures import LoadSettings
 from tron.captures.load import CaptureSettings
@@ -55,9 +56,7 @@ class Settings(ReconstructionSettings, CaptureSettings, Paths):
         None, description="local vgg16-397923af.pth, to score LPIPS as well; nothing is downloaded"
     )
     overwrite: bool = Field(False, description="begin anew in an output_dir made with other settings")
-    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = Field(
-        "llvm_ad_rgb", description="Mitsuba variant: processor or NVIDIA GPU"
-    )
+    variant: Variant = "llvm_ad_rgb"
     threads: int | None = Field(
         None, ge=1, description="threads of the renderer; null: all; 1 makes runs repeat bit by bit"
     )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from tron.apps.machine import Variant
 from tron.apps.relight.camera_files import CAMERAS, cameras_of, frame_size
 from tron.apps.relit import Background
 from tron.apps.scene_file import Up
@@ -191,9 +192,7 @@ class Settings(BaseModel):
     )
     overwrite: bool = Field(False, description="replace frames that were made with other settings")
     seed: int = Field(0, description="root of all random numbers")
-    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = Field(
-        "llvm_ad_rgb", description="Mitsuba variant: processor or NVIDIA GPU"
-    )
+    variant: Variant = "llvm_ad_rgb"
     threads: int | None = Field(None, ge=1, description="threads of renderer and network; null: all")
 
     @model_validator(mode="after")
