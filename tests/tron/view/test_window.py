@@ -1,5 +1,6 @@
 """The window in a real browser: Debian's Chromium, driven by Playwright."""
 
+import shlex
 import shutil
 import socket
 import time
@@ -11,7 +12,9 @@ import numpy as np
 import pytest
 
 from examples.stage import BALL
+from tron.apps.relight.settings import Settings as Relight
 from tron.cameras import Camera
+from tron.cli.recipes import check, compose_recipe
 from tron.editing import EditList, Material
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
@@ -165,6 +168,11 @@ def test_what_is_saved_is_what_is_shown(window, page, tmp_path):
     assert (written.roughness[written.object_id == BALL] == np.float32(0.9)).all()
     assert EditList.read(saved / "edits-001.yaml").edits == window.studio.wished.edits
     page.wait_for_selector("text=tron-relight scene=")
+    name, *words = shlex.split(window._saved.content.strip("`\n"))
+    film = check(compose_recipe("conf.relight", Relight, words), Relight)
+    assert name == "tron-relight"
+    assert (film.scene, film.cameras) == (saved / "scene-002.ply", saved / "view-001.json")
+    assert film.scene.read_bytes() == (saved / "scene-001.ply").read_bytes()
     assert page.complaints == []
 
 
