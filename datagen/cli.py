@@ -7,6 +7,7 @@ from datagen.run.captures import CAMERAS, make_captures
 from datagen.run.cost import project
 from datagen.run.dataset import make
 from datagen.run.merge import merge
+from datagen.run.publish import publish
 from datagen.run.validate import validate
 from datagen.settings.command import Settings
 from tron.cli.command_line import command
@@ -18,8 +19,9 @@ def main(settings: Settings) -> int:
     Scenes are drawn from seeds, path-traced by Mitsuba, turned into surfels and rendered again by TRON's
     tracer; the pairs land in tar shards with a manifest. With mode=plan nothing is made:
     what is missing is printed with its bytes, memory and hours. With shard=i/n one part of a
-    dataset is made; mode=merge joins them. With mode=captures scenes are path-traced from all sides
-    instead, with true maps, as folders that tron-reconstruct and nerfstudio read; with
+    dataset is made; mode=merge joins them; mode=publish makes a folder for the Hub of a dataset.
+    With mode=captures scenes are path-traced from all sides instead,
+    with true maps, as folders that tron-reconstruct and nerfstudio read; with
     mode=pseudo_captures they are photographed as by a phone, and the truth is kept apart. With
     source=captured each folder of photos in captures=DIR is reconstructed and lit, and its photos are the
     pairs' truth. With mode=equal_error guidance of a dataset's test scenes is held against the path tracer:
@@ -33,6 +35,9 @@ def main(settings: Settings) -> int:
         return 0
     if settings.mode == "merge":
         return 1 if merge(settings) else 0
+    if settings.mode == "publish":
+        publish(settings)
+        return 0
     if settings.mode in CAMERAS:
         return 1 if make_captures(settings) else 0
     if settings.mode == "equal_error":
@@ -53,6 +58,7 @@ cli = command(
         "tron-datagen output_dir=outputs/dataset mode=validate",
         "tron-datagen experiment=demo output_dir=outputs/part1 shard=1/3",
         "tron-datagen experiment=demo output_dir=outputs/dataset mode=merge 'merge=[outputs/part1,...]'",
+        "tron-datagen output_dir=outputs/dataset mode=publish publish=outputs/hub licence=cc-by-4.0",
         "tron-datagen experiment=captures output_dir=outputs/synthetic",
         "tron-datagen experiment=captured captures=photos output_dir=outputs/pairs",
         "tron-datagen experiment=pseudo_captures output_dir=outputs/pseudo",

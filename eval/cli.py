@@ -25,6 +25,16 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     benchmark: dict[str, Any] = Field(description="settings of the benchmark; benchmark=NAME chooses it")
+    export: dict[str, Any] | None = Field(
+        default=None,
+        description="settings of a suite of scenes; export=NAME writes it to output_dir/NAME, for "
+        "methods that benchmark=compare judges, and measures nothing",
+    )
+    method: dict[str, Any] | None = Field(
+        default=None,
+        description="settings of a method that runs here; method=NAME writes its pictures of suite to "
+        "output_dir/METHOD, for benchmark=compare",
+    )
     output_dir: Path = Field(
         default=Path("outputs/eval"), description="folder for results.json, report.html and the pictures"
     )
@@ -41,6 +51,13 @@ class Settings(BaseModel):
     )
     pixel_mlp: Path | list[Path] | None = Field(
         default=None, description="weights of the pixel MLP baseline, likewise"
+    )
+    suite: Path | None = Field(
+        default=None,
+        description="suite of scenes that methods are judged on or made for; export=NAME writes one",
+    )
+    methods: Path | list[Path] | None = Field(
+        default=None, description="folder of methods' folders of pictures of the suite, or [a,b]"
     )
     threads: PositiveInt = Field(default=1, description="threads that the networks use")
     seed: int = Field(default=0, description="seed of every random choice")
@@ -60,8 +77,16 @@ def main(settings: Settings) -> int:
     if settings.report is not None:
         print(f"report: {write_page(settings.report).absolute()}", flush=True)
         return 0
+    if settings.export is not None or settings.method is not None:
+        with locked(settings.output_dir):
+            try:
+                print(_export(settings) if settings.export is not None else _method(settings), flush=True)
+            except StageFailed as failure:
+                print(f"tron-eval: {failure}", file=sys.stderr)
+                return failure.exit_code
+        return 0
     benchmark = make(settings.benchmark, "benchmark")
-    for name in ("dataset", "renderer", "pixel_mlp"):
+    for name in ("dataset", "renderer", "pixel_mlp", "suite", "methods"):
         if getattr(settings, name) is not None and name not in type(benchmark).model_fields:
             mend = f"leave it out; tron-eval benchmark={benchmark.name} --help lists what it takes"
             raise TronError(f"benchmark={benchmark.name} takes no {name}", mend=mend)
@@ -79,6 +104,7 @@ def main(settings: Settings) -> int:
                 "inputs": {"settings": settings_of(benchmark), **outcome.inputs},
             },
             rows=outcome.rows,
+            absent=outcome.absent,
             reproduce=outcome.reproduce or typed(),
             series=outcome.series,
             pictures=outcome.pictures,
@@ -86,6 +112,19 @@ def main(settings: Settings) -> int:
         results.save(settings.output_dir / "results.json")
         print_results(results, write_page(settings.output_dir))
     return 0
+
+
+def _export(settings: Settings) -> str:
+    """Write a suite; its id is what methods cite."""
+    suite = make(settings.export or {}, "export").write(settings.output_dir)
+    lights = sum(len(scene.lights) for scene in suite.scenes.values())
+    return f"suite {suite.id}: {len(suite.scenes)} scenes, {lights} lights, in {suite.folder.absolute()}"
+
+
+def _method(settings: Settings) -> str:
+    """Write the folders of methods that run here."""
+    folders = make(settings.method or {}, "method").make(settings.output_dir.absolute())
+    return "\n".join(f"method: {folder}" for folder in folders)
 
 
 def settings_of(benchmark: Benchmark) -> dict[str, Any]:
@@ -107,6 +146,15 @@ cli = command(
     examples=(
         "tron-eval benchmark=demo output_dir=outputs/demo",
         "tron-eval report=docs/benchmarks/tracing",
+        "tron-eval export=tron_synth_small output_dir=outputs/suites",
+        "tron-eval method=photos suite=outputs/suites/tron_synth_small output_dir=outputs/methods",
+        "tron-eval benchmark=compare suite=outputs/suites/tron_synth_small methods=outputs/methods "
+        "output_dir=outputs/compare",
+        "tron-eval benchmark=judge suite=outputs/suites/tron_synth_small methods=outputs/methods "
+        "benchmark.ours=NAME benchmark.endpoint=https://HOST/v1 benchmark.model=NAME "
+        "output_dir=outputs/judge",
+        "tron-eval benchmark=video suite=outputs/suites/tron_synth_small methods=outputs/methods "
+        "output_dir=outputs/video",
         "tron-eval benchmark=relighting dataset=outputs/data renderer=outputs/train/renderer.safetensors "
         "output_dir=outputs/relighting",
         "tron-eval benchmark=tracing output_dir=outputs/tracing",

@@ -14,6 +14,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from eval.compare.measures import MAP_MEASURES, MEASURES
+from eval.compare.published import published
 from eval.relighting.baselines import METHODS
 from eval.relighting.scores import METRICS
 from eval.report.figures import bound, interval_note, left_out, row_cell, verdict, with_interval
@@ -44,6 +46,7 @@ def write_page(folder: Path) -> Path:
     names = {name: getattr(functions, name) for name in dir(functions) if not name.startswith("_")}
     titles = {method.name: method.title for method in METHODS}
     names |= {"metrics": METRICS, "methods": titles, "what": {method.name: method.what for method in METHODS}}
+    names |= {"measures": MEASURES, "map_measures": MAP_MEASURES, "published": published}
     names["underscored"] = {name.replace(".", "_"): title for name, title in titles.items()}
     page = render_template("eval.report", template, brand="benchmark report", **names)
     write_atomic(path, page)
@@ -231,6 +234,11 @@ class Figures:
         return (
             Table(caption, ["Figure", "Measured", "Target", "Verdict"], rows, words=[0, 3]) if rows else None
         )
+
+    def absent(self) -> Table | None:
+        """Figures that could not be measured, and why; None where all were."""
+        lacking = list(self.results.absent.items())
+        return Table("Not measured, and why.", ["Figure", "Why"], lacking, words=[1]) if lacking else None
 
     def stages(self) -> Table | None:
         """Wall time, commit and commands of the stages in stages.json; None without any."""

@@ -1,9 +1,10 @@
 """Figures of one benchmark on one machine (results.json), and the targets they are held to.
 
 The file is ``{"benchmark", "environment", "rows": [{"metric", "value", "unit", "reference", "ratio",
-"n"}]}``. Metric names are unique; a figure that was not measured has no row, and a row never holds NaN or
-infinity (JSON has no way to write them). Beside the rows stands what else the page is made of: ``targets``
-that the rows are held to, ``reproduce`` (commands), ``series`` (curves) and ``pictures`` (files beside it).
+"n"}]}``. Metric names are unique; a figure that was not measured has no row (``absent`` may say why), and a
+row never holds NaN or infinity (JSON has no way to write them). Beside the rows stands what else the page is
+made of: ``targets`` that the rows are held to, ``reproduce`` (commands), ``series`` (curves) and ``pictures``
+(files beside it).
 
 A row that is a mean over scenes also has ``"scenes"``, their number, and where that is two or more ``"low"``
 and ``"high"``, the ends of its confidence interval (:mod:`eval.confidence`). A gain has ``"without_one"``
@@ -137,6 +138,9 @@ class Results(BaseModel):
     environment: dict[str, Any]
     rows: list[Row]
     targets: list[Target] = Field(default_factory=list)
+    absent: dict[str, str] = Field(
+        default_factory=dict, description="figure that could not be measured -> why, in words"
+    )
     reproduce: list[str] = Field(default_factory=list, description="command lines that measure it again")
     series: dict[str, dict[str, list[tuple[FiniteFloat, FiniteFloat]]]] = Field(
         default_factory=dict, description="name of a chart -> label of a line -> (x, y) of its points"

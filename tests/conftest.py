@@ -257,3 +257,37 @@ def live_memory() -> Any:
             self.live -= size
 
     return LiveMemory
+
+
+@pytest.fixture(scope="session")
+def vgg16_features() -> Callable[[], Any]:
+    """torchvision's vgg16().features with random weights, written anew from the paper's configuration D."""
+    import torch
+
+    def made() -> torch.nn.Sequential:
+        layers: list[torch.nn.Module] = []
+        channels = 3
+        for width in (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512, 0):
+            if width == 0:
+                layers.append(torch.nn.MaxPool2d(2, 2))
+                continue
+            convolution = torch.nn.Conv2d(channels, width, 3, padding=1)
+            torch.nn.init.kaiming_normal_(convolution.weight)
+            torch.nn.init.normal_(convolution.get_parameter("bias"), std=0.1)
+            layers += [convolution, torch.nn.ReLU()]
+            channels = width
+        return torch.nn.Sequential(*layers)
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def random_vgg(tmp_path_factory: pytest.TempPathFactory, vgg16_features: Callable[[], Any]) -> Path:
+    """A file like torchvision's vgg16-397923af.pth, with random weights."""
+    import torch
+
+    torch.manual_seed(0)
+    state = {f"features.{name}": value for name, value in vgg16_features().state_dict().items()}
+    path = tmp_path_factory.mktemp("vgg") / "vgg16.pth"
+    torch.save({**state, "classifier.0.weight": torch.zeros(2)}, path)
+    return path

@@ -16,6 +16,8 @@ from scipy.ndimage import label
 
 from tron.errors import TronError
 
+Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""From a world that is z up to one that is y up, as glTF's and most of USD's."""
 # Fraction of the subject's surfels that may lie outside the frame.
 STRAYS = 0.01
 # Empty border around the subject, as a fraction of the image's sides.
@@ -220,3 +222,11 @@ def upright(up: np.ndarray) -> np.ndarray:
     # Rodrigues' formula about up x z, with cos = z: R = I + [v]x + [v]x^2 / (1 + cos).
     cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
     return np.eye(3) + cross + cross @ cross / (1 + z)
+
+
+def even_directions(count: int) -> np.ndarray:
+    """(count, 3) unit vectors on Fibonacci's spiral (Gonzalez 2010, Measurement of areas on a sphere)."""
+    i = np.arange(count) + 0.5
+    z, angle = 1 - 2 * i / count, i * np.pi * (3 - np.sqrt(5))
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], -1)

@@ -38,6 +38,7 @@ _LLVM_FOLDERS = (
     "/opt/homebrew/opt/llvm*/lib",
     "/usr/local/opt/llvm*/lib",
 )
+_LLVM_NAMES = {"darwin": ("libLLVM.dylib", "libLLVM-[0-9]*.dylib"), "win32": ("LLVM-C.dll",)}
 T = TypeVar("T")
 ALIGNMENT = 64
 """Bytes of the widest packet: 16 numbers of 32 bits."""
@@ -103,7 +104,9 @@ def _llvm_candidates() -> list[Path]:
     )  # users' PATH may lack /sbin
     folders += sorted({os.path.dirname(path) for path in re.findall(r"=> (\S*libLLVM\S*)", cache)})
     folders += _LLVM_FOLDERS
-    names = ("libLLVM.dylib", "libLLVM-[0-9]*.dylib") if sys.platform == "darwin" else ("libLLVM*.so*",)
+    if sys.platform == "win32":
+        folders += [*os.environ.get("PATH", "").split(os.pathsep), r"C:\Program Files\LLVM\bin"]
+    names = _LLVM_NAMES.get(sys.platform, ("libLLVM*.so*",))
     found = (glob.glob(os.path.join(folder, name)) for folder in folders for name in names)
     return [Path(path) for path in dict.fromkeys(path for paths in found for path in sorted(paths))]
 
@@ -111,6 +114,8 @@ def _llvm_candidates() -> list[Path]:
 def _llvm_remedy() -> str:
     if sys.platform == "darwin":
         return "run `brew install llvm@19`, or set DRJIT_LIBLLVM_PATH to libLLVM.dylib"
+    if sys.platform == "win32":
+        return "run `winget install LLVM.LLVM`, or set DRJIT_LIBLLVM_PATH to LLVM-C.dll"
     return (
         "install it with `apt-get install libllvm19` (Debian, Ubuntu), `dnf install llvm-libs` (Fedora) or "
         "`conda install -c conda-forge libllvm19`, or set DRJIT_LIBLLVM_PATH to libLLVM.so"
@@ -186,7 +191,7 @@ def describe_machine() -> dict[str, Any]:
     return {
         "cpu": _cpu_model(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "memory_gb": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1),
+        "memory_gb": _memory_gb(),
         "gpu": (_output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]) or "none").replace(
             "\n", ", "
         ),
@@ -197,6 +202,12 @@ def describe_machine() -> dict[str, Any]:
         "variant": (mitsuba.variant() if mitsuba else None) or "none",
         **_git_state(Path(__file__).resolve().parent.parent),
     }
+
+
+def _memory_gb() -> float | None:
+    if not hasattr(os, "sysconf"):  # Windows
+        return None
+    return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
 
 
 def _cpu_model() -> str:

@@ -9,11 +9,7 @@ A catalogue is a JSON list beside the files (``catalogue.json``) or elsewhere:
 may be ``"z"`` for models that do not stand on y. A file without a licence is used only if its name is allowed
 explicitly.
 
-A model is read as textured parts that surfels can represent. Textures become linear float32 images; glTF's
-metallic-roughness model maps one to one onto Mitsuba's ``principled``. Surfels and shadow rays know opaque
-surfaces only, so transparency is decided once, here: what is below the cut-off of alpha (one half where the
-material blends) is cut away, the rest becomes opaque. Path tracer, G-buffers and reference then agree on what
-is there.
+Models are read by :mod:`tron.models`.
 """
 
 from __future__ import annotations
@@ -22,32 +18,23 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from datagen.files.contents import Content, compared, model_contents
-from datagen.files.gltf.meshes import read_parts
-from datagen.files.obj import read_obj
-from datagen.files.parts import Part, split_mirrored, without_slivers
 from datagen.world.lights import Contrast, HdriSpec, classify
 from tron.errors import TronError
+from tron.models.load import SUFFIXES, load_model
+from tron.models.parts import Part
 from tron.shading.environments.environment import EnvironmentMap
 from tron.storage import sha256
 
 log = logging.getLogger(__name__)
 
-SUFFIXES = (".gltf", ".glb", ".obj")
-MOST_TRIANGLES = 5_000_000
 
-NEEDLE = 1e-3
-"""Least width over length of a model: below it no pixel and no surfel would find it."""
-
-_Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 CATALOGUE_NAME = "catalogue.json"
 LARGEST_CATALOGUE = 64 * 2**20
 LISTED = 20
@@ -220,7 +207,7 @@ def find_environments(
     """List the maps of a folder with their measured contrast; raises as :func:`find_assets` does."""
     assets = [
         asset.model_copy(update={"contents": (Content(path=asset.path, kind="map", sha256=asset.sha256),)})
-        for asset in find_assets(folder, (".hdr", ".exr"), catalogue, allow_unlicensed)
+        for asset in find_assets(folder, (".hdr", ".exr", ".dds", ".ktx2"), catalogue, allow_unlicensed)
     ]
     specs = [
         HdriSpec(
@@ -272,57 +259,3 @@ def _reason(error: Exception) -> str:
         first = error.errors()[0]
         return f"entry {'.'.join(map(str, first['loc']))}: {first['msg']}"
     return str(error)
-
-
-def load_model(path: str | Path, up: str = "y") -> list[Part]:
-    """Read a model; it comes out standing (z up) and fitted into the unit ball around the origin.
-
-    Args:
-        path: .gltf, .glb or .obj.
-        up: the file's own up axis, ``y`` (glTF's rule, OBJ's habit) or ``z``.
-
-    Raises:
-        TronError: a file that is missing, damaged, too large, refers to what lies outside its folder, needs
-            what is not read, or has nothing to show.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise TronError("model not found", path)
-    try:
-        parts = (
-            read_obj(path, MOST_TRIANGLES)
-            if path.suffix.lower() == ".obj"
-            else read_parts(path, MOST_TRIANGLES)
-        )
-        return _fitted(parts, up)
-    except TronError as error:
-        raise TronError(error.what, error.where or path, error.mend) from error
-    except Exception as error:  # trimesh, DracoPy and damaged JSON raise whatever they stumble over
-        raise TronError(f"model cannot be read: {type(error).__name__}: {error}", path) from error
-
-
-def _fitted(parts: list[Part], up: str) -> list[Part]:
-    """Parts with area, z up, in the unit ball."""
-    with np.errstate(all="ignore"):  # overflow is found below
-        parts = [part for part in map(without_slivers, parts) if len(part.faces)]
-    if not parts:
-        raise TronError("model has no opaque triangles")
-    if sum(len(part.faces) for part in parts) > MOST_TRIANGLES:
-        raise TronError(f"model has more than {MOST_TRIANGLES:,} triangles", mend="simplify it")
-    if not all(np.isfinite(part.vertices).all() for part in parts):
-        raise TronError("model has vertices that are not finite")
-    if any(part.uv is not None and not np.isfinite(part.uv).all() for part in parts):
-        raise TronError("model has texture coordinates that are not finite")
-    turn = _Y_UP_TO_Z_UP if up == "y" else np.eye(3)
-    parts = [replace(p, vertices=p.vertices @ turn.T, normals=p.normals @ turn.T) for p in parts]
-    used = np.concatenate([part.vertices for part in parts])
-    centre = 0.5 * used.min(axis=0) + 0.5 * used.max(axis=0)
-    with np.errstate(over="ignore"):
-        radius = float(np.linalg.norm(used - centre, axis=1).max())
-    if not 0 < radius < np.inf:
-        raise TronError("model has no extent, or more than numbers hold")
-    parts = [replace(part, vertices=(part.vertices - centre) / radius) for part in parts]
-    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(((used - centre) / radius).T)), 0.0))
-    if spread[1] < NEEDLE * spread[2]:
-        raise TronError(f"model is {spread[2] / max(spread[1], 1e-30):,.0f} times longer than wide: a needle")
-    return [piece for part in parts for piece in split_mirrored(part)]

@@ -17,11 +17,11 @@ import numpy as np
 from PIL import Image
 from pydantic import BaseModel, ConfigDict
 
-from datagen.files.gltf.document import confined, read_document
-from datagen.files.gltf.materials import require_size
-from datagen.files.mtl import find_libraries, joined_lines, read_library
-from datagen.files.parts import Part
 from tron.errors import TronError
+from tron.io.gltf_document import confined, read_document
+from tron.models.gltf.materials import require_size
+from tron.models.mtl import find_libraries, joined_lines, read_library
+from tron.models.parts import Part
 from tron.storage import sha256
 
 ContentKind = Literal["model", "buffer", "library", "mesh", "texture", "plain", "map"]
@@ -58,7 +58,7 @@ def model_contents(folder: Path, path: str, parts: Sequence[Part]) -> tuple[Cont
     Args:
         folder: of the assets.
         path: of the model, relative to it.
-        parts: the model as :func:`datagen.files.assets.load_model` gives it.
+        parts: the model as :func:`tron.models.load.load_model` gives it.
     """
     found = [Content(path=path, kind="model", sha256=sha256(folder / path))]
     for file, kind in _references(folder / path):

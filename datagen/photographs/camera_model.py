@@ -18,7 +18,7 @@ from datagen.dataset.records import Work
 from datagen.settings.captures import ViewSettings
 from datagen.settings.command import Settings
 from datagen.truth.build import Geometry
-from datagen.truth.pathtrace import direct_irradiance, metered, render_frames
+from datagen.truth.pathtrace import direct_irradiance, gbuffers, metered, render_frames
 from datagen.world.scene import SceneSpec
 from tron.cameras import Camera
 from tron.captures import Capture, View
@@ -115,6 +115,16 @@ def held_out(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
     return dict(list(cameras.items())[::HELD_OUT])
 
 
+def relit_cameras(
+    spec: SceneSpec, cameras: Mapping[str, Camera], settings: ViewSettings
+) -> dict[str, Camera]:
+    """Cameras that other lights are shown to: the held-out ones of a capture, or the scene's own film."""
+    if settings.film_frames is None:
+        return held_out(cameras)
+    film = spec.cameras.film.cameras(settings.film_frames, settings.width, settings.height)
+    return {f"frame_{number:05d}": camera for number, camera in enumerate(film)}
+
+
 def relit_folders(folder: Path, name: str, families: Sequence[str]) -> list[Path]:
     """Folders of a scene's held-out views under each of the lights, such as ``relit/test-000000_1_sun``."""
     return [folder / f"{name}_{number}_{family}" for number, family in enumerate(families, start=1)]
@@ -136,7 +146,7 @@ def write_relit(
         geometry: its meshes.
         environments: one for each of ``settings.relights``.
         cameras: name of a view -> camera.
-        settings: families of the lights, paths per pixel.
+        settings: families of the lights, paths per pixel; whether true maps stand beside.
 
     Raises:
         TronError: a frame is not finite, or a folder cannot be written.
@@ -156,15 +166,29 @@ def write_relit(
             direct_irradiance(geometry, scene, camera, settings.relight_spp, seed).shadowed
             for camera, seed in zip(cameras.values(), seeds)
         ]
+        surfaces = [{}] * len(shots) if settings.film_frames is None else _surfaces(geometry, cameras)
         views = [
-            View(name, camera, straight, "linear", mask=mask, irradiance=arriving)
-            for (name, camera), (straight, mask), arriving in zip(cameras.items(), shots, direct)
+            View(name, camera, straight, "linear", mask=mask, irradiance=arriving, **maps)
+            for (name, camera), (straight, mask), arriving, maps in zip(
+                cameras.items(), shots, direct, surfaces, strict=True
+            )
         ]
         exposure = shown_with(spec, environment, frames)
         capture = Capture(tuple(views), up=np.array([0.0, 0.0, 1.0]), exposure=exposure)
         beside = {"environment.exr": encode_exr(environment.image, half=False)}
         path.parent.mkdir(parents=True, exist_ok=True)
         write_capture(path, capture, overwrite=True, beside=beside)
+
+
+def _surfaces(geometry: Geometry, cameras: Mapping[str, Camera]) -> list[dict[str, np.ndarray]]:
+    """True base color and normals of each view, zero where there is no surface."""
+    return [
+        {
+            "base_color": np.where(seen.valid[..., None], seen.base_color, 0),
+            "normal": np.where(seen.valid[..., None], seen.normal, 0),
+        }
+        for seen in gbuffers(geometry, list(cameras.values()))
+    ]
 
 
 def shown_with(spec: SceneSpec, environment: EnvironmentMap, frames: np.ndarray) -> float:

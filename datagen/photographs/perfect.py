@@ -83,7 +83,8 @@ class PerfectCamera(CameraModel):
         """Pictures and maps of all views, the relit ones and the light."""
         wanted = settings.capture
         pixels = wanted.views * wanted.width * wanted.height
-        relit = pixels // HELD_OUT * len(wanted.relights) * RELIT_PIXEL_BYTES
+        shown = wanted.views // HELD_OUT if wanted.film_frames is None else wanted.film_frames
+        relit = shown * wanted.width * wanted.height * len(wanted.relights) * RELIT_PIXEL_BYTES
         return relit + pixels * PIXEL_BYTES + wanted.views * 10_000 + settings.environment_height**2 * 2 * 12
 
     def shoot(self, stage: Stage, settings: Settings) -> None:

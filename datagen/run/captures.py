@@ -20,7 +20,7 @@ from datagen.photographs.camera_model import (
     RELIT,
     CameraModel,
     Stage,
-    held_out,
+    relit_cameras,
     relit_folders,
     view_names,
     write_relit,
@@ -119,7 +119,9 @@ def make_capture(item: Work, settings: Settings, sources: Sources) -> Path:
         light.bake(settings.environment_height, settings.environments).baked() for light in spec.lights
     )
     cameras = dict(zip(names, spec.views(len(names), wanted.width, wanted.height)))
-    write_relit(settings.output_dir / RELIT, spec, geometry, others, held_out(cameras), wanted)
+    write_relit(
+        settings.output_dir / RELIT, spec, geometry, others, relit_cameras(spec, cameras, wanted), wanted
+    )
     camera.shoot(Stage(spec, geometry, environment, cameras), settings)
     del geometry
     gc.collect()

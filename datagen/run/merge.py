@@ -170,12 +170,12 @@ def _link_all(files: Mapping[str, Path], output: Path) -> None:
     """Link every file into a folder, records last: until its record is there, a scene does not count."""
     copied = 0
     for name in sorted(files, key=lambda name: (name.endswith(f"/{RECORD_NAME}"), name)):
-        copied += _link(files[name], output / name)
+        copied += link(files[name], output / name)
     if copied:
         log.warning("%d files were copied: their file system cannot be linked from %s", copied, output)
 
 
-def _link(source: Path, target: Path) -> bool:
+def link(source: Path, target: Path) -> bool:
     """Link a file, whole or not at all; copy it where it cannot be. Return whether it was copied."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if target.is_file() and (os.path.samefile(source, target) or _same(source, target)):

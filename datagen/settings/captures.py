@@ -69,6 +69,13 @@ class ViewSettings(SettingsModel):
         "well, into output_dir/relit: the truth of relighting.",
     )
     relight_spp: int = Field(default=144, ge=1, description="Paths per pixel of those.")
+    film_frames: int | None = Field(
+        default=None,
+        ge=1,
+        le=10_000,
+        description="Show the lights of relights from so many places along the path of the scene's clips, "
+        "with true base color and normals, instead of from the held-out views.",
+    )
 
 
 class CaptureSettings(ViewSettings):

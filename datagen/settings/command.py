@@ -26,10 +26,10 @@ from tron.estimation import FINAL, FINEST, PREVIEW, Diffuse, Estimation, Estimat
 from tron.run_folder import leaves
 from tron.seeds import generator
 
-Mode = Literal["make", "plan", "validate", "merge", "captures", "pseudo_captures", "equal_error"]
+Mode = Literal["make", "plan", "validate", "merge", "captures", "pseudo_captures", "equal_error", "publish"]
 Split = Literal["train", "train_b", "validation", "test"]
 SHARD = re.compile(r"([1-9][0-9]{0,8})/([1-9][0-9]{0,8})")
-SCALING = ("shard", "merge", "merge_incomplete", "store")
+SCALING = ("shard", "merge", "merge_incomplete", "store", "publish", "licence")
 """Keys that decide where parts of a dataset are made and kept, and nothing of what is in it."""
 
 Item = TypeVar("Item")
@@ -109,6 +109,13 @@ class ScaleSettings(SettingsModel):
         examples=["s3://bucket/dataset"],
     )
 
+    publish: Path | None = Field(
+        None, description="Folder for the Hub that mode=publish makes of the dataset in output_dir."
+    )
+    licence: str | None = Field(
+        None, description="Licence of a published dataset, by the Hub's names; none: that of its files."
+    )
+
     @field_validator("shard")
     @classmethod
     def _one_of_n(cls, value: str | None) -> str | None:
@@ -147,8 +154,8 @@ class Settings(ScaleSettings):
         "make",
         description="make the dataset; plan it: print what is missing, the bytes and hours it takes and the "
         "memory of a worker, by a table of measured costs, and render nothing; validate the one in "
-        "output_dir and list every problem; join the parts in `merge`; path-trace captures for "
-        "tron-reconstruct into "
+        "output_dir and list every problem; join the parts in `merge`; publish it: a folder "
+        "for the Hub; path-trace captures for tron-reconstruct into "
         "output_dir/captures; photograph the splits' scenes as a phone would, with the truth kept apart in "
         "output_dir/truth (pseudo_captures); or measure on the test scenes in output_dir how long the path "
         "tracer takes to be as near the truth as guidance is (equal_error).",
@@ -543,7 +550,7 @@ class KeysOfCaptured:
         """Raise ValueError without captures, or where a key is of synthetic scenes."""
         if settings.captures is None:
             raise ValueError("source=captured needs captures=DIR, a folder with a capture a sub-folder")
-        if settings.mode not in ("make", "plan", "validate", "merge"):
+        if settings.mode not in ("make", "plan", "validate", "merge", "publish"):
             raise ValueError(f"mode={settings.mode} is of source=synthetic")
         ours = OF_CAPTURES | OF_BOTH_SOURCES | OUTSIDE - {"variety_against", "disjoint_from"}
         for name, field in Settings.model_fields.items():

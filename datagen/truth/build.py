@@ -10,17 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, NamedTuple
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from datagen.clock import stage
 from datagen.dataset.records import Work
 from datagen.files.assets import load_models
-from datagen.files.parts import Part, Sampling, outline
 from datagen.files.sources import Sources, of_split, slots
 from datagen.files.texture_sets import opened
 from datagen.settings.command import Settings
@@ -34,7 +31,8 @@ from datagen.world.shapes import make_pieces, split_creases
 from datagen.world.styles import Choice
 from tron.cameras import Camera
 from tron.errors import TronError
-from tron.runtime import aligned
+from tron.models.parts import Part, outline
+from tron.models.shapes import Shape, flat, limited, mitsuba_mesh, mitsuba_texture, textured
 from tron.shading.environments.environment import EnvironmentMap
 
 FIRST_ID = 1
@@ -65,20 +63,14 @@ class _Solid(NamedTuple):
 
 
 @dataclass
-class Surface:
-    """One Mitsuba mesh and what is needed to read its true materials at a hit.
+class Surface(Shape):
+    """A mesh of the scene, and which object each of its triangles is of.
 
     Attributes:
-        shape: the mesh, with its material.
-        principled: the innermost material, which knows base color, roughness and metallic.
-        normal_map: texture of tangent-space normals as (n + 1) / 2, or None.
         object_id: (F,) uint32 object of each triangle.
         rest: (V, 3) positions and normals before anything moved.
     """
 
-    shape: mi.Mesh
-    principled: mi.BSDF
-    normal_map: mi.Texture | None
     object_id: np.ndarray
     rest: tuple[np.ndarray, ...] | None = None
 
@@ -104,7 +96,7 @@ class Geometry:
             positions, normals = (array.copy() for array in surface.rest)
             positions[which] = (positions[which] - pose.pivot) @ pose.rotation.T + pose.pivot + pose.shift
             normals[which] = normals[which] @ pose.rotation.T
-            parameters["vertex_positions"], parameters["vertex_normals"] = _flat(positions), _flat(normals)
+            parameters["vertex_positions"], parameters["vertex_normals"] = flat(positions), flat(normals)
             parameters.update()
 
     def lit(self, environment: EnvironmentMap | None = None) -> mi.Scene:
@@ -160,7 +152,7 @@ def build(
             raise TronError(
                 f"the scene needs the asset {item.asset!r}", spec.name, "give its folder as assets=..."
             )
-        surfaces += [_textured(part.moved(matrix, item.size), number, i) for i, part in enumerate(parts)]
+        surfaces += [_of_model(part.moved(matrix, item.size), number, i) for i, part in enumerate(parts)]
     return Geometry([_solids(solids, texels_per_unit, most_texels), *surfaces])
 
 
@@ -179,187 +171,23 @@ def _solids(solids: Sequence[_Solid], texels_per_unit: float, most: int = texels
     principled = mi.load_dict(
         {
             "type": "principled",
-            "base_color": _texture(limited(atlas.base_color, atlas.metallic), half=True),
-            "roughness": _texture(atlas.roughness, half=True),
-            "metallic": _texture(atlas.metallic, half=True),
+            "base_color": mitsuba_texture(limited(atlas.base_color, atlas.metallic), half=True),
+            "roughness": mitsuba_texture(atlas.roughness, half=True),
+            "metallic": mitsuba_texture(atlas.metallic, half=True),
             "specular": 0.5,
         }
     )
-    normal_map = mi.load_dict(_texture(atlas.normal_map, half=True))
+    normal_map = mi.load_dict(mitsuba_texture(atlas.normal_map, half=True))
     bsdf: Any = mi.load_dict({"type": "normalmap", "normalmap": normal_map, "bsdf": principled})
     # Cloth, leaves and walls are open; a back face that renders black would not match its surfels.
     bsdf = mi.load_dict({"type": "twosided", "bsdf": bsdf})
-    mesh = _mesh("solids", bsdf, *(np.concatenate(part) for part in (vertices, normals, faces, uvs)))
+    mesh = mitsuba_mesh("solids", bsdf, *(np.concatenate(part) for part in (vertices, normals, faces, uvs)))
     return Surface(mesh, principled, normal_map, np.concatenate(ids))
 
 
-def _textured(part: Part, object_id: int, index: int) -> Surface:
-    per_vertex = part.base_color.ndim == 2
-    look = part.sampling.get
-    base_color = (
-        {"type": "mesh_attribute", "name": "vertex_base_color"}
-        if per_vertex
-        else _texture(part.base_color, look("base_color"))
-    )
-    if part.tint is not None:
-        base_color = tinted(base_color)
-    metallic = _texture(part.metallic, look("metallic"))
-    if part.base_color.max() > DIELECTRIC:
-        base_color = limited_texture(base_color, metallic)
-    principled = mi.load_dict(
-        {
-            "type": "principled",
-            "base_color": base_color,
-            "roughness": _texture(part.roughness, look("roughness")),
-            "metallic": metallic,
-            "specular": 0.5,
-        }
-    )
-    bsdf: Any = principled
-    normal_map = None
-    if part.normal_map is not None:
-        normal_map = mi.load_dict(_texture(part.normal_map, look("normal_map")))
-        bsdf = mi.load_dict({"type": "normalmap", "normalmap": normal_map, "bsdf": principled})
-    # Models are often open shells; a back face that renders black would not match its surfels.
-    bsdf = mi.load_dict({"type": "twosided", "bsdf": bsdf})
-    mesh = _mesh(f"object{object_id}-{index}", bsdf, part.vertices, part.normals, part.faces, part.uv)
-    if per_vertex:
-        mesh.add_attribute("vertex_base_color", 3, _flat(part.base_color))
-    if part.tint is not None:
-        mesh.add_attribute(ATTRIBUTE, 3, _flat(part.tint))
-    return Surface(mesh, principled, normal_map, np.full(len(part.faces), object_id, np.uint32))
-
-
-def _texture(value: np.ndarray | float, sampling: Sampling | None = None, half: bool = False) -> Any:
-    """A constant or an image as Mitsuba texture; values are linear already, ``half`` halves their memory."""
-    image = np.asarray(value, np.float32)
-    if image.ndim == 0:
-        return float(image)
-    if image.ndim == 1:
-        return {"type": "rgb", "value": image.tolist()}
-    pixels = np.ascontiguousarray(image if image.ndim == 3 else image[..., None])
-    texture = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
-    if half:
-        texture |= {"format": "fp16", "wrap_mode": "clamp"}
-    if sampling is not None:
-        texture |= {"to_uv": mi.ScalarTransform3f(sampling.matrix), "wrap_mode": sampling.wrap}
-    return texture
-
-
-def _flat(values: np.ndarray) -> Any:
-    return aligned(np.ascontiguousarray(values, np.float32).ravel())
-
-
-def _mesh(
-    name: str,
-    bsdf: mi.BSDF,
-    vertices: np.ndarray,
-    normals: np.ndarray,
-    faces: np.ndarray,
-    uv: np.ndarray | None,
-) -> mi.Mesh:
-    properties = mi.Properties()
-    properties["bsdf"] = bsdf
-    mesh = mi.Mesh(
-        name,
-        len(vertices),
-        len(faces),
-        props=properties,
-        has_vertex_normals=True,
-        has_vertex_texcoords=uv is not None,
-    )
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = _flat(vertices)
-    parameters["vertex_normals"] = _flat(normals)
-    parameters["faces"] = aligned(np.ascontiguousarray(faces, np.uint32).ravel())
-    if uv is not None:
-        parameters["vertex_texcoords"] = _flat(uv)
-    parameters.update()
-    return mesh
-
-
-@cache
-def register(_variant: str, name: str, color: Callable[[Any, Any, Any], Any]) -> None:
-    """Make a texture known to the variant in use, whose class has to be made under it.
-
-    Args:
-        name: its plugin type; its inputs are ``image`` and ``metallic``, a texture each.
-        color: linear RGB of the texture at a surface interaction.
-    """
-
-    class Derived(mi.Texture):
-        """A texture computed from its inputs at the same point."""
-
-        def __init__(self, properties: mi.Properties):
-            super().__init__(properties)
-            self.image: Any = properties.get_texture("image", 1.0)
-            self.metallic = properties.get_texture("metallic", 0.0)
-
-        def eval(self, si: Any, active: Any = True) -> Any:
-            return self.eval_3(si, active)
-
-        def eval_3(self, si: Any, active: Any = True) -> Any:
-            return color(self, si, active)
-
-        def eval_1(self, si: Any, active: Any = True) -> Any:
-            return mi.luminance(self.eval_3(si, active))
-
-        def mean(self) -> Any:
-            return self.image.mean()
-
-        def is_spatially_varying(self) -> bool:
-            return True
-
-        def to_string(self) -> str:
-            return f"{name}[{self.image}]"
-
-    mi.register_texture(name, Derived)
-
-
-ATTRIBUTE = "vertex_tint"
-
-
-def tinted(image: dict[str, Any]) -> Any:
-    """Mitsuba texture: that of a dictionary, times the mesh's attribute ``vertex_tint``; both linear RGB."""
-    register(str(mi.variant()), "tinted", _product)
-    return mi.load_dict({"type": "tinted", "image": image})
-
-
-def _product(texture: Any, si: Any, active: Any) -> mi.Color3f:
-    return texture.image.eval_3(si, active) * si.shape.eval_attribute_3(ATTRIBUTE, si, active)
-
-
-DIELECTRIC = 0.85
-"""Highest base color of a surface that is no metal, that path tracing makes no light.
-
-Mitsuba's ``principled`` adds its dielectric layer (specular 0.5) to its diffuse part and takes nothing away
-for it: with base color 1 and roughness 1 a surface sends out 1.08 times what arrives, averaged over views,
-and a closed white room never settles. At 0.85 the same average is 0.92 at most; at grazing views it can
-still pass 1 (1.2 at 6 degrees above the surface). Metals have no diffuse part, so they may be white:
-
-    base_color <= 0.85 + 0.15 metallic
-"""
-
-
-def highest(metallic: Any) -> Any:
-    """Highest base color, linear, of what is ``metallic`` in [0, 1]; NumPy and Dr.Jit alike."""
-    return DIELECTRIC + (1 - DIELECTRIC) * metallic
-
-
-def limited(base_color: np.ndarray, metallic: np.ndarray) -> np.ndarray:
-    """``base_color`` (..., 3), linear, no higher than ``metallic`` (..., 1) allows."""
-    return np.minimum(base_color, highest(metallic))
-
-
-def limited_texture(base_color: dict[str, Any] | mi.Texture, metallic: dict[str, Any] | float) -> mi.Texture:
-    """Mitsuba texture: linear ``base_color``, no higher than ``metallic`` allows at the same point."""
-    register(str(mi.variant()), "limited", _limited)
-    return mi.load_dict({"type": "limited", "image": base_color, "metallic": metallic})
-
-
-def _limited(texture: Any, si: Any, active: Any) -> mi.Color3f:
-    most = highest(texture.metallic.eval_1(si, active))
-    return dr.minimum(texture.image.eval_3(si, active), mi.Color3f(most))
+def _of_model(part: Part, object_id: int, index: int) -> Surface:
+    made = textured(part, f"object{object_id}-{index}")
+    return Surface(**vars(made), object_id=np.full(len(part.faces), object_id, np.uint32))
 
 
 @stage("build")

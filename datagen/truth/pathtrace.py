@@ -25,6 +25,7 @@ from tron.cameras import Camera, mitsuba_sensor
 from tron.color import luminance
 from tron.gaussians.initialize import GBufferView
 from tron.integrators import embed, register
+from tron.models.shapes import materials_at, surface_points
 from tron.runtime import lanes
 from tron.shading.environments.environment import EnvironmentMap
 
@@ -161,15 +162,12 @@ def stream_gbuffers(geometry: Geometry, cameras: Iterable[Camera]) -> Iterator[G
 def _views(geometry: Geometry, scene: mi.Scene, cameras: Sequence[Camera]) -> list[GBufferView]:
     rays = [_pixel_rays(camera) for camera in cameras]
     ray = _upload(*(np.concatenate(part) for part in zip(*rays)))
-    si, normal = _surface_points(geometry, scene, ray)
+    si, normal = surface_points(geometry.surfaces, scene, ray)
     valid = si.is_valid()
-    base_color, roughness, metallic = mi.Color3f(0.0), mi.Float(0.0), mi.Float(0.0)
+    base_color, roughness, metallic = materials_at(geometry.surfaces, si)
     object_id = dr.zeros(mi.UInt32, dr.width(valid))
     for surface in geometry.surfaces:
         here = valid & (si.shape == mi.ShapePtr(surface.shape))
-        base_color = dr.select(here, surface.principled.eval_attribute_3("base_color", si, here), base_color)
-        roughness = dr.select(here, surface.principled.eval_attribute_1("roughness", si, here), roughness)
-        metallic = dr.select(here, surface.principled.eval_attribute_1("metallic", si, here), metallic)
         ids = dr.gather(mi.UInt32, mi.UInt32(surface.object_id), si.prim_index, here)
         object_id = dr.select(here, ids, object_id)
     dr.eval(si.p, normal, base_color, roughness, metallic, object_id, valid)
@@ -233,7 +231,7 @@ def _irradiance_block(
     geometry: Geometry, scene: mi.Scene, origins: np.ndarray, directions: np.ndarray, pairs: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     lanes = len(origins) * pairs
-    si, normal = _surface_points(geometry, scene, _upload(origins, directions))
+    si, normal = surface_points(geometry.surfaces, scene, _upload(origins, directions))
     dr.eval(si, normal)
     pixel = dr.arange(mi.UInt32, lanes) // pairs
     si, normal = dr.gather(mi.SurfaceInteraction3f, si, pixel), dr.gather(mi.Normal3f, normal, pixel)
@@ -291,23 +289,6 @@ def _upload(origins: np.ndarray, directions: np.ndarray) -> mi.Ray3f:
 def _download(vector: mi.Vector3f | mi.Color3f) -> np.ndarray:
     """(N, 3) float32 of an evaluated vector."""
     return np.stack([np.array(coordinate) for coordinate in vector], axis=-1)
-
-
-def _surface_points(
-    geometry: Geometry, scene: mi.Scene, ray: mi.Ray3f
-) -> tuple[mi.SurfaceInteraction3f, mi.Normal3f]:
-    """First hits and their unit shading normals on the side of the ray's origin."""
-    si = scene.ray_intersect(ray)
-    normal = mi.Normal3f(si.sh_frame.n)
-    for surface in geometry.surfaces:
-        if surface.normal_map is None:
-            continue
-        here = si.is_valid() & (si.shape == mi.ShapePtr(surface.shape))
-        bent = dr.normalize(2.0 * mi.Vector3f(surface.normal_map.eval_3(si, here)) - 1.0)
-        normal = dr.select(here, mi.Normal3f(si.sh_frame.to_world(bent)), normal)
-    # Which side is seen is the triangle's affair: near silhouettes shading normals may well look away.
-    normal = dr.select(dr.dot(si.n, ray.d) > 0.0, -normal, normal)
-    return si, dr.normalize(normal)
 
 
 GREY = 0.1

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw
-from renderer import enlarged, find, side_by_side
+from renderer import find, side_by_side
 
 from tron.io.images import write_image
 from tron.neural.renderer import render_clip
@@ -17,6 +17,14 @@ from tron.runtime import set_torch_threads
 
 CLIPS = (("test-000000-l1", 0), ("test-000001-l0", 2), ("test-000002-l2", 2))
 """Clip and frame."""
+SIZE = 256
+"""Side of each picture, pixels."""
+
+
+def enlarged(image: np.ndarray) -> np.ndarray:
+    """Display values as a square of SIZE, without smoothing."""
+    shown = Image.fromarray((np.clip(image, 0, 1) * 255).round().astype(np.uint8))
+    return np.asarray(shown.resize((SIZE, SIZE), Image.Resampling.NEAREST)) / 255.0
 
 
 def main(demo: Path, out: Path) -> None:
@@ -28,7 +36,7 @@ def main(demo: Path, out: Path) -> None:
     }
     rows = []
     for key, frame in CLIPS:
-        clip = find(demo, "dataset", "test", key)
+        clip = find(demo / "dataset", key)
         pictures = {
             "split-sum PBR": clip.displayed("pbr")[frame],
             "shadowed irradiance": clip.displayed("irradiance")[frame],
@@ -38,7 +46,7 @@ def main(demo: Path, out: Path) -> None:
             given = {name: clip.displayed(name)[frame : frame + 1] for name in network.config.guidance}
             pictures[title] = render_clip(network, given)[0]
         pictures["path tracer"] = clip.displayed("rgb")[frame]
-        rows.append(side_by_side([np.asarray(enlarged(image)) / 255.0 for image in pictures.values()], 1))
+        rows.append(side_by_side([enlarged(image) for image in pictures.values()], 1))
         titles = list(pictures)
     head = Image.new("RGB", (rows[0].shape[1], 16), "white")
     for column, title in enumerate(titles):

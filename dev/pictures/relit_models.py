@@ -16,7 +16,6 @@ from tron.runtime import activate
 
 activate("llvm_ad_rgb")
 
-from datagen.files.assets import load_model  # noqa: E402
 from datagen.truth.build import Geometry, build  # noqa: E402
 from datagen.truth.pathtrace import gbuffers, render_frames  # noqa: E402
 from datagen.world.materials.plastic import PlasticSpec  # noqa: E402
@@ -26,6 +25,7 @@ from tron.cameras import Camera  # noqa: E402
 from tron.color import to_display  # noqa: E402
 from tron.gaussians.initialize import surfels_from_gbuffers  # noqa: E402
 from tron.io.images import write_image  # noqa: E402
+from tron.models.load import load_model  # noqa: E402
 from tron.relighting import EnvironmentMap, Estimation, Relighter  # noqa: E402
 
 SMALL = "--small" in sys.argv

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import fminbound
 
+from eval.light_scale import COVERED, fitted_factor
+from tron.apps.relight.camera_files import filmed_with
 from tron.apps.relight.settings import QUALITY
 from tron.captures import Capture
 from tron.captures.folder import read_capture_folder
@@ -27,11 +28,6 @@ from tron.report.page import Picture, Pictures
 from tron.seeds import integer
 from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Guidance
-
-COVERED = 0.999
-"""Coverage from which a pixel shows nothing but surfaces."""
-STOPS = 6.0
-"""The factor is looked for within so many powers of two either way."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +73,9 @@ def relight(scene: Path, truths: Sequence[Path], estimation: Estimation = QUALIT
     """
     surfels = GaussianScene.load(scene)
     captures = {path.name.rpartition("_")[2]: (path, read_capture_folder(path)) for path in truths}
-    relighter = Relighter(surfels, estimation, integer(0, "reconstruction", "relit bounces"))
+    seed = integer(0, "reconstruction", "relit bounces")
+    filmed = filmed_with(scene, np.eye(3), surfels.offset)
+    relighter = Relighter(surfels, estimation, seed, cameras=filmed)
     pictures = {
         name: _lit_views(relighter.under(EnvironmentMap.load(path / "environment.exr")), capture)
         for name, (path, capture) in captures.items()
@@ -94,27 +92,6 @@ def relight(scene: Path, truths: Sequence[Path], estimation: Estimation = QUALIT
         middle = len(truth) // 2
         found[name] = RelitLight(float(np.mean(psnrs)), truth[middle], shown[middle])
     return Relit(found, factor)
-
-
-def fitted_factor(lights: Sequence[tuple[np.ndarray, float, np.ndarray, np.ndarray]]) -> float:
-    """The one factor on radiance that brings display values nearest to the truth, in the mean square.
-
-    Args:
-        lights: of each its radiance (K, H, W, 3), exposure, true display values (K, H, W, 3) and the pixels
-            that count (K, H, W) bool.
-    """
-
-    def error(stops: float) -> float:
-        squares = [
-            np.square(to_display(radiance[where], 2.0**stops * exposure) - truth[where]).ravel()
-            for radiance, exposure, truth, where in lights
-        ]
-        return float(np.concatenate(squares).mean())
-
-    # The error has one valley, but for plateaus where all is black or white: a coarse look finds its floor.
-    coarse = np.linspace(-STOPS, STOPS, 25)
-    floor, step = coarse[np.argmin([error(stops) for stops in coarse])], coarse[1] - coarse[0]
-    return float(np.exp2(fminbound(error, floor - step, floor + step)))
 
 
 def relit_frames(light: Illumination, capture: Capture) -> list[Guidance]:

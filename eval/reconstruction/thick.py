@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from eval.light_scale import fitted_factor
 from eval.reconstruction.light import irradiance, light_errors, read_light
-from eval.reconstruction.relighting import display, fitted_factor, relit_frames
+from eval.reconstruction.relighting import display, relit_frames
 from eval.results import Row
 from tron.captures import View
 from tron.captures.folder import read_capture_folder

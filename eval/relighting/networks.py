@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,12 +10,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eval.relighting.buffers import Buffers
+from tron.cameras import Camera
 from tron.errors import TronError
+from tron.flow import surface_motion
 from tron.neural.clips import Overlap
 from tron.neural.shipped import SHIPPED, checkpoint_file
+from tron.shards.schema import displayed
 
 if TYPE_CHECKING:
     from tron.neural.protocols import Renderer
+    from tron.relighting import Illumination
 
 
 @dataclass(frozen=True)
@@ -74,3 +78,37 @@ def load_networks(kind: str, given: Iterable[str | Path], vae: Path | None = Non
             )
         networks[name] = network
     return networks
+
+
+@dataclass(frozen=True)
+class Guided:
+    """What a network is given of a lit scene: (K, H, W, 3) display values by name, and distances (H, W)."""
+
+    displayed: dict[str, np.ndarray]
+    depths: list[np.ndarray]
+
+
+def guided(
+    network: Network, light: Illumination, cameras: Sequence[Camera], exposure: float, seed: int
+) -> Guided:
+    """Trace what a network is given of some frames."""
+    names, depths, frames = network.renderer.config.guidance, [], []
+    for camera in cameras:
+        guidance = light.render(camera, seed)
+        depths.append(guidance.gbuffer["depth"])
+        made = dict(vars(guidance))
+        if any(name not in made for name in names):
+            made |= light.relighter.surface_maps(camera, light.estimation)[0]
+        frames.append({name: displayed(name, made[name], exposure) for name in names})
+    return Guided({name: np.stack([frame[name] for frame in frames]) for name in names}, depths)
+
+
+def drawn(
+    network: Network, light: Illumination, cameras: Sequence[Camera], exposure: float, seed: int
+) -> np.ndarray:
+    """Pictures (K, H, W, 3), display values, of a lit scene; of several all are averaged along the motion."""
+    from tron.neural.renderer import render_clip
+
+    given = guided(network, light, cameras, exposure, seed)
+    motion = surface_motion(cameras, given.depths.__getitem__) if len(cameras) > 1 else None
+    return render_clip(network.renderer, given.displayed, len(cameras), motion=motion)

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import logging
-import statistics
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 
@@ -30,7 +27,7 @@ from eval.renderer.datasets import (
     require_data,
 )
 from eval.renderer.gains import between, everywhere, gain_rows, over_lit, time_rows
-from eval.renderer.pictures import comparison, sweep_pictures
+from eval.renderer.pictures import comparison
 from eval.renderer.shadows import measure_shadows
 from eval.renderer.truths import TRUTH, Truths
 from eval.renderer.validation import validation_rows
@@ -51,10 +48,6 @@ KINDS = {"neural_lit": "lit", "neural": "pair"}
 """Method -> what its rows call it."""
 FOLDS = 4
 """Groups of scenes, each judged by fits on the others: a quarter of the scenes is left out of a fit."""
-WARM_UP = 1
-"""Rounds of throughput that do not count."""
-CORES = 2
-"""Threads of the network's share of a frame, in seconds."""
 PREFIX: dict[Quality, str] = {"preview": "ood_", "final": "final_"}
 """Quality of real models' frames -> beginning of its rows."""
 FEW = "few_"
@@ -116,13 +109,9 @@ class Run:
         return load_networks("neural", self.settings.weights())
 
     def synthetic(self) -> None:
-        """Gains on held-out scenes and lights, and the weights of the pair's latents."""
+        """Gains on held-out scenes and lights."""
         sizes = {size: self.datasets.synthetic(size) for size in self.settings.synthetic}
         self._judge("synthetic", "", sizes, TEST, FIT)
-        if pair := self.networks.get("neural"):
-            clip = next(iter(read_clips(next(iter(sizes.values())), TEST, MEMBERS)))
-            for name, group in sweep_pictures(clip, pair):
-                self.outcome.show("sweep", name, group)
 
     def models(self) -> None:
         """Gains on real models at every size and quality; of the largest frames also with few surfels."""
@@ -181,42 +170,6 @@ class Run:
             for size in self.settings.validation:
                 dataset = self.datasets.validation(size)
                 self.outcome.add(validation_rows(dataset, TEST, network, size, self.settings.seed))
-
-    def throughput(self) -> None:
-        """Frames a second of every checkpoint at every size, rendering and in training, by medians."""
-        for size in self.settings.sizes:
-            runs = {
-                (kind, way): work
-                for kind, network in self._by_kind().items()
-                for way, work in passes(network, size, self.settings.seed).items()
-            }
-            seconds: dict[tuple[str, str], list[float]] = {each: [] for each in runs}
-            for number in range(self.settings.rounds + WARM_UP):
-                for each, work in runs.items():
-                    begun = time.perf_counter()
-                    work()
-                    if number >= WARM_UP:
-                        seconds[each].append(time.perf_counter() - begun)
-            for (kind, way), rounds in seconds.items():
-                metric = f"{'renderer' if kind == 'lit' else f'renderer.{kind}'}.{way}.{size}"
-                value = 1 / statistics.median(rounds)
-                self.outcome.add([Row(metric=metric, value=value, unit="frames/s", n=len(rounds))])
-        self._network_seconds(max(self.settings.sizes))
-
-    def _network_seconds(self, size: int) -> None:
-        """The network's share of a frame on CORES threads, whatever the benchmark's are."""
-        set_torch_threads(CORES)
-        for kind, network in self._by_kind().items():
-            rounds = []
-            draw = passes(network, size, self.settings.seed)["frames_per_second"]
-            for _ in range(self.settings.rounds + WARM_UP):
-                begun = time.perf_counter()
-                draw()
-                rounds.append(time.perf_counter() - begun)
-            metric = f"renderer.{'' if kind == 'lit' else f'{kind}.'}network_seconds.{size}"
-            value, count = statistics.median(rounds[WARM_UP:]), self.settings.rounds
-            self.outcome.add([Row(metric=metric, value=value, unit="s", n=count)])
-        set_torch_threads(self.settings.threads)
 
     def _by_kind(self) -> dict[str, Network]:
         return {kind: self.networks[name] for name, kind in KINDS.items() if name in self.networks}
@@ -300,29 +253,3 @@ def fold(scenes: list[str], folds: int, seed: int) -> list[list[str]]:
     order = generator(seed, "eval", "folds").permutation(len(scenes))
     count = min(folds, len(scenes))
     return [[scenes[k] for k in np.sort(order[start::count])] for start in range(count)]
-
-
-def passes(network: Network, size: int, seed: int) -> dict[str, Callable[[], None]]:
-    """Name in rows -> one frame of random buffers through a network, and a training step on a copy of it."""
-    import torch
-
-    def drawn() -> Iterator[torch.Tensor]:
-        rng = generator(seed, "eval", "throughput", size)
-        while True:
-            yield torch.from_numpy(rng.uniform(-1, 1, (1, 3, 1, size, size)).astype(np.float32))
-
-    buffers = dict(zip((*network.renderer.config.guidance, "rgb"), drawn()))
-    truth = buffers.pop("rgb")
-    learner = copy.deepcopy(network.renderer).train().requires_grad_(True)
-    optimizer = torch.optim.AdamW(learner.parameters(), lr=1e-6)
-
-    def inference() -> None:
-        with torch.no_grad():
-            network.renderer(buffers)
-
-    def training() -> None:
-        optimizer.zero_grad()
-        torch.nn.functional.mse_loss(learner(buffers), truth).backward()
-        optimizer.step()
-
-    return {"frames_per_second": inference, "training_frames_per_second": training}

@@ -8,7 +8,6 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,10 +17,11 @@ from eval.relighting.networks import Network
 from eval.renderer.pictures import KIND_TITLES, LEAST_WIDTH, enlarge
 from eval.report.outcome import Outcome
 from eval.results import Row, mean_row
+from eval.video.steadiness import Difference, Step, steps, warping_error
 from tron import metrics
 from tron.cameras import Camera
 from tron.errors import TronError
-from tron.flow import surface_motion, warp
+from tron.flow import surface_motion
 from tron.io.video import VideoWriter
 from tron.neural.clips import averaged_frames
 from tron.report.page import Film, Films
@@ -45,10 +45,10 @@ DEPTH = "depth_ref"
 
 @dataclass(frozen=True)
 class ClipScore:
-    """One clip by one method: its flicker, and the PSNR of each of its frames in dB (foreground)."""
+    """One clip by one method: its warping error, and the PSNR of each of its frames in dB (foreground)."""
 
     scene: str
-    flicker: Flicker
+    warping: Difference
     psnr: Sequence[float]
 
 
@@ -57,13 +57,13 @@ Scored = Mapping[str, Sequence[ClipScore]]
 
 
 def clip_rows(scores: Scored, kinds: Sequence[str], seed: int) -> Iterator[Row]:
-    """Root mean squared flicker of every method; ratios and gains of averages over single frames.
+    """Root mean square of the warping error of every method; ratios and gains of averages over single frames.
 
     Figures without a checkpoint's name are of that which starts from lit, the default of tron-relight, whose
     averages are compared with lit that is averaged alike, too.
     """
     for method, found in scores.items():
-        mean = sum(each.flicker.squared for each in found) / sum(each.flicker.pixels for each in found)
+        mean = sum(each.warping.squared for each in found) / sum(each.warping.pixels for each in found)
         yield Row(
             metric=f"renderer.warp_rms.{method}", value=float(np.sqrt(mean)), unit="fraction", n=len(found)
         )
@@ -79,7 +79,7 @@ def clip_rows(scores: Scored, kinds: Sequence[str], seed: int) -> Iterator[Row]:
 
 def _ratio(metric: str, many: Sequence[ClipScore], single: Sequence[ClipScore], seed: int) -> Row:
     """Mean square over that of single frames: the pixels are the same."""
-    sums = np.array([[a.flicker.squared, b.flicker.squared] for a, b in zip(many, single)])
+    sums = np.array([[a.warping.squared, b.warping.squared] for a, b in zip(many, single)])
 
     def ratio(sums: np.ndarray) -> np.ndarray:
         return sums[..., 0] / np.maximum(sums[..., 1], 1e-12)
@@ -107,7 +107,7 @@ def measure_clips(
     for clip in read_clips(dataset, split, (*MEMBERS, DEPTH, SURFELS_DEPTH)):
         if clip.meta.frames < WINDOW:
             continue
-        moves, truth, inside = steps(clip), clip.displayed("rgb"), region_mask(clip, "foreground")
+        moves, truth, inside = clip_steps(clip), clip.displayed("rgb"), region_mask(clip, "foreground")
         if not any(move.judged.any() for move in moves):
             continue
         buffers = Buffers.of(clip)
@@ -122,10 +122,10 @@ def measure_clips(
                 for image, target, mask in zip(frames, truth, inside)
                 if mask.any()
             ]
-            scores[method].append(ClipScore(clip.meta.scene, flicker(frames, moves), psnr))
+            scores[method].append(ClipScore(clip.meta.scene, warping_error(frames, moves), psnr))
         for kind in list(networks)[:1]:
-            if films is None or scores[f"{kind}.{SINGLE}"][-1].flicker.mean > worst:
-                worst = scores[f"{kind}.{SINGLE}"][-1].flicker.mean
+            if films is None or scores[f"{kind}.{SINGLE}"][-1].warping.mean > worst:
+                worst = scores[f"{kind}.{SINGLE}"][-1].warping.mean
                 films = _films(f"Scene {clip.meta.scene}, light {clip.meta.light}", kind, shown)
         log.info("clip %s", clip.meta.key)
     if not scores:
@@ -158,32 +158,8 @@ def _films(title: str, kind: str, shown: Mapping[str, np.ndarray]) -> Films:
     return Films(title, films, columns=2)
 
 
-class Step(NamedTuple):
-    """From one frame of a clip to that before it.
-
-    Attributes:
-        displacement: (H, W, 2) pixels, x then y, from each pixel to its surface's place in the frame before.
-        judged: (H, W) bool, foreground whose surface both frames see.
-    """
-
-    displacement: np.ndarray
-    judged: np.ndarray
-
-
-class Flicker(NamedTuple):
-    """Squared differences, summed, and the pixels that they are of."""
-
-    squared: float
-    pixels: int
-
-    @property
-    def mean(self) -> float:
-        """Mean square, 0 where no pixel was judged."""
-        return self.squared / self.pixels if self.pixels else 0.0
-
-
-def steps(clip: Clip) -> list[Step]:
-    """The K - 1 steps of a clip with true depth.
+def clip_steps(clip: Clip) -> list[Step]:
+    """Steps of a clip with true depth from each frame's foreground to the frame before.
 
     Raises:
         TronError: the clip holds no true depth, or does not say how its object moves.
@@ -194,30 +170,6 @@ def steps(clip: Clip) -> list[Step]:
         )
     cameras = [Camera.from_dict(each) for each in clip.meta.cameras]
     depths, moving = clip.frames[DEPTH][..., 0], Moving.of(clip.meta)
-    foreground = clip.frames["foreground"][..., 0] > 0.5
     match = surface_motion(cameras, depths.__getitem__, None if moving is None else moving.between)
-    found = []
-    for k in range(1, clip.meta.frames):
-        displacement, seen = match(k, k - 1)
-        found.append(Step(displacement, seen & foreground[k]))
-    return found
-
-
-def flicker(frames: np.ndarray, moves: list[Step]) -> Flicker:
-    """Squared differences of each frame and that before it, warped, over the pixels that are judged.
-
-    Lai et al. 2018, *Learning Blind Video Temporal Consistency*, eq. 10, with the flow of the true surfaces
-    and cameras (:mod:`tron.flow`). It is not zero for the truth: reflections move otherwise than the surface
-    that shows them, lights that turn move shadows, path tracing is noisy, and interpolation blurs.
-
-    Args:
-        frames: (K, H, W, 3) display values.
-        moves: the K - 1 steps between them.
-    """
-    squared, pixels = 0.0, 0
-    for before, now, move in zip(frames, frames[1:], moves):
-        warped = warp(before, move.displacement)
-        judged = move.judged & np.isfinite(warped).all(-1)
-        squared += float(((now[judged] - warped[judged]) ** 2).mean(-1).sum())
-        pixels += int(judged.sum())
-    return Flicker(squared, pixels)
+    foreground = clip.frames["foreground"][..., 0] > 0.5
+    return steps(match, foreground, ((k, k - 1) for k in range(1, clip.meta.frames)))

@@ -32,7 +32,7 @@ BASELINE_BUFFERS = {
 Recipe = list[str]
 """Arguments of tron-datagen or tron-train, but for what it reads and where it writes."""
 Sizes = Annotated[dict[PositiveInt, Recipe], Field(min_length=1)]
-Part = Literal["synthetic", "models", "captures", "clips", "shadows", "throughput", "validation"]
+Part = Literal["synthetic", "models", "captures", "clips", "shadows", "validation"]
 Quality = Literal["preview", "final"]
 
 
@@ -85,12 +85,6 @@ class RendererSettings(Benchmark):
         default=None,
         description="arguments of tron-train for the per-pixel baselines, trained on the training split of "
         "each test distribution that has one; null: without them",
-    )
-    sizes: list[PositiveInt] = Field(
-        default=[64, 128, 256, 512], description="frames that are counted, width"
-    )
-    rounds: PositiveInt = Field(
-        default=5, description="of throughput, in which all take turns; medians count"
     )
     pictures: NonNegativeInt = Field(default=3, description="scenes of each distribution that are shown")
 

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 from scipy.ndimage import uniform_filter
 
 from eval.relighting.baselines import NEURAL, NEURAL_LIT
-from eval.relighting.buffers import Buffers
 from eval.relighting.gallery import Example
-from eval.relighting.networks import Network
-from tron.errors import TronError
 from tron.report.page import Picture, Pictures
-from tron.shards.schema import Clip
 
 LEAST_WIDTH = 256
 """Pixels: smaller frames are enlarged by whole numbers, without smoothing."""
@@ -21,8 +15,6 @@ ZOOM = 4
 """An inset shows a square of a side that is this much smaller than the frame's, as large as the frame."""
 KIND_TITLES = {"pair": "network of the paper's pair", "lit": "network that starts from lit"}
 GAP = 4
-SWEEP_WIDTH = 128
-"""Least width of a picture of the sweep, pixels."""
 FRAME_COLOUR = (1.0, 0.85, 0.1)
 COLUMNS = (
     ("pbr", "pbr (guidance)"),
@@ -89,42 +81,3 @@ def with_inset(image: np.ndarray, corner: tuple[int, int], side: int) -> np.ndar
 def enlarge(image: np.ndarray, scale: int) -> np.ndarray:
     """Every pixel as a square of ``scale`` pixels; a copy."""
     return image.repeat(scale, 0).repeat(scale, 1)
-
-
-def sweep_pictures(clip: Clip, pair: Network) -> Iterator[tuple[str, Pictures]]:
-    """The first frame of a clip by the paper's pair under 5 x 5 weights of its latents, named by files.
-
-    Raises:
-        TronError: the network takes no weights, or not both buffers.
-    """
-    from tron.neural.renderer import NeuralRenderer
-    from tron.neural.sweep import SWEEP, weight_sweep
-
-    if not isinstance(pair.renderer, NeuralRenderer):
-        raise TronError("only neural renderers weight their buffers", pair.path)
-    buffers, where = Buffers.of(clip), f"scene {clip.meta.scene}, {clip.meta.light_family} light"
-    displayed = {name: buffers.displayed(name)[:1] for name in pair.renderer.config.guidance}
-    given = {name: image[0] for name, image in displayed.items()} | {"path tracer": clip.displayed("rgb")[0]}
-    scale = -(-SWEEP_WIDTH // clip.meta.width)
-    shown = [Picture(enlarge(each, scale), name, f"{name}, {where}") for name, each in given.items()]
-    note = f"A colour over all is the light's: {where}."
-    yield (
-        "renderer-sweep-given",
-        Pictures("What it is given, and the truth", shown, note, columns=len(SWEEP)),
-    )
-    images = weight_sweep(pair.renderer, displayed)
-    shown = [
-        Picture(
-            enlarge(image, scale),
-            f"w_pbr {of_pbr:g}, w_irr {of_irradiance:g}",
-            f"latents weighted {of_pbr:g} and {of_irradiance:g}, {where}",
-            strong=of_pbr == of_irradiance == 0.5,
-        )
-        for of_pbr, row in zip(SWEEP, images)
-        for of_irradiance, image in zip(SWEEP, row)
-    ]
-    note = (
-        "Framed: the weights of the paper and of the training. At 0, 0 the network sees nothing; what it "
-        "draws is added to filtered pbr, whatever the weights."
-    )
-    yield "renderer-sweep", Pictures("Weights of the two latents", shown, note, columns=len(SWEEP))

@@ -25,7 +25,6 @@ from eval.results import Row
 from tron.errors import TronError
 from tron.report.page import Picture, Pictures
 from tron.shards.reader import read_clips
-from tron.shards.schema import Clip
 
 log = logging.getLogger("tron.eval")
 
@@ -64,7 +63,7 @@ def measure_shadows(
         shown = {PBR: buffers.displayed("pbr"), LIT: buffers.displayed("lit")}
         shown |= {kind: network.show(buffers) for kind, network in networks.items()}
         for now in range(1, clip.meta.frames):
-            judged = stayed(clip, now - 1, now)
+            judged = stayed(clip.frames, now - 1, now)
             if not judged.any():
                 continue
             change = (truth[now] - truth[now - 1])[judged]
@@ -109,15 +108,16 @@ def _pictures(title: str, pairs: Mapping[str, tuple[np.ndarray, np.ndarray]], ju
     return Pictures(title, pictures, columns=3)
 
 
-def stayed(clip: Clip, before: int, now: int) -> np.ndarray:
+def stayed(frames: Mapping[str, np.ndarray], before: int, now: int) -> np.ndarray:
     """(H, W) bool: foreground in two frames whose true depth, normal and base color are unchanged.
+
+    ``frames`` are a clip's (K, H, W, C): :data:`SURFACE` and ``foreground``.
 
     The eight pixels around have not changed either: a pixel's picture gathers light from half a pixel beyond
     its centre and more, so that beside a silhouette that moves it shows the occluder, not its shadow.
     """
-    frames = {name: clip.frames[name] for name in (*SURFACE, "foreground")}
     (depth, other), (normal, turned), (color, dyed), (solid, there) = (
-        (images[now], images[before]) for images in frames.values()
+        (frames[name][now], frames[name][before]) for name in (*SURFACE, "foreground")
     )
     same = np.abs(depth - other)[..., 0] <= SAME_DEPTH * np.maximum(other[..., 0], 1e-6)
     same &= (normal * turned).sum(-1) >= 1 - SAME_NORMAL

@@ -89,7 +89,8 @@ def interval_note(scenes: int, observed: str = "") -> str:
 
 
 _LISTED = re.compile(
-    r"(demo|surfels|guidance|irradiance|fox|step|reconstruction(\.(depth_init|photos|light))?|splats(\.raw|\.thick)?)\.[a-z_]\w*"
+    r"(demo|surfels|guidance|irradiance|fox|step|reconstruction(\.(depth_init|photos|light))?|splats(\.raw|\.thick)?"
+    r"|judge(\.win_rate)?|video\.(warping|flicker|far)(_excess)?|vbench\.\w+)\.[a-z_]\w*"
 )
 """Rows without a target that are listed all the same; rows of one scene end in another segment."""
 

@@ -29,6 +29,7 @@ class Outcome:
         folder: of results.json.
         rows: the figures, in the order in which they are read.
         pictures: written already, in the order of the page.
+        absent: figure that could not be measured -> why.
         series: name of a chart -> label of a line -> its points.
         reproduce: command lines that measure it again; where there are none, the one that was typed.
         inputs: what was measured (hashes of data and weights); joins settings and environment in
@@ -38,6 +39,7 @@ class Outcome:
     folder: Path
     rows: list[Row] = field(default_factory=list)
     pictures: list[Group] = field(default_factory=list)
+    absent: dict[str, str] = field(default_factory=dict)
     series: dict[str, dict[str, Points]] = field(default_factory=dict)
     reproduce: list[str] = field(default_factory=list)
     inputs: dict[str, Any] = field(default_factory=dict)
@@ -47,6 +49,11 @@ class Outcome:
         for row in rows:
             log.info("%s: %.4g %s", row.metric, row.value, row.unit)
             self.rows.append(row)
+
+    def lack(self, metric: str, why: str) -> None:
+        """Name a figure that could not be measured, and why."""
+        log.warning("%s: not measured: %s", metric, why)
+        self.absent[metric] = why
 
     def show(self, section: str, file: str, group: Pictures | Films) -> None:
         """Write pictures or films below ``folder/pictures``, for a section of the page."""

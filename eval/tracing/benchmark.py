@@ -10,6 +10,7 @@ from pydantic import Field, PositiveInt
 
 from eval.benchmark import Benchmark
 from eval.report.outcome import Outcome
+from eval.timing import Timed, write_times
 from eval.tracing.accuracy import camera_errors, compare_images, shadow_errors
 from eval.tracing.hard_cases import measure_hard_cases
 from eval.tracing.peers import SHAPES, Contenders
@@ -23,7 +24,6 @@ from eval.tracing.speed import (
     measure_shadow,
     measure_shapes,
 )
-from eval.tracing.timing import Timed, write_times
 from tron.color import to_display
 from tron.errors import TronError
 from tron.report.page import Picture, Pictures

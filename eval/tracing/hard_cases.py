@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from eval.results import Row
-from eval.tracing.timing import Times, interleaved
+from eval.timing import Times, interleaved
 from tron.cameras import Camera, mitsuba_sensor
 from tron.color import luminance
 from tron.estimation import FINAL, PREVIEW, Estimation

@@ -27,10 +27,10 @@ import mitsuba as mi
 import numpy as np
 
 from eval.results import Row
+from eval.timing import Timed, format_count, interleaved
 from eval.tracing import peers
 from eval.tracing.peers import Contenders
 from eval.tracing.scene import LIGHTS, camera, mitsuba_mesh, soft
-from eval.tracing.timing import Timed, format_count, interleaved
 from tron import seeds
 from tron.cameras import mitsuba_sensor
 from tron.estimation import FINAL

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -165,3 +166,71 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_renderer(folder / "tiny_of_two.safetensors", NeuralRenderer(RendererConfig.model_validate(two)))
     save_renderer(folder / "pixel_mlp_of_two.safetensors", PixelMLP(PixelMLPConfig.model_validate(two)))
     return folder
+
+
+@pytest.fixture(scope="session")
+def write_drawn_suite() -> Callable[..., Path]:
+    """Write a suite of drawn scenes: write_drawn_suite(folder, scenes=2, frames=2, size=32).
+
+    Scenes are those of draw_frame by their seeds, under noon and dusk; truth is its rgb.
+    """
+    from eval.protocol.suite import MapName, NewScene, write_suite
+    from tron.captures import Capture, View
+    from tron.captures.folder import write_capture
+    from tron.shading.environments.environment import EnvironmentMap
+
+    def write(
+        folder: Path,
+        scenes: int = 2,
+        frames: int = 2,
+        size: int = 32,
+        background: Literal["black", "environment"] = "environment",
+    ) -> Path:
+        def scene(seed: int) -> NewScene:
+            drawn = {
+                light: [draw_frame(size, seed, light, k) for k in range(frames)] for light in ("noon", "dusk")
+            }
+            cameras = [
+                Camera.from_dict(each)
+                for each in describe_clip("k", "test", "s", "noon", frames, size).cameras
+            ]
+            photos = [
+                View(
+                    f"v{k}", camera, np.clip(frame["rgb"], 0, 1), "display", mask=frame["foreground"][..., 0]
+                )
+                for k, (camera, frame) in enumerate(zip(cameras, drawn["noon"]))
+            ]
+            lights = {
+                f"{number}_{light}": (
+                    EnvironmentMap.constant(1.0 + seed),
+                    0.4,
+                    LIGHTS[light],
+                    np.stack([frame["rgb"] for frame in drawn[light]]),
+                )
+                for number, light in enumerate(drawn, 1)
+            }
+            maps: dict[MapName, np.ndarray] = {
+                "mask": np.stack([frame["foreground"][..., 0] for frame in drawn["noon"]]),
+                "albedo": np.stack([frame["base_color_ref"] for frame in drawn["noon"]]),
+                "normals": np.stack([frame["normal_ref"] for frame in drawn["noon"]]),
+                "depth": np.stack([frame["depth_ref"] for frame in drawn["noon"]]),
+            }
+            return NewScene(
+                f"drawn-{seed:06d}",
+                "table" if seed % 2 else "object",
+                lambda path: write_capture(path, Capture(tuple(photos))),
+                EnvironmentMap.constant(1.0),
+                cameras,
+                lights,
+                maps,
+            )
+
+        return write_suite(folder, "drawn", map(scene, range(scenes)), background=background).folder
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def drawn_suite(tmp_path_factory: pytest.TempPathFactory, write_drawn_suite: Callable[..., Path]) -> Path:
+    """A suite of two drawn scenes, shared by the tests that only read it."""
+    return write_drawn_suite(tmp_path_factory.mktemp("suites") / "drawn")

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eval.reconstruction.relighting import fitted_factor, relight
+from eval.light_scale import fitted_factor
+from eval.reconstruction.relighting import relight
 from eval.reconstruction.scans import THICKNESS, collect_scan, write_scan
 from eval.tracing.scene import surfels
 from tron.captures import Capture, View

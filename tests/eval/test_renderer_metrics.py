@@ -8,12 +8,13 @@ import pytest
 
 from eval.relighting.scores import Score, Scores
 from eval.renderer.benchmark import fold
-from eval.renderer.clips import ClipScore, Flicker, clip_rows, flicker, steps
+from eval.renderer.clips import ClipScore, clip_rows, clip_steps
 from eval.renderer.gains import between, everywhere, gain_rows, over_lit
 from eval.renderer.pictures import busiest_square, with_inset
 from eval.renderer.shadows import change_sums, correlation, slope, stayed
 from eval.renderer.truths import Truths
 from eval.results import Row
+from eval.video.steadiness import Difference, warping_error
 from tron.cameras import Camera
 from tron.errors import TronError
 from tron.seeds import generator
@@ -46,28 +47,30 @@ def wall(drawn_clip: Callable[..., Clip], frames: int = 4, size: int = 24) -> tu
     return clip, np.stack([texture[:, SHIFT * k : SHIFT * k + size] for k in range(frames)])
 
 
-def test_a_clip_that_moves_by_whole_pixels_does_not_flicker(drawn_clip: Callable[..., Clip]):
+def test_a_clip_that_moves_by_whole_pixels_has_no_warping_error(drawn_clip: Callable[..., Clip]):
     clip, shown = wall(drawn_clip)
-    moves = steps(clip)
+    moves = clip_steps(clip)
     assert len(moves) == 3
     assert all(np.allclose(move.displacement, (SHIFT, 0), atol=1e-4) for move in moves)
-    found = flicker(shown, moves)
+    found = warping_error(shown, moves)
     assert found.pixels > 3 * 24 * (24 - SHIFT - 3)
     assert found.squared / found.pixels < 1e-7
 
 
-def test_noise_raises_the_flicker_by_twice_its_variance(drawn_clip: Callable[..., Clip]):
+def test_noise_raises_the_warping_error_by_twice_its_variance(drawn_clip: Callable[..., Clip]):
     """Places are rounded to whole pixels, so a warped frame keeps the whole of its noise."""
     clip, shown = wall(drawn_clip, frames=8)
     sigma = 0.05
     noisy = shown + sigma * generator(6, "noise").standard_normal(shown.shape)
-    found = flicker(noisy, steps(clip))
+    found = warping_error(noisy, clip_steps(clip))
     assert found.squared / found.pixels == pytest.approx(2 * sigma**2, rel=0.1)
 
 
-def test_a_picture_that_stands_still_before_a_moving_camera_flickers(drawn_clip: Callable[..., Clip]):
+def test_a_picture_that_stands_still_before_a_moving_camera_has_a_warping_error(
+    drawn_clip: Callable[..., Clip],
+):
     clip, shown = wall(drawn_clip)
-    found = flicker(np.repeat(shown[:1], 4, 0), steps(clip))
+    found = warping_error(np.repeat(shown[:1], 4, 0), clip_steps(clip))
     assert found.squared / found.pixels > 0.1
 
 
@@ -75,16 +78,16 @@ def test_a_clip_without_true_depth_is_refused(drawn_clip: Callable[..., Clip]):
     clip, _ = wall(drawn_clip)
     del clip.frames["depth_ref"]
     with pytest.raises(TronError, match="no depth_ref"):
-        steps(clip)
+        clip_steps(clip)
 
 
 def test_ratios_are_of_mean_squares_and_gains_of_the_same_frames():
     psnr = {"lit_buffer_averaged": 30.0, "lit.k1": 30.0, "lit.averaged": 30.5}
     scores: dict[str, list[ClipScore]] = {name: [] for name in ("truth", *psnr)}
     for scene, single, many in (("a", (8.0, 100), (4.0, 100)), ("b", (2.0, 50), (1.5, 50))):
-        scores["truth"].append(ClipScore(scene, Flicker(0.5, single[1]), [100.0, 100.0]))
+        scores["truth"].append(ClipScore(scene, Difference(0.5, single[1]), [100.0, 100.0]))
         for name, first in psnr.items():
-            of = Flicker(*(many if name == "lit.averaged" else single))
+            of = Difference(*(many if name == "lit.averaged" else single))
             scores[name].append(ClipScore(scene, of, [first, first + 1]))
     rows = values(clip_rows(scores, ["lit"], 0))
     assert rows["renderer.warp_error_ratio"].value == pytest.approx(5.5 / 10)
@@ -120,11 +123,11 @@ def test_a_surface_stays_where_depth_normal_and_color_do(drawn_clip: Callable[..
     for name in ("depth_ref", "normal_ref", "base_color_ref"):
         clip.frames[name][1] = clip.frames[name][0]
     solid = clip.frames["foreground"][0, ..., 0] > 0.5
-    assert np.array_equal(stayed(clip, 0, 1), solid)
+    assert np.array_equal(stayed(clip.frames, 0, 1), solid)
     floor = np.argwhere(solid)[-3:]
     for (row, column), name in zip(floor, ("depth_ref", "normal_ref", "base_color_ref")):
         clip.frames[name][1, row, column] *= -0.5
-    left = stayed(clip, 0, 1)
+    left = stayed(clip.frames, 0, 1)
     around = np.zeros_like(solid)
     for row, column in floor:
         around[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = True

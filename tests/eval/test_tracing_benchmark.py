@@ -9,12 +9,12 @@ import pytest
 
 from eval.cli import cli
 from eval.results import Results
+from eval.timing import Timed, Times, format_count, interleaved
 from eval.tracing import accuracy, hard_cases, peers, scene
 from eval.tracing.benchmark import Tracing
 from eval.tracing.peers import Contenders
 from eval.tracing.scene import Box, Floor, Sphere, Surface, Torus
 from eval.tracing.speed import shadow_rows
-from eval.tracing.timing import Timed, Times, format_count, interleaved
 from tron import metrics, seeds
 from tron.cameras import Camera
 from tron.tracing import reference
@@ -263,7 +263,7 @@ def test_contestants_take_turns_and_slow_ones_sit_out(monkeypatch: pytest.Monkey
 
         return work
 
-    monkeypatch.setattr("eval.tracing.timing.seconds_of", timed)
+    monkeypatch.setattr("eval.timing.seconds_of", timed)
     times = interleaved({name: contestant(name) for name in seconds}, 5)
     assert calls == ["quick", "slow"] * 4 + ["quick"] * 2  # the first round warms up
     assert times["slow"].over(times["quick"]) == pytest.approx(20)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from PIL import Image, PngImagePlugin
 
-from datagen.files.assets import load_model
 from datagen.files.contents import model_contents
 from tron.color import srgb_to_linear
 from tron.errors import TronError
+from tron.models.load import load_model
 
 CARD = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
 FACE = "f 1/1 2/2 3/3 4/4\n"
@@ -208,7 +208,7 @@ LINES = {
 @pytest.mark.parametrize("said", LINES)
 def test_what_is_not_honoured_gets_a_line(folder, caplog, said):
     read(folder, PLAIN, a=f"newmtl m\n{LINES[said]}\n")
-    (line,) = [each.getMessage() for each in caplog.records if each.name == "datagen.files.obj"]
+    (line,) = [each.getMessage() for each in caplog.records if each.name == "tron.models.obj"]
     assert said in line
     assert "model.obj" in line
 

@@ -24,6 +24,7 @@ from tron.captures import load_capture
 from tron.captures.load import FORMATS
 from tron.errors import TronError
 from tron.gaussians.foreign_files import refuse_foreign
+from tron.gaussians.ply import check_header
 
 METASHAPE = '<?xml version="1.0" encoding="UTF-8"?>\n<document version="2.0.0">\n  <chunk label="Chunk 1">\n'
 REALITY = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\nIMG_0000.jpg,1,2,3,0,0,0,26,0,0,0\n"
@@ -81,15 +82,12 @@ def text(content: str | bytes) -> Callable[[Path], None]:
 
 
 KNOWN: dict[str, tuple[Callable[[Path], None], list[str]]] = {
-    "polycam": (
-        polycam,
-        ["Polycam's raw export", "corrected_images poses its photos anew", "ns-process-data"],
-    ),
-    "record3d": (record3d, ["Record3D's export", "rgb poses its photos anew", "ns-process-data record3d"]),
+    "polycam": (polycam, ["Polycam's raw export", "tron-reconstruct capture="]),
+    "record3d": (record3d, ["Record3D's export", "tron-reconstruct capture="]),
     "walk.r3d": (zipped, ["Record3D's recording", "export it in Record3D"]),
-    "cameras.xml": (text(METASHAPE), ["Metashape's cameras", "as Colmap"]),
+    "cameras.xml": (text(METASHAPE), ["Metashape's cameras", "tron-reconstruct capture=CAMERAS.xml"]),
     "cameras of Metashape.txt": (text("\ufeff" + METASHAPE), ["Metashape's cameras"]),
-    "project.psz": (zipped, ["Metashape's cameras"]),
+    "project.psz": (zipped, ["Metashape's project", "Export Cameras"]),
     "registration.csv": (text(REALITY), ["RealityCapture's cameras", "as COLMAP"]),
     "counted.csv": (text("#cameras 24\n" + REALITY), ["RealityCapture's cameras"]),
     "last.ckpt": (zipped, ["a checkpoint", "ns-export gaussian-splat"]),
@@ -110,13 +108,19 @@ EMPTY = {"capture": "transforms.json", "scene": "scene.ply", "cameras": "cameras
 
 READERS: dict[str, Callable[[Path], object]] = {
     "capture": load_capture,
-    "scene": refuse_foreign,
+    "scene": lambda path: (refuse_foreign(path), check_header(path)),
     "cameras": lambda path: read_cameras(path, 64, 48),
 }
 
 
-@pytest.mark.parametrize("role", READERS)
-@pytest.mark.parametrize("name", KNOWN)
+AS_CAPTURES = ("polycam", "record3d", "cameras.xml")
+"""Those that are read where a capture is asked for."""
+
+
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [(name, role) for name in KNOWN for role in READERS if not (role == "capture" and name in AS_CAPTURES)],
+)
 def test_what_is_known_by_sight_is_one_line(tmp_path: Path, name: str, role: str) -> None:
     make, words = KNOWN[name]
     make(tmp_path / name)
@@ -162,7 +166,7 @@ def test_commands_that_a_line_names_can_be_typed(tmp_path: Path, kind: str) -> N
     path = tmp_path / "a (1), [b] & c" / kind
     KNOWN[kind][0](path)
     with pytest.raises(TronError) as caught:
-        load_capture(path)
+        READERS["scene" if kind in AS_CAPTURES else "capture"](path)
     assert caught.value.mend is not None
     words = shlex.split(re.sub("[`;]", " ", caught.value.mend))
     assert any(str(path) in word for word in words), words
@@ -176,9 +180,7 @@ def test_an_empty_folder_and_one_around_a_capture(tmp_path: Path) -> None:
         load_capture(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "poses", ["photos/cameras.xml", "photos/images/cameras.csv", "photos.csv", "polycam"]
-)
+@pytest.mark.parametrize("poses", ["cameras.xml", "photos/images/cameras.csv", "photos.csv", "polycam"])
 def test_photos_beside_poses_that_are_not_read_are_posed_anew_with_a_line(
     tmp_path: Path, monkeypatch, caplog, poses: str
 ) -> None:

@@ -7,11 +7,11 @@ from tron.apps.reconstruct.splat_capture import SplatSettings, film_splats
 from tron.apps.surroundings import treat_surroundings
 from tron.cameras import Camera
 from tron.estimation import Estimation
+from tron.framing import even_directions
 from tron.gaussians import GaussianScene
 from tron.gaussians.edit import subset
 from tron.gaussians.harmonics import rgb_to_dc
 from tron.gaussians.scene import quats_from_normals
-from tron.reconstruction.geometry.seen_space import even_directions
 from tron.reconstruction.settings import FusionSettings
 from tron.relighting import EnvironmentMap, Relighter
 from tron.seeds import generator

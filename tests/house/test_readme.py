@@ -73,7 +73,9 @@ def test_every_extra_is_named_with_its_size():
     extras = tomllib.loads((README.parent / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for page in (README, README.parent / "docs/start/install.md"):
         rows = "".join(line for line in page.read_text().splitlines() if line.startswith("|"))
-        assert [name for name in extras if name not in ("dev", "surfels") and f"`{name}`" not in rows] == []
+        assert [
+            name for name in extras if name not in ("dev", "surfels", "tracer") and f"`{name}`" not in rows
+        ] == []
 
 
 def test_the_line_for_cuda_users_names_the_gpu_or_says_in_one_line_why_not():

@@ -29,7 +29,7 @@ COMMANDS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scri
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built from a copy: setuptools leaves build/ and *.egg-info beside the sources."""
+    """Built from the sdist, and that from a copy: setuptools leaves build/ and *.egg-info beside sources."""
     source = tmp_path_factory.mktemp("source")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source / name)
@@ -38,7 +38,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (source / "outputs").mkdir()
     (source / "outputs" / "__init__.py").touch()  # a package beside ours that must stay outside
     target = tmp_path_factory.mktemp("wheel")
-    _run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", target, source)
+    _run(sys.executable, "-m", "build", "--no-isolation", "--outdir", target, source)
     (built,) = target.glob("*.whl")
     return built
 
@@ -196,7 +196,13 @@ def test_a_command_whose_extra_is_missing_says_so(smallest: Path, tmp_path: Path
 def test_help_lists_every_key_without_the_extra_and_names_it(smallest: Path, tmp_path: Path, command: str):
     shown = start(smallest, command, "--help", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
-    installed = command in ("tron-relight", "tron-edit", "tron-bake")  # whose libraries this environment has
+    installed = command in (
+        "tron-relight",
+        "tron-edit",
+        "tron-bake",
+        "tron-environment",
+        "tron-export",
+    )  # whose libraries this environment has
     extra = f"tron-relight[{'relight' if installed else command.removeprefix('tron-')}]"
     first = f"of {extra}, which is installed" if installed else f"needs pip install '{extra}'"
     assert shown.stdout.startswith(first)

@@ -27,9 +27,13 @@ COMPLETE = {
     "tron-relight": ["scene={inputs}/good.ply", "environment={inputs}/good.exr"],
     "tron-edit": ["scene={inputs}/good.ply", "edits={inputs}/good.yaml"],
     "tron-bake": ["scene={inputs}/good.ply", "environment={inputs}/good.exr"],
+    "tron-environment": ["environment={inputs}/good.exr"],
+    "tron-export": ["scene={inputs}/good.ply"],
     "tron-view": ["scene={inputs}/good.ply", "environments={inputs}/good.exr"],
 }
-WRITES: dict[str, str] = dict.fromkeys(("tron-edit", "tron-bake"), "output=out.ply")
+WRITES: dict[str, str] = dict.fromkeys(
+    ("tron-edit", "tron-bake", "tron-export", "tron-environment"), "output=out.ply"
+)
 """Of commands that write no folder."""
 
 BAD_FILES = [
@@ -47,9 +51,12 @@ BAD_FILES = [
     ("tron-bake", ["scene={inputs}/absent.ply"], ["file not found", "absent.ply"]),
     ("tron-bake", ["scene={inputs}/text.ply"], ["text.ply"]),
     ("tron-bake", ["environment={inputs}/text.hdr"], ["text.hdr"]),
-    ("tron-bake", ["environment={inputs}/empty"], ["is a folder", "empty"]),
+    ("tron-bake", ["environment={inputs}/empty"], ["no six faces", "empty"]),
     ("tron-bake", ["output={inputs}/good.ply"], ["output is the scene itself"]),
-    ("tron-bake", ["output=cut.splat"], ["output is no PLY", "cut.splat"]),
+    ("tron-bake", ["output=cut.obj"], ["does not say a format", "cut.obj", ".spz"]),
+    ("tron-export", ["scene={inputs}/cat.sog"], ["cat.sog"]),
+    ("tron-export", ["output=cut.obj"], ["cut.obj", ".spz"]),
+    ("tron-export", ["output={inputs}/good.ply"], ["output is the scene itself"]),
     ("tron-view", ["scene={inputs}/text.ply"], ["text.ply"]),
     ("tron-view", ["environments={inputs}/empty"], ["holds no environment map", "empty"]),
     ("tron-view", ["environments={inputs}/absent"], ["there is no such folder", "absent"]),
@@ -60,11 +67,12 @@ BAD_FILES = [
     ("tron-relight", ["scene={inputs}/text.ply"], ["text.ply"]),
     ("tron-relight", ["scene={inputs}/points.ply"], ["points.ply"]),
     ("tron-relight", ["environment={inputs}/text.hdr"], ["text.hdr"]),
+    ("tron-relight", ["trajectory=keyframes"], ["cameras=FILE"]),
     ("tron-relight", ["environment={inputs}/text.xyz"], ["text.xyz"]),
     ("tron-relight", ["environment={inputs}/walk.mp4"], ["a video cannot hold", "walk.mp4"]),
     ("tron-relight", ["scene={inputs}/walk.mp4"], ["a video", "tron-reconstruct capture=walk.mp4"]),
     ("tron-relight", ["scene={inputs}/cat.splat"], ["antimatter15", "splat-transform cat.splat cat.ply"]),
-    ("tron-relight", ["scene={inputs}/cat.spz"], ["Niantic", "splat-transform cat.spz cat.ply"]),
+    ("tron-relight", ["scene={inputs}/cat.spz"], ["Niantic", "by what it begins with"]),
     ("tron-relight", ["scene={inputs}/cat.compressed.ply"], ["PlayCanvas", "cat.compressed.ply cat.ply"]),
     ("tron-relight", ["checkpoint={inputs}/text.safetensors"], ["text.safe"]),
     ("tron-train", ["dataset={inputs}/absent"], ["absent"]),
@@ -83,7 +91,16 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Files that are fine, hostile in the simplest way, or absent."""
     folder = tmp_path_factory.mktemp("inputs")
     (folder / "empty").mkdir()
-    for name in ("text.ply", "text.hdr", "text.xyz", "text.safetensors", "walk.mp4", "cat.splat", "cat.spz"):
+    for name in (
+        "text.ply",
+        "text.hdr",
+        "text.xyz",
+        "text.safetensors",
+        "walk.mp4",
+        "cat.splat",
+        "cat.spz",
+        "cat.sog",
+    ):
         (folder / name).write_text("not what the name says\n")
     header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
     (folder / "points.ply").write_text(header + "end_header\n0 0 0\n")

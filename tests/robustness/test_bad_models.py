@@ -15,7 +15,7 @@ import trimesh
 from hydra.utils import get_object
 from PIL import Image
 
-from datagen.files.assets import load_model
+from tron.models.load import load_model
 
 POSITIONS = np.array([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], np.float32)
 UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
@@ -204,7 +204,7 @@ def spoil(kind, path):
 MEASURE = """
 import json, pathlib, sys, time
 from tron.errors import TronError
-from datagen.files.assets import load_model
+from tron.models.load import load_model
 
 def peak():
     text = pathlib.Path("/proc/self/status").read_text()

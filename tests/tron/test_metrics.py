@@ -1,5 +1,6 @@
 """Metrics against closed forms and independent implementations."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -105,33 +106,6 @@ def test_empty_masks_and_different_shapes_are_refused():
         metrics.ssim(a[:5], b[:5])
 
 
-@pytest.fixture(scope="module")
-def random_vgg(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file like torchvision's vgg16-397923af.pth, with random weights."""
-    torch.manual_seed(0)
-    backbone = vgg16_features()
-    state = {f"features.{name}": value for name, value in backbone.state_dict().items()}
-    path = tmp_path_factory.mktemp("vgg") / "vgg16.pth"
-    torch.save({**state, "classifier.0.weight": torch.zeros(2)}, path)
-    return path
-
-
-def vgg16_features() -> torch.nn.Sequential:
-    """torchvision's vgg16().features, written anew from the paper's configuration D."""
-    layers: list[torch.nn.Module] = []
-    channels = 3
-    for width in (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512, 0):
-        if width == 0:
-            layers.append(torch.nn.MaxPool2d(2, 2))
-            continue
-        convolution = torch.nn.Conv2d(channels, width, 3, padding=1)
-        torch.nn.init.kaiming_normal_(convolution.weight)
-        torch.nn.init.normal_(convolution.get_parameter("bias"), std=0.1)
-        layers += [convolution, torch.nn.ReLU()]
-        channels = width
-    return torch.nn.Sequential(*layers)
-
-
 def image_batch() -> tuple[torch.Tensor, torch.Tensor]:
     rng = generator(0, "lpips")
     a = rng.uniform(-1, 1, (2, 3, 40, 56))
@@ -140,7 +114,7 @@ def image_batch() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_lpips_agrees_with_torchmetrics_on_the_same_random_backbone(
-    random_vgg: Path, monkeypatch: pytest.MonkeyPatch
+    random_vgg: Path, vgg16_features: Callable[[], torch.nn.Sequential], monkeypatch: pytest.MonkeyPatch
 ):
     import torchmetrics.functional.image.lpips as theirs
 

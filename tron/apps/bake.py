@@ -1,4 +1,4 @@
-"""tron-bake: a scene under a light as a plain 3DGS file, which every splat viewer draws."""
+"""tron-bake: a scene under a light as a file of splats, which every splat viewer draws."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from tron.apps.capture_light import over_scene
 from tron.apps.machine import Threads, Variant
 from tron.apps.relight.camera_files import filmed_orbit, filmed_with
 from tron.apps.relight.scan_materials import with_materials
@@ -21,9 +22,8 @@ from tron.cli.progress import track, working
 from tron.color import Look
 from tron.estimation import PREVIEW
 from tron.framing import upright
-from tron.gaussians.edit import with_kernel
-from tron.gaussians.ply import write_ply
 from tron.gaussians.scene import GaussianScene
+from tron.gaussians.splat_files import SUFFIXES, check_suffix, write_splats
 from tron.runtime import activate
 from tron.trajectories import plan_cameras
 
@@ -40,11 +40,14 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    scene: Path = Field(description="PLY of the scene: TRON's, or a plain 3DGS or 2DGS file")
+    scene: Path = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats")
     environment: Path = Field(
-        description="lat-long environment map, .hdr or .exr (.png and .jpg are clipped)"
+        description="environment map, .hdr or .exr (.png and .jpg are clipped), or what else "
+        "tron-environment reads"
     )
-    output: Path = Field(description="PLY to write, or to replace; not the scene's own")
+    output: Path = Field(
+        description=f"file to write, or to replace, not the scene's own: {', '.join(SUFFIXES)}"
+    )
     rotation: float = Field(
         0.0, description="turn of the environment about up, degrees, counter-clockwise seen from above"
     )
@@ -67,7 +70,7 @@ class Settings(BaseModel):
 
 
 def main(settings: Settings) -> None:
-    """Light a Gaussian scene and write what it looks like as a plain 3DGS PLY, for any splat viewer.
+    """Light a Gaussian scene and write what it looks like as splats, for any splat viewer.
 
     Shadows, bounced light and rough reflections are in the file's spherical harmonics (degree 3), as display
     values: viewers show them as they are. Reflections sharper than harmonics are blurred. The file has 3DGS'
@@ -78,12 +81,14 @@ def main(settings: Settings) -> None:
     from tron.relighting.relighter import Relighter
     from tron.shading.environments.environment import EnvironmentMap
 
-    check_scene_files(settings.scene, settings.output, settings.environment)
+    check_suffix(settings.output)
+    check_scene_files(settings.scene, settings.output)
     with working("reading the light and the scene"):
         environment = EnvironmentMap.load(settings.environment)
         activate(settings.variant, settings.threads)
         scene = load_scene(settings.scene, settings.up, settings.materials)
     turn, offset = upright(scene.up), scene.offset
+    environment = over_scene(environment, settings.environment, settings.scene, turn)
     scene = scene.upright()  # +z is up in environment maps
     surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
     scene = surrounded.shown
@@ -107,19 +112,14 @@ def main(settings: Settings) -> None:
     lit = baked(light, exposure, settings.look, partial(track, label="baking"))
     if not np.allclose(turn, np.eye(3)):
         lit = lit.rotated(turn.T)
-    plain = with_kernel(lit, 2)
-    write_ply(
-        settings.output,
-        vars(plain) | {"normals": plain.normals(), "materials_guessed": True},
-        plain=True,
-    )
+    write_splats(settings.output, lit)
     smooth = float((scene.roughness < MIRRORING).mean())
     if smooth > 0:
         log.info(
             "%.0f %% of the surfels have a roughness below %.1f: their reflections are blurred, since "
             "harmonics of degree 3 hold nothing sharper", 100 * smooth, MIRRORING,
         )  # fmt: skip
-    log.info("%d splats, for any 3DGS viewer: %s", len(plain), settings.output)
+    log.info("%d splats, for any 3DGS viewer: %s", len(lit), settings.output)
 
 
 def _front(scene: GaussianScene, filmed: list[Camera] | None) -> Camera:
@@ -139,6 +139,7 @@ cli = command(
         "tron-bake scene=surfels.ply environment=studio.hdr output=relit.ply",
         "tron-bake scene=scan.ply environment=sunset.hdr rotation=90 up=[0,0,1] output=evening.ply",
     ),
+    ended="no file was written; materials and a proxy that were found for a scan are kept",
 )
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from tron.apps.relight.camera_files import CAMERAS, cameras_of, in_frame_of
 from tron.apps.scene_file import Up, check_scene_files
-from tron.cli.command_line import command
+from tron.cli.command_line import ANEW, command
 from tron.cli.progress import working
 from tron.editing import Edit, EditList, Insert, Material, Views
 from tron.errors import TronError
@@ -31,7 +31,7 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     scene: Path = Field(
-        description="PLY of the scene: TRON's, or a plain 3DGS or 2DGS file; it stays as it is"
+        description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats; it stays as it is"
     )
     edits: Path | Annotated[tuple[Path, ...], Field(min_length=1)] = Field(
         description="YAML with a list of edits, done in their order; several files, [a.yaml,b.yaml], are "
@@ -61,13 +61,19 @@ def main(settings: Settings) -> None:
 
     {action: insert, file: cat.ply, at: [1,0,2], turn: 90},
 
-    {action: material, select: {object: 2}, hue: 200, roughness: {scale: 0.5}, metallic: 1}]
+    {action: material, select: {object: 2}, hue: 200, roughness: {scale: 0.5}, metallic: 1},
 
+    {action: separate, select: {grow: {view: 0, at: [[120, 80]]}}, object: 8}]
+
+    separate gives what it selects a number of its own, by which later edits, motion and tron-view name it.
     What else selects: material (ranges), grow (from a picked surfel or pixel), clicks (inside and outside),
     masks (of views). Several together hold at once; any joins selections, but_not takes one away.
 
     Writes the scene with the edits done, or nothing. The same is in Python: tron.editing.
     """
+    if settings.output.suffix.lower() != ".ply":
+        mend = "give it a name that ends with .ply; tron-export makes other files of that"
+        raise TronError("output is no PLY", settings.output, mend)
     check_scene_files(settings.scene, settings.output, *_files(settings), _cameras_file(settings))
     edits, where = _read(settings)
     with working("reading the scene"):
@@ -169,6 +175,7 @@ cli = command(
         "tron-edit scene=scan.ply edits=clicks.yaml cameras=capture/transforms.json output=cut.ply",
         "tron-edit scene=surfels.ply edits=[mine.yaml,yours.yaml] output=ours.ply",
     ),
+    ended=ANEW,
 )
 
 if __name__ == "__main__":

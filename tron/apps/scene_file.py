@@ -37,11 +37,11 @@ Up = Annotated[
 
 
 def check_scene_files(scene: Path, output: Path, *read: Path | None) -> None:
-    """What a command that makes a PLY of a scene needs is there, and what it writes is another file.
+    """What a command that makes a file of a scene needs is there, and what it writes is another file.
 
     Args:
-        scene: PLY that is read.
-        output: PLY that is written.
+        scene: that is read.
+        output: that is written.
         read: other files that are read, where they are given.
 
     Raises:
@@ -52,14 +52,17 @@ def check_scene_files(scene: Path, output: Path, *read: Path | None) -> None:
             if path.is_dir():
                 raise TronError("cannot read: is a folder", path, "give one file of it")
             raise TronError("file not found", path)
-    if output.suffix.lower() != ".ply":
-        raise TronError("output is no PLY", output, "give it a name that ends with .ply")
-    if output.is_dir():
-        raise TronError("output is a folder", output, "give a file in it")
-    if output.exists() and output.samefile(scene):
-        raise TronError("output is the scene itself", output, "give another name")
+    check_output(output, scene, "the scene")
     refuse_foreign(scene)
     check_header(scene)
+
+
+def check_output(output: Path, source: Path, what: str) -> None:
+    """TronError if a file to write is a folder, or ``what`` it is made of."""
+    if output.is_dir():
+        raise TronError("output is a folder", output, "give a file in it")
+    if output.exists() and output.samefile(source):
+        raise TronError(f"output is {what} itself", output, "give another name")
 
 
 def load_scene(

@@ -4,22 +4,38 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from importlib.util import find_spec
 from pathlib import Path
+from tempfile import mkdtemp
+from threading import Thread
+from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from tron.apps.capture_light import is_of_capture, over_scene
 from tron.apps.machine import Threads, Variant
+from tron.apps.relight.network_gains import expected_gain
 from tron.apps.scene_file import Up, check_scene_files, load_scene
 from tron.cameras import Camera
 from tron.cli.command_line import command
+from tron.cli.installation import missing_libraries, require_extra
 from tron.cli.progress import working
 from tron.errors import TronError
+from tron.framing import upright
 from tron.gaussians.scene import GaussianScene
-from tron.runtime import activate
+from tron.neural.shipped import DEFAULT, checkpoint_file, installed
+from tron.runtime import activate, set_torch_threads, torch_device
+
+if TYPE_CHECKING:
+    from tron.neural.protocols import Renderer
+    from tron.shading.environments.environment import EnvironmentMap
+    from tron.view.finishing import Finish
+    from tron.view.window import Window
 
 log = logging.getLogger(__name__)
 
-LIGHTS = (".hdr", ".exr", ".png", ".jpg", ".jpeg")
 LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
@@ -29,7 +45,7 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     scene: Path = Field(
-        description="PLY of the scene: TRON's, or a plain 3DGS or 2DGS file; it stays as it is"
+        description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats; it stays as it is"
     )
     environments: Path = Field(
         description="folder of lat-long environment maps (.hdr, .exr, .png, .jpg), or one of them"
@@ -51,34 +67,17 @@ class Settings(BaseModel):
 def main(settings: Settings) -> None:
     """Show a Gaussian scene in a browser: turn the light, walk around, hide, paint, move, insert, save.
 
-    Open the address that it prints. Pictures are rough while something moves and get fine at rest. Edits are
-    those of tron-edit: they are undone one by one and saved as its YAML. "Film" saves the view and says the
-    tron-relight command line that films it. Ends with Ctrl-C.
+    Open the address that it prints. Pictures are rough while something moves, get fine at rest and end with
+    the network that checkpoint=auto of tron-relight takes, or Open Image Denoise where it is installed.
+    Clicks inside and outside cut an object out of a scan; a divider compares with the scene before the edits,
+    its own look or another light. Edits are those of tron-edit: they are undone one by one and saved as its
+    YAML. "Film" saves the view, or the path through those that are kept, and says the tron-relight command
+    line that films it. Ends with Ctrl-C.
     """
-    # viser and Mitsuba: not for --help
-    from tron.shading.environments.environment import EnvironmentMap
-    from tron.view.window import Window, require_free_port
-
-    output = settings.output_dir
-    if output.exists() and not output.is_dir():
-        raise TronError("output_dir is a file", output, "give a folder, which need not exist")
-    check_scene_files(settings.scene, output / "scene.ply")
-    lights = _files(settings.environments, LIGHTS, "environment map")
-    models = {} if settings.models is None else _files(settings.models, (".ply",), "PLY")
-    EnvironmentMap.load(next(iter(lights.values())))  # others are read, or refused, when they are chosen
-    require_free_port(settings.host, settings.port)
-    logging.getLogger("websockets").setLevel(logging.WARNING)  # it says who comes and goes
-    activate(settings.variant, settings.threads)
-    with working("reading the scene"):
-        scene = load_scene(settings.scene, settings.up, "as_is")
-        home = _home(scene)
-    window = Window(
-        scene, settings.scene, lights, models, output, settings.host, settings.port, home,
-        seed=settings.seed, variant=settings.variant, threads=settings.threads,
-    )  # fmt: skip
+    window = opened(settings)
     if settings.host not in LOCAL:
         log.warning("everybody who reaches %s can look, change and save", settings.host)
-    log.info("open http://%s:%d in a browser; Ctrl-C ends it", settings.host, settings.port)
+    log.info("open %s in a browser; Ctrl-C ends it", window.address)
     try:
         while True:
             time.sleep(3600)
@@ -86,6 +85,150 @@ def main(settings: Settings) -> None:
         pass
     finally:
         window.close()
+
+
+def opened(settings: Settings) -> Window:
+    """A window that serves until it is closed.
+
+    Raises:
+        TronError: a file is missing or no scene, no map, no PLY; the port is taken.
+    """
+    # viser and Mitsuba: not for --help
+    from tron.shading.environments.environment import EnvironmentMap
+    from tron.shading.environments.light_files import LIGHT_SUFFIXES
+    from tron.view.window import Window, require_free_port
+
+    output = settings.output_dir
+    if output.exists() and not output.is_dir():
+        raise TronError("output_dir is a file", output, "give a folder, which need not exist")
+    check_scene_files(settings.scene, output / "scene.ply")
+    lights = _files(settings.environments, LIGHT_SUFFIXES, "environment map")
+    models = {} if settings.models is None else _files(settings.models, (".ply",), "PLY")
+    EnvironmentMap.load(next(iter(lights.values())))  # others are read, or refused, when they are chosen
+    require_free_port(settings.host, settings.port)
+    logging.getLogger("websockets").setLevel(logging.WARNING)  # it says who comes and goes
+    activate(settings.variant, settings.threads)
+    with working("reading the scene"):
+        scene = load_scene(settings.scene, settings.up, "as_is")
+        home, turn = _home(scene), upright(scene.up)
+        own = {name: file for name, file in lights.items() if is_of_capture(file, settings.scene)}
+        turned = {k: over_scene(EnvironmentMap.load(f), f, settings.scene, turn) for k, f in own.items()}
+    finish = _finish(settings.threads)
+    return Window(
+        scene, settings.scene, lights, models, output, settings.host, settings.port, home, turned,
+        seed=settings.seed, variant=settings.variant, threads=settings.threads, finish=finish,
+    )  # fmt: skip
+
+
+def _finish(threads: int | None) -> Callable[[int, int], Finish | None]:
+    """What pictures at rest of a width and height are finished by.
+
+    As checkpoint=auto of tron-relight has it, a network where it is sure to gain; else Open Image Denoise,
+    where it is installed.
+    """
+    from tron.view.finishing import Denoised, Drawn
+
+    drawn = denoised = None
+    if not missing_libraries("network") and DEFAULT in installed():
+        loaded: Future[Renderer] = Future()
+        Thread(target=_load, args=(loaded, threads), daemon=True).start()
+        drawn = Drawn(loaded)
+    if find_spec("pyoidn") is not None:
+        denoised = Denoised()
+
+    def finish(width: int, height: int) -> Finish | None:
+        return drawn if drawn and expected_gain("final", width, height) > 0 else denoised
+
+    return finish
+
+
+def _load(soon: Future[Renderer], threads: int | None) -> None:
+    """The shipped network, while the scene is looked at: torch takes seconds."""
+    try:
+        from tron.neural.weights import load_renderer
+
+        if threads is not None:
+            set_torch_threads(threads)
+        soon.set_result(load_renderer(checkpoint_file(DEFAULT)).to(torch_device()))
+    except Exception as error:
+        soon.set_exception(error)
+
+
+def show(
+    scene: str | Path | GaussianScene,
+    environments: str | Path | EnvironmentMap | Mapping[str, EnvironmentMap],
+    height: int = 640,
+    **settings: Any,
+) -> Shown:
+    """Watch and change a scene in a notebook's cell.
+
+    Args:
+        scene: PLY; or surfels, valid.
+        environments: folder of environment maps, or one of them; or maps, by name.
+        height: of the frame in the page, pixels.
+        settings: of tron-view by name, such as ``models`` or ``port``; without a port, the
+            first free one. What is no file yet is kept in a folder ``shown-...`` in ``output_dir``, where the
+            command lines that film it find it.
+
+    Raises:
+        TronError: viser is not installed, a setting is wrong, or as :func:`opened`.
+    """
+    require_extra("the viewer", "view")
+    where = {"scene": Path("scene.ply"), "environments": Path()}
+    try:
+        chosen = Settings.model_validate(where | settings)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise TronError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}", "show") from error
+    chosen = chosen.model_copy(update=_kept(scene, environments, chosen.output_dir))
+    if "port" not in settings:  # a cell that is run twice leaves its first window open
+        from tron.view.window import free_port
+
+        chosen = chosen.model_copy(update={"port": free_port(chosen.host, chosen.port)})
+    return Shown(opened(chosen), height)
+
+
+def _kept(
+    scene: str | Path | GaussianScene,
+    environments: str | Path | EnvironmentMap | Mapping[str, EnvironmentMap],
+    folder: Path,
+) -> dict[str, Path]:
+    """Files of a scene and of its lights, written where they are none."""
+    from tron.shading.environments.environment import EnvironmentMap
+
+    if isinstance(environments, EnvironmentMap):
+        environments = {"light": environments}
+    of_files = not isinstance(scene, GaussianScene), isinstance(environments, str | Path)
+    if not all(of_files):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            folder = Path(mkdtemp(prefix="shown-", dir=folder))
+        except OSError as error:
+            raise TronError(f"cannot be written: {error.strerror or error}", folder) from error
+    if isinstance(scene, GaussianScene):
+        scene.save(folder / "scene.ply")
+        scene = folder / "scene.ply"
+    if isinstance(environments, Mapping):
+        for name, light in environments.items():
+            if Path(name).name != name:
+                raise TronError("the name of a light is that of its file", name, "leave out / and ..")
+            light.save(folder / f"{name}.exr")
+        environments = folder
+    return {"scene": Path(scene), "environments": Path(environments)}
+
+
+class Shown:
+    """A window in a notebook; it shows itself, and serves until :meth:`close` or the end of the notebook."""
+
+    def __init__(self, window: Window, height: int) -> None:
+        self.window, self._height = window, height
+
+    def close(self) -> None:
+        """End it."""
+        self.window.close()
+
+    def _repr_html_(self) -> str:
+        return f'<iframe src="{self.window.address}" width="100%" height="{self._height}"></iframe>'
 
 
 def _home(scene: GaussianScene) -> Camera:
@@ -116,6 +259,7 @@ cli = command(
         "tron-view scene=surfels.ply environments=hdris",
         "tron-view scene=scan.ply environments=studio.hdr models=things port=8090",
     ),
+    ended="what was saved is kept",
 )
 
 if __name__ == "__main__":

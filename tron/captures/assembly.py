@@ -13,6 +13,7 @@ import numpy as np
 from tron.cameras import Camera
 from tron.captures.capture import Capture
 from tron.captures.coverage import HALF, seen_from_deg
+from tron.captures.metric import in_metres
 from tron.captures.photos.image_folder import view_names
 from tron.captures.photos.photo_files import LINEAR_SUFFIXES, exposure_of, require_decoders
 from tron.captures.photos.photo_views import PhotoViews
@@ -38,6 +39,8 @@ def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> C
     """
     if not posed.photos:
         raise TronError("the file names no photos", posed.source)
+    if settings.scale is not None:
+        posed = in_metres(posed, settings.scale)
     posed, offset = about_local_origin(posed)
     require_decoders(photo.path for photo in posed.photos)
     cache = PhotoCache(cache_bytes)
@@ -62,7 +65,8 @@ def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> C
     _log_reduced(posed.source, len(views), made.reduced, settings)
     ordered = tuple(views[name] for name in sorted(views))
     cameras = [view.camera for view in ordered]
-    up = estimate_up(cameras) if settings.up is None else np.array(settings.up, float)
+    stated = posed.up if settings.up is None else np.array(settings.up, float)
+    up = estimate_up(cameras) if stated is None else np.array(stated)
     up /= np.linalg.norm(up)
     around = seen_from_deg(cameras, up)
     if around is not None and around < HALF:

@@ -30,7 +30,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from tron.cameras import Camera, opencv_to_opengl, opengl_to_opencv
 from tron.captures.capture import Capture
 from tron.captures.settings import PhotoSettings
-from tron.captures.view import MAPS, ColorSpace, View
+from tron.captures.view import MAPS, ColorSpace, ToneCurve, View
 from tron.errors import TronError, located
 from tron.io.images import MAX_SIDE, encode_exr, encode_png, read_image
 from tron.io.local_frame import ORIGIN, moved_cameras
@@ -94,7 +94,10 @@ class _ViewEntry(BaseModel):
 
 
 class _Tron(BaseModel):
-    """Object of what nerfstudio's format has no word for; ``views`` is keyed by the frames' file_path."""
+    """Object of what nerfstudio's format has no word for; ``views`` is keyed by the frames' file_path.
+
+    tone_curve: of display images; AgX where it is not said.
+    """
 
     model_config = ConfigDict(allow_inf_nan=False, extra="forbid")
 
@@ -107,6 +110,7 @@ class _Tron(BaseModel):
     skipped: dict[str, str] = Field(default_factory=dict)
     points: InnerPath | None = None
     offset: tuple[float, float, float] | None = None
+    tone_curve: ToneCurve | None = None
     views: dict[str, _ViewEntry]
 
     @field_validator("version")
@@ -135,6 +139,7 @@ def write_capture(
     overwrite: bool = False,
     *,
     beside: Mapping[str, bytes] | None = None,
+    tone_curve: ToneCurve = "agx",
 ) -> None:
     """Write a capture as a folder that appears whole or not at all.
 
@@ -146,6 +151,7 @@ def write_capture(
         capture: all its views in one colour space.
         overwrite: replace a capture folder that is there; anything else there is never touched.
         beside: more files for the folder, name -> content.
+        tone_curve: that display images went through, which is said where it is not AgX.
 
     Raises:
         TronError: the folder is taken, views differ in colour space, a view cannot be read, or the disk says
@@ -169,7 +175,7 @@ def write_capture(
         if capture.points is not None:
             places = capture.points + capture.offset if capture.offset.any() else capture.points
             (folder / POINTS_NAME).write_bytes(encode_points(places, capture.point_colors))
-        text = _describe(capture, entries).model_dump_json(indent=1, exclude_none=True) + "\n"
+        text = _describe(capture, entries, tone_curve).model_dump_json(indent=1, exclude_none=True) + "\n"
         (folder / TRANSFORMS_NAME).write_bytes(text.encode())
 
 
@@ -207,7 +213,7 @@ def read_capture_folder(path: str | os.PathLike[str]) -> Capture:
             exposure=tron.exposure,
             transform=np.array(tron.transform),
             skipped=tron.skipped,
-            tone_curve="agx",
+            tone_curve=tron.tone_curve or "agx",
             offset=np.array(tron.offset or ORIGIN),
         )
 
@@ -290,7 +296,7 @@ def _write(path: Path, data: bytes) -> None:
     path.write_bytes(data)
 
 
-def _describe(capture: Capture, entries: Mapping[str, _ViewEntry]) -> _Transforms:
+def _describe(capture: Capture, entries: Mapping[str, _ViewEntry], tone_curve: ToneCurve) -> _Transforms:
     intrinsics = [_intrinsics(view.camera) for view in capture.views]
     shared = intrinsics[0] if all(each == intrinsics[0] for each in intrinsics) else {}
     cameras = moved_cameras([view.camera for view in capture.views], capture.offset)
@@ -317,6 +323,7 @@ def _describe(capture: Capture, entries: Mapping[str, _ViewEntry]) -> _Transform
         skipped=dict(capture.skipped),
         points=points,
         offset=(east, north, high) if capture.offset.any() else None,
+        tone_curve=None if tone_curve == "agx" else tone_curve,
         views=dict(entries),
     )
     return _Transforms(

@@ -15,7 +15,11 @@ from tron.captures.assembly import assemble
 from tron.captures.capture import Capture
 from tron.captures.folder import is_capture_folder, load_traced
 from tron.captures.formats.colmap import model_folder, read_colmap
+from tron.captures.formats.metashape import cameras_file, read_metashape
 from tron.captures.formats.not_a_capture import refusal
+from tron.captures.formats.opensfm import read_opensfm, reconstruction_file
+from tron.captures.formats.polycam import camera_folder, read_polycam
+from tron.captures.formats.record3d import metadata_file, read_record3d
 from tron.captures.formats.tensoir import TensoirSettings, is_tensoir, read_tensoir
 from tron.captures.formats.transforms import has_transforms, read_transforms
 from tron.captures.photos.photographs import PosedPhotos
@@ -64,6 +68,10 @@ FORMATS = {
     ),
     "colmap": CaptureFormat("COLMAP's sparse/0", model_folder, read_colmap),
     "tensoir": CaptureFormat("TensoIR's folders train_000, ...", is_tensoir, read_tensoir),
+    "polycam": CaptureFormat("Polycam's raw export", camera_folder, read_polycam),
+    "record3d": CaptureFormat("Record3D's EXR + RGB export", metadata_file, read_record3d),
+    "metashape": CaptureFormat("Metashape's XML of cameras", cameras_file, read_metashape, (".xml",)),
+    "opensfm": CaptureFormat("a project of OpenSfM or OpenDroneMap", reconstruction_file, read_opensfm),
     "video": CaptureFormat("a video file, whose sharpest frames are posed", is_video, read_video, VIDEOS),
     "photos": CaptureFormat("photos, posed by structure from motion", has_photos, pose_photos),
 }
@@ -112,8 +120,8 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
         raise TronError("capture not found", path)
     if not any(each.takes(path) for each in FORMATS.values()):
         raise refusal(path, HOLDS, _holds_capture)
-    if path.is_file():
-        refuse_by_sight(path, "a capture is a folder or a transforms.json")
+    if path.is_file() and not cameras_file(path):
+        refuse_by_sight(path, "a capture is a folder, a transforms.json or Metashape's XML")
     name = _detected(path) if settings.format == "auto" else settings.format
     if not FORMATS[name].takes(path):
         raise TronError(f"a capture of format {name} is a folder", path)

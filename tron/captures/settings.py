@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, Field, field_validator
@@ -52,6 +53,12 @@ class PhotoSettings(BaseModel):
         gt=0,
         description="factor on linear photos (EXR) before the sRGB curve, as they are learnt from; null: one "
         "for all, such that 98 % of what they show lie below 0.9",
+    )
+    scale: Literal["gps"] | tuple[str, str, Annotated[float, Field(gt=0)]] | None = Field(
+        default=None,
+        description="brings the world to metres: by the photos' GPS, or by the metres between the cameras of "
+        "two photos; null: the unit of the poses stays",
+        examples=["[a.jpg,b.jpg,1.2]"],
     )
     up: tuple[float, float, float] | None = Field(
         default=None, description="up direction in the capture's world; null: estimated from the cameras"

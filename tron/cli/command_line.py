@@ -40,7 +40,9 @@ Settings = TypeVar("Settings", bound=pydantic.BaseModel)
 USER_ERROR = 2
 INTERRUPTED = 130
 KEPT = "what is finished is kept, and the same command goes on from it"
-"""What a command that was ended says, unless the exception has a note of its own."""
+"""What a command that was ended says, unless it is told otherwise or the exception has a note of its own."""
+ANEW = "no file was written, and the same command begins anew"
+"""The same where a command writes its files at once, at its end."""
 TRACEBACK_VARIABLE = "TRON_TRACEBACK"
 """Environment variable that stands for --traceback in the commands that a command starts."""
 SHOWN_FUNCTIONS = 15
@@ -56,6 +58,7 @@ class Command(Generic[Settings]):
     settings: type[Settings]
     main: Callable[[Settings], int | None]
     examples: Sequence[str] = ()
+    ended: str = KEPT
 
     def __call__(self, arguments: Sequence[str] | None = None) -> NoReturn:
         """Run on `arguments`, those of the process where None."""
@@ -84,7 +87,7 @@ class Command(Generic[Settings]):
                 return 0
             with loading(self.name):
                 settings = check(recipe, self.settings)
-            kept = f"; {KEPT}"
+            kept = f"; {self.ended}" if self.ended else ""
             configure_logging(options.log_level)
             if options.profile:
                 folder = getattr(settings, "output_dir", Path()) / "profile"
@@ -121,6 +124,7 @@ def command(
     settings: type[Settings],
     main: Callable[[Settings], int | None],
     examples: Sequence[str] = (),
+    ended: str = KEPT,
 ) -> Command[Settings]:
     """Make a console entry point.
 
@@ -130,8 +134,9 @@ def command(
         settings: pydantic model of the whole configuration, `extra="forbid"`; its descriptions make `--help`.
         main: does the work; its docstring is what `--help` says the command does. It may return an exit code.
         examples: command lines for `--help`.
+        ended: what is left after an interruption, said behind it; "": nothing.
     """
-    return Command(name, config_module, settings, main, examples)
+    return Command(name, config_module, settings, main, examples, ended)
 
 
 def _note(end: BaseException) -> str:

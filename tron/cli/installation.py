@@ -172,6 +172,8 @@ class ConsoleScript:
 relight = ConsoleScript("tron-relight", "tron.apps.relight.command")
 edit = ConsoleScript("tron-edit", "tron.apps.edit", of_extra="relight")
 bake = ConsoleScript("tron-bake", "tron.apps.bake", of_extra="relight")
+environment = ConsoleScript("tron-environment", "tron.apps.environment", of_extra="relight")
+export = ConsoleScript("tron-export", "tron.apps.export", of_extra="relight")
 view = ConsoleScript("tron-view", "tron.apps.view")
 reconstruct = ConsoleScript("tron-reconstruct", "tron.apps.reconstruct.command", ("tron.reconstruction",))
 datagen = ConsoleScript("tron-datagen", "datagen.cli")

@@ -226,9 +226,18 @@ def _shared_options(config_module: str) -> dict[str, tuple[dict[str, Any], str]]
     return found
 
 
-def unknown_key(key: str, known: Sequence[str]) -> TronError:
-    """The error for a key that does not exist, with the nearest one that does."""
-    return TronError(f"unknown key '{key}'", mend=f"{did_you_mean(key, known)}--help lists every key")
+def unknown_key(key: str, known: Sequence[str], beside: Sequence[str] = ()) -> TronError:
+    """The error for a key that does not exist, with the nearest one that does.
+
+    Args:
+        key: dotted.
+        known: keys that --help lists.
+        beside: names that could stand in its place, where --help does not list them.
+    """
+    if not beside:
+        return TronError(f"unknown key '{key}'", mend=f"{did_you_mean(key, known)}--help lists every key")
+    near = did_you_mean(key, [f"{key.rpartition('.')[0]}.{name}" for name in beside])
+    return TronError(f"unknown key '{key}'", mend=f"{near}there are {', '.join(beside)}")
 
 
 def did_you_mean(name: str, known: Sequence[str]) -> str:
@@ -330,7 +339,7 @@ def _one_line(error: pydantic.ValidationError, values: Any, settings: type[pydan
         return TronError(first["msg"].removeprefix("Value error, "))
     key = _written_key(first["loc"], values)
     if first["type"] == "extra_forbidden":
-        return unknown_key(key, list(field_keys(settings)))
+        return unknown_key(key, list(field_keys(settings)), _keys_in_list(key, settings))
     # What may be of several types fails as each of them: the error furthest inside a list says most.
     same = [each for each in errors if f"{_written_key(each['loc'], values)}.".startswith(f"{key}.")]
     first = max(same, key=lambda each: (len(_written_key(each["loc"], values)), _wrong_length(each)))
@@ -350,6 +359,18 @@ def _one_line(error: pydantic.ValidationError, values: Any, settings: type[pydan
     if words and first["type"] != "literal_error":  # a number, or one of some words
         reason += f"; or give {words[0]}"
     return TronError(f"wrong value for '{key}'", where=shown, mend=reason)
+
+
+def _keys_in_list(key: str, settings: type[pydantic.BaseModel]) -> list[str]:
+    """Names of the keys of the model that an unknown key stands in, if that is an item of a list."""
+    annotation: Any = settings
+    parents = key.split(".")[:-1]
+    for part in parents:
+        annotation = _member(annotation, None, part)
+    if not any(part.isdecimal() for part in parents):
+        return []
+    models = [each for each in _alternatives(annotation) if isinstance(each, type)]
+    return [name for each in models if issubclass(each, pydantic.BaseModel) for name in each.model_fields]
 
 
 def _wants_list(error: Any) -> bool:

@@ -6,7 +6,7 @@ A mesh model joins as one more kind of edit (:mod:`tron.editing.edits`), once it
 """
 
 from tron.editing.edit_list import EditList, Session
-from tron.editing.edits import Duplicate, Edit, Insert, Material, Move, Remove
+from tron.editing.edits import Duplicate, Edit, Insert, Material, Move, Remove, Separate
 from tron.editing.selections import Box, Clicks, Grown, MaterialRange, Selection, Sphere
 from tron.editing.views import Views
 
@@ -17,6 +17,7 @@ __all__ = [
     "Remove",
     "Move",
     "Duplicate",
+    "Separate",
     "Insert",
     "Material",
     "Selection",

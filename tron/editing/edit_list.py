@@ -11,13 +11,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
+from tron.editing.documents import in_one_line, read_yaml, with_paths
 from tron.editing.edits import ACTIONS, Edit, Insert
 from tron.editing.selections import PARTS
 from tron.editing.views import Views
@@ -62,18 +62,11 @@ class EditList:
         Raises:
             TronError: no such file, no YAML, or as :meth:`of`.
         """
-        try:
-            data = yaml.safe_load(path.read_text("utf-8"))
-        except OSError as error:
-            raise TronError(f"cannot read: {error.strerror or error}", path) from error
-        except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-            reason = str(getattr(error, "problem", None) or "not text")
-            raise TronError(f"not YAML: {reason}", path, _MEND) from error
-        return cls.of(data, path.parent, str(path))
+        return cls.of(read_yaml(path, _MEND), path.parent, str(path))
 
     def write(self, path: Path) -> None:
         """Write YAML, whole or not at all; files are named from its folder."""
-        plain = [_with_paths(_plain(each), lambda file: os.path.relpath(file, path.parent)) for each in self]
+        plain = [with_paths(_plain(each), lambda file: os.path.relpath(file, path.parent)) for each in self]
         write_atomic(path, yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=110))
 
     def apply(
@@ -179,57 +172,21 @@ def _checked(data: Any, where: str, folder: Path) -> Edit:
     if not isinstance(data, dict):
         raise TronError(f"an edit is a mapping, not {str(data)[:_SHOWN]!r}", where, _MEND)
     try:
-        return _EDIT.validate_python(_with_paths(data, lambda file: str(folder / file)))
+        return _EDIT.validate_python(with_paths(data, lambda file: str(folder / file)))
     except ValidationError as error:
-        raise _one_line(error, where) from error
+        raise _said(error, where) from error
 
 
-def _one_line(error: ValidationError, where: str) -> TronError:
-    errors = error.errors()
-    # A misspelt key often leaves a second error behind, of the key that was meant. What may be of several
-    # types fails as each of them: the error furthest inside says most.
-    first = max(errors, key=lambda each: (each["type"] == "extra_forbidden", len(each["loc"])))
-    if first["type"] == "union_tag_not_found":
+def _said(error: ValidationError, where: str) -> TronError:
+    kind, given = error.errors()[0]["type"], error.errors()[0].get("ctx", {})
+    if kind == "union_tag_not_found":
         return TronError("the edit has no action", where, f"give one of {', '.join(_ACTIONS)}")
-    if first["type"] == "union_tag_invalid":
-        unknown = f"unknown action {first.get('ctx', {}).get('tag')!r}"
-        return TronError(unknown, where, f"give one of {', '.join(_ACTIONS)}")
-    key = ".".join(str(part) for part in first["loc"][1:] if _is_key(part))
-    if first["type"] == "extra_forbidden":
-        key_given = str(first["loc"][-1])
-        near = get_close_matches(key_given, sorted(_KEYS - {key_given}), n=1)
-        return TronError(f"unknown key '{key}'", where, f"did you mean '{near[0]}'?" if near else None)
-    reason = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "value_error":
-        return TronError(reason, where)
-    if first["type"] == "missing":
-        return TronError(f"'{key}' has no value", where)
-    shown = repr(first["input"])
-    shown = shown if len(shown) <= _SHOWN else f"{shown[:_SHOWN]}..."
-    return TronError(f"wrong value for '{key}': {shown}", where, reason[:1].lower() + reason[1:])
-
-
-def _is_key(part: int | str) -> bool:
-    """Whether a part of an error's place is written in the file: names of types are pydantic's."""
-    return isinstance(part, int) or (part.islower() and part.isidentifier() and part not in ("float", "int"))
+    if kind == "union_tag_invalid":
+        return TronError(f"unknown action {given.get('tag')!r}", where, f"give one of {', '.join(_ACTIONS)}")
+    return in_one_line(error, where, _KEYS, below=1)  # the action
 
 
 def _plain(edit: Edit) -> dict[str, Any]:
     """Plain values of an edit, its action and its selection first, without what was not given."""
     given = {"action": edit.action} | edit.model_dump(mode="json", exclude_unset=True)
     return {name: given[name] for name in ("action", *(["select"] if "select" in given else ()))} | given
-
-
-def _with_paths(data: Any, changed: Callable[[str], str]) -> Any:
-    """Plain values of an edit whose files, of ``insert`` and of masks, have other paths."""
-    if isinstance(data, list):
-        return [_with_paths(each, changed) for each in data]
-    if not isinstance(data, dict):
-        return data
-    result = {name: _with_paths(value, changed) for name, value in data.items()}
-    if isinstance(result.get("file"), str):
-        result["file"] = changed(result["file"])
-    if isinstance(result.get("masks"), dict):
-        masks = result["masks"].items()
-        result["masks"] = {k: changed(path) if isinstance(path, str) else path for k, path in masks}
-    return result

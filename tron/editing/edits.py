@@ -7,20 +7,27 @@ was: shadows of what nobody touched must not change by it.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from tron.editing.colors import hues, with_hue
+from tron.editing.models import MODELS, read_model
 from tron.editing.placement import fitted, foot, placed, surface_below
-from tron.editing.selections import ObjectId, Part, Selection, Vector
+from tron.editing.selections import Axis, ObjectId, Part, Selection, Vector
 from tron.editing.views import Views
 from tron.errors import TronError
 from tron.gaussians.edit import joined, removed
 from tron.gaussians.scene import GaussianScene
+
+log = logging.getLogger(__name__)
+
+SURFELS = 20_000
+"""Of an inserted mesh, at least, unless it says a spacing."""
 
 Unit = Annotated[float, Field(ge=0, le=1)]
 Color = tuple[Unit, Unit, Unit]
@@ -57,16 +64,9 @@ class _Placing(Part):
 
     by: Vector = (0.0, 0.0, 0.0)
     turn: float = 0.0
-    axis: Vector | None = None
+    axis: Axis | None = None
     scale: float = Field(default=1.0, gt=0)
     about: Vector | None = None
-
-    @field_validator("axis")
-    @classmethod
-    def _has_a_length(cls, axis: Vector | None) -> Vector | None:
-        if axis is not None and not any(axis):
-            raise ValueError("an axis has a length: give three numbers that are not all 0")
-        return axis
 
     def place(self, scene: GaussianScene, which: np.ndarray) -> GaussianScene:
         """The scene with the surfels (M,) bool where they go."""
@@ -121,11 +121,37 @@ class Duplicate(_Selecting, _Placing):
         return _with(self.select.objects, self.object)
 
 
-class Insert(Part):
-    """Put another scene's surfels in, upright, as one object.
+class Separate(_Selecting):
+    """Make surfels an object of their own, which further edits, tron-relight's motion and the viewer name.
+
+        {action: separate, select: {clicks: {view: 0, inside: [[120, 80]], outside: [[30, 200]]}}, object: 8}
+
+    Surfels that were of other objects leave them; their places, materials and radiance stay.
 
     Attributes:
-        file: PLY of the other scene.
+        object: the number that they get, one that no object has; a free one where none is given.
+    """
+
+    action: Literal["separate"] = "separate"
+    object: ObjectId | None = None
+
+    def apply(self, scene: GaussianScene, views: Views) -> GaussianScene:
+        """The scene with them under another number; nothing that is seen changes."""
+        which, number = self.selected(scene, views), _free_object(scene, self.object)
+        return replace(scene, object_id=np.where(which, np.int32(number), scene.object_id))
+
+    @property
+    def objects(self) -> frozenset[int] | None:
+        """Those it takes them from, and the one it makes."""
+        return _with(self.select.objects, self.object)
+
+
+class Insert(Part):
+    """Put another scene's surfels, or those of a mesh, in, upright, as one object.
+
+    Attributes:
+        file: PLY of the other scene, or a glTF or OBJ model, which becomes surfels and keeps its units.
+        spacing: of a model's surfels, world units; by default of 20,000 of them, or the scene's if finer.
         at: point that they stand at, world; or above it, where they stand on what lies straight below.
         standing: whether they are lowered onto the surface below ``at``.
         take: which of the other scene's surfels; all by default.
@@ -136,6 +162,7 @@ class Insert(Part):
 
     action: Literal["insert"] = "insert"
     file: Path
+    spacing: float | None = Field(default=None, gt=0)
     at: Vector
     standing: bool = True
     take: Selection | None = None
@@ -146,7 +173,7 @@ class Insert(Part):
     def apply(self, scene: GaussianScene, views: Views) -> GaussianScene:
         """The scene with them at its end."""
         number = _free_object(scene, self.object)
-        other = GaussianScene.load(self.file)
+        other = self._read(scene)
         if self.take is not None:
             taken = self.take.of(other)
             if not taken.any():
@@ -156,6 +183,24 @@ class Insert(Part):
         both = joined(scene, _named(fitted(other, scene), number))
         new = np.arange(len(both)) >= len(scene)
         return placed(both, new, by=at - foot(both, new), turn_deg=self.turn, scale=self.scale)
+
+    def _read(self, scene: GaussianScene) -> GaussianScene:
+        if self.file.suffix.lower() not in MODELS:
+            if self.spacing is not None:
+                raise TronError(
+                    "spacing is of meshes: surfels of a PLY have theirs", self.file, "leave it out"
+                )
+            return GaussianScene.load(self.file)
+        parts = read_model(self.file)
+        from tron.models.surfels import MOST, areas, surfels_of_model  # after it has said what is missing
+
+        of_many = float(np.sqrt(sum(areas(part).sum() for part in parts) / SURFELS))
+        spacing = max(min(scene.spacing / self.scale, of_many), of_many * (SURFELS / MOST) ** 0.5 * 1.01)
+        spacing = spacing if self.spacing is None else self.spacing / self.scale
+        made = surfels_of_model(parts, spacing, kernel_degree=scene.kernel_degree)
+        size = np.ptp(made.means, axis=0) * self.scale
+        log.info("%s is %d surfels, %.3g x %.3g x %.3g", self.file.name, len(made), *size)
+        return made
 
     @property
     def objects(self) -> frozenset[int] | None:
@@ -221,8 +266,8 @@ class Material(_Selecting):
         return replace(scene, **changed)
 
 
-Edit = Annotated[Remove | Move | Duplicate | Insert | Material, Field(discriminator="action")]
-ACTIONS = (Remove, Move, Duplicate, Insert, Material)
+Edit = Annotated[Remove | Move | Duplicate | Separate | Insert | Material, Field(discriminator="action")]
+ACTIONS = (Remove, Move, Duplicate, Separate, Insert, Material)
 
 
 def _free_object(scene: GaussianScene, wanted: int | None) -> int:

@@ -26,7 +26,9 @@ REACH = 3.0
 # square of the change of colour. Squares forgive noise and curvature, which fine surfels share out over many
 # steps. Things are convex and meet in creases (Stein et al. 2014, "Object partitioning using local
 # convexity"), so that a ridge counts less than a crease where normals have a sign.
-_LENGTH, _BEND, _TINT, _RIDGE = 0.03, 20.0, 20.0, 0.3
+_LENGTH, _BEND, _TINT, _RIDGE = 0.01, 20.0, 60.0, 0.3
+_MOST_TINT = 0.25
+"""Change of colour beyond which an edge costs no more: else the tiles of one floor are kept apart."""
 _STEP = 0.05
 """Length of a step between surfels at one place, spacings."""
 
@@ -135,7 +137,8 @@ def parted(scene: GaussianScene, inside: np.ndarray, outside: np.ndarray) -> np.
     if len(np.intersect1d(within, without)):
         raise TronError("a surfel was picked both inside and outside", mend="move one of the two clicks")
     bend = np.where(graph.ridge, _RIDGE, 1.0) * graph.bend**2
-    cost = (graph.length / scene.spacing + _STEP) * (_LENGTH + _BEND * bend + _TINT * graph.tint**2)
+    tint = np.minimum(graph.tint, _MOST_TINT) ** 2
+    cost = (graph.length / scene.spacing + _STEP) * (_LENGTH + _BEND * bend + _TINT * tint)
     count = len(graph.seen)
     one_way = coo_matrix((cost, (graph.start, graph.end)), shape=(count, count)).tocsr()
     both_ways = one_way.maximum(one_way.T)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from tron.color import luminance
 from tron.editing.colors import hues
@@ -20,6 +20,16 @@ from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 
 Vector = tuple[float, float, float]
+
+
+def _with_a_length(axis: Vector) -> Vector:
+    if not any(axis):
+        raise ValueError("an axis has a length: give three numbers that are not all 0")
+    return axis
+
+
+Axis = Annotated[Vector, AfterValidator(_with_a_length)]
+"""Direction of any length but 0, world."""
 Range = tuple[float, float]
 ObjectId = Annotated[int, Field(ge=0, lt=2**31)]
 Picked = Annotated[int, Field(ge=0)] | tuple[float, float]
@@ -193,6 +203,13 @@ class Selection(Part):
             return None
         each = [one.objects for one in self.any]
         return None if None in each else frozenset().union(*(ids for ids in each if ids is not None))
+
+    @property
+    def asks_views(self) -> bool:
+        """Whether it names pixels, clicks, masks, or surfels by number."""
+        parts = [*(self.any or ()), *([self.but_not] if self.but_not else [])]
+        own = (self.grow, self.clicks, self.masks)
+        return any(each is not None for each in own) or any(each.asks_views for each in parts)
 
     def of(self, scene: GaussianScene, views: Views | None = None) -> np.ndarray:
         """(M,) bool; ``views`` where pixels or masks are named.

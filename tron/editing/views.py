@@ -17,6 +17,7 @@ from tron.seeds import integer
 
 if TYPE_CHECKING:
     from tron.relighting import Relighter
+    from tron.relighting.beside import BesideMeshes
     from tron.relighting.proxy import ProxiedTracer
     from tron.tracing import SurfelTracer
 
@@ -115,6 +116,14 @@ class Views:
         near = found & (np.abs(distances - middle) <= THICKNESS * scene.spacing)
         return np.unique(surfels[near]).astype(int), middle
 
+    def shares(self, scene: GaussianScene, which: np.ndarray, camera: Camera) -> np.ndarray:
+        """(H, W) in [0, 1]: how much of each pixel of a camera shows the surfels (M,) bool."""
+        import mitsuba as mi
+
+        tracer = self._tracer(scene, camera)
+        seen = tracer.gbuffer(camera, [mi.Float(which.astype(np.float32))]).numpy()
+        return seen["opacity"] * seen["values"][..., 0]
+
     def lifted(self, scene: GaussianScene, masks: Mapping[str, Path]) -> np.ndarray:
         """(M,) bool: surfels for which most votes of the masked views are for their masks.
 
@@ -151,7 +160,7 @@ class Views:
             votes[framed] += np.where(mask[y, x], 1, -1) * seen * cosine[framed]
         return votes > 0
 
-    def _tracer(self, scene: GaussianScene, camera: Camera) -> SurfelTracer | ProxiedTracer:
+    def _tracer(self, scene: GaussianScene, camera: Camera) -> SurfelTracer | ProxiedTracer | BesideMeshes:
         """A tracer whose rays meet what the camera sees: the scene itself, and no back face."""
         from tron.relighting import Estimation, Relighter
 

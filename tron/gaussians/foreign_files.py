@@ -1,4 +1,4 @@
-"""Splats by other programs: what is refused, unpacked, made usable, and which way is up."""
+"""Splats by other programs: what is refused, expanded, made usable, and which way is up."""
 
 from __future__ import annotations
 
@@ -15,15 +15,11 @@ from scipy.special import log_expit
 
 from tron.errors import TronError
 from tron.gaussians.fields import FIELDS, LOG_SCALE_LIMIT
+from tron.gaussians.formats.registry import FORMATS
+from tron.gaussians.packed_files import PACKED_SPLATS, conversion
 from tron.io.recognised import refuse_by_sight
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".insv")
-PACKED_SPLATS = {
-    ".splat": "antimatter15's .splat",
-    ".ksplat": "mkkellogg's .ksplat",
-    ".spz": "Niantic's .spz",
-    ".sog": "PlayCanvas's .sog",
-}
 
 
 def refuse_foreign(path: Path) -> None:
@@ -32,19 +28,11 @@ def refuse_foreign(path: Path) -> None:
     if suffix in VIDEOS:
         mend = f"tron-reconstruct capture={quote(path.name)} output_dir=OUT makes a scene of its frames"
         raise TronError("a video is no scene", path, mend)
-    if suffix in PACKED_SPLATS:
-        raise packed_splats(path, PACKED_SPLATS[suffix])
-    refuse_by_sight(path, "a scene is a PLY of splats")
-
-
-def packed_splats(path: Path, kind: str) -> TronError:
-    """The error for Gaussians in a packed format, such as "Niantic's .spz"."""
-    plain = path.name.removesuffix(path.suffix).removesuffix(".compressed") + ".ply"
-    mend = (
-        f"make a plain 3DGS PLY: npx @playcanvas/splat-transform {quote(path.name)} {quote(plain)}, "
-        "or superspl.at/convert"
-    )
-    return TronError(f"Gaussians in a packed format, {kind}", path, mend)
+    if suffix == ".ksplat":
+        raise TronError("mkkellogg's .ksplat is not read", path, f"{conversion(path)} makes a PLY of it")
+    known = PACKED_SPLATS.get(suffix) or FORMATS.get(suffix)
+    if known is None or not known.begins(path):  # .spz, .sog, .usdz and checkpoints begin as archives do
+        refuse_by_sight(path, "a scene is a file of splats")
 
 
 ROUND = 0.9

@@ -101,9 +101,37 @@ def surfels_from_gbuffers(
     if count < 1:
         raise TronError(f"surfel count is {count}", mend="ask for at least one")
     samples = _gather(views, count)
-    has_rgb = "rgb" in samples.values
     if not len(samples.weight):
         raise TronError("no view sees any surface, so there are no surfels to make")
+    return _surfels(samples, count, kernel_degree, scale, opacity, up)
+
+
+def surfels_from_points(
+    values: dict[str, np.ndarray],
+    object_id: int,
+    count: int,
+    kernel_degree: int = 4,
+    scale: float = 0.4,
+    opacity: float = 0.99,
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+) -> GaussianScene:
+    """The same of one object's points, which lie evenly on its surface.
+
+    Args:
+        values: position, normal (unit), base_color (linear), (N, 3) each, and roughness, metallic, (N, 1).
+        object_id: of the surfels.
+        count, kernel_degree, scale, opacity, up: as of :func:`surfels_from_gbuffers`.
+    """
+    given = {name: np.asarray(array, np.float32) for name, array in values.items()}
+    number = len(given["position"])
+    samples = _Samples(given, np.ones(number), np.full(number, object_id, np.int64))
+    return _surfels(samples, count, kernel_degree, scale, opacity, up)
+
+
+def _surfels(
+    samples: _Samples, count: int, kernel_degree: int, scale: float, opacity: float, up: Sequence[float]
+) -> GaussianScene:
+    has_rgb = "rgb" in samples.values
     samples = samples.merged(_cell_size(samples, count))
     means, normals = samples.values["position"], samples.values["normal"]
     distances = _sheet_distances(means, normals)

@@ -34,7 +34,6 @@ from tron.gaussians.foreign_files import (
     foreign_kernels,
     is_gzipped,
     largest,
-    packed_splats,
     refuse_foreign,
     round_ones,
     smoothed,
@@ -42,7 +41,10 @@ from tron.gaussians.foreign_files import (
     usable_splats,
     whole,
 )
+from tron.gaussians.formats.registry import FORMATS, Format
+from tron.gaussians.formats.splats import Splats
 from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
+from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS, Packing, packing, unpacked
 from tron.io.local_frame import local_origin, said
 from tron.storage import atomic_path
 
@@ -121,8 +123,8 @@ def write_ply(
         )
 
 
-def read_ply(path: str | Path) -> dict[str, Any]:
-    """Attributes of the GaussianScene in a TRON, 2DGS or 3DGS PLY; ``spacing`` only if the file says it.
+def read_splats(path: str | Path) -> dict[str, Any]:
+    """Attributes of the GaussianScene in a file of splats; ``spacing`` only if the file says it.
 
     Of three scales the smallest is dropped and the rotation permuted, so that the surfel's normal is the axis
     along which the Gaussian was thinnest; ``round_ones`` (M,) bool tells where there is no such axis.
@@ -135,18 +137,28 @@ def read_ply(path: str | Path) -> dict[str, Any]:
     coordinates is taken away in float64, and is in `offset` (:mod:`tron.io.local_frame`). Each of these says
     so in one line.
 
-    The file may be compressed by gzip.
+    The file may be compressed by gzip, packed (:mod:`tron.gaussians.packed_files`), or of another program
+    (:mod:`tron.gaussians.formats`). ``turn`` (3, 3) is the rotation from a packed file's frame into that of
+    3DGS' PLYs. Formats that are y up say so: .spz, glTF, USD.
 
     Raises:
-        TronError: files that are missing, are no PLY or a packed one, lack properties (named), declare more
-            than they hold, expand without limit, or hold no splat.
+        TronError: files that are missing, are neither a PLY nor packed splats, lack properties (named),
+            declare more than they hold, expand without limit, or hold no splat.
     """
     path = Path(path)
-    check_header(path)
-    data = _parsed(path)
-    constants = _read_constants(data.comments, path)
-    columns = {p.name: data["vertex"][p.name] for p in data["vertex"].properties}
-    _check_properties(columns, data.comments, path)
+    known = check_header(path)
+    if isinstance(known, Format):
+        splats = known.read(path)
+        columns, comments, up = _columns(splats), [], splats.up
+    else:
+        data = _parsed(path, known)
+        columns = {p.name: data["vertex"][p.name] for p in data["vertex"].properties}
+        comments, up = data.comments, stated_up(data.comments)
+    turn = HALF_TURN if isinstance(known, Packing) and known.half_turned else np.eye(3)
+    if isinstance(known, Packing) and known.half_turned:
+        up = GUESSED_UP @ turn
+    constants = _read_constants(comments, path)
+    _check_properties(columns, comments, path)
     scales = [name for name in (*FIELDS["log_scales"].properties, THIRD_SCALE) if name in columns]
     # Before they are smoothed: a filter much wider than a splat hides its axes, not where it faces.
     columns["round_ones"] = round_ones(np.stack([columns[name] for name in scales], axis=-1))
@@ -172,7 +184,7 @@ def read_ply(path: str | Path) -> dict[str, Any]:
     quats, log_scales = flattened(field("quats"), stack(scales))
     sh = _harmonics(columns, stack, path)
     guessed = MATERIAL_PROPERTIES[0] not in columns
-    stated = constants["up"] if "up" in constants else stated_up(data.comments)
+    stated = constants.get("up", up)
     return {
         "means": means,
         "quats": quats,
@@ -184,6 +196,7 @@ def read_ply(path: str | Path) -> dict[str, Any]:
         "object_id": _object_id(columns, len(means), path),
         "kernel_degree": int(constants.get("kernel_degree", [2])[0]),
         **({"spacing": constants["spacing"][0]} if "spacing" in constants else {}),
+        "turn": turn,
         "up": np.array(GUESSED_UP if stated is None else stated),
         "up_guessed": stated is None or bool(constants.get("up_guessed", [0])[0]),
         "materials_guessed": guessed or bool(constants.get("materials_guessed", [0])[0]),
@@ -192,14 +205,25 @@ def read_ply(path: str | Path) -> dict[str, Any]:
     }
 
 
-def check_header(path: Path) -> None:
+def check_header(path: Path) -> Packing | Format | None:
     """Look at the first bytes of a scene's file alone: a wrong one is found before anything is loaded.
+
+    Returns the format of packed splats or of another program's, None of a PLY.
 
     Raises:
         TronError: it cannot be opened, is no PLY of Gaussians as far as its header tells, or is shorter than
             the header says.
     """
+    other = FORMATS.get(path.suffix.lower())
+    if other is not None:
+        refuse_foreign(path)
+        other.check(path)
+        return other
     try:
+        with open(path, "rb") as stream:
+            packed = packing(path, stream.read(_HEADER_LIMIT))
+        if packed in PACKED_SPLATS.values():
+            return packed
         if is_gzipped(path):
             head, size = beginning(path, _HEADER_LIMIT), largest(path)
         else:
@@ -211,6 +235,7 @@ def check_header(path: Path) -> None:
         refuse_foreign(path)
         raise TronError("not a PLY file", path, _EXPORT)
     _check_sizes(head, size, path)
+    return packed
 
 
 def header_comments(path: Path) -> list[str]:
@@ -223,17 +248,30 @@ def header_comments(path: Path) -> list[str]:
     return [line[len("comment ") :].rstrip() for line in header.splitlines() if line.startswith("comment ")]
 
 
-def _parsed(path: Path) -> plyfile.PlyData:
+def _parsed(path: Path, packed: Packing | None) -> plyfile.PlyData:
     try:
-        if not is_gzipped(path):
+        if packed is None and not is_gzipped(path):
             return plyfile.PlyData.read(str(path))
-        content = whole(path)
+        content = whole(path) if packed is None else unpacked(path, packed)
         _check_sizes(content[:_HEADER_LIMIT], len(content), path)
         return plyfile.PlyData.read(io.BytesIO(content))
     except OSError as error:
         raise TronError(f"cannot read: {error.strerror or error}", path) from error
     except (plyfile.PlyParseError, ValueError) as error:  # ValueError: text that is no number
         raise TronError(f"not a readable PLY: {error}", path) from error
+
+
+def _columns(splats: Splats) -> dict[str, np.ndarray]:
+    """By the names of 3DGS' properties."""
+    rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(len(splats.sh), -1).T
+    return {
+        **dict(zip(FIELDS["means"].properties, splats.means.T)),
+        **dict(zip(FIELDS["sh"].properties, splats.sh[:, 0].T)),
+        **dict(zip(REST, rest)),
+        "opacity": splats.opacity_logits,
+        **dict(zip((*FIELDS["log_scales"].properties, THIRD_SCALE), splats.log_scales.T)),
+        **dict(zip(FIELDS["quats"].properties, splats.quats.T)),
+    }
 
 
 def _filtered(columns: dict[str, np.ndarray], scales: Sequence[str], path: Path) -> dict[str, np.ndarray]:
@@ -306,8 +344,6 @@ def _check_sizes(head: bytes, size: int, path: Path) -> None:
     end = head.find(b"end_header")
     if end < 0:
         raise TronError("the PLY header has no end", path)
-    if b"packed_position" in head[:end]:
-        raise packed_splats(path, "PlayCanvas's compressed PLY")
     ascii_body = False
     elements: list[tuple[str, int, int]] = []  # name, count, least bytes of a row
     for line in head[:end].decode("ascii", "replace").splitlines():

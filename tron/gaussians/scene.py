@@ -20,7 +20,7 @@ from tron.errors import TronError, located
 from tron.framing import upright
 from tron.gaussians.fields import FIELDS, LOG_SCALE_LIMIT, MATERIALS
 from tron.gaussians.harmonics import rotate_sh
-from tron.gaussians.ply import read_ply, write_ply
+from tron.gaussians.ply import read_splats, write_ply
 
 log = logging.getLogger(__name__)
 
@@ -173,15 +173,15 @@ class GaussianScene:
             values, expected = getattr(self, name), (count, *described.shape)
             if values.shape != expected:
                 raise TronError(f"{name} has shape {values.shape}, expected {expected}")
-            bad = ~np.isfinite(values.reshape(count, -1)).all(axis=1)
-            if bad.any():
+            if not np.isfinite(values).all():
+                bad = ~np.isfinite(values.reshape(count, -1)).all(axis=1)
                 raise TronError(
                     f"{name} of {bad.sum()} of {count} surfels is not finite (first: {bad.argmax()})"
                 )
         for name in MATERIALS:
             values = getattr(self, name).reshape(count, -1)
-            bad = ((values < -_TOLERANCE) | (values > 1 + _TOLERANCE)).any(axis=1)
-            if bad.any():
+            if values.min() < -_TOLERANCE or values.max() > 1 + _TOLERANCE:
+                bad = ((values < -_TOLERANCE) | (values > 1 + _TOLERANCE)).any(axis=1)
                 raise TronError(f"{name} of {bad.sum()} surfels is outside [0, 1] (first: {bad.argmax()})")
         bad = (np.abs(self.log_scales) > LOG_SCALE_LIMIT).any(axis=1)
         if bad.any():
@@ -221,7 +221,9 @@ class GaussianScene:
 
     @classmethod
     def load(cls, path: str | Path) -> GaussianScene:
-        """Read a TRON, 2DGS or 3DGS PLY; what files leave out: :func:`tron.gaussians.ply.read_ply`.
+        """Read a TRON, 2DGS or 3DGS PLY, or another file of splats (docs/guides/formats.md).
+
+        What files leave out: :func:`tron.gaussians.ply.read_splats`.
 
         A file that says no spacing has it measured. Where a scan is made of round Gaussians, as those of
         SplaTAM and MonoGS, which have no axis for a normal, they get that of their neighbourhood.
@@ -229,7 +231,7 @@ class GaussianScene:
         Raises:
             TronError: no such file, or no scene in it.
         """
-        values = read_ply(path)
+        values = read_splats(path)
         means, round_ones = values["means"], values.pop("round_ones")
         if round_ones.mean() > ROUND_SHARE and len(means) >= FEWEST_NEIGHBOURS:
             log.warning(
@@ -239,7 +241,9 @@ class GaussianScene:
             values["quats"][round_ones] = quats_from_normals(neighbour_normals(means, round_ones))
         if "spacing" not in values:
             values["spacing"] = measure_spacing(means)
-        return cls(**values).validate(path)
+        turn = values.pop("turn")
+        scene = cls(**values)
+        return (scene if np.array_equal(turn, np.eye(3)) else scene.rotated(turn)).validate(path)
 
 
 def rotation_matrices(quats: np.ndarray) -> np.ndarray:

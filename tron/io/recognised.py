@@ -31,16 +31,14 @@ class Sight(NamedTuple):
 _EMPTY = Sight("an empty file", "copy or download it again")
 _ARCHIVE = Sight("an archive", "unpack it and give what is in it")
 _CHECKPOINT = Sight(
-    "a checkpoint, which only the program that wrote it can read",
+    "a checkpoint of another program",
     "give the PLY of splats that it exports: point_cloud/iteration_N/point_cloud.ply of 3DGS, "
     "`ns-export gaussian-splat` of nerfstudio; or reconstruct the photos, tron-reconstruct capture=FOLDER",
 )
 _METASHAPE = Sight(
-    "Metashape's cameras",
-    "export them in Metashape as Colmap (Export Cameras, files of type Colmap), or convert them with "
-    "`ns-process-data metashape`; then give the folder of the result",
-    poses=True,
+    "Metashape's cameras", "tron-reconstruct capture=CAMERAS.xml reads them, beside the photos", poses=True
 )
+_PROJECT = Sight("Metashape's project", "export its cameras there (Export Cameras, .xml) beside the photos")
 _REALITY = Sight(
     "RealityCapture's cameras",
     "export them there as COLMAP, or convert them with `ns-process-data realitycapture`; then give the "
@@ -49,8 +47,7 @@ _REALITY = Sight(
 )
 _RECORD3D_FILE = Sight(
     "Record3D's recording",
-    "export it in Record3D as EXR + RGB; capture=EXPORT/rgb poses its photos anew, "
-    "`ns-process-data record3d` keeps its poses",
+    "export it in Record3D as EXR + RGB and give the folder of that",
 )
 _LFS = Sight("a pointer of Git LFS, not the file itself", "git lfs pull brings the file")
 _PAGE = Sight("a web page, not the file itself", "download the file, not the page that shows it")
@@ -58,7 +55,7 @@ _PAGE = Sight("a web page, not the file itself", "download the file, not the pag
 _SUFFIXES = {
     **dict.fromkeys((".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar"), _ARCHIVE),
     **dict.fromkeys((".ckpt", ".pth", ".pt", ".safetensors", ".pkl"), _CHECKPOINT),
-    **dict.fromkeys((".psx", ".psz"), _METASHAPE),
+    **dict.fromkeys((".psx", ".psz"), _PROJECT),
     ".rcproj": _REALITY,
     ".r3d": _RECORD3D_FILE,
 }
@@ -132,10 +129,9 @@ def _folder(path: Path) -> Sight | None:
         for corrected in ("corrected_", ""):
             photos, cameras = frames / f"{corrected}images", frames / f"{corrected}cameras"
             if photos.is_dir() and cameras.is_dir():
-                mend = _converted("polycam", path, photos)
-                return Sight("Polycam's raw export", mend, poses=True)
+                return Sight("Polycam's raw export", _as_capture(path), poses=True)
     if (path / "rgb").is_dir() and any((path / name).is_file() for name in ("metadata.json", "metadata")):
-        return Sight("Record3D's export", _converted("record3d", path, path / "rgb"), poses=True)
+        return Sight("Record3D's export", _as_capture(path), poses=True)
     if any(path.glob("point_cloud/iteration_*/point_cloud.ply")):
         newest = max(
             path.glob("point_cloud/iteration_*/point_cloud.ply"), key=lambda each: _number(each.parent)
@@ -150,11 +146,8 @@ def _folder(path: Path) -> Sight | None:
     return None
 
 
-def _converted(program: str, path: Path, photos: Path) -> str:
-    return (
-        f"capture={quote(str(photos))} poses its photos anew; `ns-process-data {program} "
-        f"--data {quote(str(path))} --output-dir OUT` makes a transforms.json that keeps its poses"
-    )
+def _as_capture(path: Path) -> str:
+    return f"tron-reconstruct capture={quote(str(path))} reads its photos and poses"
 
 
 def _number(folder: Path) -> int:

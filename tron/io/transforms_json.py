@@ -75,6 +75,15 @@ def cameras_of_transforms(file: Path, size: tuple[int, int]) -> list[Camera]:
 
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON file that holds an object; TronError if it cannot be read or holds something else."""
+    return _read(path, dict)
+
+
+def read_list(path: Path) -> list[Any]:
+    """A JSON file that holds a list; TronError if it cannot be read or holds something else."""
+    return _read(path, list)
+
+
+def _read(path: Path, kind: type) -> Any:
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise TronError("JSON file is too large", path)
@@ -84,8 +93,9 @@ def read_json(path: Path) -> dict[str, Any]:
         raise TronError(f"cannot read: {error.strerror or error}", path) from error
     except (ValueError, RecursionError) as error:
         raise TronError(f"not readable as JSON: {error}", path) from error
-    if not isinstance(content, dict):
-        raise TronError(f"JSON holds a {type(content).__name__}, not an object", path)
+    if not isinstance(content, kind):
+        wanted = "an object" if kind is dict else "a list"
+        raise TronError(f"JSON holds a {type(content).__name__}, not {wanted}", path)
     return content
 
 

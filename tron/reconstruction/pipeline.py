@@ -46,7 +46,7 @@ from tron.reconstruction.progress import Track, untracked
 from tron.reconstruction.scores import LOOKS, Seen, ViewScore, score_views
 from tron.reconstruction.settings import FitSettings, ReconstructionSettings
 from tron.relighting import Relighter
-from tron.relighting.proxy import Proxy
+from tron.relighting.proxy import THICK, Proxy, thickness
 from tron.run_folder import RunFolder
 from tron.storage import write_atomic
 from tron.termination import Termination, termination_noted
@@ -76,7 +76,7 @@ class Reconstruction:
         confident: share of the subject's pixels whose depth stereo found and other photos confirm; None where
             stereo was not asked.
         seconds: of surfels with materials, those before an interruption included, and of the light.
-        proxy: what light sees of a scan that was kept; None where surfels are new.
+        proxy: what light sees of the surfels; None: themselves.
         opened: surfels that showed the sky in a room's windows and were taken out.
     """
 
@@ -179,16 +179,22 @@ def reconstruct(
     frozen = Surfels(taught, scene, learn, settings.seed, track)
     found = prior.find_materials(frozen)
     tracer = SurfelTracer(found.scene.validate())
+    proxy = found.proxy
+    if proxy is not None and thickness(tracer, [view.camera for view in views]) < THICK:
+        proxy = None
     seconds, started = {"surfels": run.seconds()}, time.perf_counter()
     lit = None
     if light is not None:
         lit = found.light or prior.find_light(frozen, tracer, light)
     seconds["light"] = time.perf_counter() - started
-    scores = _scores(tracer, capture, settings, lpips, track)
+    seen = tracer if proxy is None else Relighter(found.scene, proxy=proxy)
+    scores = _scores(seen, capture, settings, lpips, track)
     begun = dict(run.begun)
     if looks := begun.pop("looks", None):
         scores = _as_they_looked(scores, looks)
-    return Reconstruction(found.scene, lit, scores, found.learnt, found.gains, seconds=seconds, **begun)
+    return Reconstruction(
+        found.scene, lit, scores, found.learnt, found.gains, seconds=seconds, proxy=proxy, **begun
+    )
 
 
 def _scores(

@@ -66,8 +66,10 @@ def baked(
         track: wraps the loop over directions, to show progress.
 
     Raises:
-        TronError: nothing bounces in the estimation of ``light``.
+        TronError: nothing bounces in the estimation of ``light``, or meshes stand beside the surfels.
     """
+    if light.relighter.meshes is not None:
+        raise TronError("a file of surfels holds no mesh", mend="insert the model as surfels: tron-edit")
     surface = _surfels(light)
     local = mi.Frame3f(mi.Vector3f(surface.normal))
     dr.eval(local)

@@ -12,7 +12,7 @@ No light is sent up from the plane to the scene: the map's lower half does that,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 
 import drjit as dr
 import mitsuba as mi
@@ -84,14 +84,11 @@ class Ground:
         seen = down & (distance > 0) & (view.opacity < 1)
         met = mi.Point3f(dr.fma(distance, view.direction, mi.Vector3f(origin)))
         position = dr.select(seen, met, view.position)
-        plane = replace(
-            view,
-            position=position,
-            depth=dr.select(seen, distance, 0),
-            normal=mi.Normal3f(0, 0, dr.select(seen, 1, 0)),
-            opacity=dr.select(seen, mi.Float(1), 0),
-            values=[],
-        )
+        given = {field.name: getattr(view, field.name) for field in fields(GBuffer)}
+        given |= {"position": position, "depth": dr.select(seen, distance, 0), "values": []}
+        given |= {"opacity": dr.select(seen, mi.Float(1), 0)}
+        given |= {"normal": mi.Normal3f(0, 0, dr.select(seen, 1, 0))}
+        plane = GBuffer(**given)
         dr.eval(plane)
         share = visibility(tracer, plane, lighting, estimation.of_sub_pixel(), integer(seed, "ground"))
         outward = dr.select(seen, dr.normalize(position - eye), view.direction)

@@ -17,12 +17,13 @@ surfels without a sign are turned to each of them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -34,6 +35,7 @@ from tron.errors import TronError
 from tron.estimation import FINAL, Estimation
 from tron.gaussians.edit import subset
 from tron.gaussians.scene import GaussianScene
+from tron.relighting.beside import BesideMeshes, LightTracer, some_of
 from tron.relighting.ground import Ground
 from tron.relighting.proxy import THICK, Choice, ProxiedTracer, Proxy, fingerprint, make_proxy, thickness
 from tron.runtime import activate
@@ -51,7 +53,11 @@ from tron.shading.guidance import (
 )
 from tron.shading.lighting import Lighting
 from tron.tracing import GBuffer, SurfelTracer
+from tron.tracing.meshes import Meshes
 from tron.tracing.surface import Surface, centres
+
+if TYPE_CHECKING:
+    from tron.models.parts import Part
 
 log = logging.getLogger(__name__)
 
@@ -75,6 +81,8 @@ class Relighter:
         proxy_file: PLY that keeps the proxy; taken where it was made from the same, else written.
         filming: wraps the loop over the proxy's views, to show progress.
         ground: what the scene stands on and throws shadows on, where frames show the environment.
+        meshes: models, each as :func:`tron.models.load.load_model` reads it, where they stand, in the scene's
+            world and units: opaque things beside the surfels (:mod:`tron.tracing.meshes`).
     """
 
     def __init__(
@@ -90,6 +98,7 @@ class Relighter:
         proxy_file: Path | None = None,
         filming: Callable[[range], Iterable[int]] = iter,
         ground: Ground | None = None,
+        meshes: Sequence[Sequence[Part]] = (),
     ) -> None:
         if mi.variant() is None:
             activate()
@@ -98,12 +107,13 @@ class Relighter:
         self._choice, self._cameras, self._proxy_file, self._filming = proxy, cameras, proxy_file, filming
         self._tracer = SurfelTracer(scene, backdrop=backdrop).sided(estimation.two_sided)
         self._turned_to: tuple[bytes, SurfelTracer] | None = None
+        self.meshes = Meshes(meshes, seed) if meshes else None
 
-    def tracer(self, camera: Camera) -> SurfelTracer | ProxiedTracer:
+    def tracer(self, camera: Camera) -> SurfelTracer | ProxiedTracer | BesideMeshes:
         """The tracer for a camera: one for all, unless surfels are turned to each."""
-        return (
-            self._seen_by(camera) if self._proxied is None else self._proxied.showing(self._seen_by(camera))
-        )
+        seen = self._seen_by(camera)
+        tracer = seen if self._proxied is None else self._proxied.showing(seen)
+        return tracer if self._beside is None else BesideMeshes(tracer, self._beside)
 
     def _seen_by(self, camera: Camera) -> SurfelTracer:
         """The scene itself; surfels without a sign are turned to the camera, but not those of a backdrop."""
@@ -133,7 +143,11 @@ class Relighter:
         if kept is not None:
             log.info("%s: light sees the proxy of %s, %d surfels", said, self._proxy_file, len(kept.surfels))
             return kept
-        made = make_proxy(tracer, self._cameras, self._filming)
+        try:
+            made = make_proxy(tracer, self._cameras, self._filming)
+        except (KeyboardInterrupt, SystemExit) as end:
+            end.add_note("the proxy begins anew; what was finished before it is kept")
+            raise
         if made is None:
             log.warning("%s, but views of the scene agree on no surface: light sees the scan itself", said)
             return None
@@ -174,17 +188,34 @@ class Relighter:
 
     @property
     def _light(self) -> SurfelTracer:
-        """Surfels that light bounces among: the proxy's, or the scene's, turned outward without a sign."""
+        """Surfels that light bounces among: the proxy's, or the scene's, turned outward without a sign.
+
+        Behind them those that stand for meshes.
+        """
+        return self._surfels_of_light if self._beside is None else self._beside
+
+    @property
+    def _surfels_of_light(self) -> SurfelTracer:
         if self._proxied is not None:
             return self._proxied.light
         return self._tracer if self.scene.oriented else self._tracer.turned_over(self._outward)
+
+    @cached_property
+    def _beside(self) -> LightTracer | None:
+        if self.meshes is None:
+            return None
+        backdrop = self._backdrop if self._proxied is None else None
+        traced = LightTracer(self._surfels_of_light, self.meshes, backdrop)
+        return traced.sided(self.estimation.two_sided)
 
     def surfels(self, values: Sequence[mi.Float] = ()) -> Surface:
         """(M,) the scene's surfels at their centres, facing as light sees them, with ``values`` of a bake."""
         if self._proxied is not None:
             return self._proxied.surfels(values)
-        found = centres(self._light.records, dr.arange(mi.UInt32, len(self.scene)))
-        return replace(found, values=list(values))
+        count = len(self.scene)
+        found = centres(self._light.records, dr.arange(mi.UInt32, count))
+        own = values if self._beside is None else [some_of(value, 0, count) for value in values]
+        return replace(found, values=list(own))
 
     def gbuffer(self, camera: Camera, values: Sequence[mi.Float] = ()) -> GBuffer:
         """What a camera sees; ``values`` of the surfels that light sees are composited too."""
@@ -239,7 +270,8 @@ class Relighter:
         """Whether surfels and the light's rays among them are those of another relighter."""
         traced = (self._tracer.bvh.order, self.estimation, self.seed)
         others = (other._tracer.bvh.order, other.estimation, other.seed)
-        return self.stands_as(other.scene) and traced[0] is others[0] and traced[1:] == others[1:]
+        alike = traced[0] is others[0] and traced[1:] == others[1:] and self.meshes is other.meshes
+        return self.stands_as(other.scene) and alike
 
     def stands_as(self, scene: GaussianScene) -> bool:
         """Whether a scene is this one but for materials and radiance; False where light sees a proxy."""
@@ -247,18 +279,54 @@ class Relighter:
             return False
         return _same(self.scene, scene, (*REACH, "means", "quats"))
 
-    def changed(self, scene: GaussianScene, *, quick: bool = False) -> Relighter:
+    def show(
+        self,
+        lights: str | Path | EnvironmentMap | Mapping[str, EnvironmentMap],
+        height: int = 640,
+        **settings: Any,
+    ) -> Any:
+        """Watch and change the scene in a notebook's cell: the window of tron-view, which shows itself.
+
+        It is a copy: what is changed there stays there, until it is saved. It estimates light as tron-view
+        does, and decides by itself whether light sees a proxy.
+
+        Args:
+            lights: to choose from: maps by name, one map, or a folder of files.
+            height: of the cell's frame, pixels.
+            settings: of tron-view by name, such as ``models``, ``port``, ``output_dir``.
+
+        Returns:
+            :class:`tron.apps.view.Shown`, which ``close()`` ends.
+
+        Raises:
+            TronError: viser is not installed, a setting is wrong, or there are meshes, which it cannot show.
+        """
+        if self.meshes is not None:
+            raise TronError("the viewer shows no meshes", mend="insert them as surfels (tron.editing.Insert)")
+        # By name: it stands above all floors, and whoever lights a scene needs no viser.
+        return import_module("tron.apps.view").show(self.scene, lights, height, **settings)
+
+    def changed(
+        self,
+        scene: GaussianScene,
+        *,
+        quick: bool = False,
+        proxy: Proxy | None = None,
+        meshes: Meshes | None = None,
+    ) -> Relighter:
         """The relighter of another scene, which shares what stays the same; this one goes on as it is.
 
         Where surfels have moved or have other materials, the hierarchy is refitted and only rays that have
         changed are traced again: as if all were, to the bit. Rays are drawn in the hierarchy's order, which a
         refitted one keeps, so that what has moved has other noise than in a new ``Relighter``. Where sizes or
-        opacities differ, surfels come or go, or light sees a proxy, all is made anew. Whether there is a
-        proxy stays as it was.
+        opacities differ, surfels come or go, or light sees a proxy, all is made anew; beside meshes, all rays
+        are. Whether there is a proxy stays as it was.
 
         Args:
             scene: the other scene.
             quick: rays between surfels are not traced again, for ``under(quick=True)`` while something moves.
+            proxy: that of the other scene, where light sees one; None: it is made.
+            meshes: where they are now, such as ``relighter.meshes.moved(..)``; None: where they were.
 
         Raises:
             TronError: another number of surfels than the backdrop has.
@@ -266,18 +334,23 @@ class Relighter:
         before = self.scene
         if self._backdrop is not None and len(scene) != len(self._backdrop):
             raise TronError("surfels have come or gone before a backdrop", mend="make a new Relighter")
-        proxy: Choice = "never" if self.proxy is None else "always"
+        choice: Choice | Proxy = "never" if self.proxy is None else proxy or "always"
         if not _same(scene, before, REACH) or self.proxy is not None:
-            return Relighter(
+            anew = Relighter(
                 scene, self.estimation, self.seed, backdrop=self._backdrop, track=self._track,
-                proxy=proxy, cameras=self._cameras, filming=self._filming, ground=self.ground,
+                proxy=choice, cameras=self._cameras, filming=self._filming, ground=self.ground,
             )  # fmt: skip
+            anew.meshes = meshes or self.meshes
+            return anew
         other = copy(self)
+        other.meshes = meshes or self.meshes
+        other.__dict__.pop("_beside", None)
         other.scene, other._tracer, other._turned_to = scene, self._tracer.moved(scene), None
         traced = other.__dict__.pop("transport", None)
         # Rays that look for moved surfels alone would find those of a backdrop too, and are not those of a
         # hierarchy that was sorted anew.
         kept = other._tracer.bvh.order is self._tracer.bvh.order and self._backdrop is None
+        kept &= other.meshes is None
         if traced is not None and kept:
             carried = traced.carried if quick else traced.moved
             other.__dict__["transport"] = carried(other._light)
@@ -381,10 +454,10 @@ class TracedFrame:
         lit = np.maximum(frame.lit - self.noise, 0)
         return replace(frame, lit=lit, shadowed=frame.shadowed if self.estimation.bounces else lit)
 
-    def image(self, name: str) -> np.ndarray:
-        """(H, W, 3) one buffer of :meth:`shade` alone, of a frame without sub-pixels and not denoised."""
+    def images(self, names: Iterable[str]) -> dict[str, np.ndarray]:
+        """(H, W, 3) buffers of :meth:`shade` alone, of a frame without sub-pixels and not denoised."""
         colors = shade_surface(self.view, self.arriving, self.lighting, None, self.estimation.diffuse)
-        return self.view.image(colors[name])
+        return self.view.images({name: colors[name] for name in names})
 
     def denoised(self, albedo: np.ndarray) -> TracedFrame:
         """The frame whose ``lit`` is through Open Image Denoise (:mod:`tron.denoising`).

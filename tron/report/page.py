@@ -19,6 +19,7 @@ _STYLES = {
     "surfels": (1, 0, " surfels"),
     "views": (1, 0, " views"),
     "kills": (1, 0, " kills"),
+    "faults": (1, 0, " faults"),
     "frames/h": (1, 0, " frames/h"),
 }
 """Unit -> factor, decimals, what is written behind the number."""

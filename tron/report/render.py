@@ -1,7 +1,7 @@
 """Pages: a jinja2 template -> one HTML file that fetches nothing.
 
-Pictures are data URIs, the style is inline, there is no script. To write a page of your own, put the
-sentences into a template beside your code and the figures into blocks, and call
+Pictures are data URIs, the style is inline, there is no script but what a template has. To write a page of
+your own, put the sentences into a template beside your code and the figures into blocks, and call
 ``render_template("mypackage", "mine.html.j2", ...)``::
 
     {% extends "page.html.j2" %}

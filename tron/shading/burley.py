@@ -36,6 +36,7 @@ def burley_terms(normal: mi.Vector3f, along: mi.Vector3f, light: mi.Vector3f) ->
     )
 
 
+_LEAST_WEIGHT = 1e-30
 EVEN_LENGTH = 2 / 3
 """Length of the mean direction that even light arrives from; of a single direction it is 1."""
 
@@ -122,8 +123,11 @@ def _nothing(surface: Surface) -> tuple[mi.Vector3f, mi.Float]:
 
 
 def weighed_mean(total: mi.Vector3f, weight: mi.Float) -> mi.Vector3f:
-    """Means of terms or directions, from sums of them by ``weight``; 0 of no weight."""
-    there = weight > 0
+    """Means of terms or directions, from sums of them by ``weight``; 0 of none to speak of.
+
+    Behind many surfels a ray's share is below float32's normal numbers, and its inverse is infinite.
+    """
+    there = weight > _LEAST_WEIGHT
     return dr.select(there, total / dr.select(there, weight, 1), 0)
 
 

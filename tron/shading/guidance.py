@@ -33,7 +33,7 @@ import numpy as np
 from tron.cameras import Camera
 from tron.color import Look, to_display
 from tron.estimation import FINAL, MOST_RAYS, OCTAVES, Diffuse, Estimation
-from tron.io.images import write_image
+from tron.io.images import encode_png, write_image
 from tron.metering import incident_exposure
 from tron.shading.bounces.bounce import BOUNCED_VALUES, SHOWN_RAYS, BouncedLight
 from tron.shading.burley import terms_of_mean
@@ -123,6 +123,10 @@ class Guidance:
         if Path(path).suffix.lower() in (".png", ".jpg", ".jpeg") and name != "mask":
             image = to_display(image, self.exposure(look) if exposure is None else exposure, look=look)
         write_image(path, image)
+
+    def _repr_png_(self) -> bytes:
+        """The picture of ``lit``, which a notebook shows in place of a frame."""
+        return encode_png(to_display(self.lit, self.exposure(), look="photograph"))
 
 
 Guidance.BUFFERS = tuple(

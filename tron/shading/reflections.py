@@ -88,7 +88,7 @@ def reflections(
         offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
         pixel, lobe = gbuffer.pixel, Lobe.of(gbuffer)
         seen = where & (gbuffer.opacity > 0) & (lobe.view.z > 0)
-        origin, run = gbuffer.position + gbuffer.normal * offset, points.run(pixel)
+        origin, run = gbuffer.raised(offset), points.run(pixel)
         dr.eval(pixel, lobe, seen, origin, run)
         none = dr.zeros(mi.Color3f, dr.width(pixel))
         sums = {name: mi.Color3f(none) for name in ("weight", "met", "light", "escaped")}

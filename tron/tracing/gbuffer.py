@@ -18,7 +18,14 @@ from tron.tracing.compositing import MOST_HITS, STOP_TRANSMITTANCE, Composite, H
 from tron.tracing.hits import MAX_HITS, LocalHits, Walk, collect, drop, settle, sort
 from tron.tracing.kernel import SurfelRecords, recorded
 from tron.tracing.surface import Surface, surface
-from tron.tracing.tiled.kbuffer import LISTED_IDS, RelistedHits, Search, composite_rounds, search_list
+from tron.tracing.tiled.kbuffer import (
+    LISTED_IDS,
+    RelistedHits,
+    Search,
+    composite_rounds,
+    lanes_of,
+    search_list,
+)
 from tron.tracing.tiled.tiles import TileLists, lanes_of_pixels, tile_pixels
 
 KEPT_HITS = 128
@@ -71,7 +78,7 @@ class GBuffer(Surface):
         """:meth:`image` of many, made at once."""
         values = self.in_rows(dr.detach(values))
         dr.eval(values)
-        return {name: self._pixels(np.array(value)) for name, value in values.items()}
+        return {name: self._pixels(value) for name, value in values.items()}
 
     def numpy(self) -> dict[str, np.ndarray]:
         """Every field as (H, W), (H, W, 3) or, where there are C ``values``, (H, W, C) float32."""
@@ -80,9 +87,12 @@ class GBuffer(Surface):
     def _fields(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(Surface) if f.name != "values" or self.values}
 
-    def _pixels(self, array: np.ndarray) -> np.ndarray:
-        shape = (self.height, self.width) if array.ndim == 1 else (self.height, self.width, -1)
-        return np.ascontiguousarray(array.T.reshape(shape))
+    def _pixels(self, value: Any) -> np.ndarray:
+        if isinstance(value, mi.Float):
+            return np.array(value).reshape(self.height, self.width)
+        # One by one: together they would be laid one behind another by a kernel of every size's own.
+        channels = np.stack([np.array(channel) for channel in value], axis=-1)
+        return channels.reshape(self.height, self.width, -1)
 
 
 @dataclass
@@ -110,7 +120,11 @@ def tile_rays(camera: Camera) -> TileRays:
 
 
 def trace_tiles(
-    records: SurfelRecords, lists: TileLists, rays: TileRays, keep_hits: bool
+    records: SurfelRecords,
+    lists: TileLists,
+    rays: TileRays,
+    keep_hits: bool,
+    limit: mi.Float | None = None,
 ) -> tuple[Composite, list[Iterable[HitList]]]:
     """Sums of every ray in tile order, and the hits that they are made of, if they are to be known.
 
@@ -120,6 +134,7 @@ def trace_tiles(
     Args:
         records: the surfels, detached.
         lists: tile lists. rays: the rays of their pixels.
+        limit: distance of each ray beyond which no surfel counts, world units; None: there is none.
     """
     start = dr.gather(mi.UInt32, lists.start, rays.tile)
     count = dr.select(rays.inside, dr.gather(mi.UInt32, lists.count, rays.tile), 0)
@@ -131,7 +146,7 @@ def trace_tiles(
     sums, crowded, kept_hits = stream(
         # Not how many surfels there are, which would be one more thing to record the kernel anew for.
         replace(records, count=0), lists.entries, lists.near, start, count, rays.origin, rays.direction,
-        None if out is None else out.rows(),
+        None if out is None else out.rows(), limit,
     )  # fmt: skip
     known: list[Iterable[HitList]] = []
     if out is not None:
@@ -142,11 +157,14 @@ def trace_tiles(
         return sums, known
     start, count = (dr.gather(mi.UInt32, values, again) for values in (start, count))
     direction = dr.gather(mi.Vector3f, rays.direction, again)
+    end = mi.Float(dr.inf) if limit is None else dr.gather(mi.Float, limit, again)
 
     def search(lane: mi.UInt32) -> Search:
         first, length = (dr.gather(mi.UInt32, values, lane) for values in (start, count))
-        along = dr.gather(mi.Vector3f, direction, lane)
-        return partial(search_list, records, lists.entries, lists.near, first, length, rays.origin, along)
+        along, far = dr.gather(mi.Vector3f, direction, lane), lanes_of(end, lane)
+        return partial(
+            search_list, records, lists.entries, lists.near, first, length, rays.origin, along, far
+        )
 
     capacity = min(int(dr.max(count)[0]), MOST_HITS)
     fits = keep_hits and capacity * dr.width(again) <= LISTED_IDS
@@ -172,10 +190,12 @@ def _overwrite(sums: Composite, some: Composite, ray: mi.UInt32) -> None:
     dr.eval(sums)
 
 
-def trace_gbuffer(records: SurfelRecords, lists: TileLists, camera: Camera) -> GBuffer:
-    """Render a camera's G-buffer from its tile lists; differentiable in the records."""
+def trace_gbuffer(
+    records: SurfelRecords, lists: TileLists, camera: Camera, limit: mi.Float | None = None
+) -> GBuffer:
+    """Render a camera's G-buffer from its tile lists, up to ``limit``; differentiable in the records."""
     rays = tile_rays(camera)
-    sums, hits = trace_tiles(records.detached(), lists, rays, has_gradients(records, rays.direction))
+    sums, hits = trace_tiles(records.detached(), lists, rays, has_gradients(records, rays.direction), limit)
     sums = attach(sums, records, rays.origin, rays.direction, hits)
     seen = surface(sums, rays.origin, rays.direction)
     dr.eval(seen)
@@ -194,7 +214,7 @@ def trace_gbuffer(records: SurfelRecords, lists: TileLists, camera: Camera) -> G
 @recorded
 def stream(
     records: SurfelRecords, entries: mi.UInt32, near: mi.Float, start: mi.UInt32, count: mi.UInt32,
-    origin: mi.Point3f, direction: mi.Vector3f, out: HitRows | None,
+    origin: mi.Point3f, direction: mi.Vector3f, out: HitRows | None, limit: mi.Float | None,
 ) -> tuple[Composite, mi.Bool, mi.UInt32]:  # fmt: skip
     """Composite the front-facing hits of each ray, in one kernel.
 
@@ -203,12 +223,13 @@ def stream(
         entries, near: tile lists' ids and lower bounds of t; start, count: each ray's slice of them.
         origin, direction: world rays, unit directions.
         out: receives the composited ids, list r from lane r, as many as it has room for.
+        limit: distance of each ray beyond which no surfel counts, world units; None: there is none.
 
     Returns:
         All evaluated: the sums of each ray; whether it was not finished, or has more hits than there is room
         for; and how many ids it has in ``out``, none where that is so.
     """
-    sums, crowded = _rounds(records, entries, near, Walk.along(start, count), origin, direction, out)
+    sums, crowded = _rounds(records, entries, near, Walk.along(start, count, limit), origin, direction, out)
     if out is not None:
         crowded |= sums.count > out.capacity
     return sums, crowded, dr.select(crowded, 0, sums.count)

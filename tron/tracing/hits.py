@@ -65,15 +65,18 @@ class Walk:
     open: mi.Bool
 
     @staticmethod
-    def along(start: mi.UInt32, count: mi.UInt32) -> Walk:
-        """At the beginning of the lists of ``count`` candidates from ``start`` on."""
+    def along(start: mi.UInt32, count: mi.UInt32, limit: mi.Float | None = None) -> Walk:
+        """At the beginning of the lists of ``count`` candidates from ``start`` on.
+
+        ``limit``: distance of each ray beyond which no surfel counts, world units; None: there is none.
+        """
         return Walk(
             mi.UInt32(start),
             start + count,
             mi.Float(0),
             mi.Float(1),
             mi.Float(0),
-            mi.Float(dr.inf),
+            mi.Float(dr.inf if limit is None else limit),
             count > 0,
         )
 
@@ -125,7 +128,8 @@ def collect(
         hits.count += dr.select(valid, mi.UInt32(1), mi.UInt32(0))
         walk.product = dr.select(valid, walk.product * (1 - hit.alpha), walk.product)
         walk.farthest = dr.select(valid & (hit.t > walk.farthest), hit.t, walk.farthest)
-        walk.t_cut = dr.select((walk.product < stop) & (walk.t_cut == dr.inf), walk.farthest, walk.t_cut)
+        stopped = (walk.product < stop) & (walk.farthest < walk.t_cut)
+        walk.t_cut = dr.select(stopped, walk.farthest, walk.t_cut)
         walk.cursor += 1
         walk.near = dr.gather(mi.Float, near, walk.cursor, walk.cursor < walk.end)
         walk.open &= (walk.cursor < walk.end) & (walk.near <= walk.t_cut)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import wraps
 from typing import Any, TypeVar
 
@@ -221,8 +221,11 @@ def recorded(function: Function) -> Function:
     Nothing is collected in between: a Mitsuba object that is freed while Dr.Jit records a function aborts the
     process, and Python's collector of cycles may free one at any allocation: an integrator or a scene that
     nobody holds any more.
+
+    Of Python's own numbers Dr.Jit 1.5.0 knows only the first of a value: a second one equal to an earlier is
+    taken for any other such (4, 3, 4 for 4, 3, 3). So they are told apart here.
     """
-    frozen = dr.freeze(function, limit=64, warn_after=1000)
+    frozen = dr.freeze(function, state_fn=lambda *arguments: _kind(arguments), limit=64, warn_after=1000)
 
     @wraps(frozen)
     def call(*arguments: object) -> object:
@@ -235,3 +238,12 @@ def recorded(function: Function) -> Function:
                 gc.enable()
 
     return call  # pyright: ignore[reportReturnType]
+
+
+def _kind(value: object) -> str:
+    """What is no array in arguments, in order."""
+    if is_dataclass(value):
+        return _kind([getattr(value, field.name) for field in fields(value)])
+    if isinstance(value, (list, tuple)):
+        return f"({','.join(map(_kind, value))})"
+    return repr(value) if value is None or isinstance(value, (bool, int, float, str)) else ""

@@ -75,7 +75,7 @@ class SurfelParameters:
 
 def highest_sh_degree(scene: GaussianScene) -> int:
     """Highest spherical-harmonics degree of the scene with a coefficient that is not zero."""
-    used = np.any(scene.sh != 0.0, axis=(0, 2)) if len(scene) else np.zeros(16, bool)
+    used = np.any(scene.sh != 0.0, axis=0).any(axis=1) if len(scene) else np.zeros(16, bool)
     return math.isqrt(int(np.flatnonzero(used).max())) if used.any() else 0
 
 

@@ -16,6 +16,9 @@ import mitsuba as mi
 from tron.tracing.compositing import CHANNELS, Composite
 from tron.tracing.kernel import FEATURE_PACKETS, GEOMETRY_PACKETS, SurfelRecords
 
+GRAZING = 0.05
+"""Cosine to the ray of normals that looked away and are bent."""
+
 
 @dataclass
 class Surface:
@@ -51,6 +54,10 @@ class Surface:
     direction: mi.Vector3f
     values: list[mi.Float]
 
+    def raised(self, offset: mi.Float) -> mi.Point3f:
+        """Origins of rays that leave the surface, ``offset`` above it, world units; not differentiated."""
+        return mi.Point3f(dr.detach(self.position)) + mi.Normal3f(dr.detach(self.normal)) * offset
+
 
 def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surface:
     """Normalise the sums of rays from ``origin`` along unit ``direction``; differentiable in the sums."""
@@ -78,6 +85,13 @@ def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surf
         direction=direction,
         values=[value * inverse for value in channels[CHANNELS:]],
     )
+
+
+def seen_normal(normal: mi.Vector3f, direction: mi.Vector3f) -> mi.Vector3f:
+    """Unit normals, bent where they look away from rays along unit ``direction``, until those see them."""
+    away = dr.dot(normal, direction)
+    bent = dr.normalize(normal - (away + GRAZING) * direction)
+    return dr.select(away > 0, bent, normal)
 
 
 def centres(records: SurfelRecords, surfel: mi.UInt32, active: mi.Bool | bool = True) -> Surface:

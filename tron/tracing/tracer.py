@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import drjit as dr
 import mitsuba as mi
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from tron.gaussians.scene import GaussianScene
 
 
+_PLACES = ("means", "quats", "log_scales", "opacity_logits")
+"""What says where surfels are, and how far they reach."""
 LOOSE_BOXES = 1.5
 """A hierarchy is built anew once its boxes' area is this many times what it was when it was last built."""
 
@@ -80,12 +82,17 @@ class SurfelTracer:
                 f"{len(scene)} surfels cannot be where {len(self.scene)} were",
                 mend="make a new SurfelTracer where surfels come or go",
             )
-        other = copy(self)
-        other.scene = scene
-        other._take(pack(SurfelParameters.from_scene(scene)))
+        before, other = self.scene, copy(self)
+        degree = self.records.sh_degree if scene.sh is before.sh else None
+        other.scene, records = scene, pack(SurfelParameters.from_scene(scene, degree))
+        stay = all(np.array_equal(getattr(scene, name), getattr(before, name)) for name in _PLACES)
+        if stay and scene.kernel_degree == before.kernel_degree:  # the hierarchy is of places alone
+            other.records = records
+        else:
+            other._take(records)
         return other
 
-    def sided(self, two_sided: bool) -> SurfelTracer:
+    def sided(self, two_sided: bool) -> Self:
         """The same surfels for shadow rays of other sides: back faces block beyond two spacings, or never.
 
         A new tracer lets them block; that they never do is the paper's rule. Ask again after :meth:`update`.
@@ -96,7 +103,7 @@ class SurfelTracer:
         other._two_sided = two_sided
         return other
 
-    def turned_over(self, which: np.ndarray | None = None) -> SurfelTracer:
+    def turned_over(self, which: np.ndarray | None = None) -> Self:
         """The same surfels in the same hierarchy, sides exchanged; without gradients.
 
         ``which``: (M,) bool, those that are turned; None: all.
@@ -145,14 +152,20 @@ class SurfelTracer:
     def back_faces(self) -> BackFaces:
         return self._beyond if self._two_sided else BackFaces.never()
 
-    def gbuffer(self, camera: Camera, values: Sequence[mi.Float] = ()) -> GBuffer:
+    def gbuffer(
+        self, camera: Camera, values: Sequence[mi.Float] = (), limit: mi.Float | None = None
+    ) -> GBuffer:
         """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it.
 
-        ``values``: quantities of the surfels to composite as their materials are, each an array of one number
-        a surfel in the scene's order. They come back in ``GBuffer.values``, differentiable.
+        Args:
+            camera: the view.
+            values: quantities of the surfels to composite as their materials are, each an array of one number
+                a surfel in the scene's order. They come back in ``GBuffer.values``, differentiable.
+            limit: distance along each ray, in tile order, beyond which no surfel counts, world units: what is
+                opaque there hides the rest; None: there is nothing.
         """
         records = pack_values(self.attached(), values)
-        return trace_gbuffer(records, build_tiles(self.records, camera), camera)
+        return trace_gbuffer(records, build_tiles(self.records, camera), camera, limit)
 
     def trace(
         self,

@@ -7,7 +7,7 @@ and whether light sees a proxy is decided by the scene before all edits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -17,9 +17,9 @@ import numpy as np
 
 from tron.cameras import Camera
 from tron.color import linear_to_srgb, to_display
-from tron.editing import Edit, Session
+from tron.editing import Clicks, Edit, Selection, Session
 from tron.errors import TronError, located
-from tron.estimation import PREVIEW
+from tron.estimation import FINEST, PREVIEW
 from tron.framing import upright
 from tron.gaussians.edit import removed
 from tron.gaussians.scene import GaussianScene
@@ -29,19 +29,30 @@ from tron.seeds import integer
 from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.lighting import Lighting
 from tron.trajectories import turn_cameras
+from tron.view.finishing import Finish
 
-Buffer = Literal["lit", "irradiance", "indirect", "base color", "normal", "roughness", "metallic"]
+Buffer = Literal["lit", "irradiance", "indirect", "base color", "normal", "roughness", "metallic", "capture"]
 BUFFERS: tuple[Buffer, ...] = get_args(Buffer)
 EXPOSED = ("lit", "irradiance", "indirect")
-"""Buffers of light: linear, shown by exposure and AgX. The others are shown as they are."""
-RAYS = 16
-"""Shadow rays of a pixel in each pass; with one that finds what glossy surfaces mirror."""
+"""Buffers of light: linear, shown by exposure and AgX. The others are shown as they are.
+
+``capture`` is the look that the scene has in its file, its own radiance, whatever the light.
+"""
+Left = Literal["nothing", "before", "capture", "light"]
+"""What is seen left of the divider: the scene before all edits, its own look then, or another light."""
+PASS = FINEST.of_sub_pixel()
+"""Estimation of each pass; all together are ``quality=final`` of tron-relight."""
 SUB_PIXELS = ((-0.25, -0.25), (0.25, 0.25), (0.25, -0.25), (-0.25, 0.25))
 """Place of each pass within the pixel, from its centre."""
+BAND_PIXELS = 24_000
+"""Of a piece of a pass: 0.1 seconds on one core with 16 rays among 50,000 surfels."""
 THUMBNAIL = 80, 280
 """Height and width of a light's picture, pixels."""
 METERED = 128
 """Pixels of the frame that a light's exposure is metered in."""
+MARK = np.array((40, 190, 255), np.float32)
+"""Colour of what clicks select, and how much of it is laid over the picture."""
+MARKED = 0.55
 
 
 @dataclass(frozen=True)
@@ -55,7 +66,10 @@ class Wish:
         buffer: what is shown.
         edits: done to the scene in their order.
         hidden: objects that are not there, after all edits.
-        before: whether the scene is seen as it was before them.
+        left: of the divider, where it is something else.
+        left_light: name of the light that is seen there, not turned.
+        divider: where it stands, 0 to 1 of the width.
+        marked: clicks whose surfels are marked, of the scene after all edits.
     """
 
     light: str
@@ -64,7 +78,72 @@ class Wish:
     buffer: Buffer = "lit"
     edits: tuple[Edit, ...] = ()
     hidden: frozenset[int] = frozenset()
-    before: bool = False
+    left: Left = "nothing"
+    left_light: str = ""
+    divider: float = 0.5
+    marked: Clicks | None = None
+
+
+@dataclass(frozen=True)
+class Part:
+    """A side of the divider, or all of a picture: what is seen there, and the camera that sees it."""
+
+    left: bool
+    before: bool
+    buffer: Buffer
+    light: str
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Hit:
+    """What a ray meets first: an object, a point in the frame of the scene's file, and surfels by number."""
+
+    object: int
+    point: np.ndarray
+    surfels: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class _Visible:
+    """A scene without its hidden objects: (M,) bool which surfels are left, them, and them with +z up."""
+
+    scene: GaussianScene
+    hidden: frozenset[int]
+    which: np.ndarray
+    left: GaussianScene
+    upright: GaussianScene
+
+
+def bands(camera: Camera) -> list[Camera]:
+    """A camera's picture in pieces from above, between which work on it can be given up."""
+    rows = max(1, BAND_PIXELS // camera.width)
+    return [
+        camera.window(0, y, camera.width, min(rows, camera.height - y)) for y in range(0, camera.height, rows)
+    ]
+
+
+class _Lit:
+    """A relighter under one light, baked no more than it has to be."""
+
+    def __init__(self) -> None:
+        self.illumination: Illumination | None = None
+        self.settled = False
+        self._light: tuple[str, float] | None = None
+
+    def bring(
+        self, relighter: Relighter, lighting: Lighting, name: str, turn: float, seed: int, rough: bool
+    ) -> None:
+        """Bake what is another than before: of few rays, if ``rough``."""
+        now, light = self.illumination, (name, turn % 360)
+        if now is not None and self._light == light and (rough or self.settled):
+            if now.relighter is relighter:
+                return
+            if relighter.stands_as(now.relighter.scene):
+                self.illumination = relighter.still_under(now)
+                return
+        self.illumination = relighter.under(lighting.turned_to(turn), seed, quick=rough)
+        self._light, self.settled = light, not rough
 
 
 class Stage:
@@ -93,11 +172,10 @@ class Stage:
         self._yields = False  # whether what is under way may be given up
         self._base = Relighter(scene.upright(), PREVIEW, seed, track=self._watched)
         self._prepared: dict[str, tuple[Lighting, float]] = {}
-        self._shown: tuple[GaussianScene, frozenset[int], GaussianScene] | None = None
+        self._shown: _Visible | None = None
+        self._selected: tuple[GaussianScene, Clicks, np.ndarray] | None = None
         self._relighter, self._fresh = self._base, True
-        self._light: tuple[str, float] | None = None
-        self._illumination: Illumination | None = None
-        self._settled = False
+        self._right, self._left = _Lit(), _Lit()
 
     def bring(self, wish: Wish, rough: bool) -> None:
         """Do what is left to do for a wish.
@@ -110,70 +188,118 @@ class Stage:
             TronError: an edit cannot be done, nothing is left to see, or a light cannot be read.
         """
         lighting, _ = self._lighting(wish.light)
-        self._yields = not rough and self._illumination is not None
+        other = self._lighting(wish.left_light)[0] if wish.left == "light" else lighting
+        self._yields = not rough and self._right.illumination is not None
         self._relight(self._scene(wish), rough)
-        now, light = self._illumination, (wish.light, wish.turn % 360)
-        if now is not None and self._light == light and (rough or self._settled):
-            if now.relighter is self._relighter:
-                return
-            if self._relighter.stands_as(now.relighter.scene):
-                self._illumination = self._relighter.still_under(now)
-                return
-        self._illumination = self._relighter.under(lighting.turned_to(wish.turn), self._seed, quick=rough)
-        self._light, self._settled = light, not rough
+        self._right.bring(self._relighter, lighting, wish.light, wish.turn, self._seed, rough)
+        if wish.left == "light":
+            self._left.bring(self._relighter, other, wish.left_light, 0.0, self._seed, rough)
+        elif wish.left == "before":
+            self._left.bring(self._base, lighting, wish.light, wish.turn, self._seed, rough)
+        if wish.marked is not None:
+            self.selected(wish.marked)
+
+    def parts(self, wish: Wish, camera: Camera) -> list[Part]:
+        """What a picture is made of, from left to right."""
+        whole = Part(False, False, wish.buffer, wish.light, camera)
+        column = 0 if wish.left == "nothing" else round(np.clip(wish.divider, 0, 1) * camera.width)
+        if not column:
+            return [whole]
+        before = wish.left != "light"
+        buffer = "capture" if wish.left == "capture" else wish.buffer
+        light = wish.light if before else wish.left_light
+        left = Part(True, before, buffer, light, camera.window(0, 0, column, camera.height))
+        if column == camera.width:
+            return [left]
+        return [left, replace(whole, camera=camera.window(column, 0, camera.width - column, camera.height))]
 
     def linear(
-        self, buffer: Buffer, camera: Camera, number: int = -1, band: int = 0, *, rough: bool = False
-    ) -> np.ndarray:
-        """(H, W, 3) linear radiance, or values in [0, 1], as a camera sees them.
+        self, part: Part, camera: Camera, number: int = -1, band: int = 0,
+        *, rough: bool = False, more: Sequence[str] = (),
+    ) -> dict[str, np.ndarray]:  # fmt: skip
+        """The part's buffer by its name, (H, W, 3) linear radiance, or values in [0, 1]; and more of light.
 
         Args:
-            buffer: what is shown.
-            camera: in the frame where up is +z.
+            part: what is shown.
+            camera: that of the part, or of a piece of it.
             number: of the pass; -1: the light that reached the surfels, found without a shadow ray.
+            band: number of the piece, for its random numbers.
             rough: whether metals mirror no surfel, which takes a ray.
-            band: number of the part of the picture that the camera sees, for its random numbers.
+            more: other buffers of light.
         """
-        light = self._illumination
-        assert light is not None
+        light = (self._left if part.left else self._right).illumination
         if number >= 0:
             dx, dy = SUB_PIXELS[number]
             camera = replace(camera, cx=camera.cx + dx, cy=camera.cy + dy)
-            light = light.framed(rays=RAYS, filtered=False, reflections=1)
+        if part.buffer not in EXPOSED:
+            return {part.buffer: self._surface(part, camera)}
+        assert light is not None
+        if number >= 0:
+            light = light.framed(rays=PASS.rays, filtered=PASS.filtered, reflections=PASS.reflections)
         elif rough:
             light = light.framed(filtered=False)
-        if buffer not in EXPOSED:
-            return self._surface(buffer, camera)
-        return light.trace(camera, integer(self._seed, "view", number + 1, band)).image(buffer)
+        frame = light.trace(camera, integer(self._seed, "view", number + 1, band))
+        return frame.images((part.buffer, *more))
 
-    def display(self, wish: Wish, image: np.ndarray) -> np.ndarray:
-        """(H, W, 3) uint8 of :meth:`linear`."""
-        if wish.buffer in EXPOSED:
-            image = np.asarray(to_display(image, np.float32(self.exposure(wish)), look="photograph"))
-        return (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8)
+    def finished(self, part: Part, means: Mapping[str, np.ndarray], finish: Finish) -> np.ndarray:
+        """(H, W, 3) linear radiance: the means of all passes over a part without the noise that is left."""
+        relighter = self._base if part.before else self._relighter
+        maps = []
+        for window in bands(part.camera):
+            self._watch()
+            maps.append(relighter.surface_maps(window, FINEST)[0])
+        whole = {name: np.concatenate([each[name] for each in maps]) for name in maps[0]}
+        exposure = self._lighting(part.light)[0].environment.exposure()
+        return finish({**means, **whole}, exposure, self._watch)
 
-    def exposure(self, wish: Wish) -> float:
+    def display(self, wish: Wish, part: Part, image: np.ndarray) -> np.ndarray:
+        """(H, W, 3) uint8 of :meth:`linear`; what clicks select is marked."""
+        if part.buffer in EXPOSED:
+            factor = self.exposure(part.light, wish.stops)
+            image = np.asarray(to_display(image, np.float32(factor), look="photograph"))
+        shown = (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8)
+        if wish.marked is None or part.left:
+            return shown
+        which, visible = self.selected(wish.marked), self._visible(wish.hidden)
+        (camera,) = turn_cameras([part.camera], self.turn.T)
+        share = MARKED * self.session.views.shares(visible.left, which[visible.which], camera)[..., None]
+        return ((1 - share) * shown + share * MARK + 0.5).astype(np.uint8)
+
+    def exposure(self, light: str, stops: float) -> float:
         """Factor on linear values before AgX: metered once a light, at home, before it turns."""
-        return self._lighting(wish.light)[1] * 2.0**wish.stops
+        return self._lighting(light)[1] * 2.0**stops
 
-    def first_hit(self, origin: np.ndarray, direction: np.ndarray) -> tuple[int, np.ndarray] | None:
-        """Object that a ray meets first, and where, in the frame of the scene's file; None if nothing.
+    def selected(self, clicks: Clicks) -> np.ndarray:
+        """(M,) bool: surfels of the scene after all edits; none while clicks are of one kind alone.
+
+        Raises:
+            TronError: a surfel is not there, or was clicked both inside and outside.
+        """
+        scene = self.session.scene
+        if not (clicks.inside and clicks.outside):
+            return np.zeros(len(scene), bool)
+        if self._selected is None or self._selected[0] is not scene or self._selected[1] != clicks:
+            self._selected = scene, clicks, Selection(clicks=clicks).of(scene, self.session.views)
+        return self._selected[2]
+
+    def first_hit(self, origin: np.ndarray, direction: np.ndarray) -> Hit | None:
+        """What a ray meets first among what is shown; None if nothing.
 
         Args:
             origin: (3,) where up is +z.
             direction: (3,) likewise, of any length.
         """
-        scene, level = self.session.scene, np.eye(3)[np.abs(direction).argmin()]
-        if self._shown is not None and self._shown[0] is scene and self._shown[1]:
-            which = np.isin(scene.object_id, list(self._shown[1]))
-            scene = removed(scene, which) if which.any() else scene
+        visible = self._visible(frozenset() if self._shown is None else self._shown.hidden)
+        scene, level = visible.left, np.eye(3)[np.abs(direction).argmin()]
         pixel = Camera.look_at(origin, origin + direction, up=level, fov_deg=0.1, width=1, height=1)
         (pixel,) = turn_cameras([pixel], self.turn.T)
         surfels, distance = self.session.views.met(scene, pixel)
         if not len(surfels):
             return None
         ids, counts = np.unique(scene.object_id[surfels], return_counts=True)
-        return int(ids[counts.argmax()]), pixel.position + distance * pixel.forward
+        numbers = np.flatnonzero(visible.which)[surfels]
+        point = pixel.position + distance * pixel.forward
+        return Hit(int(ids[counts.argmax()]), point, tuple(numbers.tolist()))
 
     def objects(self) -> dict[int, int]:
         """Numbers of surfels of the objects after all edits, hidden ones too."""
@@ -213,18 +339,18 @@ class Stage:
             self.session.undo()
         for edit in wish.edits[common:]:
             self.session.do(edit)
-        if wish.before:
-            return self._base.scene
-        scene = self.session.scene
-        if self._shown is None or self._shown[0] is not scene or self._shown[1] != wish.hidden:
-            which = np.isin(scene.object_id, list(wish.hidden))
-            if which.all():
+        return self._visible(wish.hidden).upright
+
+    def _visible(self, hidden: frozenset[int]) -> _Visible:
+        scene, shown = self.session.scene, self._shown
+        if shown is None or shown.scene is not scene or shown.hidden != hidden:
+            which = ~np.isin(scene.object_id, list(hidden))
+            if not which.any():
                 raise TronError("everything is hidden", mend="show an object again")
-            turned = (removed(scene, which) if which.any() else scene).upright()
-            if scene is self._original and not which.any():
-                turned = self._base.scene
-            self._shown = scene, wish.hidden, turned
-        return self._shown[2]
+            left = scene if which.all() else removed(scene, ~which)
+            upright = self._base.scene if left is self._original else left.upright()
+            self._shown = shown = _Visible(scene, hidden, which, left, upright)
+        return shown
 
     def _relight(self, scene: GaussianScene, rough: bool) -> None:
         """Make a relighter of the scene: of moved surfels in the hierarchy that is there, if ``rough``."""
@@ -240,10 +366,14 @@ class Stage:
         else:
             proxy = "never" if self._base.proxy is None else "always"
             self._relighter = Relighter(scene, PREVIEW, self._seed, proxy=proxy, track=self._watched)
-            self._fresh, self._settled = True, False
+            self._fresh = True
+            self._right.settled = self._left.settled = False
 
-    def _surface(self, buffer: Buffer, camera: Camera) -> np.ndarray:
-        seen = self._relighter.gbuffer(camera).numpy()
+    def _surface(self, part: Part, camera: Camera) -> np.ndarray:
+        buffer, relighter = part.buffer, self._base if part.before else self._relighter
+        seen = relighter.gbuffer(camera).numpy()
+        if buffer == "capture":
+            return seen["rgb"]
         there = seen["opacity"][..., None]
         if buffer == "normal":
             return there * (0.5 + 0.5 * seen["normal"])

@@ -7,6 +7,7 @@ that with what it has done and does the next piece of work towards it:
                           where that takes long
     at rest               the same of all rays, at full size
     then                  four passes of 16 shadow rays a pixel, each on a sub-pixel of its own, averaged
+    at last               what noise they have left is taken out (:mod:`tron.view.finishing`)
 
 A pass is given up, between two bands of the picture, as soon as it is of a wish that is past. Pictures at
 rest are handed out only while they are of the wish of the moment; the last of them is the same, to the bit
@@ -19,7 +20,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,7 +33,8 @@ from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.runtime import activate
 from tron.shading.environments.environment import EnvironmentMap
-from tron.view.stage import SUB_PIXELS, Stage, Wish
+from tron.view.finishing import Finish
+from tron.view.stage import SUB_PIXELS, Part, Stage, Wish, bands
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -43,10 +45,13 @@ MOVING_SECONDS = 0.11
 """Time that a picture may take while a hand moves, before the next ones are made smaller."""
 SMALLEST = 0.3
 """Side of the smallest of them, of the full size."""
-BAND_PIXELS = 24_000
-"""Of a part of a pass: 0.1 seconds on one core with 16 rays among 50,000 surfels."""
-LAST = 2 + len(SUB_PIXELS)
-"""Level of a view that is done: 0 of nothing, 1 of a rough picture, 2 of one at rest, then one a pass."""
+PASSED = 2 + len(SUB_PIXELS)
+"""Level of a view after all passes: 0 of nothing, 1 of a rough picture, 2 of one at rest, then one a pass."""
+
+
+_ONE_AT_A_TIME = threading.Lock()
+"""Held by the studio of a process that works. Dr.Jit 1.5 asks Python for the fields of arguments while it
+holds its own lock; a second thread that computes meanwhile has Python's and waits for that one, for ever."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ class _View:
     level: int = 0
     scale: float = 0.5
     drawn: float = 0.0
-    passes: np.ndarray | None = field(default=None, repr=False)
+    passes: list[dict[str, np.ndarray]] = field(default_factory=list, repr=False)  # sums, those of each part
 
 
 class _Outdated(Exception):
@@ -90,6 +95,7 @@ class Studio:
         home: camera that exposure is metered in, in the frame where up is +z.
         show: called with the number of a view and its next picture, on the studio's thread.
         notice: called with a line for the user where a wish cannot be fulfilled: it is taken back.
+        finish: of pictures of lit, by their width and height; None: none at all, or none of that size.
         seed: root of all random numbers.
         variant: of Mitsuba.
         threads: of Dr.Jit; None: as it is.
@@ -103,6 +109,7 @@ class Studio:
         show: Callable[[int, Picture], None],
         notice: Callable[[str], None] = log.warning,
         *,
+        finish: Callable[[int, int], Finish | None] = lambda *_: None,
         seed: int = 0,
         variant: str = "llvm_ad_rgb",
         threads: int | None = None,
@@ -111,7 +118,7 @@ class Studio:
             raise TronError("there is no light", mend="give one at least")
         self._make = lambda: Stage(scene, lights, home, seed, self._watch)
         self._machine = variant, threads
-        self._show, self._notice = show, notice
+        self._show, self._notice, self._finish = show, notice, finish
         self._changed = threading.Condition()
         self._wish, self._done = Wish(next(iter(lights))), None
         self._refused: Wish | None = None
@@ -203,10 +210,11 @@ class Studio:
                 self._began, wish = self._version, self._wish
                 rough = time.perf_counter() - self._moved < REST_SECONDS
             try:
-                if stage is None:
-                    activate(*self._machine)
-                    stage = self._make()
-                self._work(stage, wish, rough)
+                with _ONE_AT_A_TIME:
+                    if stage is None:
+                        activate(*self._machine)
+                        stage = self._make()
+                    self._work(stage, wish, rough)
             except _Outdated:
                 pass
             except Exception as error:
@@ -218,8 +226,10 @@ class Studio:
         """Until there is something to do; holds the lock."""
         while not self._closing and not self._asked:
             left = self._moved + REST_SECONDS - time.perf_counter()
-            levels = [view.level for view in self._views.values()]
-            if self._wish == self._refused or not levels or min(levels) == LAST:
+            levels = [
+                view.level for view in self._views.values() if view.level < self._last(view, self._wish)
+            ]
+            if self._wish == self._refused or not levels:
                 self._changed.wait()
             elif min(levels) > 0 and left > 0:
                 self._changed.wait(left)
@@ -234,7 +244,8 @@ class Studio:
         with self._changed:
             asked = list(self._asked)
             self._asked.clear()
-            open_ones = [(view.level, view.drawn, number) for number, view in self._views.items()]
+            views = self._views.items()
+            open_ones = [(v.level, v.drawn, number) for number, v in views if v.level < self._last(v, wish)]
         for question, answer in asked:
             try:
                 answer.set_result(question(stage))
@@ -243,7 +254,7 @@ class Studio:
         if not open_ones or wish == self._refused:
             return
         level, _, number = min(open_ones)
-        if level < LAST and (level == 0 or not rough):
+        if level == 0 or not rough:
             self._draw(stage, wish, number, rough)
 
     def _draw(self, stage: Stage, wish: Wish, number: int, rough: bool) -> None:
@@ -258,17 +269,26 @@ class Studio:
             if rough:
                 size = (max(16, round(scale * side)) for side in (camera.width, camera.height))
                 seen = camera.resized(*size)
-            image = stage.linear(wish.buffer, seen, rough=rough)
-            view.passes = None
+            parts = stage.parts(wish, seen)
+            images = [stage.linear(part, part.camera, rough=rough)[part.buffer] for part in parts]
+            view.passes = []
             reached = 1 if rough else 2
-        else:
-            found = self._refined(stage, wish, camera, level - 2)
-            view.passes = found if view.passes is None else view.passes + found
-            image = view.passes / np.float32(level - 1)
+        elif level < PASSED:
+            parts = stage.parts(wish, camera)
+            found = [self._pass(stage, part, level - 2) for part in parts]
+            for sums, one in zip(view.passes, found):
+                for name in one:
+                    one[name] += sums[name]
+            view.passes = found
+            images = [one[part.buffer] / np.float32(level - 1) for one, part in zip(found, parts)]
             reached = level + 1
-        shown = stage.display(wish, image)
+        else:
+            parts = stage.parts(wish, camera)
+            images = [self._finished(stage, *each) for each in zip(parts, view.passes)]
+            reached = level + 1
+        shown = beside([stage.display(wish, *each) for each in zip(parts, images)])
         seconds = time.perf_counter() - began
-        refined = 0.0 if rough else (reached - 1) / (LAST - 1)
+        refined = 0.0 if rough else min((reached - 1) / (self._last(view, wish) - 1), 1.0)
         picture = Picture(shown, wish, camera, refined, seconds)
         with self._changed:
             still = self._views.get(number) is view and self._wish == wish and not self._closing
@@ -285,15 +305,38 @@ class Studio:
         if now is not None:
             self._show(number, picture)
 
-    def _refined(self, stage: Stage, wish: Wish, camera: Camera, number: int) -> np.ndarray:
-        """One pass over a picture, given up between two bands once it is out of date."""
-        rows = max(1, BAND_PIXELS // camera.width)
-        bands = []
-        for band, y in enumerate(range(0, camera.height, rows)):
+    def _pass(self, stage: Stage, part: Part, number: int) -> dict[str, np.ndarray]:
+        """One pass over a part of a picture, given up between two bands once it is out of date."""
+        finish = self._finish_of(part)
+        more = () if finish is None else finish.buffers
+        found = []
+        for band, window in enumerate(bands(part.camera)):
             self._watch()
-            window = camera.window(0, y, camera.width, min(rows, camera.height - y))
-            bands.append(stage.linear(wish.buffer, window, number, band))
-        return np.concatenate(bands)
+            found.append(stage.linear(part, window, number, band, more=more))
+        return {name: np.concatenate([each[name] for each in found]) for name in found[0]}
+
+    def _finished(self, stage: Stage, part: Part, sums: dict[str, np.ndarray]) -> np.ndarray:
+        """A part after all passes, its noise taken out where there is something that does."""
+        means = {name: each / np.float32(PASSED - 2) for name, each in sums.items()}
+        finish = self._finish_of(part)
+        if finish is None:
+            return means[part.buffer]
+        try:
+            return stage.finished(part, means, finish)
+        except _Outdated:
+            raise
+        except Exception as error:  # of libraries that are there, but do not run here
+            log.warning("pictures stay as their passes leave them: %s", error)
+            self._finish = lambda *_: None
+            return means[part.buffer]
+
+    def _finish_of(self, part: Part) -> Finish | None:
+        return self._finish(part.camera.width, part.camera.height) if part.buffer == "lit" else None
+
+    def _last(self, view: _View, wish: Wish) -> int:
+        """Level of a view that is done."""
+        finish = self._finish(view.camera.width, view.camera.height) if wish.buffer == "lit" else None
+        return PASSED + (finish is not None)
 
     def _watch(self) -> None:
         """Raise _Outdated where a wish, a view or a question has come since the piece of work began."""
@@ -312,3 +355,11 @@ class Studio:
         for _, answer in asked:
             answer.set_exception(TronError(why))
         self._notice(why)
+
+
+def beside(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """(H, W, 3) uint8 of parts from left to right, a white line between two."""
+    whole, column = np.concatenate(parts, axis=1), parts[0].shape[1]
+    if len(parts) > 1:
+        whole[:, max(column - 1, 0) : column + 1] = 255
+    return whole

@@ -6,13 +6,14 @@ read but what the window was given by name, and nothing is written outside its f
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import logging
 import shlex
 import socket
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -25,14 +26,18 @@ from scipy.spatial.transform import Rotation
 
 from tron.cameras import Camera
 from tron.color import linear_to_srgb, srgb_to_linear
-from tron.editing import Edit, Insert, Material, Move, Remove, Selection
+from tron.editing import Edit, Insert, Material, Move, Remove, Selection, Separate
 from tron.errors import TronError
 from tron.framing import find_subject
 from tron.gaussians.scene import GaussianScene, rotation_matrices
 from tron.io.images import write_image
+from tron.shading.environments.environment import EnvironmentMap
 from tron.storage import write_atomic
 from tron.trajectories import turn_cameras
-from tron.view.stage import BUFFERS, THUMBNAIL, Stage, Wish
+from tron.view.cutting import Cutting
+from tron.view.dragging import divider, panorama
+from tron.view.filming import FRAMES_PER_SECOND, Filming
+from tron.view.stage import BUFFERS, Left, Stage, Wish
 from tron.view.studio import Picture, Studio
 
 log = logging.getLogger(__name__)
@@ -44,22 +49,51 @@ QUALITY = {True: 75, False: 92}
 PATIENCE_SECONDS = 30.0
 """For an answer of the studio's thread."""
 NOTICE_SECONDS = 8.0
+SIDES: dict[str, tuple[Left, str]] = {
+    "nothing": ("nothing", ""),
+    "before the edits": ("before", ""),
+    "the scan's own look": ("capture", ""),
+}
+"""What may be left of the divider besides other lights."""
 NOBODY = "click one, or choose"
 ABOVE = 4.0
 """Spacings above a point that was clicked from which what is inserted is lowered."""
+EVERYWHERE = "0.0.0.0"
+"""Host that stands for all addresses of the machine."""
 BRAND = (232, 150, 60)
 
 
 def require_free_port(host: str, port: int) -> None:
     """Raise TronError where nothing can listen there: viser would silently take the next port."""
+    error = _refusal(host, port)
+    if error is not None:
+        mend = f"give another, such as port={port + 1}"
+        what = f"cannot listen on {host}:{port}: {error.strerror or error}"
+        raise TronError(what, mend=mend) from error
+
+
+def free_port(host: str, first: int) -> int:
+    """The first port from ``first`` on that nobody listens on.
+
+    Raises:
+        TronError: it is refused for another reason, or none of the next 100 is free.
+    """
+    for port in range(first, min(first + 100, 65_536)):
+        error = _refusal(host, port)
+        if error is None or error.errno != errno.EADDRINUSE:
+            break
+    require_free_port(host, port)
+    return port
+
+
+def _refusal(host: str, port: int) -> OSError | None:
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, port))
         except OSError as error:
-            mend = f"give another, such as port={port + 1}"
-            what = f"cannot listen on {host}:{port}: {error.strerror or error}"
-            raise TronError(what, mend=mend) from error
+            return error
+    return None
 
 
 class Window:
@@ -73,6 +107,7 @@ class Window:
         folder: that is written to; it need not exist.
         host, port: to listen on.
         home: the first view, where up is +z.
+        turned: lights that stand otherwise than in their files, by name.
         studio: more arguments of :class:`tron.view.studio.Studio`.
 
     Raises:
@@ -89,10 +124,13 @@ class Window:
         host: str,
         port: int,
         home: Camera,
+        turned: Mapping[str, EnvironmentMap] | None = None,
         **studio: Any,
     ) -> None:
         require_free_port(host, port)
         self._file, self._lights, self._models, self._folder = file, lights, models, folder
+        # Every address is none that a browser on this machine could go to.
+        self.address = f"http://{'localhost' if host == EVERYWHERE else host}:{port}"
         self._spacing, self._offset = scene.spacing, scene.offset
         self._undone: list[Edit] = []
         self._numbers: dict[str, int] = {}  # of the objects, by their label
@@ -106,12 +144,14 @@ class Window:
             self._server = viser.ViserServer(host=host, port=port, label="TRON", verbose=False)
         # A client may ask for a tunnel through viser's own host, button or not: nobody listens from outside.
         self._server.request_share_url = lambda *_, **__: None
-        self._frame(home, find_subject(scene.upright()).centre)
-        self._build()
-        self.studio = Studio(scene, lights, home, self._show, self._say, **studio)
+        subject = find_subject(scene.upright())
+        self._frame(home, subject.centre)
+        self._build(subject.radius)
+        self.studio = Studio(scene, {**lights, **(turned or {})}, home, self._show, self._say, **studio)
         self._server.on_client_connect(self._greet)
         self._server.on_client_disconnect(lambda client: self._part(client.client_id))
-        self._server.scene.on_click()(self._pick)
+        self._server.scene.on_click()(lambda event: self._pick(event, shift=False))
+        self._server.scene.on_click(modifier="shift")(lambda event: self._pick(event, shift=True))
         threading.Thread(target=self._refresh, daemon=True).start()
 
     def close(self) -> None:
@@ -133,12 +173,12 @@ class Window:
         server.initial_camera.look_at = tuple(centre)
         server.initial_camera.fov = 2 * float(np.arctan(0.5 * home.height / home.fy))
 
-    def _build(self) -> None:
+    def _build(self, size: float) -> None:
         gui = self._server.gui
         self._buffer = gui.add_dropdown("Show", BUFFERS, initial_value="lit", hint="what the picture is of")
         self._buffer.on_update(lambda _: self._want(buffer=self._buffer.value))
         with gui.add_folder("Light"):
-            self._map = gui.add_image(np.full((THUMBNAIL[0], THUMBNAIL[1], 3), 40, np.uint8), format="jpeg")
+            self._map = gui.add_html("", order=-1)
             names = tuple(self._lights)
             self._light = gui.add_dropdown("Map", names, initial_value=names[0])
             self._turn = gui.add_slider("Turn °", min=0, max=360, step=1, initial_value=0)
@@ -146,6 +186,14 @@ class Window:
         self._light.on_update(lambda _: self._choose_light())
         self._turn.on_update(lambda _: self._want(turn=float(self._turn.value)))
         self._stops.on_update(lambda _: self._want(stops=float(self._stops.value)))
+        with gui.add_folder("Compare", expand_by_default=False):
+            lights = {f"light: {name}": name for name in names}
+            self._sides = {**SIDES, **{said: ("light", name) for said, name in lights.items()}}
+            self._left = gui.add_dropdown("Left side", tuple(self._sides), initial_value=next(iter(SIDES)))
+            self._divider = gui.add_slider("Divider %", min=0, max=100, step=0.1, initial_value=50)
+            self._bar = gui.add_html("")
+        self._left.on_update(lambda _: self._compare())
+        self._divider.on_update(lambda _: self._want(divider=float(self._divider.value) / 100))
         with gui.add_folder("Object"):
             self._object: Any = gui.add_dropdown("Object", [NOBODY], initial_value=NOBODY)
             self._visible = gui.add_checkbox("Visible", True, hint="what is hidden is still saved")
@@ -161,6 +209,9 @@ class Window:
         self._metallic.on_update(self._of_user(lambda: self._paint(metallic=float(self._metallic.value))))
         self._arrows.on_update(lambda _: self._place_arrows())
         self._remove.on_click(lambda _: self._edit_chosen(lambda of: Remove(select=of)))
+        self._cutting = Cutting(
+            self._server, size, lambda of: self.studio.change(of), self._ask, self._edit, self._take
+        )
         if self._models:
             with gui.add_folder("Insert", expand_by_default=False):
                 names = tuple(self._models)
@@ -168,11 +219,10 @@ class Window:
                 self._size = gui.add_number("Size", 1.0, min=0.001, max=1000.0, step=0.01)
                 gui.add_button("Insert where you clicked").on_click(lambda _: self._insert())
         with gui.add_folder("Edits"):
-            self._before = gui.add_checkbox("Show before", False, hint="the scene without any edit")
             self._done = gui.add_markdown("*none*")
             steps = gui.add_button_group("Step", ("Undo", "Redo"))
-        self._before.on_update(lambda _: self._want(before=self._before.value))
         steps.on_click(lambda event: (self._undo if event.target.value == "Undo" else self._redo)())
+        self._filming = Filming(self._server, size, lambda client: _camera_of(client.camera), BRAND)
         with gui.add_folder("Save", expand_by_default=False):
             save = gui.add_button_group("Save", ("Picture", "Scene", "Film"))
             self._saved = gui.add_markdown(f"into `{self._folder}`")
@@ -191,6 +241,12 @@ class Window:
         self._want(light=self._light.value)
         self._show_map()
 
+    def _compare(self) -> None:
+        said = self._left.value
+        left, light = self._sides[said]
+        self._want(left=left, left_light=light)
+        self._bar.content = "" if left == "nothing" else divider(self._divider._impl.uuid, said)
+
     def _edit(self, edit: Edit, replaced: type[Edit] | None = None) -> None:
         """Do one more edit; or another in place of the last one, if that is of the same kind and object."""
 
@@ -204,11 +260,15 @@ class Window:
             return replace(wish, edits=(*edits, edit))
 
         self._undone.clear()
-        self._before.value = False
-        self.studio.change(lambda wish: replace(with_it(wish), before=False))
-        self._refresh()
+        self._changed(with_it)
         if self._moving and not isinstance(edit, Move):  # the arrows count from where the object stands now
             self._place_arrows()
+
+    def _changed(self, by: Callable[[Wish], Wish]) -> None:
+        """Change the edits; clicks are of the scene before."""
+        self.studio.change(lambda wish: replace(by(wish), marked=None))
+        self._cutting.clear()
+        self._refresh()
 
     def _edit_chosen(self, made: Any, replaced: type[Edit] | None = None) -> None:
         if self._chosen is not None:
@@ -233,15 +293,13 @@ class Window:
             self._undone.extend(wish.edits[-1:])
             return replace(wish, edits=wish.edits[:-1])
 
-        self.studio.change(without)
-        self._refresh()
+        self._changed(without)
         self._place_arrows()
 
     def _redo(self) -> None:
         if self._undone:
             edit = self._undone.pop()
-            self.studio.change(lambda wish: replace(wish, edits=(*wish.edits, edit)))
-            self._refresh()
+            self._changed(lambda wish: replace(wish, edits=(*wish.edits, edit)))
             self._place_arrows()
 
     def _insert(self) -> None:
@@ -320,14 +378,23 @@ class Window:
         gizmo.on_update(moved)
         self._gizmo = gizmo
 
-    def _pick(self, event: viser.SceneClickEvent) -> None:
+    def _pick(self, event: viser.SceneClickEvent, shift: bool) -> None:
+        """Choose the object of a click; where clicks select, it is one of those."""
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-        found = self._ask(lambda stage: stage.first_hit(origin, direction))
-        if found is None:
+        found = self._ask(
+            lambda stage: (stage.first_hit(origin, direction), stage.session.scene.up, stage.turn)
+        )
+        if found is None or found[0] is None:
             return
-        number, point = found
-        up = self._ask(lambda stage: stage.session.scene.up)
-        self._clicked = point + ABOVE * self._spacing * (np.zeros(3) if up is None else up)
+        hit, up, turn = found
+        if self._cutting.active:
+            self._cutting.click(hit, turn @ hit.point, shift)
+        elif not shift:
+            self._clicked = hit.point + ABOVE * self._spacing * up
+            self._take(hit.object)
+
+    def _take(self, number: int) -> None:
+        """Choose the object of a number, as if in the list."""
         label = next((name for name, each in self._numbers.items() if each == number), None)
         if label is not None:
             self._object.value = label
@@ -355,7 +422,7 @@ class Window:
         name = self._light.value
         found = self._ask(lambda stage: stage.thumbnail(name))
         if found is not None:
-            self._map.image = found
+            self._map.content = panorama(found, self._turn._impl.uuid)
 
     def _ask(self, question: Any) -> Any:
         """The studio's answer; None where there is none."""
@@ -407,21 +474,24 @@ class Window:
         return [path, listed]
 
     def _film(self, picture: Picture) -> str:
-        """Save what tron-relight needs to film the view; its command line, as Markdown."""
+        """Save what tron-relight needs to film the path, or the view; its command line, as Markdown."""
         wish, scene = picture.wish, self._file
-        turn, exposure = self.studio.ask(lambda stage: (stage.turn, stage.exposure(wish))).result(
-            PATIENCE_SECONDS
-        )
-        if wish.edits and not wish.before:
+        turn, exposure = self.studio.ask(
+            lambda stage: (stage.turn, stage.exposure(wish.light, wish.stops))
+        ).result(PATIENCE_SECONDS)
+        if wish.edits:
             scene = self._save_scene()[0]
-        (camera,) = turn_cameras([picture.camera], turn.T)
-        path = self._path("view", ".json")
-        content = {"offset": self._offset.tolist(), "cameras": [camera.to_dict()]}
-        write_atomic(path, json.dumps(content, indent=1) + "\n")
+        path = self._filming.path()
+        file = self._path("path" if path else "view", ".json")
+        cameras = turn_cameras(path or [picture.camera], turn.T)
+        content = {"offset": self._offset.tolist(), "cameras": [camera.to_dict() for camera in cameras]}
+        write_atomic(file, json.dumps(content, indent=1) + "\n")
         words = [
             *("tron-relight", f"scene={scene}", f"environment={self._lights[wish.light]}"),
-            *(f"rotation={wish.turn:g}", f"exposure={exposure:.4g}", f"cameras={path}", "quality=final"),
-            *(f"width={camera.width}", f"height={camera.height}", f"output_dir={path.with_suffix('')}"),
+            *(f"rotation={wish.turn:g}", f"exposure={exposure:.4g}", f"cameras={file}", "quality=final"),
+            *(f"width={cameras[0].width}", f"height={cameras[0].height}"),
+            *([f"fps={FRAMES_PER_SECOND}"] if path else []),
+            f"output_dir={file.with_suffix('')}",
         ]
         line = " ".join(map(shlex.quote, words))
         log.info("%s", line)
@@ -475,7 +545,10 @@ class Window:
                 "That cannot be done", line, auto_close_seconds=NOTICE_SECONDS, color="red"
             )
         wish = self.studio.wished
-        self._light.value, self._before.value = wish.light, wish.before
+        self._light.value = wish.light
+        sides = {side: said for said, side in self._sides.items()}
+        self._left.value = sides[wish.left, wish.left_light]
+        self._cutting.follow(wish.marked)
         if self._chosen is not None:
             self._visible.value = self._chosen not in wish.hidden
         threading.Thread(target=self._refresh, daemon=True).start()
@@ -513,6 +586,8 @@ def _said(edit: Edit) -> str:
     """An edit in words, for the list of those that were done."""
     if isinstance(edit, Insert):
         return f"insert {edit.file.name}"
+    if isinstance(edit, Separate):
+        return f"cut out {edit.object}"
     changed = [
         name for name in ("base_color", "roughness", "metallic") if getattr(edit, name, None) is not None
     ]

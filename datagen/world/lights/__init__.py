@@ -17,10 +17,11 @@ from datagen.world.lights.families import (
     draw_light,
 )
 from datagen.world.lights.hdri import HdriSpec
-from datagen.world.lights.light import Contrast, Light, classify, contrast_share
+from datagen.world.lights.light import Light
 from datagen.world.lights.overcast import OvercastSpec
 from datagen.world.lights.studio import Panel, StudioSpec
 from datagen.world.lights.sun import SunSpec
+from tron.shading.environments.contrast import Contrast, classify, contrast_share
 
 __all__ = [
     "EVERY",

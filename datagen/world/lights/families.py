@@ -12,7 +12,8 @@ import numpy as np
 from pydantic import Field
 
 from datagen.world.lights.hdri import HdriSpec
-from datagen.world.lights.light import CONTRAST_ROWS, INTERVALS, Contrast, Light, contrast_share
+from datagen.world.lights.light import Light
+from tron.shading.environments.contrast import CONTRAST_ROWS, INTERVALS, Contrast, contrast_share
 
 
 def _is_light(each: object) -> TypeGuard[type[Light]]:

@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from datagen.world.lights.light import Contrast, Light
+from datagen.world.lights.light import Light
 from datagen.world.spec import Number
+from tron.shading.environments.contrast import Contrast
 from tron.shading.environments.environment import EnvironmentMap
 
 

@@ -1,7 +1,6 @@
 """Base of the families of light: a distribution, a radiance, and the map that it is baked to.
 
-Beside it what families share (directions, soft edges, tints, small bright discs), and contrast: high,
-medium or low, by the share of all light that comes from the brightest hundredth of the sphere.
+Beside it what families share (directions, soft edges, tints, small bright discs).
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 
@@ -131,39 +130,3 @@ def lay(image: np.ndarray, discs: Iterable[Disc]) -> np.ndarray:
         covered = (share * area[rows, None]).sum()
         image[rows] += share[..., None] * (np.asarray(disc.irradiance) / covered)
     return image.astype(np.float32)
-
-
-Contrast = Literal["high", "medium", "low"]
-
-HIGH_CONTRAST = 0.3
-"""Share above which a map casts distinct shadows."""
-
-LOW_CONTRAST = 0.12
-"""Share up to which it hardly casts any."""
-
-CONTRAST_ROWS = 64
-"""Rows of the map that is measured: a class does not depend on the resolution of a bake."""
-
-INTERVALS: dict[Contrast, tuple[float, float]] = {
-    "high": (HIGH_CONTRAST, 1.0),
-    "medium": (LOW_CONTRAST, HIGH_CONTRAST),
-    "low": (0.0, LOW_CONTRAST),
-}
-"""Class -> shares above the first number and up to the second.
-
-The share is 0.01 for a constant, near 1 for a bare lamp. Of 80 lights of each of our eight families (seeds 0
-to 79), 28 % lie below LOW_CONTRAST, in the valley between covered skies and the rest, and 56 % above
-HIGH_CONTRAST.
-"""
-
-
-def contrast_share(environment: EnvironmentMap) -> float:
-    """Share of the light from the brightest hundredth of the sphere, rounded to four decimals."""
-    rows = min(environment.image.shape[0], CONTRAST_ROWS)
-    return round(environment.resized(rows).contrast(), 4)
-
-
-def classify(environment: EnvironmentMap) -> Contrast:
-    """Class of a map's contrast."""
-    share = contrast_share(environment)
-    return "high" if share > HIGH_CONTRAST else "medium" if share > LOW_CONTRAST else "low"

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import datagen.files.alpha
-from datagen.files.alpha import without_clear
-from datagen.files.parts import Part, Sampling
+import tron.models.alpha
+from tron.models.alpha import without_clear
+from tron.models.parts import Part, Sampling
 from tron.seeds import generator
 
 QUAD = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -92,7 +92,7 @@ def test_what_vertices_carry_is_interpolated():
 
 
 def test_noise_is_cut_no_further_than_the_budget(monkeypatch):
-    monkeypatch.setattr(datagen.files.alpha, "MOST_PIECES", 2000)
+    monkeypatch.setattr(tron.models.alpha, "MOST_PIECES", 2000)
     noise = generator(0, "noise").random((512, 512)) < 0.5
     part = without_clear(card(), noise.astype(np.float32), 0.5, None)
     assert 100 < len(part.faces) <= 2000

@@ -8,15 +8,16 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from datagen.files.assets import load_model
-from datagen.files.parts import Part, outline
-from datagen.truth.build import build, highest
+from datagen.truth.build import build
 from datagen.truth.pathtrace import gbuffers
 from datagen.world.objects import ObjectSpec, Placement
 from datagen.world.scene import draw_scene
 from tron.cameras import Camera
 from tron.color import srgb_to_linear
 from tron.errors import TronError
+from tron.models.load import load_model
+from tron.models.parts import Part, outline
+from tron.models.shapes import highest
 from tron.seeds import generator
 
 QUAD = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]])  # faces +z, y up: a standing card

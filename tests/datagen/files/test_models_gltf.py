@@ -17,12 +17,12 @@ import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from datagen.files.assets import load_model
-from datagen.files.gltf.document import APPROXIMATED, HONOURED, IGNORED
-from datagen.files.gltf.materials import decode_image, metallic_of
-from datagen.files.gltf.meshes import read_parts
 from tron.color import srgb_to_linear
 from tron.errors import TronError
+from tron.io.gltf_document import APPROXIMATED, HONOURED, IGNORED
+from tron.models.gltf.materials import decode_image, metallic_of
+from tron.models.gltf.meshes import read_parts
+from tron.models.load import load_model
 from tron.seeds import generator
 
 POSITIONS = np.array([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], np.float32)

@@ -13,11 +13,11 @@ import trimesh
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from datagen.files.assets import load_model
-from datagen.files.parts import Part, Sampling, split_mirrored
-from datagen.truth.build import Geometry, _textured
+from datagen.truth.build import Geometry, _of_model
 from datagen.truth.pathtrace import gbuffers, render_frames
 from tron.cameras import Camera
+from tron.models.load import load_model
+from tron.models.parts import Part, Sampling, split_mirrored
 from tron.shading.environments.environment import EnvironmentMap
 
 QUAD = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], np.float32)
@@ -41,7 +41,7 @@ def png(pixels):
 
 
 def view(parts, position, width=48):
-    geometry = Geometry([_textured(part, 2, i) for i, part in enumerate(parts)])
+    geometry = Geometry([_of_model(part, 2, i) for i, part in enumerate(parts)])
     camera = Camera.look_at(position, (0, 0, 0), fov_deg=40, width=width, height=width)
     return gbuffers(geometry, [camera])[0], camera
 
@@ -172,9 +172,9 @@ def test_vertex_colours_tint_the_texture_in_path_tracer_and_g_buffers(variant):
         expected = color * ((1 - up) * tint[0] + up * tint[2])
         assert near.sum() > 2
         np.testing.assert_allclose(seen.base_color[near], expected, atol=2e-3)
-    plain = Geometry([_textured(card(base_color=image, tint=tint), 2, 0)])
-    folded = Geometry([_textured(card(base_color=np.float32(image[:1, :1] * 0.5)), 2, 0)])
-    same = Geometry([_textured(card(base_color=image[:1, :1], tint=np.full((4, 3), 0.5, np.float32)), 2, 0)])
+    plain = Geometry([_of_model(card(base_color=image, tint=tint), 2, 0)])
+    folded = Geometry([_of_model(card(base_color=np.float32(image[:1, :1] * 0.5)), 2, 0)])
+    same = Geometry([_of_model(card(base_color=image[:1, :1], tint=np.full((4, 3), 0.5, np.float32)), 2, 0)])
     camera = Camera.look_at((0, -0.01, 4), (0, 0, 0), fov_deg=40, width=16, height=16)
     white = EnvironmentMap.constant(1.0)
     frames = [render_frames(each.lit(white), [camera], 4, [1]) for each in (folded, same, plain)]

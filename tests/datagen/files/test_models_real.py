@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from datagen.files import assets
-from datagen.files.gltf.meshes import read_parts
-from datagen.truth.build import Geometry, _textured
+from datagen.truth.build import Geometry, _of_model
 from datagen.truth.pathtrace import gbuffers
 from tron.cameras import Camera
+from tron.models import load
+from tron.models.gltf.meshes import read_parts
 
 MODELS = {
     "FlightHelmet/FlightHelmet.gltf": (94_000, 0.1),
@@ -33,7 +33,7 @@ CUT = ("FlightHelmet", "house")
 
 @cache
 def load_model(path):
-    return assets.load_model(path)
+    return load.load_model(path)
 
 
 def corners(parts):
@@ -47,7 +47,7 @@ def test_a_model_is_seen_from_both_sides(shared_data, variant, name):
     parts = load_model(shared_data / "assets" / name)
     triangles, share = MODELS[name]
     assert sum(len(part.faces) for part in parts) >= triangles
-    geometry = Geometry([_textured(part, 2, i) for i, part in enumerate(parts)])
+    geometry = Geometry([_of_model(part, 2, i) for i, part in enumerate(parts)])
     cameras = [
         Camera.look_at((2.5 * x, -2.5 * x, 1.2), (0, 0, 0), fov_deg=38, width=48, height=48)
         for x in (0.7, -0.7)
@@ -97,7 +97,7 @@ def test_the_chess_boards_compressed_positions_are_as_far_apart_as_its_file_says
 
 def test_the_chess_board_has_light_and_dark_squares_and_pieces(shared_data, variant):
     parts = load_model(shared_data / "assets/chess-board/chess-board.glb")
-    geometry = Geometry([_textured(part, 2, i) for i, part in enumerate(parts)])
+    geometry = Geometry([_of_model(part, 2, i) for i, part in enumerate(parts)])
     camera = Camera.look_at((0, -0.01, 3), (0, 0, 0), fov_deg=40, width=128, height=128)
     (view,) = gbuffers(geometry, [camera])
     middle = view.valid & (np.abs(view.position[..., :2]).max(axis=2) < 0.4)

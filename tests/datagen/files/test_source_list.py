@@ -3,10 +3,11 @@
 import numpy as np
 import trimesh
 
-from datagen.files.assets import Asset, find_models, load_model
+from datagen.files.assets import Asset, find_models
 from datagen.files.contents import compared, model_contents
 from datagen.files.sources import HELD_OUT, families, for_split
 from tron.io.images import write_image
+from tron.models.load import load_model
 from tron.seeds import generator
 
 

@@ -290,3 +290,25 @@ def test_points_lie_on_surfaces_and_have_the_colours_of_the_pictures(tmp_path, c
 def test_two_workers_make_the_bytes_of_one_process(output, tmp_path, files_of):
     assert make_captures(tiny(tmp_path, "cluster=local", "workers=2")) == 0
     assert files_of(tmp_path) == files_of(output)
+
+
+def test_relit_views_are_of_the_scenes_film_where_asked_for(tmp_path):
+    wanted = [
+        "capture.scenes=1",
+        "capture.views=2",
+        "capture.path_spp=4",
+        "capture.relights=[sun]",
+        "capture.film_frames=3",
+    ]
+    settings = tiny(tmp_path, *wanted, "capture.relight_spp=4")
+    assert make_captures(settings) == 0
+    spec = SceneSpec.model_validate_json((tmp_path / "captures/test-000000/spec.json").read_bytes())
+    relit = read_capture_folder(tmp_path / "relit/test-000000_1_sun")
+    film = spec.cameras.film.cameras(3, 28, 20)
+    shot = zip(relit.views, film, gbuffers(scene_geometry(spec, settings, Sources()), film), strict=True)
+    for view, camera, truth in shot:
+        np.testing.assert_allclose(view.camera.world_to_camera, camera.world_to_camera, rtol=0, atol=1e-12)
+        seen = truth.valid
+        np.testing.assert_allclose(view.read("base_color")[seen], truth.base_color[seen], atol=1e-3)
+        np.testing.assert_allclose(view.read("normal")[seen], truth.normal[seen], atol=1e-3)
+        assert not view.read("normal")[~seen].any()

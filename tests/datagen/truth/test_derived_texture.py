@@ -5,8 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from datagen.files.parts import Part
-from datagen.truth.build import _textured, highest, limited
+from tron.models.parts import Part
+from tron.models.shapes import highest, limited, textured
 
 
 def mean_albedo(base: float, roughness: float, metallic: float, count: int = 40_000) -> float:
@@ -62,7 +62,7 @@ def test_the_true_base_color_of_a_white_model_is_the_limited_one(variant):
         normal_map=None,
         tint=np.ones((4, 3), np.float32),
     )
-    surface = _textured(part, 1, 0)
+    surface = textured(part, "part")
     scene = mi.load_dict({"type": "scene", "shape": surface.shape})
     rays = mi.Ray3f(mi.Point3f([0.25, 0.75], [0.3, 0.3], [1.0, 1.0]), mi.Vector3f(0, 0, -1))
     si = scene.ray_intersect(rays)

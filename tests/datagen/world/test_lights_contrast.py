@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from datagen.world.lights import EVERY, FAMILIES, HdriSpec, classify, contrast_share, draw_light
-from datagen.world.lights.light import HIGH_CONTRAST, INTERVALS, LOW_CONTRAST, Disc, lay
+from datagen.world.lights.light import Disc, lay
 from datagen.world.scene import SceneSpec, draw_scene
 from tron.seeds import generator
+from tron.shading.environments.contrast import HIGH_CONTRAST, INTERVALS, LOW_CONTRAST
 from tron.shading.environments.environment import EnvironmentMap
 
 pytestmark = pytest.mark.usefixtures("variant")

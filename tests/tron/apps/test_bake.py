@@ -1,12 +1,12 @@
 """tron-bake from end to end: a file that an independent splat rasteriser draws as tron lights the scene."""
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
 import plyfile
 import pytest
 
+from eval.applications.splat_rasteriser import rasterise
 from tron.apps.bake import cli
 from tron.cameras import Camera
 from tron.color import to_display
@@ -29,17 +29,6 @@ REFERENCE_ORDER = [
 
 
 @pytest.fixture
-def rasterise():
-    path = Path(__file__).parents[1] / "relighting/splat_rasteriser.py"
-    spec = importlib.util.spec_from_file_location("splat_rasteriser", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.rasterise
-
-
-@pytest.fixture
 def folder(tmp_path: Path, ball_on_floor) -> Path:
     ball_on_floor().save(tmp_path / "scene.ply")
     image = np.full((32, 64, 3), 0.3, np.float32)
@@ -56,7 +45,7 @@ def bake(folder: Path, *arguments: str) -> int:
 
 
 @pytest.mark.usefixtures("variant")
-def test_a_splat_rasteriser_draws_the_relit_scene(folder, rasterise, caplog):
+def test_a_splat_rasteriser_draws_the_relit_scene(folder, caplog):
     """At a view that no fit saw; without the wider kernel it is worse."""
     with caplog.at_level("INFO"):
         assert bake(folder, "exposure=1", "look=none") == 0

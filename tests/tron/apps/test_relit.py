@@ -153,14 +153,14 @@ def test_foreground_over_one_radiance_is_the_picture_of_sub_pixels_too(relight, 
     radiance = np.array([2.0, 4.0, 8.0])
     EnvironmentMap.constant(radiance).save(tmp_path / "c.exr")
     files = [f"scene={scene_path}", f"environment={tmp_path / 'c.exr'}", f"output_dir={tmp_path}", "frames=1"]
-    assert relight(*files, "supersample=2") == 0
+    assert relight(*files, "supersample=2", "checkpoint=null") == 0
     foreground, mask, share, lit = (
         picture(tmp_path, name, suffix="exr") for name in ("foreground", "mask", "share", "lit")
     )
     of_mean = background_share(1 - mask)
     assert (np.abs(share - of_mean) > 0.005).sum() > 10, "rims are tested"
     np.testing.assert_allclose((1 - share) * foreground + share * radiance, lit, rtol=2e-3, atol=2e-3)
-    assert relight(*files, "supersample=2", "background=[0.2,0.9,0.4]") == 0
+    assert relight(*files, "supersample=2", "checkpoint=null", "background=[0.2,0.9,0.4]") == 0
     assert json.loads((tmp_path / "relight.json").read_text())["frames_rendered"] == 0
     exposure = json.loads((tmp_path / "relight.json").read_text())["exposure"]
     shown = to_display(foreground, exposure, look="photograph")

@@ -1,9 +1,12 @@
 """One world point lands on the same pixel through every loader, at full size and reduced."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tron.captures import Capture, LoadSettings, load_capture
 from tron.errors import TronError
@@ -61,7 +64,123 @@ def tensoir(folder: Path, photos, write) -> None:
     write.tensoir(folder, photos)
 
 
-FORMATS = [nerf_synthetic, instant_ngp, nerfstudio, per_frame, dl3dv, colmap_binary, colmap_text, tensoir]
+def pinhole(write) -> dict:
+    fx, fy, cx, cy = write.intrinsics
+    width, height = write.size
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height}
+
+
+def polycam(folder: Path, photos, write) -> None:
+    """The corrected poses count."""
+    for corrected, shift in (("", 1.0), ("corrected_", 0.0)):
+        write.photos(folder / "keyframes" / f"{corrected}images", photos)
+        for name, matrix in zip(photos.names, photos.opengl):
+            entries = {f"t_{row}{column}": matrix[row, column] for row in range(3) for column in range(4)}
+            entries["t_03"] += shift
+            path = folder / "keyframes" / f"{corrected}cameras" / f"{Path(name).stem}.json"
+            write.json(path, {**entries, **pinhole(write), "blur_score": 100, "timestamp": 1})
+
+
+def record3d(folder: Path, photos, write) -> None:
+    quats = Rotation.from_matrix(photos.opengl[:, :3, :3]).as_quat()
+    fx, fy, cx, cy = write.intrinsics
+    content = {
+        "w": write.size[0], "h": write.size[1], "fps": 60, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1],
+        "poses": np.concatenate([quats, photos.opengl[:, :3, 3]], axis=1).tolist(),
+    }  # fmt: skip
+    write.json(folder / "metadata", content)
+    write.photos(folder / "rgb", replace(photos, names=tuple(f"{n}.png" for n in range(len(photos.names)))))
+
+
+def metashape(folder: Path, photos, write) -> None:
+    """f belongs to y, b1 is what x has more; another component and a photo that was not aligned."""
+    fx, fy, cx, cy = write.intrinsics
+    width, height = write.size
+    calibration = f"<f>{fy}</f><cx>{cx - width / 2}</cx><cy>{cy - height / 2}</cy><b1>{fx - fy}</b1>"
+    lines = [
+        '<document version="2.0.0"><chunk label="Chunk 1"><sensors><sensor id="3" type="frame">',
+        f'<resolution width="{width}" height="{height}"/><calibration class="initial"><f>1</f></calibration>',
+        f'<calibration class="adjusted">{calibration}</calibration></sensor></sensors><cameras>',
+        '<group id="0">',
+        *(
+            f'<camera id="{n}" sensor_id="3" component_id="0" label="{Path(name).stem}">'
+            f"<transform>{' '.join(map(repr, matrix.ravel().tolist()))}</transform></camera>"
+            for n, (name, matrix) in enumerate(zip(photos.names, photos.opencv))
+        ),
+        "</group></cameras></chunk></document>",
+    ]
+    (folder / "cameras.xml").write_text("\n".join(lines))
+    write.photos(folder / "photos", photos)
+
+
+def opensfm(folder: Path, photos, write) -> None:
+    fx, fy, cx, cy = write.intrinsics
+    width, height = write.size
+    camera = {
+        "projection_type": "brown", "width": width, "height": height,
+        "focal_x": fx / width, "focal_y": fy / width,
+        "c_x": (cx - width / 2) / width, "c_y": (cy - height / 2) / width,
+    }  # fmt: skip
+    to_camera = np.linalg.inv(photos.opencv)
+    turns = Rotation.from_matrix(to_camera[:, :3, :3]).as_rotvec()
+    shots = {
+        name: {"rotation": turn.tolist(), "translation": matrix[:3, 3].tolist(), "camera": "v2 phone"}
+        for name, turn, matrix in zip(photos.names, turns, to_camera)
+    }
+    points = {str(n): {"coordinates": p.tolist(), "color": [9, 9, 9]} for n, p in enumerate(photos.points)}
+    largest = {"cameras": {"v2 phone": camera}, "shots": shots, "points": points}
+    (folder / "opensfm").mkdir()
+    (folder / "opensfm" / "reconstruction.json").write_text(json.dumps([{"shots": {"x": {}}}, largest]))
+    write.photos(folder / "images", photos)
+
+
+def colmap_rigs(folder: Path, photos, write) -> None:
+    """COLMAP 4: two cameras a rig, of which the second stands where the rig says; images say no pose."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    width, height = write.size
+    poses = [pycolmap.Rigid3d(matrix[:3]) for matrix in np.linalg.inv(photos.opencv)]
+    for first in range(0, len(photos.names), 2):
+        rig, frame = pycolmap.Rig(rig_id=first + 1), pycolmap.Frame(frame_id=first + 1, rig_id=first + 1)
+        sensors = []
+        for number in (first + 1, first + 2):
+            camera = pycolmap.Camera(
+                model="PINHOLE", width=width, height=height, params=write.intrinsics, camera_id=number
+            )
+            model.add_camera(camera)
+            sensors.append(camera.sensor_id)
+            frame.add_data_id(pycolmap.data_t(camera.sensor_id, number))
+        rig.add_ref_sensor(sensors[0])
+        rig.add_sensor(sensors[1], poses[first + 1] * poses[first].inverse())
+        frame.rig_from_world = poses[first]
+        model.add_rig(rig)
+        model.add_frame(frame)
+        for number in (first + 1, first + 2):
+            model.add_image(
+                pycolmap.Image(
+                    name=photos.names[number - 1], camera_id=number, image_id=number, frame_id=first + 1
+                )
+            )
+    for frame_id in list(model.frames):
+        model.register_frame(frame_id)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    model.write(folder / "sparse" / "0")
+    write.photos(folder / "images", photos)
+
+
+def other_case(folder: Path, photos, write) -> None:
+    """Poses of a camera's names, photos renamed by a system that heeds no case."""
+    shouted = replace(photos, names=tuple(name.upper() for name in photos.names))
+    write.colmap(folder / "sparse" / "0", shouted, text=True)
+    write.photos(folder / "images", photos)
+
+
+FORMATS = [
+    *(nerf_synthetic, instant_ngp, nerfstudio, per_frame, dl3dv, colmap_binary, colmap_text, tensoir),
+    *(colmap_rigs, other_case),
+    *(polycam, record3d, metashape, opensfm),
+]
 
 
 @pytest.mark.parametrize("downscale", [1, 2, 3.7])
@@ -88,6 +207,13 @@ def test_a_world_point_lands_on_the_same_pixel(
         assert np.abs(pixels - expected).max() < TOLERANCE
         assert view.read().shape == (size[1], size[0], 3)
         assert view.read()[..., 2].mean() == pytest.approx(index / 16, abs=0.01)  # and it is its own image
+
+
+@pytest.mark.parametrize("layout", FORMATS, ids=lambda layout: layout.__name__)
+def test_poses_come_back_from_every_format(tmp_path: Path, photos, write, layout) -> None:
+    layout(tmp_path, photos, write)
+    found = [view.camera.camera_to_world for view in in_order(load_capture(tmp_path), layout)]
+    np.testing.assert_allclose(found, photos.opencv, atol=1e-6)
 
 
 def in_order(capture: Capture, layout) -> list:

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tron.cli.command_line import command
+from tron.cli.command_line import ANEW, command
 from tron.errors import TronError
 from tron.runtime import activate
 
@@ -287,6 +287,21 @@ def test_an_interruption_exits_130_without_a_traceback(run: Run):
         "",
         "tron-toy: interrupted; what is finished is kept, and the same command goes on from it\n",
     )
+
+
+def test_a_command_that_keeps_nothing_does_not_promise_to_go_on(toy_conf, capsys):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit, match="130"):
+        command("tron-toy", toy_conf, Settings, interrupt, ended=ANEW)(["output_dir=o"])
+    assert capsys.readouterr().err == f"tron-toy: interrupted; {ANEW}\n"
+
+
+def test_a_mistyped_key_of_an_item_of_a_list_gets_the_items_keys(run: Run):
+    code, _, said = run("output_dir=o", "stages=[{name: a, stps: 3}]")
+    near = "did you mean 'stages.0.steps'? there are name, steps"
+    assert (code, said) == (2, f"tron-toy: unknown key 'stages.0.stps': {near}\n")
 
 
 def test_sigterm_unwinds_and_exits_143_without_a_traceback(run: Run):

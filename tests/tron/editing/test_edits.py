@@ -1,6 +1,8 @@
 """Laws of edits: what is done is what was said, comes back when undone, and depends on no order of people."""
 
 import colorsys
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,12 +13,24 @@ from scipy.spatial.distance import pdist
 
 from examples.stage import BALL, FLOOR, RING
 from tron.color import linear_to_srgb
-from tron.editing import Duplicate, EditList, Insert, Material, Move, Remove, Selection, Session, Views
+from tron.editing import (
+    Duplicate,
+    EditList,
+    Insert,
+    Material,
+    Move,
+    Remove,
+    Selection,
+    Separate,
+    Session,
+    Views,
+)
 from tron.errors import TronError
 from tron.gaussians.fields import FIELDS
 from tron.gaussians.harmonics import eval_sh
 from tron.gaussians.scene import GaussianScene
 from tron.seeds import generator
+from tron.termination import TERMINATED
 
 HERE = Views()
 RINGS, BALLS, FLOORS = (Selection(object=which) for which in (RING, BALL, FLOOR))
@@ -57,6 +71,23 @@ def test_insert_then_remove_gives_the_bytes_back(scene, insert, content):
 
 
 @pytest.mark.usefixtures("variant")
+def test_separate_changes_ids_alone_and_undoes(scene, content):
+    half = Selection(object=BALL, box={"low": (-9, -9, 0.4), "high": (9, 9, 9)})  # type: ignore[arg-type]
+    session = Session(scene)
+    apart = session.do(Separate(select=half, object=8))
+    upper = (scene.object_id == BALL) & (scene.means[:, 2] >= 0.4)
+    assert 0 < upper.sum() < (scene.object_id == BALL).sum()
+    np.testing.assert_array_equal(apart.object_id, np.where(upper, 8, scene.object_id))
+    assert content(replace(apart, object_id=scene.object_id)) == content(scene)
+    assert Separate(select=half).apply(scene, HERE).object_id.max() == RING + 1
+    assert Separate(select=half, object=8).objects == {BALL, 8}
+    assert EditList.of([{"action": "separate", "select": {"object": BALL}, "object": 8}]).merged(
+        EditList((Remove(select=RINGS),))
+    )
+    session.undo()
+    assert content(session.scene) == content(scene)
+
+
 def test_it_does_so_where_what_is_inserted_was_stood_on_the_floor(scene, other, content):
     standing = Insert(file=other, at=(1, 0.2, 3), take=RINGS, object=9).apply(scene, HERE)
     lowest = standing.means[standing.object_id == 9, 2].min()
@@ -241,6 +272,7 @@ def test_another_kernel_keeps_its_width(scene, tmp_path, caplog):
         (Remove(select=Selection(object=(FLOOR, BALL, RING))), "no surfel is left"),
         (Remove(select=Selection(sphere={"center": (9, 9, 9), "radius": 1})), "no surfel is selected"),  # type: ignore[arg-type]
         (Duplicate(select=BALLS, by=(1, 0, 0), object=RING), "there is an object 3 already"),
+        (Separate(select=BALLS, object=FLOOR), "there is an object 1 already"),
         (Insert(file=Path("absent.ply"), at=(0, 0, 0), standing=False), "absent.ply"),
     ],
 )
@@ -280,3 +312,28 @@ def test_a_mistake_in_a_file_is_one_line_that_names_its_place(tmp_path, text, sa
     assert said in str(refusal.value)
     assert str(path) in str(refusal.value)
     assert len(str(refusal.value).splitlines()) == 1
+
+
+def test_an_end_amid_the_imports_of_a_model_is_an_end(tmp_path):
+    """trimesh takes whatever comes while it imports its libraries for one that is missing, SIGTERM too."""
+    program = """
+import os, signal, sys, time
+from pathlib import Path
+from tron.editing.models import read_model
+from tron.termination import termination_unwinds
+
+class Swallowing:
+    def find_spec(self, name, *_):
+        if name == "trimesh":
+            try:
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(0.01)
+            except BaseException:
+                pass
+
+sys.meta_path.insert(0, Swallowing())
+with termination_unwinds():
+    read_model(Path(sys.argv[1]))
+"""
+    done = subprocess.run([sys.executable, "-c", program, str(tmp_path / "a.obj")], check=False)
+    assert done.returncode == TERMINATED

@@ -44,6 +44,18 @@ def without_sign(scene: GaussianScene) -> GaussianScene:
 
 
 @pytest.mark.parametrize("sign", [lambda scene: scene, without_sign], ids=["signed", "without-sign"])
+def test_shares_are_of_the_pixels_that_a_ball_fills(scene, views, sign):
+    """Against its outline: 1 well inside, 0 well outside; but where the ring stands before it."""
+    shown, camera = sign(scene), views["front.jpg"]
+    ball, ring = scene.object_id == BALL, scene.object_id == RING
+    share, hidden = views.shares(shown, ball, camera), views.shares(shown, ring, camera) > 0.01
+    assert share[on_ball(camera, 0.85 * RADIUS) & ~hidden].min() > 0.9
+    assert share[~on_ball(camera, 1.2 * RADIUS)].max() < 0.02
+    both = views.shares(shown, np.ones(len(scene), bool), camera)
+    np.testing.assert_allclose(share + views.shares(shown, ~ball, camera), both, atol=1e-5)
+
+
+@pytest.mark.parametrize("sign", [lambda scene: scene, without_sign], ids=["signed", "without-sign"])
 def test_a_pixel_picks_what_its_ray_meets(scene, views, sign):
     """On the ball: surfels of it, no further from the first root of the quadratic than two spacings."""
     shown, camera = sign(scene), views["front.jpg"]

@@ -151,11 +151,6 @@ def test_real_scans_load_and_stand_upright(shared_data, name):
     assert (high - low).argmax() == np.abs(scene.up).argmax(), "taller than wide, along up"
 
 
-@pytest.mark.parametrize("name", ["biker.compressed.ply", "guitar.compressed.ply", "biker.spz"])
-def test_packed_splats_are_named_with_the_way_out(shared_data, name):
-    refuse(shared_data / "splats" / name, f"packed format.*splat-transform {name} {name.split('.')[0]}.ply")
-
-
 def test_a_2dgs_file_with_two_scales_loads(scene, tmp_path):
     path = tmp_path / "a.ply"
     scene.save(path)

@@ -14,6 +14,7 @@ def test_a_shipped_checkpoint_is_given_what_its_name_says_and_has_a_card(name: s
     assert set(load_renderer(path).config.guidance) == {
         "pbr",
         "irradiance",
+        "sampling",
         *(["lit", "albedo", "surface"] if name == "surfaces" else []),
     }
     assert path.stat().st_size < 8_000_000

@@ -87,7 +87,7 @@ def test_the_proxy_is_one_layer_of_the_scans_surface_and_materials(proxy):
     """The median of the fog lies within its layers, and its normals are those of ball and floor."""
     surfels = proxy.surfels
     assert surfels.oriented
-    assert thickness(SurfelTracer(surfels)) < THICK
+    assert thickness(SurfelTracer(surfels)) < 0.05
     from_middle = surfels.means - np.array([0, 0, 0.5])
     radius = np.linalg.norm(from_middle, axis=1)
     ball = (surfels.means[:, 2] > 0.2) & (radius < 0.8)
@@ -237,6 +237,17 @@ def test_a_kept_proxy_is_not_filmed_again(fog, tmp_path, monkeypatch, caplog):
 
 
 @pytest.mark.usefixtures("short_film")
+def test_a_proxy_that_is_cut_off_says_that_it_begins_anew(fog, tmp_path):
+    def ends(_):
+        raise KeyboardInterrupt
+        yield
+
+    with pytest.raises(KeyboardInterrupt) as end:
+        _ = Relighter(fog, proxy_file=tmp_path / "fog.proxy.ply", filming=ends).proxy
+    assert "begins anew" in "".join(end.value.__notes__)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_file_that_cannot_be_written_stops_nothing(fog, tmp_path, caplog):
     caplog.set_level("INFO")
     (tmp_path / "file").touch()

@@ -218,8 +218,9 @@ def test_a_changed_scene_is_lit_as_if_it_were_new(light, scene, change, signed):
     assert_same(before.under(light).render(VIEWS[1]), first)
 
 
-def test_other_materials_stand_under_the_light_that_was_baked_as_if_it_were_baked_anew(light, scene):
-    """Bitwise: no shadow ray knows a material."""
+def test_other_materials_stand_under_the_light_that_was_baked_as_if_it_were_baked_anew(variant, light, scene):
+    """Bitwise, where sums have an order: no shadow ray knows a material."""
+    rtol = 0 if variant.startswith("llvm") else 1e-5  # a GPU adds in no fixed order
     before = Relighter(scene, Estimation(rays=0, filtered=True))
     baked = before.under(light)
     painted = replace(scene, base_color=0.5 * scene.base_color, metallic=1 - scene.metallic)
@@ -230,8 +231,11 @@ def test_other_materials_stand_under_the_light_that_was_baked_as_if_it_were_bake
     assert found.bounced is not None
     assert anew.bounced is not None
     for name in ("direct", "indirect", "outgoing", "behind", "openness"):
-        np.testing.assert_array_equal(getattr(found.bounced, name), getattr(anew.bounced, name))
-    np.testing.assert_array_equal(found.render(VIEWS[0]).lit, anew.render(VIEWS[0]).lit)
+        np.testing.assert_allclose(
+            getattr(found.bounced, name), getattr(anew.bounced, name), rtol=rtol, atol=0.1 * rtol
+        )
+    pictures = found.render(VIEWS[0]).lit, anew.render(VIEWS[0]).lit
+    np.testing.assert_allclose(*pictures, rtol=rtol, atol=0.1 * rtol)
     assert np.abs(found.render(VIEWS[0]).lit - baked.render(VIEWS[0]).lit).max() > 0.05
 
 
@@ -262,12 +266,12 @@ def test_what_moves_quickly_is_lit_where_it_is_and_traces_no_bounce(light, scene
     assert -10 * np.log10(np.square(one - other).mean()) > 30
 
 
-def test_one_buffer_alone_is_that_of_the_frame(light, scene):
+def test_some_buffers_alone_are_those_of_the_frame(light, scene):
     lit = Relighter(scene, Estimation(rays=0, filtered=True)).under(light)
     frame = lit.trace(VIEWS[0], 3)
     whole = frame.shade()
-    for name in ("lit", "irradiance", "indirect"):
-        np.testing.assert_array_equal(frame.image(name), whole[name])
+    for name, image in frame.images(("lit", "irradiance", "indirect")).items():
+        np.testing.assert_array_equal(image, whole[name])
 
 
 def test_a_backdrop_stays_in_no_light_s_way_when_things_move(light, scene):

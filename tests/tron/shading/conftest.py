@@ -104,17 +104,34 @@ def cubemap_of(variant: str) -> Callable[[EnvironmentMap, int], CubemapLight]:
     return make
 
 
-@pytest.fixture
-def points_gbuffer() -> Callable[[np.ndarray, np.ndarray], SimpleNamespace]:
-    """Make what `irradiance` reads of a G-buffer from positions and unit normals (N, 3)."""
+class PointsGBuffer(GBuffer):
+    """Points row by row instead of tile by tile; tests may arrange them in another width and height."""
 
-    def make(positions: np.ndarray, normals: np.ndarray) -> SimpleNamespace:
+    @property
+    def pixel(self) -> mi.UInt32:
+        return dr.arange(mi.UInt32, dr.width(self.opacity))
+
+
+@pytest.fixture
+def points_gbuffer(variant: str) -> Callable[[np.ndarray, np.ndarray], PointsGBuffer]:
+    """Make an opaque, black G-buffer of positions and unit normals (N, 3)."""
+
+    def make(positions: np.ndarray, normals: np.ndarray) -> PointsGBuffer:
         columns = [np.ascontiguousarray(np.asarray(a, np.float32).T) for a in (positions, normals)]
-        return SimpleNamespace(
+        normal, none = mi.Normal3f(columns[1]), dr.zeros(mi.Float, len(positions))
+        return PointsGBuffer(
             position=mi.Point3f(columns[0]),
-            normal=mi.Normal3f(columns[1]),
-            opacity=dr.ones(mi.Float, len(positions)),
-            pixel=dr.arange(mi.UInt32, len(positions)),
+            depth=none,
+            lift=none,
+            normal=normal,
+            normal_sum=normal,
+            base_color=mi.Color3f(none),
+            roughness=none,
+            metallic=none,
+            rgb=mi.Color3f(none),
+            opacity=none + 1,
+            direction=mi.Vector3f(none),
+            values=[],
             width=len(positions),
             height=1,
         )

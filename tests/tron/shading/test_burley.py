@@ -11,7 +11,7 @@ from tron.cameras import Camera
 from tron.estimation import Estimation
 from tron.seeds import generator
 from tron.shading.brdf_table import BrdfTable
-from tron.shading.burley import burley_factor, burley_terms, even_terms, terms_of_mean
+from tron.shading.burley import burley_factor, burley_terms, even_terms, terms_of_mean, weighed_mean
 from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Lighting, render_guidance
 
@@ -86,3 +86,15 @@ def test_terms_of_a_mean_direction_are_exact_for_one_direction_and_for_even_ligh
         np.testing.assert_allclose(np.array(found), np.array(expected), atol=2e-4)
     nothing = terms_of_mean(up, -view, dr.zeros(mi.Vector3f, 200))
     assert np.isfinite(np.array(nothing)).all()
+
+
+def test_light_that_hardly_arrives_has_terms_that_are_numbers(variant: str) -> None:
+    """Behind many surfels a ray's share is a denormal number, whose inverse is infinite: NaN in previews."""
+    for weight in (0.0, 1e-45, 1e-42, 1e-39, 1e-30, 1e-20, 1.0):
+        mean = weighed_mean(
+            mi.Vector3f(*(mi.Float(part * weight) for part in (0.5, 0.2, -0.3))), mi.Float(weight)
+        )
+        terms = terms_of_mean(mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0.6, -0.8), mean)
+        assert np.isfinite(np.array(terms)).all(), weight
+        assert np.linalg.norm(np.array(mean)) <= 1
+    np.testing.assert_allclose(np.array(mean).ravel(), [0.5, 0.2, -0.3], rtol=1e-6)

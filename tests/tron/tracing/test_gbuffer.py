@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import numpy as np
 import pytest
 
@@ -153,14 +152,11 @@ def test_edge_on_huge_and_tiny_surfels_stay_finite(disks):
     assert seen["opacity"].min() > 0.85  # the huge one fills the view
 
 
-def test_a_new_view_compiles_no_new_kernel(random_scene):
+def test_a_new_view_compiles_no_new_kernel(random_scene, kernels_of):
+    """Nor does its way to NumPy, whatever its size."""
     tracer = SurfelTracer(random_scene(60, sh_degree=0))
-    views = [Camera.look_at((2, y, 1), (0, 0, 0), fov_deg=40, width=16, height=12 + 8 * y) for y in (0, 1, 2)]
-    tracer.gbuffer(views[0])
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        for view in views[1:]:
-            tracer.gbuffer(view)
-        kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
-    assert kernels
-    assert all(entry["cache_hit"] for entry in kernels)
+    views = [Camera.look_at((2, y, 1), (0, 0, 0), fov_deg=40, width=17, height=13 + 8 * y) for y in (0, 1, 2)]
+    tracer.gbuffer(views[0]).numpy()
+    one, other = (kernels_of(lambda view=view: tracer.gbuffer(view).numpy()) for view in views[1:])
+    assert one
+    assert one == other

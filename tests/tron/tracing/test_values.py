@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -33,6 +35,15 @@ def test_a_material_given_as_values_comes_back_as_the_material(random_scene, sur
     np.testing.assert_allclose(seen["values"][..., 3], seen["roughness"], atol=1e-6)
     np.testing.assert_allclose(seen["values"][..., 4], seen["metallic"], atol=1e-6)
     assert (seen["opacity"] > 0.5).mean() > 0.3
+
+
+def test_each_number_of_values_is_recorded_by_itself(random_scene):
+    """Three of a scene of degrees 4 and 3, then four: Dr.Jit took one for the other."""
+    scene = random_scene(60)
+    scene = replace(scene, kernel_degree=4, sh=np.tile(scene.sh[:, :1], (1, 16, 1)))
+    tracer = SurfelTracer(scene)
+    for count in (3, 4, 3, 2, 5):
+        assert len(tracer.gbuffer(CAMERA, materials(scene)[:count]).values) == count
 
 
 def test_any_rays_see_the_values_that_camera_rays_see(random_scene):

@@ -14,7 +14,7 @@ from tron.gaussians.scene import GaussianScene
 from tron.shading.environments.environment import EnvironmentMap
 from tron.view.studio import Picture, Studio
 
-PATIENCE = 120
+PATIENCE = 300
 """Seconds to wait for a picture."""
 
 

@@ -6,16 +6,18 @@ import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from examples.stage import BALL
+from tron.apps.relight.camera_files import read_cameras
 from tron.apps.relight.settings import Settings as Relight
 from tron.cameras import Camera
 from tron.cli.recipes import check, compose_recipe
-from tron.editing import EditList, Material
+from tron.editing import EditList, Material, Separate
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.io.images import read_image
@@ -95,7 +97,11 @@ def shot(page: Any) -> np.ndarray:
 
 def drag(page: Any, number: int, by: int) -> None:
     """Move the thumb of a slider, counted from above."""
-    box = page.locator("[role=slider]").nth(number).bounding_box()
+    pull(page, page.locator("[role=slider]").nth(number).bounding_box(), by)
+
+
+def pull(page: Any, box: Any, by: int) -> None:
+    """Press the middle of a box and move sideways."""
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(x, y)
     page.mouse.down()
@@ -105,7 +111,7 @@ def drag(page: Any, number: int, by: int) -> None:
     page.mouse.up()
 
 
-TURN, STOPS, ROUGHNESS, METALLIC = range(4)
+TURN, STOPS, DIVIDER, ROUGHNESS, METALLIC = range(5)
 
 
 @pytest.mark.long
@@ -176,6 +182,112 @@ def test_what_is_saved_is_what_is_shown(window, page, tmp_path):
     assert page.complaints == []
 
 
+def dragged(page: Any, name: str, by: int) -> None:
+    """Drag an element of a class sideways."""
+    pull(page, page.locator(name).bounding_box(), by)
+    time.sleep(1)
+
+
+@pytest.mark.long
+def test_the_light_turns_by_dragging_its_picture(window, page, lights):
+    """Its picture moves with the hand, and is then that of the turned map."""
+    final(window)
+    page.wait_for_selector(".tron-panorama")
+    dragged(page, ".tron-panorama", -60)
+    wide, place = page.locator(".tron-panorama").evaluate(
+        "box => [box.clientWidth, parseFloat(box.style.backgroundPositionX)]"
+    )
+    turn = window.studio.wished.turn
+    assert turn == pytest.approx(360 * 60 / wide, abs=2)
+    assert place == pytest.approx(-60, abs=2)
+    columns = lights["east"].image.shape[1]
+    turned = lights["east"].rotated(360 * round(-place / wide * columns) / columns).baked().image
+    moved = np.roll(lights["east"].image, round(place / wide * columns), axis=1)
+    np.testing.assert_allclose(turned, moved, atol=1e-4)
+    assert page.complaints == []
+
+
+@pytest.mark.long
+def test_the_divider_is_dragged_and_goes(window, page):
+    alone = final(window)
+    page.get_by_text("Compare", exact=True).first.click()
+    page.get_by_role("combobox", name="Left side").click()
+    page.get_by_role("option", name="light: west").click()
+    page.wait_for_selector(".tron-divider")
+    wide = page.locator("canvas").first.bounding_box()["width"]
+    dragged(page, ".tron-divider", -40)
+    both, wish = final(window), window.studio.wished
+    assert (wish.left, wish.left_light) == ("light", "west")
+    assert wish.divider == pytest.approx(0.5 - 40 / wide, abs=0.02)
+    column = round(wish.divider * both.shape[1])
+    assert (both[:, column - 1 : column + 1] == 255).all()
+    change = np.abs(both.astype(int) - alone).mean((0, 2))
+    assert change[: column - 2].mean() > 4 * change[column + 2 :].mean()
+    page.get_by_role("combobox", name="Left side").click()
+    page.get_by_role("option", name="nothing").click()
+    np.testing.assert_array_equal(final(window), alone)
+    assert page.locator(".tron-divider").count() == 0
+    assert page.complaints == []
+
+
+@pytest.mark.long
+def test_a_camera_path_is_kept_played_and_filmed(window, page, tmp_path):
+    final(window)
+    page.get_by_text("Camera path", exact=True).first.click()
+    page.get_by_role("button", name="Keep this view").click()
+    time.sleep(0.5)
+    page.mouse.move(150, 500)
+    page.mouse.down()
+    for step in range(10):
+        page.mouse.move(150 + 8 * step, 500)
+        time.sleep(0.1)
+    page.mouse.up()
+    time.sleep(1)
+    page.get_by_role("button", name="Keep this view").click()
+    window._filming._seconds.value = 2.0
+    time.sleep(0.5)
+    path = window._filming.path()
+    assert len(path) == 48
+    assert np.linalg.norm(path[0].position - path[-1].position) > 0.1
+    (client,) = window._server.get_clients().values()
+    page.get_by_role("button", name="Play").click()
+    seen = []
+    for _ in range(40):
+        time.sleep(0.1)
+        seen.append(np.array(client.camera.position))
+    distances = np.linalg.norm(np.array(seen) - path[0].position, axis=1)
+    assert distances.min() < 0.1
+    np.testing.assert_allclose(client.camera.position, path[-1].position, atol=1e-3)
+    final(window)
+    page.get_by_text("Save", exact=True).first.click()
+    page.get_by_role("button", name="Film").click()
+    page.wait_for_selector("text=tron-relight scene=")
+    _, *words = shlex.split(window._saved.content.strip("`\n"))
+    film = check(compose_recipe("conf.relight", Relight, words), Relight)
+    assert film.cameras == tmp_path / "saved" / "path-001.json"
+    assert film.cameras is not None
+    cameras = read_cameras(film.cameras, *film.shaped().size)
+    assert len(cameras) == 48
+    np.testing.assert_allclose(cameras[20].world_to_camera, path[20].world_to_camera, atol=1e-6)
+    assert page.complaints == []
+
+
+def test_views_of_other_sizes_join_the_path(window, scene):
+    """Framed as the first: what is at the top and bottom edge stays there."""
+    first = Camera.around(scene, azimuth_deg=10, width=96, height=80)
+    other = Camera.around(scene, azimuth_deg=90, width=200, height=60)
+    window._filming.keep(first)
+    assert window._filming.path() == []
+    window._filming.keep(other)
+    path = window._filming.path()
+    assert {(each.width, each.height) for each in path} == {(96, 80)}
+    np.testing.assert_allclose(path[-1].position, other.position)
+    rows = [2 * np.arctan(each.height / 2 / each.fy) for each in (path[-1], other)]
+    assert rows[0] == pytest.approx(rows[1])
+    window._filming._step(SimpleNamespace(target=SimpleNamespace(value="Drop last"), client=None))
+    assert window._filming.path() == []
+
+
 @pytest.mark.usefixtures("page")
 @pytest.mark.long
 def test_a_broken_model_is_a_notice_and_the_server_goes_on(window):
@@ -187,6 +299,38 @@ def test_a_broken_model_is_a_notice_and_the_server_goes_on(window):
     window._insert()
     assert np.abs(final(window).astype(int) - picture).max() > 20
     assert len(window._numbers) == 4
+
+
+def test_clicks_and_shift_clicks_cut_an_object_out(window, scene):
+    """And the tools for objects have it: its list names it, and it is chosen."""
+    camera = Camera.around(scene.upright(), azimuth_deg=30, width=96, height=80)
+
+    def click(at: np.ndarray, shift: bool) -> None:
+        window._pick(SimpleNamespace(ray_origin=camera.position, ray_direction=at - camera.position), shift)
+
+    panel, ball = window._cutting, scene.means[scene.object_id == BALL]
+    click(ball.mean(0), False)
+    assert window._chosen == BALL, "clicks choose objects as long as they do not select"
+    panel._on.value = True
+    click(ball.mean(0), False)
+    assert window.studio.wished.marked.inside
+    assert "one of each" in panel._words.content
+    click(np.array([1.2, -1.2, 0]), True)
+    click(ball.mean(0), True)
+    assert panel._words.content == "That is inside already."
+    click(np.array([-1.2, 1.2, 0]), True)
+    panel._take_back()
+    assert len(window.studio.wished.marked.outside) > 0
+    assert "1 inside, 1 outside" in panel._words.content
+    panel._separate()
+    (edit,) = window.studio.wished.edits
+    assert isinstance(edit, Separate)
+    assert (edit.object, window._chosen) == (4, 4)
+    assert window.studio.wished.marked is None
+    cut = window.studio.ask(lambda stage: stage.session.scene.object_id == 4).result(60)
+    assert cut[scene.object_id == BALL].mean() > 0.95
+    window._undo()
+    assert window._numbers.keys() == {name for name in window._numbers if not name.startswith("4 ")}
 
 
 def test_a_port_in_use_is_said():

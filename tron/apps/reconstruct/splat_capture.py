@@ -23,7 +23,9 @@ from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.errors import TronError
-from tron.gaussians.foreign_files import PACKED_SPLATS, refuse_foreign
+from tron.gaussians.foreign_files import refuse_foreign
+from tron.gaussians.formats.registry import FORMATS
+from tron.gaussians.packed_files import PACKED_SPLATS
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
 from tron.seeds import generator
@@ -71,8 +73,8 @@ class SplatSettings(BaseModel):
 
 
 def is_splats(path: Path) -> bool:
-    """Whether a path is a file of splats by its name, packed ones included, which are refused when read."""
-    return path.is_file() and path.name.lower().endswith((".ply", ".ply.gz", *PACKED_SPLATS))
+    """Whether a path is a file of splats by its name, packed ones included."""
+    return path.is_file() and path.name.lower().endswith((".ply", ".ply.gz", *PACKED_SPLATS, *FORMATS))
 
 
 def film_splats(
@@ -90,7 +92,7 @@ def film_splats(
     those of the median hit where these views agree: they are fused, and rays walked to the surface.
 
     Args:
-        path: a 3DGS, 2DGS or TRON PLY.
+        path: a 3DGS, 2DGS or TRON PLY, or packed splats.
         settings: of the cameras.
         up: direction in the file's world; None: what the file says.
         test_every: each view of this distance is held out, from the first; 0 holds out none.
@@ -99,7 +101,7 @@ def film_splats(
         track: shows progress.
 
     Raises:
-        TronError: the file is packed, is no PLY of Gaussians or is damaged; no free place is inside.
+        TronError: the file holds no splats or is damaged; no free place is inside.
     """
     refuse_foreign(path)
     check_header(path)

@@ -1,6 +1,6 @@
 """Cameras that a scene was filmed with, paths between them, and paths from files.
 
-Files are TRON's own lists, those of 3DGS, transforms.json and nerfstudio's viewer's.
+Files are TRON's own lists, those of 3DGS, transforms.json and nerfstudio's viewer's, and others'.
 
 Either the cameras or the scene may have had its large coordinates taken away: :func:`in_frame_of`.
 """
@@ -18,6 +18,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tron.apps.camera_formats import (
+    UPRIGHT,
+    of_supersplat,
+    read_colmap,
+    read_gltf,
+    read_usd,
+    supersplat_document,
+)
 from tron.cameras import Camera, focus_of, opengl_to_opencv, rigid_pose
 from tron.errors import TronError, located
 from tron.io.local_frame import ORIGIN, moved_cameras
@@ -32,25 +40,26 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _MEND = (
-    'give a list, {"cameras": [...]} as in relight.json, cameras.json of a 3DGS model, a transforms.json, or '
-    "nerfstudio's camera_path.json"
+    'give a list, {"cameras": [...]} as in relight.json, cameras.json of a 3DGS model, a transforms.json, '
+    "nerfstudio's camera_path.json, SuperSplat's project, COLMAP's images.txt, or a .glb or .usda"
 )
 CAMERAS = "cameras.json"
 _AROUND_DEG = 60.0
 _KERNEL_DEG = 15.0
 
 
-def read_cameras(path: Path, width: int, height: int) -> list[Camera]:
-    """Cameras of a JSON file, resized.
+def read_cameras(path: Path, width: int, height: int, fps: float = 24.0) -> list[Camera]:
+    """Cameras of a file, resized.
 
-    The file is a list of cameras (Camera.to_dict), or an object with such a list as "cameras", as
+    A JSON is a list of cameras (Camera.to_dict), or an object with such a list as "cameras", as
     relight.json and the metadata of shards have it; the cameras.json of a 3DGS model; a transforms.json, in
     the world of its capture (:func:`cameras_of_transforms`); or nerfstudio's camera_path.json, whose world is
-    that of the scene that nerfstudio exports (`ns-export gaussian-splat`).
+    that of the scene that nerfstudio exports (`ns-export gaussian-splat`). Others are those of
+    :mod:`tron.apps.camera_formats`.
 
-    Raises TronError if the file is missing, is no such JSON, holds no camera, or has another aspect ratio.
+    Raises TronError if the file is missing, is no such file, holds no camera, or has another aspect ratio.
     """
-    cameras = cameras_of(path, (width, height))
+    cameras = cameras_of(path, (width, height), fps)
     for camera in cameras:
         if abs(camera.width * height - camera.height * width) > max(width, height):
             fit = frame_size((camera.width, camera.height), max(width, height))
@@ -68,14 +77,24 @@ def frame_size(shape: tuple[int, int], longer: int) -> tuple[int, int]:
     return width, height
 
 
-def cameras_of(path: Path, size: tuple[int, int] = (512, 512)) -> list[Camera]:
-    """Cameras of a JSON file (see :func:`read_cameras`) at their own size; TronError likewise.
+def cameras_of(path: Path, size: tuple[int, int] = (512, 512), fps: float = 24.0) -> list[Camera]:
+    """Cameras of a file (see :func:`read_cameras`) at their own size; TronError likewise.
 
     Args:
         path: the file.
         size: (width, height) in pixels of cameras that have none, as those of NeRF's transforms.json.
+        fps: frames a second that cameras which move are taken at.
     """
+    suffix = path.suffix.lower()
+    if suffix in UPRIGHT:
+        if not path.is_file():
+            raise TronError("cannot read: no such file", path)
+        return (read_gltf if suffix in (".glb", ".gltf") else read_usd)(path, size, fps)
+    if suffix == ".ssproj":
+        return of_supersplat(supersplat_document(path), size)
     refuse_by_sight(path, "cameras are a JSON file")
+    if suffix in (".txt", ".bin"):
+        return read_colmap(path)
     try:
         content = json.loads(path.read_text("utf-8"))
     except OSError as error:
@@ -84,6 +103,9 @@ def cameras_of(path: Path, size: tuple[int, int] = (512, 512)) -> list[Camera]:
         raise TronError(f"not JSON: {error}", path, _MEND) from error
     if isinstance(content, dict) and "frames" in content and "cameras" not in content:
         return cameras_of_transforms(path, size)
+    if isinstance(content, dict) and "poseSets" in content:
+        with located(path):
+            return of_supersplat(content, size)
     saved_by_viewer = isinstance(content, dict) and "camera_path" in content
     key = "camera_path" if saved_by_viewer else "cameras"
     entries = content.get(key) if isinstance(content, dict) else content
@@ -140,17 +162,19 @@ def in_frame_of(offset: np.ndarray, cameras: Sequence[Camera], path: Path) -> li
 
     A file that says its own ``offset``, as cameras.json and relight.json of a scene with one do, holds
     positions about it. One that says none holds coordinates of the map or of the local frame: whichever its
-    cameras are nearer to.
+    cameras are nearer to. Cameras of modellers are of the local frame.
 
     Args:
         offset: (3,) of the scene, zero where nothing was taken away from it.
         cameras: of the file.
-        path: the file, JSON.
+        path: the file.
 
     Raises:
         TronError: its offset is not three finite numbers.
     """
-    own = _stated_offset(path)
+    if path.suffix.lower() in UPRIGHT:
+        return list(cameras)
+    own = _stated_offset(path) if path.suffix.lower() == ".json" else None
     if own is None:
         middle = np.median([camera.position for camera in cameras], axis=0)
         own = np.zeros(3) if np.linalg.norm(middle - offset) < np.linalg.norm(middle) else offset

@@ -7,10 +7,10 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from tron.apps.relit import RelitPicture, surfels_alone
 from tron.cameras import Camera
 from tron.cli.progress import track, working
 from tron.color import LOOKS, from_agx
+from tron.editing.motion import LightNow
+from tron.editing.moving import MovingScene
+from tron.errors import TronError
 from tron.estimation import Estimation
 from tron.flow import surface_motion
 from tron.gaussians.scene import GaussianScene
@@ -30,6 +33,7 @@ from tron.shards.schema import GUIDANCE, displayed, surface_members
 from tron.storage import write_atomic
 
 if TYPE_CHECKING:
+    from tron.models.parts import Part
     from tron.neural.protocols import Renderer
     from tron.relighting import Illumination, Relighter
     from tron.relighting.ground import Ground
@@ -54,6 +58,8 @@ class Clip:
     Attributes:
         environment: the light, not turned.
         rotations: its turn in each frame, degrees.
+        lights: what else it is in each frame; None: itself.
+        others: maps that it may fade into, by their files.
         exposure: factor before AgX of buffers and of what networks draw: the light's.
         picture: how the relit picture is made.
         folder: the frames; claimed before anything is written.
@@ -72,23 +78,46 @@ class Clip:
     keeps_linear: bool = False
     chosen: float | None = None
     seconds: list[float] = field(default_factory=list)
-    _turned: tuple[float, Illumination] | None = None
-
-    @cached_property
-    def _lighting(self) -> Lighting:
-        """The environment, prepared when the first frame is traced."""
-        from tron.shading.lighting import Lighting
-
-        return Lighting(self.environment)
+    lights: Sequence[LightNow] | None = None
+    others: Mapping[Path, EnvironmentMap] = field(default_factory=dict)
+    _prepared: tuple[tuple[Any, ...], Lighting] | None = None
+    _baked: tuple[float, Lighting, Illumination] | None = None
 
     def light(self, relighter: Relighter, index: int) -> Illumination:
-        """The environment as frame ``index`` has it, baked where it has turned."""
-        rotation = self.rotations[index]
-        if self._turned is None or self._turned[0] != rotation:
-            baking = working("light that bounces, baked") if self._turned is None else nullcontext()
-            with baking:
-                self._turned = rotation, relighter.under(self._lighting.turned_to(rotation))
-        return self._turned[1]
+        """The environment as frame ``index`` has it, baked where it, or the scene, is another than before."""
+        rotation, lighting = self.rotations[index], self._lighting(index)
+        before = self._baked
+        if before is None or before[:2] != (rotation, lighting) or before[2].relighter is not relighter:
+            with working("light that bounces, baked") if before is None else nullcontext():
+                self._baked = rotation, lighting, relighter.under(lighting.turned_to(rotation))
+        assert self._baked is not None
+        return self._baked[2]
+
+    def _lighting(self, index: int) -> Lighting:
+        """The environment of frame ``index``, not turned, prepared where it is another than before."""
+        from tron.shading.lighting import Lighting
+
+        now = None if self.lights is None else self.lights[index]
+        key = () if now is None else (now.factor, now.maps)
+        if self._prepared is None or self._prepared[0] != key:
+            environment = self.environment if now is None else self._mixed(now)
+            self._prepared = key, Lighting(environment)
+        return self._prepared[1]
+
+    def first_exposure(self) -> float:
+        """That of the light of the first frame; of a black one, what it was."""
+        if self.lights is None:
+            return self.exposure
+        try:
+            return self._mixed(self.lights[0]).exposure()
+        except TronError:
+            return self.exposure
+
+    def _mixed(self, now: LightNow) -> EnvironmentMap:
+        maps = [(self.others[path] if path else self.environment, share) for path, share in now.maps]
+        height = max(each.image.shape[0] for each, _ in maps)
+        image = sum(np.float32(share * now.factor) * each.resized(height).image for each, share in maps)
+        return replace(self.environment, image=image)
 
     @cached_property
     def shown_exposure(self) -> float:
@@ -184,6 +213,9 @@ def trace(
     filmed: Sequence[Camera] | None = None,
     proxy_file: Path | None = None,
     ground: Ground | None = None,
+    moving: MovingScene | None = None,
+    times: Sequence[float] = (),
+    meshes: Sequence[Sequence[Part]] = (),
 ) -> None:
     """Trace the frames that are missing, and write the pictures of all.
 
@@ -197,21 +229,27 @@ def trace(
         proxy, filmed, proxy_file: whether light sees a proxy, cameras to film it, and where it is kept, as
             there.
         ground: what the scene stands on, as there.
+        moving: the scene's motion, if it has one, and the seconds of each frame.
+        meshes: models beside the surfels, as there.
     """
     from tron.relighting import Relighter
 
     bounces, rays = seeds.integer(seed, "relight", "bounces"), partial(track, label="where light bounces")
-    relighter = Relighter(
-        scene, estimation, bounces, backdrop=backdrop, track=rays,
-        proxy=proxy, cameras=filmed, proxy_file=proxy_file,
-        filming=partial(track, label="filming a proxy for light"), ground=ground,
-    )  # fmt: skip
+    with working("surfels of the models") if meshes else nullcontext():
+        relighter = Relighter(
+            scene, estimation, bounces, backdrop=backdrop, track=rays,
+            proxy=proxy, cameras=filmed, proxy_file=proxy_file,
+            filming=partial(track, label="filming a proxy for light"), ground=ground, meshes=meshes,
+        )  # fmt: skip
     for clip in clips:
         if lacking := clip.folder.lacking(len(cameras)):
             log.info("frames that have no %s yet are traced again", ", ".join(lacking))
     if not all(clip.folder.finished(index) for clip in clips for index in range(len(cameras))):
         relighter.prepare()
+    follow = None if moving is None else _Follow(relighter, moving)
     for index, camera in enumerate(track(cameras, "guidance")):
+        if follow and not all(clip.folder.finished(index) and clip.metered for clip in clips):
+            relighter = follow.to(times[index])
         surfaces = cache(partial(relighter.surface_maps, camera, estimation))  # alike under all lights
         for clip in clips:
             if not clip.folder.finished(index) or not clip.metered:
@@ -224,6 +262,27 @@ def trace(
                     log.info(METERED, clip.shown_exposure, clip.shown_exposure)
                 clip.folder.write(index, buffers)
             clip.write_pictures(index)
+
+
+class _Follow:
+    """The relighter of a scene that moves; from one time to another it shares what has not moved."""
+
+    def __init__(self, first: Relighter, moving: MovingScene) -> None:
+        self._first, self._moving, self._last, self._poses = first, moving, first, b""
+
+    def to(self, seconds: float) -> Relighter:
+        poses = self._moving.poses_at(seconds)
+        if poses != self._poses:
+            scene, proxy = self._moving.at(seconds), self._first.proxy
+            if proxy is not None:
+                proxy = replace(proxy, surfels=self._moving.follow(proxy.surfels, seconds))
+            meshes = self._first.meshes
+            if self._moving.meshes and meshes is not None:
+                meshes = meshes.moved(self._moving.meshes_at(seconds, len(meshes)))
+            stands = scene is self._moving.scene and not self._moving.meshes
+            self._last = self._first if stands else self._last.changed(scene, proxy=proxy, meshes=meshes)
+            self._poses = poses
+        return self._last
 
 
 def _shade(

@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import tron
+from tron.apps.camera_formats import UPRIGHT
+from tron.apps.capture_light import LIGHT, is_of_capture, over_scene
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.relight.camera_files import (
     CAMERAS,
@@ -37,9 +39,12 @@ from tron.apps.surroundings import treat_surroundings
 from tron.cameras import Camera
 from tron.cli.command_line import command
 from tron.cli.installation import require_extra
-from tron.cli.progress import working
+from tron.cli.progress import track, working
 from tron.cli.recipes import model_defaults
 from tron.denoising import require_oidn
+from tron.editing.models import PlacedModel, foot_of, read_model
+from tron.editing.motion import Motion
+from tron.editing.moving import in_motion
 from tron.errors import TronError, located
 from tron.framing import upright
 from tron.gaussians.foreign_files import refuse_foreign
@@ -51,7 +56,7 @@ from tron.neural.shipped import DEFAULT, SHIPPED, checkpoint_file
 from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
 from tron.shards.schema import GUIDANCE
 from tron.storage import locked, require_free_space, sha256, write_atomic
-from tron.trajectories import plan_cameras, turn_cameras
+from tron.trajectories import keyframed, plan_cameras, turn_cameras
 
 if TYPE_CHECKING:
     from tron.neural.protocols import Renderer
@@ -81,17 +86,30 @@ def main(settings: Settings) -> None:
     _check_paths(settings, settings.by_light())
     settings = settings.shaped()
     lights = settings.by_light()
-    given = None if settings.cameras is None else read_cameras(settings.cameras, *settings.size)
-    with working("reading the lights, the network and the scene"):
+    given = None if settings.cameras is None else read_cameras(settings.cameras, *settings.size, settings.fps)
+    if settings.trajectory == "keyframes":
+        if given is None:
+            raise TronError("trajectory=keyframes has none", mend="give cameras=FILE")
+        given = keyframed(given, settings.frames)
+    motion = None if settings.motion is None else _motion(settings.motion)
+    named = track(settings.meshes, "reading the models") if settings.meshes else ()
+    models = [read_model(each.file) for each in named]
+    with working("reading the lights and the network"):
         environments = [EnvironmentMap.load(light.light) for light in lights]
+        others = {} if motion is None else {path: EnvironmentMap.load(path) for path in motion.maps}
         activate(settings.variant, settings.threads)
         settings, renderer = chosen_network(settings)
         lights = settings.by_light()
+    with working("reading the scene"):
         scene = load_scene(settings.scene, settings.up, settings.materials)
     offset = scene.offset
     if given is not None and settings.cameras is not None:
         given = in_frame_of(offset, given, settings.cameras)
     turn = upright(scene.up)  # to +z, which is up in environment maps
+    environments = [
+        over_scene(each, light.light, settings.scene, turn) for light, each in zip(lights, environments)
+    ]
+    others = {path: over_scene(each, path, settings.scene, turn) for path, each in others.items()}
     scene = scene if np.allclose(turn, np.eye(3)) else scene.rotated(turn)
     with working("looking for surroundings"):
         surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
@@ -100,7 +118,8 @@ def main(settings: Settings) -> None:
     if scene.materials_guessed and settings.materials == "auto":
         scene = with_materials(scene, settings.scene, filmed, settings.seed, surrounded.backdrop, turn)
     if given is not None:
-        cameras = turn_cameras(given, turn)
+        upright_file = settings.cameras is not None and settings.cameras.suffix.lower() in UPRIGHT
+        cameras = given if upright_file else turn_cameras(given, turn)
     else:
         cameras = _planned(settings, surrounded.content, filmed)
     # Without a network the relit picture is one of them, and is shown as such; so is lit if nothing bounces.
@@ -109,6 +128,28 @@ def main(settings: Settings) -> None:
     averaged = averaged_frames_of(settings, len(cameras))
     network = describe_network(settings, renderer, len(cameras))
     clips = [_clip(*each, len(cameras), guidance, averaged > 1) for each in zip(lights, environments)]
+    ground = _ground(settings, surrounded.content, cameras, float(turn[2] @ offset))
+    placing = track(settings.meshes, "placing the models") if settings.meshes else ()
+    meshes = [
+        each.stood(parts, surrounded.content, turn, ground and ground.height)
+        for each, parts in zip(placing, models)
+    ]
+    times, moving = [index / settings.fps for index in range(len(cameras))], None
+    if motion is not None:
+        if offset.any():
+            log.info("coordinates of the motion are about %s", offset.tolist())
+        if motion.end > times[-1]:
+            log.info(
+                "the motion lasts %g s, the film %g s: frames=%d shows all of it",
+                motion.end, times[-1], math.ceil(motion.end * settings.fps) + 1,
+            )  # fmt: skip
+        with working("what moves"):
+            height, feet = ground and ground.height, [foot_of(parts, scene.up) for parts in meshes]
+            moving = in_motion(motion, scene, times[-1], turn, height, surrounded.backdrop, feet)
+        for clip in clips:
+            clip.lights, clip.others = [motion.light_at(time) for time in times], others
+            clip.exposure = clip.first_exposure()
+            clip.rotations = [a + b.rotation for a, b in zip(clip.rotations, clip.lights)]
     clock.lap("loading")
 
     pixels = len(clips) * len(cameras) * math.prod(settings.size)
@@ -121,7 +162,8 @@ def main(settings: Settings) -> None:
         traced |= {"filmed": filmed, "proxy_file": settings.scene.with_suffix(".proxy.ply")}
         if settings.proxy == "never":
             log.info("proxy=never: light sees the scan itself")
-        traced["ground"] = _ground(settings, surrounded.content, cameras, float(turn[2] @ offset))
+        traced["ground"] = ground
+        traced |= {"moving": moving, "times": times, "meshes": meshes}
         trace(scene, cameras, clips, **traced, backdrop=surrounded.backdrop)
         clock.lap("guidance")
         if renderer is not None:
@@ -140,6 +182,15 @@ def main(settings: Settings) -> None:
             write_atomic(light.output_dir / "relight.json", json.dumps(report, indent=1) + "\n")
             made = len(cameras), len(clip.seconds), light.output_dir / "relit.mp4"
             log.info("frames: %d, rendered now: %d; look at %s", *made)
+
+
+def _motion(path: Path) -> Motion:
+    """What moves; all that it names is there."""
+    motion = Motion.read(path)
+    for environment in motion.maps:
+        if not environment.is_file():
+            raise TronError("file not found", environment, f"{path} names it")
+    return motion
 
 
 def _ground(
@@ -164,6 +215,7 @@ def _planned(settings: Settings, scene: GaussianScene, filmed: list[Camera] | No
         "fov_deg": settings.fov,
         "distance": settings.distance,
     }
+    assert settings.trajectory != "keyframes"
     if filmed is None or settings.trajectory not in ("orbit", "still"):
         return plan_cameras(scene, settings.trajectory, settings.frames, **view)
     log.info("the orbit stays between the %d cameras of %s", len(filmed), settings.scene.with_name(CAMERAS))
@@ -191,12 +243,16 @@ def _check_paths(settings: Settings, lights: Sequence[Settings]) -> None:
     # The default checkpoint is no mistake where it is missing.
     asked = None if settings.takes_default else settings.checkpoint
     checkpoint = None if asked is None else checkpoint_file(asked)
-    for path in (settings.scene, *maps, settings.cameras, checkpoint, settings.vae):
+    models = [model.file for model in settings.meshes]
+    given = (settings.scene, *maps, *models, settings.cameras, settings.motion, checkpoint, settings.vae)
+    for path in given:
         if path is not None and not path.is_file():
             if path.is_dir():
                 refuse_by_sight(path, "this should be a file")
                 raise TronError("cannot read: is a folder", path, "give one file of it")
             names = f"checkpoints of the package are {', '.join(SHIPPED)}" if path == checkpoint else ""
+            if path.name == LIGHT:
+                names = "tron-reconstruct writes it beside its scene: the light of the capture"
             raise TronError("file not found", path, names)
     if settings.output_dir.exists() and not settings.output_dir.is_dir():
         raise TronError("output_dir is a file", settings.output_dir, "give a folder, which need not exist")
@@ -250,8 +306,19 @@ def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> 
         **light.model_dump(mode="json", include=keys),
         **light.estimation().model_dump(mode="json"),
         **({"denoise": light.denoise} if light.denoise == "oidn" else {}),  # else `filtered` says it
+        **({"turned_with_scene": True} if is_of_capture(light.light, light.scene) else {}),
+        **({} if light.motion is None else _motion_made_with(light.motion, light.fps)),
+        **({} if not light.meshes else {"meshes": [_mesh_made_with(each) for each in light.meshes]}),
         "version": tron.__version__,
     }
+
+
+def _motion_made_with(path: Path, fps: float) -> dict[str, Any]:
+    return {"motion_sha256": [sha256(each) for each in (path, *Motion.read(path).maps)], "fps": fps}
+
+
+def _mesh_made_with(model: PlacedModel) -> dict[str, Any]:
+    return model.model_dump(mode="json", exclude={"file"}) | {"sha256": sha256(model.file)}
 
 
 def _report(
@@ -323,8 +390,8 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
 
 
 def averaged_frames_of(settings: Settings, frames: int) -> int:
-    """Frames that each one is the mean of along its motion: 1 where the light turns, or nothing is drawn."""
-    turns = len(set(settings.rotations(frames))) > 1
+    """Frames that each one is the mean of along the camera's motion: 1 where anything else moves or turns."""
+    turns = len(set(settings.rotations(frames))) > 1 or settings.motion is not None
     return 1 if settings.checkpoint is None or turns else min(settings.reproject, frames)
 
 
@@ -380,6 +447,8 @@ cli = command(
         "tron-relight scene=surfels.ply environment=studio.hdr quality=final reflections=16 output_dir=out",
         "tron-relight scene=scan.ply environment=[dawn.hdr,night.hdr] output_dir=out",
         "tron-relight scene=surfels.ply environment=a.hdr trajectory=still rotation=[0,360] output_dir=out",
+        "tron-relight scene=surfels.ply environment=a.hdr 'meshes=[{file: cow.glb, at: [0,0,1]}]' "
+        "output_dir=out",
         "tron-relight scene=surfels.ply environment=a.hdr background=transparent output_dir=out",
         "tron-relight scene=surfels.ply environment=a.hdr checkpoint=renderer.safetensors output_dir=out",
         "tron-relight scene=surfels.ply environment=a.hdr checkpoint=paper overlap=newest "

@@ -53,7 +53,7 @@ def with_materials(
         log.info("materials are those of %s; materials=as_is leaves them out", kept)
     else:
         try:
-            require_extra("finding a scan's materials", "surfels")
+            require_extra("finding a scan's materials", "reconstruct")
         except TronError as error:
             log.warning(
                 "%s: they are guessed from its colours, which keep the light it was captured in", error

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from tron.apps.capture_light import LIGHT
 from tron.apps.machine import Variant
 from tron.apps.relight.camera_files import CAMERAS, cameras_of, frame_size
 from tron.apps.relit import Background
 from tron.apps.scene_file import Up
 from tron.apps.surroundings import DESCRIPTION, Treatment
 from tron.color import Look
+from tron.editing.models import PlacedModel
 from tron.errors import TronError
 from tron.estimation import FINAL, FINEST, PREVIEW, Estimation, Estimator, require_bounces
 from tron.neural.clips import Overlap
@@ -45,10 +47,11 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    scene: Path = Field(description="PLY of the scene: TRON's, or a plain 3DGS or 2DGS file")
+    scene: Path = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or packed splats")
     environment: Path | Annotated[tuple[Path, ...], Field(min_length=1)] = Field(
-        description="lat-long environment map, .hdr or .exr (.png and .jpg are clipped); of several, "
-        "[a.hdr,b.hdr], each has its own folder in output_dir, named after the file",
+        description="environment map, .hdr or .exr (.png and .jpg are clipped), or what else "
+        "tron-environment reads; capture: the light that the scene's photos were taken in, environment.exr "
+        "beside it; of several, [a.hdr,b.hdr], each has its own folder in output_dir, named after the file",
         examples=["[a.hdr,b.hdr]"],
     )
     output_dir: Path = Field(description="folder for frames, videos and relight.json")
@@ -81,15 +84,28 @@ class Settings(BaseModel):
         "turns it evenly over the clip, whose end is left out so that it loops: frame i of n is at 360 i/n",
         examples=["[0,360]"],
     )
-    trajectory: TrajectoryName = Field(
+    trajectory: TrajectoryName | Literal["keyframes"] = Field(
         "orbit",
-        description="camera path around the scene; still: no motion. Where cameras.json lies beside the "
+        description="camera path around the scene; still: no motion; keyframes: through those of "
+        "`cameras`. Where cameras.json lies beside the "
         "scene, orbit and still keep between its cameras",
     )
     cameras: Path | None = Field(
         None,
-        description="JSON to use instead of a trajectory: a list of cameras (as in relight.json), "
-        "cameras.json of a 3DGS model, a transforms.json, or nerfstudio's camera_path.json",
+        description="file to use instead of a trajectory: a list of cameras (as in relight.json), "
+        "cameras.json of a 3DGS model, a transforms.json, nerfstudio's camera_path.json, SuperSplat's "
+        ".ssproj, COLMAP's images.txt or .bin; .glb and .usd with a camera, moving or not, upright",
+    )
+    motion: Path | None = Field(
+        None,
+        description="YAML of what moves: keyframes of things and of the light, and objects that fall; see "
+        "docs/guides/editing.md",
+    )
+    meshes: tuple[PlacedModel, ...] = Field(
+        (),
+        description="models that stand in the scene as they are: they and the surfels shadow and light each "
+        "other (pip install 'tron-relight[models]'); tron-edit's insert makes surfels of a model instead",
+        examples=["[{file: cow.glb, at: [0,0,1], height: 0.5}]"],
     )
     quality: Literal["preview", "final"] = Field(
         "preview",
@@ -129,7 +145,12 @@ class Settings(BaseModel):
         "picture besides by Intel's Open Image Denoise, led by base color, in place of a network "
         "(pip install 'tron-relight[oidn]')",
     )
-    frames: int = Field(60, ge=1, le=10_000, description="number of frames (those of `cameras` win)")
+    frames: int = Field(
+        60,
+        ge=1,
+        le=10_000,
+        description="number of frames (those of `cameras` win, but for trajectory=keyframes)",
+    )
     width: Side | None = Field(
         None,
         description="pixels; null: in the shape of the cameras of `cameras`, or of cameras.json beside the "
@@ -194,6 +215,16 @@ class Settings(BaseModel):
     seed: int = Field(0, description="root of all random numbers")
     variant: Variant = "llvm_ad_rgb"
     threads: int | None = Field(None, ge=1, description="threads of renderer and network; null: all")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _finds_its_own_light(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or not isinstance(data.get("scene"), str | Path):
+            return data
+        own, given = str(Path(data["scene"]).with_name(LIGHT)), data.get("environment")
+        several = isinstance(given, list | tuple)
+        found = [own if str(each) == "capture" else each for each in (given if several else [given])]
+        return {**data, "environment": found if several else found[0]}
 
     @model_validator(mode="after")
     def _has_radiance(self) -> Settings:

@@ -9,7 +9,8 @@ from typing import Any
 
 from tron.captures.photos.photo_files import SUFFIXES
 from tron.errors import TronError
-from tron.gaussians.foreign_files import PACKED_SPLATS, VIDEOS, packed_splats
+from tron.gaussians.foreign_files import VIDEOS
+from tron.gaussians.packed_files import PACKED_SPLATS
 from tron.io.recognised import recognised
 
 _PHOTO = ("one photo", "give the folder of all photos of the scene")
@@ -70,9 +71,7 @@ def _kind(file: Path) -> tuple[str, str] | None:
     if suffix in VIDEOS:
         return "a video", f"give the file itself, capture={quote(str(file))}"
     if suffix in PACKED_SPLATS:
-        mend = (
-            f"they are a scene already, for tron-relight scene=FILE.ply: {packed_splats(file, suffix).mend}"
-        )
+        mend = f"they are a scene already: tron-relight scene={quote(file.name)}"
         return "packed splats, not photos", mend
     if suffix in _KINDS:
         return _KINDS[suffix]

@@ -8,6 +8,7 @@ do too, but ``transforms.json`` is written by tools that follow COLMAP.
 from __future__ import annotations
 
 import ctypes
+import os
 import signal
 from dataclasses import dataclass
 from functools import lru_cache
@@ -205,6 +206,11 @@ def load_pycolmap() -> Any:
     prints a native stack and kills the process with whatever is in hand. The action is saved and put back
     below Python, which may do so in its main thread only.
     """
+    if os.name == "nt":  # which has no such handlers
+        import pycolmap
+
+        pycolmap.logging.minloglevel = 3
+        return pycolmap
     system = ctypes.CDLL(None)
     action = ctypes.create_string_buffer(_ACTION_BYTES)
     system.sigaction(int(signal.SIGTERM), None, action)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
@@ -17,7 +18,8 @@ class ImageFolder:
 
     An image is sought where its name says, below ``root``. If it names a folder that is absent, such as
     ``images``, the largest reduced copy of it is taken: ``images_2``, else ``images_4`` and so on, as DL3DV
-    and nerfstudio ship them. A name without a suffix, or with another one than the file, is completed.
+    and nerfstudio ship them. A name without a suffix, or with another one than the file, is completed; so is
+    one in other case, or whose accents are composed otherwise (macOS), where one file alone is meant.
 
     Args:
         root: the capture's folder.
@@ -69,12 +71,18 @@ class ImageFolder:
         if path.parent not in self._stems:
             stems: dict[str, list[Path]] = {}
             for each in photos_in(path.parent):
-                stems.setdefault(each.stem, []).append(each)
-                stems.setdefault(each.name, []).append(each)
+                for name in {each.stem, each.name, _plain(each.stem), _plain(each.name)}:
+                    stems.setdefault(name, []).append(each)
             self._stems[path.parent] = stems
         stem = path.stem if path.suffix.lower() in SUFFIXES else path.name
-        same = self._stems[path.parent].get(stem, [])
-        return same[0] if len(same) == 1 else None
+        names = (name for each in (path.name, stem) for name in (each, _plain(each)))
+        found = (self._stems[path.parent].get(name, []) for name in names)
+        return next((same[0] for same in found if len(same) == 1), None)
+
+
+def _plain(name: str) -> str:
+    """A name as systems that heed neither case nor composition see it; NUL keeps it apart from others."""
+    return "\0" + unicodedata.normalize("NFC", name).casefold()
 
 
 def relative_parts(name: str) -> tuple[str, ...]:

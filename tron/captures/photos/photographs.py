@@ -186,6 +186,7 @@ class PosedPhotos:
         source: the file or folder, for messages.
         upright: the poses belong to photos turned as their EXIF tags say.
         names: of the views, in the order of photos; None names them after their images.
+        up: (3,) unit, that the format states; None: it is estimated from the cameras.
     """
 
     source: Path
@@ -196,3 +197,4 @@ class PosedPhotos:
     skipped: Mapping[str, str] = field(default_factory=dict)
     upright: bool = False
     names: Sequence[str] | None = None
+    up: np.ndarray | None = None

@@ -19,10 +19,11 @@ from scipy.spatial import KDTree
 from tron.captures import View
 from tron.captures.view import CLIPPED, FLOOR, ToneCurve, decoded, linear_light
 from tron.color import luminance
+from tron.framing import even_directions
 from tron.gaussians.fields import FIELDS
 from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
-from tron.reconstruction.geometry.seen_space import OPAQUE, even_directions, pixels_of
+from tron.reconstruction.geometry.seen_space import OPAQUE, pixels_of
 from tron.reconstruction.progress import Track, untracked
 from tron.tracing import SurfelTracer
 

@@ -25,6 +25,7 @@ from scipy.spatial import ConvexHull, KDTree
 from tron.captures import View
 from tron.captures.view import ToneCurve, encoded
 from tron.color import luminance
+from tron.framing import even_directions
 from tron.gaussians.harmonics import SH_C0, SH_COUNT
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.reconstruction.geometry.openings import (
@@ -35,7 +36,7 @@ from tron.reconstruction.geometry.openings import (
     towards,
     usual_luminance,
 )
-from tron.reconstruction.geometry.seen_space import even_directions, pixels_of
+from tron.reconstruction.geometry.seen_space import pixels_of
 from tron.reconstruction.progress import Track, untracked
 from tron.reconstruction.settings import Indoors
 from tron.runtime import lanes

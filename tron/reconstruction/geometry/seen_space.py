@@ -77,11 +77,3 @@ def pixels_of(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
         within = (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
         column, row = np.where(within[:, None], pixels, 0).astype(int).T
     return column, row, within
-
-
-def even_directions(count: int) -> np.ndarray:
-    """(count, 3) unit vectors on Fibonacci's spiral (Gonzalez 2010, Measurement of areas on a sphere)."""
-    i = np.arange(count) + 0.5
-    z, angle = 1 - 2 * i / count, i * np.pi * (3 - np.sqrt(5))
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), z], -1)

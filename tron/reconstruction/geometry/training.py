@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from cachetools import LRUCache
 from torch import Tensor
 
 from tron.captures import View
@@ -36,6 +37,9 @@ from tron.tracing.torch_bridge import render
 Background = Literal["black", "white", "random"]
 _PSNR_MEMORY = 0.98
 _EXPOSURES_FROM = 0.1
+# Of views, kept on a GPU, and no more than a quarter of what is free: what is read, checked and reduced for
+# each step on the host leaves it idle.
+_KEPT_ON_DEVICE = 8 << 30
 
 
 @dataclass(frozen=True)
@@ -195,6 +199,10 @@ class Stage:
             self.fused = FusedNormals(plan.consistency, kernel_degree)
         self._reduced: tuple[int, Sequence[View]] = (1, views)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
+        kept = 0
+        if torch.device(surfels.device).type == "cuda" and plan.window is None:
+            kept = min(_KEPT_ON_DEVICE, torch.cuda.mem_get_info()[0] // 4)
+        self._targets: LRUCache[View, dict[str, Tensor]] = LRUCache(kept, getsizeof=_n_bytes)
 
     def run(self, watch: Watch | None = None) -> None:
         """Take the steps that are left.
@@ -212,7 +220,7 @@ class Stage:
         began = time.perf_counter()
         plan, surfels, number = self.plan, self.surfels, self.step + 1
         view = self._view(self.step)
-        target = targets(view, plan.weights.wanted(), surfels.device)
+        target = self._target(view)
         if self.fused is not None:
             if self.step % self.fused.settings.every == 0 or self._resized():
                 self.fused.make(surfels, self.pictured())
@@ -270,6 +278,15 @@ class Stage:
             self._order = (epoch, order)
         view = self.pictured()[self._order[1][place]]
         return view if self.plan.window is None else self._window(view, self.plan.window, step)
+
+    def _target(self, view: View) -> dict[str, Tensor]:
+        """Its maps, those of recent steps as they were."""
+        found = self._targets.get(view)
+        if found is None:
+            found = targets(view, self.plan.weights.wanted(), self.surfels.device)
+            if _n_bytes(found) <= self._targets.maxsize:
+                self._targets[view] = found
+        return dict(found)
 
     def _window(self, view: View, side: int, step: int) -> View:
         sides = (view.camera.width, view.camera.height)
@@ -421,6 +438,10 @@ class DensityControl:
     def restore(self, stored: dict[str, Tensor], device: torch.device) -> None:
         """Inverse of :meth:`state`."""
         self.total, self.seen = (stored[f"density.{name}"].to(device) for name in ("total", "seen"))
+
+
+def _n_bytes(maps: dict[str, Tensor]) -> int:
+    return sum(values.nbytes for values in maps.values())
 
 
 def _tangents(quats: Tensor) -> tuple[Tensor, Tensor]:

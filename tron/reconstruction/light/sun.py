@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from tron.reconstruction.geometry.seen_space import even_directions
+from tron.framing import even_directions
 from tron.reconstruction.light.fit_pairs import Light, Points
 from tron.reconstruction.light.sky_visibility import visibility_towards
 from tron.seeds import generator

@@ -28,6 +28,7 @@ from tron.reconstruction.light.fit_environment import fit_environment
 from tron.reconstruction.materials.carried import Carried
 from tron.reconstruction.progress import Track, untracked
 from tron.reconstruction.settings import FitSettings
+from tron.relighting.proxy import Proxy
 from tron.shading.environments.environment import EnvironmentMap
 from tron.tracing import SurfelTracer
 
@@ -90,12 +91,14 @@ class Materials:
         light: None where :meth:`Prior.find_light` has to look for it.
         gains: (V, 3) linear exposure and white balance of the training photos over the mean photo's, where
             the prior finds them.
+        proxy: that they were found on; None: on the surfels themselves.
     """
 
     scene: GaussianScene
     learnt: tuple[str, ...] = ()
     light: Light | None = None
     gains: np.ndarray | None = None
+    proxy: Proxy | None = None
 
 
 class Prior(ABC):

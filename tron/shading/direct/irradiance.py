@@ -103,7 +103,7 @@ def irradiance(
     # Rays stand still where the surface is differentiated.
     normal = mi.Normal3f(dr.detach(gbuffer.normal))
     offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
-    origin = mi.Point3f(dr.detach(gbuffer.position)) + normal * offset
+    origin = gbuffer.raised(offset)
     surface, frame, pixel = dr.detach(gbuffer.opacity) > 0, mi.Frame3f(normal), gbuffer.pixel
     dr.eval(pixel, surface, frame, origin)
     lanes = dr.width(surface)

@@ -12,33 +12,27 @@ Between those samples radiance is bilinear in (u, v), and every integral below i
 
 from __future__ import annotations
 
-import logging
 from copy import copy
 from dataclasses import dataclass, replace
-from mimetypes import guess_type
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy import sparse
 
-from tron.color import luminance, srgb_to_linear
-from tron.errors import TronError, located, say_once
-from tron.io.images import read_image, write_image
+from tron.color import luminance
+from tron.errors import TronError
+from tron.io.images import write_image
 from tron.runtime import aligned
+from tron.shading.environments.lat_long import directions, resampled, row_integrals
+from tron.shading.environments.light_files import read_light
 
 PDF_WIDTH = 512
 """Widest grid, in cells, that directions are drawn from: finer maps are averaged down to it."""
 
 PDF_FLOOR = 0.01
 """Least density of a cell, relative to the mean: no direction is impossible, so lookups stay unbiased."""
-_RADIANCE, _DISPLAY = (".hdr", ".exr"), (".png", ".jpg", ".jpeg")
-_WIDTH_OFF = 2
-"""Columns that a width may be off twice the height: stitchers and croppers leave out one."""
-_NEGATIVE_SHARE = 0.05
-"""Largest share of all radiance that negative values may be: resampling and wide gamuts leave some behind."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +98,10 @@ class EnvironmentMap:
         """The same map turned by another ``degrees`` about +z (counter-clockwise seen from above)."""
         return replace(self, rotation_deg=(self.rotation_deg + degrees) % 360.0)
 
+    def turned(self, turn: np.ndarray) -> EnvironmentMap:
+        """The same light in a world that is turned by ``turn`` (3, 3): looked up anew, so a little softer."""
+        return EnvironmentMap(self.lookup(self.directions() @ np.asarray(turn, np.float64)))
+
     def resized(self, height: int, width: int | None = None) -> EnvironmentMap:
         """Area average over the new texels' solid angles; ``width`` is 2 ``height`` if not given.
 
@@ -137,16 +135,11 @@ class EnvironmentMap:
 
     def solid_angles(self) -> np.ndarray:
         """(H,) float64: integral over the sphere of one texel's bilinear weight; W times the sum is 4 pi."""
-        return _row_integrals(self.image.shape[0], np.sin) * (2 * np.pi / self.image.shape[1])
+        return row_integrals(self.image.shape[0], np.sin) * (2 * np.pi / self.image.shape[1])
 
     def directions(self) -> np.ndarray:
         """(H, W, 3) float64 unit directions that the samples of the image come from, before the rotation."""
-        height, width = self.image.shape[:2]
-        polar = np.arange(height)[:, None] * np.pi / (height - 1)
-        around = (np.arange(width) + 0.5)[None] * 2 * np.pi / width
-        across = np.sin(polar)
-        axes = np.broadcast_arrays(across * np.sin(around), across * np.cos(around), np.cos(polar))
-        return np.stack(axes, axis=-1)
+        return directions(*self.image.shape[:2])
 
     def mean(self) -> np.ndarray:
         """(3,) float64: mean radiance over the sphere."""
@@ -168,7 +161,7 @@ class EnvironmentMap:
 
     def unoccluded_upward(self) -> np.ndarray:
         """(3,) float64: radiance of a white diffuse plane facing +z with nothing in the way, E / pi."""
-        weights = _row_integrals(self.image.shape[0], lambda t: np.maximum(np.cos(t), 0) * np.sin(t))
+        weights = row_integrals(self.image.shape[0], lambda t: np.maximum(np.cos(t), 0) * np.sin(t))
         weights *= 2 / self.image.shape[1]
         return np.einsum("i,ijc->c", weights, self.image, dtype=np.float64)
 
@@ -316,133 +309,3 @@ def _check(image: np.ndarray, where: str | None) -> None:
             where,
             "clamp it to zero or above",
         )
-
-
-def _row_integrals(height: int, density: Any) -> np.ndarray:
-    """(H,) integral over theta in [0, pi] of each row's hat times ``density(theta)``, by Gauss-Legendre."""
-    node, weight = np.polynomial.legendre.leggauss(8)
-    node, weight = 0.5 * (node + 1), 0.5 * weight
-    step = np.pi / (height - 1)
-    # Each interval between rows is halved, so that the horizon, a kink of cosines, is always an end point.
-    total = np.zeros(height)
-    for half in (0.0, 0.5):
-        inner = half + 0.5 * node
-        theta = (np.arange(height - 1)[:, None] + inner) * step
-        value = density(theta) * weight * 0.5 * step
-        total[:-1] += (value * (1 - inner)).sum(1)
-        total[1:] += (value * inner).sum(1)
-    return total
-
-
-def read_light(path: Path) -> np.ndarray:
-    """(H, W, 3) float32, linear BT.709, of a lat-long picture of radiance, or of display values.
-
-    Mended, each with a line: infinite texels become the largest finite value, negative ones zero; a width
-    that is off by a column or two is resampled; display values are decoded, of which the line says that they
-    are clipped.
-
-    Raises:
-        TronError: missing or unreadable file, another suffix, NaN, nothing finite, or radiance of which more
-            than a twentieth is negative.
-    """
-    suffix = path.suffix.lower()
-    if suffix not in _RADIANCE + _DISPLAY:
-        is_video = (guess_type(path.name)[0] or "").startswith("video/")
-        kind = "a video" if is_video else path.suffix or "a file without suffix"
-        raise TronError(f"{kind} cannot hold an environment map", path, "give a lat-long .hdr or .exr")
-    image = read_image(path, channels=3)
-    notes = []
-    if suffix in _DISPLAY:
-        image = np.asarray(srgb_to_linear(image), np.float32)
-        notes.append(
-            "display values as a light: their range is clipped at 1, so suns and lamps are far too dark; "
-            "give an .hdr or .exr where there is one"
-        )
-    with located(path):
-        image, mended = _usable(image)
-    height, width = image.shape[:2]
-    if width != 2 * height and abs(width - 2 * height) <= _WIDTH_OFF and height >= 4:
-        image = resampled(image, (width + 1) // 2, (width + 1) // 2 * 2)
-        mended.append(f"{width} x {height} pixels are resampled to {image.shape[1]} x {image.shape[0]}")
-    for note in notes + mended:
-        say_once(__name__, f"{path}: {note}", logging.WARNING)
-    return image
-
-
-def _usable(image: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Finite radiance that is not negative, and what was done to it."""
-    texels = image.shape[0] * image.shape[1]
-    if unknown := int(np.isnan(image).any(-1).sum()):
-        raise TronError(f"{unknown} of {texels} texels are NaN", mend="repair the file: render it again")
-    notes = []
-    if infinite := int(np.isposinf(image).any(-1).sum()):
-        finite = image[np.isfinite(image)]
-        if not (finite > 0).any():
-            raise TronError("environment map holds no finite radiance", mend="store it in 32 bits")
-        image = np.where(np.isposinf(image), finite.max(), image)
-        notes.append(
-            f"{infinite} of {texels} texels are infinite and are given the largest finite value, "
-            f"{finite.max():.6g}: what they had more is lost"
-        )
-    if negative := int((image < 0).any(-1).sum()):
-        least, share = float(image.min()), float(-np.minimum(image, 0).sum(dtype=np.float64))
-        share /= max(float(np.abs(image).sum(dtype=np.float64)), 1e-300)
-        if not share <= _NEGATIVE_SHARE:
-            raise TronError(
-                f"environment map holds negative radiance (down to {least:.3g})",
-                mend="clamp it to zero or above, or store its colours in BT.709",
-            )
-        image = np.maximum(image, 0)
-        notes.append(f"{negative} of {texels} texels are negative (down to {least:.3g}) and are set to zero")
-    return image, notes
-
-
-def resampled(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """(height, width, 3) float32, not negative, of (H, W, 3); rows stand on the poles before and after.
-
-    Lights do not move, and a constant stays constant.
-    """
-    rows = _row_average(image.shape[0], height)
-    columns = _column_average(image.shape[1], width)
-    wide = np.asarray(image, np.float64)
-    wide = (rows @ wide.reshape(len(wide), -1)).reshape(height, -1, 3)
-    wide = (columns @ wide.transpose(1, 0, 2).reshape(wide.shape[1], -1)).reshape(width, height, 3)
-    return np.maximum(wide.transpose(1, 0, 2), 0).astype(np.float32)
-
-
-def _average(edges: np.ndarray, size: int, offset: float, density: Any) -> sparse.csr_matrix:
-    """Rows are the averages of a hat basis over [edges[i], edges[i + 1]], weighted by ``density``.
-
-    Basis function j has its peak at ``offset`` + j, in source texels; ``edges`` are in source texels too.
-    Indices wrap around modulo ``size``.
-    """
-    lower, upper = edges[:-1], edges[1:]
-    pieces = int(np.ceil((upper - lower).max())) + 1
-    node, weight = np.polynomial.legendre.leggauss(4)
-    row, column, value = [], [], []
-    for k in range(pieces):
-        # Piece k of a cell lies between two neighbouring peaks, where the hats are linear.
-        start = np.floor(lower - offset) + offset + k
-        a, b = np.clip(start, lower, upper), np.clip(start + 1, lower, upper)
-        x = a[:, None] + (b - a)[:, None] * 0.5 * (node + 1)
-        w = density(x) * weight * (b - a)[:, None]
-        left = np.floor(start - offset + 0.5).astype(int)
-        part = x - start[:, None]
-        for shift, share in ((0, (w * (1 - part)).sum(1)), (1, (w * part).sum(1))):
-            row.append(np.arange(len(lower)))
-            column.append((left + shift) % size)
-            value.append(share)
-    shape = (len(lower), size)
-    entries = np.concatenate(value), (np.concatenate(row), np.concatenate(column))
-    matrix = sparse.coo_matrix(entries, shape).tocsr()
-    return sparse.diags(1 / np.asarray(matrix.sum(1)).ravel()) @ matrix
-
-
-def _row_average(source: int, target: int) -> sparse.csr_matrix:
-    ratio = (source - 1) / (target - 1)
-    edges = np.clip(np.arange(target + 1) - 0.5, 0, target - 1) * ratio
-    return _average(edges, source, 0.0, lambda y: np.sin(y * np.pi / (source - 1)))
-
-
-def _column_average(source: int, target: int) -> sparse.csr_matrix:
-    return _average(np.arange(target + 1) * (source / target), source, 0.5, np.ones_like)

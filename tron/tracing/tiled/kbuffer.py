@@ -37,7 +37,7 @@ class _Nearest:
     Attributes:
         t, alpha: K of mi.Float; index: K of mi.UInt32, the scene's ids.
         nearest, last: t and id of the last hit composited; nearest is a list of one, as walks have it.
-        farthest: t of the last slot, a list of one.
+        farthest: t beyond which nothing is kept, a list of one: of the last slot, or where the ray ends.
     """
 
     t: list[mi.Float]
@@ -77,7 +77,7 @@ def _insert(kept: _Nearest, hit: SurfelHit, index: mi.UInt32, active: mi.Bool) -
                 dr.select(nearer, index_, index),
                 dr.select(nearer, alpha_, alpha),
             )
-        kept.farthest[0] = kept.t[K - 1]
+        kept.farthest[0] = dr.select(kept.t[K - 1] < kept.farthest[0], kept.t[K - 1], kept.farthest[0])
     return kept
 
 
@@ -94,9 +94,13 @@ def search_hierarchy(bvh: Bvh, origin: mi.Point3f, direction: mi.Vector3f) -> Se
 @dr.syntax
 def search_list(
     records: SurfelRecords, entries: mi.UInt32, near: mi.Float, start: mi.UInt32, count: mi.UInt32,
-    origin: mi.Point3f, direction: mi.Vector3f, kept: _Nearest, active: mi.Bool,
+    origin: mi.Point3f, direction: mi.Vector3f, limit: mi.Float, kept: _Nearest, active: mi.Bool,
 ) -> _Nearest:  # fmt: skip
-    """Look for hits of camera rays in their tiles' lists (all but the last two as in ``hits.collect``)."""
+    """Look for hits of camera rays in their tiles' lists, up to the distance ``limit`` of each ray.
+
+    Arguments before it as in ``hits.collect``.
+    """
+    kept.farthest[0] = mi.Float(limit)
     cursor, end = mi.UInt32(start), start + count
     going = active & (cursor < end)
     while going:

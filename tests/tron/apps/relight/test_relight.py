@@ -213,7 +213,7 @@ def test_each_part_of_a_run_names_itself_as_it_begins(relight, scene_path, light
     with caplog.at_level(logging.INFO, "tron.cli.progress"):
         arguments = (f"scene={scene_path}", f"environment={light_path}", "frames=3", "checkpoint=null")
         assert relight(*arguments, f"output_dir={tmp_path}") == 0
-    begun = ["reading the lights, the network and the scene", "where light bounces: 0 of 8"]
+    begun = ["reading the lights and the network", "reading the scene", "where light bounces: 0 of 8"]
     begun += ["guidance: 0 of 3", "light that bounces, baked", "videos and contact sheets"]
     assert [line for line in caplog.messages if line in begun] == begun
     assert not [line for line in caplog.messages if line.endswith("0:00 left")]
@@ -397,3 +397,33 @@ def test_mistakes_are_one_line_and_leave_nothing(
     assert error.startswith("tron-relight: ")
     assert "\n" not in error
     assert not (tmp_path / "out").exists()
+
+
+def test_the_captures_own_light_stands_as_the_scene_does(
+    relight, ball_on_floor, light_path, tmp_path, capsys
+):
+    """environment=capture of a scene whose up is y, beside the map of its world: as if both were z up."""
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # z to y
+    folder, light = tmp_path / "capture", EnvironmentMap.load(light_path).resized(128)
+    folder.mkdir()
+    ball_on_floor().rotated(turn).save(folder / "scene.ply")
+    ball_on_floor().save(tmp_path / "upright.ply")
+    light.save(tmp_path / "light.exr")
+    given = [f"scene={folder / 'scene.ply'}", "environment=capture", "up=[0,1,0]", "frames=1", "exposure=1"]
+    shot = ["buffers=[lit]", "background=[0,0,0]", "checkpoint=null"]
+    assert relight(*given, *shot, f"output_dir={tmp_path / 'out'}") == 2
+    assert "tron-reconstruct writes it beside its scene" in capsys.readouterr().err
+    light.turned(turn).save(folder / "environment.exr")
+    assert relight(*given, *shot, f"output_dir={tmp_path / 'out'}") == 0
+    given[:3] = [f"scene={tmp_path / 'upright.ply'}", f"environment={tmp_path / 'light.exr'}"]
+    assert relight(*given, *shot, f"output_dir={tmp_path / 'plain'}") == 0
+    lit = [read_image(tmp_path / name / "frames" / "0000.lit.exr") for name in ("out", "plain")]
+    # By another path it is the same file.
+    given[:2] = [
+        f"scene={folder / 'scene.ply'}",
+        f"environment={folder / '..' / 'capture' / 'environment.exr'}",
+    ]
+    assert relight(*given, "up=[0,1,0]", *shot, f"output_dir={tmp_path / 'again'}") == 0
+    np.testing.assert_allclose(read_image(tmp_path / "again" / "frames" / "0000.lit.exr"), lit[0], rtol=0.05)
+    shown = [to_display(each, 0.3) for each in lit]
+    assert -10 * np.log10(np.square(shown[0] - shown[1]).mean()) > 33

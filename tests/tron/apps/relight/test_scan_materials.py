@@ -100,4 +100,4 @@ def test_where_none_can_be_told_the_scan_is_as_it_is(asked, plain, tmp_path, mon
 def test_without_the_libraries_of_the_fit_the_scan_is_as_it_is(plain, tmp_path, monkeypatch, variant, caplog):
     monkeypatch.setattr("tron.cli.installation.missing_libraries", lambda extra: ["torch"])
     assert with_materials(plain, tmp_path / "scan.ply", None, 0) is plain
-    assert "needs torch: pip install 'tron-relight[surfels]'" in caplog.text
+    assert "needs torch: pip install 'tron-relight[reconstruct]'" in caplog.text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import mitsuba as mi
@@ -13,10 +14,13 @@ from tron.captures import Capture
 from tron.color import linear_to_srgb, srgb_to_linear
 from tron.gaussians.harmonics import dc_to_rgb, rgb_to_dc
 from tron.gaussians.scene import GaussianScene
-from tron.reconstruction.film import film_of_scan
+from tron.reconstruction.film import film, film_of_scan
 from tron.reconstruction.light.surfel_colors import SurfelColors
 from tron.reconstruction.materials.carried import Carried, carry, carry_materials
-from tron.reconstruction.materials.joint_fit import JointFit, JointSettings
+from tron.reconstruction.materials.joint_fit import JointFit, JointSettings, fit_jointly
+from tron.reconstruction.priors.joint import Joint
+from tron.reconstruction.priors.prior import Surfels
+from tron.reconstruction.progress import untracked
 from tron.relighting import proxy
 from tron.seeds import generator
 from tron.shading.environments.environment import EnvironmentMap
@@ -86,7 +90,12 @@ def test_a_known_shade_is_divided_out_and_all_else_stays(painted: GaussianScene)
     found = carry(scan, fit_of(flat, (painted.base_color * shade).astype(np.float32)), "srgb")
     for name in KEPT:
         np.testing.assert_array_equal(getattr(found, name), getattr(scan, name), err_msg=name)
-    np.testing.assert_allclose(found.base_color, np.tile(mottled, (LAYERS, 1)), rtol=1e-3, atol=1e-4)
+    # Shade is averaged over a spacing, so that the edge of a shadow is as wide.
+    far = np.abs(scan.means[:, 0]) > 5 * SPACING
+    np.testing.assert_allclose(
+        found.base_color[far], np.tile(mottled, (LAYERS, 1))[far], rtol=2e-3, atol=1e-4
+    )
+    assert far.mean() > 0.5
     np.testing.assert_array_equal(found.roughness, np.tile(flat.roughness, LAYERS))
     np.testing.assert_array_equal(found.metallic, np.tile(flat.metallic, LAYERS))
     assert not found.materials_guessed
@@ -144,7 +153,7 @@ class Scanned:
 
 
 @pytest.fixture(scope="module")
-def scanned(variant: str, dense_surfels, painted: GaussianScene) -> Scanned:
+def lit(variant: str, dense_surfels, painted: GaussianScene) -> GaussianScene:
     """A lamp and a dim blue sky, path-traced, as a camera shows it that balances white and meters grey.
 
     Of what it sees three tenths are the scene, of albedo 0.31, the rest of 0.25: 0.67 of that is 0.18.
@@ -153,12 +162,22 @@ def scanned(variant: str, dense_surfels, painted: GaussianScene) -> Scanned:
     image[4:8, 10:16] = (14.0, 10.0, 7.0)
     received = path_traced(dense_surfels, painted, EnvironmentMap(image))
     received *= 0.67 / received.mean(0)
-    scan = layered(with_colors(painted, painted.base_color * received))
-    capture = film_of_scan(scan, film_around(scan, 32, 96))
+    return with_colors(painted, painted.base_color * received)
+
+
+@pytest.fixture(scope="module")
+def small_film() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {"VIEWS": 32, "SIDE": 96}.items():
             patch.setattr(proxy, name, value)
-        found = carry_materials(capture, JointSettings(), 0)
+        yield
+
+
+@pytest.fixture(scope="module")
+def scanned(small_film: None, painted: GaussianScene, lit: GaussianScene) -> Scanned:
+    scan = layered(lit)
+    capture = film_of_scan(scan, film_around(scan, 32, 96))
+    found = carry_materials(capture, JointSettings(), 0)
     assert found is not None
     return Scanned(capture, np.tile(painted.base_color, (LAYERS, 1)), found)
 
@@ -192,3 +211,25 @@ def test_the_light_that_was_found_shows_the_scan_as_it_was(scanned: Scanned) -> 
     """Were materials and light not of one kind, their picture would not be the scan's."""
     assert scanned.found.explained > 22
     assert scanned.found.said()["explained_psnr"] == pytest.approx(scanned.found.explained, abs=0.01)
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("small_film")
+def test_photos_give_surfels_whose_normals_wander_the_paint_that_they_show(
+    painted: GaussianScene, lit: GaussianScene
+) -> None:
+    """Beside the fit on the surfels themselves, which takes each tilt for light."""
+    quats = lit.quats + 0.15 * generator(0, "tests", "wander").normal(size=lit.quats.shape)
+    learnt = replace(lit, quats=quats / np.linalg.norm(quats, axis=1, keepdims=True))
+    cameras = film_around(learnt, 32, 96)
+    photos = Capture(tuple(film(lit, cameras)), up=lit.up)
+    found = Joint().find_materials(Surfels(photos, learnt, lambda names: learnt, 0, untracked))
+    themselves = fit_jointly(photos, learnt, Joint(), 0)
+    assert found.proxy is not None
+    seen = themselves.colors.seen
+    ours, theirs = (
+        quality(each.base_color[seen], painted.base_color[seen]) for each in (found.scene, themselves.scene)
+    )
+    assert ours > theirs + 1, (ours, theirs)
+    for name in KEPT:
+        np.testing.assert_array_equal(getattr(found.scene, name), getattr(learnt, name), err_msg=name)

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tron import seeds
+from tron.cameras import Camera
 from tron.errors import TronError
 from tron.gaussians.edit import moved
 from tron.tracing import SurfelTracer, reference
@@ -110,6 +111,30 @@ def test_a_tenth_of_the_surfels_may_move_every_frame_without_a_new_hierarchy(
     assert not calls
     assert np.abs(shadows(current, origins, directions) - before).max() > 0.1
     np.testing.assert_array_equal(shadows(tracer, origins, directions), before)
+
+
+@pytest.mark.parametrize(
+    ("change", "kept"),
+    [
+        ({"base_color": 0.25, "roughness": 0.5}, True),
+        ({"sh": 0.125}, True),
+        ({"opacity_logits": 2.0}, False),
+        ({"log_scales": -3.5}, False),
+    ],
+)
+def test_where_places_stay_so_does_the_hierarchy_and_all_is_seen_as_by_a_new_tracer(
+    random_scene, change, kept
+):
+    scene = random_scene(400)
+    tracer = SurfelTracer(scene)
+    values = {name: np.full_like(getattr(scene, name), value) for name, value in change.items()}
+    other = dataclasses.replace(scene, **values)
+    now, anew = tracer.moved(other), SurfelTracer(other)
+    assert (now.bvh is tracer.bvh) == kept
+    camera = Camera.look_at((0.5, -2.0, 0.5), (0.5, 0.5, 0.5), fov_deg=40, width=24, height=24)
+    seen, expected = now.gbuffer(camera).numpy(), anew.gbuffer(camera).numpy()
+    for name in ("rgb", "base_color", "roughness", "opacity", "depth"):
+        np.testing.assert_array_equal(seen[name], expected[name])
 
 
 def test_a_hierarchy_gone_loose_is_built_anew(random_scene, monkeypatch):

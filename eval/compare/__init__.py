@@ -1,0 +1,1 @@
+"""Benchmark `compare`: folders of pictures, ours and anyone's, judged alike on a suite."""

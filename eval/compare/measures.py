@@ -1,0 +1,38 @@
+"""Figures that methods are compared by, as rows and tables name them."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+from eval.relighting.scores import METRICS
+
+
+class Measure(NamedTuple):
+    """A figure of a relit picture, in rows and tables.
+
+    Attributes:
+        name, unit, title: as of :class:`eval.relighting.scores.Metric`.
+        better: the good side.
+    """
+
+    name: str
+    unit: str
+    title: str
+    better: Literal["more", "less"]
+
+
+MEASURES = (
+    *(Measure(each.name, each.unit, each.title, "more") for each in METRICS),
+    Measure("lpips", "1", "LPIPS ↓", "less"),
+    Measure("flip", "1", "FLIP ↓", "less"),
+    Measure("hdr_flip", "1", "HDR-FLIP ↓", "less"),
+)
+MAP_MEASURES = (
+    Measure("albedo_psnr", "dB", "albedo, a factor a view and channel (TRON) ↑", "more"),
+    Measure("albedo_psnr_median", "dB", "albedo, a median ratio a scene and channel (TensoIR) ↑", "more"),
+    Measure("albedo_psnr_unscaled", "dB", "albedo as it is ↑", "more"),
+    Measure("albedo_ssim", "1", "albedo SSIM, a factor a view ↑", "more"),
+    Measure("albedo_lpips", "1", "albedo LPIPS of sRGB, a factor a view ↓", "less"),
+    Measure("normal_mae_deg", "deg", "normals, mean error ↓", "less"),
+    Measure("normal_median_deg", "deg", "normals, median error ↓", "less"),
+)

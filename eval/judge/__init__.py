@@ -1,0 +1,1 @@
+"""Benchmark `judge`: a vision model chooses the more photorealistic of two pictures."""

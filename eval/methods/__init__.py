@@ -1,0 +1,1 @@
+"""Methods that write folders of the protocol, one a file."""

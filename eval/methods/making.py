@@ -1,0 +1,39 @@
+"""What all methods that run here are told: `tron-eval method=NAME suite=DIR output_dir=METHODS`.
+
+``conf/eval/method/NAME.yaml`` names the class by ``_target_``. A method writes folders that benchmark=compare
+judges like anyone's.
+"""
+
+from __future__ import annotations
+
+import abc
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from eval.protocol.suite import Suite
+from tron.errors import TronError
+
+
+class Making(BaseModel, abc.ABC):
+    """A method, or several that share what is dear."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    suite: Path | None = Field(description="folder that tron-eval export=SUITE wrote")
+    seed: int = 0
+
+    def read_suite(self) -> Suite:
+        """The suite; TronError where there is none."""
+        if self.suite is None:
+            raise TronError("no suite", mend="give suite=DIR, written by tron-eval export=SUITE")
+        return Suite.load(self.suite)
+
+    @abc.abstractmethod
+    def make(self, output_dir: Path) -> list[Path]:
+        """Write the methods' folders below ``output_dir``, and return them; what is finished is kept.
+
+        Raises:
+            TronError: an input is missing or is not what it should be.
+            StageFailed: a command that it runs failed.
+        """

@@ -1,0 +1,175 @@
+"""tron-export: a scene as a file for other programs."""
+
+from __future__ import annotations
+
+import logging
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from tron.apps.camera_formats import UPRIGHT, check_camera_file, write_camera_file
+from tron.apps.machine import Threads, Variant
+from tron.apps.relight.camera_files import cameras_of, filmed_with, in_frame_of
+from tron.apps.scene_file import Up, check_output, check_scene_files, load_scene
+from tron.apps.surroundings import treat_surroundings
+from tron.cli.command_line import ANEW, command
+from tron.cli.installation import loading
+from tron.cli.progress import track, working
+from tron.errors import TronError
+from tron.framing import upright
+from tron.gaussians.edit import KERNEL_WIDTHS
+from tron.gaussians.scene import GaussianScene
+from tron.gaussians.splat_files import SUFFIXES, check_suffix, write_points, write_splats
+from tron.io.local_frame import moved_cameras
+from tron.runtime import activate
+from tron.trajectories import turn_cameras
+
+log = logging.getLogger(__name__)
+
+MESHES = (".glb", ".usdz")
+POINTS = (".ply",)
+Kind = Literal["mesh", "splats", "points"]
+
+
+class Settings(BaseModel):
+    """Everything that tron-export can be told."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    scene: Path = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats")
+    output: Path = Field(
+        description=f"file to write, or to replace, not the scene's own; its name says the format: "
+        f"{', '.join(MESHES)}, a mesh with textures; {', '.join(SUFFIXES)}, splats; .ply, points too"
+    )
+    kind: Kind | None = Field(None, description="null: a mesh in .glb and .usdz, splats in all others")
+    cameras: Path | None = Field(
+        None,
+        description="cameras to write instead of the scene, as tron-relight takes them: cameras.json beside "
+        "it, relight.json; output is then transforms.json, cameras.json (3DGS'), camera_path.json "
+        "(nerfstudio's), images.txt (COLMAP's), or a .glb or .usda with one camera that moves, upright",
+    )
+    fps: float = Field(24.0, gt=0, le=240, description="frames a second of cameras that move")
+    triangles: int = Field(60_000, ge=100, le=5_000_000, description="of a mesh, at most")
+    texture: int = Field(2048, ge=64, le=8192, description="pixels of a side of a mesh's textures")
+    up: Up = None
+    variant: Variant = "llvm_ad_rgb"
+    threads: Threads = None
+
+
+def main(settings: Settings) -> None:
+    """Write a scene in a format of other programs.
+
+    .glb and .usdz are a mesh with textures of base color, roughness and metallic, for Blender, engines and
+    web viewers, which light it anew. Its surface is fused from what views around the scene see, or the views
+    of cameras.json beside it.
+
+    The other formats are splats in the colours that they were captured with. .ply is 3DGS' own, which every
+    viewer of splats and every converter reads; .spz (Niantic), .sog (PlayCanvas) and .splat are 5 to 20 times
+    smaller and round what they hold; .splat has no colours that change with the view. .usd, .usda and .usdc
+    are USD's particle fields, and so is .usdz with kind=splats; .glb with kind=splats is glTF's
+    KHR_gaussian_splatting. Splats are flat, as TRON's surfels are; glTF and USD stand y up, the others in the
+    scene's own frame. None of these formats has materials.
+
+    kind=points writes a .ply of points with normals and colours, where the photos' map has them.
+
+    tron-bake writes splats with another light in the colours. The file is written whole, at the end: a
+    command that is ended before leaves none, and begins anew.
+    """
+    if settings.cameras is not None:
+        _write_cameras(settings, settings.cameras)
+        return
+    check_suffix(settings.output)
+    suffix = settings.output.suffix.lower()
+    kind = settings.kind or ("mesh" if suffix in MESHES else "splats")
+    fitting = {"mesh": MESHES, "splats": SUFFIXES, "points": POINTS}[kind]
+    if suffix not in fitting:
+        raise TronError(f"{suffix} holds no {kind}", settings.output, f"{kind}: {', '.join(fitting)}")
+    check_scene_files(settings.scene, settings.output)
+    {"mesh": _write_mesh, "splats": _write_splats, "points": _write_points}[kind](settings)
+
+
+def _write_cameras(settings: Settings, file: Path) -> None:
+    check_camera_file(settings.output)
+    check_scene_files(settings.scene, settings.output, file)
+    check_output(settings.output, file, "the file of cameras")
+    cameras = cameras_of(file, fps=settings.fps)
+    with working("reading the scene"):
+        scene = load_scene(settings.scene, settings.up, "as_is")
+    cameras = in_frame_of(scene.offset, cameras, file)
+    stands, wanted = (path.suffix.lower() in UPRIGHT for path in (file, settings.output))
+    if stands != wanted:
+        turn = upright(scene.up)
+        cameras = turn_cameras(cameras, turn if wanted else turn.T)
+    if not wanted:
+        cameras = moved_cameras(cameras, scene.offset)
+    write_camera_file(settings.output, cameras, settings.fps)
+    log.info("%d cameras: %s", len(cameras), settings.output)
+
+
+def _write_splats(settings: Settings) -> None:
+    with working("reading the scene"):
+        scene = GaussianScene.load(settings.scene)
+    if scene.kernel_degree != 2:
+        log.info(
+            "splats of other programs fade more slowly: they are made %.1f times as wide, and edges soften",
+            KERNEL_WIDTHS,
+        )  # fmt: skip
+    with working("writing"):
+        write_splats(settings.output, scene)
+    _log_written(settings, f"{len(scene)} splats")
+
+
+def _write_points(settings: Settings) -> None:
+    with working("reading the scene"):
+        scene = GaussianScene.load(settings.scene)
+    _log_written(settings, f"{write_points(settings.output, scene)} points")
+
+
+def _write_mesh(settings: Settings) -> None:
+    try:
+        # Mitsuba: not for --help; the extra `models`: not for splats
+        with loading("tron-export"):
+            from tron.meshing.surface import surface_of, views_of
+            from tron.meshing.textures import textured
+            from tron.models.write import write_glb, write_usdz
+            from tron.tracing.tracer import SurfelTracer
+    except ModuleNotFoundError as error:
+        what = f"{error.name} is not installed, which makes meshes"
+        raise TronError(what, mend="pip install 'tron-relight[relight,models]'") from error
+    activate(settings.variant, settings.threads)
+    scene = load_scene(settings.scene, settings.up, "as_is")
+    filmed = filmed_with(settings.scene, upright(scene.up), scene.offset)
+    scene = treat_surroundings(scene.upright(), "drop", settings.scene).content
+    tracer, views = SurfelTracer(scene), views_of(scene, filmed)
+    surface = surface_of(tracer, views, triangles=settings.triangles, track=partial(track, label="surface"))
+    with working("textures"):
+        part = textured(tracer, surface, settings.texture)
+    with working("writing"):
+        (write_glb if settings.output.suffix.lower() == ".glb" else write_usdz)(settings.output, part)
+    _log_written(settings, f"{len(part.faces)} triangles")
+
+
+def _log_written(settings: Settings, what: str) -> None:
+    before, after = (path.stat().st_size for path in (settings.scene, settings.output))
+    log.info("%s, %.3g MB of %.3g: %s", what, after / 1e6, before / 1e6, settings.output)
+
+
+cli = command(
+    "tron-export",
+    "conf.export",
+    Settings,
+    main,
+    examples=(
+        "tron-export scene=scene/scene.ply output=scene.glb",
+        "tron-export scene=surfels.ply output=surfels.spz",
+        "tron-export scene=surfels.ply output=splats.glb kind=splats",
+        "tron-export scene=scan.compressed.ply output=scan.spz",
+        "tron-export scene=scene/scene.ply cameras=scene/cameras.json output=shot.glb",
+    ),
+    ended=ANEW,
+)
+
+if __name__ == "__main__":
+    cli()

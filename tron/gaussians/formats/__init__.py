@@ -1,0 +1,1 @@
+"""Splats in other files than PLYs, one format a file."""

@@ -1,0 +1,100 @@
+"""Scenes as files of splats or points for other programs."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import plyfile
+
+from tron.errors import TronError
+from tron.framing import Y_UP, upright
+from tron.gaussians.edit import with_kernel
+from tron.gaussians.fields import FIELDS
+from tron.gaussians.formats.registry import FORMATS
+from tron.gaussians.formats.splats import Splats
+from tron.gaussians.harmonics import dc_to_rgb
+from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS, packed
+from tron.gaussians.ply import FLATNESS, NORMAL, write_ply
+from tron.gaussians.scene import GaussianScene
+from tron.io.optional import usd
+from tron.storage import atomic_path, write_atomic
+
+SUFFIXES = (".ply", *PACKED_SPLATS, *(suffix for suffix, each in FORMATS.items() if each.write))
+"""Of files that :func:`write_splats` writes."""
+_SEEN = 0.1
+"""Opacity from which a surfel is a point."""
+
+
+def check_suffix(path: Path) -> None:
+    """Raise TronError unless :func:`write_splats` knows a file's suffix, and what writes it is there."""
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        known = ", ".join(SUFFIXES)
+        raise TronError("its name does not say a format", path, f"let it end with one of {known}")
+    if suffix.startswith(".usd"):
+        usd(str(path))
+
+
+def write_splats(path: Path, scene: GaussianScene) -> None:
+    """Write a scene's radiance for other programs: the kernel and the properties of 3DGS, no materials.
+
+    A kernel of degree 4 becomes one of degree 2 (:func:`tron.gaussians.edit.with_kernel`). Packed files
+    round places, sizes and colours; ``.splat`` holds colours from all sides alone. glTF and USD are y up, the
+    others stay in the scene's frame.
+
+    Raises:
+        TronError: no such suffix, or the file cannot be written.
+    """
+    check_suffix(path)
+    suffix = path.suffix.lower()
+    other = FORMATS.get(suffix)
+    if other is not None and other.write is not None:
+        write_atomic(path, other.write(_splats(scene.rotated(Y_UP @ upright(scene.up))), suffix))
+        return
+    kind = PACKED_SPLATS.get(suffix)
+    if kind is None:
+        _write_plain(path, scene)
+        return
+    with tempfile.TemporaryDirectory(prefix="tron-") as folder:
+        plain = Path(folder) / "plain.ply"
+        _write_plain(plain, scene.rotated(HALF_TURN) if kind.half_turned else scene)
+        write_atomic(path, packed(plain.read_bytes(), kind))
+
+
+def write_points(path: Path, scene: GaussianScene) -> int:
+    """Write the centres of surfels that are seen as a PLY of points; return their number.
+
+    They have normals and mean colours, and stand where the file that the scene came from put them, in doubles
+    where coordinates are large.
+
+    Raises:
+        TronError: the surfels can all be looked through, or the file cannot be written.
+    """
+    seen = scene.opacities() >= _SEEN
+    if not seen.any():
+        raise TronError("no surfel is opaque enough to be a point")
+    places = (scene.means + scene.offset)[seen] if scene.offset.any() else scene.means[seen]
+    colors = (np.clip(dc_to_rgb(scene.sh[seen, 0]), 0, 1) * 255).round().astype(np.uint8)
+    columns = dict(zip(FIELDS["means"].properties, places.T))
+    columns |= dict(zip(NORMAL, scene.normals()[seen].T)) | dict(zip(("red", "green", "blue"), colors.T))
+    rows = np.empty(len(places), [(name, each.dtype.newbyteorder("<")) for name, each in columns.items()])
+    for name, values in columns.items():
+        rows[name] = values
+    with atomic_path(path) as temporary:
+        plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
+    return len(rows)
+
+
+def _splats(scene: GaussianScene) -> Splats:
+    plain = with_kernel(scene, 2)
+    thin = plain.log_scales.min(axis=1, keepdims=True) + np.float32(np.log(FLATNESS))
+    log_scales = np.concatenate([plain.log_scales, thin], axis=1)
+    return Splats(plain.means, plain.quats, log_scales, plain.opacity_logits, plain.sh)
+
+
+def _write_plain(path: Path, scene: GaussianScene) -> None:
+    plain = with_kernel(scene, 2)
+    values = vars(plain) | {"normals": plain.normals(), "materials_guessed": True}
+    write_ply(path, values, plain=True)

@@ -1,0 +1,1 @@
+"""Surfels as triangles with textures."""

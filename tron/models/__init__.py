@@ -1,0 +1,1 @@
+"""Models of meshes: read from glTF and OBJ, and made surfels."""
