@@ -87,7 +87,7 @@ class TrainingLog(Callback):
         del pl_module, batch, batch_idx
         step = trainer.global_step
         # Reading a number from a GPU waits for it, and from other processes too: there not at every step.
-        if outputs["loss"].device.type == "cpu" or step % 10 == 0:
+        if outputs["loss"].device.type == "cpu" or step % 10 == 0 or self.loss != self.loss:
             loss = trainer.strategy.reduce(outputs["loss"].detach(), reduce_op="mean").item()
             self.loss = loss if self.loss != self.loss else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
         if not trainer.is_global_zero:

@@ -15,6 +15,7 @@ from tron.errors import TronError
 from tron.flow import surface_motion
 from tron.neural.clips import Overlap
 from tron.neural.shipped import SHIPPED, checkpoint_file
+from tron.runtime import torch_device
 from tron.shards.schema import displayed
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def find_weights(given: str | Path) -> Path:
 
 
 def load_networks(kind: str, given: Iterable[str | Path], vae: Path | None = None) -> dict[str, Network]:
-    """Read weights; torch is imported here and not before.
+    """Read weights, onto the device of the active Mitsuba variant; torch is imported here and not before.
 
     Args:
         kind: such as neural; its network that sees lit is called neural_lit.
@@ -70,7 +71,7 @@ def load_networks(kind: str, given: Iterable[str | Path], vae: Path | None = Non
 
     networks: dict[str, Network] = {}
     for path in map(find_weights, given):
-        network = Network(path, load_renderer(path, vae))
+        network = Network(path, load_renderer(path, vae).to(torch_device()))
         name = f"{kind}_lit" if network.sees_lit else kind
         if name in networks:
             raise TronError(

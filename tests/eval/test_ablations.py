@@ -1,5 +1,6 @@
 """The benchmark `ablations` end to end at toy sizes: one choice reached by several ways is one figure."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -52,20 +53,19 @@ def test_one_choice_varies_and_the_others_stay(weights: Path, tmp_path: Path):
 
 @pytest.mark.long
 def test_sources_and_fusions_by_their_commands(tmp_path: Path):
-    small = "capture.views=8,capture.width=32,capture.height=32,capture.path_spp=4,mesh_edge=0.2"
-    small += ",capture.relight_spp=4"
-    captures = f"[experiment=captures,capture.scenes=1,'capture.relights=[sun]',{small},seed=4100]"
-    steps = "[initial.count=400,steps_scaler=0.002,light=null,report=null]"
-    size = (
-        "train.width=32,train.height=32,test.width=32,test.height=32,surfels=500,refine_steps=0,mesh_edge=0.2"
-    )
-    few = f"train.scenes=1,train_b.scenes=0,validation.scenes=0,test.scenes=1,{size},environment_height=32"
+    side = ["train.width=32", "train.height=32", "test.width=32", "test.height=32"]
+    captures = ["experiment=captures", "seed=4100", "capture.scenes=1", "capture.relights=[sun]", "mesh_edge=0.2"]
+    captures += [f"capture.{key}" for key in ("views=8", "width=32", "height=32", "path_spp=4", "relight_spp=4")]
+    data = ["experiment=demo", "train.scenes=1", "train_b.scenes=0", "validation.scenes=0", "test.scenes=1"]
+    data += [*side, "surfels=500", "refine_steps=0", "mesh_edge=0.2", "environment_height=32", "workers=1"]
+    data += ["train.path_spp=4", "test.path_spp=4", "train.guidance_spp=2"]
+    steps = ["initial.count=400", "steps_scaler=0.002", "light=null", "report=null"]
+    learn = ["experiment=demo", "renderer=tiny", "renderer.config.guidance=[pbr,irradiance]", "max_seconds=4"]
+    learn += ["stages=[{name: synthetic, split: train, steps: 1900, crop: 24}]"]
     out = tmp_path / "out"
-    code = run(
-        f"output_dir={out}", parts="[sources,fusion]", captures=captures, reconstruct=steps,
-        dataset=f"[experiment=demo,{few},train.path_spp=4,test.path_spp=4,train.guidance_spp=2,workers=1]",
-        train="[renderer=tiny,'renderer.config.guidance=[pbr,irradiance]',experiment=demo,max_seconds=4]",
-    )  # fmt: skip
+    given = {"captures": captures, "reconstruct": steps, "dataset": data, "train": learn}
+    lists = {key: json.dumps(value) for key, value in given.items()}
+    code = run(f"output_dir={out}", parts="[sources,fusion]", **lists)
     assert code == 0
     found = Results.load(out / "results.json")
     for name in ("gbuffers", "joint", "ground_truth"):

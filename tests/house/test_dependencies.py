@@ -229,6 +229,6 @@ def written(extras: set[str]) -> list[str]:
 def test_the_constraints_pin_what_setup_installs_and_nothing_else():
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
-    peers = names(EXTRAS["gpu-peers"]) | names(EXTRAS["oidn"])  # `make setup` installs neither
+    peers = names(EXTRAS["gpu-peers"])  # which `make setup` does not install
     assert {canonical(name) for name in pins} == closure(written({"all", "dev", "cluster"})) | peers
     assert pins["torch"] == "2.13.0", "no local version: a CPU build is taken where one is offered"

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -74,7 +75,11 @@ def test_each_view_comes_once_before_any_comes_again(painted, painted_capture) -
         views.append(replace(bare(view), image=partial(reader, view.name, view.read())))
     stage_of(painted, views, radiance(10)).run()
     names = {view.name for view in views}
-    assert set(read[:5]) == set(read[5:]) == names
+    assert set(read[:5]) == names
+    if mi.variant().startswith("cuda"):  # a GPU keeps the photos
+        assert len(read) == 5
+        return
+    assert set(read[5:]) == names
     assert len(read) == 10
     assert read[:5] != read[5:]
 
