@@ -55,9 +55,16 @@ class Synthetic(Benchmark):
         made, shown = folder / "suite", folder / "methods"
         stages.run("suite", [Child("suite", "tron-eval", [*self.export, f"output_dir={made}"])])
         suite = next(path.parent for path in sorted(made.glob(f"*/{SUITE_NAME}")))
-        for method, arguments in self.methods.items():
-            typed = [f"method={method}", f"suite={suite}", *arguments, f"output_dir={shown}"]
-            stages.run(method, [Child(method, "tron-eval", typed)])
+        children = {
+            method: Child(
+                method, "tron-eval", [f"method={method}", f"suite={suite}", *given, f"output_dir={shown}"]
+            )
+            for method, given in self.methods.items()
+        }
+        if maps := children.pop("true_maps", None):
+            stages.run("true_maps", [maps])
+        if children:  # at the same time, so that neither has a quieter machine
+            stages.run("from_photos", list(children.values()))
         judging = self.compare.model_copy(update={"suite": suite, "methods": shown})
         stages.restart("compare")
         with stages.timed("compare", [["tron-eval", "benchmark=compare", f"suite={suite}"]]):
