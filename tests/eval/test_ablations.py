@@ -54,8 +54,8 @@ def test_one_choice_varies_and_the_others_stay(weights: Path, tmp_path: Path):
 @pytest.mark.long
 def test_sources_and_fusions_by_their_commands(tmp_path: Path):
     side = ["train.width=32", "train.height=32", "test.width=32", "test.height=32"]
-    captures = ["experiment=captures", "seed=4100", "capture.scenes=1", "capture.relights=[sun]", "mesh_edge=0.2"]
-    captures += [f"capture.{key}" for key in ("views=8", "width=32", "height=32", "path_spp=4", "relight_spp=4")]
+    sizes = ["views=8", "width=32", "height=32", "path_spp=4", "relight_spp=4", "relights=[sun]", "scenes=1"]
+    captures = ["experiment=captures", "seed=4100", "mesh_edge=0.2", *(f"capture.{size}" for size in sizes)]
     data = ["experiment=demo", "train.scenes=1", "train_b.scenes=0", "validation.scenes=0", "test.scenes=1"]
     data += [*side, "surfels=500", "refine_steps=0", "mesh_edge=0.2", "environment_height=32", "workers=1"]
     data += ["train.path_spp=4", "test.path_spp=4", "train.guidance_spp=2"]

@@ -9,11 +9,13 @@ from eval.cli import cli
 from eval.compare.synthetic import gains
 from eval.results import Results, Row
 
+SIZES = [
+    "scenes=2", "views=8", "width=32", "height=32", "path_spp=4", "reference_spp=4", "relights=[high]",
+    "relight_spp=4", "film_frames=1",
+]  # fmt: skip
 TOY = [
-    "test.scenes=2", "test.style={object: 1, table: 1}", "capture.scenes=2", "capture.views=8", "capture.width=32",
-    "capture.height=32", "capture.path_spp=4", "capture.reference_spp=4", "capture.relights=[high]",
-    "capture.relight_spp=4", "capture.film_frames=1", "test.width=32", "test.height=32",
-    "environment_height=32", "mesh_edge=0.2", "workers=1",
+    *(f"capture.{size}" for size in SIZES), "test.scenes=2", "test.style={object: 1, table: 1}", "test.width=32",
+    "test.height=32", "environment_height=32", "mesh_edge=0.2", "workers=1",
 ]  # fmt: skip
 FEW = ["initial.count=500", "steps_scaler=0.005"]
 
