@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -78,18 +79,32 @@ def choose_frames(path: Path, count: int) -> list[np.ndarray]:
     if not seconds > 0:
         mend = f"ffmpeg -i {path.name} -c copy new.mp4"
         raise TronError("video does not say how long it lasts", path, mend)
-    chosen: list[np.ndarray] = []
-    best: Frame | None = None
+    chosen = sharpest(frames_of(path), lambda _, frame: min(int(frame.seconds / seconds * count), count - 1))
+    return [frame.rgb() for _, frame in chosen]
+
+
+def sharpest(
+    frames: Iterable[Frame], interval_of: Callable[[int, Frame], int]
+) -> Iterator[tuple[int, Frame]]:
+    """The sharpest frame of each interval, with its number among all.
+
+    Args:
+        frames: of a video, in order.
+        interval_of: tells the interval of a frame and its number, which grows with the number.
+    """
+    best: tuple[int, Frame] | None = None
     most, interval = -1.0, 0
-    for frame in frames_of(path):
-        now = min(int(frame.seconds / seconds * count), count - 1)
+    for number, frame in enumerate(frames):
+        now = interval_of(number, frame)
         if now != interval and best is not None:
-            chosen.append(best.rgb())
-            best, most, interval = None, -1.0, now
+            yield best
+            best, most = None, -1.0
+        interval = now
         sharp = sharpness(frame.grey(_WIDTH))
         if sharp > most:
-            best, most = frame, sharp
-    return chosen if best is None else [*chosen, best.rgb()]
+            best, most = (number, frame), sharp
+    if best is not None:
+        yield best
 
 
 def sharpness(grey: np.ndarray) -> float:
@@ -134,11 +149,8 @@ def _kept_frames(path: Path, count: int, workspace: Path) -> Path:
     """Folder of the chosen frames, made unless it is there from the same video."""
     folder = workspace / FRAMES
     wanted = {"version": _VERSION, "video": sha256(path), "frames": count}
-    try:
-        if json.loads((folder / _RECORD).read_text("utf-8")) == wanted:
-            return folder
-    except (OSError, ValueError):
-        pass
+    if holds_frames(folder, wanted):
+        return folder
     log.info("%s: looking for the sharpest frames of %d intervals", path, count)
     frames = choose_frames(path, count)
     if len(frames) < _FEWEST:
@@ -149,9 +161,28 @@ def _kept_frames(path: Path, count: int, workspace: Path) -> Path:
             path,
             "walk around the scene as you film it",
         )
-    with atomic_folder(folder) as made:
-        for index, frame in enumerate(frames):
-            (made / f"{index:05d}.jpg").write_bytes(encode_jpeg(frame))
-        (made / _RECORD).write_text(json.dumps(wanted), "utf-8")
+    keep_frames(folder, wanted, ((f"{index:05d}", frame) for index, frame in enumerate(frames)))
     log.info("%s: %d frames of %d x %d taken", path, len(frames), frames[0].shape[1], frames[0].shape[0])
     return folder
+
+
+def holds_frames(folder: Path, wanted: Mapping[str, Any]) -> bool:
+    """Whether a folder was written by :func:`keep_frames` with this record."""
+    try:
+        return json.loads((folder / _RECORD).read_text("utf-8")) == wanted
+    except (OSError, ValueError):
+        return False
+
+
+def keep_frames(folder: Path, record: Mapping[str, Any], frames: Iterable[tuple[str, np.ndarray]]) -> None:
+    """Write frames as JPEGs, in a folder that appears whole or not at all.
+
+    Args:
+        folder: the folder.
+        record: what they were made of, for :func:`holds_frames`.
+        frames: name without suffix, and (H, W, 3) uint8, of each.
+    """
+    with atomic_folder(folder) as made:
+        for name, frame in frames:
+            (made / f"{name}.jpg").write_bytes(encode_jpeg(frame))
+        (made / _RECORD).write_text(json.dumps(record), "utf-8")
