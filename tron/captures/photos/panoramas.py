@@ -26,6 +26,8 @@ _TURNS = {
     "up": ("x", 90),
     "down": ("x", -90),
 }
+_WIDEST = 32_000
+"""Columns that ``cv2.remap``, which counts them in 16 bits, is sure to reach."""
 FACES = tuple(_TURNS)
 """Names of the faces: what the middle of each looks at."""
 
@@ -35,7 +37,7 @@ class Panorama:
     """The camera of an equirectangular photo of ``width`` x ``height`` pixels.
 
     Raises:
-        TronError: it is not twice as wide as high.
+        TronError: it is not twice as wide as high, or wider than OpenCV resamples.
     """
 
     width: float
@@ -47,6 +49,8 @@ class Panorama:
             raise TronError(
                 f"a photo of 360 degrees is twice as wide as high, not {self.width:g} x {self.height:g}"
             )
+        if self.width > _WIDEST:
+            raise TronError(f"a photo of 360 degrees has {self.width:g} columns", mend=f"at most {_WIDEST}")
 
     @property
     def distorts(self) -> bool:
@@ -112,13 +116,17 @@ class Face:
         return np.stack([longitude / (2 * np.pi) + 0.5, latitude / np.pi + 0.5], axis=-1)
 
     def undistortion_maps(self, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-        """Places in a :func:`bordered` photo of ``width`` x ``height`` pixels of the face's pixels.
+        """Places of the face's pixels in a :func:`bordered` photo of ``width`` x ``height`` pixels.
+
+        Args:
+            width, height: with the border.
 
         Returns:
             (side, side, 2) int16 and (side, side) uint16: fixed-point maps for ``cv2.remap``.
         """
         import cv2
 
+        width, height = width - 2, height - 2
         side = self.camera(np.eye(4), width, height).width
         # Centres of pixels lie at whole numbers for OpenCV, and the border is one pixel.
         floats = self.fractions(side, side) * (width, height) + 0.5

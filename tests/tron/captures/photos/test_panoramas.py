@@ -196,10 +196,11 @@ def test_a_photo_of_another_shape_is_no_panorama(tmp_path: Path, write, size: tu
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_columns_may_be_odd() -> None:
+def test_columns_may_be_odd_and_are_not_without_end() -> None:
     assert len(Panorama(4095, 2048).faces) == 6
-    with pytest.raises(TronError, match="twice as wide"):
-        Panorama(0, 0)
+    for size, line in (((0, 0), "twice as wide"), ((40_000, 20_000), "40000 columns")):
+        with pytest.raises(TronError, match=line):
+            Panorama(*size)
 
 
 def test_photos_that_cannot_be_cut_are_one_line_each(tmp_path: Path, write) -> None:
