@@ -191,7 +191,6 @@ def read_usd(path: Path, size: tuple[int, int], fps: float) -> list[Camera]:
 def read_colmap(path: Path) -> list[Camera]:
     """Cameras of the COLMAP model that a file is of; lenses without their distortion."""
     from tron.captures.formats.colmap import posed_by, read_model
-    from tron.captures.photos.distortion import Lens
 
     try:
         posed = posed_by(read_model(path.parent))
@@ -199,7 +198,7 @@ def read_colmap(path: Path) -> list[Camera]:
         raise TronError("COLMAP's models need pycolmap", path, "pip install pycolmap") from error
     cameras, distorted = [], 0
     for _, pose, lens in posed:
-        if not isinstance(lens, Lens):
+        if callable(lens):
             raise TronError("camera of 360 degrees, which is no one view", path, "choose another path")
         numbers, two = lens.parameters, lens.model in _TWO_FOCAL
         fx, fy, cx, cy = numbers[:4] if two else (numbers[0], numbers[0], *numbers[1:3])

@@ -26,13 +26,14 @@ from tron.captures.formats.stray_scanner import is_stray_scanner, read_stray_sca
 from tron.captures.formats.tensoir import TensoirSettings, is_tensoir, read_tensoir
 from tron.captures.formats.transforms import has_transforms, read_transforms
 from tron.captures.photos.photographs import PosedPhotos
+from tron.captures.photos.video_frames import FrameSettings
 from tron.captures.posing.structure_from_motion import (
     MatchingSettings,
     PosingSettings,
     has_photos,
     pose_photos,
 )
-from tron.captures.posing.video import FrameSettings, is_video, read_video
+from tron.captures.posing.video import is_video, read_video
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
 from tron.gaussians.foreign_files import VIDEOS

@@ -5,8 +5,8 @@
 A row of odometry.csv is a frame: timestamp, frame, x, y, z, qx, qy, qz, qw, camera to world in OpenCV's
 camera axes, metres, y up; newer ones add the frame's fx, fy, cx, cy. The oldest have x to qw alone, in the
 order of frames. camera_matrix.csv is the pinhole, row after row; depth is in millimetres along the axis, 16
-bits, in older recordings .npy. Facts of https://github.com/strayrobots/scanner (docs/format.md and
-OdometryEncoder.swift).
+bits, in older recordings .npy. Facts of the format's page and OdometryEncoder.swift in
+https://github.com/strayrobots/scanner.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import csv
 import logging
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,7 +24,7 @@ from tron.captures.formats.polycam import UP
 from tron.captures.photos.distortion import Lens, opencv_lens
 from tron.captures.photos.image_folder import photos_in
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
-from tron.captures.posing.video import FRAMES, VideoSettings, holds_frames, keep_frames, sharpest
+from tron.captures.photos.video_frames import FRAMES, holds_frames, keep_frames, sharpest
 from tron.errors import TronError
 from tron.io.video import frames_of
 from tron.storage import locked, sha256
@@ -37,12 +38,22 @@ _PINHOLE = ("fx", "fy", "cx", "cy")
 _UNIT = 0.01
 
 
+class FilmSettings(Protocol):
+    """How many frames are taken of a recording's video, and the folder that keeps them."""
+
+    @property
+    def frames(self) -> int: ...
+
+    @property
+    def workspace(self) -> Path | None: ...
+
+
 def is_stray_scanner(path: Path) -> bool:
     """Whether a folder holds a recording."""
     return (path / _VIDEO).is_file() and (path / _ODOMETRY).is_file()
 
 
-def read_stray_scanner(path: Path, settings: VideoSettings) -> PosedPhotos:
+def read_stray_scanner(path: Path, settings: FilmSettings) -> PosedPhotos:
     """Take the sharpest frames of a recording; its world is ARKit's, y up, in metres.
 
     Frames are kept in the workspace, by default ``rgb_frames`` in the recording's folder. Poses belong to the

@@ -2,42 +2,35 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, Field
 
 from tron.captures.photos.photographs import PosedPhotos
+from tron.captures.photos.video_frames import (
+    FEWEST,
+    FRAMES,
+    WIDTH,
+    FrameSettings,
+    holds_frames,
+    keep_frames,
+    sharpest,
+)
 from tron.captures.posing.structure_from_motion import PosingSettings, pose_photos
 from tron.errors import TronError
 from tron.gaussians.foreign_files import VIDEOS
-from tron.io.images import encode_jpeg
-from tron.io.video import Frame, duration_of, frames_of
-from tron.storage import atomic_folder, locked, sha256
+from tron.io.video import duration_of, frames_of
+from tron.storage import locked, sha256
 
 log = logging.getLogger(__name__)
 
-FRAMES = "frames"
-_RECORD = "video.json"
 _VERSION = 2
-_FEWEST = 3
-_WIDTH = 480
 _CORNERS = 200
 _STILL = 0.004
 """Share of a picture's width that something must have moved by, from one chosen frame to another."""
-
-
-class FrameSettings(BaseModel):
-    """Frames of a video that become photos."""
-
-    frames: int = Field(
-        default=120, ge=_FEWEST, description="photos made of a video: the sharpest of as many intervals"
-    )
 
 
 class VideoSettings(FrameSettings, PosingSettings):
@@ -83,37 +76,6 @@ def choose_frames(path: Path, count: int) -> list[np.ndarray]:
     return [frame.rgb() for _, frame in chosen]
 
 
-def sharpest(
-    frames: Iterable[Frame], interval_of: Callable[[int, Frame], int]
-) -> Iterator[tuple[int, Frame]]:
-    """The sharpest frame of each interval, with its number among all.
-
-    Args:
-        frames: of a video, in order.
-        interval_of: tells the interval of a frame and its number, which grows with the number.
-    """
-    best: tuple[int, Frame] | None = None
-    most, interval = -1.0, 0
-    for number, frame in enumerate(frames):
-        now = interval_of(number, frame)
-        if now != interval and best is not None:
-            yield best
-            best, most = None, -1.0
-        interval = now
-        sharp = sharpness(frame.grey(_WIDTH))
-        if sharp > most:
-            best, most = (number, frame), sharp
-    if best is not None:
-        yield best
-
-
-def sharpness(grey: np.ndarray) -> float:
-    """Variance of the Laplacian of a picture (H, W): blur takes it away (Pech-Pacheco et al. 2000)."""
-    import cv2
-
-    return float(cv2.Laplacian(grey, cv2.CV_32F).var())
-
-
 def motion(frames: Sequence[np.ndarray]) -> float:
     """Largest median distance that corners move by between neighbouring frames, over the frames' width.
 
@@ -141,7 +103,7 @@ def _small(frame: np.ndarray) -> np.ndarray:
     import cv2
 
     grey = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
-    width = min(_WIDTH, grey.shape[1])
+    width = min(WIDTH, grey.shape[1])
     return cv2.resize(grey, (width, max(2, round(grey.shape[0] * width / grey.shape[1]))))
 
 
@@ -153,8 +115,8 @@ def _kept_frames(path: Path, count: int, workspace: Path) -> Path:
         return folder
     log.info("%s: looking for the sharpest frames of %d intervals", path, count)
     frames = choose_frames(path, count)
-    if len(frames) < _FEWEST:
-        raise TronError(f"video has {len(frames)} frames, at least {_FEWEST} are needed", path)
+    if len(frames) < FEWEST:
+        raise TronError(f"video has {len(frames)} frames, at least {FEWEST} are needed", path)
     if motion(frames) < _STILL:
         raise TronError(
             "nothing moves in the video: all its frames show one view",
@@ -164,25 +126,3 @@ def _kept_frames(path: Path, count: int, workspace: Path) -> Path:
     keep_frames(folder, wanted, ((f"{index:05d}", frame) for index, frame in enumerate(frames)))
     log.info("%s: %d frames of %d x %d taken", path, len(frames), frames[0].shape[1], frames[0].shape[0])
     return folder
-
-
-def holds_frames(folder: Path, wanted: Mapping[str, Any]) -> bool:
-    """Whether a folder was written by :func:`keep_frames` with this record."""
-    try:
-        return json.loads((folder / _RECORD).read_text("utf-8")) == wanted
-    except (OSError, ValueError):
-        return False
-
-
-def keep_frames(folder: Path, record: Mapping[str, Any], frames: Iterable[tuple[str, np.ndarray]]) -> None:
-    """Write frames as JPEGs, in a folder that appears whole or not at all.
-
-    Args:
-        folder: the folder.
-        record: what they were made of, for :func:`holds_frames`.
-        frames: name without suffix, and (H, W, 3) uint8, of each.
-    """
-    with atomic_folder(folder) as made:
-        for name, frame in frames:
-            (made / f"{name}.jpg").write_bytes(encode_jpeg(frame))
-        (made / _RECORD).write_text(json.dumps(record), "utf-8")
