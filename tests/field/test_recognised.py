@@ -88,8 +88,10 @@ KNOWN: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "cameras.xml": (text(METASHAPE), ["Metashape's cameras", "tron-reconstruct capture=CAMERAS.xml"]),
     "cameras of Metashape.txt": (text("\ufeff" + METASHAPE), ["Metashape's cameras"]),
     "project.psz": (zipped, ["Metashape's project", "Export Cameras"]),
-    "registration.csv": (text(REALITY), ["RealityCapture's cameras", "as COLMAP"]),
+    "registration.csv": (text(REALITY), ["RealityCapture's cameras", "capture=CAMERAS.csv"]),
     "counted.csv": (text("#cameras 24\n" + REALITY), ["RealityCapture's cameras"]),
+    "places.csv": (text("#name,x,y,alt,heading,pitch,roll\n"), ["RealityCapture's cameras", "camera param"]),
+    "scan.rcproj": (text("<RealityCaptureProject/>"), ["RealityCapture's project", "camera parameters"]),
     "last.ckpt": (zipped, ["a checkpoint", "ns-export gaussian-splat"]),
     "chkpnt30000.pth": (zipped, ["a checkpoint", "point_cloud/iteration_N/point_cloud.ply"]),
     "splats.pt": (zipped, ["a checkpoint"]),
@@ -113,7 +115,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 }
 
 
-AS_CAPTURES = ("polycam", "record3d", "cameras.xml")
+AS_CAPTURES = ("polycam", "record3d", "cameras.xml", "registration.csv", "counted.csv")
 """Those that are read where a capture is asked for."""
 
 

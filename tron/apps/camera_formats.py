@@ -198,6 +198,8 @@ def read_colmap(path: Path) -> list[Camera]:
         raise TronError("COLMAP's models need pycolmap", path, "pip install pycolmap") from error
     cameras, distorted = [], 0
     for _, pose, lens in posed:
+        if callable(lens):
+            raise TronError("camera of 360 degrees, which is no one view", path, "choose another path")
         numbers, two = lens.parameters, lens.model in _TWO_FOCAL
         fx, fy, cx, cy = numbers[:4] if two else (numbers[0], numbers[0], *numbers[1:3])
         distorted += any(numbers[4 if two else 3 :])

@@ -45,7 +45,7 @@ def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> C
     require_decoders(photo.path for photo in posed.photos)
     cache = PhotoCache(cache_bytes)
     skipped = dict(posed.skipped)
-    views: dict[str, View] = {}
+    views: dict[str, list[View]] = {}  # of each photo; a panorama has several
     splits: dict[str, str | None] = {}
     claimed: set[str | Path] = set()
     whole = [photo.path for photo in posed.photos if photo.path is not None]
@@ -56,14 +56,15 @@ def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> C
             if name in claimed or photo.path in claimed:
                 raise TronError("named more than once")
             claimed |= {name} if photo.path is None else {name, photo.path}
-            views[name] = made.view(name, photo)
+            views[name] = made.views(name, photo)
             splits[name] = photo.split
         except TronError as error:
             skipped[_free(name, skipped, views)] = error.what + (f": {error.mend}" if error.mend else "")
     _report(posed, skipped, len(views), made.lost_maps)
     _log_kinds(posed.source, made, sum(path.suffix.lower() in LINEAR_SUFFIXES for path in whole), settings)
-    _log_reduced(posed.source, len(views), made.reduced, settings)
-    ordered = tuple(views[name] for name in sorted(views))
+    ordered = tuple(view for name in sorted(views) for view in views[name])
+    _log_reduced(posed.source, len(ordered), made.reduced, settings)
+    held_out = _held_out(splits, settings.test_every, posed.source)
     cameras = [view.camera for view in ordered]
     stated = posed.up if settings.up is None else np.array(settings.up, float)
     up = estimate_up(cameras) if stated is None else np.array(stated)
@@ -78,7 +79,7 @@ def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> C
         )
     return Capture(
         views=ordered,
-        test=_held_out(splits, settings.test_every, posed.source),
+        test=frozenset(view.name for name in held_out for view in views[name]),
         points=posed.points,
         point_colors=posed.point_colors,
         up=up,
@@ -89,6 +90,7 @@ def assemble(posed: PosedPhotos, settings: PhotoSettings, cache_bytes: int) -> C
 
 
 def _held_out(splits: Mapping[str, str | None], test_every: int, source: Path) -> frozenset[str]:
+    """Names of the photos that are held out; all faces of a panorama show one place and stay together."""
     if "test" in splits.values():
         test = frozenset(name for name, split in splits.items() if split == "test")
     else:
@@ -132,6 +134,8 @@ def _log_kinds(source: Path, made: PhotoViews, linear: int, settings: PhotoSetti
         meaning = {"ignore": "is not learnt from", "subject": "is empty background"}[str(settings.masks)]
         log.info("%s: what is black in the masks of %d photos %s (masks=ignore, subject or null)",
                  source, made.masked, meaning)  # fmt: skip
+    if made.panoramas:
+        log.info("%s: %d photos of 360 degrees are cut into six views each", source, made.panoramas)
     for note, count in made.notes.items():
         log.info("%s: of %d photos %s", source, count, note)
     if linear:

@@ -19,17 +19,21 @@ from tron.captures.formats.metashape import cameras_file, read_metashape
 from tron.captures.formats.not_a_capture import refusal
 from tron.captures.formats.opensfm import read_opensfm, reconstruction_file
 from tron.captures.formats.polycam import camera_folder, read_polycam
+from tron.captures.formats.realitycapture import read_realitycapture, registration_file
 from tron.captures.formats.record3d import metadata_file, read_record3d
+from tron.captures.formats.scanner_app import is_scanner_app, read_scanner_app
+from tron.captures.formats.stray_scanner import is_stray_scanner, read_stray_scanner
 from tron.captures.formats.tensoir import TensoirSettings, is_tensoir, read_tensoir
 from tron.captures.formats.transforms import has_transforms, read_transforms
 from tron.captures.photos.photographs import PosedPhotos
+from tron.captures.photos.video_frames import FrameSettings
 from tron.captures.posing.structure_from_motion import (
     MatchingSettings,
     PosingSettings,
     has_photos,
     pose_photos,
 )
-from tron.captures.posing.video import FrameSettings, is_video, read_video
+from tron.captures.posing.video import is_video, read_video
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
 from tron.gaussians.foreign_files import VIDEOS
@@ -72,6 +76,11 @@ FORMATS = {
     "record3d": CaptureFormat("Record3D's EXR + RGB export", metadata_file, read_record3d),
     "metashape": CaptureFormat("Metashape's XML of cameras", cameras_file, read_metashape, (".xml",)),
     "opensfm": CaptureFormat("a project of OpenSfM or OpenDroneMap", reconstruction_file, read_opensfm),
+    "realitycapture": CaptureFormat(
+        "RealityCapture's CSV of cameras", registration_file, read_realitycapture, (".csv",)
+    ),
+    "stray_scanner": CaptureFormat("Stray Scanner's recording", is_stray_scanner, read_stray_scanner),
+    "scanner_app": CaptureFormat("3D Scanner App's data", is_scanner_app, read_scanner_app),
     "video": CaptureFormat("a video file, whose sharpest frames are posed", is_video, read_video, VIDEOS),
     "photos": CaptureFormat("photos, posed by structure from motion", has_photos, pose_photos),
 }
@@ -120,8 +129,8 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
         raise TronError("capture not found", path)
     if not any(each.takes(path) for each in FORMATS.values()):
         raise refusal(path, HOLDS, _holds_capture)
-    if path.is_file() and not cameras_file(path):
-        refuse_by_sight(path, "a capture is a folder, a transforms.json or Metashape's XML")
+    if path.is_file() and not (cameras_file(path) or registration_file(path)):
+        refuse_by_sight(path, "a capture is a folder, or a file of its cameras")
     name = _detected(path) if settings.format == "auto" else settings.format
     if not FORMATS[name].takes(path):
         raise TronError(f"a capture of format {name} is a folder", path)

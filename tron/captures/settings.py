@@ -46,7 +46,8 @@ class PhotoSettings(BaseModel):
     depth_unit: float = Field(
         default=0.001,
         gt=0,
-        description="world units of one step of the depth files that transforms.json names",
+        description="world units of one step of depth files: those that transforms.json names or that a "
+        "phone recorded, in millimetres by default",
     )
     exr_exposure: float | None = Field(
         default=None,

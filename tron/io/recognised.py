@@ -39,12 +39,13 @@ _METASHAPE = Sight(
     "Metashape's cameras", "tron-reconstruct capture=CAMERAS.xml reads them, beside the photos", poses=True
 )
 _PROJECT = Sight("Metashape's project", "export its cameras there (Export Cameras, .xml) beside the photos")
+_EXPORTED = "export Internal/External camera parameters (CSV) beside the photos"
 _REALITY = Sight(
     "RealityCapture's cameras",
-    "export them there as COLMAP, or convert them with `ns-process-data realitycapture`; then give the "
-    "folder of the result",
+    f"{_EXPORTED}; tron-reconstruct capture=CAMERAS.csv reads them",
     poses=True,
 )
+_REALITY_PROJECT = Sight("RealityCapture's project", f"there, {_EXPORTED}")
 _RECORD3D_FILE = Sight(
     "Record3D's recording",
     "export it in Record3D as EXR + RGB and give the folder of that",
@@ -56,7 +57,7 @@ _SUFFIXES = {
     **dict.fromkeys((".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar"), _ARCHIVE),
     **dict.fromkeys((".ckpt", ".pth", ".pt", ".safetensors", ".pkl"), _CHECKPOINT),
     **dict.fromkeys((".psx", ".psz"), _PROJECT),
-    ".rcproj": _REALITY,
+    **dict.fromkeys((".rcproj", ".rsproj"), _REALITY_PROJECT),
     ".r3d": _RECORD3D_FILE,
 }
 _ARCHIVE_STARTS = (b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!", b"\x1f\x8b", b"\xfd7zXZ", b"BZh")

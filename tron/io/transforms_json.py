@@ -23,6 +23,8 @@ from tron.io.recognised import refuse_by_sight
 log = logging.getLogger(__name__)
 
 _MAX_BYTES = 500_000_000
+EQUIRECTANGULAR = "EQUIRECTANGULAR"
+"""nerfstudio's ``camera_model`` of photos of 360 degrees."""
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
@@ -64,6 +66,8 @@ def cameras_of_transforms(file: Path, size: tuple[int, int]) -> list[Camera]:
                 raise TronError("frame is no object")
             pose = rigid_pose(transform @ opengl_to_opencv(rigid_pose(frame.get("transform_matrix"))))
             data = described(meta, frame)
+            if data.get("camera_model") == EQUIRECTANGULAR:
+                raise TronError("camera of 360 degrees, which is no one view", mend="choose another path")
             width, height, focal, center = intrinsics_of(data, *size)
             distorted += any(number(data, key, 0.0) for key in _DISTORTION)
             camera = Camera(*focal, *center, round(width), round(height), np.linalg.inv(pose))

@@ -99,14 +99,14 @@ def write_json(path: Path, content: object) -> None:
 
 
 def write_colmap(
-    folder: Path, photos: Photos, *, text: bool, model: str = "PINHOLE", parameters=None
+    folder: Path, photos: Photos, *, text: bool, model: str = "PINHOLE", parameters=None, size=(WIDTH, HEIGHT)
 ) -> None:
     """A sparse model whose points lie exactly where the photos see them; the last one is seen only twice."""
     import pycolmap
 
     scene = pycolmap.Reconstruction()
     camera = pycolmap.Camera(
-        model=model, width=WIDTH, height=HEIGHT, params=parameters or [FX, FY, CX, CY], camera_id=1
+        model=model, width=size[0], height=size[1], params=parameters or [FX, FY, CX, CY], camera_id=1
     )
     scene.add_camera_with_trivial_rig(camera)
     for index, name in enumerate(photos.names):
@@ -140,12 +140,32 @@ def write_tensoir(folder: Path, photos: Photos) -> float:
     return 0.5 * WIDTH / np.tan(0.5 * angle)
 
 
+def panorama(matrix: np.ndarray, index: int, size: tuple[int, int]) -> np.ndarray:
+    """Equirectangular picture, uint8 (H, W, 3), of a world whose red and green are its directions' x and y.
+
+    Written out for OpenGL's axes: ``matrix`` is camera to world. Blue tells the index.
+    """
+    width, height = size
+    longitude = ((np.arange(width) + 0.5) / width - 0.5) * 2 * np.pi
+    latitude = (0.5 - (np.arange(height)[:, None] + 0.5) / height) * np.pi
+    right, up, backward = matrix[:3, :3].T
+    ray = np.cos(latitude) * np.sin(longitude) * right[:2, None, None]
+    ray = (
+        ray
+        + np.sin(latitude) * up[:2, None, None]
+        - np.cos(latitude) * np.cos(longitude) * backward[:2, None, None]
+    )
+    color = [*(0.5 + 0.5 * ray), np.full((height, width), index / 16)]
+    return np.round(255 * np.stack(color, axis=-1)).astype(np.uint8)
+
+
 class Writers:
     """The functions above, for tests that ask for the fixture."""
 
     size = (WIDTH, HEIGHT)
     intrinsics = (FX, FY, CX, CY)
     picture = staticmethod(picture)
+    panorama = staticmethod(panorama)
     save = staticmethod(save)
     photos = staticmethod(write_photos)
     transforms = staticmethod(transforms)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tron.captures import Capture, LoadSettings, load_capture
 from tron.errors import TronError
+from tron.io.video import VideoWriter
 
 TOLERANCE = 1e-3
 
@@ -176,10 +177,136 @@ def other_case(folder: Path, photos, write) -> None:
     write.photos(folder / "images", photos)
 
 
+def realitycapture(folder: Path, photos, write) -> None:
+    """Angles of an OpenGL camera that turns about z, x and y; one focal length, in millimetres of film."""
+    angles = Rotation.from_matrix(photos.opengl[:, :3, :3]).as_euler("ZXY", degrees=True)
+    fx, _, cx, cy = write.intrinsics
+    width, height = write.size
+    calibration = [fx * 36 / width, (cx - width / 2) / width, (cy - height / 2) / width, *[0] * 6]
+    lines = [f"#cameras {len(photos.names)}", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
+    for name, matrix, (yaw, pitch, roll) in zip(photos.names, photos.opengl, angles):
+        numbers = [*matrix[:3, 3], -yaw, pitch, roll, *calibration]
+        lines.append(",".join([name, *(repr(float(each)) for each in numbers)]))
+    (folder / "registration.csv").write_text("\n".join(lines) + "\n")
+    write.photos(folder / "photos", photos)
+
+
+def stray_scanner(folder: Path, photos, write) -> None:
+    quats = Rotation.from_matrix(photos.opencv[:, :3, :3]).as_quat()
+    fx, fy, cx, cy = write.intrinsics
+    lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    with VideoWriter(folder / "rgb.mp4", 30, write.size) as video:
+        for index, (matrix, quat) in enumerate(zip(photos.opencv, quats)):
+            numbers = ", ".join(repr(float(each)) for each in (*matrix[:3, 3], *quat))
+            lines.append(f"{100 + index / 30}, {index:06d}, {numbers}")
+            video.write(write.picture(index))
+    (folder / "odometry.csv").write_text("\n".join(lines))
+    (folder / "camera_matrix.csv").write_text(f"{fx}, 0.0, {cx}\n0.0, {fy}, {cy}\n0.0, 0.0, 1.0")
+
+
+def scanner_app(folder: Path, photos, write) -> None:
+    """Frames between those with a photo have a pose alone."""
+    fx, fy, cx, cy = write.intrinsics
+    for index, matrix in enumerate(photos.opengl):
+        content = {
+            "cameraPoseARFrame": matrix.ravel().tolist(),
+            "intrinsics": [fx, 0, cx, 0, fy, cy, 0, 0, 1],
+            "frame_index": 6 * index,
+        }
+        write.json(folder / f"frame_{6 * index:05d}.json", content)
+        write.json(folder / f"frame_{6 * index + 1:05d}.json", content)
+        write.save(folder / f"frame_{6 * index:05d}.png", write.picture(index))
+    write.json(folder / "info.json", {"device": "iPhone"})
+
+
+def blender_nerf(folder: Path, photos, write) -> None:
+    """The BlenderNeRF add-on, on Windows: both kinds of focal length, sizes as floats, a scale of its box."""
+    fx, fy, _, _ = write.intrinsics
+    width, height = map(float, write.size)
+    frames = write.transforms(photos, "images_train\\")["frames"]
+    content = {
+        "camera_angle_x": 2 * np.arctan(width / 2 / fx), "camera_angle_y": 2 * np.arctan(height / 2 / fy),
+        "fl_x": fx, "fl_y": fy, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "cx": width / 2, "cy": height / 2,
+        "w": width, "h": height, "aabb_scale": 4, "frames": frames,
+    }  # fmt: skip
+    write.json(folder / "transforms_train.json", content)
+    write.photos(folder / "images_train", photos, channels=4)
+
+
+def nerf_capture(folder: Path, photos, write) -> None:
+    """The app NeRFCapture: names without a suffix, intrinsics of each frame that win over the file's."""
+    content = write.transforms(photos)
+    own = {key: content[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
+    frames = [
+        {**own, "file_path": f"images/{n}", "depth_path": f"images/{n}.depth.png", "timestamp": float(n),
+         "transform_matrix": frame["transform_matrix"]}
+        for n, frame in enumerate(content["frames"])
+    ]  # fmt: skip
+    content |= {"fl_x": 1.0, "fl_y": 1.0, "cx": 320, "cy": 240, "depth_integer_scale": 1.0, "frames": frames}
+    write.json(folder / "transforms.json", content)
+    write.photos(folder / "images", replace(photos, names=tuple(f"{n}.png" for n in range(len(frames)))))
+
+
+PANORAMA = (128, 64)
+
+
+def panoramas_of(folder: Path, photos, write) -> None:
+    for index, (name, matrix) in enumerate(zip(photos.names, photos.opengl)):
+        write.save(folder / name, write.panorama(matrix, index, PANORAMA))
+
+
+def panoramas_of_colmap(folder: Path, photos, write) -> None:
+    write.colmap(
+        folder / "sparse" / "0",
+        photos,
+        text=False,
+        model="EQUIRECTANGULAR",
+        parameters=PANORAMA,
+        size=PANORAMA,
+    )
+    panoramas_of(folder / "images", photos, write)
+
+
+def panoramas_of_nerfstudio(folder: Path, photos, write) -> None:
+    frames = write.transforms(photos)["frames"]
+    width, height = PANORAMA
+    content = {"camera_model": "EQUIRECTANGULAR", "w": width, "h": height, "fl_x": 64, "fl_y": 64}
+    write.json(folder / "transforms.json", {**content, "cx": 64, "cy": 32, "frames": frames})
+    panoramas_of(folder / "images", photos, write)
+
+
+def panoramas_of_metashape(folder: Path, photos, write) -> None:
+    width, height = PANORAMA
+    lines = [
+        '<document version="2.0.0"><chunk label="Chunk 1"><sensors><sensor id="0" type="spherical">',
+        f'<resolution width="{width}" height="{height}"/></sensor></sensors><cameras>',
+        *(
+            f'<camera id="{n}" sensor_id="0" component_id="0" label="{Path(name).stem}">'
+            f"<transform>{' '.join(map(repr, matrix.ravel().tolist()))}</transform></camera>"
+            for n, (name, matrix) in enumerate(zip(photos.names, photos.opencv))
+        ),
+        "</cameras></chunk></document>",
+    ]
+    (folder / "cameras.xml").write_text("\n".join(lines))
+    panoramas_of(folder / "photos", photos, write)
+
+
+def panoramas_of_opensfm(folder: Path, photos, write) -> None:
+    width, height = PANORAMA
+    opensfm(folder, photos, write)
+    file = folder / "opensfm" / "reconstruction.json"
+    content = json.loads(file.read_text())
+    content[1]["cameras"]["v2 phone"] = {"projection_type": "spherical", "width": width, "height": height}
+    file.write_text(json.dumps(content))
+    panoramas_of(folder / "images", photos, write)
+
+
+PANORAMAS = [panoramas_of_colmap, panoramas_of_nerfstudio, panoramas_of_metashape, panoramas_of_opensfm]
 FORMATS = [
     *(nerf_synthetic, instant_ngp, nerfstudio, per_frame, dl3dv, colmap_binary, colmap_text, tensoir),
     *(colmap_rigs, other_case),
     *(polycam, record3d, metashape, opensfm),
+    *(realitycapture, stray_scanner, scanner_app, blender_nerf, nerf_capture),
 ]
 
 
@@ -195,6 +322,8 @@ def test_a_world_point_lands_on_the_same_pixel(
     width, height = write.size
     intrinsics = {
         "nerf_synthetic": (fx, fx, width / 2, height / 2),
+        "realitycapture": (fx, fx, cx, cy),
+        "blender_nerf": (fx, fy, width / 2, height / 2),
         "tensoir": (0.5 * width / np.tan(0.4), 0.5 * width / np.tan(0.4), width / 2, height / 2),
     }.get(layout.__name__, (fx, fy, cx, cy))
     order = in_order(capture, layout)
@@ -209,15 +338,33 @@ def test_a_world_point_lands_on_the_same_pixel(
         assert view.read()[..., 2].mean() == pytest.approx(index / 16, abs=0.01)  # and it is its own image
 
 
-@pytest.mark.parametrize("layout", FORMATS, ids=lambda layout: layout.__name__)
+@pytest.mark.parametrize("layout", [*FORMATS, *PANORAMAS], ids=lambda layout: layout.__name__)
 def test_poses_come_back_from_every_format(tmp_path: Path, photos, write, layout) -> None:
     layout(tmp_path, photos, write)
     found = [view.camera.camera_to_world for view in in_order(load_capture(tmp_path), layout)]
     np.testing.assert_allclose(found, photos.opencv, atol=1e-6)
 
 
+@pytest.mark.parametrize("downscale", [1, 2.5])
+@pytest.mark.parametrize("layout", PANORAMAS, ids=lambda layout: layout.__name__)
+def test_every_pixel_of_a_panorama_shows_its_direction(
+    tmp_path: Path, photos, write, layout, downscale: float
+) -> None:
+    layout(tmp_path, photos, write)
+    capture = load_capture(tmp_path, LoadSettings(downscale=downscale))
+    assert not capture.skipped
+    assert len(capture.views) == 6 * len(photos.names)
+    for index, view in enumerate(capture.views):
+        seen = view.read()
+        assert np.abs(seen[..., :2] - (0.5 + 0.5 * view.camera.rays()[..., :2])).max() < 0.01
+        assert seen[..., 2] == pytest.approx(index // 6 / 16, abs=0.003)
+        assert view.camera.fov_deg == pytest.approx(90)
+
+
 def in_order(capture: Capture, layout) -> list:
-    """Views in the order of the cameras; TensoIR's last three are its test views."""
+    """Views in the order of the cameras: TensoIR's last three are its test views; the front of a panorama."""
+    if layout in PANORAMAS:
+        return [view for view in capture.views if view.name.endswith("/front")]
     if layout is not tensoir:
         return list(capture.views)
     return [*capture.train_views, *capture.test_views]

@@ -17,6 +17,7 @@ import numpy as np
 
 from tron.captures.photos.distortion import Lens, load_pycolmap
 from tron.captures.photos.image_folder import ImageFolder, photos_in, view_names
+from tron.captures.photos.panoramas import Panorama
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
@@ -29,7 +30,7 @@ log = logging.getLogger(__name__)
 
 _MAX_ERROR = 2.0
 _MIN_TRACK = 3
-_CAMERA_BYTES = 24 + 3 * 8  # id, model, width, height and at least three parameters
+_CAMERA_BYTES = 24 + 2 * 8  # id, model, width, height and at least two parameters
 _POSE_BYTES = 7 * 8
 INPUT = "input"
 """Folder of the original photos in 3DGS' layout."""
@@ -96,7 +97,9 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     return model
 
 
-def posed_by(model: pycolmap.Reconstruction) -> list[tuple[str, np.ndarray, Lens]]:
+def posed_by(
+    model: pycolmap.Reconstruction,
+) -> list[tuple[str, np.ndarray, Lens | Callable[[int, int], Panorama]]]:
     """Name, (4, 4) OpenCV camera-to-world and lens of every posed image, in the order of names.
 
     A lens that pycolmap knows and that has no pinhole view is refused when a photo of it is used.
@@ -130,7 +133,9 @@ def points_of(model: pycolmap.Reconstruction) -> tuple[np.ndarray | None, np.nda
     return (xyz[kept], colors[kept]) if kept.any() else (None, None)
 
 
-def _lens(camera: pycolmap.Camera) -> Lens:
+def _lens(camera: pycolmap.Camera) -> Lens | Callable[[int, int], Panorama]:
+    if camera.model.name == "EQUIRECTANGULAR":
+        return lambda *_: Panorama(camera.width, camera.height)
     return Lens(camera.model.name, camera.width, camera.height, tuple(camera.params))
 
 

@@ -4,7 +4,8 @@ A camera has a label, the photo's name with or without its suffix, the id of its
 numbers, row after row, camera to the chunk's own world, OpenCV's camera axes. A sensor has its resolution and
 a calibration: f, cx and cy from the middle of the picture, in pixels, b1 (how much wider pixels are seen), b2
 (skew), k1 to k4, p1 and p2. Metashape's p1 is OpenCV's p2 and the other way round (Metashape manual, appendix
-"Camera models"). Cameras of several components stand in worlds of their own: the largest is read.
+"Camera models"). A spherical sensor, of equirectangular photos of 360 degrees, has its resolution alone.
+Cameras of several components stand in worlds of their own: the largest is read.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 from tron.cameras import rigid_pose
 from tron.captures.photos.distortion import Lens, opencv_lens
 from tron.captures.photos.image_folder import ImageFolder
+from tron.captures.photos.panoramas import Panorama
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError, located
@@ -109,22 +111,24 @@ def _photo(
     return PosedPhoto(label, image, pose, lens)
 
 
-def _lens(sensor: ElementTree.Element) -> Lens:
+def _lens(sensor: ElementTree.Element) -> Lens | Panorama:
     calibrations = sensor.findall("calibration")
     # Where photos were aligned there are two: what was given, and what was found.
     calibration = next((each for each in calibrations if each.get("class") == "adjusted"), None)
     calibration = calibration if calibration is not None else next(iter(calibrations), None)
     resolution = sensor.find("resolution")
     kind = sensor.get("type", "frame")
-    if kind != "frame":
+    if kind not in ("frame", "spherical"):
         raise TronError(f"cameras of type {kind} are not supported")
-    if calibration is None or resolution is None:
+    if resolution is None or (calibration is None and kind == "frame"):
         raise TronError("its sensor is not calibrated")
+    width, height = (float(resolution.get(name, 0)) for name in ("width", "height"))
+    if kind == "spherical" or calibration is None:
+        return Panorama(width, height)
 
     def value(name: str) -> float:
         return float(calibration.findtext(name) or 0.0)
 
-    width, height = (float(resolution.get(name, 0)) for name in ("width", "height"))
     if value("k4"):
         raise TronError("calibrated with k4, which is not supported: calibrate without it")
     if value("b2"):

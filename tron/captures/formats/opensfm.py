@@ -17,11 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from tron.captures.photos.distortion import Lens, opencv_lens
 from tron.captures.photos.image_folder import ImageFolder
+from tron.captures.photos.panoramas import Panorama
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError, located
 from tron.io.transforms_json import number, read_list
 
+_SPHERICAL = ("spherical", "equirectangular")
 _NAMES = ("reconstruction.json", "opensfm/reconstruction.json")
 
 
@@ -81,10 +83,12 @@ def _photo(
     return PosedPhoto(name, image, np.linalg.inv(to_camera), _lens_maker(camera))
 
 
-def _lens_maker(camera: Mapping[str, Any]) -> Callable[[int, int], Lens]:
-    def lens(width: int, height: int) -> Lens:
+def _lens_maker(camera: Mapping[str, Any]) -> Callable[[int, int], Lens | Panorama]:
+    def lens(width: int, height: int) -> Lens | Panorama:
         w, h = number(camera, "width", width), number(camera, "height", height)
         side, kind = max(w, h), camera.get("projection_type", "perspective")
+        if kind in _SPHERICAL:
+            return Panorama(w, h)
         k1, k2, k3 = (number(camera, key, 0.0) for key in ("k1", "k2", "k3"))
         if kind == "perspective":
             focal = number(camera, "focal", 0.0)

@@ -4,8 +4,9 @@ The dialects agree on OpenGL camera-to-world matrices; they differ in what else 
 
 - NeRF-synthetic: one file a split, ``camera_angle_x`` alone, names without ``.png``;
 - instant-ngp: intrinsics and OpenCV distortion for the file, ``is_fisheye``;
-- nerfstudio: the same for the file or each frame, ``camera_model``, ``train_filenames`` and so on,
-  ``applied_transform`` and ``applied_scale``, points in ``ply_file_path``;
+- nerfstudio: the same for the file or each frame, ``camera_model`` (EQUIRECTANGULAR of photos of 360 degrees,
+  without a focal length), ``train_filenames`` and so on, ``applied_transform`` and ``applied_scale``, points
+  in ``ply_file_path``;
 - DL3DV: nerfstudio's, with intrinsics of the full resolution and reduced images.
 
 The capture's world is COLMAP's (:mod:`tron.io.transforms_json`). Points are written in that of the file and
@@ -29,10 +30,19 @@ from tron.captures.formats.colmap import model_folder
 from tron.captures.formats.not_a_capture import require_poses_of_photos
 from tron.captures.photos.distortion import Lens, opencv_lens
 from tron.captures.photos.image_folder import ImageFolder, relative_parts
+from tron.captures.photos.panoramas import Panorama
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
-from tron.io.transforms_json import described, frames_of, intrinsics_of, number, read_json, to_original
+from tron.io.transforms_json import (
+    EQUIRECTANGULAR,
+    described,
+    frames_of,
+    intrinsics_of,
+    number,
+    read_json,
+    to_original,
+)
 
 log = logging.getLogger(__name__)
 
@@ -132,8 +142,10 @@ def _beside(frame: Mapping[str, Any], key: str, where: str, root: Path) -> Path 
         raise TronError(error.what.replace("image name", key), where, error.mend) from error
 
 
-def _lens_maker(data: Mapping[str, Any]) -> Callable[[int, int], Lens]:
-    def lens(width: int, height: int) -> Lens:
+def _lens_maker(data: Mapping[str, Any]) -> Callable[[int, int], Lens | Panorama]:
+    def lens(width: int, height: int) -> Lens | Panorama:
+        if data.get("camera_model") == EQUIRECTANGULAR:
+            return Panorama(number(data, "w", width), number(data, "h", height))
         w, h, focal, center = intrinsics_of(data, width, height)
         k1, k2, k3, k4 = (number(data, key, 0.0) for key in ("k1", "k2", "k3", "k4"))
         tangential = (number(data, "p1", 0.0), number(data, "p2", 0.0))

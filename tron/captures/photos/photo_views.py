@@ -3,27 +3,47 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tron.cameras import Camera, rigid_pose
+from tron.cameras import rigid_pose
 from tron.captures.masks import MaskMeaning, beside_reduced, find_mask
+from tron.captures.photos.depth_files import DepthReader, nearest, require_depth
 from tron.captures.photos.distortion import Lens
+from tron.captures.photos.panoramas import Face, Panorama
 from tron.captures.photos.photo_files import PhotoHeader, inspect_photo
-from tron.captures.photos.photographs import PhotoCache, PhotoReader, PosedPhoto
+from tron.captures.photos.photographs import Decode, PhotoCache, PhotoReader, PosedPhoto
 from tron.captures.settings import PhotoSettings
-from tron.captures.view import View
+from tron.captures.view import Pixels, View
 from tron.color import luminance, srgb_to_linear
 from tron.errors import TronError
 
 _SHAPE_TOLERANCE = 0.02
 
 Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class _Files:
+    """A photo's own file and those that say more of its pixels, found and inspected.
+
+    Attributes:
+        photo: the photo, and ``header`` its header.
+        mask: its mask and its header.
+        maps: more images of the same pixels, with their headers and what they encode, by field.
+        depth: its depth and the world units of one step.
+    """
+
+    photo: Path
+    header: PhotoHeader
+    mask: tuple[Path, PhotoHeader] | None
+    maps: Mapping[str, tuple[Path, PhotoHeader, Decode]]
+    depth: tuple[Path, float] | None
 
 
 @dataclass
@@ -37,7 +57,9 @@ class PhotoViews:
         exposure: of linear photos.
         lost_maps: maps that could not be read, and why.
         reduced: sizes before and after, of photos that are made smaller.
-        masked: number of views with a mask of their own file.
+        masked: number of photos with a mask of their own file.
+        notes: what is to be said of the photos' colours, counted.
+        panoramas: number of photos that were cut into faces.
     """
 
     settings: PhotoSettings
@@ -48,9 +70,10 @@ class PhotoViews:
     reduced: list[tuple[Size, Size]] = field(default_factory=list)
     masked: int = 0
     notes: Counter[str] = field(default_factory=Counter)
+    panoramas: int = 0
 
-    def view(self, name: str, photo: PosedPhoto) -> View:
-        """The view of a photo, which is read when it is looked at.
+    def views(self, name: str, photo: PosedPhoto) -> list[View]:
+        """The view of a photo, or six of a panorama, ``NAME/front`` and so on; read when they are looked at.
 
         Raises:
             TronError: the photo, its pose, its lens or its mask cannot be used.
@@ -59,50 +82,84 @@ class PhotoViews:
             raise TronError(photo.refused or "no camera")
         if photo.path is None:
             raise TronError("image not found")
-        world_to_camera = np.linalg.inv(rigid_pose(photo.camera_to_world))
+        pose = rigid_pose(photo.camera_to_world)
         header = inspect_photo(photo.path)
         self.notes.update(header.notes)
         size = header.size(self.upright)
         lens = _lens_of(photo, *size)
-        reduced = self.settings.size_of(*size)
-        camera = lens.camera(world_to_camera, *size).resized(*reduced)
+        mask = mask_of(photo.path, header, self.settings.masks, self.upright, photo.mask)
+        files = _Files(
+            photo.path, header, mask, self._maps_of(name, photo, size), self._depth_of(name, photo)
+        )
+        self.masked += mask is not None
+        if not isinstance(lens, Panorama):
+            return [self._view(name, files, lens, np.linalg.inv(pose))]
+        self.panoramas += 1
+        return [
+            self._view(f"{name}/{face.name}", files, face, np.linalg.inv(pose @ face.to_panorama))
+            for face in lens.faces
+        ]
+
+    def _view(self, name: str, files: _Files, lens: Lens | Face, world_to_camera: np.ndarray) -> View:
+        camera = lens.camera(world_to_camera, *files.header.size(self.upright))
+        full = (camera.width, camera.height)
+        size = self.settings.size_of(*full)
+        camera = camera.resized(*size)
 
         def reader(path: Path, header: PhotoHeader, **kind: Any) -> PhotoReader:
             return PhotoReader(
-                path, header, lens, reduced, self.cache, self.upright, exposure=self.exposure, **kind
+                path, header, lens, size, self.cache, self.upright, exposure=self.exposure, **kind
             )
 
-        read = reader(photo.path, header)
-        maps = {}
-        for map_name, (path, decode) in photo.maps.items():
-            try:
-                found = reader(path, _of_size(path, size, self.upright, "image"))
-                maps[map_name] = partial(found.decoded, decode)
-            except TronError as error:
-                self.lost_maps.append(f"{map_name} of {name} ({error.what})")
-        if photo.depth is not None:
-            try:
-                require_depth(photo.depth)
-                unit = self.settings.depth_unit * photo.depth_scale
-                maps["depth"] = DepthReader(photo.depth, unit, lens, camera)
-            except TronError as error:
-                self.lost_maps.append(f"depth of {name} ({error.what})")
-        if header.alpha:
+        read = reader(files.photo, files.header)
+        maps: dict[str, Pixels] = {
+            field: partial(reader(path, header).decoded, decode)
+            for field, (path, header, decode) in files.maps.items()
+        }
+        if files.depth is not None:
+            maps["depth"] = DepthReader(*files.depth, lens, camera)
+        if files.header.alpha:
             maps["mask"] = read.alpha
-        mask = mask_of(photo.path, header, self.settings.masks, self.upright, photo.mask)
-        if mask is not None:
+        if files.mask is not None:
             meaning = self.settings.masks
-            maps["mask" if meaning == "subject" else "valid"] = reader(*mask, mask=meaning).grey
-            self.masked += 1
+            maps["mask" if meaning == "subject" else "valid"] = reader(*files.mask, mask=meaning).grey
         if self.settings.sky and "mask" not in maps:
             maps |= {"sky_mask": partial(self._sky, read), "mask": partial(self._below_sky, read)}
-        if reduced != size:
-            self.reduced.append((size, reduced))
+        if size != full:
+            self.reduced.append((full, size))
         return View(name, camera, read.color, "display", **maps)
 
+    def _maps_of(
+        self, name: str, photo: PosedPhoto, size: Size
+    ) -> dict[str, tuple[Path, PhotoHeader, Decode]]:
+        """More images of a photo's pixels that can be read, by field."""
+        found = {}
+        for field_name, (path, decode) in photo.maps.items():
+            try:
+                found[field_name] = (path, _of_size(path, size, self.upright, "image"), decode)
+            except TronError as error:
+                self.lost_maps.append(f"{field_name} of {name} ({error.what})")
+        return found
+
+    def _depth_of(self, name: str, photo: PosedPhoto) -> tuple[Path, float] | None:
+        """File of a photo's depth and the world units of one step of it, if it can be read."""
+        if photo.depth is None:
+            return None
+        try:
+            require_depth(photo.depth)
+        except TronError as error:
+            self.lost_maps.append(f"depth of {name} ({error.what})")
+            return None
+        return photo.depth, self.settings.depth_unit * photo.depth_scale
+
     def _sky(self, read: PhotoReader) -> np.ndarray:
-        """(H, W) float32, 1 where a photo shows the sky."""
-        return self.cache.get((read, "sky"), lambda: open_sky(read.color())).astype(np.float32)
+        """(H, W) float32, 1 where a photo shows the sky; a panorama is looked at as a whole."""
+        if not isinstance(read.lens, Face):
+            return self.cache.get((read, "sky"), lambda: open_sky(read.color())).astype(np.float32)
+        side = min(2 * read.size[1], read.header.size(self.upright)[1])
+        whole = replace(read, lens=read.lens.panorama, size=(2 * side, side))
+        sky = self.cache.get((whole, "sky"), lambda: open_sky(whole.color()))
+        return nearest(sky, read.lens.fractions(*read.size)).astype(np.float32)
 
     def _below_sky(self, read: PhotoReader) -> np.ndarray:
         return 1 - self._sky(read)
@@ -137,7 +194,7 @@ def mask_of(
     return path, _of_size(path, header.size(upright), upright, "mask")
 
 
-def _lens_of(photo: PosedPhoto, width: int, height: int) -> Lens:
+def _lens_of(photo: PosedPhoto, width: int, height: int) -> Lens | Panorama:
     assert photo.lens is not None
     lens = photo.lens(width, height) if callable(photo.lens) else photo.lens
     # Halved sizes are rounded, so shapes may differ by a pixel.
@@ -213,95 +270,3 @@ def open_sky(image: np.ndarray) -> np.ndarray:
     for _ in range(_RIM):
         sky |= (cv2.dilate(sky.astype(np.uint8), cross) > 0) & alike
     return sky
-
-
-_DEPTH_SUFFIXES = (".png", ".npy")
-
-
-@dataclass(frozen=True)
-class DepthReader:
-    """Reads the depth of one photo as its view wants it.
-
-    Nothing is averaged, for between a near and a far surface there is none: each pixel takes the depth that
-    lies nearest to its centre. The file may be smaller than the photo, as a phone's lidar is.
-
-    Attributes:
-        path: 16-bit PNG or .npy of (H, W) numbers, 0 where nothing is known.
-        unit: world units of one step.
-        lens: of the photo.
-        camera: of the view.
-    """
-
-    path: Path
-    unit: float
-    lens: Lens
-    camera: Camera
-
-    def __call__(self) -> np.ndarray:
-        """(H, W) float32 distance from the camera along each pixel's ray, world units.
-
-        Raises:
-            TronError: no such file, or one that holds no depth of this photo.
-        """
-        stored = _read(self.path)
-        width, height = self.camera.width, self.camera.height
-        if abs(stored.shape[1] * height - stored.shape[0] * width) > max(
-            _SHAPE_TOLERANCE * width * stored.shape[0], width, height
-        ):
-            raise TronError(
-                f"depth has {stored.shape[1]} x {stored.shape[0]} pixels, its view {width} x {height}",
-                self.path,
-            )
-        columns, rows = _centres(self.lens, width, height)
-        along_axis = stored[
-            _nearest(rows / height, stored.shape[0]), _nearest(columns / width, stored.shape[1])
-        ]
-        cosine = self.camera.rays() @ self.camera.forward
-        return (along_axis * self.unit / cosine).astype(np.float32)
-
-
-def require_depth(path: Path) -> None:
-    """Raise TronError unless there is a depth file of a kind that is read; it is not decoded."""
-    if path.suffix.lower() not in _DEPTH_SUFFIXES:
-        raise TronError("depth in an unknown format", path, f"use {', '.join(_DEPTH_SUFFIXES)}")
-    if not path.is_file():
-        raise TronError("not found", path)
-
-
-def _centres(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows, (height, width) each, in the stored photo as if it had this size."""
-    if not lens.distorts:
-        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        return columns, rows
-    places = lens.places(width, height)
-    return places[..., 0], places[..., 1]
-
-
-def _nearest(fraction: np.ndarray, count: int) -> np.ndarray:
-    return np.clip((fraction * count).astype(int), 0, count - 1)
-
-
-def _read(path: Path) -> np.ndarray:
-    """(H, W) float64, finite and not negative."""
-    try:
-        depth = _READERS[path.suffix.lower()](path)
-    except (OSError, ValueError, EOFError) as error:
-        raise TronError(f"not a readable depth file: {error}", path) from error
-    if depth is None or depth.ndim not in (2, 3) or depth.dtype.kind not in "uif":
-        raise TronError("depth file holds no numbers of one channel", path)
-    depth = depth.reshape(*depth.shape[:2], -1)
-    if depth.shape[2] != 1 or depth.size == 0 or depth.dtype == np.uint8:
-        raise TronError("depth file has several channels or 8 bits", path, "store 16 bits of one channel")
-    return np.nan_to_num(depth[..., 0].astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0).clip(0)
-
-
-def _png(path: Path) -> np.ndarray | None:
-    import cv2
-
-    return cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-
-
-_READERS: dict[str, Callable[[Path], np.ndarray | None]] = {
-    ".png": _png,
-    ".npy": lambda path: np.load(path, allow_pickle=False),
-}

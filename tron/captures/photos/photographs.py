@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,8 +17,11 @@ from cachetools import LRUCache
 
 from tron.captures.masks import MaskMeaning, mask_values
 from tron.captures.photos.distortion import Lens
+from tron.captures.photos.panoramas import Face, Panorama, bordered
 from tron.captures.photos.photo_files import PhotoHeader, decode_photo
 
+_OVERSAMPLED = 3
+"""A panorama is reduced to so many times the resolution of the faces, before these are cut out."""
 Decode = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """What a map's file means: stored values (H, W, 3) and alpha (H, W), both in [0, 1] -> the map."""
 
@@ -58,7 +61,7 @@ class PhotoReader:
     Attributes:
         path: the file.
         header: what it said when the capture was loaded; it is held to that.
-        lens: undistorts it.
+        lens: undistorts it, or cuts a face out of it; a whole panorama is read as it is.
         size: width and height of what is read; not larger than the photo.
         cache: shared by the photos of a capture.
         upright: turn the photo as its EXIF tag says. Poses of files belong to the pixels as stored, hence no.
@@ -68,7 +71,7 @@ class PhotoReader:
 
     path: Path
     header: PhotoHeader
-    lens: Lens
+    lens: Lens | Face | Panorama
     size: tuple[int, int]
     cache: PhotoCache
     upright: bool = False
@@ -95,15 +98,37 @@ class PhotoReader:
 
     def _pixels(self) -> np.ndarray:
         """(H, W, 1, 3 or 4) float32 in [0, 1]."""
-        stored = self.cache.get(self, self._read)
+        if isinstance(self.lens, Face):
+            stored = self.cache.get((self.lens.panorama, replace(self, lens=self.lens.panorama)), self._cut)
+            stored = stored[self.lens.index]
+        else:
+            stored = self.cache.get(self, lambda: self._reduced(self._decoded()))
         return stored.astype(np.float32) / np.iinfo(stored.dtype).max
 
-    def _read(self) -> np.ndarray:
+    def _cut(self) -> tuple[np.ndarray, ...]:
+        """All faces of the panorama, cut at once: decoding it takes longer.
+
+        It is reduced before that as far as leaves the faces three times as fine as they are wanted, but not
+        with alpha, for the colours that it hides must not bleed in.
+        """
+        assert isinstance(self.lens, Face)
+        pixels = self._decoded()
+        height = min(pixels.shape[0], round(_OVERSAMPLED * self.size[1] * np.pi / 2))
+        if pixels.shape[2] != 4:
+            pixels = _area(pixels, (2 * height, height))
+        pixels = bordered(pixels)
+        return tuple(replace(self, lens=face)._reduced(pixels) for face in self.lens.panorama.faces)
+
+    def _decoded(self) -> np.ndarray:
         pixels = decode_photo(self.path, self.header, self.exposure)
         if self.mask is not None:
             pixels = mask_values(pixels, self.mask)
         if self.upright:
             pixels = _turned(pixels, self.header.orientation)
+        return pixels
+
+    def _reduced(self, pixels: np.ndarray) -> np.ndarray:
+        """What is read of the whole photo's pixels (H, W, C): undistorted, or a face, at ``size``."""
         if pixels.shape[2] == 4:
             return self._resampled_under_alpha(pixels)
         return _area(self._undistort(pixels), self.size)
@@ -120,12 +145,12 @@ class PhotoReader:
         return np.clip(np.round(weighted), 0, scale).astype(pixels.dtype)
 
     def _undistort(self, pixels: np.ndarray) -> np.ndarray:
-        if not self.lens.distorts:
+        if isinstance(self.lens, Panorama) or not self.lens.distorts:
             return pixels
         import cv2
 
-        height, width = pixels.shape[:2]
-        maps = self.cache.get((self.lens, width, height), lambda: self.lens.undistortion_maps(width, height))
+        lens, (height, width) = self.lens, pixels.shape[:2]
+        maps = self.cache.get((lens, width, height), lambda: lens.undistortion_maps(width, height))
         return cv2.remap(pixels, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
@@ -156,20 +181,21 @@ class PosedPhoto:
         name: as the file has it.
         path: the image, None if it was not found.
         camera_to_world: matrix to the capture's world, OpenCV camera axes; anything (4, 4) or (3, 4).
-        lens: of the photo, or what gives the lens for a photo of this width and height.
+        lens: of the photo, or what gives the lens for a photo of this width and height; a panorama becomes
+            six views.
         split: whether the file holds the photo out; None where it does not say.
         maps: more images of the same pixels, by field of :class:`View`, with what they encode.
         refused: why the photo cannot be used, if the file itself shows that.
         mask: that the file names; None: one is looked for beside the photo (see :func:`find_mask`).
-        depth: file of the photo's depth (see :class:`DepthReader`), whose units are ``depth_scale`` times the
-            user's.
+        depth: file of the photo's depth (see :mod:`tron.captures.photos.depth_files`), whose units are
+            ``depth_scale`` times the user's.
         depth_scale: world units of the capture in one of the file's.
     """
 
     name: str
     path: Path | None
     camera_to_world: object
-    lens: Lens | Callable[[int, int], Lens] | None
+    lens: Lens | Panorama | Callable[[int, int], Lens | Panorama] | None
     split: Literal["train", "test"] | None = None
     maps: Mapping[str, tuple[Path, Decode]] = field(default_factory=dict)
     refused: str | None = None

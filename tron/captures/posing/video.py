@@ -2,41 +2,35 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, Field
 
 from tron.captures.photos.photographs import PosedPhotos
+from tron.captures.photos.video_frames import (
+    FEWEST,
+    FRAMES,
+    WIDTH,
+    FrameSettings,
+    holds_frames,
+    keep_frames,
+    sharpest,
+)
 from tron.captures.posing.structure_from_motion import PosingSettings, pose_photos
 from tron.errors import TronError
 from tron.gaussians.foreign_files import VIDEOS
-from tron.io.images import encode_jpeg
-from tron.io.video import Frame, duration_of, frames_of
-from tron.storage import atomic_folder, locked, sha256
+from tron.io.video import duration_of, frames_of
+from tron.storage import locked, sha256
 
 log = logging.getLogger(__name__)
 
-FRAMES = "frames"
-_RECORD = "video.json"
 _VERSION = 2
-_FEWEST = 3
-_WIDTH = 480
 _CORNERS = 200
 _STILL = 0.004
 """Share of a picture's width that something must have moved by, from one chosen frame to another."""
-
-
-class FrameSettings(BaseModel):
-    """Frames of a video that become photos."""
-
-    frames: int = Field(
-        default=120, ge=_FEWEST, description="photos made of a video: the sharpest of as many intervals"
-    )
 
 
 class VideoSettings(FrameSettings, PosingSettings):
@@ -78,25 +72,8 @@ def choose_frames(path: Path, count: int) -> list[np.ndarray]:
     if not seconds > 0:
         mend = f"ffmpeg -i {path.name} -c copy new.mp4"
         raise TronError("video does not say how long it lasts", path, mend)
-    chosen: list[np.ndarray] = []
-    best: Frame | None = None
-    most, interval = -1.0, 0
-    for frame in frames_of(path):
-        now = min(int(frame.seconds / seconds * count), count - 1)
-        if now != interval and best is not None:
-            chosen.append(best.rgb())
-            best, most, interval = None, -1.0, now
-        sharp = sharpness(frame.grey(_WIDTH))
-        if sharp > most:
-            best, most = frame, sharp
-    return chosen if best is None else [*chosen, best.rgb()]
-
-
-def sharpness(grey: np.ndarray) -> float:
-    """Variance of the Laplacian of a picture (H, W): blur takes it away (Pech-Pacheco et al. 2000)."""
-    import cv2
-
-    return float(cv2.Laplacian(grey, cv2.CV_32F).var())
+    chosen = sharpest(frames_of(path), lambda _, frame: min(int(frame.seconds / seconds * count), count - 1))
+    return [frame.rgb() for _, frame in chosen]
 
 
 def motion(frames: Sequence[np.ndarray]) -> float:
@@ -126,7 +103,7 @@ def _small(frame: np.ndarray) -> np.ndarray:
     import cv2
 
     grey = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
-    width = min(_WIDTH, grey.shape[1])
+    width = min(WIDTH, grey.shape[1])
     return cv2.resize(grey, (width, max(2, round(grey.shape[0] * width / grey.shape[1]))))
 
 
@@ -134,24 +111,18 @@ def _kept_frames(path: Path, count: int, workspace: Path) -> Path:
     """Folder of the chosen frames, made unless it is there from the same video."""
     folder = workspace / FRAMES
     wanted = {"version": _VERSION, "video": sha256(path), "frames": count}
-    try:
-        if json.loads((folder / _RECORD).read_text("utf-8")) == wanted:
-            return folder
-    except (OSError, ValueError):
-        pass
+    if holds_frames(folder, wanted):
+        return folder
     log.info("%s: looking for the sharpest frames of %d intervals", path, count)
     frames = choose_frames(path, count)
-    if len(frames) < _FEWEST:
-        raise TronError(f"video has {len(frames)} frames, at least {_FEWEST} are needed", path)
+    if len(frames) < FEWEST:
+        raise TronError(f"video has {len(frames)} frames, at least {FEWEST} are needed", path)
     if motion(frames) < _STILL:
         raise TronError(
             "nothing moves in the video: all its frames show one view",
             path,
             "walk around the scene as you film it",
         )
-    with atomic_folder(folder) as made:
-        for index, frame in enumerate(frames):
-            (made / f"{index:05d}.jpg").write_bytes(encode_jpeg(frame))
-        (made / _RECORD).write_text(json.dumps(wanted), "utf-8")
+    keep_frames(folder, wanted, ((f"{index:05d}", frame) for index, frame in enumerate(frames)))
     log.info("%s: %d frames of %d x %d taken", path, len(frames), frames[0].shape[1], frames[0].shape[0])
     return folder

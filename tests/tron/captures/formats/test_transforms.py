@@ -144,3 +144,18 @@ def test_names_keep_their_suffix_where_they_must(tmp_path: Path, write, capture:
 
 def test_an_up_direction_can_be_said(tmp_path: Path, capture: dict) -> None:
     assert np.allclose(load_capture(tmp_path, LoadSettings(up=(0, 3, 0))).up, (0, 1, 0))
+
+
+def test_views_that_blender_nerf_logs_and_does_not_render_are_no_test_views(
+    tmp_path: Path, photos, write
+) -> None:
+    """The add-on writes poses of test views whether or not it draws their pictures."""
+    write.json(tmp_path / "transforms_train.json", write.transforms(photos, "images_train/"))
+    write.json(tmp_path / "transforms_test.json", write.transforms(photos, "images_test/"))
+    write.photos(tmp_path / "images_train", photos)
+    capture = load_capture(tmp_path)
+    assert len(capture.views) == len(photos.names)
+    assert len(capture.test) == 2  # every eighth
+    assert set(capture.skipped.values()) == {"image not found"}
+    write.photos(tmp_path / "images_test", photos)
+    assert len(load_capture(tmp_path).test_views) == len(photos.names)

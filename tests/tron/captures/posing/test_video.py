@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from tron.captures import LoadSettings, load_capture
+from tron.captures.photos.video_frames import sharpness
 from tron.captures.posing import video as module
 from tron.captures.posing.video import (
     VideoSettings,
@@ -16,7 +17,6 @@ from tron.captures.posing.video import (
     choose_frames,
     motion,
     read_video,
-    sharpness,
 )
 from tron.errors import TronError
 from tron.io.video import VideoWriter, frames_of
