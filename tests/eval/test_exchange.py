@@ -91,7 +91,8 @@ def test_splats_without_a_sign_are_seen_from_both_sides(world):
     assert max(alike(signed, draw(world.plain, world.cameras))) < 30
 
 
-def test_a_program_that_fails_is_named_with_its_words(world, tmp_path: Path):
+def test_a_program_that_fails_is_named_with_its_words(world, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(splats, "ROUNDS", 1)
     failing = tmp_path / "fails"
     failing.write_text("#!/bin/sh\necho no such thing >&2\nexit 3\n")
     failing.chmod(0o755)
