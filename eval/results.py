@@ -38,7 +38,7 @@ class Row(BaseModel):
 
     metric: str = Field(pattern=METRIC_PATTERN, description="what was measured, e.g. neural.psnr_full.sun")
     value: FiniteFloat = Field(description="the figure, in its unit")
-    unit: str = Field(min_length=1, description="dB, s, deg, x (times), fraction, abs (error) or 1")
+    unit: str = Field(min_length=1, description="dB, s, deg, x (times), fraction, bytes, abs (error) or 1")
     reference: str | None = Field(default=None, description="what the value is held against, in words")
     ratio: FiniteFloat | None = Field(default=None, description="the value over the reference's number")
     n: PositiveInt = Field(description="number of things that it was averaged over")

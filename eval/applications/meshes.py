@@ -168,7 +168,7 @@ class Truth:
         shapes = [textured(part, f"true{n}").shape for n, (_, part) in enumerate(parts)]
         white = [_white(part, f"white{n}") for n, (_, part) in enumerate(parts)]
         lit, irradiance = (
-            _traced(each, light, depth, paths, integer(seed, "meshes", "truth", depth))
+            path_traced(each, light, VIEW, depth, paths, integer(seed, "meshes", "truth", depth))
             for each, depth, paths in ((shapes, FINEST.bounces + 2, PATHS), (white, 2, SHADOW_PATHS))
         )
         return cls(lit, irradiance, _numbers(shapes, [k for k, _ in parts]))
@@ -184,18 +184,20 @@ def _white(part: Part, name: str) -> mi.Mesh:
     return mitsuba_mesh(name, made, part.vertices, part.normals, part.faces, part.uv)
 
 
-def _scene(shapes: Sequence[mi.Mesh], light: EnvironmentMap | None = None) -> mi.Scene:
+def scene_of(shapes: Sequence[mi.Mesh], light: EnvironmentMap | None = None) -> mi.Scene:
+    """Meshes with their materials, and a light around them, if any."""
     lamp = {} if light is None else {"light": light.to_mitsuba()}
     return mi.load_dict({"type": "scene", **lamp, **{f"shape{k}": shape for k, shape in enumerate(shapes)}})
 
 
-def _traced(
-    shapes: Sequence[mi.Mesh], light: EnvironmentMap, depth: int, paths: int, seed: int
+def path_traced(
+    shapes: Sequence[mi.Mesh], light: EnvironmentMap, camera: Camera, depth: int, paths: int, seed: int
 ) -> np.ndarray:
-    sensor = mitsuba_sensor(VIEW, paths)
+    """(H, W, 3) linear radiance of meshes by Mitsuba's paths of up to ``depth`` edges, ``paths`` a pixel."""
+    sensor = mitsuba_sensor(camera, paths)
     sensor["sampler"]["type"] = "multijitter"
     integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": depth})
-    scene, seen = _scene(shapes, light), mi.load_dict(sensor)
+    scene, seen = scene_of(shapes, light), mi.load_dict(sensor)
     image = mi.render(scene, sensor=seen, integrator=integrator, spp=paths, seed=mi.UInt32(seed % 2**32))
     return np.array(image)[..., :3]
 
@@ -204,7 +206,7 @@ def _numbers(shapes: Sequence[mi.Mesh], numbers: Sequence[int]) -> np.ndarray:
     """(H, W) number of the thing that nine rays of a pixel meet; 0 where they meet several or none."""
     fine = VIEW.resized(3 * VIEW.width, 3 * VIEW.height)
     along = mi.Vector3f(fine.rays().reshape(-1, 3).T.astype(np.float32))
-    si = _scene(shapes).ray_intersect(mi.Ray3f(mi.Point3f(*VIEW.position.tolist()), along))
+    si = scene_of(shapes).ray_intersect(mi.Ray3f(mi.Point3f(*VIEW.position.tolist()), along))
     found = mi.UInt32(0)
     for shape, number in zip(shapes, numbers, strict=True):
         found = dr.select(si.is_valid() & (si.shape == mi.ShapePtr(shape)), number, found)

@@ -113,7 +113,7 @@ def _write_splats(settings: Settings) -> None:
         scene = GaussianScene.load(settings.scene)
     if scene.kernel_degree != 2:
         log.info(
-            "splats of other programs fade more slowly: they are made %.1f times as wide, and edges soften",
+            "splats of other programs fade more slowly: they are made %.2f times as wide, and edges soften",
             KERNEL_WIDTHS,
         )  # fmt: skip
     with working("writing"):

@@ -18,6 +18,7 @@ from tron.gaussians.harmonics import dc_to_rgb
 from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS, packed
 from tron.gaussians.ply import FLATNESS, NORMAL, write_ply
 from tron.gaussians.scene import GaussianScene
+from tron.gaussians.spz_harmonics import with_harmonics
 from tron.io.optional import usd
 from tron.storage import atomic_path, write_atomic
 
@@ -59,8 +60,10 @@ def write_splats(path: Path, scene: GaussianScene) -> None:
         return
     with tempfile.TemporaryDirectory(prefix="tron-") as folder:
         plain = Path(folder) / "plain.ply"
-        _write_plain(plain, scene.rotated(HALF_TURN) if kind.half_turned else scene)
-        write_atomic(path, packed(plain.read_bytes(), kind))
+        turned = scene.rotated(HALF_TURN) if kind.half_turned else scene
+        _write_plain(plain, turned)
+        content = packed(plain.read_bytes(), kind)
+    write_atomic(path, with_harmonics(content, turned.sh) if suffix == ".spz" else content)
 
 
 def write_points(path: Path, scene: GaussianScene) -> int:

@@ -21,6 +21,7 @@ _STYLES = {
     "kills": (1, 0, " kills"),
     "faults": (1, 0, " faults"),
     "frames/h": (1, 0, " frames/h"),
+    "bytes": (1e-3, 0, " kB"),
 }
 """Unit -> factor, decimals, what is written behind the number."""
 

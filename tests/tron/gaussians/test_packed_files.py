@@ -1,5 +1,6 @@
 """Packed splats: what PlayCanvas' splat-transform made of two real scans, round trips, and damaged files."""
 
+import gzip
 import json
 import shutil
 import subprocess
@@ -11,9 +12,10 @@ import pytest
 
 from tron.errors import TronError
 from tron.gaussians.harmonics import eval_sh, spread_directions
-from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS
+from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS, packed
 from tron.gaussians.scene import GaussianScene
 from tron.gaussians.splat_files import write_splats
+from tron.gaussians.spz_harmonics import BITS, with_harmonics
 
 
 @pytest.mark.parametrize(
@@ -67,6 +69,23 @@ def test_round_trips_keep_what_formats_hold(random_scene, tmp_path, suffix):
         of_degree = wanted["sh"] * (np.arange(16) < (degree + 1) ** 2)[:, None]
         error = np.abs(eval_sh(found.sh, seen) - eval_sh(of_degree, seen))
         assert error.mean() < (0.04 if suffix == ".spz" else 0.02)  # colours of 0.1 in the mean
+
+
+def test_harmonics_of_spz_are_rounded_to_thirty_seconds_and_nothing_else_is_touched(random_scene, tmp_path):
+    """gaussforge itself rounds to sixteenths and eighths."""
+    scene = arranged(random_scene)
+    write_splats(tmp_path / "a.spz", scene)
+    found = GaussianScene.load(tmp_path / "a.spz").rotated(HALF_TURN).sh  # as the file has them
+    wanted = scene.rotated(HALF_TURN).sh
+    assert np.abs(found - wanted)[:, 1:].max() < 0.5 / 2 ** (BITS - 1) + 1 / 256 + 1e-6
+    write_splats(tmp_path / "a.ply", scene.rotated(HALF_TURN))
+    coarse = packed((tmp_path / "a.ply").read_bytes(), PACKED_SPLATS[".spz"])
+    fine = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    before = len(fine) - 45 * len(scene)
+    assert fine[:before] == gzip.decompress(coarse)[:before]
+    steps = [np.frombuffer(each[before:], np.uint8).astype(int) for each in (fine, gzip.decompress(coarse))]
+    assert np.abs(steps[0] - steps[1]).max() <= 8 + 2  # the same splats in the same order
+    assert with_harmonics(coarse, scene.sh[:-1]) == coarse
 
 
 @pytest.mark.skipif(

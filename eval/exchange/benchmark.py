@@ -1,0 +1,90 @@
+"""Benchmark `exchange`: scenes as files of other programs, each read by a program that is not ours."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from pydantic import Field, PositiveInt
+
+from eval.benchmark import Benchmark
+from eval.report.outcome import Outcome
+from eval.stages import Stages, script_path
+from tron.errors import TronError
+
+Part = Literal["splats", "mesh"]
+
+
+class Exchange(Benchmark):
+    """Parts, sizes, and where the other programs are."""
+
+    name: ClassVar[str] = "exchange"
+
+    parts: list[Part] = Field(description="what is measured", min_length=1)
+    seed: int = 0
+    variant: str = Field(default="llvm_ad_rgb", description="Mitsuba variant; cuda_ad_rgb on a GPU")
+    threads: PositiveInt | None = Field(default=None, description="of Dr.Jit and of Cycles; null: one a core")
+    splat_transform: Path | None = Field(
+        default=None, description="PlayCanvas's splat-transform; null: the one on PATH, if any"
+    )
+    blender_python: Path | None = Field(
+        default=None, description="a Python that has bpy, of an environment of its own; null: no mesh"
+    )
+    real_data: Path | None = Field(description="folder with assets and hdri; null: no mesh")
+    worlds: PositiveInt = Field(default=3, description="scenes of splats, each under another kind of light")
+    surfels: PositiveInt = Field(default=20_000, description="of each scene of splats, about")
+    mesh_surfels: PositiveInt = Field(default=60_000, description="of the model that becomes a mesh, about")
+    views: PositiveInt = Field(default=3, description="of the mesh")
+    width: PositiveInt = Field(default=256, description="of the square views of the mesh")
+    paths: PositiveInt = Field(default=144, description="of a pixel of the mesh, by Cycles and by Mitsuba")
+    texture: int = Field(default=2048, ge=64, le=8192, description="pixels of a side of the mesh's textures")
+
+    def check(self) -> None:
+        """Find the programs that are given."""
+        from eval.exchange.blender import blender_version
+        from eval.exchange.readers import find_splat_transform, splat_transform_version
+
+        if "splats" in self.parts and (program := find_splat_transform(self.splat_transform)):
+            splat_transform_version(program)
+        if "mesh" in self.parts:
+            script_path("tron-export")
+            if self.real_data is not None and not self.real_data.is_dir():
+                raise TronError("no such folder", self.real_data, "give benchmark.real_data, or null")
+            if self.blender_python is not None:
+                blender_version(self.blender_python)
+
+    def run(self, output_dir: Path) -> Outcome:
+        """Measure part after part; one line on stderr for each figure.
+
+        Raises:
+            StageFailed: tron-export failed.
+            TronError: a program that is given is not there, or Blender cannot read the mesh.
+        """
+        # The renderer: not for a mistyped key
+        from eval.exchange.blender import blender_version
+        from eval.exchange.mesh import Sizes, measure_mesh
+        from eval.exchange.readers import find_splat_transform, splat_transform_version
+        from eval.exchange.splats import find_readers, measure_splats
+        from tron.runtime import activate
+
+        self.check()
+        activate(self.variant, self.threads)
+        outcome, stages = Outcome(output_dir), Stages(output_dir)
+        threads = self.threads or os.cpu_count() or 1
+        for part in self.parts:
+            stages.restart(f"part {part}")  # a figure of this run, never of one before
+            with stages.timed(f"part {part}", [["tron-eval", f"benchmark.parts=[{part}]"]]):
+                if part == "splats":
+                    program = find_splat_transform(self.splat_transform)
+                    if program is not None:
+                        outcome.inputs["splat_transform"] = splat_transform_version(program)
+                    readers = find_readers(program)
+                    measure_splats(self.worlds, self.surfels, self.seed, readers, outcome)
+                else:
+                    if self.blender_python is not None:
+                        outcome.inputs["blender"] = blender_version(self.blender_python)
+                    sizes = Sizes(self.mesh_surfels, self.views, self.width, self.paths, self.texture)
+                    data, python = self.real_data, self.blender_python
+                    measure_mesh(data, python, sizes, self.seed, threads, outcome, stages)
+        return outcome
