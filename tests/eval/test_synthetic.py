@@ -14,8 +14,8 @@ SIZES = [
     "relight_spp=4", "film_frames=1",
 ]  # fmt: skip
 TOY = [
-    *(f"capture.{size}" for size in SIZES), "test.scenes=2", "test.style={object: 1, table: 1}", "test.width=32",
-    "test.height=32", "environment_height=32", "mesh_edge=0.2", "workers=1",
+    *(f"capture.{size}" for size in SIZES), "test.scenes=2", "test.style={object: 1, table: 1}",
+    "test.width=32", "test.height=32", "environment_height=32", "mesh_edge=0.2", "workers=1",
 ]  # fmt: skip
 FEW = ["initial.count=500", "steps_scaler=0.005"]
 
