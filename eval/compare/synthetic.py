@@ -15,6 +15,7 @@ from pydantic import Field
 
 from eval.benchmark import Benchmark
 from eval.compare.benchmark import Compare
+from eval.protocol.method import METHOD_NAME
 from eval.protocol.suite import SUITE_NAME
 from eval.report.outcome import Outcome
 from eval.results import Row
@@ -57,7 +58,9 @@ class Synthetic(Benchmark):
         suite = next(path.parent for path in sorted(made.glob(f"*/{SUITE_NAME}")))
         children = {
             method: Child(
-                method, "tron-eval", [f"method={method}", f"suite={suite}", *given, f"output_dir={shown}"]
+                method,
+                "tron-eval",
+                [f"method={method}", f"suite={suite}", *given, f"output_dir={shown / method}"],
             )
             for method, given in self.methods.items()
         }
@@ -65,7 +68,8 @@ class Synthetic(Benchmark):
             stages.run("true_maps", [maps])
         if children:  # at the same time, so that neither has a quieter machine
             stages.run("from_photos", list(children.values()))
-        judging = self.compare.model_copy(update={"suite": suite, "methods": shown})
+        folders = sorted(path.parent for path in shown.glob(f"*/*/{METHOD_NAME}"))
+        judging = self.compare.model_copy(update={"suite": suite, "methods": folders})
         stages.restart("compare")
         with stages.timed("compare", [["tron-eval", "benchmark=compare", f"suite={suite}"]]):
             outcome = judging.run(output_dir)
