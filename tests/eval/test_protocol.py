@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from eval.cli import cli, main
 from eval.protocol.export import Photos, Synthetic, Tensoir, from_tensoir
 from eval.protocol.method import Method, MethodFolder, write_method
 from eval.protocol.pictures import Fault
@@ -301,6 +303,36 @@ def test_captures_of_anyone_stand_under_maps_of_anyone(suite: Suite, tmp_path: P
     np.testing.assert_allclose(night[:2], [-day[1], day[0]], atol=1e-6)
     with pytest.raises(Fault, match="no truth"):
         room.truth("0_day")
+
+
+def test_mip_nerf_360s_layout_is_read(suite: Suite, tmp_path: Path):
+    """bicycle/sparse/0 beside bicycle/images_4, a quarter of what cameras say; each eighth photo is held out."""
+    scene, folder = first(suite), tmp_path / "mip/bicycle"
+    (folder / "sparse/0").mkdir(parents=True)
+    (folder / "images_4").mkdir()
+    camera, lines = scene.cameras[0], []
+    whole = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    sizes = " ".join(str(4 * each) for each in whole)
+    (folder / "sparse/0/cameras.txt").write_text(f"1 PINHOLE {sizes}\n")
+    for k in range(9):
+        pose = scene.cameras[k % len(scene.cameras)].world_to_camera
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        numbers = " ".join(map(repr, map(float, (w, x, y, z, *pose[:3, 3]))))
+        lines += [f"{k + 1} {numbers} 1 DSC{k}.JPG", ""]
+        write_image(
+            folder / f"images_4/DSC{k}.JPG", np.full((camera.height, camera.width, 3), k / 9, np.float32)
+        )
+    (folder / "sparse/0/images.txt").write_text("\n".join(lines) + "\n")
+    (folder / "sparse/0/points3D.txt").write_text("")
+    write_image(tmp_path / "day.hdr", np.ones((16, 32, 3), np.float32))
+    given = [f"export.captures={tmp_path / 'mip'}", f"export.lights=[{tmp_path / 'day.hdr'}]"]
+    main(cli.compose("export=mip360", *given, f"output_dir={tmp_path / 'suites'}"))
+    found = Suite.load(tmp_path / "suites/mip360").scenes["bicycle"]
+    trained = {view.name for view in read_capture_folder(found.train).views}
+    assert len(found.cameras) == 2
+    assert trained == {f"DSC{k}" for k in range(1, 8)} or trained == {f"DSC{k}.JPG" for k in range(1, 8)}
+    assert found.cameras[0].fx == pytest.approx(camera.fx)
+    np.testing.assert_allclose(found.cameras[0].world_to_camera, scene.cameras[0].world_to_camera, atol=1e-9)
 
 
 def write_tensoir(folder: Path, suite: Suite, lights: dict[str, str]) -> None:
