@@ -306,7 +306,7 @@ def test_captures_of_anyone_stand_under_maps_of_anyone(suite: Suite, tmp_path: P
 
 
 def test_mip_nerf_360s_layout_is_read(suite: Suite, tmp_path: Path):
-    """bicycle/sparse/0 beside bicycle/images_4, a quarter of what cameras say; each eighth photo is held out."""
+    """bicycle/sparse/0 beside bicycle/images_4, a quarter as large as cameras say; each eighth held out."""
     scene, folder = first(suite), tmp_path / "mip/bicycle"
     (folder / "sparse/0").mkdir(parents=True)
     (folder / "images_4").mkdir()
