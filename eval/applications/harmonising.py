@@ -7,8 +7,8 @@ is path tracing of capture and thing together. The capture's light and materials
 judged is the insertion, not the reconstruction. Once more they are those that `tron-reconstruct` would write
 beside the capture: found from path-traced photos of it, by the joint fit, on the true geometry.
 
-Pasted is what a picture editor does at its best: the true photograph of the capture, the true outline with
-its covered shares, each photograph exposed for its own light. It has no error but at the thing and where
+Pasted is what a cut and paste does: the true photograph of the capture, the true outline with its covered
+shares, each photograph exposed for its own light; nobody has corrected its colours. It has no error but at the thing and where
 light changes by it; ours has the blur of surfels everywhere. So pixels are judged at the thing and where the
 truth changes by it, and nowhere else.
 """

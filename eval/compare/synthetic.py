@@ -84,19 +84,17 @@ class Synthetic(Benchmark):
 
 def gains(rows: Mapping[str, Row]) -> Iterator[Row]:
     """The two questions' rows, from those of the comparison; none where a method is not there."""
-    others = [
-        name.removesuffix(".psnr")
-        for name in rows
-        if name.startswith(WITHOUT) and name.endswith(".psnr") and not name.startswith(NETWORK)
-    ]
-    if others and f"{NETWORK}.psnr" in rows:
+    ours = [name.removesuffix(".faults") for name in rows if name.endswith(".faults")]
+    others = [name for name in ours if name.startswith(WITHOUT) and name != NETWORK]
+    # A method with a fault has no mean, and no best is sought among those that happen to have one.
+    if others and all(f"{name}.psnr" in rows for name in (NETWORK, *others)):
         best = max(others, key=lambda name: rows[f"{name}.psnr"].value)
         yield _gain(rows, NETWORK, best, "synth.network_gain_db")
     if f"{OURS}.psnr" in rows and f"{PEER}.psnr" in rows:
         yield _gain(rows, OURS, PEER, "synth.gain_over_mesh_db")
-    ours, peer = rows.get(f"{OURS}.seconds_fit"), rows.get(f"{PEER}.seconds_fit")
-    if ours and peer:
-        yield Row(metric="synth.time_over_mesh", value=ours.value / peer.value, unit="x", n=ours.n)
+    fit, peer = rows.get(f"{OURS}.seconds_fit"), rows.get(f"{PEER}.seconds_fit")
+    if fit and peer:
+        yield Row(metric="synth.time_over_mesh", value=fit.value / peer.value, unit="x", n=fit.n)
 
 
 def _gain(rows: Mapping[str, Row], ours: str, other: str, metric: str) -> Row:

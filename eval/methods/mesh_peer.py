@@ -28,7 +28,7 @@ from tron.gaussians.scene import GaussianScene
 from tron.reconstruction import Prior, reconstruct
 from tron.reconstruction.priors.prior import Materials, Surfels
 from tron.reconstruction.settings import ReconstructionSettings
-from tron.runtime import activate, describe_machine
+from tron.runtime import activate, describe_machine, set_torch_threads
 from tron.seeds import integer
 
 log = logging.getLogger("tron.eval")
@@ -67,6 +67,7 @@ class MeshPeer(Making):
         require_oidn("method=mesh_peer")
         settings = self.surfels
         activate()
+        set_torch_threads(1)  # as tron-reconstruct has it: two would wait for each other beside Dr.Jit's
         method = Method(
             name="mesh_peer", title="textured mesh, fitted and path-traced by Mitsuba", suite=suite.id,
             color_space="linear", background="environment", scale="scene", saw=["photos", "masks"],

@@ -18,7 +18,7 @@ from tron.gaussians.harmonics import dc_to_rgb
 from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS, packed
 from tron.gaussians.ply import FLATNESS, NORMAL, write_ply
 from tron.gaussians.scene import GaussianScene
-from tron.gaussians.spz_harmonics import with_harmonics
+from tron.gaussians.spz_precision import refined
 from tron.io.optional import usd
 from tron.storage import atomic_path, write_atomic
 
@@ -46,9 +46,12 @@ def write_splats(path: Path, scene: GaussianScene) -> None:
     others stay in the scene's frame.
 
     Raises:
-        TronError: no such suffix, or the file cannot be written.
+        TronError: no such suffix, no surfels, places that the format does not hold, or the file cannot be
+            written.
     """
     check_suffix(path)
+    if not len(scene):
+        raise TronError("there are no surfels to write", path)
     suffix = path.suffix.lower()
     other = FORMATS.get(suffix)
     if other is not None and other.write is not None:
@@ -63,7 +66,7 @@ def write_splats(path: Path, scene: GaussianScene) -> None:
         turned = scene.rotated(HALF_TURN) if kind.half_turned else scene
         _write_plain(plain, turned)
         content = packed(plain.read_bytes(), kind)
-    write_atomic(path, with_harmonics(content, turned.sh) if suffix == ".spz" else content)
+    write_atomic(path, refined(content, turned.means, turned.sh) if suffix == ".spz" else content)
 
 
 def write_points(path: Path, scene: GaussianScene) -> int:

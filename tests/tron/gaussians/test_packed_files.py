@@ -5,6 +5,8 @@ import json
 import shutil
 import subprocess
 import zipfile
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import plyfile
@@ -15,7 +17,7 @@ from tron.gaussians.harmonics import eval_sh, spread_directions
 from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS, packed
 from tron.gaussians.scene import GaussianScene
 from tron.gaussians.splat_files import write_splats
-from tron.gaussians.spz_harmonics import BITS, with_harmonics
+from tron.gaussians.spz_precision import BITS, refined
 
 
 @pytest.mark.parametrize(
@@ -71,21 +73,38 @@ def test_round_trips_keep_what_formats_hold(random_scene, tmp_path, suffix):
         assert error.mean() < (0.04 if suffix == ".spz" else 0.02)  # colours of 0.1 in the mean
 
 
-def test_harmonics_of_spz_are_rounded_to_thirty_seconds_and_nothing_else_is_touched(random_scene, tmp_path):
-    """gaussforge itself rounds to sixteenths and eighths."""
-    scene = arranged(random_scene)
+@pytest.mark.parametrize("size", [1e-3, 1.0, 3e3, 1e5])
+def test_spz_keeps_places_and_harmonics_of_any_scene(random_scene, tmp_path, size):
+    """gaussforge itself rounds harmonics to sixteenths and eighths, and wraps places beyond 2,048."""
+    plain = arranged(random_scene)
+    scene = replace(plain, means=plain.means * np.float32(size))
     write_splats(tmp_path / "a.spz", scene)
-    found = GaussianScene.load(tmp_path / "a.spz").rotated(HALF_TURN).sh  # as the file has them
-    wanted = scene.rotated(HALF_TURN).sh
-    assert np.abs(found - wanted)[:, 1:].max() < 0.5 / 2 ** (BITS - 1) + 1 / 256 + 1e-6
-    write_splats(tmp_path / "a.ply", scene.rotated(HALF_TURN))
+    found, wanted = GaussianScene.load(tmp_path / "a.spz").rotated(HALF_TURN), scene.rotated(HALF_TURN)
+    assert np.abs(found.means - wanted.means).max() < max(np.abs(wanted.means).max() * 2.0**-22, 2.0**-20)
+    assert np.abs(found.sh - wanted.sh)[:, 1:].max() < 0.5 / 2 ** (BITS - 1) + 1 / 256 + 1e-6
+    write_splats(tmp_path / "a.ply", wanted)
     coarse = packed((tmp_path / "a.ply").read_bytes(), PACKED_SPLATS[".spz"])
-    fine = gzip.decompress((tmp_path / "a.spz").read_bytes())
-    before = len(fine) - 45 * len(scene)
-    assert fine[:before] == gzip.decompress(coarse)[:before]
-    steps = [np.frombuffer(each[before:], np.uint8).astype(int) for each in (fine, gzip.decompress(coarse))]
+    fine, before = (gzip.decompress(each) for each in ((tmp_path / "a.spz").read_bytes(), coarse))
+    others = slice(16 + 9 * len(scene), len(fine) - 45 * len(scene))
+    assert fine[others] == before[others]
+    assert (fine[:13], fine[14:16]) == (before[:13], before[14:16])  # all but the fractional bits
+    steps = [np.frombuffer(each[others.stop :], np.uint8).astype(int) for each in (fine, before)]
     assert np.abs(steps[0] - steps[1]).max() <= 8 + 2  # the same splats in the same order
-    assert with_harmonics(coarse, scene.sh[:-1]) == coarse
+
+
+def test_what_spz_cannot_hold_is_one_line(random_scene, tmp_path):
+    scene = arranged(random_scene)
+    with pytest.raises(TronError, match="no place as far out"):
+        write_splats(tmp_path / "a.spz", replace(scene, means=scene.means * np.float32(1e8)))
+    content = packed(_plain_file(scene, tmp_path), PACKED_SPLATS[".spz"])
+    with pytest.raises(TronError, match="not known here"):
+        refined(content, scene.means[:-1], scene.sh[:-1])
+    assert not (tmp_path / "a.spz").exists()
+
+
+def _plain_file(scene: GaussianScene, folder: Path) -> bytes:
+    write_splats(folder / "plain.ply", scene)
+    return (folder / "plain.ply").read_bytes()
 
 
 @pytest.mark.skipif(

@@ -83,6 +83,6 @@ def _square(frame: Mapping[str, Any], key: str, side: int) -> np.ndarray:
     """(side, side) float64 of a list of numbers, row after row."""
     try:
         return np.array(frame.get(key), np.float64).reshape(side, side)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         shown = json.dumps(frame.get(key), default=str)[:40]
         raise TronError(f"{key} is {shown}, not {side * side} numbers") from error

@@ -36,6 +36,8 @@ _VERSION = 1
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _PINHOLE = ("fx", "fy", "cx", "cy")
 _UNIT = 0.01
+_LAST = 10_000_000
+"""Frames of no recording: two days of them."""
 
 
 class FilmSettings(Protocol):
@@ -99,6 +101,8 @@ def _rows(file: Path) -> dict[int, dict[str, float]]:
     for index, line in enumerate(lines):
         row = {title: _number(text) for title, text in zip(titles, line)}
         frame = row.get("frame", float(index))
+        if np.isfinite(frame) and not 0 <= frame < _LAST:
+            raise TronError(f"row {index + 1} is of frame {frame:g}", file, "is it Stray Scanner's recording?")
         rows[int(frame) if np.isfinite(frame) else index] = row
     if not rows:
         raise TronError("holds no frame", file)
@@ -127,7 +131,7 @@ def _matrix(file: Path) -> dict[str, float]:
 def _kept_frames(video: Path, rows: Mapping[int, object], count: int, workspace: Path) -> Path:
     """Folder of the sharpest frames that have a pose, named by their numbers."""
     folder, last = workspace / FRAMES, max(rows)
-    wanted = {"version": _VERSION, "video": sha256(video), "frames": count, "poses": last}
+    wanted = {"version": _VERSION, "video": sha256(video), "frames": count, "poses": sorted(rows)}
     if holds_frames(folder, wanted):
         return folder
     log.info("%s: looking for the sharpest frames of %d intervals", video, count)

@@ -50,6 +50,10 @@ def test_frames_are_kept_until_the_recording_or_their_number_changes(tmp_path: P
     load_capture(tmp_path, LoadSettings(frames=4))
     assert {each.name: each.stat().st_mtime_ns for each in folder.iterdir()} == before
     assert len(load_capture(tmp_path, LoadSettings(frames=6)).views) == 6
+    taken, table = load_capture(tmp_path, LoadSettings(frames=6)).views[1].name, tmp_path / "odometry.csv"
+    rows = [row for row in table.read_text().splitlines() if f" {taken}," not in row]
+    table.write_text("\n".join(rows))
+    assert taken not in [view.name for view in load_capture(tmp_path, LoadSettings(frames=6)).views]
 
 
 def test_intrinsics_of_a_frame_win_and_the_oldest_tables_have_no_header(tmp_path: Path, write) -> None:
@@ -95,6 +99,8 @@ def test_bad_rows_are_left_out_with_their_reasons(tmp_path: Path, write) -> None
         ("odometry.csv", "time, place\n0, 1\n", "rows are not x, y, z, qx"),
         ("odometry.csv", "", "rows are not x, y, z, qx"),
         ("odometry.csv", HEADER, "holds no frame"),
+        ("odometry.csv", f"{HEADER}\n0, -1, 0, 0, 0, 0, 0, 0, 1", "row 1 is of frame -1"),
+        ("odometry.csv", f"{HEADER}\n0, 1e300, 0, 0, 0, 0, 0, 0, 1", "row 1 is of frame 1e"),
         ("camera_matrix.csv", "1, 2\n3, 4", "not the 3 x 3 matrix"),
         ("camera_matrix.csv", "90, 0, 48\n0, nan", "not a matrix"),
         ("camera_matrix.csv", None, "no camera_matrix.csv"),
@@ -138,6 +144,7 @@ def test_scans_have_depth_and_only_their_photos_are_views(tmp_path: Path, write)
         ({"cameraPoseARFrame": [float("nan")] * 16}, "NaN"),
         ({"intrinsics": "none"}, "not 9 numbers"),
         ({"intrinsics": [0] * 9}, "focal length is 0"),
+        ({"intrinsics": [10**400] * 9}, "not 9 numbers"),
         (None, "not readable as JSON"),
     ],
 )
