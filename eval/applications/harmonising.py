@@ -8,9 +8,9 @@ judged is the insertion, not the reconstruction. Once more they are those that `
 beside the capture: found from path-traced photos of it, by the joint fit, on the true geometry.
 
 Pasted is what a cut and paste does: the true photograph of the capture, the true outline with its covered
-shares, each photograph exposed for its own light; nobody has corrected its colours. It has no error but at the thing and where
-light changes by it; ours has the blur of surfels everywhere. So pixels are judged at the thing and where the
-truth changes by it, and nowhere else.
+shares, each photograph exposed for its own light; nobody has corrected its colours. It has no error but at
+the thing and where light changes by it; ours has the blur of surfels everywhere. So pixels are judged at the
+thing and where the truth changes by it, and nowhere else.
 """
 
 from __future__ import annotations

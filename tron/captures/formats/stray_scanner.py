@@ -102,7 +102,8 @@ def _rows(file: Path) -> dict[int, dict[str, float]]:
         row = {title: _number(text) for title, text in zip(titles, line)}
         frame = row.get("frame", float(index))
         if np.isfinite(frame) and not 0 <= frame < _LAST:
-            raise TronError(f"row {index + 1} is of frame {frame:g}", file, "is it Stray Scanner's recording?")
+            mend = "is it Stray Scanner's recording?"
+            raise TronError(f"row {index + 1} is of frame {frame:g}", file, mend)
         rows[int(frame) if np.isfinite(frame) else index] = row
     if not rows:
         raise TronError("holds no frame", file)
