@@ -4,8 +4,8 @@ Worlds of surfels under a light that is baked into their harmonics, so that colo
 Files hold kernels of degree 2: what that change costs is a figure of its own (``format.degree2.psnr``), and
 every format is held against the degree 2 that went into it. No file of splats says which side a surfel shows,
 so that both are drawn as seen from both; what that costs is a figure too (``format.both_sides.psnr``). Files
-that splat-transform writes and we read are held against the same. Pixels count that surfels cover, before or
-after.
+that splat-transform writes and we read are held against the same. ``scene_psnr`` is against the scene itself:
+all of the losses together. Pixels count that surfels cover, before or after.
 """
 
 from __future__ import annotations
@@ -198,7 +198,8 @@ class Trip:
         world: its name.
         size: of the file, bytes.
         write, read: seconds of ours; None where another program does it.
-        psnr: dB of each view.
+        psnr: dB of each view, against what went into the file.
+        scene_psnr: the same against the scene, its kernels of degree 4 and the signs of its normals.
         views: the first one as it came back, and as it was.
         equal: share of the PLY's values that came back bit by bit; None of other formats.
     """
@@ -208,12 +209,19 @@ class Trip:
     write: float | None
     read: float | None
     psnr: list[float]
+    scene_psnr: list[float]
     views: tuple[np.ndarray, np.ndarray]
     equal: float | None = None
 
 
 def exchange(
-    each: Exchanged, convert: Convert, scene: GaussianScene, seen: Baked, plain: Sequence[Drawn], folder: Path
+    each: Exchanged,
+    convert: Convert,
+    scene: GaussianScene,
+    seen: Baked,
+    plain: Sequence[Drawn],
+    own: Sequence[Drawn],
+    folder: Path,
 ) -> Trip:
     """Take a scene through a file of a format and a program that is not ours.
 
@@ -223,6 +231,7 @@ def exchange(
         scene: what is written.
         seen: the same world in the frame of the file.
         plain: its views with kernels of degree 2.
+        own: its views as it is.
         folder: for the files.
 
     Raises:
@@ -245,7 +254,8 @@ def exchange(
         raise TronError(f"{len(found)} splats of {len(scene)} came back", file)
     drawn = draw(found, seen.cameras)
     views = drawn[0].image, plain[0].image
-    return Trip(seen.name, file.stat().st_size, write, read, alike(drawn, plain), views, equal)
+    size = file.stat().st_size
+    return Trip(seen.name, size, write, read, alike(drawn, plain), alike(drawn, own), views, equal)
 
 
 def equal_share(file: Path, other: Path) -> float:
@@ -264,7 +274,7 @@ class Splats:
 
     Attributes:
         trips: format -> a trip for each world.
-        degree2, both_sides, rasteriser: world -> dB of each view.
+        degree2, both_sides, rasteriser, rasteriser_scene: world -> dB of each view.
         pictures: of the first world.
         lacking: format -> why it was not exchanged.
     """
@@ -273,6 +283,7 @@ class Splats:
     degree2: dict[str, list[float]] = field(default_factory=dict)
     both_sides: dict[str, list[float]] = field(default_factory=dict)
     rasteriser: dict[str, list[float]] = field(default_factory=dict)
+    rasteriser_scene: dict[str, list[float]] = field(default_factory=dict)
     pictures: list[Pictures] = field(default_factory=list)
     lacking: dict[str, str] = field(default_factory=dict)
 
@@ -284,6 +295,8 @@ class Splats:
         for name, trips in self.trips.items():
             views = {trip.world: trip.psnr for trip in trips}
             yield mean_row(f"format.{name}.psnr", "dB", _by_world(views), seed)
+            whole = {trip.world: trip.scene_psnr for trip in trips}
+            yield mean_row(f"format.{name}.scene_psnr", "dB", _by_world(whole), seed)
             plain: dict[str, tuple[str, list[float | None]]] = {
                 "bytes": ("bytes", [trip.size for trip in trips]),
                 "write_seconds": ("s", [trip.write for trip in trips]),
@@ -297,6 +310,7 @@ class Splats:
                     yield Row(metric=f"format.{name}.{measure}", value=mean, unit=unit, n=len(held))
         if self.rasteriser:
             yield mean_row("rasteriser.psnr", "dB", _by_world(self.rasteriser), seed)
+            yield mean_row("rasteriser.scene_psnr", "dB", _by_world(self.rasteriser_scene), seed)
 
 
 def measure_splats(
@@ -329,7 +343,8 @@ def _measure_world(world: Baked, programs: Mapping[str, Reader], found: Splats, 
     kernel = draw(replace(world.plain, oriented=world.scene.oriented), world.cameras)
     found.degree2[world.name], found.both_sides[world.name] = alike(kernel, own), alike(plain, kernel)
     standing = world.standing()
-    frames = {False: (world, plain), True: (standing, draw(standing.plain, standing.cameras))}
+    stood = (standing, *(draw(each, standing.cameras) for each in (standing.plain, standing.scene)))
+    frames = {False: (world, plain, own), True: stood}
     first = not found.pictures
     shown = [
         ("kernel of degree 2", kernel[0].image, own[0].image, found.degree2[world.name][0]),
@@ -357,6 +372,7 @@ def _measure_world(world: Baked, programs: Mapping[str, Reader], found: Splats, 
     drawn = [averaged(np.clip(rasterise(file, _fine(c)), 0, 1), FINENESS) for c in world.cameras]
     other = [Drawn(image, view.opacity) for image, view in zip(drawn, plain)]
     found.rasteriser[world.name] = alike(other, plain)
+    found.rasteriser_scene[world.name] = alike(other, own)
     shown.append(("3DGS rasteriser", drawn[0], plain[0].image, found.rasteriser[world.name][0]))
     if first:
         found.pictures = list(_pictures(own[0].image, shown))
