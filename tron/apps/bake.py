@@ -23,7 +23,7 @@ from tron.color import Look
 from tron.estimation import PREVIEW
 from tron.framing import upright
 from tron.gaussians.scene import GaussianScene
-from tron.gaussians.splat_files import SUFFIXES, check_suffix, write_splats
+from tron.gaussians.splat_files import SUFFIXES, check_count, check_suffix, write_splats
 from tron.runtime import activate
 from tron.trajectories import plan_cameras
 
@@ -87,6 +87,7 @@ def main(settings: Settings) -> None:
         environment = EnvironmentMap.load(settings.environment)
         activate(settings.variant, settings.threads)
         scene = load_scene(settings.scene, settings.up, settings.materials)
+    check_count(settings.output, len(scene))
     turn, offset = upright(scene.up), scene.offset
     environment = over_scene(environment, settings.environment, settings.scene, turn)
     scene = scene.upright()  # +z is up in environment maps

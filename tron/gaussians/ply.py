@@ -84,7 +84,11 @@ _EXPORT = "is it a Gaussian scene? export it as an uncompressed 3DGS or 2DGS PLY
 
 
 def write_ply(
-    path: str | Path, scene: Mapping[str, Any], comments: Sequence[str] = (), plain: bool = False
+    path: str | Path,
+    scene: Mapping[str, Any],
+    comments: Sequence[str] = (),
+    plain: bool = False,
+    changing: bool = True,
 ) -> None:
     """Write what a valid scene holds, by the names of GaussianScene's attributes, and its ``normals`` (M, 3).
 
@@ -93,6 +97,7 @@ def write_ply(
         scene: its values.
         comments: that stand in the header, after those of the scene.
         plain: the properties of 3DGS alone, without materials and objects.
+        changing: with harmonics beyond degree 0.
 
     Raises:
         TronError: the file cannot be written.
@@ -106,7 +111,8 @@ def write_ply(
     add(FIELDS["means"].properties, scene["means"])
     add(NORMAL, scene["normals"])
     add(FIELDS["sh"].properties, sh[:, 0])
-    add(REST, sh[:, 1:].transpose(0, 2, 1))
+    if changing:
+        add(REST, sh[:, 1:].transpose(0, 2, 1))
     add(FIELDS["opacity_logits"].properties, scene["opacity_logits"])
     add(FIELDS["log_scales"].properties, log_scales)
     add([THIRD_SCALE], log_scales.min(axis=1) + np.float32(np.log(FLATNESS)))

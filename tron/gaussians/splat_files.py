@@ -24,6 +24,11 @@ from tron.storage import atomic_path, write_atomic
 
 SUFFIXES = (".ply", *PACKED_SPLATS, *(suffix for suffix, each in FORMATS.items() if each.write))
 """Of files that :func:`write_splats` writes."""
+MOST_SOG = 64_000
+"""Splats with harmonics beyond degree 0 that gaussforge packs as .sog within a minute. From 65,000 on it
+gathers them around 65,536 others, and 100,000 were not done after ten minutes."""
+_CHANGING = 1e-4
+"""Coefficient beyond degree 0 from which packed files hold harmonics; 8 bits of display are 4e-3."""
 _SEEN = 0.1
 """Opacity from which a surfel is a point."""
 
@@ -38,6 +43,13 @@ def check_suffix(path: Path) -> None:
         usd(str(path))
 
 
+def check_count(path: Path, count: int) -> None:
+    """Raise TronError if a file's format does not take so many splats whose colours change with the view."""
+    if path.suffix.lower() == ".sog" and count > MOST_SOG:
+        what = f"{count:,} splats with harmonics, and .sog is packed here up to {MOST_SOG:,}"
+        raise TronError(what, path, "write .spz, or .ply and then: splat-transform scene.ply scene.sog")
+
+
 def write_splats(path: Path, scene: GaussianScene) -> None:
     """Write a scene's radiance for other programs: the kernel and the properties of 3DGS, no materials.
 
@@ -46,8 +58,8 @@ def write_splats(path: Path, scene: GaussianScene) -> None:
     others stay in the scene's frame.
 
     Raises:
-        TronError: no such suffix, no surfels, places that the format does not hold, or the file cannot be
-            written.
+        TronError: no such suffix, no surfels, places or a number of them that the format does not hold, or
+            the file cannot be written.
     """
     check_suffix(path)
     if not len(scene):
@@ -61,10 +73,13 @@ def write_splats(path: Path, scene: GaussianScene) -> None:
     if kind is None:
         _write_plain(path, scene)
         return
+    changing = bool(np.abs(scene.sh[:, 1:]).max() > _CHANGING)
+    if changing:
+        check_count(path, len(scene))
     with tempfile.TemporaryDirectory(prefix="tron-") as folder:
         plain = Path(folder) / "plain.ply"
         turned = scene.rotated(HALF_TURN) if kind.half_turned else scene
-        _write_plain(plain, turned)
+        _write_plain(plain, turned, changing)
         content = packed(plain.read_bytes(), kind)
     write_atomic(path, refined(content, turned.means, turned.sh) if suffix == ".spz" else content)
 
@@ -100,7 +115,7 @@ def _splats(scene: GaussianScene) -> Splats:
     return Splats(plain.means, plain.quats, log_scales, plain.opacity_logits, plain.sh)
 
 
-def _write_plain(path: Path, scene: GaussianScene) -> None:
+def _write_plain(path: Path, scene: GaussianScene, changing: bool = True) -> None:
     plain = with_kernel(scene, 2)
     values = vars(plain) | {"normals": plain.normals(), "materials_guessed": True}
-    write_ply(path, values, plain=True)
+    write_ply(path, values, plain=True, changing=changing)

@@ -249,6 +249,9 @@ def test_usdz_with_references_outside_is_refused(tmp_path: Path) -> None:
     (tmp_path / "other.usda").write_text(USDA)
     whole = {"a.usda": "#usda 1.0\n(\n    subLayers = [@b.usda@]\n)\n", "b.usda": USDA}
     assert len(GaussianScene.load(usdz(tmp_path / "whole.usdz", whole))) == 1
+    mesh = '#usda 1.0\ndef Mesh "ball"\n{\n    custom asset picture = @paint.png@\n}\n'
+    with pytest.raises(TronError, match=r"holds no splats .*, but a mesh"):
+        GaussianScene.load(usdz(tmp_path / "mesh.usdz", {"mesh.usda": mesh, "paint.png": "no layer"}))
     for name in ("../other.usda", f"{tmp_path}/other.usda"):
         for layer in ("a.usda", "b.usda"):
             layers = whole | {layer: f"#usda 1.0\n(\n    subLayers = [@b.usda@, @{name}@]\n)\n"}

@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 import plyfile
 import pytest
+from scipy.spatial import KDTree
 
 from tron.errors import TronError
+from tron.gaussians import splat_files
 from tron.gaussians.harmonics import eval_sh, spread_directions
 from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS, packed
 from tron.gaussians.scene import GaussianScene
@@ -90,6 +92,28 @@ def test_spz_keeps_places_and_harmonics_of_any_scene(random_scene, tmp_path, siz
     assert (fine[:13], fine[14:16]) == (before[:13], before[14:16])  # all but the fractional bits
     steps = [np.frombuffer(each[others.stop :], np.uint8).astype(int) for each in (fine, before)]
     assert np.abs(steps[0] - steps[1]).max() <= 8 + 2  # the same splats in the same order
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog"])
+def test_colours_that_do_not_change_with_the_view_have_no_harmonics_in_the_file(
+    random_scene, tmp_path, suffix
+):
+    scene = arranged(random_scene)
+    scene = replace(scene, sh=scene.sh * (np.arange(16) == 0)[:, None].astype(np.float32))
+    write_splats(tmp_path / f"a{suffix}", scene)
+    found = GaussianScene.load(tmp_path / f"a{suffix}")
+    assert np.abs(found.sh[:, 1:]).max() < 1e-12  # turned from the file's frame
+    nearest = KDTree(scene.means).query(found.means)[1]
+    assert np.abs(found.sh[:, 0] - scene.sh[nearest, 0]).max() < 0.05
+    assert (tmp_path / f"a{suffix}").stat().st_size < 24 * len(scene) + 30_000
+
+
+def test_a_sog_of_more_splats_than_its_packer_takes_is_one_line(random_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(splat_files, "MOST_SOG", 499)
+    with pytest.raises(TronError, match="500 splats with harmonics") as told:
+        write_splats(tmp_path / "a.sog", arranged(random_scene))
+    assert "splat-transform" in str(told.value)
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_spz_cannot_hold_is_one_line(random_scene, tmp_path):

@@ -59,7 +59,9 @@ def main(site: str, name: str, memory: str) -> None:
         held[f"{count}.matrix"] = np.array(transforms.GetLocalToWorldTransform(prim)).T
         count += 1
     if not count:
-        sys.exit(f"this USD holds no splats ({PRIM})")
+        meshes = any(prim.IsA(UsdGeom.Mesh) for prim in stage.Traverse(Usd.TraverseInstanceProxies()))
+        beside = ", but a mesh: as .glb it is put beside a scene (meshes=)" if meshes else ""
+        sys.exit(f"this USD holds no splats ({PRIM}){beside}")
     content = io.BytesIO()
     np.savez(content, **(held | {"count": np.array(count)}))  # pyright: ignore[reportArgumentType]
     with open(output, "wb") as stream:
@@ -79,9 +81,11 @@ def require_confined(path: Path) -> None:
         if name in seen:
             continue
         seen.add(name)
+        if Sdf.FileFormat.FindByExtension(Path(name.rstrip("]")).suffix.lstrip(".")) is None:
+            continue  # a picture
         layer = Sdf.Layer.FindOrOpen(name)
         if layer is None:
-            continue  # a picture
+            continue
         for kind in UsdUtils.ExtractExternalReferences(name):
             for inner in kind:
                 whole = layer.ComputeAbsolutePath(inner)
