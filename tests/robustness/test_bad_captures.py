@@ -203,7 +203,7 @@ def test_json_of_another_shape(folder: Path, text: str) -> None:
         ({"fl_x": None, "camera_angle_x": 4.0}, "camera_angle_x"),
         ({"cx": float("nan")}, "cx"),
         ({"w": 0}, "0.0 x 24"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "twice as wide as high"),
         ({"k1": -50.0}, "distortion"),
         ({"k4": 0.1}, "k4"),
         ({"applied_transform": [[1, 0, 0]]}, "applied_transform"),

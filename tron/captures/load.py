@@ -87,6 +87,7 @@ FORMATS = {
 """Formats by the names that ``format=`` takes, in the order in which ``auto`` looks for them."""
 
 HOLDS = "; ".join(f"{name}: {each.holds}" for name, each in FORMATS.items())
+KINDS = "; ".join(each.holds for each in FORMATS.values())
 
 if TYPE_CHECKING:
     FormatName = str
@@ -128,7 +129,7 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
     if not path.exists():
         raise TronError("capture not found", path)
     if not any(each.takes(path) for each in FORMATS.values()):
-        raise refusal(path, HOLDS, _holds_capture)
+        raise refusal(path, KINDS, _holds_capture)
     if path.is_file() and not (cameras_file(path) or registration_file(path)):
         refuse_by_sight(path, "a capture is a folder, or a file of its cameras")
     name = _detected(path) if settings.format == "auto" else settings.format
@@ -143,7 +144,7 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
 def _detected(path: Path) -> str:
     name = _format_of(path)
     if name is None:
-        raise refusal(path, HOLDS, _holds_capture)
+        raise refusal(path, KINDS, _holds_capture)
     return name
 
 
