@@ -343,8 +343,8 @@ def _measure_world(world: Baked, programs: Mapping[str, Reader], found: Splats, 
     kernel = draw(replace(world.plain, oriented=world.scene.oriented), world.cameras)
     found.degree2[world.name], found.both_sides[world.name] = alike(kernel, own), alike(plain, kernel)
     standing = world.standing()
-    stood = (standing, *(draw(each, standing.cameras) for each in (standing.plain, standing.scene)))
-    frames = {False: (world, plain, own), True: stood}
+    stood_plain, stood_own = (draw(each, standing.cameras) for each in (standing.plain, standing.scene))
+    frames = {False: (world, plain, own), True: (standing, stood_plain, stood_own)}
     first = not found.pictures
     shown = [
         ("kernel of degree 2", kernel[0].image, own[0].image, found.degree2[world.name][0]),
