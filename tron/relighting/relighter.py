@@ -258,7 +258,7 @@ class Relighter:
     def still_under(self, before: Illumination) -> Illumination:
         """:meth:`under` the light of a scene whose materials alone were others: its shadows stay, to the bit.
 
-        Where more than that differs, or light sees a proxy, all is baked anew.
+        Where more than that differs, all is baked anew.
         """
         baked = before.bounced
         if baked is None or not self._stands_like(before.relighter):
@@ -268,16 +268,14 @@ class Relighter:
 
     def _stands_like(self, other: Relighter) -> bool:
         """Whether surfels and the light's rays among them are those of another relighter."""
-        traced = (self._tracer.bvh.order, self.estimation, self.seed)
-        others = (other._tracer.bvh.order, other.estimation, other.seed)
+        traced = (self._surfels_of_light.bvh.order, self.estimation, self.seed)
+        others = (other._surfels_of_light.bvh.order, other.estimation, other.seed)
         alike = traced[0] is others[0] and traced[1:] == others[1:] and self.meshes is other.meshes
         return self.stands_as(other.scene) and alike
 
     def stands_as(self, scene: GaussianScene) -> bool:
-        """Whether a scene is this one but for materials and radiance; False where light sees a proxy."""
-        if self.proxy is not None or len(scene) != len(self.scene):
-            return False
-        return _same(self.scene, scene, (*REACH, "means", "quats"))
+        """Whether a scene is this one but for materials and radiance."""
+        return len(scene) == len(self.scene) and _same(self.scene, scene, (*REACH, "means", "quats"))
 
     def show(
         self,
@@ -318,9 +316,9 @@ class Relighter:
 
         Where surfels have moved or have other materials, the hierarchy is refitted and only rays that have
         changed are traced again: as if all were, to the bit. Rays are drawn in the hierarchy's order, which a
-        refitted one keeps, so that what has moved has other noise than in a new ``Relighter``. Where sizes or
-        opacities differ, surfels come or go, or light sees a proxy, all is made anew; beside meshes, all rays
-        are. Whether there is a proxy stays as it was.
+        refitted one keeps, so that what has moved has other noise than in a new ``Relighter``. A proxy is made
+        anew unless materials alone differ. Where sizes or opacities differ, or surfels come or go, all is made
+        anew; beside meshes, all rays are. Whether there is a proxy stays as it was.
 
         Args:
             scene: the other scene.
@@ -335,7 +333,9 @@ class Relighter:
         if self._backdrop is not None and len(scene) != len(self._backdrop):
             raise TronError("surfels have come or gone before a backdrop", mend="make a new Relighter")
         choice: Choice | Proxy = "never" if self.proxy is None else proxy or "always"
-        if not _same(scene, before, REACH) or self.proxy is not None:
+        stands = self.stands_as(scene)
+        painted = self.proxy if stands and proxy is None else None
+        if not _same(scene, before, REACH) or (painted is None and self.proxy is not None):
             anew = Relighter(
                 scene, self.estimation, self.seed, backdrop=self._backdrop, track=self._track,
                 proxy=choice, cameras=self._cameras, filming=self._filming, ground=self.ground,
@@ -346,10 +346,14 @@ class Relighter:
         other.meshes = meshes or self.meshes
         other.__dict__.pop("_beside", None)
         other.scene, other._tracer, other._turned_to = scene, self._tracer.moved(scene), None
+        if painted is not None and self._proxied is not None:
+            content = scene if self._backdrop is None else subset(scene, ~self._backdrop)
+            other.__dict__["proxy"] = painted = painted.painted(content)
+            other.__dict__["_proxied"] = self._proxied.painted(other._tracer, painted.surfels)
         traced = other.__dict__.pop("transport", None)
         # Rays that look for moved surfels alone would find those of a backdrop too, and are not those of a
         # hierarchy that was sorted anew.
-        kept = other._tracer.bvh.order is self._tracer.bvh.order and self._backdrop is None
+        kept = other._tracer.bvh.order is self._tracer.bvh.order and (stands or self._backdrop is None)
         kept &= other.meshes is None
         if traced is not None and kept:
             carried = traced.carried if quick else traced.moved

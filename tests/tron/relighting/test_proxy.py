@@ -265,6 +265,26 @@ def test_a_changed_scan_is_filmed_anew(fog, light):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.usefixtures("short_film")
+def test_paint_asks_for_no_film_and_no_ray(fog, light, monkeypatch):
+    """And is lit as a scan that had it from the start, to the bit."""
+    rng, estimation = generator(4, "tests", "paint"), Estimation(rays=0)
+    paint = {"base_color": rng.random((len(fog), 3), np.float32), "roughness": rng.random(len(fog), np.float32)}
+    painted = replace(fog, **paint)
+    fresh = Relighter(painted, estimation, 3).under(light).render(VIEW)
+    before = Relighter(fog, estimation, 3).under(light)
+    plain = before.render(VIEW)
+    with monkeypatch.context() as nothing:
+        nothing.setattr(relighter, "make_proxy", None)
+        nothing.setattr(SurfelTracer, "first_hits", None)
+        nothing.setattr(SurfelTracer, "transmittances", None)
+        ours = before.relighter.changed(painted).still_under(before)
+    for name in Guidance.BUFFERS:
+        np.testing.assert_array_equal(ours.render(VIEW)[name], fresh[name])
+    assert np.abs(fresh.lit - plain.lit)[plain.mask > 0.9].mean() > 0.01
+    assert np.abs(fresh.indirect - plain.indirect)[plain.mask > 0.9].mean() > 1e-4, "the proxy is painted too"
+
+
 def test_fog_that_shows_no_surface_is_lit_itself(clean, light, caplog):
     thin = replace(clean, opacity_logits=np.full(len(clean), -4.0), oriented=False)
     lit = Relighter(thin, Estimation(rays=8)).under(light)

@@ -138,9 +138,12 @@ class BounceTransport:
         if len(tracer.scene) != len(self.tracer.scene):
             raise TronError("surfels have come or gone", mend="trace the rays of the new scene")
         rays = self.rays.after(tracer)
-        if rays.met is self.rays.met and "_lending" in self.__dict__:  # materials alone
-            return self.carried(tracer)
-        return BounceTransport(rays, Undersides.of(rays))
+        if rays.met is not self.rays.met:
+            return BounceTransport(rays, Undersides.of(rays))
+        other = BounceTransport(rays, self.undersides)  # materials alone
+        if "_lending" in self.__dict__:
+            other.__dict__["_lending"] = self._lending
+        return other
 
     def carried(self, tracer: SurfelTracer) -> BounceTransport:
         """:meth:`moved` without a ray: what was met, and who lends to whom, stays as it was where it was.
