@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+TRIED = 8
+"""Maps that are read to find the brightest of them: 4,096 x 2,048 texels take half a second each."""
 LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
@@ -49,6 +51,11 @@ class Settings(BaseModel):
     )
     environments: Path = Field(
         description="folder of lat-long environment maps (.hdr, .exr, .png, .jpg), or one of them"
+    )
+    light: str | None = Field(
+        None,
+        description="the map to begin with, by its name without suffix; null: the light of the capture, else "
+        f"the brightest of the first {TRIED}",
     )
     models: Path | None = Field(None, description="folder of PLYs that may be inserted; null: none")
     output_dir: Path = Field(
@@ -104,7 +111,7 @@ def opened(settings: Settings) -> Window:
     check_scene_files(settings.scene, output / "scene.ply")
     lights = _files(settings.environments, LIGHT_SUFFIXES, "environment map")
     models = {} if settings.models is None else _files(settings.models, (".ply",), "PLY")
-    EnvironmentMap.load(next(iter(lights.values())))  # others are read, or refused, when they are chosen
+    first = _first_light(settings, lights)
     require_free_port(settings.host, settings.port)
     logging.getLogger("websockets").setLevel(logging.WARNING)  # it says who comes and goes
     activate(settings.variant, settings.threads)
@@ -116,8 +123,33 @@ def opened(settings: Settings) -> Window:
     finish = _finish(settings.threads)
     return Window(
         scene, settings.scene, lights, models, output, settings.host, settings.port, home, turned,
-        seed=settings.seed, variant=settings.variant, threads=settings.threads, finish=finish,
+        first, seed=settings.seed, variant=settings.variant, threads=settings.threads, finish=finish,
     )  # fmt: skip
+
+
+def _first_light(settings: Settings, lights: Mapping[str, Path]) -> str:
+    """The name of the map to begin with; the others are read, or refused, when they are chosen.
+
+    Raises:
+        TronError: it cannot be read, or there is none of that name.
+    """
+    from tron.shading.environments.environment import EnvironmentMap
+
+    own = [name for name, file in lights.items() if is_of_capture(file, settings.scene)]
+    tried = list(lights)[:TRIED] if settings.light is None and not own else [settings.light or own[0]]
+    if tried[0] not in lights:
+        raise TronError(
+            f"light: no map is called {tried[0]}", settings.environments, f"give one of {', '.join(lights)}"
+        )
+    bright: dict[str, float] = {}
+    for name in tried:
+        try:
+            bright[name] = 1 / EnvironmentMap.load(lights[name]).exposure()
+        except TronError as error:
+            if len(tried) == 1 or (name == tried[-1] and not bright):
+                raise
+            log.warning("%s", error)
+    return max(bright, key=bright.__getitem__)
 
 
 def _finish(threads: int | None) -> Callable[[int, int], Finish | None]:

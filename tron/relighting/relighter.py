@@ -316,9 +316,9 @@ class Relighter:
 
         Where surfels have moved or have other materials, the hierarchy is refitted and only rays that have
         changed are traced again: as if all were, to the bit. Rays are drawn in the hierarchy's order, which a
-        refitted one keeps, so that what has moved has other noise than in a new ``Relighter``. A proxy is made
-        anew unless materials alone differ. Where sizes or opacities differ, or surfels come or go, all is made
-        anew; beside meshes, all rays are. Whether there is a proxy stays as it was.
+        refitted one keeps, so that what has moved has other noise than in a new ``Relighter``. A proxy is
+        made anew unless materials alone differ. Where sizes or opacities differ, or surfels come or go, all
+        is made anew; beside meshes, all rays are. Whether there is a proxy stays as it was.
 
         Args:
             scene: the other scene.

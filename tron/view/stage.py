@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 
 from tron.cameras import Camera
-from tron.color import linear_to_srgb, to_display
+from tron.color import linear_to_srgb, srgb_to_linear, to_display
 from tron.editing import Clicks, Edit, Selection, Session
 from tron.errors import TronError, located
 from tron.estimation import FINEST, PREVIEW
@@ -24,6 +24,7 @@ from tron.framing import upright
 from tron.gaussians.edit import removed
 from tron.gaussians.scene import GaussianScene
 from tron.relighting import Relighter
+from tron.relighting.proxy import Choice
 from tron.relighting.relighter import Illumination
 from tron.seeds import integer
 from tron.shading.environments.environment import EnvironmentMap
@@ -36,10 +37,13 @@ BUFFERS: tuple[Buffer, ...] = get_args(Buffer)
 EXPOSED = ("lit", "irradiance", "indirect")
 """Buffers of light: linear, shown by exposure and AgX. The others are shown as they are.
 
-``capture`` is the look that the scene has in its file, its own radiance, whatever the light.
+``capture`` is the look that the scene has in its file, its own radiance, whatever the light: display values,
+which stops make brighter.
 """
 Left = Literal["nothing", "before", "capture", "light"]
 """What is seen left of the divider: the scene before all edits, its own look then, or another light."""
+Quality = Literal["final", "preview"]
+"""How far pictures at rest go: through all passes, or no farther than the light that reached the surfels."""
 PASS = FINEST.of_sub_pixel()
 """Estimation of each pass; all together are ``quality=final`` of tron-relight."""
 SUB_PIXELS = ((-0.25, -0.25), (0.25, 0.25), (0.25, -0.25), (-0.25, 0.25))
@@ -70,6 +74,7 @@ class Wish:
         left_light: name of the light that is seen there, not turned.
         divider: where it stands, 0 to 1 of the width.
         marked: clicks whose surfels are marked, of the scene after all edits.
+        quality: of pictures at rest.
     """
 
     light: str
@@ -82,6 +87,7 @@ class Wish:
     left_light: str = ""
     divider: float = 0.5
     marked: Clicks | None = None
+    quality: Quality = "final"
 
 
 @dataclass(frozen=True)
@@ -155,6 +161,7 @@ class Stage:
         home: camera that exposure is metered in.
         seed: root of all random numbers.
         watch: called between pieces of long work that may be given up; it raises then.
+        busy: called with what long work is about, and the share of it that is done.
     """
 
     def __init__(
@@ -164,13 +171,14 @@ class Stage:
         home: Camera,
         seed: int = 0,
         watch: Callable[[], None] = lambda: None,
+        busy: Callable[[str, float], None] = lambda *_: None,
     ) -> None:
         self.session, self.turn = Session(scene), upright(scene.up)
-        self._lights, self._seed, self._watch = lights, seed, watch
+        self._lights, self._seed, self._watch, self._busy = lights, seed, watch, busy
         self._home = home.resized(METERED, max(1, round(METERED * home.height / home.width)))
         self._original = scene
         self._yields = False  # whether what is under way may be given up
-        self._base = Relighter(scene.upright(), PREVIEW, seed, track=self._watched)
+        self._base = self._lit_anew(scene.upright(), "auto")
         self._prepared: dict[str, tuple[Lighting, float]] = {}
         self._shown: _Visible | None = None
         self._selected: tuple[GaussianScene, Clicks, np.ndarray] | None = None
@@ -257,6 +265,8 @@ class Stage:
         if part.buffer in EXPOSED:
             factor = self.exposure(part.light, wish.stops)
             image = np.asarray(to_display(image, np.float32(factor), look="photograph"))
+        elif part.buffer == "capture" and wish.stops:  # it has an exposure, that of its photos
+            image = np.asarray(linear_to_srgb(srgb_to_linear(image) * np.float32(2.0**wish.stops)))
         shown = (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8)
         if wish.marked is None or part.left:
             return shown
@@ -364,10 +374,13 @@ class Stage:
         elif rough and len(scene) == len(self._relighter.scene):
             self._relighter, self._fresh = self._relighter.changed(scene, quick=True), False
         else:
-            proxy = "never" if self._base.proxy is None else "always"
-            self._relighter = Relighter(scene, PREVIEW, self._seed, proxy=proxy, track=self._watched)
+            self._relighter = self._lit_anew(scene, "never" if self._base.proxy is None else "always")
             self._fresh = True
             self._right.settled = self._left.settled = False
+
+    def _lit_anew(self, scene: GaussianScene, proxy: Choice) -> Relighter:
+        rays, film = self._watched("tracing light"), self._watched("filming the scan for light")
+        return Relighter(scene, PREVIEW, self._seed, proxy=proxy, track=rays, filming=film)
 
     def _surface(self, part: Part, camera: Camera) -> np.ndarray:
         buffer, relighter = part.buffer, self._base if part.before else self._relighter
@@ -381,9 +394,13 @@ class Stage:
             return there * np.asarray(linear_to_srgb(seen["base_color"]))
         return np.broadcast_to(there * seen[buffer][..., None], (*seen["opacity"].shape, 3))
 
-    def _watched(self, work: range) -> Iterable[int]:
-        for each in work:
-            if self._yields:
+    def _watched(self, about: str) -> Callable[[range], Iterable[int]]:
+        def watched(work: range) -> Iterable[int]:
+            for number, each in enumerate(work):
                 dr.sync_thread()  # launches are asynchronous: else all of them are under way already
-                self._watch()
-            yield each
+                self._busy(about, number / len(work))
+                if self._yields:
+                    self._watch()
+                yield each
+
+        return watched

@@ -45,6 +45,8 @@ MOVING_SECONDS = 0.11
 """Time that a picture may take while a hand moves, before the next ones are made smaller."""
 SMALLEST = 0.3
 """Side of the smallest of them, of the full size."""
+WORKING = "working"
+"""What is said of a wish before more is known."""
 PASSED = 2 + len(SUB_PIXELS)
 """Level of a view after all passes: 0 of nothing, 1 of a rough picture, 2 of one at rest, then one a pass."""
 
@@ -96,6 +98,9 @@ class Studio:
         show: called with the number of a view and its next picture, on the studio's thread.
         notice: called with a line for the user where a wish cannot be fulfilled: it is taken back.
         finish: of pictures of lit, by their width and height; None: none at all, or none of that size.
+        busy: called with what is worked on, and the share of it that is done, as long as no picture of the
+            wish of the moment is there; on any thread.
+        light: name of the first one; None: the first of them.
         seed: root of all random numbers.
         variant: of Mitsuba.
         threads: of Dr.Jit; None: as it is.
@@ -110,20 +115,23 @@ class Studio:
         notice: Callable[[str], None] = log.warning,
         *,
         finish: Callable[[int, int], Finish | None] = lambda *_: None,
+        busy: Callable[[str, float], None] = lambda *_: None,
+        light: str | None = None,
         seed: int = 0,
         variant: str = "llvm_ad_rgb",
         threads: int | None = None,
     ) -> None:
         if not lights:
             raise TronError("there is no light", mend="give one at least")
-        self._make = lambda: Stage(scene, lights, home, seed, self._watch)
+        self._make = lambda: Stage(scene, lights, home, seed, self._watch, busy)
         self._machine = variant, threads
-        self._show, self._notice, self._finish = show, notice, finish
+        self._show, self._notice, self._finish, self._busy = show, notice, finish, busy
         self._changed = threading.Condition()
-        self._wish, self._done = Wish(next(iter(lights))), None
+        self._wish, self._done = Wish(next(iter(lights)) if light is None else light), None
+        self._wishes = 0  # that there have been
         self._refused: Wish | None = None
         self._views: dict[int, _View] = {}
-        self._asked: deque[tuple[Callable[[Stage], Any], Future[Any]]] = deque()
+        self._asked: deque[tuple[int, Callable[[Stage], Any], Future[Any]]] = deque()
         self._closing, self._version, self._began = False, 0, 0
         self._moved = -np.inf
         self._thread = threading.Thread(target=self._run, name="studio", daemon=True)
@@ -167,13 +175,16 @@ class Studio:
             self._changed.notify()
 
     def ask(self, question: Callable[[Stage], T]) -> Future[T]:
-        """Let the studio's thread answer a question between two pieces, the wish of the moment done."""
+        """Let the studio's thread answer a question between two pieces, the wish of the moment done.
+
+        It may take as long as that wish does. Where it cannot be done, the question is not answered.
+        """
         answer: Future[T] = Future()
         with self._changed:
             if self._closing:
                 answer.cancel()
             else:
-                self._asked.append((question, answer))
+                self._asked.append((self._wishes, question, answer))
                 self._version += 1  # a pass that is under way is given up
                 self._changed.notify()
         return answer
@@ -192,9 +203,11 @@ class Studio:
             return wish
         self._wish, self._moved = wish, time.perf_counter()
         self._version += 1
+        self._wishes += 1
         self._refused = None
         for view in self._views.values():
             view.level = 0
+        self._busy(WORKING, 0.0)
         self._changed.notify()
         return wish
 
@@ -204,23 +217,23 @@ class Studio:
             with self._changed:
                 self._wait()
                 if self._closing:
-                    for _, answer in self._asked:
+                    for *_, answer in self._asked:
                         answer.cancel()
                     return
-                self._began, wish = self._version, self._wish
+                self._began, wish, number = self._version, self._wish, self._wishes
                 rough = time.perf_counter() - self._moved < REST_SECONDS
             try:
                 with _ONE_AT_A_TIME:
                     if stage is None:
                         activate(*self._machine)
                         stage = self._make()
-                    self._work(stage, wish, rough)
+                    self._work(stage, wish, number, rough)
             except _Outdated:
                 pass
             except Exception as error:
                 if not isinstance(error, TronError):
                     log.exception("drawing failed")
-                self._refuse(wish, str(error) or type(error).__name__)
+                self._refuse(wish, number, str(error) or type(error).__name__)
 
     def _wait(self) -> None:
         """Until there is something to do; holds the lock."""
@@ -236,16 +249,15 @@ class Studio:
             else:
                 return
 
-    def _work(self, stage: Stage, wish: Wish, rough: bool) -> None:
+    def _work(self, stage: Stage, wish: Wish, number: int, rough: bool) -> None:
         """The next piece of work: questions first, then a picture of the view that has least."""
         if wish != self._refused:
             stage.bring(wish, rough)
             self._done = wish
         with self._changed:
-            asked = list(self._asked)
-            self._asked.clear()
+            asked = self._taken(number)
             views = self._views.items()
-            open_ones = [(v.level, v.drawn, number) for number, v in views if v.level < self._last(v, wish)]
+            open_ones = [(v.level, v.drawn, view) for view, v in views if v.level < self._last(v, wish)]
         for question, answer in asked:
             try:
                 answer.set_result(question(stage))
@@ -253,9 +265,15 @@ class Studio:
                 answer.set_exception(error)
         if not open_ones or wish == self._refused:
             return
-        level, _, number = min(open_ones)
+        level, _, view = min(open_ones)
         if level == 0 or not rough:
-            self._draw(stage, wish, number, rough)
+            self._draw(stage, wish, view, rough)
+
+    def _taken(self, number: int) -> list[tuple[Callable[[Stage], Any], Future[Any]]]:
+        """The questions of a wish and of those before it: others wait for their own. Holds the lock."""
+        taken = [(question, answer) for asked, question, answer in self._asked if asked <= number]
+        self._asked = deque(each for each in self._asked if each[0] > number)
+        return taken
 
     def _draw(self, stage: Stage, wish: Wish, number: int, rough: bool) -> None:
         with self._changed:
@@ -335,6 +353,8 @@ class Studio:
 
     def _last(self, view: _View, wish: Wish) -> int:
         """Level of a view that is done."""
+        if wish.quality == "preview":
+            return 2
         finish = self._finish(view.camera.width, view.camera.height) if wish.buffer == "lit" else None
         return PASSED + (finish is not None)
 
@@ -344,14 +364,14 @@ class Studio:
             if self._version != self._began:
                 raise _Outdated
 
-    def _refuse(self, wish: Wish, why: str) -> None:
+    def _refuse(self, wish: Wish, number: int, why: str) -> None:
         """Go back to what could be done last, and say so."""
         with self._changed:
             if self._wish == wish and self._done is not None and self._done != wish:
                 self._want(self._done)
             else:
                 self._refused = wish
-            asked, self._asked = list(self._asked), deque()
+            asked = self._taken(number)
         for _, answer in asked:
             answer.set_exception(TronError(why))
         self._notice(why)

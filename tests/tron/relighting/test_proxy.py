@@ -269,8 +269,8 @@ def test_a_changed_scan_is_filmed_anew(fog, light):
 def test_paint_asks_for_no_film_and_no_ray(fog, light, monkeypatch):
     """And is lit as a scan that had it from the start, to the bit."""
     rng, estimation = generator(4, "tests", "paint"), Estimation(rays=0)
-    paint = {"base_color": rng.random((len(fog), 3), np.float32), "roughness": rng.random(len(fog), np.float32)}
-    painted = replace(fog, **paint)
+    color, roughness = rng.random((len(fog), 3), np.float32), rng.random(len(fog), np.float32)
+    painted = replace(fog, base_color=color, roughness=roughness)
     fresh = Relighter(painted, estimation, 3).under(light).render(VIEW)
     before = Relighter(fog, estimation, 3).under(light)
     plain = before.render(VIEW)

@@ -1,6 +1,12 @@
-"""A floor, a ball and a ring under two lights, and a studio that keeps what it shows."""
+"""A floor, a ball and a ring under two lights, a studio that keeps what it shows, and a real browser.
 
+That is Debian's Chromium, driven by Playwright.
+"""
+
+import shutil
+import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -16,6 +22,7 @@ from tron.view.studio import Picture, Studio
 
 PATIENCE = 300
 """Seconds to wait for a picture."""
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
 class Shown:
@@ -83,3 +90,56 @@ def open_studio(scene, lights, camera, variant) -> Callable[..., Any]:
             yield studio, shown
 
     return opened
+
+
+@pytest.fixture(scope="session")
+def free_port() -> Callable[[], int]:
+    def found() -> int:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            return probe.getsockname()[1]
+
+    return found
+
+
+@pytest.fixture
+def browse() -> Iterator[Callable[..., Any]]:
+    """Opens an address in a browser of its own; the page lists ``complaints`` of its console."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
+    if (program := shutil.which("chromium")) is None:
+        pytest.skip("no chromium: apt-get install chromium")
+
+    def is_error(said: Any) -> bool:
+        """viser gives a picture up that a newer one replaces while it loads: no error."""
+        return said.type == "error" and not said.location["url"].startswith("blob:")
+
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=program, args=FLAGS)
+
+        def opened(address: str, width: int = 620, height: int = 900) -> Any:
+            page = browser.new_context(viewport={"width": width, "height": height}).new_page()
+            page.complaints = []
+            page.on("console", lambda said: is_error(said) and page.complaints.append(said.text))
+            page.on("pageerror", lambda error: page.complaints.append(str(error)))
+            page.goto(address)
+            page.wait_for_selector("text=Exposure", state="attached", timeout=60_000)
+            return page
+
+        yield opened
+        browser.close()
+
+
+@pytest.fixture(scope="session")
+def pull() -> Callable[[Any, Any, int], None]:
+    """Presses the middle of a box of a page and moves sideways by some pixels."""
+
+    def pulled(page: Any, box: Any, by: int) -> None:
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        page.mouse.move(x, y)
+        page.mouse.down()
+        for step in range(1, 6):
+            page.mouse.move(x + by * step / 5, y)
+            time.sleep(0.1)
+        page.mouse.up()
+
+    return pulled

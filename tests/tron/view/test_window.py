@@ -1,10 +1,9 @@
 """The window in a real browser: Debian's Chromium, driven by Playwright."""
 
 import shlex
-import shutil
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,23 +23,10 @@ from tron.io.images import read_image
 from tron.view.window import Window, require_free_port
 
 PATIENCE = 120
-BROWSER = shutil.which("chromium")
-FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-def is_error(said: Any) -> bool:
-    """Of a console's line; viser gives a picture up that a newer one replaces while it loads."""
-    return said.type == "error" and not said.location["url"].startswith("blob:")
 
 
 @pytest.fixture
-def window(scene, lights, variant, tmp_path) -> Iterator[Window]:
+def window(scene, lights, variant, tmp_path, free_port) -> Iterator[Window]:
     files = {}
     for name, light in lights.items():
         files[name] = tmp_path / f"{name}.exr"
@@ -58,20 +44,8 @@ def window(scene, lights, variant, tmp_path) -> Iterator[Window]:
 
 
 @pytest.fixture
-def page(window) -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
-    if BROWSER is None:
-        pytest.skip("no chromium: apt-get install chromium")
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=BROWSER, args=FLAGS)
-        opened = browser.new_context(viewport={"width": 620, "height": 900}).new_page()
-        opened.complaints = []
-        opened.on("console", lambda said: is_error(said) and opened.complaints.append(said.text))
-        opened.on("pageerror", lambda error: opened.complaints.append(str(error)))
-        opened.goto(f"http://127.0.0.1:{window._server.get_port()}")
-        opened.wait_for_selector("text=Exposure", timeout=60_000)
-        yield opened
-        browser.close()
+def page(window, browse) -> Any:
+    return browse(window.address)
 
 
 def final(window: Window) -> np.ndarray:
@@ -95,34 +69,24 @@ def shot(page: Any) -> np.ndarray:
     return image.astype(int)
 
 
-def drag(page: Any, number: int, by: int) -> None:
-    """Move the thumb of a slider, counted from above."""
-    pull(page, page.locator("[role=slider]").nth(number).bounding_box(), by)
-
-
-def pull(page: Any, box: Any, by: int) -> None:
-    """Press the middle of a box and move sideways."""
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    page.mouse.move(x, y)
-    page.mouse.down()
-    for step in range(1, 6):
-        page.mouse.move(x + by * step / 5, y)
-        time.sleep(0.1)
-    page.mouse.up()
+@pytest.fixture
+def drag(pull) -> Callable[[Any, int, int], None]:
+    """Moves the thumb of a slider, counted from above."""
+    return lambda page, number, by: pull(page, page.locator("[role=slider]").nth(number).bounding_box(), by)
 
 
 TURN, STOPS, DIVIDER, ROUGHNESS, METALLIC = range(5)
 
 
 @pytest.mark.long
-def test_sliders_change_the_picture_and_undo_brings_it_back(window, page):
+def test_sliders_change_the_picture_and_undo_brings_it_back(window, page, drag):
     first, seen = final(window), shot(page)
     drag(page, TURN, 40)
     turned = final(window)
     assert window.studio.wished.turn > 0
     assert np.abs(turned.astype(int) - first).mean() > 1
     assert np.abs(shot(page) - seen).mean() > 1, "the browser shows it"
-    label = next(name for name, number in window._numbers.items() if number == BALL)
+    label = next(name for name, number in window.objects.numbers.items() if number == BALL)
     page.get_by_role("combobox", name="Object").click()
     page.get_by_role("option", name=label, exact=True).click()
     time.sleep(1)
@@ -141,7 +105,7 @@ def test_sliders_change_the_picture_and_undo_brings_it_back(window, page):
 
 
 @pytest.mark.long
-def test_a_second_client_sees_the_same_scene(window, page):
+def test_a_second_client_sees_the_same_scene(window, page, drag):
     final(window)
     other = page.context.new_page()
     other.goto(page.url)
@@ -161,8 +125,8 @@ def test_a_second_client_sees_the_same_scene(window, page):
 @pytest.mark.long
 def test_what_is_saved_is_what_is_shown(window, page, tmp_path):
     picture = final(window)
-    window._chosen = BALL
-    window._paint(roughness=0.9)
+    window.objects.take(BALL)
+    window.objects.paint(roughness=0.9)
     picture = final(window)
     page.get_by_text("Save", exact=True).first.click()
     for what in ("Picture", "Scene", "Film"):
@@ -174,7 +138,7 @@ def test_what_is_saved_is_what_is_shown(window, page, tmp_path):
     assert (written.roughness[written.object_id == BALL] == np.float32(0.9)).all()
     assert EditList.read(saved / "edits-001.yaml").edits == window.studio.wished.edits
     page.wait_for_selector("text=tron-relight scene=")
-    name, *words = shlex.split(window._saved.content.strip("`\n"))
+    name, *words = shlex.split(window.saving.told)
     film = check(compose_recipe("conf.relight", Relight, words), Relight)
     assert name == "tron-relight"
     assert (film.scene, film.cameras) == (saved / "scene-002.ply", saved / "view-001.json")
@@ -182,14 +146,19 @@ def test_what_is_saved_is_what_is_shown(window, page, tmp_path):
     assert page.complaints == []
 
 
-def dragged(page: Any, name: str, by: int) -> None:
-    """Drag an element of a class sideways."""
-    pull(page, page.locator(name).bounding_box(), by)
-    time.sleep(1)
+@pytest.fixture
+def dragged(pull) -> Callable[[Any, str, int], None]:
+    """Drags an element of a class sideways."""
+
+    def moved(page: Any, name: str, by: int) -> None:
+        pull(page, page.locator(name).bounding_box(), by)
+        time.sleep(1)
+
+    return moved
 
 
 @pytest.mark.long
-def test_the_light_turns_by_dragging_its_picture(window, page, lights):
+def test_the_light_turns_by_dragging_its_picture(window, page, lights, dragged):
     """Its picture moves with the hand, and is then that of the turned map."""
     final(window)
     page.wait_for_selector(".tron-panorama")
@@ -208,7 +177,7 @@ def test_the_light_turns_by_dragging_its_picture(window, page, lights):
 
 
 @pytest.mark.long
-def test_the_divider_is_dragged_and_goes(window, page):
+def test_the_divider_is_dragged_and_goes(window, page, dragged):
     alone = final(window)
     page.get_by_text("Compare", exact=True).first.click()
     page.get_by_role("combobox", name="Left side").click()
@@ -262,7 +231,7 @@ def test_a_camera_path_is_kept_played_and_filmed(window, page, tmp_path):
     page.get_by_text("Save", exact=True).first.click()
     page.get_by_role("button", name="Film").click()
     page.wait_for_selector("text=tron-relight scene=")
-    _, *words = shlex.split(window._saved.content.strip("`\n"))
+    _, *words = shlex.split(window.saving.told)
     film = check(compose_recipe("conf.relight", Relight, words), Relight)
     assert film.cameras == tmp_path / "saved" / "path-001.json"
     assert film.cameras is not None
@@ -298,7 +267,7 @@ def test_a_broken_model_is_a_notice_and_the_server_goes_on(window):
     window._model.value = "whole"
     window._insert()
     assert np.abs(final(window).astype(int) - picture).max() > 20
-    assert len(window._numbers) == 4
+    assert len(window.objects.numbers) == 4
 
 
 def test_clicks_and_shift_clicks_cut_an_object_out(window, scene):
@@ -310,7 +279,7 @@ def test_clicks_and_shift_clicks_cut_an_object_out(window, scene):
 
     panel, ball = window._cutting, scene.means[scene.object_id == BALL]
     click(ball.mean(0), False)
-    assert window._chosen == BALL, "clicks choose objects as long as they do not select"
+    assert window.objects.chosen == BALL, "clicks choose objects as long as they do not select"
     panel._on.value = True
     click(ball.mean(0), False)
     assert window.studio.wished.marked.inside
@@ -325,12 +294,14 @@ def test_clicks_and_shift_clicks_cut_an_object_out(window, scene):
     panel._separate()
     (edit,) = window.studio.wished.edits
     assert isinstance(edit, Separate)
-    assert (edit.object, window._chosen) == (4, 4)
+    assert (edit.object, window.objects.chosen) == (4, 4)
     assert window.studio.wished.marked is None
     cut = window.studio.ask(lambda stage: stage.session.scene.object_id == 4).result(60)
     assert cut[scene.object_id == BALL].mean() > 0.95
-    window._undo()
-    assert window._numbers.keys() == {name for name in window._numbers if not name.startswith("4 ")}
+    window.history.undo()
+    assert window.objects.numbers.keys() == {
+        name for name in window.objects.numbers if not name.startswith("4 ")
+    }
 
 
 def test_a_port_in_use_is_said():
@@ -343,9 +314,9 @@ def test_a_port_in_use_is_said():
 
 
 def test_files_are_saved_under_free_names_in_the_folder_alone(window, tmp_path: Path):
-    names = [window._path("scene", ".ply") for _ in range(2)]
+    names = [window.saving.path("scene", ".ply") for _ in range(2)]
     names[0].touch()
-    names.append(window._path("scene", ".ply"))
+    names.append(window.saving.path("scene", ".ply"))
     assert [str(each.relative_to(tmp_path / "saved")) for each in names] == [
         *("scene-001.ply", "scene-001.ply"),
         "scene-002.ply",

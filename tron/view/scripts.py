@@ -1,7 +1,7 @@
-"""What is dragged in the page: the light's picture, and the divider of a picture of two.
+"""What viser has no control for, as HTML with scripts: what is dragged in the page, and a panel that folds.
 
-viser has no such controls. Both are HTML that moves the slider of the same value, as a hand would, and
-follows it: the server knows the slider alone, and every client sees what another one drags.
+The light's picture and the divider of a picture of two move the slider of the same value, as a hand would,
+and follow it: the server knows the slider alone, and every client sees what another one drags.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from tron.errors import TronError
 
 QUALITY = 88
 """Of the picture's JPEG."""
+NARROW = 576
+"""Pixels of a page up to which viser lays its panel over the picture."""
 
 _SLIDER = """
 const field = () => document.getElementById('%(slider)s')
@@ -70,6 +72,13 @@ follow(() => {
   return true;
 });
 """
+_FOLD = """
+let panel = this.parentElement;
+while (panel && getComputedStyle(panel).position !== 'fixed') panel = panel.parentElement;
+const narrow = matchMedia('(max-width: %(narrow)dpx)').matches;
+const handle = panel?.querySelector('[style*="cursor: pointer"]');
+if (narrow && handle && !window.tronFolded) { window.tronFolded = true; handle.click(); }
+"""
 _PIXEL = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7"
 
 
@@ -100,6 +109,11 @@ def divider(slider: str, words: str) -> str:
         words: what is left of it.
     """
     return _run(_PIXEL, _SLIDER % {"slider": slider} + _DIVIDER % {"words": html.escape(words, quote=True)})
+
+
+def folded_on_phones() -> str:
+    """HTML that folds viser's panel once where it would cover the picture."""
+    return _run(_PIXEL, _FOLD % {"narrow": NARROW})
 
 
 def _run(source: str, script: str) -> str:
