@@ -89,7 +89,7 @@ def test_the_relit_picture_has_no_fireflies(run, tmp_path: Path, monkeypatch):
     """Off the metal ring no pixel jumps from one seed of its rays to another.
 
     The ball mirrors the sun that the ring mirrors: four rays a pixel find it by chance, and were 0.9 to 2.6
-    above their median of ten seeds in nine of them; 64 are 0.07 to 0.13.
+    above their median of ten seeds in nine of them; 64 are 0.07 to 0.13. The example sends more.
     """
     frames = []
     render = Illumination.render
