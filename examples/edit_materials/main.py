@@ -23,7 +23,8 @@ else:
     session.do(Material(select=everything, roughness=0.4, metallic=1))
 
 (camera,) = look_at(scene, chosen)
-before = Relighter(scene, Estimation(rays=64, bounces=0))
+# Rays that find what a mirror shows show the light that bounces there.
+before = Relighter(scene, Estimation(rays=64, reflections=64, supersample=2))
 after = before.changed(session.scene)  # nothing has moved: what rays meet is kept
 pictures = [relighter.under(light).render(camera).lit for relighter in (before, after)]
 write_image(chosen.output, to_display(np.hstack(pictures), light.exposure()))

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from tron.apps.capture_light import over_scene
 from tron.apps.machine import Threads, Variant
 from tron.apps.relight.camera_files import filmed_orbit, filmed_with
-from tron.apps.relight.scan_materials import with_materials
+from tron.apps.relight.scan_materials import proxy_file, with_materials
 from tron.apps.scene_file import Up, check_scene_files, load_scene
 from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
 from tron.cameras import Camera
@@ -22,6 +22,7 @@ from tron.cli.progress import track, working
 from tron.color import Look
 from tron.estimation import PREVIEW
 from tron.framing import upright
+from tron.gaussians.kept import KeptFiles
 from tron.gaussians.scene import GaussianScene
 from tron.gaussians.splat_files import SUFFIXES, check_count, check_suffix, write_splats
 from tron.runtime import activate
@@ -94,11 +95,13 @@ def main(settings: Settings) -> None:
     surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
     scene = surrounded.shown
     filmed = filmed_with(settings.scene, turn, offset)
+    kept = KeptFiles(settings.scene, settings.output.parent)
     if scene.materials_guessed and settings.materials == "auto":
-        scene = with_materials(scene, settings.scene, filmed, settings.seed, surrounded.backdrop, turn)
+        scene = with_materials(scene, kept, filmed, settings.seed, surrounded.backdrop, turn)
+    never = settings.proxy == "never"
     relighter = Relighter(
         scene, PREVIEW, settings.seed, backdrop=surrounded.backdrop, proxy=settings.proxy,
-        cameras=filmed, proxy_file=settings.scene.with_suffix(".proxy.ply"),
+        cameras=filmed, proxy_file=None if never else proxy_file(scene, kept, filmed, surrounded.backdrop),
         track=partial(track, label="light between surfels"), filming=partial(track, label="filming the scan"),
     )  # fmt: skip
     light = relighter.under(environment.rotated(settings.rotation))

@@ -11,13 +11,17 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from tron.apps.capture_light import LIGHT
 from tron.apps.relight.camera_files import CAMERAS, cameras_of, in_frame_of
-from tron.apps.scene_file import Up, check_scene_files
+from tron.apps.relight.scan_materials import with_known_materials
+from tron.apps.scene_file import Up, check_scene_files, load_scene
 from tron.cli.command_line import ANEW, command
 from tron.cli.progress import working
 from tron.editing import Edit, EditList, Insert, Material, Views
 from tron.errors import TronError
+from tron.gaussians.kept import KeptFiles
 from tron.gaussians.scene import GaussianScene
+from tron.storage import write_atomic
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +73,9 @@ def main(settings: Settings) -> None:
     What else selects: material (ranges), grow (from a picked surfel or pixel), clicks (inside and outside),
     masks (of views). Several together hold at once; any joins selections, but_not takes one away.
 
-    Writes the scene with the edits done, or nothing. The same is in Python: tron.editing.
+    Writes the scene with the edits done, or nothing. What is known of the scene stays known: its up, the
+    materials that tron-relight found, and in another folder its cameras.json and environment.exr. The same
+    is in Python: tron.editing.
     """
     if settings.output.suffix.lower() != ".ply":
         mend = "give it a name that ends with .ply; tron-export makes other files of that"
@@ -77,20 +83,20 @@ def main(settings: Settings) -> None:
     check_scene_files(settings.scene, settings.output, *_files(settings), _cameras_file(settings))
     edits, where = _read(settings)
     with working("reading the scene"):
-        scene = GaussianScene.load(settings.scene)
-    if settings.up is not None:
-        scene.up, scene.up_guessed = np.array(settings.up) / np.linalg.norm(settings.up), False
+        scene = load_scene(settings.scene, settings.up)
+    if scene.materials_guessed:
+        scene = with_known_materials(scene, KeptFiles(settings.scene, settings.output.parent))
     _describe(scene)
     if scene.offset.any():
         log.info("coordinates of edits are about %s", scene.offset.tolist())
     if scene.materials_guessed and any(isinstance(each, Insert | Material) for each in edits):
         log.warning(
-            "%s has no materials of its own: tron-relight would find them anew and undo these edits; edit "
-            "%s, which it keeps, or give it materials=as_is", settings.scene,
-            settings.scene.with_suffix(".materials.ply").name,
+            "%s has no materials of its own: tron-relight would find them anew and undo these edits; relight "
+            "the scan first, which keeps what it finds, or give it materials=as_is", settings.scene,
         )  # fmt: skip
     edited = edits.apply(scene, _views(settings, scene), where, _said)
     edited.save(settings.output)
+    _keep_beside(settings.scene, settings.output)
     _describe(edited)
     log.info("%d surfels, now %d: %s", len(scene), len(edited), settings.output)
 
@@ -105,6 +111,22 @@ def _cameras_file(settings: Settings) -> Path | None:
             return path / name
     mend = "give the cameras.json that tron-reconstruct writes beside its scene"
     raise TronError(f"the folder holds no {' and no '.join(CAMERAS_FILES)}", path, mend)
+
+
+def _keep_beside(scene: Path, output: Path) -> None:
+    """Let a scene's cameras and the light of its capture, where they lie beside it, lie beside the output."""
+    for name in (CAMERAS, LIGHT):
+        own, there = (path.with_name(name) for path in (scene, output))
+        known, found = (path.read_bytes() if path.is_file() else None for path in (own, there))
+        if known == found:
+            continue
+        if known is not None and found is None:
+            write_atomic(there, known)
+            log.info("%s goes with it: %s", own, there)
+        else:
+            log.warning(
+                "%s is not of this scene, and commands will take it for its own: give another folder", there
+            )
 
 
 def _files(settings: Settings) -> tuple[Path, ...]:

@@ -144,8 +144,7 @@ def _write_mesh(settings: Settings) -> None:
     scene = treat_surroundings(scene.upright(), "drop", settings.scene).content
     tracer, views = SurfelTracer(scene), views_of(scene, filmed)
     surface = surface_of(tracer, views, triangles=settings.triangles, track=partial(track, label="surface"))
-    with working("textures"):
-        part = textured(tracer, surface, settings.texture)
+    part = textured(tracer, surface, settings.texture, track)
     with working("writing"):
         (write_glb if settings.output.suffix.lower() == ".glb" else write_usdz)(settings.output, part)
     _log_written(settings, f"{len(part.faces)} triangles")

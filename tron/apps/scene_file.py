@@ -70,6 +70,8 @@ def load_scene(
 ) -> GaussianScene:
     """The scene of a file, with a line in the log where its materials or which way is up are guessed.
 
+    What is up is settled by that: files that are made of the scene say so, and nobody is warned again.
+
     Args:
         path: the PLY.
         up: direction of any length, in the file's frame; None: the file's own.
@@ -90,4 +92,5 @@ def load_scene(
             "side, give up=[0,0,1] or another direction",
             path,
         )
+    scene.up_guessed = False
     return scene

@@ -1,6 +1,7 @@
 """tron-edit from end to end: the file it writes is what the edits say, or there is none."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,14 @@ import pytest
 
 from examples.stage import BALL, FLOOR, RING, make_scene
 from tron.apps.edit import cli
+from tron.apps.scene_file import load_scene
 from tron.cameras import Camera
 from tron.editing import EditList, Remove, Selection, Views
+from tron.gaussians.edit import subset
+from tron.gaussians.ply import header_comments, write_ply
 from tron.gaussians.scene import GaussianScene
 from tron.io.images import write_image
+from tron.relighting.proxy import fingerprint
 
 TOP = Camera.look_at((0.1, -0.45, 4), (0.1, -0.4, 0), fov_deg=50, width=64, height=64)
 
@@ -29,7 +34,7 @@ def edit(folder: Path, edits: str, *arguments: str) -> int:
             [
                 f"scene={folder}/scene.ply",
                 f"edits={folder}/edits.yaml",
-                f"output={folder}/out.ply",
+                *([] if any("output=" in word for word in arguments) else [f"output={folder}/out.ply"]),
                 *arguments,
             ]
         )
@@ -121,6 +126,72 @@ def test_a_mistake_is_one_line_and_leaves_the_last_output_as_it_was(folder, caps
     assert said in errors[0]
     assert "edit 2" in errors[0] or "nowhere" in said
     assert (folder / "out.ply").read_text() == "of the last run"
+
+
+def commented(path: Path) -> list[str]:
+    return [line for line in header_comments(path) if line.startswith(("tron up", "tron materials"))]
+
+
+def test_what_was_guessed_is_said_once(folder, caplog):
+    """The next command reads it from the file, and neither warns nor guesses again."""
+    scene = GaussianScene.load(folder / "scene.ply")
+    scene.up_guessed = True
+    scene.save(folder / "scene.ply")
+    assert edit(folder, "- {action: remove, select: {object: 3}}") == 0
+    assert caplog.text.count("does not say which way is up") == 1
+    caplog.clear()
+    assert load_scene(folder / "out.ply", None, "as_is").up.tolist() == scene.up.tolist()
+    assert caplog.text == ""
+
+
+def test_an_up_that_was_given_is_known_of_all_that_is_written(folder):
+    scene = GaussianScene.load(folder / "scene.ply")
+    scene.up_guessed = True
+    scene.save(folder / "scene.ply")
+    load_scene(folder / "scene.ply", (0, 2, 0)).save(folder / "again.ply")
+    assert commented(folder / "again.ply")[0] == "tron up 0.0 1.0 0.0"
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("sky", [False, True])
+def test_materials_that_were_found_for_a_scan_are_in_its_edits(folder, caplog, monkeypatch, sky):
+    """Those that tron-relight keeps beside it, of all but a sky, which has none."""
+    scan = GaussianScene.load(folder / "scene.ply")
+    scan.materials_guessed, scan.oriented = True, False
+    scan.save(folder / "scene.ply")
+    scan = GaussianScene.load(folder / "scene.ply")
+    around = (scan.object_id == FLOOR) if sky else np.zeros(len(scan), bool)
+    monkeypatch.setattr("tron.tracing.surroundings.find_surroundings", lambda scene: around)
+    content = subset(scan, ~around)
+    found = replace(content, metallic=np.full(len(content), 0.25), materials_guessed=False)
+    comments = [f"materials {fingerprint(content, None)}"]
+    write_ply(folder / "scene.materials.ply", vars(found) | {"normals": found.normals()}, comments)
+    with caplog.at_level("INFO"):
+        assert edit(folder, "- {action: material, select: {object: 2}, roughness: 0.9}") == 0
+    out = GaussianScene.load(folder / "out.ply")
+    assert not out.materials_guessed
+    np.testing.assert_array_equal(out.metallic[~around], np.float32(0.25))
+    np.testing.assert_array_equal(out.metallic[around], scan.metallic[around])
+    np.testing.assert_array_equal(out.roughness[scan.object_id == BALL], np.float32(0.9))
+    assert "materials are those of" in caplog.text
+    assert "no materials of its own" not in caplog.text
+
+
+def test_cameras_and_light_of_a_capture_go_with_the_scene(folder, tmp_path, caplog):
+    """In another folder the next command would orbit elsewhere, and find no light of the capture."""
+    (folder / "cameras.json").write_text(json.dumps({"names": ["a"], "cameras": [TOP.to_dict()]}))
+    (folder / "environment.exr").write_bytes(b"of the capture")
+    other = tmp_path / "other"
+    for _ in range(2):
+        caplog.clear()
+        assert edit(folder, "- {action: remove, select: {object: 3}}", f"output={other}/out.ply") == 0
+        for name in ("cameras.json", "environment.exr"):
+            assert (other / name).read_bytes() == (folder / name).read_bytes()
+        assert "of this scene" not in caplog.text
+    (other / "environment.exr").write_bytes(b"of another capture")
+    assert edit(folder, "- {action: remove, select: {object: 3}}", f"output={other}/out.ply") == 0
+    assert (other / "environment.exr").read_bytes() == b"of another capture"
+    assert f"{other / 'environment.exr'} is not of this scene" in caplog.text
 
 
 def test_guessed_materials_are_not_edited_in_silence(folder, caplog):

@@ -1,5 +1,6 @@
 """tron-export from end to end: a scene packed and read back, and what is refused."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -47,3 +48,16 @@ def test_points_and_splats_of_a_kind(tmp_path: Path, ball_on_floor):
     assert len(GaussianScene.load(tmp_path / "b.glb")) == len(scene)
     assert export(f"scene={tmp_path}/a.ply", f"output={tmp_path}/b.ply", "kind=points") == 0
     assert b"property uchar red" in (tmp_path / "b.ply").read_bytes()[:500]
+
+
+def test_every_long_part_of_a_mesh_has_a_share(tmp_path: Path, ball_on_floor, caplog, variant, monkeypatch):
+    """A part that is one piece would be a name alone, minutes long."""
+    caplog.set_level("INFO")
+    monkeypatch.setattr("tron.meshing.surface.VIEWS", 24)
+    monkeypatch.setattr("tron.meshing.surface.SIDE", 128)
+    ball_on_floor(0.15).save(tmp_path / "a.ply")
+    words = ["texture=64", "triangles=2000", f"variant={variant}"]
+    assert export(f"scene={tmp_path}/a.ply", f"output={tmp_path}/b.glb", *words) == 0
+    parts = dict(re.findall(r"^(.+): 0 of (\d+)$", "\n".join(caplog.messages), re.MULTILINE))
+    assert list(parts) == ["surface", "cutting the surface", "textures"]
+    assert int(parts["surface"]) > 10

@@ -1,6 +1,8 @@
 """Surfels as triangles: a painted ball against its own formula, read back by trimesh."""
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from tron.framing import Y_UP
 from tron.gaussians.edit import joined
 from tron.gaussians.initialize import surfels_from_points
 from tron.gaussians.scene import GaussianScene
+from tron.meshing import textures
 from tron.meshing.surface import surface_of, views_of
 from tron.meshing.textures import textured
 from tron.models.write import write_glb
@@ -41,7 +44,11 @@ def ball(radius: float = RADIUS, middle: np.ndarray = MIDDLE, surfels: int = 600
 
 
 @pytest.mark.usefixtures("variant")
-def test_a_ball_is_a_ball_with_its_paint(tmp_path: Path) -> None:
+@pytest.mark.parametrize("together", [None, 500])
+def test_a_ball_is_a_ball_with_its_paint(tmp_path: Path, monkeypatch, together: int | None) -> None:
+    """Whether it is cut whole, or piece by piece: charts of several pieces would paint over one another."""
+    if together is not None:
+        monkeypatch.setattr(textures, "_PIECE", together)
     scene = ball()
     speck = ball(0.03, MIDDLE + np.array([0, 0, 0.9]), 60)  # a floater
     tracer = SurfelTracer(joined(scene, speck))
@@ -56,6 +63,7 @@ def test_a_ball_is_a_ball_with_its_paint(tmp_path: Path) -> None:
     assert trimesh.Trimesh(surface.vertices, surface.faces).volume == pytest.approx(VOLUME, rel=0.03)
 
     part = textured(tracer, surface, 256)
+    assert len(part.faces) == len(surface.faces)
     write_glb(tmp_path / "ball.glb", part)
     read = trimesh.load_mesh(tmp_path / "ball.glb", process=False)
     assert isinstance(read, trimesh.Trimesh)
@@ -85,6 +93,25 @@ def test_surfels_without_a_sign_are_painted_from_both_sides() -> None:
     surface = surface_of(SurfelTracer(scene), views_of(scene), voxels=48, triangles=3000)
     found, wanted = (textured(each, surface, 128) for each in (tracer, SurfelTracer(scene)))
     assert np.abs(found.base_color - wanted.base_color).mean() < 1e-4
+
+
+@pytest.mark.usefixtures("variant")
+def test_cutting_and_painting_tell_how_far_they_have_come(monkeypatch) -> None:
+    """Steps are shares of the work: half of the triangles, a quarter of the texels."""
+    monkeypatch.setattr(textures, "_PIECE", 1500)
+    monkeypatch.setattr(textures, "_AT_ONCE", 128 * 32)
+    scene, steps = ball(), {}
+
+    def track(items: Sequence[Any], label: str) -> Iterator[Any]:
+        steps[label] = 0
+        for item in items:
+            yield item
+            steps[label] += 1
+        assert steps[label] == len(items)
+
+    surface = surface_of(SurfelTracer(scene), views_of(scene), voxels=48, triangles=3000)
+    textured(SurfelTracer(scene), surface, 128, track)
+    assert steps == {"cutting the surface": 2, "textures": 4}
 
 
 @pytest.mark.usefixtures("variant")

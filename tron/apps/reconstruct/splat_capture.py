@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import KDTree
 
 from tron.apps.relight.camera_files import CAMERAS, filmed_cameras
+from tron.apps.scene_file import load_scene
 from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
 from tron.cameras import Camera
 from tron.captures import Capture, View
@@ -105,15 +106,7 @@ def film_splats(
     """
     refuse_foreign(path)
     check_header(path)
-    scene = GaussianScene.load(path)
-    if up is not None:
-        scene.up = np.asarray(up, np.float64) / np.linalg.norm(up)
-    elif scene.up_guessed:
-        log.warning(
-            "%s does not say which way is up: -y is taken, as in most 3DGS files; if the picture lies on its "
-            "side, give up=[0,0,1] or another direction",
-            path,
-        )
+    scene = load_scene(path, up)
     surrounded = treat_surroundings(scene, settings.surroundings, path, "splats.surroundings")
     filmed = filmed_cameras(path, scene.offset) if settings.cameras == "auto" else None
     if filmed is None:

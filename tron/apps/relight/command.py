@@ -31,7 +31,7 @@ from tron.apps.relight.camera_files import (
 )
 from tron.apps.relight.clip import DEPTH, Clip, trace
 from tron.apps.relight.network_gains import expected_gain, quality_of
-from tron.apps.relight.scan_materials import with_materials
+from tron.apps.relight.scan_materials import proxy_file, with_materials
 from tron.apps.relight.settings import Settings
 from tron.apps.relit import RelitPicture
 from tron.apps.scene_file import load_scene
@@ -48,6 +48,7 @@ from tron.editing.moving import in_motion
 from tron.errors import TronError, located
 from tron.framing import upright
 from tron.gaussians.foreign_files import refuse_foreign
+from tron.gaussians.kept import KeptFiles
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
 from tron.io.recognised import refuse_by_sight
@@ -115,8 +116,9 @@ def main(settings: Settings) -> None:
         surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
     scene = surrounded.shown
     filmed = filmed_with(settings.scene, turn, offset)
+    kept = KeptFiles(settings.scene, settings.output_dir)
     if scene.materials_guessed and settings.materials == "auto":
-        scene = with_materials(scene, settings.scene, filmed, settings.seed, surrounded.backdrop, turn)
+        scene = with_materials(scene, kept, filmed, settings.seed, surrounded.backdrop, turn)
     if given is not None:
         upright_file = settings.cameras is not None and settings.cameras.suffix.lower() in UPRIGHT
         cameras = given if upright_file else turn_cameras(given, turn)
@@ -159,9 +161,11 @@ def main(settings: Settings) -> None:
         for light, clip in zip(lights, clips):
             clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite, model_defaults(Settings))
         traced = {"estimation": settings.estimation(), "seed": settings.seed, "proxy": settings.proxy}
-        traced |= {"filmed": filmed, "proxy_file": settings.scene.with_suffix(".proxy.ply")}
+        traced["filmed"] = filmed
         if settings.proxy == "never":
             log.info("proxy=never: light sees the scan itself")
+        else:
+            traced["proxy_file"] = proxy_file(scene, kept, filmed, surrounded.backdrop)
         traced["ground"] = ground
         traced |= {"moving": moving, "times": times, "meshes": meshes}
         trace(scene, cameras, clips, **traced, backdrop=surrounded.backdrop)

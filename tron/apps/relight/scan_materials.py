@@ -1,4 +1,4 @@
-"""Materials of a plain scan for tron-relight: found once, and kept beside it as NAME.materials.ply."""
+"""Materials of a plain scan for tron-relight, found once, and where they and its proxy for light are kept."""
 
 from __future__ import annotations
 
@@ -9,14 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
+from tron.apps.relight.camera_files import filmed_with
 from tron.cameras import Camera
 from tron.cli.installation import require_extra
 from tron.cli.progress import track
 from tron.errors import TronError
+from tron.framing import upright
 from tron.gaussians.edit import subset
 from tron.gaussians.fields import MATERIALS
-from tron.gaussians.ply import header_comments, write_ply
+from tron.gaussians.kept import KeptFiles
+from tron.gaussians.ply import write_ply
 from tron.gaussians.scene import GaussianScene
+from tron.runtime import activate
 from tron.trajectories import film_around, film_with
 
 log = logging.getLogger(__name__)
@@ -26,7 +30,7 @@ VIEWS, SIDE = 64, 200
 
 def with_materials(
     scene: GaussianScene,
-    path: Path,
+    kept: KeptFiles,
     filmed: Sequence[Camera] | None,
     seed: int,
     backdrop: np.ndarray | None = None,
@@ -38,7 +42,7 @@ def with_materials(
 
     Args:
         scene: of a file without materials.
-        path: of that file, beside which they are kept, with the proxy for light that they were found on.
+        kept: of that file: where they are kept, with the proxy for light that they were found on.
         filmed: cameras that the scan was filmed with, in its world; None: around it.
         seed: root of the random numbers.
         backdrop: (M,) bool, surfels that are in no light's way, which stay as they are.
@@ -47,11 +51,9 @@ def with_materials(
     from tron.relighting.proxy import fingerprint  # Mitsuba: not for --help
 
     content = scene if backdrop is None else subset(scene, ~backdrop)
-    made_from, kept = fingerprint(content, filmed), path.with_suffix(".materials.ply")
-    found = _kept(kept, made_from, len(content))
-    if found is not None:
-        log.info("materials are those of %s; materials=as_is leaves them out", kept)
-    else:
+    made_from = fingerprint(content, filmed)
+    found = _known(kept, made_from, "; materials=as_is leaves them out")
+    if found is None:
         try:
             require_extra("finding a scan's materials", "reconstruct")
         except TronError as error:
@@ -59,9 +61,54 @@ def with_materials(
                 "%s: they are guessed from its colours, which keep the light it was captured in", error
             )
             return scene
-        found = _found(content, path, kept, made_from, filmed, seed, turn)
+        found = _found(content, kept, made_from, filmed, seed, turn)
         if found is None:
             return scene
+    return _with(scene, found, backdrop)
+
+
+def with_known_materials(scene: GaussianScene, kept: KeptFiles) -> GaussianScene:
+    """The scan with the materials that :func:`with_materials` found before; as it is where it found none.
+
+    Sets the Mitsuba variant where there are some.
+
+    Args:
+        scene: of a file without materials, in its frame.
+        kept: of that file: where they would be kept.
+    """
+    if not any(path.is_file() for path in kept.candidates("materials")):
+        return scene
+    import mitsuba as mi
+
+    from tron.relighting.proxy import fingerprint
+    from tron.tracing.surroundings import find_surroundings
+
+    if mi.variant() is None:
+        activate()
+    filmed = filmed_with(kept.scan, upright(scene.up), scene.offset)
+    standing = scene.upright()
+    found, around = _known(kept, fingerprint(standing, filmed)), None
+    if found is None:  # of a scan with a sky they are those of all else, but with surroundings=keep
+        around = find_surroundings(standing)
+        found = _known(kept, fingerprint(subset(standing, ~around), filmed)) if around.any() else None
+    return scene if found is None else _with(scene, found, around)
+
+
+def proxy_file(
+    scene: GaussianScene,
+    kept: KeptFiles,
+    filmed: Sequence[Camera] | None,
+    backdrop: np.ndarray | None = None,
+) -> Path:
+    """The file that has the scene's proxy, or is to have it; arguments as of :func:`with_materials`."""
+    from tron.relighting.proxy import fingerprint
+
+    content = scene if backdrop is None else subset(scene, ~backdrop)
+    return kept.path("proxy", fingerprint(content, filmed))
+
+
+def _with(scene: GaussianScene, found: GaussianScene, backdrop: np.ndarray | None = None) -> GaussianScene:
+    """The scene with the materials that were found of what is no backdrop, (M,) bool."""
     values = {name: getattr(found, name) for name in MATERIALS}
     if backdrop is not None:
         for name, own in values.items():
@@ -70,20 +117,21 @@ def with_materials(
     return replace(scene, **values, materials_guessed=False)
 
 
-def _kept(path: Path, made_from: str, count: int) -> GaussianScene | None:
-    if f"materials {made_from}" not in header_comments(path):
+def _known(kept: KeptFiles, made_from: str, said: str = "") -> GaussianScene | None:
+    path = kept.found("materials", made_from)
+    if path is None:
         return None
     try:
         scene = GaussianScene.load(path)
     except TronError:
         return None
-    return scene if len(scene) == count else None
+    log.info("materials are those of %s%s", path, said)
+    return scene
 
 
 def _found(
     scan: GaussianScene,
-    path: Path,
-    kept: Path,
+    kept: KeptFiles,
     made_from: str,
     filmed: Sequence[Camera] | None,
     seed: int,
@@ -94,7 +142,8 @@ def _found(
     from tron.reconstruction.materials.joint_fit import JointSettings
     from tron.relighting.proxy import fingerprint
 
-    log.info("%s has no materials: they and the light it was captured in are looked for, once", path)
+    log.info("%s has no materials: they and the light it was captured in are looked for, once", kept.scan)
+    path = kept.path("materials", made_from)
     cameras = film_with(filmed, VIEWS, SIDE) if filmed else film_around(scan, VIEWS, SIDE)
     carried = carry_materials(film_of_scan(scan, cameras, track), JointSettings(), seed, track)
     if carried is None:
@@ -102,9 +151,10 @@ def _found(
     scene = carried.scene
     try:
         own = scene if turn is None or np.allclose(turn, np.eye(3)) else scene.rotated(turn.T)
-        write_ply(kept, vars(own) | {"normals": own.normals()}, [f"materials {made_from}"])
-        carried.proxy.save(path.with_suffix(".proxy.ply"), fingerprint(scene, filmed))
-        log.info("they are kept in %s", kept)
+        write_ply(path, vars(own) | {"normals": own.normals()}, [f"materials {made_from}"])
+        proxied = fingerprint(scene, filmed)
+        carried.proxy.save(kept.path("proxy", proxied), proxied)
+        log.info("they are kept in %s", path)
     except TronError as error:
         log.info("materials are not kept: %s", error)
     return scene

@@ -70,13 +70,15 @@ class Settings(BaseModel):
     proxy: ProxyChoice = Field(
         "auto",
         description="what light sees of a scan whose splats lie in many layers: one layer of surfels, made "
-        "once and kept beside it as NAME.proxy.ply; auto: where the scan is thick by the log's number, or "
-        "its normals have no sign; never: the scan itself",
+        "once and kept beside it as NAME.proxy.ply, or in output_dir where that folder cannot be written; "
+        "auto: where the scan is thick by the log's number, or its normals have no sign; never: the scan "
+        "itself",
     )
     materials: Literal["auto", "as_is"] = Field(
         "auto",
         description="of a scan without any; auto: found once with the light it was captured in, which is "
-        "taken out of its colours, and kept beside it as NAME.materials.ply; as_is: guessed from its colours",
+        "taken out of its colours, and kept as NAME.materials.ply where its proxy is; as_is: guessed from "
+        "its colours",
     )
     rotation: float | tuple[float, float] = Field(
         0.0,

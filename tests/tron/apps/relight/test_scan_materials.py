@@ -1,17 +1,24 @@
 """Materials of a plain scan for tron-relight: found once, kept beside it, and used for what they are of."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tron.apps.relight import scan_materials
-from tron.apps.relight.scan_materials import with_materials
+from tron.apps.relight.scan_materials import proxy_file, with_known_materials, with_materials
+from tron.framing import upright
+from tron.gaussians.kept import KeptFiles
 from tron.gaussians.scene import GaussianScene
 from tron.relighting.proxy import Proxy
 
 CARRY = "tron.reconstruction.materials.carried.carry_materials"
+
+
+def beside(folder: Path) -> KeptFiles:
+    return KeptFiles(folder / "scan.ply", folder / "out")
 
 
 @pytest.fixture
@@ -39,9 +46,8 @@ def asked(variant, monkeypatch) -> list[int]:
 
 
 def test_materials_are_found_once_and_kept_until_the_scan_changes(asked, plain, tmp_path, caplog):
-    path = tmp_path / "scan.ply"
     caplog.set_level("INFO")
-    first, again = (with_materials(plain, path, None, 0) for _ in range(2))
+    first, again = (with_materials(plain, beside(tmp_path), None, 0) for _ in range(2))
     assert asked == [4]
     for scene in (first, again):
         np.testing.assert_array_equal(scene.base_color[:, 1], np.float32(0.6))
@@ -51,7 +57,7 @@ def test_materials_are_found_once_and_kept_until_the_scan_changes(asked, plain, 
         assert not scene.materials_guessed
     assert any("scan.materials.ply; materials=as_is leaves them out" in line for line in caplog.messages)
     assert len(GaussianScene.load(tmp_path / "scan.materials.ply")) == len(plain)
-    with_materials(replace(plain, means=plain.means + np.float32(0.1)), path, None, 0)
+    with_materials(replace(plain, means=plain.means + np.float32(0.1)), beside(tmp_path), None, 0)
     assert asked == [4, 4]
 
 
@@ -59,7 +65,7 @@ def test_what_is_kept_stands_as_the_scan_does(asked, plain, tmp_path):
     """Cameras and edits of one are right for the other."""
     lying = plain.rotated(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
     turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    scene = with_materials(lying.rotated(turn), tmp_path / "scan.ply", None, 0, None, turn)
+    scene = with_materials(lying.rotated(turn), beside(tmp_path), None, 0, None, turn)
     kept = GaussianScene.load(tmp_path / "scan.materials.ply")
     np.testing.assert_allclose(kept.means, lying.means, atol=1e-5)
     np.testing.assert_allclose(kept.up, lying.up, atol=1e-6)
@@ -70,7 +76,7 @@ def test_what_is_kept_stands_as_the_scan_does(asked, plain, tmp_path):
 def test_the_proxy_that_they_were_found_on_is_the_one_that_light_sees(asked, plain, tmp_path, caplog):
     from tron.relighting import Relighter
 
-    scene = with_materials(plain, tmp_path / "scan.ply", None, 0)
+    scene = with_materials(plain, beside(tmp_path), None, 0)
     caplog.set_level("INFO")
     assert Relighter(scene, proxy="always", proxy_file=tmp_path / "scan.proxy.ply").proxy is not None
     assert any("light sees the proxy of" in line for line in caplog.messages)
@@ -78,26 +84,80 @@ def test_the_proxy_that_they_were_found_on_is_the_one_that_light_sees(asked, pla
 
 def test_a_backdrop_stays_as_it_is(asked, plain, tmp_path):
     backdrop = np.arange(len(plain)) % 7 == 0
-    scene = with_materials(plain, tmp_path / "scan.ply", None, 0, backdrop)
+    scene = with_materials(plain, beside(tmp_path), None, 0, backdrop)
     np.testing.assert_array_equal(scene.base_color[backdrop], plain.base_color[backdrop])
     np.testing.assert_array_equal(scene.base_color[~backdrop, 1], np.float32(0.6))
 
 
-def test_a_folder_that_cannot_be_written_stops_nothing(asked, plain, tmp_path, caplog):
+def test_where_no_folder_takes_files_nothing_stops(asked, plain, tmp_path, caplog):
     caplog.set_level("INFO")
     (tmp_path / "file").write_text("no folder")
-    scene = with_materials(plain, tmp_path / "file" / "scan.ply", None, 0)
-    assert not scene.materials_guessed
+    kept = KeptFiles(tmp_path / "file" / "scan.ply", tmp_path / "file" / "out")
+    assert not with_materials(plain, kept, None, 0).materials_guessed
     assert any("materials are not kept" in line for line in caplog.messages)
+
+
+def test_a_folder_that_takes_no_files_has_them_in_the_output(asked, plain, tmp_path, caplog):
+    """One line says so, and the next run finds them there."""
+    from tron.relighting import Relighter
+
+    caplog.set_level("INFO")
+    (tmp_path / "file").write_text("no folder")
+    path, out = tmp_path / "file" / "scan.ply", tmp_path / "out"
+    for _ in range(2):
+        kept = KeptFiles(path, out)
+        scene = with_materials(plain, kept, None, 0)
+        assert Relighter(scene, proxy="always", proxy_file=proxy_file(scene, kept, None)).proxy is not None
+    assert asked == [4]
+    assert sorted(file.name for file in out.iterdir()) == ["scan.materials.ply", "scan.proxy.ply"]
+    assert sum("cannot be written" in line for line in caplog.messages) == 1
+    assert (
+        sum(f"light sees the proxy of {out / 'scan.proxy.ply'}" in line for line in caplog.messages) == 1 + 1
+    )
+
+
+def test_what_lies_beside_is_taken_before_what_lies_apart(asked, plain, tmp_path):
+    apart = KeptFiles(tmp_path / "none" / "scan.ply", tmp_path)  # that folder is not there
+    with_materials(plain, apart, None, 0)
+    assert beside(tmp_path).path("proxy", "other") == tmp_path / "scan.proxy.ply"
+    with_materials(plain, beside(tmp_path), None, 0)
+    assert asked == [4]
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="no folder that refuses root's files too")
+def test_tron_relight_keeps_them_in_its_output(asked, plain, tmp_path, light_path, relight, caplog):
+    """The scan lies where nobody may make a file, root included."""
+    plain.save(tmp_path / "scan.ply")
+    with open(tmp_path / "scan.ply", "rb") as scan:
+        path = f"/proc/self/fd/{scan.fileno()}"
+        words = [f"scene={path}", f"environment={light_path}", "proxy=always", "bounces=0", "frames=1"]
+        for _ in range(2):
+            assert relight(*words, f"output_dir={tmp_path / 'out'}", "checkpoint=null") == 0
+    assert len(asked) == 1
+    kept = {file.suffixes[0] for file in (tmp_path / "out").glob("*.ply")}
+    assert kept == {".materials", ".proxy"}
 
 
 def test_where_none_can_be_told_the_scan_is_as_it_is(asked, plain, tmp_path, monkeypatch):
     monkeypatch.setattr(CARRY, lambda *_: None)
-    assert with_materials(plain, tmp_path / "scan.ply", None, 0) is plain
+    assert with_materials(plain, beside(tmp_path), None, 0) is plain
     assert not list(tmp_path.iterdir())
 
 
 def test_without_the_libraries_of_the_fit_the_scan_is_as_it_is(plain, tmp_path, monkeypatch, variant, caplog):
     monkeypatch.setattr("tron.cli.installation.missing_libraries", lambda extra: ["torch"])
-    assert with_materials(plain, tmp_path / "scan.ply", None, 0) is plain
+    assert with_materials(plain, beside(tmp_path), None, 0) is plain
     assert "needs torch: pip install 'tron-relight[reconstruct]'" in caplog.text
+
+
+def test_materials_that_are_known_are_those_of_the_scan_in_its_file(asked, plain, tmp_path):
+    scan = plain.rotated(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
+    kept = KeptFiles(tmp_path / "scan.ply", tmp_path)
+    assert with_known_materials(scan, kept) is scan
+    with_materials(scan.upright(), kept, None, 0, None, upright(scan.up))
+    found = with_known_materials(scan, kept)
+    np.testing.assert_array_equal(found.base_color[:, 1], np.float32(0.6))
+    np.testing.assert_array_equal(found.means, scan.means)
+    assert not found.materials_guessed
+    other = replace(scan, means=scan.means + np.float32(0.1))
+    assert with_known_materials(other, kept) is other
