@@ -1,7 +1,7 @@
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-long docs lint format clean
+.PHONY: help setup demo test test-long test-narrow docs lint format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -9,7 +9,7 @@ help:  ## list the targets
 setup:  ## make .venv, install the pinned dependencies, check LLVM
 	@.ci/setup
 
-demo: setup  ## from a procedural scene to an evaluated neural renderer (13 minutes on two quiet cores)
+demo: setup  ## from a procedural scene to an evaluated neural renderer (13 to 26 minutes on two cores)
 	$(BIN)/tron-eval benchmark=demo output_dir=outputs/demo
 	@echo "report: $(CURDIR)/outputs/demo/report.html"
 
@@ -18,6 +18,10 @@ test: setup  ## the fast tests, in two processes
 
 test-long: setup  ## the tests marked long, in two processes
 	$(BIN)/python -m pytest -m long -n 2 --dist loadfile --no-loadscope-reorder || [ $$? -eq 5 ]  # 5: pytest collected none
+
+test-narrow: setup  ## the fast tests with vectors half as wide, as on another processor
+	TRON_LLVM_WIDTH=$$(grep -qw avx512vl /proc/cpuinfo 2>/dev/null && echo 8 || echo 4) \
+		$(BIN)/python -m pytest -m "not long" -n 2 --dist loadfile
 
 docs: setup  ## these pages and the reference as a site in outputs/site, links checked
 	$(BIN)/python -m mkdocs build --strict

@@ -20,6 +20,18 @@ os.environ["OMP_NUM_THREADS"] = "1"
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "shared: wants the real data of ../shared; set here")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what asks for the fixture `shared_data`, so that `-m shared` chooses it."""
+    for item in items:
+        if "shared_data" in getattr(item, "fixturenames", ()):
+            item.add_marker("shared")
+
+
 def has_cuda() -> bool:
     """Whether a CUDA driver with at least one device is present; asked of the driver, not of torch."""
     try:

@@ -164,6 +164,26 @@ def activate(variant: str = "llvm_ad_rgb", threads: int | None = None) -> None:
             f"Dr.Jit has loaded LLVM {loaded[0]} already, {MINIMUM_LLVM} or newer is needed",
             mend="call tron.runtime.activate before any other use of Dr.Jit",
         )
+    if loaded is not None and (width := os.environ.get("TRON_LLVM_WIDTH")):
+        _set_llvm_width(width)
+
+
+def _set_llvm_width(width: str) -> None:
+    """Let LLVM's kernels take ``width`` lanes at once, as on another processor: sums round as they do there.
+
+    Dr.Jit takes 16 lanes with AVX-512, 8 with AVX and 4 elsewhere, and its Python part cannot change that.
+    """
+    import drjit as dr
+
+    if width not in ("4", "8", "16"):  # Embree knows no others
+        raise TronError(f"TRON_LLVM_WIDTH must be 4, 8 or 16, not {width!r}")
+    core = ctypes.CDLL(next(map(str, Path(dr.__file__).parent.glob("libdrjit-core.*"))))
+    strings = core["_Z19jit_llvm_target_cpuv"], core["_Z24jit_llvm_target_featuresv"]
+    for string in strings:
+        string.restype = ctypes.c_char_p
+    set_target = core["_Z19jit_llvm_set_targetPKcS0_j"]
+    set_target.argtypes, set_target.restype = (ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint), None
+    set_target(*(string() for string in strings), int(width))
 
 
 def set_torch_threads(n: int) -> None:

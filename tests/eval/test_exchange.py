@@ -159,7 +159,7 @@ def test_true_maps_and_rows_of_a_square_are_what_it_is():
 )
 def test_what_is_given_and_not_there_is_one_line(tmp_path: Path, capsys, given: str, words: str):
     out = tmp_path / "out"
-    assert run(given, f"output_dir={out}") == 2
+    assert run("benchmark.real_data=null", given, f"output_dir={out}") == 2
     assert words in capsys.readouterr().err
     assert not out.exists()
 

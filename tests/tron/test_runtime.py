@@ -212,3 +212,27 @@ def test_rows_become_lanes(variant):
 
     rows = np.arange(12.0).reshape(4, 3)[::2]
     np.testing.assert_array_equal(np.array(lanes(mi.Vector3f, rows)).T, rows)
+
+
+WIDTH = """
+from tron.runtime import activate
+activate()
+import drjit as dr, mitsuba as mi
+with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+    dr.eval(dr.arange(mi.Float, 99) * 3)
+    print(dr.kernel_history()[-1]["ir"].getvalue())
+"""
+
+
+@pytest.mark.parametrize("width", [4, 8, 16])
+def test_kernels_are_as_wide_as_they_are_asked_to_be(width: int):
+    environment = {**os.environ, "TRON_LLVM_WIDTH": str(width)}
+    command = [sys.executable, "-c", WIDTH]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert set(re.findall(r"<(\d+) x float>", done.stdout)) == {str(width)}
+
+
+def test_a_width_that_no_processor_has_is_refused():
+    command = [sys.executable, "-c", "from tron.runtime import activate; activate()"]
+    done = subprocess.run(command, env={**os.environ, "TRON_LLVM_WIDTH": "7"}, capture_output=True, text=True)
+    assert "TRON_LLVM_WIDTH must be 4, 8 or 16, not '7'" in done.stderr.strip().splitlines()[-1]

@@ -92,9 +92,10 @@ def test_windows_gain_more_than_whole_views_of_as_many_pixels(spooled, one_threa
         return whole(tensors, camera, **more)
 
     monkeypatch.setattr(training, "render", counted)
-    for side, steps in ((SIDE // 2, 60), (SIDE, 15)):
+    for side, steps in ((SIDE // 4, 240), (SIDE, 15)):
         monkeypatch.setattr(refinement, "WINDOW", side)
         pixels.append(0)
         after.append(refine_surfels(surfels, seen, others, steps, SEED)[1].after.base_color_psnr)
     assert pixels[0] == pixels[1] == 15 * SIDE**2
+    # 1.0 to 1.4 of three orders of views; the vector width moves either by 0.1.
     assert after[0] > after[1] + 0.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,9 @@ from tron.tracing import SurfelTracer
 def stage(painted, painted_capture) -> Stage:
     settings = RadianceSettings(steps=5, density=DensitySettings(start=1000), sh_every=1)
     plan = radiance_plan(settings, 1.0, 0)
-    return Stage(plan, painted_capture.train_views, LearntSurfels.of_scene(painted, plan.rates), 2, 0)
+    # Some 26 dB from the truth: at 52 dB rounding alone is a tenth of a decibel.
+    off = replace(painted, sh=painted.sh + np.float32(0.2))
+    return Stage(plan, painted_capture.train_views, LearntSurfels.of_scene(off, plan.rates), 2, 0)
 
 
 def progress(step: int, steps: int = 100, stage: str = "radiance", seconds: float = 0.5) -> StepSummary:
