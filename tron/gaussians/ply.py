@@ -13,7 +13,6 @@ cannot ask for terabytes.
 
 from __future__ import annotations
 
-import io
 import logging
 import math
 import os
@@ -44,7 +43,9 @@ from tron.gaussians.foreign_files import (
 from tron.gaussians.formats.registry import FORMATS, Format
 from tron.gaussians.formats.splats import Splats
 from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
-from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS, Packing, packing, unpacked
+from tron.gaussians.packed_files import PACKED_SPLATS, Packing, packing, unpacked
+from tron.gaussians.ply_arrays import columns_in
+from tron.gaussians.spz_header import read_header
 from tron.io.local_frame import local_origin, said
 from tron.storage import atomic_path
 
@@ -80,6 +81,7 @@ _TYPE_BYTES = {
     **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
     **dict.fromkeys(("double", "float64"), 8),
 }
+NOT_READ = "not read, so that it may look different here"
 _EXPORT = "is it a Gaussian scene? export it as an uncompressed 3DGS or 2DGS PLY"
 
 
@@ -144,8 +146,9 @@ def read_splats(path: str | Path) -> dict[str, Any]:
     so in one line.
 
     The file may be compressed by gzip, packed (:mod:`tron.gaussians.packed_files`), or of another program
-    (:mod:`tron.gaussians.formats`). ``turn`` (3, 3) is the rotation from a packed file's frame into that of
-    3DGS' PLYs. Formats that are y up say so: .spz, glTF, USD.
+    (:mod:`tron.gaussians.formats`). ``turn`` (3, 3) leads from the frame of a file of .spz into that of 3DGS'
+    PLYs (:mod:`tron.gaussians.spz_header`): a rotation or a mirror image. Where the file does not state its
+    frame, `up_guessed` is True. glTF and USD say which way is up.
 
     Raises:
         TronError: files that are missing, are neither a PLY nor packed splats, lack properties (named),
@@ -157,12 +160,15 @@ def read_splats(path: str | Path) -> dict[str, Any]:
         splats = known.read(path)
         columns, comments, up = _columns(splats), [], splats.up
     else:
-        data = _parsed(path, known)
-        columns = {p.name: data["vertex"][p.name] for p in data["vertex"].properties}
-        comments, up = data.comments, stated_up(data.comments)
-    turn = HALF_TURN if isinstance(known, Packing) and known.half_turned else np.eye(3)
-    if isinstance(known, Packing) and known.half_turned:
+        columns, comments = _parsed(path, known)
+        up = stated_up(comments)
+    turn, up_stated = np.eye(3), True
+    if known == PACKED_SPLATS[".spz"]:
+        header = read_header(path.read_bytes())
+        turn, up_stated = header.turn, header.stated
         up = GUESSED_UP @ turn
+        if header.antialiased:
+            log.warning("%s: %s: %s", path, NOT_READ, "antialiased (splats filtered by the viewer's pixels)")
     constants = _read_constants(comments, path)
     _check_properties(columns, comments, path)
     scales = [name for name in (*FIELDS["log_scales"].properties, THIRD_SCALE) if name in columns]
@@ -204,7 +210,7 @@ def read_splats(path: str | Path) -> dict[str, Any]:
         **({"spacing": constants["spacing"][0]} if "spacing" in constants else {}),
         "turn": turn,
         "up": np.array(GUESSED_UP if stated is None else stated),
-        "up_guessed": stated is None or bool(constants.get("up_guessed", [0])[0]),
+        "up_guessed": stated is None or not up_stated or bool(constants.get("up_guessed", [0])[0]),
         "materials_guessed": guessed or bool(constants.get("materials_guessed", [0])[0]),
         "oriented": bool(constants.get("oriented", [0])[0]),
         "offset": np.array(offset),
@@ -254,13 +260,15 @@ def header_comments(path: Path) -> list[str]:
     return [line[len("comment ") :].rstrip() for line in header.splitlines() if line.startswith("comment ")]
 
 
-def _parsed(path: Path, packed: Packing | None) -> plyfile.PlyData:
+def _parsed(path: Path, packed: Packing | None) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns of the vertex element, and comments of the header."""
     try:
         if packed is None and not is_gzipped(path):
-            return plyfile.PlyData.read(str(path))
+            data = plyfile.PlyData.read(str(path))
+            return {each.name: data["vertex"][each.name] for each in data["vertex"].properties}, data.comments
         content = whole(path) if packed is None else unpacked(path, packed)
         _check_sizes(content[:_HEADER_LIMIT], len(content), path)
-        return plyfile.PlyData.read(io.BytesIO(content))
+        return columns_in(content)
     except OSError as error:
         raise TronError(f"cannot read: {error.strerror or error}", path) from error
     except (plyfile.PlyParseError, ValueError) as error:  # ValueError: text that is no number
@@ -389,7 +397,7 @@ def _check_properties(columns: dict[str, np.ndarray], comments: Sequence[str], p
         if values.dtype == object and name in read:
             raise TronError(f"property {name} is a list", path, _EXPORT)
     if foreign:
-        log.warning("%s: not read, so that it may look different here: %s", path, foreign)
+        log.warning("%s: %s: %s", path, NOT_READ, foreign)
     present = [name for name in MATERIAL_PROPERTIES if name in columns]
     if present and len(present) < len(MATERIAL_PROPERTIES):
         absent = ", ".join(name for name in MATERIAL_PROPERTIES if name not in columns)
