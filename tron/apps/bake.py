@@ -15,6 +15,7 @@ from tron.apps.machine import Threads, Variant
 from tron.apps.relight.camera_files import filmed_orbit, filmed_with
 from tron.apps.relight.scan_materials import with_materials
 from tron.apps.scene_file import Up, check_scene_files, load_scene
+from tron.apps.splat_file import SceneFile
 from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
 from tron.cameras import Camera
 from tron.cli.command_line import command
@@ -40,7 +41,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    scene: Path = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats")
+    scene: SceneFile = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats")
     environment: Path = Field(
         description="environment map, .hdr or .exr (.png and .jpg are clipped), or what else "
         "tron-environment reads"

@@ -13,6 +13,7 @@ from tron.apps.camera_formats import UPRIGHT, check_camera_file, write_camera_fi
 from tron.apps.machine import Threads, Variant
 from tron.apps.relight.camera_files import cameras_of, filmed_with, in_frame_of
 from tron.apps.scene_file import Up, check_output, check_scene_files, load_scene
+from tron.apps.splat_file import SceneFile
 from tron.apps.surroundings import treat_surroundings
 from tron.cli.command_line import ANEW, command
 from tron.cli.installation import loading
@@ -38,7 +39,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    scene: Path = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats")
+    scene: SceneFile = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats")
     output: Path = Field(
         description=f"file to write, or to replace, not the scene's own; its name says the format: "
         f"{', '.join(MESHES)}, a mesh with textures; {', '.join(SUFFIXES)}, splats; .ply, points too"

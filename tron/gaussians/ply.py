@@ -40,13 +40,16 @@ from tron.gaussians.foreign_files import (
     usable_splats,
     whole,
 )
+from tron.gaussians.foreign_properties import plain_columns, refuse_points
 from tron.gaussians.formats.registry import FORMATS, Format
 from tron.gaussians.formats.splats import Splats
 from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
 from tron.gaussians.packed_files import PACKED_SPLATS, Packing, packing, unpacked
 from tron.gaussians.ply_arrays import columns_in
 from tron.gaussians.spz_header import read_header
+from tron.gaussians.stored_values import as_3dgs_stores
 from tron.io.local_frame import local_origin, said
+from tron.io.recognised import refuse_placeholder
 from tron.storage import atomic_path
 
 log = logging.getLogger(__name__)
@@ -170,8 +173,11 @@ def read_splats(path: str | Path) -> dict[str, Any]:
         if header.antialiased:
             log.warning("%s: %s: %s", path, NOT_READ, "antialiased (splats filtered by the viewer's pixels)")
     constants = _read_constants(comments, path)
+    columns = plain_columns(columns, bool(constants), path)
     _check_properties(columns, comments, path)
     scales = [name for name in (*FIELDS["log_scales"].properties, THIRD_SCALE) if name in columns]
+    if not constants:
+        columns = as_3dgs_stores(columns, scales, path)
     # Before they are smoothed: a filter much wider than a splat hides its axes, not where it faces.
     columns["round_ones"] = round_ones(np.stack([columns[name] for name in scales], axis=-1))
     if FILTER in columns:
@@ -226,6 +232,7 @@ def check_header(path: Path) -> Packing | Format | None:
         TronError: it cannot be opened, is no PLY of Gaussians as far as its header tells, or is shorter than
             the header says.
     """
+    refuse_placeholder(path)
     other = FORMATS.get(path.suffix.lower())
     if other is not None:
         refuse_foreign(path)
@@ -360,6 +367,7 @@ def _check_sizes(head: bytes, size: int, path: Path) -> None:
         raise TronError("the PLY header has no end", path)
     ascii_body = False
     elements: list[tuple[str, int, int]] = []  # name, count, least bytes of a row
+    vertex: set[str] = set()
     for line in head[:end].decode("ascii", "replace").splitlines():
         words = line.split()
         if words[:2] == ["format", "ascii"]:
@@ -368,11 +376,13 @@ def _check_sizes(head: bytes, size: int, path: Path) -> None:
             elements.append((words[1], int(words[2]), 0))
         elif words[:1] == ["property"] and elements and len(words) >= 3:
             name, count, row = elements[-1]
+            vertex |= {words[-1]} if name == "vertex" else set()
             # Of a list only its length is certain to be there. In text, a digit and a separator are.
             kind = words[2] if words[1] == "list" else words[1]
             elements[-1] = (name, count, row + (2 if ascii_body else _TYPE_BYTES.get(kind, 1)))
     if "vertex" not in [name for name, _, _ in elements]:
         raise TronError("the PLY has no vertex element", path, _EXPORT)
+    refuse_points([name for name, _, _ in elements], vertex, path)
     if any(row == 0 and count for _, count, row in elements):
         raise TronError("the PLY declares an element without properties", path)
     needed = sum(count * row for _, count, row in elements)

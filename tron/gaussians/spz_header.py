@@ -20,7 +20,8 @@ counts its streams in."""
 _ANTIALIASED, _EXTENDED = 1, 2
 _FRAME = 0xADBE0003
 _FRAMES = (
-    "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
+    "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
+    "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
 )  # fmt: skip
 """By the number of SPZ_ADOBE_coordinate_system, from 1: where x, y and z point. 0 is not specified."""
 _POINTS = {

@@ -79,7 +79,8 @@ def test_round_trips_keep_what_formats_hold(random_scene, tmp_path, suffix):
 def test_spz_keeps_places_and_harmonics_of_any_scene(random_scene, tmp_path, size):
     """gaussforge itself rounds harmonics to sixteenths and eighths, and wraps places beyond 2,048."""
     plain = arranged(random_scene)
-    scene = replace(plain, means=plain.means * np.float32(size))
+    log_scales = plain.log_scales + min(0, np.log(np.float32(size)))
+    scene = replace(plain, means=plain.means * np.float32(size), log_scales=log_scales)
     write_splats(tmp_path / "a.spz", scene)
     found, wanted = GaussianScene.load(tmp_path / "a.spz").rotated(HALF_TURN), scene.rotated(HALF_TURN)
     farthest = float(np.abs(wanted.means).max())

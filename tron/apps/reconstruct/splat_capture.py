@@ -24,8 +24,7 @@ from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.errors import TronError
 from tron.gaussians.foreign_files import refuse_foreign
-from tron.gaussians.formats.registry import FORMATS
-from tron.gaussians.packed_files import PACKED_SPLATS
+from tron.gaussians.formats.registry import named_as_splats
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
 from tron.seeds import generator
@@ -74,7 +73,7 @@ class SplatSettings(BaseModel):
 
 def is_splats(path: Path) -> bool:
     """Whether a path is a file of splats by its name, packed ones included."""
-    return path.is_file() and path.name.lower().endswith((".ply", ".ply.gz", *PACKED_SPLATS, *FORMATS))
+    return path.is_file() and named_as_splats(path.name)
 
 
 def film_splats(
