@@ -118,7 +118,7 @@ def test_numbers_and_names_of_others_are_read(tmp_path: Path, caplog, kind: str,
 def test_what_is_a_blur_however_it_is_read_is_refused(tmp_path: Path) -> None:
     columns = splats()
     columns |= {name: columns[name] + 8.0 for name in SCALES}
-    with pytest.raises(TronError, match="all is one blur.*logarithms"):
+    with pytest.raises(TronError, match=r"all is one blur.*logarithms"):
         GaussianScene.load(write(tmp_path / "a.ply", columns))
 
 
@@ -233,4 +233,4 @@ def test_the_files_of_the_field(shared_data, caplog, name: str, said: str) -> No
     assert scene.opacities().min() > 0.96
     colors = np.unique(dc_to_rgb(scene.sh[:, 0]).round(2), axis=0)
     wanted = {(0.7, 0.7, 0.65), (0.35, 0.4, 0.35), (0.8, 0.15, 0.1), (0.1, 0.2, 0.8)}
-    assert {tuple(float(value) for value in color) for color in colors} == wanted
+    assert {tuple(round(float(value), 2) for value in color) for color in colors} == wanted

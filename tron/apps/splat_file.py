@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shutil
 import tarfile
 import zipfile
 from collections.abc import Sequence
@@ -26,6 +25,7 @@ _ARCHIVES = (".zip", ".tar", ".tgz", ".tar.gz", ".tar.bz2", ".tar.xz", ".tbz2", 
 _MOST_EXPANDED = 100
 """Times an archive's size that a file in it may have."""
 _ALWAYS_ALLOWED = 1 << 30
+_CHUNK = 1 << 20
 _SHOWN = 4
 _MOST_NAMES = 100_000
 
@@ -137,20 +137,9 @@ def _kept(path: Path, name: str, size: int, stream: IO[bytes]) -> Path:
         target.parent.mkdir(exist_ok=True)
         log.info("%s: unpacking to %s", path, target)
         with atomic_path(target) as temporary, open(temporary, "wb") as out:
-            shutil.copyfileobj(_Bounded(stream, size, path), out, 1 << 20)
+            while chunk := stream.read(_CHUNK):
+                size -= len(chunk)
+                if size < 0:
+                    raise TronError("expands to more than it claims", path, "unpack it yourself")
+                out.write(chunk)
     return target
-
-
-class _Bounded:
-    """A stream that may hold no more than it claimed."""
-
-    def __init__(self, stream: IO[bytes], size: int, path: Path) -> None:
-        self._stream, self._left, self._path = stream, size, path
-
-    def read(self, n_bytes: int) -> bytes:
-        """The next bytes."""
-        data = self._stream.read(n_bytes)
-        self._left -= len(data)
-        if self._left < 0:
-            raise TronError("expands to more than it claims", self._path, "unpack it yourself")
-        return data

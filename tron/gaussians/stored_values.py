@@ -1,8 +1,9 @@
 """Numbers that are not stored as 3DGS stores them, known by what is impossible.
 
 3DGS keeps logarithms of lengths and logits of opacities; exporters forget one or the other. (Formats that
-keep lengths are given logarithms: :func:`tron.gaussians.formats.splats.logarithms`.) What tells them: a length is never negative; splats are about
-as wide as the distances between them; an opacity lies in [0, 1], and no scan has only splats whose logits do.
+keep lengths are given logarithms: :func:`tron.gaussians.formats.splats.logarithms`.) What tells them: a
+length is never negative; splats are about as wide as the distances between them; an opacity lies in [0, 1], and no
+scan has only splats whose logits do.
 """
 
 from __future__ import annotations
@@ -80,8 +81,8 @@ def as_3dgs_stores(
 def _opacities(stored: np.ndarray, others: bool) -> np.ndarray | None:
     """Logits of opacities that are stored as they are; None of logits.
 
-    Between logits of 0 and 1 opacities are 0.5 to 0.73: nothing is opaque, nothing nearly gone. Equal ones may
-    be meant, unless ``others``, the scales, are not as 3DGS stores them either.
+    Between logits of 0 and 1 opacities are 0.5 to 0.73: nothing is opaque, nothing nearly gone. Equal ones
+    may be meant, unless ``others``, the scales, are not as 3DGS stores them either.
     """
     stored = np.asarray(stored, np.float64)
     finite = stored[np.isfinite(stored)]

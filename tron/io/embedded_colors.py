@@ -1,9 +1,9 @@
 """Colours that a picture of display values says it is in (ICC, cICP, nclx, gAMA, EXIF), brought to sRGB.
 
-Of several statements the first holds: PNG's cICP, an ICC profile, HEIC's and AVIF's nclx, PNG's sRGB chunk, its gAMA and
-cHRM, EXIF's Adobe RGB. Without any a picture is in sRGB. Profiles are Pillow's ImageCms' work; what has 16
-bits, which that cannot take, goes through the profile's own curves and matrix. EXIF's "uncalibrated", which
-phones write beside a profile, is a line where the profile was lost.
+Of several statements the first holds: PNG's cICP, an ICC profile, HEIC's and AVIF's nclx, PNG's sRGB chunk,
+its gAMA and cHRM, EXIF's Adobe RGB. Without any a picture is in sRGB. Profiles are Pillow's ImageCms' work;
+what has 16 bits, which that cannot take, goes through the profile's own curves and matrix. EXIF's
+"uncalibrated", which phones write beside a profile, is a line where the profile was lost.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _SAME_LEVELS = 2
 """Profiles that change no colour by more levels of 8 bits are sRGB's, of which many are about."""
 _STEPS = 9
 _NCLX, _AVIF_HEAD = re.compile(rb"colrnclx(....)", re.DOTALL), 1 << 16
-"""AVIF's box of code points (ISO/IEC 14496-12, 12.1.5), which Pillow does not tell, in the file's first part."""
+"""AVIF's box of code points (ISO/IEC 14496-12, 12.1.5), not told by Pillow, in a file's first part."""
 
 
 @dataclass(frozen=True)

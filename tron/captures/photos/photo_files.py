@@ -1,9 +1,9 @@
 """Files of photos: what their headers say, whether they are whole, and their pixels.
 
-JPEG, PNG, WebP, AVIF, TIFF and BMP hold display values; so does HEIC, which needs the extra ``heic`` (pillow-heif).
-They are brought to sRGB from what a file says it is in. OpenEXR holds linear radiance, which :func:`shown`
-encodes for display. Input is not trusted: sizes are checked before anything is decoded, and a file that is
-damaged is refused, for most decoders would fill its rest with grey and say nothing.
+JPEG, PNG, WebP, AVIF, TIFF and BMP hold display values; so does HEIC, which needs the extra ``heic``
+(pillow-heif). They are brought to sRGB from what a file says it is in. OpenEXR holds linear radiance, which
+:func:`shown` encodes for display. Input is not trusted: sizes are checked before anything is decoded, and a
+file that is damaged is refused, for most decoders would fill its rest with grey and say nothing.
 """
 
 from __future__ import annotations

@@ -46,7 +46,8 @@ FORMATS = {
     ".json": Format(sog.check, sog.read, None, (b"{",)),
     **dict.fromkeys((".ckpt", ".pt", ".pth"), _CHECKPOINT),
 }
-"""By suffix; of ``.json`` SOG's alone are splats. PLYs and packed splats: :mod:`tron.gaussians.ply`, :mod:`tron.gaussians.packed_files`."""
+"""By suffix; of ``.json`` SOG's alone are splats. PLYs and packed splats:
+:mod:`tron.gaussians.ply`, :mod:`tron.gaussians.packed_files`."""
 
 
 def named_as_splats(name: str) -> bool:

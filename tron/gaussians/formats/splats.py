@@ -124,8 +124,8 @@ _MEANT = 0.1
 def logarithms(scales: np.ndarray, path: Path) -> np.ndarray:
     """Natural logarithms of linear scales; -infinity of zero, NaN of what is negative.
 
-    Where many are negative they are logarithms already, as splat-transform wrote glTF before its issue 267 was
-    mended: a line says so.
+    Where many are negative they are logarithms already, as splat-transform wrote glTF before its issue 267
+    was mended: a line says so.
     """
     scales = np.asarray(scales, np.float64)
     if scales.size and (scales < 0).mean() > _MEANT:
