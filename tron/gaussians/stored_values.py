@@ -2,8 +2,8 @@
 
 3DGS keeps logarithms of lengths and logits of opacities; exporters forget one or the other. (Formats that
 keep lengths are given logarithms: :func:`tron.gaussians.formats.splats.logarithms`.) What tells them: a
-length is never negative; splats are about as wide as the distances between them; an opacity lies in [0, 1], and no
-scan has only splats whose logits do.
+length is never negative; splats are about as wide as the distances between them; an opacity lies in [0, 1],
+and no scan has only splats whose logits do.
 """
 
 from __future__ import annotations
