@@ -44,7 +44,8 @@ def write(folder: Path, slave: str, aligned: int = 4) -> list[np.ndarray]:
             Image.new("RGB", (16, 16), (20 * k, 90, 120)).save(folder / f"{k}_{name}.jpg")
     (folder / "cameras.xml").write_text(
         '<?xml version="1.0"?><document version="2.0.0"><chunk label="1"><sensors>'
-        f'<sensor id="0" type="frame">{sensor}</sensor><sensor id="1" type="frame" master_id="0">{sensor}{slave}</sensor></sensors>'
+        f'<sensor id="0" type="frame">{sensor}</sensor>'
+        f'<sensor id="1" type="frame" master_id="0">{sensor}{slave}</sensor></sensors>'
         f"<cameras>{''.join(cameras)}</cameras></chunk></document>"
     )
     return poses

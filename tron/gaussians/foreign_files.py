@@ -19,7 +19,7 @@ from tron.gaussians.formats.registry import FORMATS
 from tron.gaussians.packed_files import PACKED_SPLATS, conversion
 from tron.io.recognised import refuse_by_sight, refuse_placeholder
 
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".insv")
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts")
 
 
 def refuse_foreign(path: Path) -> None:

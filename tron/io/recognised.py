@@ -59,6 +59,15 @@ _LCC = Sight(
 )
 _RAD = Sight("Spark's .rad", "give the .ply or .spz that it was built from")
 _POSTSHOT = Sight("Postshot's project", "export its splats there as PLY")
+
+
+def _raw_360(whose: str, program: str) -> Sight:
+    return Sight(
+        f"{whose} raw 360 format, two fisheye pictures",
+        f"stitch it to equirectangular (2:1) first, with {program}, and give that as .mp4 or .jpg",
+    )
+
+
 _SUFFIXES = {
     **dict.fromkeys((".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar"), _ARCHIVE),
     **dict.fromkeys((".ckpt", ".pth", ".pt", ".safetensors", ".pkl"), _CHECKPOINT),
@@ -68,6 +77,8 @@ _SUFFIXES = {
     **dict.fromkeys((".lcc", ".lcc2"), _LCC),
     **dict.fromkeys((".rad", ".radc"), _RAD),
     ".psht": _POSTSHOT,
+    **dict.fromkeys((".insv", ".insp", ".lrv"), _raw_360("Insta360's", "Insta360 Studio")),
+    ".360": _raw_360("GoPro's", "GoPro Player"),
 }
 _ARCHIVE_STARTS = (b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!", b"\x1f\x8b", b"\xfd7zXZ", b"BZh")
 _HEAD = 1024

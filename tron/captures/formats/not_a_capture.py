@@ -35,7 +35,7 @@ _RAW = (
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2"),
     *(".pef", ".srw", ".x3f", ".3fr", ".iiq", ".erf", ".gpr", ".rwl"),
 )
-_UNREAD = (".jxl", ".jp2", ".j2k", ".psd", ".gif", ".insp", ".ppm", ".tga")
+_UNREAD = (".jxl", ".jp2", ".j2k", ".psd", ".gif", ".ppm", ".tga")
 _CAMERA_PATH = "camera_path"
 
 
