@@ -94,7 +94,7 @@ def main(settings: Settings) -> None:
     scene = scene.upright()  # +z is up in environment maps
     surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
     scene = surrounded.shown
-    filmed = filmed_with(settings.scene, turn, offset)
+    filmed = filmed_with(settings.scene, turn, offset, surrounded.content)
     if scene.materials_guessed and settings.materials == "auto":
         scene = with_materials(scene, settings.scene, filmed, settings.seed, surrounded.backdrop, turn)
     relighter = Relighter(

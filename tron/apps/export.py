@@ -141,8 +141,9 @@ def _write_mesh(settings: Settings) -> None:
         raise TronError(what, mend="pip install 'tron-relight[relight,models]'") from error
     activate(settings.variant, settings.threads)
     scene = load_scene(settings.scene, settings.up, "as_is")
-    filmed = filmed_with(settings.scene, upright(scene.up), scene.offset)
+    turn, offset = upright(scene.up), scene.offset
     scene = treat_surroundings(scene.upright(), "drop", settings.scene).content
+    filmed = filmed_with(settings.scene, turn, offset, scene)
     tracer, views = SurfelTracer(scene), views_of(scene, filmed)
     surface = surface_of(tracer, views, triangles=settings.triangles, track=partial(track, label="surface"))
     with working("textures"):

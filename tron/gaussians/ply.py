@@ -259,12 +259,21 @@ def check_header(path: Path) -> Packing | Format | None:
 
 def header_comments(path: Path) -> list[str]:
     """Comments of a PLY's header; none where the file is not there or no PLY."""
+    return [line[len("comment ") :].rstrip() for line in _header(path) if line.startswith("comment ")]
+
+
+def header_elements(path: Path) -> set[str]:
+    """Names of the elements of a PLY; none where the file is not there or no PLY."""
+    return {line.split()[1] for line in _header(path) if line.startswith("element ")}
+
+
+def _header(path: Path) -> list[str]:
     try:
         with path.open("rb") as file:
-            header = file.read(_HEADER_LIMIT).decode("ascii", "replace").partition("end_header")[0]
+            header, end, _ = file.read(_HEADER_LIMIT).decode("ascii", "replace").partition("end_header")
     except OSError:
         return []
-    return [line[len("comment ") :].rstrip() for line in header.splitlines() if line.startswith("comment ")]
+    return header.splitlines() if end else []
 
 
 def _parsed(path: Path, packed: Packing | None) -> tuple[dict[str, np.ndarray], list[str]]:

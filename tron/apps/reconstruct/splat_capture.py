@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import KDTree
 
 from tron.apps.relight.camera_files import CAMERAS, filmed_cameras
+from tron.apps.relight.one_view import one_view
 from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
 from tron.cameras import Camera
 from tron.captures import Capture, View
@@ -115,10 +116,13 @@ def film_splats(
         )
     surrounded = treat_surroundings(scene, settings.surroundings, path, "splats.surroundings")
     filmed = filmed_cameras(path, scene.offset) if settings.cameras == "auto" else None
+    if filmed is not None:
+        log.info("%s is filmed from where its photos were taken: %s", path, path.with_name(CAMERAS))
+    elif settings.cameras == "auto":
+        filmed = one_view(path, surrounded.content, np.eye(3))
     if filmed is None:
         cameras = virtual_cameras(surrounded.content, settings, seed)
     else:
-        log.info("%s is filmed from where its photos were taken: %s", path, path.with_name(CAMERAS))
         cameras = film_with(filmed, settings.views, settings.side)
     from tron.reconstruction.film import film  # Mitsuba: not for --help
 

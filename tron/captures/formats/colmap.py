@@ -68,8 +68,8 @@ def read_colmap(path: Path, settings: PhotoSettings) -> PosedPhotos:
     prefix = "" if found.images is not None else "images/"
     photos = []
     for name, camera_to_world, lens in posed_by(model):
-        path = found.find(prefix + name, folder)
-        photos.append(PosedPhoto(name, path, camera_to_world, lens, refused=impossible(lens)))
+        image = found.find(prefix + name, folder)
+        photos.append(PosedPhoto(name, image, camera_to_world, lens, refused=impossible(lens)))
     points, colors = points_of(model)
     used = {photo.path for photo in photos}
     folders = {each.parent for each in used if each is not None}
