@@ -23,6 +23,7 @@ from tron.errors import TronError
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
 from tron.gaussians.splat_files import write_splats
+from tron.models.load import load_model
 
 FORMATS = (".ply", ".ply.gz", ".spz", ".sog", ".splat", ".ksplat", ".glb", ".gltf", ".usdz", ".usda", ".ckpt")
 NEVER_CAME = {
@@ -63,6 +64,14 @@ def test_a_photo_that_never_came_is_called_that(tmp_path: Path, kind: str, suffi
     (tmp_path / f"a{suffix}").write_bytes(NEVER_CAME[kind])
     with pytest.raises(TronError, match=kind):
         inspect_photo(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize("kind", NEVER_CAME)
+@pytest.mark.parametrize("suffix", [".glb", ".gltf", ".obj"])
+def test_a_model_that_never_came_is_called_that(tmp_path: Path, kind: str, suffix: str) -> None:
+    (tmp_path / f"a{suffix}").write_bytes(NEVER_CAME[kind])
+    with pytest.raises(TronError, match=kind):
+        load_model(tmp_path / f"a{suffix}")
 
 
 @pytest.mark.parametrize(

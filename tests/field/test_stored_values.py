@@ -122,6 +122,14 @@ def test_what_is_a_blur_however_it_is_read_is_refused(tmp_path: Path) -> None:
         GaussianScene.load(write(tmp_path / "a.ply", columns))
 
 
+def test_a_broken_splat_hides_nothing(tmp_path: Path) -> None:
+    columns = opacities(lengths(splats()))
+    columns["scale_0"][3], columns["scale_1"][4] = np.nan, np.inf
+    found = GaussianScene.load(write(tmp_path / "a.ply", columns))
+    assert len(found) == COUNT - 2
+    assert found.scales().max() < 0.11
+
+
 def test_equal_opacities_of_plain_scans_stay_logits(tmp_path: Path) -> None:
     columns = splats() | {"opacity": np.full(COUNT, 0.97)}
     assert GaussianScene.load(write(tmp_path / "a.ply", columns)).opacities()[0] == pytest.approx(expit(0.97))

@@ -52,8 +52,9 @@ def as_3dgs_stores(
         return found
     said = []
     stored = np.stack([np.asarray(found[name], np.float64) for name in scales])
-    known = stored[np.isfinite(stored)]
-    largest = float(np.median(np.sort(stored, axis=0)[-1].clip(max=80)))
+    known = stored[np.isfinite(stored)]  # a few are broken, and flat splats have a logarithm of -infinity
+    wide = np.where(np.isfinite(stored), stored, -np.inf).max(axis=0)
+    largest = float(np.median(wide[np.isfinite(wide)].clip(max=80))) if np.isfinite(wide).any() else -np.inf
     apart, width = _apart(found), float(np.exp(largest))
     if apart > 0 and width > _FAR_WIDER * apart:
         lengths = known.min() >= 0 and largest <= _FAR_WIDER * apart
@@ -86,7 +87,7 @@ def _opacities(stored: np.ndarray, others: bool) -> np.ndarray | None:
     """
     stored = np.asarray(stored, np.float64)
     finite = stored[np.isfinite(stored)]
-    if not len(finite) or finite.min() < 0 or finite.max() > 1:
+    if not len(finite) or np.isinf(stored).any() or finite.min() < 0 or finite.max() > 1:
         return None
     if not others and not (finite.max() > 0.9 and finite.min() < 0.5):
         return None

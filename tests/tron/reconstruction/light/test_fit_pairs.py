@@ -274,8 +274,8 @@ def test_patches_bear_bumps_that_no_photo_shows(scene, transport) -> None:
         lit = replace(points, lobe=search.received(towards, 0.03))
         return 1 - search.loss(fit_light(lit, QUICK, 0), lit) / search.loss(soft, points)
 
-    # Five drawings of bumps on LLVM gave 2.6, 3.1, 1.2, 2.4 and 1.5 times as much, this one on a GPU 1.8 times:
-    # rounding alone moves either by 0.02.
+    # Five drawings on LLVM gave 2.6, 3.1, 1.2, 2.4 and 1.5 times as much, one on a GPU 1.8 times: rounding
+    # alone moves either by 0.02.
     alone, together = explained(0.0), explained(0.2)
     assert together > max(alone, 0.05)
 
