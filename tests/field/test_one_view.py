@@ -62,7 +62,7 @@ def cameras_of(path):
     ],
 )
 def test_a_scan_of_one_view_is_filmed_from_there(tmp_path, caplog, made, elements):
-    cameras, scene, turn = cameras_of(write(tmp_path / "a.ply", *made, elements))
+    cameras, scene, turn = cameras_of(write(tmp_path / "a.ply", made[0], made[1], elements))
     assert "was made from one view" in caplog.text
     assert cameras is not None
     np.testing.assert_allclose(cameras[0].position, 0, atol=1e-9)

@@ -71,8 +71,8 @@ def on_black(phase: float) -> np.ndarray:
 def photos(folder: Path, make, count: int = 4, xmp: str | None = None) -> Path:
     folder.mkdir()
     for k in range(count):
-        extra = {} if xmp is None else {"xmp": XMP.format(xmp).encode()}
-        Image.fromarray(make(k * 0.7)).save(folder / f"{k}.jpg", quality=92, **extra)
+        told = b"" if xmp is None else XMP.format(xmp).encode()
+        Image.fromarray(make(k * 0.7)).save(folder / f"{k}.jpg", quality=92, xmp=told)
     return folder
 
 
