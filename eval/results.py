@@ -14,6 +14,7 @@ too, its least and greatest value where one scene is left out. Other rows lack t
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
@@ -129,6 +130,18 @@ class Group(BaseModel):
     captions: list[Caption]
 
 
+_ABSOLUTE = re.compile(r"(?<![\w./:~])(?:/[\w.@+-]+)+(?=/[\w.@+-]+/[\w.@+-]+)/")
+
+
+def portable(value: Any) -> Any:
+    """JSON whose texts name files by their last folder and name: where these lay tells nobody anything."""
+    if isinstance(value, str):
+        return _ABSOLUTE.sub("", value)
+    if isinstance(value, dict):
+        return {key: portable(inner) for key, inner in value.items()}
+    return [portable(inner) for inner in value] if isinstance(value, list) else value
+
+
 class Results(BaseModel):
     """Everything in results.json; validated when read and when written."""
 
@@ -184,11 +197,13 @@ class Results(BaseModel):
     def save(self, path: str | Path) -> None:
         """Write the file whole or not at all; TronError if the folder cannot be written.
 
+        Folders of this machine are left out of what it says (:func:`portable`).
+
         Raises:
             ValueError: two rows share a name, or a value is not finite (a defect of the benchmark).
         """
         checked = Results.model_validate(self.model_dump()).model_dump()
-        written = {key: value for key, value in checked.items() if value or key in KEYS}
+        written = portable({key: value for key, value in checked.items() if value or key in KEYS})
         write_atomic(path, json.dumps(written, indent=2, allow_nan=False) + "\n")
 
     @staticmethod

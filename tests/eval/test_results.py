@@ -6,7 +6,7 @@ from pathlib import Path
 import pydantic
 import pytest
 
-from eval.results import Results, Row, Target
+from eval.results import Results, Row, Target, portable
 from tron.errors import TronError
 
 
@@ -68,3 +68,14 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, text: str):
         Results.load(tmp_path / "results.json")
     with pytest.raises(TronError, match="cannot read"):
         Results.load(tmp_path / "absent.json")
+
+
+def test_rows_name_no_folder_of_a_machine() -> None:
+    """Neither those that are written nor those that the documentation holds."""
+    typed = "tron-eval 'a.b=[/work/runs/x/net.safetensors,y/z]' c=/home/me/data d=https://x.org/a/b km/h"
+    assert portable({"a": [typed, 1, None]}) == {
+        "a": ["tron-eval 'a.b=[x/net.safetensors,y/z]' c=me/data d=https://x.org/a/b km/h", 1, None]
+    }
+    for path in (Path(__file__).parents[2] / "docs" / "benchmarks").rglob("*.json"):
+        content = json.loads(path.read_text())
+        assert portable(content) == content, path

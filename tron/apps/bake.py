@@ -15,6 +15,7 @@ from tron.apps.machine import Threads, Variant
 from tron.apps.relight.camera_files import filmed_orbit, filmed_with
 from tron.apps.relight.scan_materials import proxy_file, with_materials
 from tron.apps.scene_file import Up, check_scene_files, load_scene
+from tron.apps.splat_file import SceneFile
 from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
 from tron.cameras import Camera
 from tron.cli.command_line import command
@@ -41,7 +42,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    scene: Path = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats")
+    scene: SceneFile = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats")
     environment: Path = Field(
         description="environment map, .hdr or .exr (.png and .jpg are clipped), or what else "
         "tron-environment reads"
@@ -94,7 +95,7 @@ def main(settings: Settings) -> None:
     scene = scene.upright()  # +z is up in environment maps
     surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
     scene = surrounded.shown
-    filmed = filmed_with(settings.scene, turn, offset)
+    filmed = filmed_with(settings.scene, turn, offset, surrounded.content)
     kept = KeptFiles(settings.scene, settings.output.parent)
     if scene.materials_guessed and settings.materials == "auto":
         scene = with_materials(scene, kept, filmed, settings.seed, surrounded.backdrop, turn)

@@ -15,6 +15,7 @@ from tron.apps.capture_light import LIGHT
 from tron.apps.relight.camera_files import CAMERAS, cameras_of, in_frame_of
 from tron.apps.relight.scan_materials import with_known_materials
 from tron.apps.scene_file import Up, check_scene_files, load_scene
+from tron.apps.splat_file import SceneFile
 from tron.cli.command_line import ANEW, command
 from tron.cli.progress import working
 from tron.editing import Edit, EditList, Insert, Material, Views
@@ -34,7 +35,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    scene: Path = Field(
+    scene: SceneFile = Field(
         description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats; it stays as it is"
     )
     edits: Path | Annotated[tuple[Path, ...], Field(min_length=1)] = Field(

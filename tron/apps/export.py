@@ -13,6 +13,7 @@ from tron.apps.camera_formats import UPRIGHT, check_camera_file, write_camera_fi
 from tron.apps.machine import Threads, Variant
 from tron.apps.relight.camera_files import cameras_of, filmed_with, in_frame_of
 from tron.apps.scene_file import Up, check_output, check_scene_files, load_scene
+from tron.apps.splat_file import SceneFile
 from tron.apps.surroundings import treat_surroundings
 from tron.cli.command_line import ANEW, command
 from tron.cli.installation import loading
@@ -38,7 +39,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    scene: Path = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats")
+    scene: SceneFile = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats")
     output: Path = Field(
         description=f"file to write, or to replace, not the scene's own; its name says the format: "
         f"{', '.join(MESHES)}, a mesh with textures; {', '.join(SUFFIXES)}, splats; .ply, points too"
@@ -140,8 +141,9 @@ def _write_mesh(settings: Settings) -> None:
         raise TronError(what, mend="pip install 'tron-relight[relight,models]'") from error
     activate(settings.variant, settings.threads)
     scene = load_scene(settings.scene, settings.up, "as_is")
-    filmed = filmed_with(settings.scene, upright(scene.up), scene.offset)
+    turn, offset = upright(scene.up), scene.offset
     scene = treat_surroundings(scene.upright(), "drop", settings.scene).content
+    filmed = filmed_with(settings.scene, turn, offset, scene)
     tracer, views = SurfelTracer(scene), views_of(scene, filmed)
     surface = surface_of(tracer, views, triangles=settings.triangles, track=partial(track, label="surface"))
     part = textured(tracer, surface, settings.texture, track)

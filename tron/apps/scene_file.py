@@ -15,6 +15,7 @@ from tron.errors import TronError
 from tron.gaussians.foreign_files import refuse_foreign
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
+from tron.io.recognised import refuse_by_sight
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +51,7 @@ def check_scene_files(scene: Path, output: Path, *read: Path | None) -> None:
     for path in (scene, *read):
         if path is not None and not path.is_file():
             if path.is_dir():
+                refuse_by_sight(path, "this should be a file")
                 raise TronError("cannot read: is a folder", path, "give one file of it")
             raise TronError("file not found", path)
     check_output(output, scene, "the scene")

@@ -18,6 +18,7 @@ from tron.apps.capture_light import is_of_capture, over_scene
 from tron.apps.machine import Threads, Variant
 from tron.apps.relight.network_gains import expected_gain
 from tron.apps.scene_file import Up, check_scene_files, load_scene
+from tron.apps.splat_file import SceneFile
 from tron.cameras import Camera
 from tron.cli.command_line import command
 from tron.cli.installation import missing_libraries, require_extra
@@ -46,7 +47,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    scene: Path = Field(
+    scene: SceneFile = Field(
         description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats; it stays as it is"
     )
     environments: Path = Field(

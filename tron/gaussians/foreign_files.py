@@ -17,13 +17,14 @@ from tron.errors import TronError
 from tron.gaussians.fields import FIELDS, LOG_SCALE_LIMIT
 from tron.gaussians.formats.registry import FORMATS
 from tron.gaussians.packed_files import PACKED_SPLATS, conversion
-from tron.io.recognised import refuse_by_sight
+from tron.io.recognised import refuse_by_sight, refuse_placeholder
 
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".insv")
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts")
 
 
 def refuse_foreign(path: Path) -> None:
     """Raise TronError if a file, by its name or what it begins with, needs a step before it is a scene."""
+    refuse_placeholder(path)
     suffix = path.suffix.lower()
     if suffix in VIDEOS:
         mend = f"tron-reconstruct capture={quote(path.name)} output_dir=OUT makes a scene of its frames"

@@ -90,9 +90,13 @@ def unpacked(path: Path, kind: Packing) -> bytes:
         TronError: the file is damaged, of another version, or expands without limit.
     """
     try:
-        content = path.read_bytes()
+        return plain_ply(path.read_bytes(), kind, path)
     except OSError as error:
         raise TronError(f"cannot read: {error.strerror or error}", path) from error
+
+
+def plain_ply(content: bytes, kind: Packing, path: Path) -> bytes:
+    """A plain 3DGS PLY of packed splats that were read from ``path``; TronError as :func:`unpacked`."""
     memory = max(_ALWAYS_ALLOWED, _MOST_EXPANDED * len(content))
     done = _converted(content, kind.name, "ply", memory)
     if isinstance(done, str):

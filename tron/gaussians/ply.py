@@ -13,7 +13,6 @@ cannot ask for terabytes.
 
 from __future__ import annotations
 
-import io
 import logging
 import math
 import os
@@ -41,11 +40,16 @@ from tron.gaussians.foreign_files import (
     usable_splats,
     whole,
 )
+from tron.gaussians.foreign_properties import plain_columns, refuse_points
 from tron.gaussians.formats.registry import FORMATS, Format
 from tron.gaussians.formats.splats import Splats
 from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
-from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS, Packing, packing, unpacked
+from tron.gaussians.packed_files import PACKED_SPLATS, Packing, packing, unpacked
+from tron.gaussians.ply_arrays import columns_in
+from tron.gaussians.spz_header import read_header
+from tron.gaussians.stored_values import as_3dgs_stores
 from tron.io.local_frame import local_origin, said
+from tron.io.recognised import refuse_placeholder
 from tron.storage import atomic_path
 
 log = logging.getLogger(__name__)
@@ -80,6 +84,7 @@ _TYPE_BYTES = {
     **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
     **dict.fromkeys(("double", "float64"), 8),
 }
+NOT_READ = "not read, so that it may look different here"
 _EXPORT = "is it a Gaussian scene? export it as an uncompressed 3DGS or 2DGS PLY"
 
 
@@ -144,8 +149,9 @@ def read_splats(path: str | Path) -> dict[str, Any]:
     so in one line.
 
     The file may be compressed by gzip, packed (:mod:`tron.gaussians.packed_files`), or of another program
-    (:mod:`tron.gaussians.formats`). ``turn`` (3, 3) is the rotation from a packed file's frame into that of
-    3DGS' PLYs. Formats that are y up say so: .spz, glTF, USD.
+    (:mod:`tron.gaussians.formats`). ``turn`` (3, 3) leads from the frame of a file of .spz into that of 3DGS'
+    PLYs (:mod:`tron.gaussians.spz_header`): a rotation or a mirror image. Where the file does not state its
+    frame, `up_guessed` is True. glTF and USD say which way is up.
 
     Raises:
         TronError: files that are missing, are neither a PLY nor packed splats, lack properties (named),
@@ -157,15 +163,21 @@ def read_splats(path: str | Path) -> dict[str, Any]:
         splats = known.read(path)
         columns, comments, up = _columns(splats), [], splats.up
     else:
-        data = _parsed(path, known)
-        columns = {p.name: data["vertex"][p.name] for p in data["vertex"].properties}
-        comments, up = data.comments, stated_up(data.comments)
-    turn = HALF_TURN if isinstance(known, Packing) and known.half_turned else np.eye(3)
-    if isinstance(known, Packing) and known.half_turned:
+        columns, comments = _parsed(path, known)
+        up = stated_up(comments)
+    turn, up_stated = np.eye(3), True
+    if known == PACKED_SPLATS[".spz"]:
+        header = read_header(path.read_bytes())
+        turn, up_stated = header.turn, header.stated
         up = GUESSED_UP @ turn
+        if header.antialiased:
+            log.warning("%s: %s: %s", path, NOT_READ, "antialiased (splats filtered by the viewer's pixels)")
     constants = _read_constants(comments, path)
+    columns = plain_columns(columns, bool(constants), path)
     _check_properties(columns, comments, path)
     scales = [name for name in (*FIELDS["log_scales"].properties, THIRD_SCALE) if name in columns]
+    if not constants:
+        columns = as_3dgs_stores(columns, scales, path)
     # Before they are smoothed: a filter much wider than a splat hides its axes, not where it faces.
     columns["round_ones"] = round_ones(np.stack([columns[name] for name in scales], axis=-1))
     if FILTER in columns:
@@ -204,7 +216,7 @@ def read_splats(path: str | Path) -> dict[str, Any]:
         **({"spacing": constants["spacing"][0]} if "spacing" in constants else {}),
         "turn": turn,
         "up": np.array(GUESSED_UP if stated is None else stated),
-        "up_guessed": stated is None or bool(constants.get("up_guessed", [0])[0]),
+        "up_guessed": stated is None or not up_stated or bool(constants.get("up_guessed", [0])[0]),
         "materials_guessed": guessed or bool(constants.get("materials_guessed", [0])[0]),
         "oriented": bool(constants.get("oriented", [0])[0]),
         "offset": np.array(offset),
@@ -220,6 +232,7 @@ def check_header(path: Path) -> Packing | Format | None:
         TronError: it cannot be opened, is no PLY of Gaussians as far as its header tells, or is shorter than
             the header says.
     """
+    refuse_placeholder(path)
     other = FORMATS.get(path.suffix.lower())
     if other is not None:
         refuse_foreign(path)
@@ -246,21 +259,32 @@ def check_header(path: Path) -> Packing | Format | None:
 
 def header_comments(path: Path) -> list[str]:
     """Comments of a PLY's header; none where the file is not there or no PLY."""
+    return [line[len("comment ") :].rstrip() for line in _header(path) if line.startswith("comment ")]
+
+
+def header_elements(path: Path) -> set[str]:
+    """Names of the elements of a PLY; none where the file is not there or no PLY."""
+    return {line.split()[1] for line in _header(path) if line.startswith("element ")}
+
+
+def _header(path: Path) -> list[str]:
     try:
         with path.open("rb") as file:
-            header = file.read(_HEADER_LIMIT).decode("ascii", "replace").partition("end_header")[0]
+            header, end, _ = file.read(_HEADER_LIMIT).decode("ascii", "replace").partition("end_header")
     except OSError:
         return []
-    return [line[len("comment ") :].rstrip() for line in header.splitlines() if line.startswith("comment ")]
+    return header.splitlines() if end else []
 
 
-def _parsed(path: Path, packed: Packing | None) -> plyfile.PlyData:
+def _parsed(path: Path, packed: Packing | None) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns of the vertex element, and comments of the header."""
     try:
         if packed is None and not is_gzipped(path):
-            return plyfile.PlyData.read(str(path))
+            data = plyfile.PlyData.read(str(path))
+            return {each.name: data["vertex"][each.name] for each in data["vertex"].properties}, data.comments
         content = whole(path) if packed is None else unpacked(path, packed)
         _check_sizes(content[:_HEADER_LIMIT], len(content), path)
-        return plyfile.PlyData.read(io.BytesIO(content))
+        return columns_in(content)
     except OSError as error:
         raise TronError(f"cannot read: {error.strerror or error}", path) from error
     except (plyfile.PlyParseError, ValueError) as error:  # ValueError: text that is no number
@@ -352,6 +376,7 @@ def _check_sizes(head: bytes, size: int, path: Path) -> None:
         raise TronError("the PLY header has no end", path)
     ascii_body = False
     elements: list[tuple[str, int, int]] = []  # name, count, least bytes of a row
+    vertex: set[str] = set()
     for line in head[:end].decode("ascii", "replace").splitlines():
         words = line.split()
         if words[:2] == ["format", "ascii"]:
@@ -360,11 +385,13 @@ def _check_sizes(head: bytes, size: int, path: Path) -> None:
             elements.append((words[1], int(words[2]), 0))
         elif words[:1] == ["property"] and elements and len(words) >= 3:
             name, count, row = elements[-1]
+            vertex |= {words[-1]} if name == "vertex" else set()
             # Of a list only its length is certain to be there. In text, a digit and a separator are.
             kind = words[2] if words[1] == "list" else words[1]
             elements[-1] = (name, count, row + (2 if ascii_body else _TYPE_BYTES.get(kind, 1)))
     if "vertex" not in [name for name, _, _ in elements]:
         raise TronError("the PLY has no vertex element", path, _EXPORT)
+    refuse_points([name for name, _, _ in elements], vertex, path)
     if any(row == 0 and count for _, count, row in elements):
         raise TronError("the PLY declares an element without properties", path)
     needed = sum(count * row for _, count, row in elements)
@@ -389,7 +416,7 @@ def _check_properties(columns: dict[str, np.ndarray], comments: Sequence[str], p
         if values.dtype == object and name in read:
             raise TronError(f"property {name} is a list", path, _EXPORT)
     if foreign:
-        log.warning("%s: not read, so that it may look different here: %s", path, foreign)
+        log.warning("%s: %s: %s", path, NOT_READ, foreign)
     present = [name for name in MATERIAL_PROPERTIES if name in columns]
     if present and len(present) < len(MATERIAL_PROPERTIES):
         absent = ", ".join(name for name in MATERIAL_PROPERTIES if name not in columns)

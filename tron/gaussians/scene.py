@@ -140,12 +140,17 @@ class GaussianScene:
         return replace(self, quats=np.where(which[:, None], turned, self.quats))
 
     def rotated(self, rotation: np.ndarray) -> GaussianScene:
-        """The scene turned about the origin by a (3, 3) rotation: centres, frames, radiance and up."""
+        """The scene turned about the origin by a (3, 3) rotation: centres, frames, radiance and up.
+
+        A mirror image, of determinant -1, is one too: tangents u are turned over, so that frames stay
+        right-handed and normals are mirrored.
+        """
         rotation = np.asarray(rotation, dtype=np.float64)
+        handed = np.array([np.sign(np.linalg.det(rotation)), 1, 1])
         return replace(
             self,
             means=self.means @ rotation.T,
-            quats=quats_from_matrices(rotation @ self.rotations()),
+            quats=quats_from_matrices(rotation @ self.rotations() * handed),
             sh=rotate_sh(self.sh, rotation),
             up=rotation @ self.up,
             offset=rotation @ self.offset,

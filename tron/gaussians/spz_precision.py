@@ -2,7 +2,8 @@
 
 Places are 24-bit numbers with as many fractional bits as the header says
 (https://github.com/nianticlabs/spz). gaussforge always takes 12: places beyond 2,048 wrap around, and a scene
-of a few centimetres stands on a grid. Here the bits follow the scene.
+of a few centimetres stands on a grid. Here there are fewer where the scene is wide, and more where it is
+smaller than a unit: at least 4,096 steps from its origin to its edge.
 
 .spz has a byte for each coefficient, which writers round to fewer bits so that gzip packs them well
 (``quantizeSH``). gaussforge takes 5 bits of degree 1 and 4 of degrees 2 and 3. Light baked into surfels is
@@ -18,22 +19,20 @@ splat-transform and held against what went in:
 from __future__ import annotations
 
 import gzip
-import struct
 
 import numpy as np
 
 from tron.errors import TronError
+from tron.gaussians.spz_header import HEADER, MAGIC
 
 BITS = 6
 """Of each coefficient: steps of 1/32."""
-_MAGIC, _VERSION = 0x5053474E, 3
-_HEADER = struct.Struct("<IIIBBBB")
-"""Magic, version, splats, degree of harmonics, fractional bits of places, flags, a byte for later."""
+_VERSION = 3
 _PLACE, _OTHERS = 9, 1 + 3 + 3 + 4
 """Bytes of a splat's place, and of its opacity, colour, scales and rotation; its harmonics come last."""
 _LARGEST = 2**23 - 1
-_FRACTION = 20
-"""The most fractional bits: steps of a millionth."""
+_FRACTION, _FINEST = 12, 20
+"""Fractional bits of places: those of other writers, and the most, steps of a millionth."""
 
 
 def refined(content: bytes, means: np.ndarray, sh: np.ndarray) -> bytes:
@@ -48,21 +47,28 @@ def refined(content: bytes, means: np.ndarray, sh: np.ndarray) -> bytes:
         TronError: the file is not of that version or number of splats; places lie beyond 2**23.
     """
     plain, count = gzip.decompress(content), len(sh)
-    header = _HEADER.unpack_from(plain)
+    header = HEADER.unpack_from(plain)
     terms = (header[3] + 1) ** 2
     held = 3 * (terms - 1)
-    whole = _HEADER.size + count * (_PLACE + _OTHERS + held)
-    if header[:3] != (_MAGIC, _VERSION, count) or terms > sh.shape[1] or len(plain) != whole:
+    whole = HEADER.size + count * (_PLACE + _OTHERS + held)
+    if header[:3] != (MAGIC, _VERSION, count) or terms > sh.shape[1] or len(plain) != whole:
         raise TronError(f"gaussforge packed a file of version {header[1]}, which is not known here")
     farthest = float(np.abs(means).max(initial=0))
     if farthest > _LARGEST:
         raise TronError(f".spz holds no place as far out as {farthest:.3g}", mend="write .ply or .sog")
-    fraction = _FRACTION if farthest == 0 else min(_FRACTION, int(np.log2(_LARGEST / farthest)))
+    fraction = _fraction(farthest)
     fixed = np.round(np.asarray(means, np.float64) * 2**fraction).astype("<i4")
     places = fixed.view(np.uint8).reshape(count, 3, 4)[..., :3]
     step = 2 ** (8 - BITS)
     bytes_of = np.round(np.asarray(sh[:, 1:terms], np.float64) * 128) + 128
     rounded = np.clip(np.floor((bytes_of + step // 2) / step) * step, 0, 255).astype(np.uint8)
-    others = plain[_HEADER.size + count * _PLACE : len(plain) - count * held]
-    begins = _HEADER.pack(*header[:4], fraction, *header[5:])
+    others = plain[HEADER.size + count * _PLACE : len(plain) - count * held]
+    begins = HEADER.pack(*header[:4], fraction, *header[5:])
     return gzip.compress(begins + places.tobytes() + others + rounded.tobytes(), mtime=0)
+
+
+def _fraction(farthest: float) -> int:
+    if farthest == 0:
+        return _FRACTION
+    wanted = _FRACTION + max(0, int(np.ceil(-np.log2(farthest))))
+    return min(_FINEST, wanted, int(np.log2(_LARGEST / farthest)))

@@ -1,14 +1,15 @@
 """Colours that a picture of display values says it is in (ICC, cICP, nclx, gAMA, EXIF), brought to sRGB.
 
-Of several statements the first holds: PNG's cICP, an ICC profile, HEIC's nclx, PNG's sRGB chunk, its gAMA and
-cHRM, EXIF's Adobe RGB. Without any a picture is in sRGB. Profiles are Pillow's ImageCms' work; what has 16
-bits, which that cannot take, goes through the profile's own curves and matrix. EXIF's "uncalibrated", which
-phones write beside a profile, is a line where the profile was lost.
+Of several statements the first holds: PNG's cICP, an ICC profile, HEIC's and AVIF's nclx, PNG's sRGB chunk,
+its gAMA and cHRM, EXIF's Adobe RGB. Without any a picture is in sRGB. Profiles are Pillow's ImageCms' work;
+what has 16 bits, which that cannot take, goes through the profile's own curves and matrix. EXIF's
+"uncalibrated", which phones write beside a profile, is a line where the profile was lost.
 """
 
 from __future__ import annotations
 
 import io
+import re
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -35,6 +36,8 @@ _ADOBE_SPACE, _UNCALIBRATED, _ADOBE_INTEROPERABILITY = 2, 0xFFFF, "R03"
 _SAME_LEVELS = 2
 """Profiles that change no colour by more levels of 8 bits are sRGB's, of which many are about."""
 _STEPS = 9
+_NCLX, _AVIF_HEAD = re.compile(rb"colrnclx(....)", re.DOTALL), 1 << 16
+"""AVIF's box of code points (ISO/IEC 14496-12, 12.1.5), not told by Pillow, in a file's first part."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,7 @@ class DisplayColors:
 
 
 def colors_of_file(picture: Image.Image, data: bytes = b"") -> DisplayColors:
-    """Colours of a picture that Pillow has opened; a PNG's chunks are looked for in its file's bytes.
+    """Colours of a picture that Pillow has opened; PNG's chunks and AVIF's box are looked for in its bytes.
 
     Raises:
         TronError: PNG's cICP states a colour space that is not converted.
@@ -100,6 +103,9 @@ def colors_of_file(picture: Image.Image, data: bytes = b"") -> DisplayColors:
         return colors_of_code_points(code[0], code[1], "cICP")
     if profile := picture.info.get("icc_profile"):
         return colors_of_profile(bytes(profile), picture.mode)
+    if picture.format == "AVIF" and (code := _NCLX.search(data[:_AVIF_HEAD])):
+        primaries, transfer = struct.unpack(">HH", code[1])
+        return colors_of_code_points(primaries, transfer, "nclx")
     if b"sRGB" in chunks:
         return DisplayColors()
     if b"gAMA" in chunks or b"cHRM" in chunks:

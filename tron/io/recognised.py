@@ -53,12 +53,32 @@ _RECORD3D_FILE = Sight(
 _LFS = Sight("a pointer of Git LFS, not the file itself", "git lfs pull brings the file")
 _PAGE = Sight("a web page, not the file itself", "download the file, not the page that shows it")
 
+_LCC = Sight(
+    "XGRIDS' .lcc",
+    "npx @playcanvas/splat-transform FILE.lcc scene.ply makes a PLY of it, or export one there",
+)
+_RAD = Sight("Spark's .rad", "give the .ply or .spz that it was built from")
+_POSTSHOT = Sight("Postshot's project", "export its splats there as PLY")
+
+
+def _raw_360(whose: str, program: str) -> Sight:
+    return Sight(
+        f"{whose} raw 360 format, two fisheye pictures",
+        f"stitch it to equirectangular (2:1) first, with {program}, and give that as .mp4 or .jpg",
+    )
+
+
 _SUFFIXES = {
     **dict.fromkeys((".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar"), _ARCHIVE),
     **dict.fromkeys((".ckpt", ".pth", ".pt", ".safetensors", ".pkl"), _CHECKPOINT),
     **dict.fromkeys((".psx", ".psz"), _PROJECT),
     **dict.fromkeys((".rcproj", ".rsproj"), _REALITY_PROJECT),
     ".r3d": _RECORD3D_FILE,
+    **dict.fromkeys((".lcc", ".lcc2"), _LCC),
+    **dict.fromkeys((".rad", ".radc"), _RAD),
+    ".psht": _POSTSHOT,
+    **dict.fromkeys((".insv", ".insp", ".lrv"), _raw_360("Insta360's", "Insta360 Studio")),
+    ".360": _raw_360("GoPro's", "GoPro Player"),
 }
 _ARCHIVE_STARTS = (b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!", b"\x1f\x8b", b"\xfd7zXZ", b"BZh")
 _HEAD = 1024
@@ -96,6 +116,17 @@ def refuse_by_sight(path: Path, wanted: str) -> None:
         raise TronError(f"{wanted}, this is {seen.what}", path, seen.mend)
 
 
+def refuse_placeholder(path: Path) -> None:
+    """Raise TronError if a file, whatever its name, holds what stands for another: Git LFS, a web page."""
+    try:
+        with path.open("rb") as file:
+            seen = _placeholder(file.read(_HEAD))
+    except OSError:
+        return
+    if seen is not None:
+        raise TronError(f"this is {seen.what}", path, seen.mend)
+
+
 def foreign_poses(photos: Path) -> tuple[Path, Sight] | None:
     """File or folder of poses, not read, that belongs to a folder of photos or of their ``images``."""
     for folder in (photos, *(each for each in photos.glob("i*") if each.is_dir()), photos.parent):
@@ -106,13 +137,21 @@ def foreign_poses(photos: Path) -> tuple[Path, Sight] | None:
     return None
 
 
-def _of_content(head: bytes) -> Sight | None:
-    """Kind that text tells, under any name."""
+def _placeholder(head: bytes) -> Sight | None:
     if head.startswith(b"version https://git-lfs"):
         return _LFS
-    text = head.decode("utf-8", "replace").lstrip("\ufeff \t\r\n").lower()
-    if text.startswith(("<!doctype html", "<html")):
-        return _PAGE
+    return _PAGE if _text(head).startswith(("<!doctype html", "<html")) else None
+
+
+def _text(head: bytes) -> str:
+    return head.decode("utf-8", "replace").lstrip("\ufeff \t\r\n").lower()
+
+
+def _of_content(head: bytes) -> Sight | None:
+    """Kind that text tells, under any name."""
+    if (seen := _placeholder(head)) is not None:
+        return seen
+    text = _text(head)
     if text.startswith(("<?xml", "<document")) and "<document" in text and "<chunk" in text:
         return _METASHAPE
     titles = [line for line in text.splitlines()[:2] if line.startswith("#")]  # the first may count cameras
@@ -138,6 +177,8 @@ def _folder(path: Path) -> Sight | None:
             path.glob("point_cloud/iteration_*/point_cloud.ply"), key=lambda each: _number(each.parent)
         )
         return Sight("a model folder of 3DGS", f"tron-relight scene={quote(str(newest))} takes its splats")
+    if (path / "lod-meta.json").is_file() or ((path / "meta.json").is_file() and any(path.glob("*.webp"))):
+        return Sight("a folder of SOG, splats", f"tron-relight scene={quote(str(path))} takes it")
     if (path / "nerfstudio_models").is_dir():
         config = quote(str(path / "config.yml"))
         mend = (

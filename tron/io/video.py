@@ -154,6 +154,17 @@ def duration_of(path: Path) -> float:
         return float(container.duration or 0) / av.time_base
 
 
+def sizes_of(path: Path) -> list[tuple[int, int]]:
+    """Width and height of each stream of pictures of a video.
+
+    Raises:
+        TronError: no such file, or no video in it.
+    """
+    with _opened(path) as container:
+        _stream(container, path)
+        return [(stream.width, stream.height) for stream in container.streams.video]
+
+
 def frames_of(path: Path) -> Iterator[Frame]:
     """All frames of a video, one after another; a line says what becomes of colours that are not plain SDR.
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from tron.errors import TronError
+from tron.io.recognised import refuse_placeholder
 from tron.models.gltf.meshes import read_parts
 from tron.models.obj import read_obj
 from tron.models.parts import Part, split_mirrored, without_slivers
@@ -42,6 +43,7 @@ def load_model(path: str | Path, up: str = "y", *, fitted: bool = True) -> list[
     path = Path(path)
     if not path.is_file():
         raise TronError("model not found", path)
+    refuse_placeholder(path)
     try:
         parts = (
             read_obj(path, MOST_TRIANGLES)

@@ -19,14 +19,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import KDTree
 
 from tron.apps.relight.camera_files import CAMERAS, filmed_cameras
+from tron.apps.relight.one_view import one_view
 from tron.apps.scene_file import load_scene
 from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.errors import TronError
 from tron.gaussians.foreign_files import refuse_foreign
-from tron.gaussians.formats.registry import FORMATS
-from tron.gaussians.packed_files import PACKED_SPLATS
+from tron.gaussians.formats.registry import named_as_splats
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
 from tron.seeds import generator
@@ -75,7 +75,7 @@ class SplatSettings(BaseModel):
 
 def is_splats(path: Path) -> bool:
     """Whether a path is a file of splats by its name, packed ones included."""
-    return path.is_file() and path.name.lower().endswith((".ply", ".ply.gz", *PACKED_SPLATS, *FORMATS))
+    return path.is_file() and named_as_splats(path.name)
 
 
 def film_splats(
@@ -109,10 +109,13 @@ def film_splats(
     scene = load_scene(path, up)
     surrounded = treat_surroundings(scene, settings.surroundings, path, "splats.surroundings")
     filmed = filmed_cameras(path, scene.offset) if settings.cameras == "auto" else None
+    if filmed is not None:
+        log.info("%s is filmed from where its photos were taken: %s", path, path.with_name(CAMERAS))
+    elif settings.cameras == "auto":
+        filmed = one_view(path, surrounded.content, np.eye(3))
     if filmed is None:
         cameras = virtual_cameras(surrounded.content, settings, seed)
     else:
-        log.info("%s is filmed from where its photos were taken: %s", path, path.with_name(CAMERAS))
         cameras = film_with(filmed, settings.views, settings.side)
     from tron.reconstruction.film import film  # Mitsuba: not for --help
 

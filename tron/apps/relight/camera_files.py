@@ -26,6 +26,7 @@ from tron.apps.camera_formats import (
     read_usd,
     supersplat_document,
 )
+from tron.apps.relight.one_view import one_view
 from tron.cameras import Camera, focus_of, opengl_to_opencv, rigid_pose
 from tron.errors import TronError, located
 from tron.io.local_frame import ORIGIN, moved_cameras
@@ -36,6 +37,7 @@ from tron.trajectories import keyframed, turn_cameras
 
 if TYPE_CHECKING:
     from tron.captures import View
+    from tron.gaussians.scene import GaussianScene
 
 log = logging.getLogger(__name__)
 
@@ -222,14 +224,21 @@ def filmed_cameras(scene: Path, offset: np.ndarray = ORIGIN) -> list[Camera] | N
     return in_frame_of(offset, cameras_of(path), path) if path.is_file() else None
 
 
-def filmed_with(path: Path, turn: np.ndarray, offset: np.ndarray) -> list[Camera] | None:
-    """Cameras that a scene was filmed with, in the world turned by ``turn``; None where none lie beside."""
+def filmed_with(
+    path: Path, turn: np.ndarray, offset: np.ndarray, scene: GaussianScene | None = None
+) -> list[Camera] | None:
+    """Cameras that a scene was filmed with, in the world turned by ``turn``; None where nothing tells.
+
+    ``scene``, in that world, tells them where no file lies beside it and it was made from one view.
+    """
     try:
         filmed = filmed_cameras(path, offset)
     except TronError as error:
         log.warning("%s; the scene is filmed and orbited without it", error)
         return None
-    return None if filmed is None else turn_cameras(filmed, turn)
+    if filmed is not None:
+        return turn_cameras(filmed, turn)
+    return None if scene is None else one_view(path, scene, turn)
 
 
 def filmed_orbit(

@@ -115,7 +115,7 @@ def main(settings: Settings) -> None:
     with working("looking for surroundings"):
         surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
     scene = surrounded.shown
-    filmed = filmed_with(settings.scene, turn, offset)
+    filmed = filmed_with(settings.scene, turn, offset, surrounded.content)
     kept = KeptFiles(settings.scene, settings.output_dir)
     if scene.materials_guessed and settings.materials == "auto":
         scene = with_materials(scene, kept, filmed, settings.seed, surrounded.backdrop, turn)
@@ -222,7 +222,9 @@ def _planned(settings: Settings, scene: GaussianScene, filmed: list[Camera] | No
     assert settings.trajectory != "keyframes"
     if filmed is None or settings.trajectory not in ("orbit", "still"):
         return plan_cameras(scene, settings.trajectory, settings.frames, **view)
-    log.info("the orbit stays between the %d cameras of %s", len(filmed), settings.scene.with_name(CAMERAS))
+    beside = settings.scene.with_name(CAMERAS)
+    whose = str(beside) if beside.is_file() else "its one view"
+    log.info("the orbit stays between the %d cameras of %s", len(filmed), whose)
     if settings.trajectory == "orbit":
         return filmed_orbit(filmed, settings.frames, up=scene.up, **view)
     return filmed_orbit(filmed, 1, up=scene.up, **view) * settings.frames

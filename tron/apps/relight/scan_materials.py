@@ -85,12 +85,16 @@ def with_known_materials(scene: GaussianScene, kept: KeptFiles) -> GaussianScene
 
     if mi.variant() is None:
         activate()
-    filmed = filmed_with(kept.scan, upright(scene.up), scene.offset)
     standing = scene.upright()
-    found, around = _known(kept, fingerprint(standing, filmed)), None
+
+    def known(content: GaussianScene) -> GaussianScene | None:
+        filmed = filmed_with(kept.scan, upright(scene.up), scene.offset, content)
+        return _known(kept, fingerprint(content, filmed))
+
+    found, around = known(standing), None
     if found is None:  # of a scan with a sky they are those of all else, but with surroundings=keep
         around = find_surroundings(standing)
-        found = _known(kept, fingerprint(subset(standing, ~around), filmed)) if around.any() else None
+        found = known(subset(standing, ~around)) if around.any() else None
     return scene if found is None else _with(scene, found, around)
 
 

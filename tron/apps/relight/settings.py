@@ -12,6 +12,7 @@ from tron.apps.machine import Variant
 from tron.apps.relight.camera_files import CAMERAS, cameras_of, frame_size
 from tron.apps.relit import Background
 from tron.apps.scene_file import Up
+from tron.apps.splat_file import SceneFile
 from tron.apps.surroundings import DESCRIPTION, Treatment
 from tron.color import Look
 from tron.editing.models import PlacedModel
@@ -47,7 +48,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    scene: Path = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or packed splats")
+    scene: SceneFile = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or packed splats")
     environment: Path | Annotated[tuple[Path, ...], Field(min_length=1)] = Field(
         description="environment map, .hdr or .exr (.png and .jpg are clipped), or what else "
         "tron-environment reads; capture: the light that the scene's photos were taken in, environment.exr "

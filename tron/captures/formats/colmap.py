@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tron.captures.photos.distortion import Lens, load_pycolmap
+from tron.captures.photos.distortion import Lens, impossible, load_pycolmap
 from tron.captures.photos.image_folder import ImageFolder, photos_in, view_names
 from tron.captures.photos.panoramas import Panorama
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
@@ -68,7 +68,8 @@ def read_colmap(path: Path, settings: PhotoSettings) -> PosedPhotos:
     prefix = "" if found.images is not None else "images/"
     photos = []
     for name, camera_to_world, lens in posed_by(model):
-        photos.append(PosedPhoto(name, found.find(prefix + name, folder), camera_to_world, lens))
+        image = found.find(prefix + name, folder)
+        photos.append(PosedPhoto(name, image, camera_to_world, lens, refused=impossible(lens)))
     points, colors = points_of(model)
     used = {photo.path for photo in photos}
     folders = {each.parent for each in used if each is not None}

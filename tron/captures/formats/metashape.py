@@ -6,12 +6,17 @@ a calibration: f, cx and cy from the middle of the picture, in pixels, b1 (how m
 (skew), k1 to k4, p1 and p2. Metashape's p1 is OpenCV's p2 and the other way round (Metashape manual, appendix
 "Camera models"). A spherical sensor, of equirectangular photos of 360 degrees, has its resolution alone.
 Cameras of several components stand in worlds of their own: the largest is read.
+
+Of a rig of several sensors one is the master. The others' cameras have no transform but the id of the
+master's camera of the same moment, and their sensors have the rotation and the location that lead from the
+slave's axes to the master's: the pose of a slave is its master's times these.
 """
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree  # expat limits what entities expand to, and follows none outside the file
 
@@ -70,6 +75,7 @@ def read_metashape(path: Path, settings: PhotoSettings) -> PosedPhotos:
     with located(file):
         lenses = {each.get("id"): each for each in chunk.iterfind("sensors/sensor")}
         cameras = [each for each in chunk.iterfind(".//cameras//camera") if each.get("label")]
+        poses = {each.get("id", ""): text for each in cameras if (text := each.findtext("transform"))}
         of_component = Counter(
             each.get("component_id") for each in cameras if each.find("transform") is not None
         )
@@ -79,8 +85,9 @@ def read_metashape(path: Path, settings: PhotoSettings) -> PosedPhotos:
         photos = []
         for camera in cameras:
             apart = camera.get("component_id") != largest and camera.find("transform") is not None
+            sensor = lenses.get(camera.get("sensor_id"))
             photos.append(
-                _photo(camera, lenses.get(camera.get("sensor_id")), images, folders, file)
+                _photo(camera, sensor, poses, images, folders, file)
                 if not apart
                 else PosedPhoto(camera.get("label", ""), None, None, None, refused="of another component")
             )
@@ -90,25 +97,47 @@ def read_metashape(path: Path, settings: PhotoSettings) -> PosedPhotos:
 def _photo(
     camera: ElementTree.Element,
     sensor: ElementTree.Element | None,
+    poses: Mapping[str, str],
     images: ImageFolder,
     folders: list[str],
     file: Path,
 ) -> PosedPhoto:
     label, matrix = camera.get("label", ""), camera.findtext("transform")
+    master = camera.get("master_id") if matrix is None else None
+    if master is not None:
+        matrix = poses.get(master)
     found = (images.find(folder + label, file) for folder in folders)
     image = next((each for each in found if each is not None), None)
     try:
         if matrix is None:
-            raise TronError("not aligned")
+            raise TronError("not aligned" if master is None else "the master of its rig is not aligned")
         if sensor is None:
             raise TronError("its sensor is missing")
         lens = _lens(sensor)
-        pose = rigid_pose(np.reshape([float(word) for word in matrix.split()], (4, 4)))
+        pose = rigid_pose(np.reshape(_numbers(matrix), (4, 4)))
+        if master is not None:
+            pose = pose @ _in_rig(sensor)
     except TronError as error:
         return PosedPhoto(label, image, None, None, refused=error.what)
     except ValueError:
-        return PosedPhoto(label, image, None, None, refused="transform is not 16 numbers")
+        what = "rotation and location in its rig are not numbers" if master else "transform is not 16 numbers"
+        return PosedPhoto(label, image, None, None, refused=what)
     return PosedPhoto(label, image, pose, lens)
+
+
+def _in_rig(sensor: ElementTree.Element) -> np.ndarray:
+    """(4, 4) from a slave's axes to its master's; TronError or ValueError where the sensor does not say."""
+    rotation, location = sensor.findtext("rotation"), sensor.findtext("location")
+    if rotation is None or location is None:
+        raise TronError("a slave of a rig whose sensor has no rotation and location: calibrate the rig")
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.reshape(_numbers(rotation), (3, 3))
+    matrix[:3, 3] = np.reshape(_numbers(location), 3)
+    return rigid_pose(matrix)
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(word) for word in text.split()]
 
 
 def _lens(sensor: ElementTree.Element) -> Lens | Panorama:

@@ -31,6 +31,11 @@ _KINDS: dict[str, tuple[str, str]] = {
         (".bin", ".db"), ("a part of a COLMAP model", "give the folder that holds sparse/0 and the photos")
     ),
 }
+_RAW = (
+    *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2"),
+    *(".pef", ".srw", ".x3f", ".3fr", ".iiq", ".erf", ".gpr", ".rwl"),
+)
+_UNREAD = (".jxl", ".jp2", ".j2k", ".psd", ".gif", ".ppm", ".tga")
 _CAMERA_PATH = "camera_path"
 
 
@@ -43,13 +48,17 @@ def refusal(path: Path, captures: str, holds_capture: Callable[[Path], bool]) ->
         holds_capture: whether a folder is a capture: one that lies in the given one is named.
     """
     if not path.is_dir():
-        kind = _kind(path)
+        kind = _unread(path) or _kind(path)
         if kind is None:
             return TronError("a capture is a folder or a transforms.json", path)
         return TronError(f"a capture is a folder or a transforms.json, this is {kind[0]}", path, kind[1])
     kind = _kind(path)
     if kind is not None:
         return TronError(f"no capture that is read, this is {kind[0]}", path, kind[1])
+    for folder in (path, path / "images", path / "input"):
+        for file in _files(folder):
+            if (mend := _unread(file)) is not None:
+                return TronError(mend[0], folder, mend[1])
     for file in (*_files(path), *_files(path / "images")):
         kind = _kind(file)
         if kind is not None:
@@ -77,6 +86,16 @@ def _kind(file: Path) -> tuple[str, str] | None:
         return _KINDS[suffix]
     seen = recognised(file)
     return seen and seen[:2]
+
+
+def _unread(file: Path) -> tuple[str, str] | None:
+    """What photos are that are not read, and what to do with them."""
+    suffix = file.suffix
+    if suffix.lower() in _RAW:
+        return f"raw photos ({suffix}) are not read", "develop them to JPEG or TIFF, all alike"
+    if suffix.lower() in _UNREAD:
+        return f"photos in {suffix} are not read", "save them as JPEG, PNG or TIFF"
+    return None
 
 
 def _files(folder: Path) -> list[Path]:

@@ -27,6 +27,10 @@ _GRID = 33
 _WIDEST = 0.5
 """The pinhole's focal length is at least this part of the lens's: a fisheye keeps its middle sharp."""
 _NARROWEST = 4.0
+_SQUARE, _MOST_DEG = 1.1, 140.0
+"""Of lenses that are no fisheyes: the ratio of focal lengths and the field of view that are never right."""
+_TWO_FOCAL = ("PINHOLE", "OPENCV", "FULL_OPENCV", "RAD_TAN_THIN_PRISM_FISHEYE", "FOV")
+_WIDE = ("FOV", "EUCM", "DIVISION", "SIMPLE_DIVISION")
 _ACTION_BYTES = 512
 """More than a `struct sigaction` of any system: 152 bytes on Linux, 16 on macOS."""
 
@@ -113,6 +117,23 @@ class Lens:
         rays[:, 1] = np.repeat(y, width)
         pixels = np.asarray(_colmap_camera(self).img_from_cam(rays, False)) * (sx, sy)
         return pixels.reshape(height, width, 2)
+
+
+def impossible(lens: object) -> str | None:
+    """Why structure from motion cannot be right about a lens; None of any other, and of what is no lens.
+
+    Photos of 360 degrees, fisheyes and too little texture end in cameras that nobody has: pixels are square.
+    """
+    if not isinstance(lens, Lens) or "FISHEYE" in lens.model or lens.model in _WIDE:
+        return None
+    focal = [lens.parameters[0], lens.parameters[1] if lens.model in _TWO_FOCAL else lens.parameters[0]]
+    said = f"posed with focal lengths of {focal[0]:.0f} and {focal[1]:.0f} pixels"
+    if max(focal) > _SQUARE * min(focal):
+        return f"{said}, which no camera has: is it a photo of 360 degrees, a fisheye, or stretched?"
+    angle = 2 * np.degrees(np.arctan(0.5 * max(lens.width / focal[0], lens.height / focal[1])))
+    if angle > _MOST_DEG:
+        return f"{said}, a view of {angle:.0f} degrees: is it a photo of 360 degrees, or a fisheye?"
+    return None
 
 
 def opencv_lens(

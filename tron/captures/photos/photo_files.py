@@ -1,9 +1,9 @@
 """Files of photos: what their headers say, whether they are whole, and their pixels.
 
-JPEG, PNG, WebP, TIFF and BMP hold display values; so does HEIC, which needs the extra ``heic`` (pillow-heif).
-They are brought to sRGB from what a file says it is in. OpenEXR holds linear radiance, which :func:`shown`
-encodes for display. Input is not trusted: sizes are checked before anything is decoded, and a file that is
-damaged is refused, for most decoders would fill its rest with grey and say nothing.
+JPEG, PNG, WebP, AVIF, TIFF and BMP hold display values; so does HEIC, which needs the extra ``heic``
+(pillow-heif). They are brought to sRGB from what a file says it is in. OpenEXR holds linear radiance, which
+:func:`shown` encodes for display. Input is not trusted: sizes are checked before anything is decoded, and a
+file that is damaged is refused, for most decoders would fill its rest with grey and say nothing.
 """
 
 from __future__ import annotations
@@ -16,23 +16,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, TiffImagePlugin, UnidentifiedImageError
 
 from tron.color import linear_to_srgb
 from tron.errors import TronError
 from tron.io.embedded_colors import DisplayColors, colors_of_code_points, colors_of_file, colors_of_profile
 from tron.io.exr_files import open_exr
 from tron.io.image_headers import check_size
+from tron.io.recognised import refuse_placeholder
 
 HEIC_SUFFIXES = (".heic", ".heif", ".hif")
 LINEAR_SUFFIXES = (".exr",)
 SUFFIXES = (
-    *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"),
+    *(".jpg", ".jpeg", ".png", ".webp", ".avif", ".tif", ".tiff", ".bmp"),
     *HEIC_SUFFIXES,
     *LINEAR_SUFFIXES,
 )
 
-_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
+_FORMATS = ("JPEG", "PNG", "WEBP", "AVIF", "TIFF", "BMP")
+_SAMPLE_FORMAT, _INTEGERS = 339, {1, 4}
+"""TIFF's tag that tells what samples are: unsigned, or undefined, which is read so."""
 _ORIENTATION_TAG = 0x0112
 _CHECK_SIDE = 64
 _BIT_DEPTH_AT = 24
@@ -107,6 +110,7 @@ def inspect_photo(path: Path, color: bool = True) -> PhotoHeader:
             return PhotoHeader(width, height, channels == 4, linear=True, color=color, notes=tuple(notes))
         if suffix in HEIC_SUFFIXES:
             return _inspect_heic(data, color)
+        _require_integers(data)
         with Image.open(io.BytesIO(data), formats=_FORMATS) as picture:
             check_size(*picture.size, len(picture.getbands()), len(data))
             header = PhotoHeader(
@@ -119,8 +123,10 @@ def inspect_photo(path: Path, color: bool = True) -> PhotoHeader:
             kind = picture.format or ""
         _require_whole(data, kind)
     except TronError as error:
+        refuse_placeholder(path)
         raise TronError(error.what, path, error.mend) from error
     except UnidentifiedImageError as error:
+        refuse_placeholder(path)
         raise TronError("damaged, or not an image", path) from error
     except OSError as error:
         raise TronError(f"cannot read image: {error.strerror or error}", path) from error
@@ -147,7 +153,7 @@ def decode_photo(path: Path, header: PhotoHeader, exposure: float = 1.0) -> np.n
         elif path.suffix.lower() in HEIC_SUFFIXES:
             pixels = _by_heif(data, header.color)
         else:
-            pixels = _by_opencv(path, data, header)
+            pixels = _by_pillow(data) if _is_avif(data) else _by_opencv(path, data, header)
             if header.color:
                 pixels = _in_srgb(data, pixels)
     except OSError as error:
@@ -271,6 +277,34 @@ def _heic(data: bytes, eight_bits: bool = True) -> Any:
         return pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=eight_bits)
     except Exception as error:  # libheif's errors come as ValueError, RuntimeError, EOFError, SyntaxError
         raise TronError(f"not a readable HEIC image: {error}") from error
+
+
+def _require_integers(data: bytes) -> None:
+    """Raise TronError if this is a TIFF of floating-point or signed numbers, which Pillow calls no image."""
+    if not data.startswith((b"II*\0", b"MM\0*")):
+        return
+    try:
+        tags = TiffImagePlugin.ImageFileDirectory_v2(data[:8])
+        stream = io.BytesIO(data)
+        stream.seek(tags.next)
+        tags.load(stream)
+        kinds = set(tags.get(_SAMPLE_FORMAT, (1,)))
+    except Exception:  # damaged: whoever decodes it says so
+        return
+    if kinds - _INTEGERS:
+        kind = "floating-point" if 3 in kinds else "signed or complex"
+        mend = "save it with 8 or 16 bits, or as OpenEXR where it is linear"
+        raise TronError(f"a TIFF of {kind} numbers is not read", mend=mend)
+
+
+def _is_avif(data: bytes) -> bool:
+    return data[4:8] == b"ftyp" and data[8:12] in (b"avif", b"avis")
+
+
+def _by_pillow(data: bytes) -> np.ndarray:
+    """(H, W, 3 or 4) uint8 of an AVIF, in its own colours."""
+    with Image.open(io.BytesIO(data), formats=("AVIF",)) as picture:
+        return np.asarray(picture)
 
 
 def _require_whole(data: bytes, kind: str) -> None:

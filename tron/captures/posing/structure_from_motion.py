@@ -5,7 +5,8 @@ Each photo is matched with those that share most coarse features with it
 
 Features are sought in upright, reduced copies, so that nothing in the files (EXIF orientation, 16 bits,
 alpha) can be read in two ways. The copies of photos that one camera and lens took at one size lie in a folder
-of their own and share a camera, COLMAP's OPENCV model refined with the poses.
+of their own and share a camera, COLMAP's OPENCV model refined with the poses. Photos of 360 degrees
+(:mod:`tron.captures.posing.wide_pictures`) have COLMAP's EQUIRECTANGULAR, and become six views.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -25,7 +27,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from tron.captures.formats.colmap import INPUT, points_of, posed_by, read_model
 from tron.captures.masks import mask_values
-from tron.captures.photos.distortion import load_pycolmap
+from tron.captures.photos.distortion import impossible, load_pycolmap
 from tron.captures.photos.image_folder import photos_in
 from tron.captures.photos.photo_files import (
     PhotoHeader,
@@ -37,6 +39,7 @@ from tron.captures.photos.photo_files import (
 )
 from tron.captures.photos.photo_views import mask_of
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
+from tron.captures.posing.wide_pictures import equirectangular, refuse_discs
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
 from tron.storage import locked, sha256, write_atomic
@@ -58,6 +61,10 @@ _FOCAL_35MM = 0xA405
 _NEAREST = 16
 _FEWEST = 3
 _QUALITY = 95
+_PANORAMA = "panorama_"
+"""What folders of equirectangular copies begin with."""
+_PANORAMA_SIDE = 3
+"""Times the pixels a side of other copies: all around is six usual views wide; features need half of that."""
 
 
 class MatchingSettings(BaseModel):
@@ -136,14 +143,20 @@ def pose_photos(path: Path, settings: PosingSettings, progress: Progress = log.i
             folder,
             f"posing photos needs at least {_FEWEST}, overlapping",
         )
+    exposure = exposure_of(photos, settings.exr_exposure)
+    opened = {path: partial(open_photo, path, header, exposure) for path, header in photos.items()}
+    refuse_discs(photos, lambda path: opened[path]())
+    panoramas = equirectangular(photos, lambda path: opened[path]())
+    if panoramas:
+        progress(f"{len(panoramas)} of {len(photos)} photos show 360 degrees")
     with locked(workspace):
-        copies = _posed_copies(photos, masks, workspace, settings, progress)
+        copies = _posed_copies(photos, panoramas, masks, workspace, settings, progress)
         model = read_model(workspace / "sparse")
     by_name = {path.name: path for path in photos}
     posed = []
     for copy, camera_to_world, lens in posed_by(model):
-        name = copies[copy]
-        posed.append(PosedPhoto(name, by_name.pop(name), camera_to_world, lens))
+        name, wrong = copies[copy], impossible(lens)
+        posed.append(PosedPhoto(name, by_name.pop(name), camera_to_world, lens, refused=wrong))
     skipped |= dict.fromkeys(by_name, "not posed: too few features in common with the others")
     points, colors = points_of(model)
     return PosedPhotos(folder, posed, points, colors, skipped=skipped, upright=True)
@@ -151,6 +164,7 @@ def pose_photos(path: Path, settings: PosingSettings, progress: Progress = log.i
 
 def _posed_copies(
     photos: Mapping[Path, PhotoHeader],
+    panoramas: Collection[Path],
     masks: Mapping[Path, Path],
     workspace: Path,
     settings: PosingSettings,
@@ -166,6 +180,7 @@ def _posed_copies(
         "max_side": settings.feature_side,
         "features": settings.features,
         "seed": settings.seed,
+        **({"panoramas": sorted(path.name for path in panoramas)} if panoramas else {}),
     }
     kept = _kept(record)
     if kept.get("wanted") == wanted and (workspace / "sparse").is_dir():
@@ -174,7 +189,7 @@ def _posed_copies(
     record.unlink(missing_ok=True)
     _clear(workspace, "images", "masks", "models", "sparse")
     progress(f"copying {len(photos)} photos for feature extraction")
-    copies = _copy(photos, workspace / "images", settings.feature_side, settings.exr_exposure)
+    copies = _copy(photos, workspace / "images", settings.feature_side, settings.exr_exposure, panoramas)
     if masks:
         _copy_masks({copies[name]: name for name in copies}, masks, workspace)
     _map(workspace, len(photos), settings, progress)
@@ -199,7 +214,11 @@ def _kept(record: Path) -> dict[str, Any]:
 
 
 def _copy(
-    photos: Mapping[Path, PhotoHeader], folder: Path, max_side: int, exr_exposure: float | None = None
+    photos: Mapping[Path, PhotoHeader],
+    folder: Path,
+    max_side: int,
+    exr_exposure: float | None = None,
+    panoramas: Collection[Path] = (),
 ) -> dict[str, str]:
     """Write upright 8-bit copies, those of one camera into one folder; their names below ``folder``."""
     exposure = exposure_of(photos, exr_exposure)
@@ -210,14 +229,17 @@ def _copy(
             exif = picture.getexif()
             lens = exif.get_ifd(_EXIF_FOLDER)
             upright = ImageOps.exif_transpose(picture)
+            whole = path in panoramas
             key = (
+                whole,
                 upright.size,
                 *(exif.get(t) for t in _CAMERA_TAGS),
                 *(str(lens.get(t)) for t in _LENS_TAGS),
             )
-            group = cameras.setdefault(key, f"camera_{len(cameras):03d}")
+            group = cameras.setdefault(key, f"{_PANORAMA if whole else 'camera_'}{len(cameras):03d}")
             upright = _eight_bits(upright)
-            upright.thumbnail((max_side, max_side), Image.Resampling.LANCZOS, reducing_gap=None)
+            side = max_side * (_PANORAMA_SIDE if whole else 1)
+            upright.thumbnail((side, side), Image.Resampling.LANCZOS, reducing_gap=None)
             kept = Image.Exif()
             if lens.get(_FOCAL_35MM):
                 kept.get_ifd(_EXIF_FOLDER)[_FOCAL_35MM] = lens[_FOCAL_35MM]
@@ -258,7 +280,6 @@ def _map(workspace: Path, count: int, settings: PosingSettings, progress: Progre
     threads = settings.threads or (os.cpu_count() or 1)
     database, images = workspace / "database.db", workspace / "images"
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "OPENCV"
     if (workspace / "masks").is_dir():
         reader.mask_path = workspace / "masks"
     extraction = pycolmap.FeatureExtractionOptions()
@@ -270,14 +291,19 @@ def _map(workspace: Path, count: int, settings: PosingSettings, progress: Progre
     verification.ransac.random_seed = settings.seed
     try:
         progress(f"extracting features of {count} photos")
-        pycolmap.extract_features(
-            database,
-            images,
-            camera_mode=pycolmap.CameraMode.PER_FOLDER,
-            reader_options=reader,
-            extraction_options=extraction,
-            device=pycolmap.Device.cpu,
-        )
+        names = sorted(each.relative_to(images).as_posix() for each in images.rglob("*.jpg"))
+        for reader.camera_model, whole in (("OPENCV", False), ("EQUIRECTANGULAR", True)):
+            if not (some := [name for name in names if name.startswith(_PANORAMA) == whole]):
+                continue
+            pycolmap.extract_features(
+                database,
+                images,
+                image_names=some,
+                camera_mode=pycolmap.CameraMode.PER_FOLDER,
+                reader_options=reader,
+                extraction_options=extraction,
+                device=pycolmap.Device.cpu,
+            )
         options = {
             "matching_options": matching,
             "verification_options": verification,

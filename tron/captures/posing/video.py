@@ -20,6 +20,7 @@ from tron.captures.photos.video_frames import (
     sharpest,
 )
 from tron.captures.posing.structure_from_motion import PosingSettings, pose_photos
+from tron.captures.posing.wide_pictures import refuse_video
 from tron.errors import TronError
 from tron.gaussians.foreign_files import VIDEOS
 from tron.io.video import duration_of, frames_of
@@ -55,6 +56,7 @@ def read_video(path: Path, settings: VideoSettings) -> PosedPhotos:
         TronError: no readable video, one of fewer than three frames or in which nothing moves, or photos that
             cannot be posed.
     """
+    refuse_video(path)
     workspace = settings.workspace or path.with_name(f"{path.stem}_frames")
     with locked(workspace):
         folder = _kept_frames(path, settings.frames, workspace)

@@ -154,7 +154,7 @@ def _of_primitive(document: Document, primitive: dict[str, Any]) -> Splats:
     return Splats(
         means=values("POSITION"),
         quats=values(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
-        log_scales=logarithms(values(f"{EXTENSION}:SCALE")),
-        opacity_logits=logits(values(f"{EXTENSION}:OPACITY")[:, 0]),
+        log_scales=logarithms(values(f"{EXTENSION}:SCALE"), document.path),
+        opacity_logits=logits(values(f"{EXTENSION}:OPACITY")[:, 0], document.path),
         sh=np.stack([values(name) for name in names[: max(bands, 1)]], axis=1),
     )

@@ -6,8 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from tron.gaussians.formats import checkpoints, gltf, usd
+from tron.gaussians.formats import checkpoints, gltf, sog, usd
 from tron.gaussians.formats.splats import Splats
+from tron.gaussians.packed_files import PACKED_SPLATS
 
 
 class Format(NamedTuple):
@@ -42,6 +43,16 @@ FORMATS = {
     ".glb": _GLB,
     ".gltf": _GLB._replace(write=None, starts=(b"{",)),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _USD),
+    ".json": Format(sog.check, sog.read, None, (b"{",)),
     **dict.fromkeys((".ckpt", ".pt", ".pth"), _CHECKPOINT),
 }
-"""By suffix. PLYs and packed splats: :mod:`tron.gaussians.ply`, :mod:`tron.gaussians.packed_files`."""
+"""By suffix; of ``.json`` SOG's alone are splats. PLYs and packed splats:
+:mod:`tron.gaussians.ply`, :mod:`tron.gaussians.packed_files`."""
+
+
+def named_as_splats(name: str) -> bool:
+    """Whether a file of this name may hold splats; meshes and points share some suffixes."""
+    lower = name.lower()
+    if lower.endswith(".json"):
+        return lower in (sog.META, sog.LEVELS)
+    return lower.endswith((".ply", ".ply.gz", *PACKED_SPLATS, *FORMATS))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -12,6 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from tron.errors import TronError
 from tron.gaussians.harmonics import SH_COUNT, rotate_sh
+
+log = logging.getLogger(__name__)
 
 Y_UP = (0.0, 1.0, 0.0)
 Z_UP = (0.0, 0.0, 1.0)
@@ -114,14 +117,32 @@ def one_line(path: Path) -> Iterator[None]:
         raise TronError(what, path, "it is damaged: export it again") from error
 
 
-def logarithms(scales: np.ndarray) -> np.ndarray:
-    """Natural logarithms of linear scales; -infinity of zero, NaN of what is negative."""
+_MEANT = 0.1
+"""Share of values that their format does not allow from which all are stored otherwise; a few are broken."""
+
+
+def logarithms(scales: np.ndarray, path: Path) -> np.ndarray:
+    """Natural logarithms of linear scales; -infinity of zero, NaN of what is negative.
+
+    Where many are negative they are logarithms already, as splat-transform wrote glTF before its issue 267
+    was mended: a line says so.
+    """
+    scales = np.asarray(scales, np.float64)
+    if scales.size and (scales < 0).mean() > _MEANT:
+        log.warning("%s: its scales are negative, which lengths are not: read as logarithms", path)
+        return scales
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.log(np.asarray(scales, np.float64))
+        return np.log(scales)
 
 
-def logits(opacities: np.ndarray) -> np.ndarray:
-    """Logits of opacities in [0, 1]; infinite at its ends, NaN outside."""
+def logits(opacities: np.ndarray, path: Path) -> np.ndarray:
+    """Logits of opacities in [0, 1]; infinite at its ends, NaN outside.
+
+    Where many lie outside they are logits already: a line says so.
+    """
     opacities = np.asarray(opacities, np.float64)
+    if opacities.size and ((opacities < 0) | (opacities > 1)).mean() > _MEANT:
+        log.warning("%s: its opacities lie outside [0, 1]: read as logits", path)
+        return opacities
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.log(opacities) - np.log1p(-opacities)

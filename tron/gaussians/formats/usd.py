@@ -58,16 +58,16 @@ def read(path: Path) -> Splats:
     with one_line(path):
         held = np.load(io.BytesIO(done.stdout), allow_pickle=False)
         up = Z_UP if held["z_up"] else Y_UP
-        return joined([_of_prim(held, str(k)) for k in range(int(held["count"]))], up)
+        return joined([_of_prim(held, str(k), path) for k in range(int(held["count"]))], up)
 
 
-def _of_prim(held: np.lib.npyio.NpzFile, key: str) -> Splats:
+def _of_prim(held: np.lib.npyio.NpzFile, key: str, path: Path) -> Splats:
     means = held[f"{key}.positions"]
     return Splats(
         means=means,
         quats=held[f"{key}.orientations"][:, [3, 0, 1, 2]],
-        log_scales=logarithms(held[f"{key}.scales"]),
-        opacity_logits=logits(held[f"{key}.opacities"]),
+        log_scales=logarithms(held[f"{key}.scales"], path),
+        opacity_logits=logits(held[f"{key}.opacities"], path),
         sh=held[f"{key}.coefficients"].reshape(len(means), -1, 3),
     ).placed(held[f"{key}.matrix"])
 
