@@ -210,9 +210,7 @@ def evened(surfels: GaussianScene) -> GaussianScene:
     return replace(surfels, quats=quats_from_normals(even).astype(np.float32))
 
 
-def _layer(
-    film: Sequence[Camera], agreed: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> Iterator[GBufferView]:
+def _layer(film: Sequence[Camera], agreed: Sequence[tuple[np.ndarray, np.ndarray]]) -> Iterator[GBufferView]:
     """The views of the surface; its materials are not theirs."""
     for camera, (depth, normal) in zip(film, agreed, strict=True):
         position = (camera.position + depth[..., None] * camera.rays()).astype(np.float32)

@@ -192,8 +192,8 @@ def test_shadows_tell_where_the_sun_is(scene, transport) -> None:
 
 def test_a_sun_is_told_from_a_soft_light_and_metals_do_not_count(scene, transport) -> None:
     nothing = PhotographedSky(np.zeros((6 * 64, 3)), np.zeros(6 * 64))
-    # This sun explains 10 to 21 % of the differences (three orders of pairs); none, up to 3 %.
-    prior = Joint(light=QUICK.model_copy(update={"points": 700}), sun=0.06)
+    # This sun explains 9 to 23 % of the differences; none, up to 3.1 %, where 3.6 % are asked for.
+    prior = Joint(light=QUICK.model_copy(update={"points": 700}))
     seen, ones = np.full(len(scene), 9, np.int32), np.ones((9, 3))
     for sun in (True, False):
         shown = shown_under(scene, transport, sunny(sun)[0])
