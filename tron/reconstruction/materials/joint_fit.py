@@ -289,7 +289,7 @@ class LightFinder:
         sunny = fit_light(lit, settings, seed, self.sky, begin)
         gain = 1 - search.loss(sunny, lit) / search.loss(soft, points)
         log.info("a sun explains %.1f %% of the differences between neighbours", 100 * gain)
-        if gain < max(self.prior.sun, _CHANCE / np.sqrt(len(kept))):
+        if gain < max(self.prior.sun, _CHANCE / np.sqrt(kept.sum())):
             return soft, None
         return sunny, Sun(direction, width, sunny.sun)
 
