@@ -61,6 +61,10 @@ class History:
     def undo(self) -> None:
         """Take the last edit back."""
 
+        if not self._wished().edits:
+            self._list.content = "*no edit to undo; light and view are none*"
+            return
+
         def without(edits: tuple[Edit, ...]) -> tuple[Edit, ...]:
             self._undone.extend(edits[-1:])
             return edits[:-1]
@@ -79,7 +83,8 @@ class History:
     def list(self) -> None:
         """Show the last edits of the wish."""
         shown = [f"{n}. {_said(each)}" for n, each in enumerate(self._wished().edits, 1)]
-        self._list.content = "\n".join(shown[-LISTED:]) if shown else "*none*"
+        more = ["…"] if len(shown) > LISTED else []
+        self._list.content = "\n\n".join([*more, *shown[-LISTED:]]) if shown else "*none*"
 
     def _set(self, by: Callable[[tuple[Edit, ...]], tuple[Edit, ...]]) -> None:
         """Change the edits; clicks are of the scene before."""

@@ -127,7 +127,8 @@ class Objects:
         self._place(state)
 
     def _list(self, counts: dict[int, int]) -> None:
-        labels = {f"{number} · {count:,} surfels": number for number, count in counts.items()}
+        hidden = dict.fromkeys(self._wished().hidden, " · hidden")
+        labels = {f"{n} · {count:,} surfels{hidden.get(n, '')}": n for n, count in counts.items()}
         if labels == self.numbers:
             return
         self.numbers = labels
@@ -160,6 +161,7 @@ class Objects:
             self._change(
                 lambda wish: replace(wish, hidden=wish.hidden - {chosen} if show else wish.hidden | {chosen})
             )
+            self.follow()
 
     def _mark(self, state: _State | None) -> None:
         """The box, over the picture: it knows no depth."""
@@ -184,7 +186,7 @@ class Objects:
             return
         turn, place = state.turn, state.turn.T @ state.centre
         gizmo = self._scene.add_transform_controls(
-            "/move", scale=max(0.6 * float((state.high - state.low).max()), 1e-6), depth_test=False,
+            "/move", scale=max(0.35 * float((state.high - state.low).max()), 1e-6), depth_test=False,
             disable_sliders=True, position=tuple(state.centre), line_width=3.0,
         )  # fmt: skip
         drag = f"move {self.chosen} {next(self._drags)}"

@@ -24,6 +24,7 @@ from tron.io.images import write_image
 from tron.storage import write_atomic
 from tron.trajectories import turn_cameras
 from tron.view.filming import FRAMES_PER_SECOND, Filming
+from tron.view.stage import Wish
 from tron.view.studio import Picture, Studio
 
 log = logging.getLogger(__name__)
@@ -43,7 +44,7 @@ class Saving:
         filming: the path that was kept.
         studio: gives the studio, once it is there.
         look: the camera of a client, +z up; None: not yet known.
-        picture: the client's picture of the wish of the moment at rest, which it waits for.
+        picture: the client's picture of the wish and the view of the moment, which it waits for.
         say: a line for the user about what cannot be done.
     """
 
@@ -57,7 +58,7 @@ class Saving:
         filming: Filming,
         studio: Callable[[], Studio],
         look: Callable[[viser.ClientHandle], Camera | None],
-        picture: Callable[[int], Picture],
+        picture: Callable[[viser.ClientHandle], Picture],
         say: Callable[[str], None],
     ) -> None:
         self._folder, self._file, self._offset = folder.absolute(), file.absolute(), offset
@@ -73,15 +74,18 @@ class Saving:
 
     def save(self, what: str, client: viser.ClientHandle) -> None:
         """Save "Picture", "Scene" or "Film", as it is after the wish of the moment."""
-        self._tell(f"{what.lower()}: waits until the picture shows what the panel says")
+        wish = self._studio().wished
+        self._tell(
+            f"{what.lower()}: waits until {'the picture is' if what == 'Picture' else 'edits are'} done"
+        )
         try:
             with self._one:
                 if what == "Picture":
-                    told = str(self._save_picture(self._picture(client.client_id)))
+                    told = str(self._save_picture(self._picture(client)))
                 elif what == "Scene":
-                    told = "\n".join(map(str, self._save_scene()))
+                    told = "\n".join(map(str, self._save_scene(wish)))
                 else:
-                    told = self._film(client)
+                    told = self._film(wish, client)
         except CancelledError:  # the window closes
             return
         except (TronError, OSError) as error:
@@ -105,9 +109,11 @@ class Saving:
         write_image(path, picture.image)
         return path
 
-    def _save_scene(self) -> list[Path]:
-        """The scene of the moment, and the edits that made it where there are any."""
-        scene, edits = self._studio().ask(lambda stage: (stage.session.scene, stage.session.edits)).result()
+    def _save_scene(self, wish: Wish, hidden: frozenset[int] = frozenset()) -> list[Path]:
+        """The scene of a wish without what is hidden, and the edits that made it where there are any."""
+        scene, edits = self._studio().ask(lambda stage: (stage.without(hidden), stage.session.edits)).result()
+        if tuple(edits.edits) != wish.edits:
+            raise TronError("the edits have changed while it waited", mend="press it again")
         path = self.path("scene", ".ply")
         scene.save(path)
         if not edits.edits:
@@ -116,17 +122,17 @@ class Saving:
         edits.write(listed)
         return [path, listed]
 
-    def _film(self, client: viser.ClientHandle) -> str:
+    def _film(self, wish: Wish, client: viser.ClientHandle) -> str:
         """Save what tron-relight needs to film the path, or the view; its command line."""
         studio, scene, path = self._studio(), self._file, self._filming.path()
-        wish, camera = studio.wished, self._look(client)
+        camera = self._look(client)
         turn, exposure = studio.ask(
             lambda stage: (stage.turn, stage.exposure(wish.light, wish.stops))
         ).result()
         if camera is None and not path:
             raise TronError("the view is not known yet")
-        if wish.edits:
-            scene = self._save_scene()[0]
+        if wish.edits or wish.hidden:
+            scene = self._save_scene(wish, wish.hidden)[0]
         file = self.path("path" if path else "view", ".json")
         cameras = turn_cameras(path or [camera], turn.T)  # pyright: ignore[reportArgumentType]
         content = {"offset": self._offset.tolist(), "cameras": [each.to_dict() for each in cameras]}

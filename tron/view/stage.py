@@ -351,6 +351,12 @@ class Stage:
             self.session.do(edit)
         return self._visible(wish.hidden).upright
 
+    def without(self, hidden: frozenset[int]) -> GaussianScene:
+        """The scene after all edits, without some objects, in the frame of its file."""
+        scene = self.session.scene
+        which = np.isin(scene.object_id, list(hidden))
+        return removed(scene, which) if which.any() else scene
+
     def _visible(self, hidden: frozenset[int]) -> _Visible:
         scene, shown = self.session.scene, self._shown
         if shown is None or shown.scene is not scene or shown.hidden != hidden:
@@ -371,6 +377,8 @@ class Stage:
             self._relighter, self._fresh = self._base, True
         elif stays and (rough or self._fresh) and scene is not self._relighter.scene:
             self._relighter = self._relighter.changed(scene)
+        elif rough and self._base.proxy is not None:
+            pass  # what moves in a scan does so once the hand rests: its proxy takes seconds
         elif rough and len(scene) == len(self._relighter.scene):
             self._relighter, self._fresh = self._relighter.changed(scene, quick=True), False
         else:

@@ -34,7 +34,7 @@ from tron.view.objects import Objects
 from tron.view.saving import Saving
 from tron.view.scripts import divider, folded_on_phones, panorama
 from tron.view.stage import BUFFERS, Left, Quality
-from tron.view.studio import Picture, Studio
+from tron.view.studio import WORKING, Picture, Studio
 
 log = logging.getLogger(__name__)
 
@@ -132,6 +132,7 @@ class Window:
         self._sizes: dict[int, tuple[int, int]] = {}
         self._last: dict[int, Picture] = {}
         self._pictures = threading.Condition()
+        self._about, self._shape = "reading the scene", (home.width, home.height)
         with redirect_stdout(io.StringIO()):  # viser's banner
             self._server = viser.ViserServer(host=host, port=port, label="TRON", verbose=False)
         # A client may ask for a tunnel through viser's own host, button or not: nobody listens from outside.
@@ -297,14 +298,21 @@ class Window:
 
     def _greet(self, client: viser.ClientHandle) -> None:
         bar = client.gui.add_progress_bar(0, order=-2, color=BRAND)
-        words = client.gui.add_markdown("reading the scene", order=-1)
+        words = client.gui.add_markdown(self._about, order=-1)
         self._of_client[client.client_id] = bar, words
         client.camera.on_update(lambda _: self._look(client))
         with self._pictures:
             others = list(self._last.values())
-        if others:  # its own may have to wait for an edit
-            words.content = "working: the picture is another window's"
-            client.scene.set_background_image(others[-1].image, format="jpeg", jpeg_quality=QUALITY[False])
+        size = _size_of(client.camera)
+        if (
+            size is not None and size[0] * self._shape[1] < size[1] * self._shape[0]
+        ):  # what was at the sides stays
+            wide = np.tan(client.camera.fov / 2) * self._shape[0] / self._shape[1] * size[1] / size[0]
+            client.camera.fov = float(2 * np.arctan(wide))
+        if others and size is not None:  # its own may have to wait for an edit
+            words.content = f"{WORKING}: the picture is another window's"
+            image = _cropped(others[-1].image, size[0] / size[1])
+            client.scene.set_background_image(image, format="jpeg", jpeg_quality=QUALITY[False])
         self._look(client)
 
     def _look(self, client: viser.ClientHandle) -> None:
@@ -338,8 +346,9 @@ class Window:
         self._sizes.pop(number, None)
 
     def _busy(self, about: str, share: float) -> None:
+        self._about = about + (f" · {share:.0%}" if share else "")
         for bar, words in list(self._of_client.values()):
-            bar.value, words.content = 100 * share, about + (f" · {share:.0%}" if share else "")
+            bar.value, words.content = 100 * share, self._about
 
     def _show(self, number: int, picture: Picture) -> None:
         client = self._server.get_clients().get(number)
@@ -359,19 +368,20 @@ class Window:
             bar, words = self._of_client[number]
             bar.value = 100 * picture.refined
             height, width = picture.image.shape[:2]
-            state = "moving" if moving else "done" if picture.refined == 1 else "refining"
-            words.content = f"{state} · {width} × {height} · {picture.seconds:.2f} s"
+            state = f"moving · {picture.seconds:.2f} s" if moving else "refining"
+            words.content = f"{'done' if picture.refined == 1 else state} · {width} × {height}"
         client.flush()
         if first:
             threading.Thread(target=self._show_map, daemon=True).start()
 
-    def _picture_of(self, number: int) -> Picture:
-        """A client's picture of the wish of the moment at rest, once it is there."""
+    def _picture_of(self, client: viser.ClientHandle) -> Picture:
+        """A client's picture of the wish and the view of the moment, once nothing is left to refine."""
+        number = client.client_id
 
         def there() -> bool:
-            picture = self._last.get(number)
-            at_rest = picture is not None and picture.refined > 0 and picture.wish == self.studio.wished
-            return self._closed or number not in self._of_client or at_rest
+            picture, now = self._last.get(number), (self.studio.wished, self._seen_by(client))
+            done = picture is not None and picture.refined == 1 and (picture.wish, picture.camera) == now
+            return self._closed or number not in self._of_client or done
 
         with self._pictures:
             while not self._pictures.wait_for(there, timeout=1.0):  # a wish may be taken back
@@ -402,6 +412,14 @@ def _size_of(handle: viser.CameraHandle) -> tuple[int, int] | None:
     except (AssertionError, AttributeError):
         return None
     return (wide, high) if wide and high else None
+
+
+def _cropped(image: np.ndarray, aspect: float) -> np.ndarray:
+    """The middle of an image, width over height."""
+    height, width = image.shape[:2]
+    wide, high = min(width, round(height * aspect)), min(height, round(width / aspect))
+    x, y = (width - wide) // 2, (height - high) // 2
+    return image[y : y + high, x : x + wide]
 
 
 def _camera_of(handle: viser.CameraHandle, size: tuple[int, int]) -> Camera | None:
