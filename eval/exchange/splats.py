@@ -369,7 +369,7 @@ def _measure_world(world: Baked, programs: Mapping[str, Reader], found: Splats, 
         shown.append((title, *trip.views, trip.psnr[0]))
     file = folder / "rasterised.ply"
     write_splats(file, world.scene)
-    drawn = [averaged(np.clip(rasterise(file, _fine(c)), 0, 1), FINENESS) for c in world.cameras]
+    drawn = [averaged(np.clip(rasterise(file, _fine(c))[0], 0, 1), FINENESS) for c in world.cameras]
     other = [Drawn(image, view.opacity) for image, view in zip(drawn, plain)]
     found.rasteriser[world.name] = alike(other, plain)
     found.rasteriser_scene[world.name] = alike(other, own)

@@ -17,7 +17,7 @@ import io
 import logging
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,7 @@ from tron.gaussians.formats.registry import FORMATS, Format
 from tron.gaussians.formats.splats import Splats
 from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
 from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS, Packing, packing, unpacked
+from tron.gaussians.projections import DISKS, FILTER, PROJECTIONS, stated_projection
 from tron.io.local_frame import local_origin, said
 from tron.storage import atomic_path
 
@@ -53,7 +54,6 @@ log = logging.getLogger(__name__)
 NORMAL = ("nx", "ny", "nz")
 REST = tuple(f"f_rest_{i}" for i in range(3 * (SH_COUNT - 1)))
 THIRD_SCALE = "scale_2"
-FILTER = "filter_3D"
 MATERIAL_PROPERTIES = tuple(name for material in MATERIALS for name in FIELDS[material].properties)
 REQUIRED = tuple(
     name
@@ -70,6 +70,7 @@ GUESSED_METALLIC = 0.0
 GUESSED_UP = (0.0, -1.0, 0.0)
 
 _HEADER_LIMIT = 1 << 16
+_PROJECTION = "tron projection "
 _VISIBLE = 1 / 255
 """Opacity below which a splat is not drawn (conventions.md, 6)."""
 _COARSE = 0.25
@@ -190,7 +191,7 @@ def read_splats(path: str | Path) -> dict[str, Any]:
     quats, log_scales = flattened(field("quats"), stack(scales))
     sh = _harmonics(columns, stack, path)
     guessed = MATERIAL_PROPERTIES[0] not in columns
-    stated = constants.get("up", up)
+    stated, oriented = constants.get("up", up), bool(constants.get("oriented", [0])[0])
     return {
         "means": means,
         "quats": quats,
@@ -206,8 +207,9 @@ def read_splats(path: str | Path) -> dict[str, Any]:
         "up": np.array(GUESSED_UP if stated is None else stated),
         "up_guessed": stated is None or bool(constants.get("up_guessed", [0])[0]),
         "materials_guessed": guessed or bool(constants.get("materials_guessed", [0])[0]),
-        "oriented": bool(constants.get("oriented", [0])[0]),
+        "oriented": oriented,
         "offset": np.array(offset),
+        "projection": _projection(columns, comments, bool(constants), oriented, path),
     }
 
 
@@ -313,6 +315,7 @@ def _about_local_origin(columns: Mapping[str, np.ndarray], path: Path) -> tuple[
 def _constants(scene: Mapping[str, Any]) -> list[str]:
     return [
         *(["tron up_guessed 1"] if scene["up_guessed"] else []),
+        f"{_PROJECTION}{scene['projection']}",
         f"tron kernel_degree {scene['kernel_degree']}",
         f"tron spacing {scene['spacing']!r}",
         f"tron up {' '.join(repr(float(v)) for v in scene['up'])}",
@@ -327,7 +330,7 @@ def _read_constants(comments: list[str], path: Path) -> dict[str, list[float]]:
     constants = {}
     for comment in comments:
         words = comment.split()
-        if len(words) < 3 or words[0] != "tron":
+        if len(words) < 3 or words[0] != "tron" or comment.startswith(_PROJECTION):
             continue
         try:
             values = [float(word) for word in words[2:]]
@@ -339,6 +342,20 @@ def _read_constants(comments: list[str], path: Path) -> dict[str, list[float]]:
             raise TronError(f"comment '{comment[:60]}' does not hold three numbers", path)
         constants[words[1]] = values
     return constants
+
+
+def _projection(
+    properties: Collection[str], comments: Sequence[str], ours: bool, oriented: bool, path: Path
+) -> str:
+    """By what the file says; TRON's files before they said it were scans where normals have no sign."""
+    said = [comment[len(_PROJECTION) :].strip() for comment in comments if comment.startswith(_PROJECTION)]
+    if said:
+        if said[-1] not in PROJECTIONS:
+            raise TronError(
+                f"comment '{_PROJECTION}{said[-1][:40]}' names none", path, f"use {', '.join(PROJECTIONS)}"
+            )
+        return said[-1]
+    return DISKS if ours and oriented else stated_projection(properties, comments, path)
 
 
 def _check_sizes(head: bytes, size: int, path: Path) -> None:

@@ -1,0 +1,74 @@
+"""How the program that a scan's splats were learnt with shows them to a camera.
+
+A splat was optimised as a projection that is never thinner than a pixel. As a disk in space, what is thin and
+seen edge on is gone. With ``S`` the covariance of a projection, in square pixels, and ``v`` the variance of
+the pixel's filter,
+
+    S' = S + v I,     opacity' = opacity sqrt(det S / det S') where compensated, else opacity
+
+(Kerbl et al. 2023, its reference code, whose ``--antialiasing`` compensates; Yu et al. 2024, section 4.2).
+"""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+FILTER = "filter_3D"
+"""Property of Mip-Splatting's files."""
+
+
+class Projection(NamedTuple):
+    """A pixel's low-pass filter over projected splats.
+
+    Attributes:
+        variance: added to every projected covariance, square pixels.
+        compensated: whether opacity is lowered so that a splat keeps its integral.
+    """
+
+    variance: float
+    compensated: bool
+
+
+DISKS = "disks"
+PROJECTIONS: dict[str, Projection | None] = {
+    DISKS: None,
+    "3dgs": Projection(0.3, False),
+    "antialiased": Projection(0.3, True),
+    "mip": Projection(0.1, True),
+}
+"""By name, as scenes have it; surfels of our own are disks in space to cameras as to all other rays."""
+
+
+def stated_projection(properties: Collection[str], comments: Sequence[str], path: Path) -> str:
+    """The name of how a file of another program is to be projected, by what it says; "3dgs" if nothing.
+
+    Mip-Splatting's files have its ``filter_3D``, Brush's say ``SplatRenderMode: mip``, those of .spz have a
+    flag for splats that were learnt antialiased.
+
+    Args:
+        properties: names of the vertex element's properties. comments: of the header.
+        path: the file.
+    """
+    modes = [
+        comment.lower().split()[1:] for comment in comments if comment.lower().startswith("splatrendermode:")
+    ]
+    if FILTER in properties or ["mip"] in modes:
+        return "mip"
+    return "antialiased" if path.suffix.lower() == ".spz" and _learnt_antialiased(path) else "3dgs"
+
+
+_SPZ = struct.Struct("<IIIBBB")
+"""Magic, version, splats, degree of harmonics, fractional bits of places, flags."""
+_ANTIALIASED = 1
+
+
+def _learnt_antialiased(path: Path) -> bool:
+    with path.open("rb") as file:
+        packed = file.read(2) == b"\x1f\x8b"
+    with gzip.open(path) if packed else path.open("rb") as file:
+        head = file.read(_SPZ.size)
+    return len(head) == _SPZ.size and bool(_SPZ.unpack(head)[5] & _ANTIALIASED)
