@@ -40,6 +40,7 @@ from tron.gaussians.fields import FIELDS
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.gaussians.neighbours import alike_neighbours
 from tron.gaussians.ply import header_comments, write_ply
+from tron.gaussians.projections import DISKS
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.runtime import aligned
 from tron.tracing import GBuffer, SurfelTracer
@@ -97,7 +98,7 @@ class Proxy:
         """Read :meth:`save`'s file; None where there is none, or one that was made from something else."""
         comments = header_comments(path)
         voxels = [said.split()[2] for said in comments if said.startswith("tron voxel ")]
-        if f"proxy {made_from}" not in comments or not voxels:
+        if not made_as_now(path, comments, f"proxy {made_from}") or not voxels:
             return None
         try:
             return cls(GaussianScene.load(path), float(voxels[0]))
@@ -105,12 +106,21 @@ class Proxy:
             return None
 
 
+def made_as_now(path: Path, comments: Sequence[str], said: str) -> bool:
+    """Whether the comments of a file that is kept say what it would be made from now; a line if others do."""
+    kind = said.split()[0]
+    if said not in comments and any(comment.startswith(f"{kind} ") for comment in comments):
+        log.info("%s was made of another scan, or as another version does it: it is made anew", path)
+    return said in comments
+
+
 def fingerprint(scene: GaussianScene, cameras: Sequence[Camera] | None) -> str:
     """Hexadecimal digest of all that a proxy is made from."""
     digest = hashlib.sha256(_MADE.encode())
     for name in FIELDS:
         digest.update(np.ascontiguousarray(getattr(scene, name)).tobytes())
-    digest.update(repr((scene.kernel_degree, scene.oriented, scene.up.tolist())).encode())
+    seen = () if scene.projection == DISKS else (scene.projection,)
+    digest.update(repr((scene.kernel_degree, scene.oriented, scene.up.tolist(), *seen)).encode())
     for camera in cameras or ():
         digest.update(repr(camera.to_dict()).encode())
     return digest.hexdigest()

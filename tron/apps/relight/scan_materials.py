@@ -71,7 +71,9 @@ def with_materials(
 
 
 def _kept(path: Path, made_from: str, count: int) -> GaussianScene | None:
-    if f"materials {made_from}" not in header_comments(path):
+    from tron.relighting.proxy import made_as_now
+
+    if not made_as_now(path, header_comments(path), f"materials {made_from}"):
         return None
     try:
         scene = GaussianScene.load(path)
