@@ -8,6 +8,7 @@ it ends at zero: ``(exp(-q / 2) - exp(-4)) / (1 - exp(-4))``. Against its pictur
 
 from __future__ import annotations
 
+import importlib.util
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -73,6 +74,8 @@ def lacking(engine: Path | None) -> str | None:
     """Why the engine cannot draw here; None where it can."""
     if engine is None or not (engine / "build" / "playcanvas.mjs").is_file():
         return f"PlayCanvas' engine is not there: {INSTALL}"
+    if importlib.util.find_spec("playwright") is None:
+        return "playwright is not installed: pip install playwright"
     return None if shutil.which("chromium") else "Chromium is not there: apt-get install chromium"
 
 

@@ -134,6 +134,11 @@ def test_a_file_says_how_it_is_projected(tmp_path, properties, comments, name):
     assert GaussianScene.load(write(tmp_path / "a.ply", columns, comments)).projection == name
 
 
+def test_splats_of_two_scales_are_disks(tmp_path):
+    columns = {name: values for name, values in splats().items() if name != "scale_2"}
+    assert GaussianScene.load(write(tmp_path / "a.ply", columns)).projection == "disks"
+
+
 def test_a_projection_that_is_not_known_is_refused(tmp_path):
     path = write(tmp_path / "a.ply", splats(), ["tron projection fisheye"])
     with pytest.raises(TronError, match=r"projection fisheye.*disks, 3dgs"):

@@ -46,6 +46,8 @@ PROJECTIONS: dict[str, Projection | None] = {
 def stated_projection(properties: Collection[str], comments: Sequence[str], path: Path) -> str:
     """The name of how a file of another program is to be projected, by what it says; "3dgs" if nothing.
 
+    Splats of two scales are 2DGS's, which draws them as disks in space (without its low-pass filter, here).
+
     Mip-Splatting's files have its ``filter_3D``, Brush's say ``SplatRenderMode: mip``, those of .spz have a
     flag for splats that were learnt antialiased.
 
@@ -56,6 +58,8 @@ def stated_projection(properties: Collection[str], comments: Sequence[str], path
     modes = [
         comment.lower().split()[1:] for comment in comments if comment.lower().startswith("splatrendermode:")
     ]
+    if "scale_2" not in properties:
+        return DISKS
     if FILTER in properties or ["mip"] in modes:
         return "mip"
     return "antialiased" if path.suffix.lower() == ".spz" and _learnt_antialiased(path) else "3dgs"
