@@ -116,7 +116,11 @@ def _judged(name: str, kind: str, own: GaussianScene, light: str, number: int, s
         for camera, frame in zip(cameras, frames):
             truth, filled = to_display(frame.lit, exposure), frame.mask > FILLED
             fine = camera.resized(FINENESS * SIDE, FINENESS * SIDE)
-            drawn = [_harmonics(relit, fine), _harmonics(plain, fine), np.clip(rasterise(file, fine), 0, 1)]
+            drawn = [
+                _harmonics(relit, fine),
+                _harmonics(plain, fine),
+                np.clip(rasterise(file, fine)[0], 0, 1),
+            ]
             images = [_coarse(image) for image in drawn]
             for way, image in zip(DRAWN, images, strict=True):
                 found.psnr[way].append(capped_psnr(image, truth, filled))

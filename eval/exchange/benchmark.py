@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -12,8 +13,9 @@ from eval.benchmark import Benchmark
 from eval.report.outcome import Outcome
 from eval.stages import Stages, script_path
 from tron.errors import TronError
+from tron.gaussians.ply import check_header
 
-Part = Literal["splats", "mesh"]
+Part = Literal["splats", "mesh", "viewer"]
 
 
 class Exchange(Benchmark):
@@ -39,6 +41,17 @@ class Exchange(Benchmark):
     width: PositiveInt = Field(default=256, description="of the square views of the mesh")
     paths: PositiveInt = Field(default=144, description="of a pixel of the mesh, by Cycles and by Mitsuba")
     texture: int = Field(default=2048, ge=64, le=8192, description="pixels of a side of the mesh's textures")
+    scans: list[Path] | None = Field(
+        default=None, description="plain 3DGS PLYs that viewers show; null: biker and guitar of real_data"
+    )
+    scan_views: int = Field(default=8, ge=2, description="of each scan")
+    scan_sides: list[PositiveInt] = Field(
+        default=[384, 512, 1024], min_length=1, description="of these views"
+    )
+    playcanvas: Path | None = Field(
+        default=None,
+        description="node_modules/playcanvas, the npm package; null: no picture of a real viewer",
+    )
 
     def check(self) -> None:
         """Find the programs that are given."""
@@ -53,6 +66,32 @@ class Exchange(Benchmark):
                 raise TronError("no such folder", self.real_data, "give benchmark.real_data, or null")
             if self.blender_python is not None:
                 blender_version(self.blender_python)
+        for scan in self._scans() if "viewer" in self.parts else []:
+            check_header(scan)
+
+    def _scans(self) -> list[Path]:
+        if self.scans is not None:
+            return self.scans
+        found = [] if self.real_data is None else sorted((self.real_data / "splats").glob("*.ply"))
+        return [path for path in found if ".compressed" not in path.name]
+
+    def _measure_viewer(self, outcome: Outcome) -> None:
+        from eval.exchange.playcanvas import lacking
+        from eval.exchange.splats import Baked
+        from eval.exchange.viewer import measure_viewer
+
+        why = lacking(self.playcanvas)
+        if why is not None:
+            outcome.lack("viewer.playcanvas.behind", why)
+        engine = self.playcanvas if why is None else None
+        if not self._scans():
+            outcome.lack("viewer.psnr", "no scan: give benchmark.scans, or benchmark.real_data")
+        world = Baked.drawn(0, self.surfels, self.seed)
+        with tempfile.TemporaryDirectory(prefix="tron-") as folder:
+            measure_viewer(
+                self._scans(), world, self.scan_views, self.scan_sides, engine, Path(folder), self.seed,
+                outcome,
+            )  # fmt: skip
 
     def run(self, output_dir: Path) -> Outcome:
         """Measure part after part; one line on stderr for each figure.
@@ -81,6 +120,8 @@ class Exchange(Benchmark):
                         outcome.inputs["splat_transform"] = splat_transform_version(program)
                     readers = find_readers(program)
                     measure_splats(self.worlds, self.surfels, self.seed, readers, outcome)
+                elif part == "viewer":
+                    self._measure_viewer(outcome)
                 else:
                     if self.blender_python is not None:
                         outcome.inputs["blender"] = blender_version(self.blender_python)

@@ -151,7 +151,12 @@ class Baked:
         scene = baked(relighter.under(world.light), world.light.exposure(), "none")
         rng = generator(seed, "exchange", number, "views")
         cameras = [view_of(rng, SIDE, SIDE) for _ in range(VIEWS)]
-        return cls(f"world_{number}", scene, replace(with_kernel(scene, 2), oriented=False), cameras)
+        return cls(
+            f"world_{number}",
+            scene,
+            replace(with_kernel(scene, 2), oriented=False, projection="3dgs"),
+            cameras,
+        )
 
     def standing(self) -> Baked:
         """The world in the frame of files that are y up: splats of one height are sorted otherwise there."""
@@ -340,7 +345,7 @@ def measure_splats(
 
 def _measure_world(world: Baked, programs: Mapping[str, Reader], found: Splats, folder: Path) -> None:
     own, plain = draw(world.scene, world.cameras), draw(world.plain, world.cameras)
-    kernel = draw(replace(world.plain, oriented=world.scene.oriented), world.cameras)
+    kernel = draw(with_kernel(world.scene, 2), world.cameras)
     found.degree2[world.name], found.both_sides[world.name] = alike(kernel, own), alike(plain, kernel)
     standing = world.standing()
     stood_plain, stood_own = (draw(each, standing.cameras) for each in (standing.plain, standing.scene))
@@ -369,7 +374,7 @@ def _measure_world(world: Baked, programs: Mapping[str, Reader], found: Splats, 
         shown.append((title, *trip.views, trip.psnr[0]))
     file = folder / "rasterised.ply"
     write_splats(file, world.scene)
-    drawn = [averaged(np.clip(rasterise(file, _fine(c)), 0, 1), FINENESS) for c in world.cameras]
+    drawn = [averaged(np.clip(rasterise(file, _fine(c))[0], 0, 1), FINENESS) for c in world.cameras]
     other = [Drawn(image, view.opacity) for image, view in zip(drawn, plain)]
     found.rasteriser[world.name] = alike(other, plain)
     found.rasteriser_scene[world.name] = alike(other, own)

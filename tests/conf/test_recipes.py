@@ -112,6 +112,7 @@ PAPER = {
         "look": "none",
         "ground": "none",
         "proxy": "never",
+        "projection": "disks",
     },
     "datagen": {"estimator": "plain", "two_sided": False, "diffuse": "lambert", "bounces": 0},
     "reconstruct": {

@@ -13,7 +13,10 @@ from eval.cli import cli
 from eval.exchange import readers, splats
 from eval.exchange.blender import Seen, lat_long
 from eval.exchange.mesh import FILLED, METRICS, View, mesh_rows, true_maps
+from eval.exchange.playcanvas import lacking
 from eval.exchange.splats import FORMATS, Baked, alike, draw, equal_share, exchange, find_readers
+from eval.exchange.viewer import measure_viewer
+from eval.report.outcome import Outcome
 from eval.results import Results
 from tron.cameras import Camera
 from tron.errors import TronError
@@ -122,6 +125,24 @@ def test_blenders_pictures_of_light_look_along_x():
         assert abs(columns.mean() - column) < 2.5
 
 
+def test_a_scan_is_seen_as_viewers_show_it_and_not_as_disks(world, tmp_path: Path):
+    write_splats(tmp_path / "little-scan.ply", world.plain)
+    outcome = Outcome(tmp_path)
+    measure_viewer([tmp_path / "little-scan.ply"], world, 2, [40, 56], None, tmp_path, 0, outcome)
+    rows = {row.metric: row for row in outcome.rows}
+    assert rows["viewer.worst"].value > 40 > rows["viewer.disks_psnr"].value
+    assert rows["viewer.psnr"].value == pytest.approx(rows["viewer.little_scan.psnr"].value)
+    assert rows["viewer.psnr"].n == 4
+    assert rows["viewer.worst"].value <= rows["viewer.little_scan.psnr"].value
+    assert min(rows[f"viewer.harmonics_{degree}.psnr"].value for degree in (1, 2, 3)) > 40
+    assert (tmp_path / "pictures" / "viewer.png").is_file()
+
+
+@pytest.mark.parametrize(("engine", "words"), [(None, "npm install playcanvas"), (Path("no"), "npm install")])
+def test_a_viewer_that_is_not_there_is_named_with_how_to_get_it(engine, words):
+    assert words in (lacking(engine) or "")
+
+
 def square(tilt: float = 0.0) -> Part:
     """Before a camera at -y: one side is red, in a mesh of two triangles."""
     corners = np.array([[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])
@@ -170,6 +191,8 @@ def test_the_whole_benchmark_runs_and_names_what_is_absent(tmp_path: Path, monke
     monkeypatch.setattr(splats, "VIEWS", 1)
     monkeypatch.setattr(splats, "ROUNDS", 1)
     toy = ["worlds=1", "surfels=1500", "mesh_surfels=3000", "views=1", "width=48", "paths=4", "texture=128"]
+    write_splats(tmp_path / "scan.ply", Baked.drawn(1, 1500, 9).plain)
+    toy += [f"scans=[{tmp_path / 'scan.ply'}]", "scan_views=2", "scan_sides=[40]"]
     toy += [f"real_data={shared_data}", "seed=9"] + ([f"blender_python={BLENDER}"] if BLENDER else [])
     out = tmp_path / "out"
     assert run(*(f"benchmark.{each}" for each in toy), f"output_dir={out}") == 0
@@ -177,7 +200,7 @@ def test_the_whole_benchmark_runs_and_names_what_is_absent(tmp_path: Path, monke
     measured = {row.metric for row in results.rows}
     absent = {target.metric for target in results.targets} - measured
     program = readers.find_splat_transform(None)
-    expected = set() if BLENDER else set(METRICS)
+    expected = {"viewer.playcanvas.behind"} | (set() if BLENDER else set(METRICS))
     if program is None:
         expected |= {f"format.{name}" for name in ("ply.psnr", "ply.bit_equal", "spz.psnr", "sog.psnr")}
     assert absent == expected

@@ -11,6 +11,7 @@ from tron.errors import TronError
 from tron.gaussians.foreign_files import smoothed, stated_up
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
+from tron.gaussians.splat_files import write_splats
 from tron.seeds import generator
 
 COUNT = 40
@@ -103,7 +104,8 @@ def test_mip_splatting_is_read_with_its_filter(tmp_path, caplog):
         (["sg_axis_count", "sg_sharp_0"], [], "sg_axis_count and 1 more (colours by spherical Gaussians)"),
         (["sb_params_0"], [], "sb_params_0 (colours by spherical Beta"),
         (["trbf_center", "motion_0", "omega_0"], [], "trbf_center and 2 more (splats that move"),
-        ([], ["SplatRenderMode: mip"], "SplatRenderMode: mip"),
+        ([], ["SplatRenderMode: beta"], "SplatRenderMode: beta"),
+        ([], ["SplatRenderMode: mip"], None),
         ([], ["SplatRenderMode: default"], None),
         (["segment", "red", "nx"], [], None),
     ],
@@ -113,6 +115,43 @@ def test_what_changes_the_kernel_is_named_in_a_line(tmp_path, caplog, properties
     GaussianScene.load(write(tmp_path / "a.ply", splats(**extra), comments))
     assert len(caplog.messages) == (words is not None)
     assert words is None or words in caplog.messages[0]
+
+
+@pytest.mark.parametrize(
+    ("properties", "comments", "name"),
+    [
+        ([], [], "3dgs"),
+        ([], ["SplatRenderMode: default"], "3dgs"),
+        ([], ["SplatRenderMode: mip"], "mip"),
+        (["filter_3D"], [], "mip"),
+        ([], ["tron spacing 0.1", "tron oriented 0"], "3dgs"),  # TRON's own, before they said it
+        ([], ["tron spacing 0.1", "tron oriented 1"], "disks"),
+        ([], ["tron spacing 0.1", "tron projection antialiased"], "antialiased"),
+    ],
+)
+def test_a_file_says_how_it_is_projected(tmp_path, properties, comments, name):
+    columns = splats(**{each: np.full(COUNT, 0.01) for each in properties})
+    assert GaussianScene.load(write(tmp_path / "a.ply", columns, comments)).projection == name
+
+
+def test_splats_of_two_scales_are_disks(tmp_path):
+    columns = {name: values for name, values in splats().items() if name != "scale_2"}
+    assert GaussianScene.load(write(tmp_path / "a.ply", columns)).projection == "disks"
+
+
+def test_a_projection_that_is_not_known_is_refused(tmp_path):
+    path = write(tmp_path / "a.ply", splats(), ["tron projection fisheye"])
+    with pytest.raises(TronError, match=r"projection fisheye.*disks, 3dgs"):
+        GaussianScene.load(path)
+
+
+def test_spz_says_whether_it_was_learnt_antialiased(tmp_path):
+    write_splats(tmp_path / "a.spz", GaussianScene.load(write(tmp_path / "a.ply", splats())))
+    assert GaussianScene.load(tmp_path / "a.spz").projection == "3dgs"
+    plain = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
+    plain[14] |= 1  # flags, https://github.com/nianticlabs/spz
+    (tmp_path / "b.spz").write_bytes(gzip.compress(bytes(plain)))
+    assert GaussianScene.load(tmp_path / "b.spz").projection == "antialiased"
 
 
 def test_beta_splats_without_harmonics_say_what_they_are(tmp_path):

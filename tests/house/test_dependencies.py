@@ -74,6 +74,7 @@ PEERS = set().union(
 )
 PEERS |= names(EXTRAS["view"]) - names(EXTRAS["relight"])
 PEERS |= {"bpy"}  # imported by the script that Blender's own Python runs
+PEERS |= {"playwright"}  # by `benchmark=exchange`, where PlayCanvas' engine is given
 MESHES = names(EXTRAS["models"]) - names(EXTRAS["datagen"])
 PEERS |= MESHES
 # Networks are loaded where a checkpoint is given; the extras `network` and `rgbx` are asked for then.

@@ -14,7 +14,7 @@ from tron.apps.capture_light import over_scene
 from tron.apps.machine import Threads, Variant
 from tron.apps.relight.camera_files import filmed_orbit, filmed_with
 from tron.apps.relight.scan_materials import proxy_file, with_materials
-from tron.apps.scene_file import Up, check_scene_files, load_scene
+from tron.apps.scene_file import SeenAs, Up, check_scene_files, load_scene
 from tron.apps.splat_file import SceneFile
 from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
 from tron.cameras import Camera
@@ -62,6 +62,7 @@ class Settings(BaseModel):
     proxy: Literal["auto", "always", "never"] = Field(
         "auto", description="what light sees of a scan, as of tron-relight"
     )
+    projection: SeenAs = "auto"
     materials: Literal["auto", "as_is"] = Field(
         "auto", description="of a scan without any, as of tron-relight: found and kept, or guessed"
     )
@@ -88,7 +89,7 @@ def main(settings: Settings) -> None:
     with working("reading the light and the scene"):
         environment = EnvironmentMap.load(settings.environment)
         activate(settings.variant, settings.threads)
-        scene = load_scene(settings.scene, settings.up, settings.materials)
+        scene = load_scene(settings.scene, settings.up, settings.materials, settings.projection)
     check_count(settings.output, len(scene))
     turn, offset = upright(scene.up), scene.offset
     environment = over_scene(environment, settings.environment, settings.scene, turn)

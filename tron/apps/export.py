@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from tron.apps.camera_formats import UPRIGHT, check_camera_file, write_camera_file
 from tron.apps.machine import Threads, Variant
 from tron.apps.relight.camera_files import cameras_of, filmed_with, in_frame_of
-from tron.apps.scene_file import Up, check_output, check_scene_files, load_scene
+from tron.apps.scene_file import SeenAs, Up, check_output, check_scene_files, load_scene
 from tron.apps.splat_file import SceneFile
 from tron.apps.surroundings import treat_surroundings
 from tron.cli.command_line import ANEW, command
@@ -54,6 +54,7 @@ class Settings(BaseModel):
     fps: float = Field(24.0, gt=0, le=240, description="frames a second of cameras that move")
     triangles: int = Field(60_000, ge=100, le=5_000_000, description="of a mesh, at most")
     texture: int = Field(2048, ge=64, le=8192, description="pixels of a side of a mesh's textures")
+    projection: SeenAs = "auto"
     up: Up = None
     variant: Variant = "llvm_ad_rgb"
     threads: Threads = None
@@ -140,7 +141,7 @@ def _write_mesh(settings: Settings) -> None:
         what = f"{error.name} is not installed, which makes meshes"
         raise TronError(what, mend="pip install 'tron-relight[relight,models]'") from error
     activate(settings.variant, settings.threads)
-    scene = load_scene(settings.scene, settings.up, "as_is")
+    scene = load_scene(settings.scene, settings.up, "as_is", settings.projection)
     turn, offset = upright(scene.up), scene.offset
     scene = treat_surroundings(scene.upright(), "drop", settings.scene).content
     filmed = filmed_with(settings.scene, turn, offset, scene)

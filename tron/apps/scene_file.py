@@ -35,6 +35,14 @@ Up = Annotated[
     ),
 ]
 """Setting of a direction of any length, in the frame of the scene's file."""
+SeenAs = Annotated[
+    Literal["auto", "disks"],
+    Field(
+        description="what cameras see of a scan's splats; auto: their projections, as a splat viewer shows "
+        "them; disks: flat disks in space, as light's rays meet them"
+    ),
+]
+"""Setting of how splats are projected."""
 
 
 def check_scene_files(scene: Path, output: Path, *read: Path | None) -> None:
@@ -68,7 +76,10 @@ def check_output(output: Path, source: Path, what: str) -> None:
 
 
 def load_scene(
-    path: Path, up: Sequence[float] | None, materials: Literal["auto", "as_is"] = "auto"
+    path: Path,
+    up: Sequence[float] | None,
+    materials: Literal["auto", "as_is"] = "auto",
+    projection: Literal["auto", "disks"] = "auto",
 ) -> GaussianScene:
     """The scene of a file, with a line in the log where its materials or which way is up are guessed.
 
@@ -78,8 +89,11 @@ def load_scene(
         path: the PLY.
         up: direction of any length, in the file's frame; None: the file's own.
         materials: that are guessed are not looked for (as_is).
+        projection: the file's (auto), or disks in space.
     """
     scene = GaussianScene.load(path)
+    if projection != "auto":
+        scene.projection = projection
     if scene.materials_guessed and materials == "as_is":
         log.warning(
             "%s has no materials%s: they are guessed from its colours, which keep the light that it was "

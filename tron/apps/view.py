@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from tron.apps.capture_light import is_of_capture, over_scene
 from tron.apps.machine import Threads, Variant
 from tron.apps.relight.network_gains import expected_gain
-from tron.apps.scene_file import Up, check_scene_files, load_scene
+from tron.apps.scene_file import SeenAs, Up, check_scene_files, load_scene
 from tron.apps.splat_file import SceneFile
 from tron.cameras import Camera
 from tron.cli.command_line import command
@@ -66,6 +66,7 @@ class Settings(BaseModel):
         "127.0.0.1", description="address to listen on; 0.0.0.0 lets in everybody who reaches it"
     )
     port: int = Field(8080, ge=1, le=65535, description="port to listen on")
+    projection: SeenAs = "auto"
     up: Up = None
     seed: int = Field(0, description="root of all random numbers")
     variant: Variant = "llvm_ad_rgb"
@@ -117,7 +118,7 @@ def opened(settings: Settings) -> Window:
     logging.getLogger("websockets").setLevel(logging.WARNING)  # it says who comes and goes
     activate(settings.variant, settings.threads)
     with working("reading the scene"):
-        scene = load_scene(settings.scene, settings.up, "as_is")
+        scene = load_scene(settings.scene, settings.up, "as_is", settings.projection)
         home, turn = _home(scene), upright(scene.up)
         own = {name: file for name, file in lights.items() if is_of_capture(file, settings.scene)}
         turned = {k: over_scene(EnvironmentMap.load(f), f, settings.scene, turn) for k, f in own.items()}

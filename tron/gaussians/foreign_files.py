@@ -80,8 +80,8 @@ _PROPERTIES = {
 }
 """Properties by a pattern of their names, and what they change."""
 _MODE = "splatrendermode:"
-_PLAIN_MODES = ("default", "classic", "2dgs")
-"""Modes whose kernel is the Gaussian, without a filter of the viewer's pixels."""
+_PLAIN_MODES = ("default", "classic", "2dgs", "mip")
+"""Modes that are read (:mod:`tron.gaussians.projections`)."""
 
 
 def foreign_kernels(properties: Iterable[str], comments: Sequence[str]) -> list[str]:

@@ -35,14 +35,14 @@ class KeptFiles:
 
     def found(self, kind: Kind, made_from: str) -> Path | None:
         """The file that says that it was made from this; None where there is none."""
-        for path in self.candidates(kind):
-            if f"{kind} {made_from}" in header_comments(path):
-                return path
-        return None
+        files = [path for path in self.candidates(kind) if made_as_now(path, f"{kind} {made_from}")]
+        return files[0] if files else None
 
     def path(self, kind: Kind, made_from: str) -> Path:
         """The file that was made from this, or else the one to write."""
-        return self.found(kind, made_from) or self.candidates(kind)[not self._beside]
+        said = f"{kind} {made_from}"
+        there = [path for path in self.candidates(kind) if said in header_comments(path)]
+        return there[0] if there else self.candidates(kind)[not self._beside]
 
     @cached_property
     def _beside(self) -> bool:
@@ -54,6 +54,14 @@ class KeptFiles:
             self.scan.parent, self.scan.name, self.apart,
         )  # fmt: skip
         return False
+
+
+def made_as_now(path: Path, said: str) -> bool:
+    """Whether a kept file says what it would be made from now, "KIND DIGEST"; a line if it says another."""
+    comments, kind = header_comments(path), said.split()[0]
+    if said not in comments and any(comment.startswith(f"{kind} ") for comment in comments):
+        log.info("%s was made of another scan, or as another version does it: it is made anew", path)
+    return said in comments
 
 
 def _takes_files(folder: Path) -> bool:

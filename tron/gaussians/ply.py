@@ -16,7 +16,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,7 @@ from tron.gaussians.formats.splats import Splats
 from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
 from tron.gaussians.packed_files import PACKED_SPLATS, Packing, packing, unpacked
 from tron.gaussians.ply_arrays import columns_in
+from tron.gaussians.projections import DISKS, FILTER, PROJECTIONS, stated_projection
 from tron.gaussians.spz_header import read_header
 from tron.gaussians.stored_values import as_3dgs_stores
 from tron.io.local_frame import local_origin, said
@@ -57,7 +58,6 @@ log = logging.getLogger(__name__)
 NORMAL = ("nx", "ny", "nz")
 REST = tuple(f"f_rest_{i}" for i in range(3 * (SH_COUNT - 1)))
 THIRD_SCALE = "scale_2"
-FILTER = "filter_3D"
 MATERIAL_PROPERTIES = tuple(name for material in MATERIALS for name in FIELDS[material].properties)
 REQUIRED = tuple(
     name
@@ -74,6 +74,7 @@ GUESSED_METALLIC = 0.0
 GUESSED_UP = (0.0, -1.0, 0.0)
 
 _HEADER_LIMIT = 1 << 16
+_PROJECTION = "tron projection "
 _VISIBLE = 1 / 255
 """Opacity below which a splat is not drawn (conventions.md, 6)."""
 _COARSE = 0.25
@@ -165,13 +166,11 @@ def read_splats(path: str | Path) -> dict[str, Any]:
     else:
         columns, comments = _parsed(path, known)
         up = stated_up(comments)
-    turn, up_stated = np.eye(3), True
+    turn, up_stated, antialiased = np.eye(3), True, False
     if known == PACKED_SPLATS[".spz"]:
         header = read_header(path.read_bytes())
-        turn, up_stated = header.turn, header.stated
+        turn, up_stated, antialiased = header.turn, header.stated, header.antialiased
         up = GUESSED_UP @ turn
-        if header.antialiased:
-            log.warning("%s: %s: %s", path, NOT_READ, "antialiased (splats filtered by the viewer's pixels)")
     constants = _read_constants(comments, path)
     columns = plain_columns(columns, bool(constants), path)
     _check_properties(columns, comments, path)
@@ -202,7 +201,7 @@ def read_splats(path: str | Path) -> dict[str, Any]:
     quats, log_scales = flattened(field("quats"), stack(scales))
     sh = _harmonics(columns, stack, path)
     guessed = MATERIAL_PROPERTIES[0] not in columns
-    stated = constants.get("up", up)
+    stated, oriented = constants.get("up", up), bool(constants.get("oriented", [0])[0])
     return {
         "means": means,
         "quats": quats,
@@ -218,8 +217,9 @@ def read_splats(path: str | Path) -> dict[str, Any]:
         "up": np.array(GUESSED_UP if stated is None else stated),
         "up_guessed": stated is None or not up_stated or bool(constants.get("up_guessed", [0])[0]),
         "materials_guessed": guessed or bool(constants.get("materials_guessed", [0])[0]),
-        "oriented": bool(constants.get("oriented", [0])[0]),
+        "oriented": oriented,
         "offset": np.array(offset),
+        "projection": _projection(columns, comments, bool(constants) and oriented, antialiased, path),
     }
 
 
@@ -337,6 +337,7 @@ def _about_local_origin(columns: Mapping[str, np.ndarray], path: Path) -> tuple[
 def _constants(scene: Mapping[str, Any]) -> list[str]:
     return [
         *(["tron up_guessed 1"] if scene["up_guessed"] else []),
+        f"{_PROJECTION}{scene['projection']}",
         f"tron kernel_degree {scene['kernel_degree']}",
         f"tron spacing {scene['spacing']!r}",
         f"tron up {' '.join(repr(float(v)) for v in scene['up'])}",
@@ -351,7 +352,7 @@ def _read_constants(comments: list[str], path: Path) -> dict[str, list[float]]:
     constants = {}
     for comment in comments:
         words = comment.split()
-        if len(words) < 3 or words[0] != "tron":
+        if len(words) < 3 or words[0] != "tron" or comment.startswith(_PROJECTION):
             continue
         try:
             values = [float(word) for word in words[2:]]
@@ -363,6 +364,20 @@ def _read_constants(comments: list[str], path: Path) -> dict[str, list[float]]:
             raise TronError(f"comment '{comment[:60]}' does not hold three numbers", path)
         constants[words[1]] = values
     return constants
+
+
+def _projection(
+    properties: Collection[str], comments: Sequence[str], ours: bool, antialiased: bool, path: Path
+) -> str:
+    """By what the file says; ``ours``: of TRON, with signed normals, which before was all that it said."""
+    said = [comment[len(_PROJECTION) :].strip() for comment in comments if comment.startswith(_PROJECTION)]
+    if said:
+        if said[-1] not in PROJECTIONS:
+            raise TronError(
+                f"comment '{_PROJECTION}{said[-1][:40]}' names none", path, f"use {', '.join(PROJECTIONS)}"
+            )
+        return said[-1]
+    return DISKS if ours else stated_projection(properties, comments, antialiased)
 
 
 def _check_sizes(head: bytes, size: int, path: Path) -> None:

@@ -21,6 +21,7 @@ from tron.framing import upright
 from tron.gaussians.fields import FIELDS, LOG_SCALE_LIMIT, MATERIALS
 from tron.gaussians.harmonics import rotate_sh
 from tron.gaussians.ply import read_splats, write_ply
+from tron.gaussians.projections import DISKS, PROJECTIONS
 
 log = logging.getLogger(__name__)
 
@@ -61,6 +62,8 @@ class GaussianScene:
             back faces, so such scenes are turned towards each camera first (:meth:`facing`).
         offset: (3,) float64 what was taken away from large coordinates, such as those of UTM: the file's are
             means + offset (:mod:`tron.io.local_frame`). Zero in most scenes.
+        projection: how cameras see the surfels (:data:`tron.gaussians.projections.PROJECTIONS`): as disks in
+            space, or as the program that a scan's splats were learnt with projects them.
     """
 
     means: np.ndarray
@@ -79,6 +82,7 @@ class GaussianScene:
     materials_guessed: bool = False
     oriented: bool = True
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    projection: str = DISKS
 
     def __post_init__(self) -> None:
         for name, described in FIELDS.items():
@@ -200,6 +204,8 @@ class GaussianScene:
             )
         if self.kernel_degree not in KERNEL_DEGREES:
             raise TronError(f"kernel_degree is {self.kernel_degree}", mend="use 2 or 4")
+        if self.projection not in PROJECTIONS:
+            raise TronError(f"projection is {self.projection}", mend=f"use one of {', '.join(PROJECTIONS)}")
         if not (np.isfinite(self.spacing) and self.spacing > 0):
             raise TronError(
                 f"spacing is {self.spacing}", mend="give a positive length, or measure_spacing(means)"

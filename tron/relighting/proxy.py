@@ -40,8 +40,10 @@ from tron.cameras import Camera
 from tron.errors import TronError
 from tron.gaussians.fields import FIELDS, MATERIALS
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
+from tron.gaussians.kept import made_as_now
 from tron.gaussians.neighbours import alike_neighbours
 from tron.gaussians.ply import header_comments, write_ply
+from tron.gaussians.projections import DISKS
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.runtime import aligned
 from tron.tracing import GBuffer, SurfelTracer
@@ -115,7 +117,7 @@ class Proxy:
         """Read :meth:`save`'s file; None where there is none, or one that was made from something else."""
         comments = header_comments(path)
         voxels = [said.split()[2] for said in comments if said.startswith("tron voxel ")]
-        if f"proxy {made_from}" not in comments or not voxels:
+        if not made_as_now(path, f"proxy {made_from}") or not voxels:
             return None
         try:
             return cls(GaussianScene.load(path), float(voxels[0]))
@@ -128,7 +130,8 @@ def fingerprint(scene: GaussianScene, cameras: Sequence[Camera] | None) -> str:
     digest = hashlib.sha256(_MADE.encode())
     for name in FIELDS:
         digest.update(np.ascontiguousarray(getattr(scene, name)).tobytes())
-    digest.update(repr((scene.kernel_degree, scene.oriented, scene.up.tolist())).encode())
+    seen = () if scene.projection == DISKS else (scene.projection,)
+    digest.update(repr((scene.kernel_degree, scene.oriented, scene.up.tolist(), *seen)).encode())
     for camera in cameras or ():
         digest.update(repr(camera.to_dict()).encode())
     return digest.hexdigest()
@@ -187,7 +190,8 @@ def lenders(surfels: GaussianScene, scan: GaussianScene) -> tuple[np.ndarray, np
     The nearest, each by its opacity, its area, its distance across the normal and how far out it lies.
     """
     place, normals = surfels.means.astype(np.float64), surfels.normals()
-    numbers = KDTree(scan.means).query(place, k=range(1, 1 + min(_LENDERS, len(scan))))[1]
+    count = min(_LENDERS, len(scan))
+    numbers = np.asarray(KDTree(scan.means).query(place, k=count)[1]).reshape(len(place), count)
     way = scan.means[numbers] - place[:, None]
     out = np.einsum("mkj,mj->mk", way, normals)
     across = np.maximum((way**2).sum(-1) - out**2, 0)

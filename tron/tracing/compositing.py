@@ -21,6 +21,7 @@ STOP_TRANSMITTANCE = 1e-3
 MEDIAN_TRANSMITTANCE = 0.5
 BEGIN_TRANSMITTANCE = 0.9
 """Transmittance below which a surface has begun: a scan's fog before it lifts it off its median."""
+NO_SURFEL = 0xFFFFFFFF
 MOST_HITS = ceil(log(STOP_TRANSMITTANCE) / log(1 - MIN_ALPHA)) + 1
 """Most hits that any ray composites, one of them for rounding: 1764 of the faintest stop it."""
 CHANNELS = 11
@@ -96,23 +97,24 @@ class Composite:
             values.
         mean_depth: sum of ``w t``.
         transmittance: T after the last composited hit.
-        median_depth: t of the first hit after which T < 0.5; 0 where T stays above.
-        begin_depth: t of the first hit after which T < 0.9; 0 where T stays above.
+        median: the surfel after which T < 0.5 first; ``NO_SURFEL`` where T stays above.
+        begin: the surfel after which T < 0.9 first; likewise.
         count: composited hits.
     """
 
     channels: list[mi.Float]
     mean_depth: mi.Float
     transmittance: mi.Float
-    median_depth: mi.Float
-    begin_depth: mi.Float
+    median: mi.UInt32
+    begin: mi.UInt32
     count: mi.UInt32
 
     @staticmethod
     def start(values: int = 0) -> Composite:
         """Nothing hit yet, of surfels with so many more values."""
         channels = [mi.Float(0) for _ in range(CHANNELS + values)]
-        return Composite(channels, mi.Float(0), mi.Float(1), mi.Float(0), mi.Float(0), mi.UInt32(0))
+        nothing = mi.UInt32(NO_SURFEL)
+        return Composite(channels, mi.Float(0), mi.Float(1), nothing, mi.UInt32(nothing), mi.UInt32(0))
 
 
 def harmonic_sums(
@@ -185,9 +187,9 @@ def composite(
         sums.mean_depth = dr.fma(weight, t, sums.mean_depth)
         after = sums.transmittance * (1 - alpha)
         crossed = (sums.transmittance >= MEDIAN_TRANSMITTANCE) & (after < MEDIAN_TRANSMITTANCE)
-        sums.median_depth = dr.select(crossed, t, sums.median_depth)
+        sums.median = dr.select(crossed, index, sums.median)
         begun = (sums.transmittance >= BEGIN_TRANSMITTANCE) & (after < BEGIN_TRANSMITTANCE)
-        sums.begin_depth = dr.select(begun, t, sums.begin_depth)
+        sums.begin = dr.select(begun, index, sums.begin)
         sums.transmittance = after
         sums.count += 1
         slot += 1

@@ -185,19 +185,26 @@ def _overwrite(sums: Composite, some: Composite, ray: mi.UInt32) -> None:
     """Overwrite the sums of the rays ``ray``."""
     for target, source in zip(sums.channels, some.channels, strict=True):
         dr.scatter(target, source, ray)
-    for name in ("mean_depth", "transmittance", "median_depth", "begin_depth", "count"):
+    for name in ("mean_depth", "transmittance", "median", "begin", "count"):
         dr.scatter(getattr(sums, name), getattr(some, name), ray)
     dr.eval(sums)
 
 
 def trace_gbuffer(
-    records: SurfelRecords, lists: TileLists, camera: Camera, limit: mi.Float | None = None
+    records: SurfelRecords,
+    lists: TileLists,
+    camera: Camera,
+    limit: mi.Float | None = None,
+    disks: SurfelRecords | None = None,
 ) -> GBuffer:
-    """Render a camera's G-buffer from its tile lists, up to ``limit``; differentiable in the records."""
+    """Render a camera's G-buffer from its tile lists, up to ``limit``; differentiable in the records.
+
+    ``disks``: the surfels in space, where the records are their projections; None: the records.
+    """
     rays = tile_rays(camera)
     sums, hits = trace_tiles(records.detached(), lists, rays, has_gradients(records, rays.direction), limit)
     sums = attach(sums, records, rays.origin, rays.direction, hits)
-    seen = surface(sums, rays.origin, rays.direction)
+    seen = surface(sums, disks or records, rays.origin, rays.direction)
     dr.eval(seen)
     return GBuffer(**vars(seen), width=camera.width, height=camera.height)
 

@@ -49,27 +49,34 @@ def value_packets(count: int) -> int:
     return -(-count // 4)
 
 
-def cut_radius_squared(opacity: mi.Float, degree: int) -> mi.Float:
+def cut_radius_squared(opacity: mi.Float, degree: int, least: float = MIN_RESPONSE) -> mi.Float:
     """Largest squared Mahalanobis distance at which a surfel still counts; negative where it never does.
 
     Args:
         opacity: after the sigmoid; not differentiated through, because visibility is not.
         degree: kernel degree, 2 or 4.
+        least: response below which nothing counts, whatever the opacity.
     """
     if degree not in (2, 4):
         raise TronError(f"kernel degree {degree} is not known", mend="use 2 or 4")
     faintest = MIN_ALPHA / dr.select(opacity > 1e-12, opacity, 1e-12)
-    threshold = dr.select(faintest > MIN_RESPONSE, faintest, MIN_RESPONSE)
+    threshold = dr.select(faintest > least, faintest, least)
     log_response = dr.log(threshold)
     q = -2 * log_response if degree == 2 else dr.safe_sqrt(-18 * log_response)
     return dr.select(threshold <= 1, q, -1)
 
 
 def half_axes(u_axis: mi.Vector3f, v_axis: mi.Vector3f, q_cut: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Half axes of the disk within which a surfel counts, from ``t_u / s_u``, ``t_v / s_v`` of its record."""
+    """Half axes, conjugate, of the ellipse within which a surfel counts, from the axes of its record.
+
+    Those of a record are ``t_u / s_u`` and ``t_v / s_v``, and so at right angles, but for projected splats.
+    """
     reach = dr.sqrt(dr.select(q_cut > 0, q_cut, 0))
-    # t_u / s_u has length 1 / s_u: divided by its squared length it is s_u t_u.
-    return u_axis * (reach / dr.squared_norm(u_axis)), v_axis * (reach / dr.squared_norm(v_axis))
+    u_scale, v_scale = dr.rcp(dr.norm(u_axis)), dr.rcp(dr.norm(v_axis))
+    u, v = u_axis * u_scale, v_axis * v_scale  # their product may be beyond float32, that of units is not
+    normal = dr.cross(u, v)
+    reach /= dr.squared_norm(normal)
+    return dr.cross(v, normal) * (reach * u_scale), dr.cross(normal, u) * (reach * v_scale)
 
 
 def response(q: Any, degree: int) -> Any:

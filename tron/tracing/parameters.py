@@ -104,8 +104,8 @@ def pack(parameters: SurfelParameters) -> SurfelRecords:
     centre, base = rows(mi.Vector3f, parameters.means), rows(mi.Vector3f, parameters.base_color)
     axis_u, axis_v = tangent_u / scales.x, tangent_v / scales.y
     records = SurfelRecords(
-        geometry=_interleave([*centre, opacity, *axis_u, radius, *axis_v, q_cut], count),
-        features=_interleave(
+        geometry=interleave([*centre, opacity, *axis_u, radius, *axis_v, q_cut], count),
+        features=interleave(
             [*normal, parameters.roughness, *base, parameters.metallic, *radiance, mi.Float(0)], count
         ),
         # Dr.Jit refuses empty arrays as loop state: an unused scalar stands in.
@@ -134,7 +134,7 @@ def pack_values(records: SurfelRecords, values: Sequence[mi.Float]) -> SurfelRec
         if dr.width(value) not in (1, records.count):
             raise TronError(f"values[{k}] has {dr.width(value)} numbers", mend=f"give {records.count}")
     columns = [*values, *[mi.Float(0)] * (4 * value_packets(len(values)) - len(values))]
-    packed = _interleave(columns, records.count)
+    packed = interleave(columns, records.count)
     dr.eval(packed)
     return replace(records, values=packed, value_count=len(values))
 
@@ -163,7 +163,7 @@ def _column(values: mi.Float, index: mi.UInt32) -> mi.Float:
     return dr.gather(mi.Float, values, index)
 
 
-def _interleave(columns: list[mi.Float], count: int) -> mi.Float:
+def interleave(columns: list[mi.Float], count: int) -> mi.Float:
     """Columns of ``count`` floats -> one array, record by record, written as packets of four."""
     packets = len(columns) // 4
     records = dr.zeros(mi.Float, count * len(columns))

@@ -3,7 +3,8 @@
 Composited channels are alpha-weighted sums, so materials are divided by opacity and the normal is brought
 back to unit length (conventions.md, 7). The surface point is at the median depth; where transmittance
 never falls below one half there is no median, and the alpha-weighted mean depth stands in where opacity is
-not zero.
+not zero. The median is where the ray meets the plane of the surfel's own disk, also where a camera sees its
+projection, which lies at one depth: light falls where the surface is.
 """
 
 from __future__ import annotations
@@ -13,9 +14,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from tron.tracing.compositing import CHANNELS, Composite
-from tron.tracing.kernel import FEATURE_PACKETS, GEOMETRY_PACKETS, SurfelRecords
+from tron.tracing.compositing import CHANNELS, NO_SURFEL, Composite
+from tron.tracing.kernel import FEATURE_PACKETS, GEOMETRY_PACKETS, SurfelRecords, half_axes
 
+BEYOND = 2.0
+"""Times its own reach that a disk's plane is followed: a projection is wider by its pixel's filter."""
 GRAZING = 0.05
 """Cosine to the ray of normals that looked away and are bent."""
 
@@ -59,8 +62,11 @@ class Surface:
         return mi.Point3f(dr.detach(self.position)) + mi.Normal3f(dr.detach(self.normal)) * offset
 
 
-def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surface:
-    """Normalise the sums of rays from ``origin`` along unit ``direction``; differentiable in the sums."""
+def surface(sums: Composite, records: SurfelRecords, origin: mi.Point3f, direction: mi.Vector3f) -> Surface:
+    """Normalise the sums of rays from ``origin`` along unit ``direction``; differentiable in the sums.
+
+    ``records``: the surfels, as disks in space.
+    """
     opacity = 1 - sums.transmittance
     hit = opacity > 0
     # Divisors of empty rays are replaced before dividing: 0 times an infinite derivative would be NaN.
@@ -69,12 +75,12 @@ def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surf
     normal = mi.Normal3f(*channels[0:3])
     squared = dr.squared_norm(normal)
     oriented = squared > 0
-    depth = dr.detach(sums.median_depth)
+    depth = _depth(records, sums.median, origin, direction)
     distance = dr.select(depth > 0, depth, sums.mean_depth * inverse)
     return Surface(
         position=origin + distance * direction,
         depth=depth,
-        lift=dr.select(depth > 0, depth - dr.detach(sums.begin_depth), 0),
+        lift=dr.select(depth > 0, depth - _depth(records, sums.begin, origin, direction), 0),
         normal=dr.select(oriented, normal / dr.sqrt(dr.select(oriented, squared, 1)), 0),
         normal_sum=normal,
         base_color=mi.Color3f(*channels[4:7]) * inverse,
@@ -85,6 +91,27 @@ def surface(sums: Composite, origin: mi.Point3f, direction: mi.Vector3f) -> Surf
         direction=direction,
         values=[value * inverse for value in channels[CHANNELS:]],
     )
+
+
+def _depth(records: SurfelRecords, surfel: mi.UInt32, origin: mi.Point3f, direction: mi.Vector3f) -> mi.Float:
+    """Distance along unit rays to the planes of some surfels' disks, detached; 0 where there is no surfel.
+
+    No farther from a centre than twice what the disk reaches along the ray: where it is seen edge on, its
+    plane is met anywhere, or nowhere.
+    """
+    some = surfel != NO_SURFEL
+    geometry, base = dr.detach(records.geometry), surfel * GEOMETRY_PACKETS
+    centre, axis_u, axis_v = (dr.gather(mi.Vector4f, geometry, base + k, some) for k in range(3))
+    to_centre = mi.Vector3f(*[centre[k] for k in range(3)]) - dr.detach(origin)
+    along = mi.Vector3f(dr.detach(direction))
+    u_axis, v_axis = (mi.Vector3f(*[axis[k] for k in range(3)]) for axis in (axis_u, axis_v))
+    u, v = (dr.dot(half, along) for half in half_axes(u_axis, v_axis, axis_v.w))
+    middle, reach = dr.dot(to_centre, along), BEYOND * dr.sqrt(u * u + v * v)
+    normal = dr.cross(u_axis, v_axis)
+    beyond = dr.dot(normal, to_centre) / dr.dot(normal, along) - middle
+    # Of a disk that is seen from exactly edge on this is no number, and no comparison holds.
+    beyond = dr.select(dr.abs(beyond) <= reach, beyond, dr.select(beyond > 0, reach, -reach))
+    return dr.select(some, middle + beyond, 0)
 
 
 def seen_normal(normal: mi.Vector3f, direction: mi.Vector3f) -> mi.Vector3f:

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from tron.errors import TronError
+from tron.gaussians.projections import PROJECTIONS
 from tron.runtime import aligned
 from tron.tracing.adjoint import attach, has_gradients
 from tron.tracing.gbuffer import GBuffer, trace_gbuffer
@@ -22,6 +23,7 @@ from tron.tracing.kernel import CUT, GEOMETRY_PACKETS, SurfelRecords, turned_geo
 from tron.tracing.parameters import SurfelParameters, pack, pack_values
 from tron.tracing.surface import Surface, surface
 from tron.tracing.tiled.kbuffer import RelistedHits, Search, composite_rounds, lanes_of, search_hierarchy
+from tron.tracing.tiled.projected import NEAREST, NEAREST_SPACINGS, projected
 from tron.tracing.tiled.tiles import build_tiles
 
 if TYPE_CHECKING:
@@ -157,6 +159,8 @@ class SurfelTracer:
     ) -> GBuffer:
         """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it.
 
+        It sees the scene's ``projection`` of each surfel, as the viewer of a scan does, or disks in space.
+
         Args:
             camera: the view.
             values: quantities of the surfels to composite as their materials are, each an array of one number
@@ -165,7 +169,12 @@ class SurfelTracer:
                 opaque there hides the rest; None: there is nothing.
         """
         records = pack_values(self.attached(), values)
-        return trace_gbuffer(records, build_tiles(self.records, camera), camera, limit)
+        projection = PROJECTIONS[self.scene.projection]
+        if projection is None:
+            return trace_gbuffer(records, build_tiles(self.records, camera), camera, limit)
+        nearest = min(NEAREST, NEAREST_SPACINGS * self.scene.spacing)
+        seen = projected(records, camera, projection, nearest)
+        return trace_gbuffer(seen, build_tiles(seen.detached(), camera), camera, limit, records)
 
     def trace(
         self,
@@ -237,4 +246,4 @@ def trace_rays(
 
         hits = RelistedHits(still, search_lanes, along, ray, sums.count)
         sums = attach(sums, records, at, direction, [hits])
-    return surface(sums, at, along)
+    return surface(sums, still, at, along)

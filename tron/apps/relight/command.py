@@ -102,7 +102,7 @@ def main(settings: Settings) -> None:
         settings, renderer = chosen_network(settings)
         lights = settings.by_light()
     with working("reading the scene"):
-        scene = load_scene(settings.scene, settings.up, settings.materials)
+        scene = load_scene(settings.scene, settings.up, settings.materials, settings.projection)
     offset = scene.offset
     if given is not None and settings.cameras is not None:
         given = in_frame_of(offset, given, settings.cameras)
@@ -300,6 +300,7 @@ def _made_with(light: Settings, cameras: Sequence[Camera], turn: np.ndarray) -> 
         "surroundings",
         "ground",
         "proxy",
+        "projection",
         "materials",
     }
     return {
@@ -340,6 +341,7 @@ def _report(
             "spacing": scene.spacing,
             "materials_guessed": scene.materials_guessed,
             "oriented": scene.oriented,
+            "projection": scene.projection,
         },
         "exposure": clip.shown_exposure,
         "guidance_exposure": clip.exposure,

@@ -11,7 +11,7 @@ from tron.apps.capture_light import LIGHT
 from tron.apps.machine import Variant
 from tron.apps.relight.camera_files import CAMERAS, cameras_of, frame_size
 from tron.apps.relit import Background
-from tron.apps.scene_file import Up
+from tron.apps.scene_file import SeenAs, Up
 from tron.apps.splat_file import SceneFile
 from tron.apps.surroundings import DESCRIPTION, Treatment
 from tron.color import Look
@@ -75,6 +75,7 @@ class Settings(BaseModel):
         "auto: where the scan is thick by the log's number, or its normals have no sign; never: the scan "
         "itself",
     )
+    projection: SeenAs = "auto"
     materials: Literal["auto", "as_is"] = Field(
         "auto",
         description="of a scan without any; auto: found once with the light it was captured in, which is "

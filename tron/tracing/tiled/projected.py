@@ -1,0 +1,121 @@
+"""Splats as a camera of their own viewer sees them: disks parallel to the image plane.
+
+A splat of 3DGS is drawn as the Gaussian that its covariance projects to (Zwicker et al. 2001, EWA splatting;
+Kerbl et al. 2023), in the order of centres' depths. The same picture comes of a disk through the centre that
+is parallel to the image plane: rays meet all points of it at one depth. With a and b the splat's two axes
+projected into the plane at distance 1, by the Jacobian of the projection at its centre, and k the pixel
+variance in that plane,
+
+    A = a_x^2 + b_x^2 + k_x    B = a_x a_y + b_x b_y    D = (a x b)^2 + k_x (a_y^2 + b_y^2) + k_y A
+    q = X^2 / A + (Y - X B / A)^2 A / D
+
+are the covariance's first row, its determinant without a difference of large numbers, which needles would
+lose, and the distance of a point (X, Y) from the centre. Its two squares are the coordinates that a record
+stands for. The median depth is not that of such a disk: :mod:`tron.tracing.surface`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from tron.cameras import Camera
+from tron.gaussians.harmonics import sh_basis
+from tron.gaussians.projections import Projection
+from tron.tracing.compositing import MATERIAL_PACKETS, radiance
+from tron.tracing.kernel import (
+    FEATURE_PACKETS,
+    GEOMETRY_PACKETS,
+    MIN_ALPHA,
+    SurfelRecords,
+    cut_radius_squared,
+)
+from tron.tracing.parameters import interleave
+
+NEAREST = 0.2
+"""Depth of a centre from which a splat is seen, world units, as in 3DGS."""
+NEAREST_SPACINGS = 20.0
+"""The same in spacings of splats, which counts where it is less: of scans in other units than 3DGS's."""
+_OUTSIDE = 1.3
+"""Times the image's half width beyond which the projection is not bent further, as in 3DGS."""
+_LARGEST = 1e3
+"""Deviation that no splat exceeds, in depths: it covers every picture, and squares stay finite."""
+_LEAST_KEPT = 2.5e-5
+"""Least share of a determinant that compensation counts, as in 3DGS."""
+_AWAY = 1e-3
+"""Cosine up to which a splat that is seen edge on is not taken for one that looks away."""
+
+
+def projected(
+    records: SurfelRecords, camera: Camera, projection: Projection, nearest: float
+) -> SurfelRecords:
+    """The surfels as disks that a camera sees as their projections, coloured as seen along their centres.
+
+    Differentiable in the records.
+
+    Args:
+        records: disks in space. camera: the view.
+        projection: of the program that the splats were learnt with.
+        nearest: least depth of a centre that is seen, world units.
+    """
+    eye = mi.Point3f([float(v) for v in camera.position])
+    right, down, forward = (mi.Vector3f([float(v) for v in row]) for row in camera.world_to_camera[:3, :3])
+    sides = (camera.cx, camera.width - camera.cx), (camera.cy, camera.height - camera.cy)
+    # Of the longer side: windows of a view, such as its stripes, see splats alike.
+    bend = _OUTSIDE * max(max(sides[0]) / camera.fx, max(sides[1]) / camera.fy)
+    numbers = (projection.variance / camera.fx**2, projection.variance / camera.fy**2, bend, nearest)
+    variance_x, variance_y, bend, near = (mi.Float(float(v)) for v in numbers)
+    dr.make_opaque(eye, right, down, forward, variance_x, variance_y, bend, near)
+
+    surfel = dr.arange(mi.UInt32, records.count)
+    centre, axis_u, axis_v = (
+        dr.gather(mi.Vector4f, records.geometry, surfel * GEOMETRY_PACKETS + k) for k in range(3)
+    )
+    place = mi.Vector3f(*[centre[k] for k in range(3)])
+    to_centre = place - eye
+    u_axis, v_axis = (mi.Vector3f(*[axis[k] for k in range(3)]) for axis in (axis_u, axis_v))
+    depth = dr.dot(forward, to_centre)
+    seen = (depth >= near) & (axis_v.w >= 0)
+    facing = dr.dot(
+        dr.normalize(dr.cross(dr.normalize(u_axis), dr.normalize(v_axis))), dr.normalize(to_centre)
+    )
+    seen &= ~(facing > _AWAY)
+    z = dr.select(seen, depth, 1)
+    x, y = (dr.clip(dr.dot(axis, to_centre) / z, -bend, bend) for axis in (right, down))
+
+    def flat(axis: mi.Vector3f) -> mi.Vector2f:
+        deviation = axis * (dr.rcp(dr.squared_norm(axis)) / z)
+        ahead = dr.dot(forward, deviation)
+        shown = mi.Vector2f(dr.dot(right, deviation) - x * ahead, dr.dot(down, deviation) - y * ahead)
+        length = dr.detach(dr.norm(shown))
+        return shown * dr.select(length > _LARGEST, _LARGEST / length, 1)
+
+    a, b = flat(u_axis), flat(v_axis)
+    first = dr.fma(a.x, a.x, dr.fma(b.x, b.x, variance_x))
+    mixed, last = dr.fma(a.x, a.y, b.x * b.y), dr.fma(a.y, a.y, b.y * b.y)
+    own = dr.square(a.x * b.y - a.y * b.x)
+    determinant = own + variance_x * last + variance_y * first
+    opacity = centre.w
+    if projection.compensated:
+        opacity *= dr.sqrt(dr.maximum(own / determinant, _LEAST_KEPT))
+    cut = cut_radius_squared(dr.detach(opacity), records.degree, MIN_ALPHA)
+    cut = dr.select(seen, cut, -1)
+    reach = dr.detach(z * dr.sqrt(dr.maximum(cut, 0) * (first + last + variance_y)))
+    along = right * (dr.rsqrt(first) / z)
+    across = (right * (mixed / first) - down) * (dr.sqrt(first / determinant) / z)
+    geometry = interleave([*place, opacity, *along, reach, *across, cut], records.count)
+
+    direction = dr.normalize(to_centre)
+    basis = sh_basis(direction.x, direction.y, direction.z)
+    shown = [*radiance(records, surfel, basis, seen), mi.Float(0)]
+    kept = [
+        dr.gather(mi.Vector4f, records.features, surfel * FEATURE_PACKETS + k)
+        for k in range(MATERIAL_PACKETS)
+    ]
+    features = interleave([*kept[0], *kept[1], *shown], records.count)
+    dr.eval(geometry, features)
+    return replace(
+        records, geometry=geometry, features=features, harmonics=dr.zeros(mi.Float, 1), sh_degree=0
+    )
