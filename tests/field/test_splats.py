@@ -11,7 +11,6 @@ from tron.errors import TronError
 from tron.gaussians.foreign_files import smoothed, stated_up
 from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
-from tron.gaussians.splat_files import write_splats
 from tron.seeds import generator
 
 COUNT = 40
@@ -143,15 +142,6 @@ def test_a_projection_that_is_not_known_is_refused(tmp_path):
     path = write(tmp_path / "a.ply", splats(), ["tron projection fisheye"])
     with pytest.raises(TronError, match=r"projection fisheye.*disks, 3dgs"):
         GaussianScene.load(path)
-
-
-def test_spz_says_whether_it_was_learnt_antialiased(tmp_path):
-    write_splats(tmp_path / "a.spz", GaussianScene.load(write(tmp_path / "a.ply", splats())))
-    assert GaussianScene.load(tmp_path / "a.spz").projection == "3dgs"
-    plain = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
-    plain[14] |= 1  # flags, https://github.com/nianticlabs/spz
-    (tmp_path / "b.spz").write_bytes(gzip.compress(bytes(plain)))
-    assert GaussianScene.load(tmp_path / "b.spz").projection == "antialiased"
 
 
 def test_beta_splats_without_harmonics_say_what_they_are(tmp_path):

@@ -78,7 +78,9 @@ class Objects:
         gui = server.gui
         with gui.add_folder("Object"):
             self._object: Any = gui.add_dropdown("Object", [NOBODY], initial_value=NOBODY)
-            self._visible = gui.add_checkbox("Visible", True, hint="what is hidden stays in saved scenes, not in films")
+            self._visible = gui.add_checkbox(
+                "Visible", True, hint="what is hidden stays in saved scenes, not in films"
+            )
             self._paint = gui.add_rgb("Color", (128, 128, 128))
             self._roughness = gui.add_slider("Roughness", min=0.0, max=1.0, step=0.01, initial_value=0.5)
             self._metallic = gui.add_slider("Metallic", min=0.0, max=1.0, step=0.01, initial_value=0.0)
