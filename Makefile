@@ -4,7 +4,7 @@ BIN := .venv/bin
 .PHONY: help setup demo test test-long test-narrow docs lint format clean
 
 help:  ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup:  ## make .venv, install the pinned dependencies, check LLVM
 	@.ci/setup

@@ -42,7 +42,7 @@ class Exchange(Benchmark):
     paths: PositiveInt = Field(default=144, description="of a pixel of the mesh, by Cycles and by Mitsuba")
     texture: int = Field(default=2048, ge=64, le=8192, description="pixels of a side of the mesh's textures")
     scans: list[Path] | None = Field(
-        default=None, description="plain 3DGS PLYs that viewers show; null: biker and guitar of real_data"
+        default=None, description="plain 3DGS PLYs that viewers show; null: those of real_data/splats"
     )
     scan_views: int = Field(default=8, ge=2, description="of each scan")
     scan_sides: list[PositiveInt] = Field(

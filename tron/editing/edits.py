@@ -180,6 +180,9 @@ class Insert(Part):
                 raise TronError("nothing of it is taken", self.file, "widen the selection")
             other = other if taken.all() else removed(other, ~taken)
         at = surface_below(scene, views, np.array(self.at)) if self.standing else np.array(self.at)
+        if other.projection != scene.projection:
+            said = self.file, scene.projection, other.projection
+            log.warning("%s: cameras see it projected as the scene is, %s, and not as %s", *said)
         both = joined(scene, _named(fitted(other, scene), number))
         new = np.arange(len(both)) >= len(scene)
         return placed(both, new, by=at - foot(both, new), turn_deg=self.turn, scale=self.scale)

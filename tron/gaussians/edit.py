@@ -52,7 +52,7 @@ def removed(scene: GaussianScene, which: np.ndarray) -> GaussianScene:
 def joined(scene: GaussianScene, other: GaussianScene) -> GaussianScene:
     """Both scenes' surfels, those of ``other`` last, so that numbers of surfels stay.
 
-    What belongs to a whole scene (spacing, up, offset) is that of ``scene``.
+    What belongs to a whole scene (spacing, up, offset, projection) is that of ``scene``.
 
     Raises:
         TronError: kernels of different degrees.

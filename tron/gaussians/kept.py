@@ -34,15 +34,19 @@ class KeptFiles:
         return beside, self.apart / beside.name
 
     def found(self, kind: Kind, made_from: str) -> Path | None:
-        """The file that says that it was made from this; None where there is none."""
-        files = [path for path in self.candidates(kind) if made_as_now(path, f"{kind} {made_from}")]
+        """The file that says that it was made from this; None where there is none, with a line of others."""
+        said = f"{kind} {made_from}"
+        files = [path for path in dict.fromkeys(self.candidates(kind)) if made_as_now(path, said)]
         return files[0] if files else None
+
+    def known(self, kind: Kind, made_from: str) -> Path | None:
+        """The same without a word."""
+        said = f"{kind} {made_from}"
+        return next((path for path in self.candidates(kind) if said in header_comments(path)), None)
 
     def path(self, kind: Kind, made_from: str) -> Path:
         """The file that was made from this, or else the one to write."""
-        said = f"{kind} {made_from}"
-        there = [path for path in self.candidates(kind) if said in header_comments(path)]
-        return there[0] if there else self.candidates(kind)[not self._beside]
+        return self.known(kind, made_from) or self.candidates(kind)[not self._beside]
 
     @cached_property
     def _beside(self) -> bool:

@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Light = EnvironmentMap | CubemapLight | Lighting
-REACH = ("oriented", "spacing", "kernel_degree", "log_scales", "opacity_logits")
+REACH = ("oriented", "spacing", "kernel_degree", "projection", "log_scales", "opacity_logits")
 """What decides how far surfels reach, and their backs: where one differs, all rays may."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -36,6 +37,7 @@ class History:
         self._wished, self._change, self._changed = wished, change, changed
         self._undone: list[Edit] = []
         self._hand, self._moved = "", 0.0
+        self._one = threading.Lock()  # events of one slider come on several threads
         gui = server.gui
         with gui.add_folder("Edits"):
             self._list = gui.add_markdown("*none*")
@@ -50,11 +52,12 @@ class History:
             hand: what is dragged, such as a slider of an object; empty: nothing.
             within: seconds after which the same hand does another edit.
         """
-        now = time.monotonic()
-        goes_on = bool(hand) and hand == self._hand and now - self._moved < within
-        self._hand, self._moved = hand, now
-        self._undone.clear()
-        self._set(lambda edits: (*(edits[:-1] if goes_on else edits), edit))
+        with self._one:
+            now = time.monotonic()
+            goes_on = bool(hand) and hand == self._hand and now - self._moved < within
+            self._hand, self._moved = hand, now
+            self._undone.clear()
+            self._set(lambda edits: (*(edits[:-1] if goes_on else edits), edit))
         if not hand:
             self._changed()
 
@@ -69,15 +72,17 @@ class History:
             self._undone.extend(edits[-1:])
             return edits[:-1]
 
-        self._hand = ""
-        self._set(without)
+        with self._one:
+            self._hand = ""
+            self._set(without)
         self._changed()
 
     def redo(self) -> None:
         """Do again what was undone last."""
         if self._undone:
-            edit, self._hand = self._undone.pop(), ""
-            self._set(lambda edits: (*edits, edit))
+            with self._one:
+                edit, self._hand = self._undone.pop(), ""
+                self._set(lambda edits: (*edits, edit))
             self._changed()
 
     def list(self) -> None:

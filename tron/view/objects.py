@@ -203,6 +203,7 @@ class Objects:
                     words |= {"turn": angle, "axis": tuple(map(float, vector))}
                 self._edit(lambda of: Move(select=of, **words), drag, math.inf)
                 if getattr(event, "phase", None) == "end":  # the next drag counts from where it stands now
+                    self._place(None)
                     self.follow()
 
         gizmo.on_update(moved)

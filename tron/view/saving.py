@@ -86,7 +86,8 @@ class Saving:
                     told = "\n".join(map(str, self._save_scene(wish)))
                 else:
                     told = self._film(wish, client)
-        except CancelledError:  # the window closes
+        except CancelledError:  # the window or its page closes
+            self._tell(f"{what.lower()}: not saved")
             return
         except (TronError, OSError) as error:
             self._tell(f"{what.lower()}: not saved")

@@ -45,7 +45,8 @@ Left = Literal["nothing", "before", "capture", "light"]
 Quality = Literal["final", "preview"]
 """How far pictures at rest go: through all passes, or no farther than the light that reached the surfels."""
 PASS = FINEST.of_sub_pixel()
-"""Estimation of each pass; all together are ``quality=final`` of tron-relight."""
+"""Estimation of each pass; all together are ``quality=final`` of tron-relight, but that a scan's splats are
+filtered by whole pixels here, and by the sub-pixels of tron-relight."""
 SUB_PIXELS = ((-0.25, -0.25), (0.25, 0.25), (0.25, -0.25), (-0.25, 0.25))
 """Place of each pass within the pixel, from its centre."""
 BAND_PIXELS = 24_000
@@ -382,8 +383,9 @@ class Stage:
         elif rough and len(scene) == len(self._relighter.scene):
             self._relighter, self._fresh = self._relighter.changed(scene, quick=True), False
         else:
-            self._relighter = self._lit_anew(scene, "never" if self._base.proxy is None else "always")
-            self._fresh = True
+            # Prepared before it is taken: where a newer wish ends that, the one before it stays.
+            proxy = "never" if self._base.proxy is None else "always"
+            self._relighter, self._fresh = self._lit_anew(scene, proxy).prepare(), True
             self._right.settled = self._left.settled = False
 
     def _lit_anew(self, scene: GaussianScene, proxy: Choice) -> Relighter:

@@ -129,6 +129,7 @@ class Studio:
         self._changed = threading.Condition()
         self._wish, self._done = Wish(next(iter(lights)) if light is None else light), None
         self._wishes = 0  # that there have been
+        self._bringing: int | None = None  # the one that the stage is brought to
         self._refused: Wish | None = None
         self._views: dict[int, _View] = {}
         self._asked: deque[tuple[int, Callable[[Stage], Any], Future[Any]]] = deque()
@@ -185,7 +186,7 @@ class Studio:
                 answer.cancel()
             else:
                 self._asked.append((self._wishes, question, answer))
-                self._version += 1  # a pass that is under way is given up
+                self._version += 1  # a pass that is under way is given up; it waits for its wish to be done
                 self._changed.notify()
         return answer
 
@@ -252,7 +253,11 @@ class Studio:
     def _work(self, stage: Stage, wish: Wish, number: int, rough: bool) -> None:
         """The next piece of work: questions first, then a picture of the view that has least."""
         if wish != self._refused:
-            stage.bring(wish, rough)
+            self._bringing = number
+            try:
+                stage.bring(wish, rough)
+            finally:
+                self._bringing = None
             self._done = wish
         with self._changed:
             asked = self._taken(number)
@@ -359,9 +364,14 @@ class Studio:
         return PASSED + (finish is not None)
 
     def _watch(self) -> None:
-        """Raise _Outdated where a wish, a view or a question has come since the piece of work began."""
+        """Raise _Outdated where a wish has come since the piece of work began; or a view, or a question.
+
+        What is made for a wish, such as a proxy, is for all views and questions, and goes on.
+        """
         with self._changed:
-            if self._version != self._began:
+            brought = self._bringing
+            old = self._version != self._began if brought is None else self._wishes != brought
+            if old or self._closing:
                 raise _Outdated
 
     def _refuse(self, wish: Wish, number: int, why: str) -> None:

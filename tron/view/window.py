@@ -292,7 +292,9 @@ class Window:
             return self.studio.ask(question).result()
         except (CancelledError, TronError) as error:  # what cannot be done is said where it is taken back
             log.debug("no answer: %s", error)
-            return None
+        except Exception:
+            log.exception("a question of the panel failed")
+        return None
 
     # Pictures: of the studio's thread.
 
@@ -379,9 +381,10 @@ class Window:
         number = client.client_id
 
         def there() -> bool:
-            picture, now = self._last.get(number), (self.studio.wished, self._seen_by(client))
-            done = picture is not None and picture.refined == 1 and (picture.wish, picture.camera) == now
-            return self._closed or number not in self._of_client or done
+            picture, camera = self._last.get(number), self._seen_by(client)
+            done = picture is not None and picture.refined == 1 and picture.wish == self.studio.wished
+            seen = done and camera is not None and picture.camera.to_dict() == camera.to_dict()
+            return self._closed or number not in self._of_client or seen
 
         with self._pictures:
             while not self._pictures.wait_for(there, timeout=1.0):  # a wish may be taken back

@@ -52,7 +52,8 @@ def with_materials(
 
     content = scene if backdrop is None else subset(scene, ~backdrop)
     made_from = fingerprint(content, filmed)
-    found = _known(kept, made_from, "; materials=as_is leaves them out")
+    path = kept.found("materials", made_from)
+    found = _read(path, len(content), "; materials=as_is leaves them out")
     if found is None:
         try:
             require_extra("finding a scan's materials", "reconstruct")
@@ -89,7 +90,7 @@ def with_known_materials(scene: GaussianScene, kept: KeptFiles) -> GaussianScene
 
     def known(content: GaussianScene) -> GaussianScene | None:
         filmed = filmed_with(kept.scan, upright(scene.up), scene.offset, content)
-        return _known(kept, fingerprint(content, filmed))
+        return _read(kept.known("materials", fingerprint(content, filmed)), len(content))
 
     found, around = known(standing), None
     if found is None:  # of a scan with a sky they are those of all else, but with surroundings=keep
@@ -121,13 +122,14 @@ def _with(scene: GaussianScene, found: GaussianScene, backdrop: np.ndarray | Non
     return replace(scene, **values, materials_guessed=False)
 
 
-def _known(kept: KeptFiles, made_from: str, said: str = "") -> GaussianScene | None:
-    path = kept.found("materials", made_from)
+def _read(path: Path | None, count: int, said: str = "") -> GaussianScene | None:
     if path is None:
         return None
     try:
         scene = GaussianScene.load(path)
     except TronError:
+        return None
+    if len(scene) != count:
         return None
     log.info("materials are those of %s%s", path, said)
     return scene

@@ -63,7 +63,7 @@ def projected(
     eye = mi.Point3f([float(v) for v in camera.position])
     right, down, forward = (mi.Vector3f([float(v) for v in row]) for row in camera.world_to_camera[:3, :3])
     sides = (camera.cx, camera.width - camera.cx), (camera.cy, camera.height - camera.cy)
-    # Of the longer side: windows of a view, such as its stripes, see splats alike.
+    # Of the longer side: stripes of a view that is no higher than wide see splats as the whole does.
     bend = _OUTSIDE * max(max(sides[0]) / camera.fx, max(sides[1]) / camera.fy)
     numbers = (projection.variance / camera.fx**2, projection.variance / camera.fy**2, bend, nearest)
     variance_x, variance_y, bend, near = (mi.Float(float(v)) for v in numbers)
