@@ -381,10 +381,12 @@ class Window:
         number = client.client_id
 
         def there() -> bool:
+            if self._closed or number not in self._of_client:
+                return True
             picture, camera = self._last.get(number), self._seen_by(client)
-            done = picture is not None and picture.refined == 1 and picture.wish == self.studio.wished
-            seen = done and camera is not None and picture.camera.to_dict() == camera.to_dict()
-            return self._closed or number not in self._of_client or seen
+            if picture is None or camera is None or picture.refined < 1:
+                return False
+            return picture.wish == self.studio.wished and picture.camera.to_dict() == camera.to_dict()
 
         with self._pictures:
             while not self._pictures.wait_for(there, timeout=1.0):  # a wish may be taken back
