@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Estimator = Literal["ratio", "plain"]
-Diffuse = Literal["principled", "lambert"]
+Brdf = Literal["conserving", "lambert"]
 
 
 def require_bounces(bounces: int, reflections: int) -> None:
@@ -22,7 +22,7 @@ def require_bounces(bounces: int, reflections: int) -> None:
 class Estimation(BaseModel):
     """Choices in estimating light (conventions.md, 10); by default 64 rays a pixel, unfiltered.
 
-    The paper's are ``Estimation(estimator="plain", two_sided=False, bounces=0, diffuse="lambert")``. What
+    The paper's are ``Estimation(estimator="plain", two_sided=False, bounces=0, brdf="lambert")``. What
     each costs, on 10,000 to 20,000 surfels of scenes that no benchmark uses:
 
     * ``rays``: time grows with them. Their noise is below the bias of surfels from 16 on; 64 are converged.
@@ -56,10 +56,10 @@ class Estimation(BaseModel):
         description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
     )
     filtered: bool = Field(default=False, description="edge-avoiding filter over the image")
-    diffuse: Diffuse = Field(
-        default="principled",
-        description="principled: the material that data are path-traced with, whose diffuse part depends on "
-        "roughness and angle; lambert: that of base color alone, as in the paper",
+    brdf: Brdf = Field(
+        default="conserving",
+        description="conserving: the material that data are path-traced with, which sends out all the light "
+        "that it does not absorb; lambert: base color's diffuse part below a split sum, as in the paper",
     )
     bounces: int = Field(
         default=4, ge=0, le=16, description="times that light bounces between surfels; 0: direct light alone"

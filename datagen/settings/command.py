@@ -22,7 +22,7 @@ from datagen.settings.split import SplitSettings, SurfelReconstruction, SurfelSo
 from datagen.settings.surfels import AUTO, Auto, SurfelBudget, surfels_by_pixels
 from datagen.world.lights import Family, LightChoice
 from tron.errors import TronError
-from tron.estimation import FINAL, FINEST, PREVIEW, Diffuse, Estimation, Estimator, require_bounces
+from tron.estimation import FINAL, FINEST, PREVIEW, Brdf, Estimation, Estimator, require_bounces
 from tron.run_folder import leaves
 from tron.seeds import generator
 
@@ -41,7 +41,7 @@ OUTSIDE = {
 }
 """Keys that decide where, by whom and how much of a dataset is made, and nothing of what is in it."""
 
-ESTIMATED = ("estimator", "two_sided", "diffuse", "bounces", "reflections", "supersample")
+ESTIMATED = ("estimator", "two_sided", "brdf", "bounces", "reflections", "supersample")
 """Keys that decide how light on the surfels is estimated, named as in Estimation."""
 
 OF_FRAMES = ("rays", "filtered", "reflections", "supersample")
@@ -253,9 +253,9 @@ class Settings(ScaleSettings):
         description="Back faces block the surfels' shadow rays beyond two spacings; false: never, as in the "
         "paper.",
     )
-    diffuse: Diffuse = Field(
-        FINAL.diffuse,
-        description="Material that the surfels are shaded with: principled, as the path tracer's; lambert, "
+    brdf: Brdf = Field(
+        FINAL.brdf,
+        description="Material that the surfels are shaded with: conserving, as the path tracer's; lambert, "
         "as in the paper.",
     )
     bounces: int = Field(

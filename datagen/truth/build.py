@@ -1,9 +1,8 @@
 """SceneSpec -> Mitsuba scene.
 
-All procedural objects and what surrounds them are one mesh under one ``principled`` material whose parameters
-and normals come from one atlas. Every synthetic scene then has the same kernel, whatever it holds: Dr.Jit
-compiles it once and finds it in its cache for all others. Parts of the user's models bring a mesh and a
-material each.
+All procedural objects and what surrounds them are one mesh under one material whose parameters and normals
+come from one atlas. Every synthetic scene then has the same kernel, whatever it holds: Dr.Jit compiles it
+once and finds it in its cache for all others. Parts of the user's models bring a mesh and a material each.
 """
 
 from __future__ import annotations
@@ -29,10 +28,11 @@ from datagen.world.motion import Pose, Share
 from datagen.world.scene import SceneSpec, draw_scene
 from datagen.world.shapes import make_pieces, split_creases
 from datagen.world.styles import Choice
+from tron.brdf.bsdf import metallic_roughness
 from tron.cameras import Camera
 from tron.errors import TronError
 from tron.models.parts import Part, outline
-from tron.models.shapes import Shape, flat, limited, mitsuba_mesh, mitsuba_texture, textured
+from tron.models.shapes import Shape, flat, mitsuba_mesh, mitsuba_texture, textured
 from tron.shading.environments.environment import EnvironmentMap
 
 FIRST_ID = 1
@@ -168,21 +168,14 @@ def _solids(solids: Sequence[_Solid], texels_per_unit: float, most: int = texels
         faces.append(corners + count)
         ids.append(np.full(len(corners), object_id, np.uint32))
         count += len(index)
-    principled = mi.load_dict(
-        {
-            "type": "principled",
-            "base_color": mitsuba_texture(limited(atlas.base_color, atlas.metallic), half=True),
-            "roughness": mitsuba_texture(atlas.roughness, half=True),
-            "metallic": mitsuba_texture(atlas.metallic, half=True),
-            "specular": 0.5,
-        }
-    )
+    textures = (atlas.base_color, atlas.roughness, atlas.metallic)
+    material = metallic_roughness(*(mitsuba_texture(image, half=True) for image in textures))
     normal_map = mi.load_dict(mitsuba_texture(atlas.normal_map, half=True))
-    bsdf: Any = mi.load_dict({"type": "normalmap", "normalmap": normal_map, "bsdf": principled})
+    bsdf: Any = mi.load_dict({"type": "normalmap", "normalmap": normal_map, "bsdf": material})
     # Cloth, leaves and walls are open; a back face that renders black would not match its surfels.
     bsdf = mi.load_dict({"type": "twosided", "bsdf": bsdf})
     mesh = mitsuba_mesh("solids", bsdf, *(np.concatenate(part) for part in (vertices, normals, faces, uvs)))
-    return Surface(mesh, principled, normal_map, np.concatenate(ids))
+    return Surface(mesh, material, normal_map, np.concatenate(ids))
 
 
 def _of_model(part: Part, object_id: int, index: int) -> Surface:

@@ -69,7 +69,7 @@ class Atlas:
     """Textures (H, W, C) float32, linear, top row first, and how surfaces lie in them.
 
     Attributes:
-        base_color, roughness, metallic: parameters of ``principled``.
+        base_color, roughness, metallic: of :mod:`tron.brdf`.
         normal_map: tangent-space normals as (n + 1) / 2.
         laid: for each surface its vertices, once for each chart: index (V',) of the vertex that it is, uv
             (V', 2), faces (F, 3).

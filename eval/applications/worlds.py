@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from eval.tracing.scene import LIGHTS, Box, Sphere, Surface, Torus
+from tron.brdf.bsdf import metallic_roughness
 from tron.cameras import Camera, mitsuba_sensor
 from tron.gaussians.edit import joined
 from tron.gaussians.scene import GaussianScene
@@ -169,7 +170,6 @@ def draw_thing(rng: np.random.Generator) -> Part:
     points, normals = (np.concatenate([mesh[k] for mesh in meshes]) for k in (0, 1))
     faces = np.concatenate([mesh[2] + offset for mesh, offset in zip(meshes, offsets)])
     metal = rng.random() < 0.25
-    # Metals may be white; Mitsuba's principled makes light of paint that is brighter than 0.85.
     color = rng.uniform(0.15, 0.8) * (0.35 + 0.65 * rng.random(3))
     color = 0.5 + 0.5 * color if metal else color
     turn = rng.uniform(0, 2 * np.pi)
@@ -270,16 +270,11 @@ def _mitsuba(parts: Sequence[Part], light: EnvironmentMap | None) -> mi.Scene:
 
 
 def _mesh(name: str, part: Part) -> mi.Mesh:
-    """A mesh whose colours stand at its vertices, of Mitsuba's ``principled``, which both sides have."""
-    principled = {
-        "type": "principled",
-        "base_color": {"type": "mesh_attribute", "name": "vertex_color"},
-        "roughness": part.roughness,
-        "metallic": part.metallic,
-        "specular": 0.5,
-    }
+    """A mesh whose colours stand at its vertices, of :mod:`tron.brdf`, which both sides have."""
+    colors = {"type": "mesh_attribute", "name": "vertex_color"}
+    material = metallic_roughness(colors, part.roughness, part.metallic)
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": principled})
+    properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": material})
     mesh = mi.Mesh(name, len(part.vertices), len(part.faces), properties, has_vertex_normals=True)
     mesh.add_attribute("vertex_color", 3, part.base_color.astype(np.float32).ravel())  # pyright: ignore
     values = mi.traverse(mesh)

@@ -24,6 +24,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from scipy.spatial import KDTree
 
+from tron.brdf.bsdf import metallic_roughness
 from tron.cameras import Camera, mitsuba_sensor
 from tron.captures import Capture, View
 from tron.captures.view import CLIPPED, decoded, linear_light
@@ -33,7 +34,7 @@ from tron.errors import TronError
 from tron.gaussians.harmonics import SH_C0
 from tron.gaussians.scene import GaussianScene
 from tron.meshing.surface import SIDE, VIEWS, surface_of
-from tron.models.shapes import DIELECTRIC, flat, mitsuba_mesh
+from tron.models.shapes import flat, mitsuba_mesh
 from tron.runtime import aligned, lanes
 from tron.seeds import generator, integer
 from tron.shading.environments.environment import EnvironmentMap
@@ -48,7 +49,7 @@ BOUNCES = 4
 """Of a rendered frame's light between surfaces, as the truth has."""
 MATERIALS = {"base_color": 3, "roughness": 1, "metallic": 1}
 """What is fitted at the vertices -> its channels."""
-RANGES = {"base_color": (0.01, DIELECTRIC), "roughness": (0.05, 1.0), "metallic": (0.0, 1.0)}
+RANGES = {"base_color": (0.01, 1.0), "roughness": (0.05, 1.0), "metallic": (0.0, 1.0)}
 MOST_TRIANGLES = 2_000_000
 """Of the surface: it is as fine as its grid, so that patterns on flat ground have vertices too."""
 _NEAR = 4
@@ -104,9 +105,9 @@ class PaintedMesh:
     metallic: np.ndarray
 
     def lit(self, light: EnvironmentMap) -> mi.Scene:
-        """The mesh under a light. Its material is Mitsuba's ``principled``, on both sides."""
+        """The mesh under a light. Its material is that of :mod:`tron.brdf`, on both sides."""
         attributes = {name: {"type": "mesh_attribute", "name": f"vertex_{name}"} for name in MATERIALS}
-        bsdf = {"type": "twosided", "bsdf": {"type": "principled", "specular": 0.5, **attributes}}
+        bsdf = {"type": "twosided", "bsdf": metallic_roughness(**attributes)}
         mesh = mitsuba_mesh("mesh", mi.load_dict(bsdf), self.vertices, self.normals, self.faces, None)
         for name, channels in MATERIALS.items():
             mesh.add_attribute(f"vertex_{name}", channels, flat(getattr(self, name)))
@@ -169,7 +170,7 @@ def plain_mesh(capture: Capture, scene: GaussianScene, settings: MeshSettings, t
     count = len(surface.vertices)
     return PaintedMesh(
         surface.vertices, surface.normals, surface.faces,
-        base_color=np.clip(shown[near].mean(axis=1), 0.02, DIELECTRIC).astype(np.float32),
+        base_color=np.clip(shown[near].mean(axis=1), 0.02, 1.0).astype(np.float32),
         roughness=np.full(count, 0.6, np.float32), metallic=np.full(count, 0.02, np.float32),
     )  # fmt: skip
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from eval.results import Row
 from eval.timing import Times, interleaved
+from tron.brdf.bsdf import metallic_roughness
 from tron.cameras import Camera, mitsuba_sensor
 from tron.color import luminance
 from tron.estimation import FINAL, PREVIEW, Estimation
@@ -160,7 +161,7 @@ class Panel:
 
     Attributes:
         corner, along, across: world.
-        base_color: linear. roughness, metallic: of Mitsuba's ``principled``.
+        base_color: linear. roughness, metallic: of :mod:`tron.brdf`.
         cell: distance of its surfels, world units.
     """
 
@@ -193,15 +194,10 @@ class Panel:
 
     def mesh(self, name: str) -> mi.Mesh:
         """Two triangles of the material, which both sides have."""
-        principled = {
-            "type": "principled",
-            "base_color": {"type": "rgb", "value": list(self.base_color)},
-            "roughness": self.roughness,
-            "metallic": self.metallic,
-            "specular": 0.5,
-        }
+        base_color = {"type": "rgb", "value": list(self.base_color)}
+        material = metallic_roughness(base_color, self.roughness, self.metallic)
         properties = mi.Properties()
-        properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": principled})
+        properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": material})
         mesh = mi.Mesh(name, 4, 2, properties)
         a, u, v = (np.array(vector, np.float32) for vector in (self.corner, self.along, self.across))
         values = mi.traverse(mesh)

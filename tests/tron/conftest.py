@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -146,3 +147,16 @@ def cameras_around(count: int, distance: float = 4.0, size: int = 32) -> list[Ca
 def around() -> Callable[..., list[Camera]]:
     """Makes cameras on three rings that look at the origin."""
     return cameras_around
+
+
+@pytest.fixture
+def material(variant: str) -> Callable[[Any, Any, Any], SimpleNamespace]:
+    """Make a grey material from base color, roughness and metallic, a number each or (N,)."""
+
+    import mitsuba as mi
+
+    def make(base_color: float, roughness: float, metallic: float) -> SimpleNamespace:
+        base, rough, metal = (mi.Float(np.float32(value)) for value in (base_color, roughness, metallic))
+        return SimpleNamespace(base_color=mi.Color3f(base), roughness=rough, metallic=metal)
+
+    return make

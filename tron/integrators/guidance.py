@@ -12,7 +12,7 @@
     two_sided           boolean   back faces block shadow rays beyond two spacings (default: true)
     bounces             integer   times that light bounces between surfels (default: 4; 0: never)
     reflections         integer   for each camera ray, rays that find what glossy surfaces mirror (default: 0)
-    diffuse             string    material: principled (default), as Mitsuba has it, or lambert
+    brdf                string    material: conserving (default), which loses no light, or lambert
     cubemap_resolution  integer   of the prefiltered environment
 
 Buffers are those of :mod:`tron.shading.guidance`: linear, in front of the environment, which is not seen
@@ -36,7 +36,7 @@ import mitsuba as mi
 import numpy as np
 
 from tron.errors import TronError
-from tron.estimation import FINAL, Diffuse, Estimation, Estimator
+from tron.estimation import FINAL, Brdf, Estimation, Estimator
 from tron.gaussians.fields import MATERIALS, PARAMETERS
 from tron.integrators.plugin import Held, Shown, Surfels, unwrap
 from tron.shading.bounces.bounce import BouncedLight, BounceTransport, at_surfels
@@ -46,7 +46,7 @@ from tron.shading.lighting import CUBEMAP_RESOLUTION, Lighting
 from tron.tracing import GBuffer
 
 BUFFERS = tuple(name for name in Guidance.BUFFERS if name != "mask")
-CHOICES = {"estimator": Estimator, "diffuse": Diffuse}
+CHOICES = {"estimator": Estimator, "brdf": Brdf}
 NUMBERS = {"bounces": (0, 16), "reflections": (0, 1024)}
 """Least and greatest."""
 GEOMETRY = tuple(name for name in PARAMETERS if name not in (*MATERIALS, "sh"))
@@ -84,7 +84,7 @@ class GuidanceAppearance:
             dr.eval(rays)
             arriving = arriving_light(self.surfels.tracer, rays, lighting, self.estimation, seed, bounce)
             arriving = arriving.in_rows(rays)
-        shaded = shade_surface(surface, arriving, lighting, diffuse=self.estimation.diffuse)
+        shaded = shade_surface(surface, arriving, lighting, brdf=self.estimation.brdf)
         extra = [part for name in self.others for part in shaded[name]]
         return Shown(shaded[self.buffer], surface.opacity, [*extra, surface.opacity])
 

@@ -1,9 +1,9 @@
 """Models of meshes, glTF and OBJ, as textured parts that surfels can represent.
 
-Textures become linear float32 images; glTF's metallic-roughness model maps one to one onto Mitsuba's
-``principled``. Surfels and shadow rays know opaque surfaces only, so transparency is decided once, here: what
-is below the cut-off of alpha (one half where the material blends) is cut away, the rest becomes opaque. Path
-tracer, G-buffers and reference then agree on what is there.
+Textures become linear float32 images; materials are glTF's metallic-roughness, which :mod:`tron.brdf` has.
+Surfels and shadow rays know opaque surfaces only, so transparency is decided once, here: what is below the
+cut-off of alpha (one half where the material blends) is cut away, the rest becomes opaque. Path tracer,
+G-buffers and reference then agree on what is there.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from tron.brdf.bsdf import metallic_roughness
 from tron.runtime import aligned
 
 if TYPE_CHECKING:
@@ -24,12 +25,12 @@ class Shape:
 
     Attributes:
         shape: the mesh, with its material.
-        principled: the innermost material, which knows base color, roughness and metallic.
+        material: the innermost BSDF, which knows base color, roughness and metallic.
         normal_map: texture of tangent-space normals as (n + 1) / 2, or None.
     """
 
     shape: mi.Mesh
-    principled: mi.BSDF
+    material: mi.BSDF
     normal_map: mi.Texture | None
 
     def elsewhere(self, part: Part) -> Shape:
@@ -47,26 +48,19 @@ def textured(part: Part, name: str) -> Shape:
     )
     if part.tint is not None:
         base_color = tinted(base_color)
-    metallic = mitsuba_texture(part.metallic, look("metallic"))
-    if part.base_color.max() > DIELECTRIC:
-        base_color = limited_texture(base_color, metallic)
-    principled = mi.load_dict(
-        {
-            "type": "principled",
-            "base_color": base_color,
-            "roughness": mitsuba_texture(part.roughness, look("roughness")),
-            "metallic": metallic,
-            "specular": 0.5,
-        }
+    material = metallic_roughness(
+        base_color,
+        mitsuba_texture(part.roughness, look("roughness")),
+        mitsuba_texture(part.metallic, look("metallic")),
     )
-    bsdf: Any = principled
+    bsdf: Any = material
     normal_map = None
     if part.normal_map is not None:
         normal_map = mi.load_dict(mitsuba_texture(part.normal_map, look("normal_map")))
-        bsdf = mi.load_dict({"type": "normalmap", "normalmap": normal_map, "bsdf": principled})
+        bsdf = mi.load_dict({"type": "normalmap", "normalmap": normal_map, "bsdf": material})
     # Models are often open shells; a back face that renders black would not match its surfels.
     bsdf = mi.load_dict({"type": "twosided", "bsdf": bsdf})
-    return Shape(_shape(part, name, bsdf), principled, normal_map)
+    return Shape(_shape(part, name, bsdf), material, normal_map)
 
 
 def _shape(part: Part, name: str, bsdf: mi.BSDF) -> mi.Mesh:
@@ -179,39 +173,6 @@ def _product(texture: Any, si: Any, active: Any) -> mi.Color3f:
     return texture.image.eval_3(si, active) * si.shape.eval_attribute_3(ATTRIBUTE, si, active)
 
 
-DIELECTRIC = 0.85
-"""Highest base color of a surface that is no metal, that path tracing makes no light.
-
-Mitsuba's ``principled`` adds its dielectric layer (specular 0.5) to its diffuse part and takes nothing away
-for it: with base color 1 and roughness 1 a surface sends out 1.08 times what arrives, averaged over views,
-and a closed white room never settles. At 0.85 the same average is 0.92 at most; at grazing views it can
-still pass 1 (1.2 at 6 degrees above the surface). Metals have no diffuse part, so they may be white:
-
-    base_color <= 0.85 + 0.15 metallic
-"""
-
-
-def highest(metallic: Any) -> Any:
-    """Highest base color, linear, of what is ``metallic`` in [0, 1]; NumPy and Dr.Jit alike."""
-    return DIELECTRIC + (1 - DIELECTRIC) * metallic
-
-
-def limited(base_color: np.ndarray, metallic: np.ndarray) -> np.ndarray:
-    """``base_color`` (..., 3), linear, no higher than ``metallic`` (..., 1) allows."""
-    return np.minimum(base_color, highest(metallic))
-
-
-def limited_texture(base_color: dict[str, Any] | mi.Texture, metallic: dict[str, Any] | float) -> mi.Texture:
-    """Mitsuba texture: linear ``base_color``, no higher than ``metallic`` allows at the same point."""
-    register_texture(str(mi.variant()), "limited", _limited)
-    return mi.load_dict({"type": "limited", "image": base_color, "metallic": metallic})
-
-
-def _limited(texture: Any, si: Any, active: Any) -> mi.Color3f:
-    most = highest(texture.metallic.eval_1(si, active))
-    return dr.minimum(texture.image.eval_3(si, active), mi.Color3f(most))
-
-
 def surface_points(
     shapes: Sequence[Shape], scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool | bool = True
 ) -> tuple[mi.SurfaceInteraction3f, mi.Normal3f]:
@@ -243,7 +204,7 @@ def materials_at(
     base_color, roughness, metallic = mi.Color3f(0.0), mi.Float(0.0), mi.Float(0.0)
     for each in shapes:
         here = si.is_valid() & (si.shape == mi.ShapePtr(each.shape))
-        base_color = dr.select(here, each.principled.eval_attribute_3("base_color", si, here), base_color)
-        roughness = dr.select(here, each.principled.eval_attribute_1("roughness", si, here), roughness)
-        metallic = dr.select(here, each.principled.eval_attribute_1("metallic", si, here), metallic)
+        base_color = dr.select(here, each.material.eval_attribute_3("base_color", si, here), base_color)
+        roughness = dr.select(here, each.material.eval_attribute_1("roughness", si, here), roughness)
+        metallic = dr.select(here, each.material.eval_attribute_1("metallic", si, here), metallic)
     return base_color, roughness, metallic

@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from tron.estimation import FINAL, Diffuse, Estimation, Estimator
+from tron.estimation import FINAL, Brdf, Estimation, Estimator
 
 Model = TypeVar("Model", bound="Settings")
 
@@ -290,9 +290,9 @@ class FitSettings(Settings):
         default=FINAL.two_sided,
         description="Back faces block shadow rays beyond two spacings; false: never, as in the paper.",
     )
-    diffuse: Diffuse = Field(
-        default=FINAL.diffuse,
-        description="Material that the light's scale is fitted with: principled, or lambert, the paper's.",
+    brdf: Brdf = Field(
+        default=FINAL.brdf,
+        description="Material that the light's scale is fitted with: conserving, or lambert, the paper's.",
     )
     coarsest: int = Field(
         default=4,
@@ -321,7 +321,7 @@ class FitSettings(Settings):
             rays=rays,
             estimator=self.estimator,
             two_sided=self.two_sided,
-            diffuse=self.diffuse,
+            brdf=self.brdf,
             filtered=filtered,
         )
 

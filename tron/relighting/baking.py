@@ -140,8 +140,8 @@ def _surfels(light: Illumination) -> Surface:
 
 def _radiance(light: Illumination, surface: Surface) -> np.ndarray:
     """(M, 3) linear radiance of the surfels along ``surface.direction``, as frames without rays have it."""
-    arriving, diffuse = arrived(surface, light.estimation.diffuse), light.estimation.diffuse
-    response = Response.of(surface, light.lighting.split_sum, diffuse, arriving.terms)
+    arriving = arrived(surface)
+    response = Response.of(surface, light.lighting.split_sum, light.estimation.brdf)
     bounced = bounced_light(surface, arriving)
     assert bounced is not None
     radiance = response.lit(response.unshadowed * arriving.visibility, bounced)

@@ -460,7 +460,7 @@ class TracedFrame:
 
     def images(self, names: Iterable[str]) -> dict[str, np.ndarray]:
         """(H, W, 3) buffers of :meth:`shade` alone, of a frame without sub-pixels and not denoised."""
-        colors = shade_surface(self.view, self.arriving, self.lighting, None, self.estimation.diffuse)
+        colors = shade_surface(self.view, self.arriving, self.lighting, None, self.estimation.brdf)
         return self.view.images({name: colors[name] for name in names})
 
     def denoised(self, albedo: np.ndarray) -> TracedFrame:

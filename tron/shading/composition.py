@@ -1,14 +1,13 @@
 """Light that arrives at a surface -> radiance that leaves it towards a view: one formula for every picture.
 
     pbr         kd U + S                       nothing in the way
-    shadowed    kd' E + S                      shadows on the diffuse part
-    lit         kd' E + kd I + o S + ks M      and light that has met the scene
+    shadowed    kd E + S                       shadows on the diffuse part
+    lit         kd (E + I) + o S + ks M        and light that has met the scene
 
-kd' is kd for the directions that light arrives from (:mod:`tron.shading.burley`), kd that of even light.
 U is the unshadowed irradiance / pi, E what arrives of it, I the irradiance / pi of bounced light, S the
 split-sum specular of the environment alone, o the share of it that escapes the scene, M the mean radiance
 over the lobe of the scene that is in the way of the rest. kd and ks are those of
-:mod:`tron.shading.reflectance`.
+:mod:`tron.brdf.reflectance`.
 
 Without reflection rays (:mod:`tron.shading.reflections`) M is I: the scene shines into the lobe as it does
 from everywhere. And o is (1 - roughness) openness + roughness E / U: a rough lobe sees what a diffuse surface
@@ -25,10 +24,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from tron.estimation import Diffuse
+from tron.brdf.reflectance import reflectance
+from tron.estimation import Brdf
 from tron.shading.direct.visibility import shading_normal
 from tron.shading.lighting import SplitSum
-from tron.shading.reflectance import reflectance
 from tron.tracing.hierarchy.transmittance import OPAQUE_TRANSMITTANCE
 
 if TYPE_CHECKING:
@@ -59,32 +58,21 @@ class Bounced:
 
 @dataclass
 class Response:
-    """A surface under the environment, towards its view: kd, kd', ks, U and S, one lane each, linear."""
+    """A surface under the environment, towards its view: kd, ks, U and S, one lane each, linear."""
 
     diffuse: mi.Color3f
-    arriving: mi.Color3f
     lobe: mi.Color3f
     unshadowed: mi.Color3f
     specular: mi.Color3f
 
     @classmethod
-    def of(
-        cls, surface: Surface, split_sum: SplitSum, diffuse: Diffuse, terms: mi.Vector3f | None = None
-    ) -> Response:
-        """The response along the surface's own rays; differentiable by material, normal and light.
-
-        ``terms`` as of :func:`reflectance`, for kd'; without them it is kd.
-        """
+    def of(cls, surface: Surface, split_sum: SplitSum, brdf: Brdf) -> Response:
+        """The response along the surface's own rays; differentiable by material, normal and light."""
         normal, to_camera = shading_normal(surface), -surface.direction
         cosine = dr.dot(normal, to_camera)
-        share = reflectance(surface, split_sum.brdf, cosine, diffuse)
-        arriving = share.diffuse
-        if terms is not None:
-            arriving = reflectance(surface, split_sum.brdf, cosine, diffuse, terms).diffuse
+        share = reflectance(surface, split_sum.brdf, cosine, brdf)
         mirrored = split_sum.reflected(normal, to_camera, surface.roughness)
-        return cls(
-            share.diffuse, arriving, share.specular, split_sum.diffuse(normal), mirrored * share.specular
-        )
+        return cls(share.diffuse, share.specular, split_sum.diffuse(normal), mirrored * share.specular)
 
     def open(self) -> mi.Color3f:
         """Radiance with nothing in the way."""
@@ -92,13 +80,12 @@ class Response:
 
     def direct(self, irradiance: mi.Color3f) -> mi.Color3f:
         """Radiance of direct light, of which ``irradiance`` / pi arrives."""
-        return self.arriving * irradiance + self.specular
+        return self.diffuse * irradiance + self.specular
 
     def lit(self, irradiance: mi.Color3f, bounced: Bounced) -> mi.Color3f:
         """Radiance of all light: ``irradiance`` / pi of it is direct."""
         return (
-            self.arriving * irradiance
-            + self.diffuse * bounced.indirect
+            self.diffuse * (irradiance + bounced.indirect)
             + bounced.openness * self.specular
             + self.lobe * bounced.mirrored
         )

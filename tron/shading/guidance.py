@@ -32,14 +32,13 @@ import numpy as np
 
 from tron.cameras import Camera
 from tron.color import Look, to_display
-from tron.estimation import FINAL, MOST_RAYS, OCTAVES, Diffuse, Estimation
+from tron.estimation import FINAL, MOST_RAYS, OCTAVES, Brdf, Estimation
 from tron.io.images import encode_png, write_image
 from tron.metering import incident_exposure
 from tron.shading.bounces.bounce import BOUNCED_VALUES, SHOWN_RAYS, BouncedLight
-from tron.shading.burley import terms_of_mean
 from tron.shading.composition import Bounced, Response, evenly_bounced, over_background
 from tron.shading.direct.irradiance import Occluder
-from tron.shading.direct.visibility import Shadows, shading_normal, visibility_and_terms
+from tron.shading.direct.visibility import Shadows, visibility
 from tron.shading.lighting import Lighting
 from tron.shading.reflections import Mirror, metal_reflections, reflections, with_metals
 
@@ -143,18 +142,16 @@ class Arriving:
         mirror: by reflection rays; None without.
         metals: by those of metals alone, in previews (:mod:`tron.shading.reflections`); None without.
         behind: radiance behind the surfels (:class:`tron.relighting.ground.Ground`); None: the environment's.
-        terms: of Burley's diffuse part for what arrives (:mod:`tron.shading.burley`); None: as of even light.
     """
 
     visibility: mi.Color3f
     mirror: Mirror | None = None
-    terms: mi.Vector3f | None = None
     metals: Mirror | None = None
     behind: mi.Color3f | None = None
 
     def in_rows(self, gbuffer: GBuffer) -> Arriving:
         """Of pixels row by row, where lanes are those of ``gbuffer``."""
-        found = (self.visibility, self.mirror, self.terms, self.metals, self.behind)
+        found = (self.visibility, self.mirror, self.metals, self.behind)
         return Arriving(*(None if value is None else gbuffer.in_rows(value) for value in found))
 
 
@@ -218,14 +215,13 @@ def arriving_light(
     """Light that reaches the pixels of :func:`trace_view`; arguments as of :func:`render_guidance`."""
     estimation = estimation.of_sub_pixel()
     if estimation.rays == 0 and len(gbuffer.values) > BOUNCED_VALUES:
-        arriving = arrived(gbuffer, estimation.diffuse)
+        arriving = arrived(gbuffer)
     else:
-        share, terms = visibility_and_terms(tracer, gbuffer, lighting, estimation, seed)
-        arriving = Arriving(share, terms=terms)
+        arriving = Arriving(visibility(tracer, gbuffer, lighting, estimation, seed))
     if bounce is not None and estimation.bounces and estimation.reflections:
         occluder = tracer.sided(estimation.two_sided)
         arriving.mirror = reflections(
-            occluder, gbuffer, lighting, bounce, estimation.reflections, seed, estimation.diffuse
+            occluder, gbuffer, lighting, bounce, estimation.reflections, seed, estimation.brdf
         )
     elif bounce is not None and estimation.bounces and estimation.filtered:
         occluder = tracer.sided(estimation.two_sided)
@@ -233,13 +229,9 @@ def arriving_light(
     return arriving
 
 
-def arrived(surface: Surface, diffuse: Diffuse) -> Arriving:
+def arrived(surface: Surface) -> Arriving:
     """Light that has reached surfels, of a ``surface`` with all values of a bake: found without a ray."""
-    *share, x, y, z = surface.values[BOUNCED_VALUES:]
-    terms = None
-    if diffuse != "lambert":
-        terms = terms_of_mean(shading_normal(surface), surface.direction, mi.Vector3f(x, y, z))
-    return Arriving(mi.Color3f(*share), terms=terms)
+    return Arriving(mi.Color3f(*surface.values[BOUNCED_VALUES:]))
 
 
 def shade_surface(
@@ -247,14 +239,14 @@ def shade_surface(
     arriving: Arriving,
     lighting: Lighting,
     background: Sequence[float] | None = None,
-    diffuse: Diffuse = "principled",
+    brdf: Brdf = "conserving",
 ) -> dict[str, mi.Color3f]:
     """Shade what rays see, given the light that reaches each of them.
 
     Light bounces where ``surface`` has the values of a bake (``BouncedLight.values``). ``background`` as of
     :func:`render_guidance`. Returns the colours of :class:`Guidance` by name, on the device, one lane a ray.
     """
-    response = Response.of(surface, lighting.split_sum, diffuse, arriving.terms)
+    response = Response.of(surface, lighting.split_sum, brdf)
     irradiance = response.unshadowed * arriving.visibility
     bounced = bounced_light(surface, arriving)
     if background is None and arriving.behind is not None:
@@ -299,7 +291,7 @@ def shade(
 
     Arguments as of :func:`render_guidance`.
     """
-    colors = gbuffer.images(shade_surface(gbuffer, arriving, lighting, background, estimation.diffuse))
+    colors = gbuffer.images(shade_surface(gbuffer, arriving, lighting, background, estimation.brdf))
     buffers = gbuffer.numpy()
     if estimation.supersample > 1:
         colors = {name: averaged(color, estimation.supersample) for name, color in colors.items()}

@@ -15,9 +15,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from tron.brdf.table import BrdfTable
 from tron.errors import TronError
 from tron.runtime import aligned
-from tron.shading.brdf_table import BrdfTable
 from tron.shading.environments.cubemap import CubemapLight, bilinear, face_direction
 from tron.shading.environments.environment import EnvironmentLight, EnvironmentMap
 from tron.shading.environments.prefilter import LightTree, ggx_prefilter

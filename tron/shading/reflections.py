@@ -1,8 +1,8 @@
 """Mirror images of the scene in glossy surfaces: rays of each pixel's lobe that meet it or escape.
 
 Half vectors h are drawn from the normals that the view v sees (Heitz 2018, "Sampling the GGX Distribution of
-Visible Normals"); a ray l then has the density p(l) = D(h) G_1(v) / (4 n.v) and the weight w = F(v.h) G_1(l),
-with Smith's masking in its separable form as Mitsuba has it. With L the environment's radiance, V its
+Visible Normals"); a ray l then has the density p(l) = D(h) G_1(v) / (4 n.v) and the
+weight w = F(v.h) G_2(v, l) / G_1(v) (:mod:`tron.brdf.microfacets`). With L the environment's radiance, V its
 visibility and R what a surfel sends back along the ray,
 
     M = sum_met w R / sum w                  mean radiance over the lobe of what is met
@@ -25,7 +25,9 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from tron.estimation import Diffuse, Estimation
+from tron.brdf.microfacets import seen_density, unhidden, visible_normal
+from tron.brdf.reflectance import Material, fresnel
+from tron.estimation import Brdf, Estimation
 from tron.seeds import integer
 from tron.shading.bounces.bounce import BouncedLight
 from tron.shading.composition import Bounced, Response, evenly_bounced
@@ -33,7 +35,6 @@ from tron.shading.direct.irradiance import ORIGIN_OFFSET
 from tron.shading.direct.neighbours import neighbourhood_mean
 from tron.shading.direct.sampling import PixelPoints
 from tron.shading.lighting import Lighting
-from tron.shading.reflectance import Material, fresnel
 from tron.tracing.hierarchy.first_hit import NOTHING, FirstHit, ray_seeds
 from tron.tracing.surface import centres
 
@@ -65,7 +66,7 @@ def reflections(
     bounce: BouncedLight,
     rays: int,
     seed: int,
-    diffuse: Diffuse = "principled",
+    brdf: Brdf = "conserving",
     where: mi.Bool | bool = True,
 ) -> Mirror:
     """The view of each pixel's lobe.
@@ -79,7 +80,7 @@ def reflections(
         bounce: what it is at each surfel.
         rays: of each pixel.
         seed: root of their random numbers.
-        diffuse: the model of the material.
+        brdf: the model of the material.
         where: the pixels that send any.
     """
     with dr.suspend_grad():
@@ -102,16 +103,16 @@ def reflections(
             dr.eval(directions, active, seeds)
             hits = tracer.first_hits(origin, directions, active, seeds)
             for direction, counts, hit in zip(directions, active, hits, strict=True):
-                weight, share, radiance = _weights(lobe, direction, counts, gbuffer, lighting, diffuse)
+                weight, share, radiance = _weights(lobe, direction, counts, gbuffer, lighting, brdf)
                 met = hit.surfel != NOTHING
-                returned = _returned(tracer, hit, direction, lighting, bounce, diffuse)
+                returned = _returned(tracer, hit, direction, lighting, bounce, brdf)
                 sums["weight"] += weight
                 sums["met"] += dr.select(met, weight * returned, 0)
                 sums["light"] += share * radiance
                 sums["escaped"] += dr.select(met, 0, share * radiance)
             dr.eval(sums)
             directions = [lighting.light.sample(points.point(run, ray, mi.UInt32(1)))[0] for ray in fan]
-            found = [_weights(lobe, d, seen, gbuffer, lighting, diffuse) for d in directions]
+            found = [_weights(lobe, d, seen, gbuffer, lighting, brdf) for d in directions]
             values = [share * radiance for _, share, radiance in found]
             active = [dr.max(value) > 0 for value in values]
             dr.eval(directions, values, active)
@@ -154,10 +155,7 @@ class Lobe:
 
     def density(self, half: mi.Vector3f) -> mi.Float:
         """Density of :meth:`draw`, by solid angle, where the local half vector is ``half``."""
-        alpha2 = dr.square(self.alpha)
-        spread = dr.square(half.z) * (alpha2 - 1) + 1
-        distribution = alpha2 / (dr.pi * dr.square(spread))
-        return distribution * masking(self.view.z, self.alpha) / (4 * self.view.z)
+        return seen_density(self.view.z, half.z, self.alpha)
 
 
 def _weights(
@@ -166,13 +164,13 @@ def _weights(
     active: mi.Bool,
     material: Material,
     lighting: Lighting,
-    diffuse: Diffuse,
+    brdf: Brdf,
 ) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f]:
     """w, m w and L of rays along ``direction``, however they were drawn; w is 0 where inactive."""
     out = lobe.frame.to_local(direction)
     half = dr.normalize(out + lobe.view)
     facing = dr.dot(lobe.view, half)
-    weight = fresnel(material, facing, diffuse) * masking(out.z, lobe.alpha)
+    weight = fresnel(material, facing, brdf) * unhidden(lobe.view.z, out.z, lobe.alpha)
     weight = dr.select(active & (out.z > 0) & (facing > 0), weight, 0)
     own, other = lobe.density(half), lighting.light.pdf(direction)
     total = own + other
@@ -192,7 +190,7 @@ def _returned(
     direction: mi.Vector3f,
     lighting: Lighting,
     bounce: BouncedLight,
-    diffuse: Diffuse,
+    brdf: Brdf,
 ) -> mi.Color3f:
     """Radiance that what is met sends back along ``direction``; 0 where nothing is."""
     met = hit.surfel != NOTHING
@@ -204,36 +202,12 @@ def _returned(
     surface = centres(tracer.records, hit.surfel, front)
     surface.direction = direction
     direct, indirect = of(bounce.direct, front), of(bounce.indirect, front)
-    response = Response.of(surface, lighting.split_sum, diffuse)
+    response = Response.of(surface, lighting.split_sum, brdf)
     openness = dr.gather(mi.Float, bounce.openness, hit.surfel, front)
     visibility = ratio(direct, response.unshadowed, 1)
     bounced = evenly_bounced(indirect, openness, visibility, surface.roughness)
     shown = response.lit(direct, bounced)
     return dr.select(hit.front, shown, of(bounce.behind, met & ~hit.front))
-
-
-def visible_normal(view: mi.Vector3f, alpha: mi.Float, u: mi.Point2f) -> mi.Vector3f:
-    """Half vector by the GGX normals that ``view`` sees, both unit and local; Heitz 2018, listing 1."""
-    stretched = dr.normalize(mi.Vector3f(alpha * view.x, alpha * view.y, view.z))
-    length2 = dr.square(stretched.x) + dr.square(stretched.y)
-    aslant = length2 > 1e-12
-    inverse = dr.rsqrt(dr.select(aslant, length2, 1))
-    across = dr.select(
-        aslant, mi.Vector3f(-stretched.y * inverse, stretched.x * inverse, 0), mi.Vector3f(1, 0, 0)
-    )
-    along = dr.cross(stretched, across)
-    radius = dr.sqrt(u.x)
-    sin, cos = dr.sincos(u.y * float(2 * dr.pi))
-    x, y, squeeze = radius * cos, radius * sin, 0.5 * (1 + stretched.z)
-    y = (1 - squeeze) * dr.safe_sqrt(1 - x * x) + squeeze * y
-    normal = x * across + y * along + dr.safe_sqrt(1 - x * x - y * y) * stretched
-    return dr.normalize(mi.Vector3f(alpha * normal.x, alpha * normal.y, dr.maximum(normal.z, 1e-6)))
-
-
-def masking(cosine: mi.Float, alpha: mi.Float) -> mi.Float:
-    """Smith's G_1 of GGX at ``cosine`` to the normal."""
-    alpha2 = dr.square(alpha)
-    return 2 * cosine / (cosine + dr.safe_sqrt(alpha2 + (1 - alpha2) * dr.square(cosine)))
 
 
 # A metal shows nothing but reflections, so the bounced light around it will not do: a room of metal is 1.02,
@@ -263,7 +237,7 @@ def metal_reflections(
     metal = (gbuffer.opacity > 0) & (metal_share(gbuffer) > 0)
     if not dr.any(metal):
         return None
-    found = reflections(tracer, gbuffer, lighting, bounce, RAYS, seed, estimation.diffuse, metal)
+    found = reflections(tracer, gbuffer, lighting, bounce, RAYS, seed, estimation.brdf, metal)
     own = [*found.openness, *found.radiance]
     values = [dr.select(metal, value, 0) for value in own] + [dr.select(metal, mi.Float(1), 0)]
     dr.eval(values)

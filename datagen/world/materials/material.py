@@ -22,7 +22,7 @@ ROUGHNESS = (0.1, 0.95)
 
 
 class Appearance(NamedTuple):
-    """Parameters of Mitsuba's ``principled`` at N points, float32.
+    """Parameters of :mod:`tron.brdf` at N points, float32.
 
     Attributes:
         base_color: (N, 3) linear in [0, 1].

@@ -255,7 +255,7 @@ def test_a_scene_is_built_with_the_folder_of_the_settings(folder, tmp_path):
     )
     settings = Settings(output_dir=tmp_path, textures=folder, mesh_edge=0.3, texels_per_unit=8.0)
     (surface,) = scene_geometry(spec, settings, Sources(textures=sets)).surfaces
-    color = surface.principled
+    color = surface.material
     assert color is not None
     mesh, _ = make_pieces(ShapeSpec(kind="box", size=0.5, parameters=(0.5, 0.5, 0.5, 0.5)), 1.0)[0]
     material = opened(spec.objects[0].materials[0], folder, sets, 8.0)

@@ -126,7 +126,7 @@ def test_lit_is_as_bright_as_the_truth_and_equal_to_direct_light_where_nothing_b
 def test_light_on_the_surfels_is_estimated_as_everywhere_else_unless_told_otherwise(tmp_path, tiny):
     settings = tiny(tmp_path, "test.guidance_spp=64")
     assert settings.estimation("test") == FINAL
-    chosen = {"estimator": "plain", "two_sided": False, "diffuse": "lambert", "bounces": 1}
+    chosen = {"estimator": "plain", "two_sided": False, "brdf": "lambert", "bounces": 1}
     chosen |= {"reflections": 4, "supersample": 2}
     assert set(chosen) == set(ESTIMATED)
     other = tiny(tmp_path, "test.guidance_spp=64", *(f"{key}={value}" for key, value in chosen.items()))

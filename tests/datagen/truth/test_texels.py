@@ -69,9 +69,9 @@ def read(surface: build.Surface, face: np.ndarray, weights: np.ndarray) -> dict[
     assert (np.array(si.prim_index) == face).mean() > 0.98
     bent = 2.0 * mi.Vector3f(surface.normal_map.eval_3(si)) - 1.0
     return {
-        "base_color": np.array(surface.principled.eval_attribute_3("base_color", si)).T,
-        "roughness": np.array(surface.principled.eval_attribute_1("roughness", si)),
-        "metallic": np.array(surface.principled.eval_attribute_1("metallic", si)),
+        "base_color": np.array(surface.material.eval_attribute_3("base_color", si)).T,
+        "roughness": np.array(surface.material.eval_attribute_1("roughness", si)),
+        "metallic": np.array(surface.material.eval_attribute_1("metallic", si)),
         "normal": np.array(dr.normalize(si.sh_frame.to_world(bent))).T,
         "position": np.array(si.p).T,
     }

@@ -91,7 +91,7 @@ def test_a_white_surface_in_constant_light_shows_the_exposed_value(
     (tmp_path / "view.json").write_text(json.dumps([view.to_dict()]))
     out = tmp_path / "out"
     files = [f"scene={tmp_path / 'a.ply'}", f"environment={tmp_path / 'c.exr'}", f"output_dir={out}"]
-    files += [f"cameras={tmp_path / 'view.json'}", "buffers=[relit]", "diffuse=lambert"]
+    files += [f"cameras={tmp_path / 'view.json'}", "buffers=[relit]", "brdf=lambert"]
     assert relight(*files, f"exposure={exposure}") == 0
     luma = light @ (0.2126, 0.7152, 0.0722)
     shown = json.loads((out / "relight.json").read_text())["exposure"]

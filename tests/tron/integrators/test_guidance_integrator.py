@@ -83,7 +83,7 @@ def test_pixel_centres_see_the_librarys_guidance(surfels, light, buffer: str) ->
 
 
 def test_choices_about_bounced_light_are_the_librarys(surfels, light) -> None:
-    chosen = {"bounces": 1, "reflections": 4, "diffuse": "lambert"}
+    chosen = {"bounces": 1, "reflections": 4, "brdf": "lambert"}
     integrator = plugin(surfels, buffer="lit", **chosen)
     seen = channels(mi.render(scene_of(light.to_mitsuba()), integrator=integrator), integrator)["main"]
     assert (np.abs(seen - ours(surfels, light, **chosen).lit) > 5e-3).mean() < 0.02
@@ -270,7 +270,7 @@ def test_mistakes_are_named(surfels, tmp_path) -> None:
     for given, complaint in (
         ({"buffer": "albedo"}, "choose one of pbr, irradiance, unshadowed, shadowed"),
         ({"estimator": "median"}, "choose ratio or plain"),
-        ({"diffuse": "velvet"}, "choose principled or lambert"),
+        ({"brdf": "velvet"}, "choose conserving or lambert"),
         ({"bounces": -1}, "give 0 to 16"),
         ({"shadow_rays": 3}, "an even number"),
         ({"environment": str(tmp_path / "missing.exr")}, "missing.exr"),

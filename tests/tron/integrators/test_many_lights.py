@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tron import integrators
+from tron.brdf.bsdf import register_bsdf
 from tron.cameras import Camera, mitsuba_sensor
 from tron.errors import TronError
 from tron.integrators.many_lights import StackedLights, hilbert_order
@@ -24,6 +25,7 @@ CAMERA = Camera.look_at((2.2, -2.6, 1.5), (0, 0, 0.35), fov_deg=38, width=24, he
 @pytest.fixture
 def registered(variant) -> None:
     integrators.register()
+    register_bsdf()
 
 
 def lights() -> list[EnvironmentMap]:
@@ -45,10 +47,10 @@ def shapes() -> dict[str, Any]:
     bumpy = {
         "type": "normalmap",
         "normalmap": {"type": "bitmap", "bitmap": bumps, "raw": True},
-        "bsdf": {"type": "principled", "base_color": textured, "roughness": 0.4},
+        "bsdf": {"type": "metallicroughness", "base_color": textured, "roughness": 0.4},
     }
-    metal = {"type": "principled", "base_color": {"type": "rgb", "value": [0.9, 0.6, 0.3]}}
-    white = {"type": "principled", "base_color": {"type": "rgb", "value": 0.7}, "roughness": 0.8}
+    metal = {"type": "metallicroughness", "base_color": {"type": "rgb", "value": [0.9, 0.6, 0.3]}}
+    white = {"type": "metallicroughness", "base_color": {"type": "rgb", "value": 0.7}, "roughness": 0.8}
     place = mi.ScalarTransform4f()
     return {
         "type": "scene",

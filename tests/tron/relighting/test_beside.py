@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
+from tron.brdf.bsdf import metallic_roughness
 from tron.cameras import Camera, mitsuba_sensor
 from tron.errors import TronError
 from tron.estimation import Estimation
@@ -132,7 +133,7 @@ def still_life(dense: Any) -> tuple[Any, list[Part], list[dict[str, Any]]]:
         box((0.1, -0.6, 0), (0.6, -0.2, 0.4), (0.1, 0.6, 0.2), 0.3),
     ]
     tone = {"type": "rgb", "value": [0.8] * 3}
-    bsdf = {"type": "principled", "base_color": tone, "roughness": 0.7, "metallic": 0.0, "specular": 0.5}
+    bsdf = metallic_roughness(tone, 0.7, 0.0)
     shapes: list[Any] = [{**floor.mitsuba, "bsdf": bsdf}]
     return scene, parts, shapes + [textured(part, f"part{k}").shape for k, part in enumerate(parts)]
 

@@ -137,14 +137,3 @@ def points_gbuffer(variant: str) -> Callable[[np.ndarray, np.ndarray], PointsGBu
         )
 
     return make
-
-
-@pytest.fixture
-def material(variant: str) -> Callable[[float, float, float], SimpleNamespace]:
-    """Make a grey material from base color, roughness and metallic, a number each or (N,)."""
-
-    def make(base_color: float, roughness: float, metallic: float) -> SimpleNamespace:
-        base, rough, metal = (mi.Float(np.float32(value)) for value in (base_color, roughness, metallic))
-        return SimpleNamespace(base_color=mi.Color3f(base), roughness=rough, metallic=metal)
-
-    return make

@@ -11,6 +11,7 @@ import pytest
 from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial.transform import Rotation
 
+from tron.brdf.bsdf import metallic_roughness
 from tron.cameras import Camera, mitsuba_sensor
 from tron.estimation import Estimation
 from tron.gaussians.scene import measure_spacing
@@ -279,7 +280,7 @@ def test_irradiance_is_that_of_mitsuba_on_the_shape_itself(
         ("sphere", 1.0, 0.5, "smooth", 0.04, 0.07),
     ],
 )
-def test_direct_light_is_that_of_mitsubas_principled_bsdf(
+def test_direct_light_is_that_of_the_path_tracers_material(
     dense_surfels,
     sun_map,
     shape: str,
@@ -289,7 +290,7 @@ def test_direct_light_is_that_of_mitsubas_principled_bsdf(
     bias: float,
     spread: float,
 ) -> None:
-    """Within noise plus the bias of split-sum, which takes view and normal for one, and of Disney's diffuse.
+    """Within noise plus the bias of split-sum, which takes view and normal for one.
 
     ``bias`` bounds the mean's, ``spread`` the median pixel's, relative to the mean. Rough metal under a sun
     is left out: there split-sum itself is off by half.
@@ -303,13 +304,7 @@ def test_direct_light_is_that_of_mitsubas_principled_bsdf(
         metallic=np.full(count, metallic),
     )
     guidance = render_guidance(SurfelTracer(scene), VIEW, Lighting(environment), Estimation(rays=64))
-    bsdf = {
-        "type": "principled",
-        "base_color": {"type": "rgb", "value": 0.6},
-        "roughness": roughness,
-        "metallic": metallic,
-        "specular": 0.5,  # a reflectance of 0.04 at the normal
-    }
+    bsdf = metallic_roughness(0.6, roughness, metallic)
     truth = render_mitsuba(sheets, VIEW, environment, bsdf, 128)
     inner = away_from_silhouettes(guidance)
     ours, theirs = guidance.shadowed[inner], truth[inner]

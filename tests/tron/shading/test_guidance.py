@@ -47,7 +47,7 @@ def test_buffers_are_finite_float32_images(variant: str, sphere_over_plane, came
 
 def test_buffers_differ_by_the_diffuse_shadow_alone(variant: str, sphere_over_plane, camera, sun_map) -> None:
     tracer = sphere_over_plane(base_color=0.6, metallic=0.25)
-    guidance = render_guidance(tracer, camera, Lighting(sun_map), Estimation(rays=16, diffuse="lambert"))
+    guidance = render_guidance(tracer, camera, Lighting(sun_map), Estimation(rays=16, brdf="lambert"))
     inside = guidance.mask == 1
     lost = 0.6 * 0.75 * (guidance.unshadowed - guidance.irradiance)
     assert lost[inside].max() > 0.1
@@ -140,7 +140,7 @@ def test_the_plain_estimate_is_the_mean_over_the_rays(
     variant: str, sphere_over_plane, camera, sun_map
 ) -> None:
     tracer, lighting = sphere_over_plane(base_color=0.5), Lighting(sun_map)
-    paper = Estimation(rays=16, estimator="plain", diffuse="lambert")
+    paper = Estimation(rays=16, estimator="plain", brdf="lambert")
     plain = render_guidance(tracer, camera, lighting, paper, seed=3)
     gbuffer, surface = tracer.gbuffer(camera), plain.mask > 0
     mean = gbuffer.image(irradiance(tracer, gbuffer, lighting.light, 16, 3)[0])

@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tron.brdf.bsdf import metallic_roughness
 from tron.cameras import Camera, mitsuba_sensor
 from tron.estimation import Estimation
 from tron.seeds import generator
@@ -53,13 +54,7 @@ def still_life(dense: Any, metal: bool) -> tuple[Any, list[dict[str, Any]]]:
     shapes = [
         {
             **sheet.mitsuba,
-            "bsdf": {
-                "type": "principled",
-                "base_color": {"type": "rgb", "value": list(color)},
-                "roughness": rough,
-                "metallic": metallic,
-                "specular": 0.5,
-            },
+            "bsdf": metallic_roughness({"type": "rgb", "value": list(color)}, rough, metallic),
         }
         for sheet, color, rough, metallic in sheets
     ]

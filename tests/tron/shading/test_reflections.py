@@ -7,10 +7,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tron.brdf.microfacets import unhidden
+from tron.brdf.reflectance import fresnel, reflectance
+from tron.brdf.table import BrdfTable
 from tron.seeds import generator
-from tron.shading.brdf_table import BrdfTable
-from tron.shading.reflectance import fresnel, reflectance
-from tron.shading.reflections import Lobe, masking
+from tron.shading.reflections import Lobe
 
 N = 1 << 18
 
@@ -25,18 +26,18 @@ def uniform() -> mi.Point2f:
 
 
 @pytest.mark.parametrize(
-    ("diffuse", "metallic"), [("principled", 0.0), ("lambert", 0.0), ("lambert", 0.6), ("principled", 1.0)]
+    ("brdf", "metallic"), [("conserving", 0.0), ("lambert", 0.0), ("lambert", 0.6), ("conserving", 1.0)]
 )
 @pytest.mark.parametrize(("cosine", "roughness"), [(0.2, 0.5), (0.7, 0.15), (0.9, 0.9)])
 def test_the_mean_weight_of_rays_is_the_albedo_of_the_lobe(
-    variant: str, material, cosine: float, roughness: float, metallic: float, diffuse: str
+    variant: str, material, cosine: float, roughness: float, metallic: float, brdf: str
 ) -> None:
     surface, lobe = material(0.6, roughness, metallic), lobe_of(cosine, roughness)
     out, above = lobe.draw(uniform())
     half = dr.normalize(out + lobe.view)
-    weight = fresnel(surface, dr.dot(half, lobe.view), diffuse) * masking(out.z, lobe.alpha)
+    weight = fresnel(surface, dr.dot(half, lobe.view), brdf) * unhidden(lobe.view.z, out.z, lobe.alpha)
     mean = np.array(dr.select(above, weight, 0)).mean(1)
-    share = reflectance(surface, BrdfTable.load(), mi.Float(cosine), diffuse)
+    share = reflectance(surface, BrdfTable.load(), mi.Float(cosine), brdf)
     np.testing.assert_allclose(mean, np.array(share.specular)[:, 0], atol=4e-3)
 
 

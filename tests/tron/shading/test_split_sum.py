@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tron.brdf.reflectance import reflectance
 from tron.errors import TronError
 from tron.seeds import generator
 from tron.shading.environments.cubemap import direction_face, face_direction
@@ -12,7 +13,6 @@ from tron.shading.environments.environment import EnvironmentLight, EnvironmentM
 from tron.shading.environments.prefilter import LightTree, ggx_prefilter
 from tron.shading.guidance import Lighting
 from tron.shading.lighting import SplitSum
-from tron.shading.reflectance import reflectance
 
 
 def unit(n: int, seed: int = 0) -> np.ndarray:

@@ -17,7 +17,7 @@ from tron.apps.surroundings import DESCRIPTION, Treatment
 from tron.color import Look
 from tron.editing.models import PlacedModel
 from tron.errors import TronError
-from tron.estimation import FINAL, FINEST, PREVIEW, Estimation, Estimator, require_bounces
+from tron.estimation import FINAL, FINEST, PREVIEW, Brdf, Estimation, Estimator, require_bounces
 from tron.neural.clips import Overlap
 from tron.neural.configs import check_sizes
 from tron.neural.shipped import AUTO, DEFAULT, SHIPPED
@@ -130,9 +130,9 @@ class Settings(BaseModel):
     supersample: Literal[1, 2] | None = Field(
         None, description="2: the mean of 2 x 2 sub-pixels, with a quarter of the rays each; null: by quality"
     )
-    diffuse: Literal["principled", "lambert"] = Field(
-        FINAL.diffuse,
-        description="diffuse reflection: that of the principled material, or Lambert's, as in the paper",
+    brdf: Brdf = Field(
+        FINAL.brdf,
+        description="material: conserving, which loses no light, or lambert, as in the paper",
     )
     estimator: Estimator = Field(
         FINAL.estimator,
@@ -272,7 +272,7 @@ class Settings(BaseModel):
             "filtered": self.denoise is not False,
             "reflections": self.reflections if self.bounces else 0,
             "supersample": self.supersample,
-            **self.model_dump(include={"estimator", "two_sided", "bounces", "diffuse"}),
+            **self.model_dump(include={"estimator", "two_sided", "bounces", "brdf"}),
         }
         given = {name: value for name, value in said.items() if value is not None}
         return Estimation(**{**QUALITY[self.quality].model_dump(), **given})

@@ -1,10 +1,10 @@
 """Materials of each surfel by evidence over views, in a light that is known.
 
-For a roughness r and a metallic m of 0 or 1, what leaves a surfel towards a camera is linear in its base
-color b (:mod:`tron.shading.composition`, with E + I received, o S + I mirrored by the lobe of r):
+For a roughness r and a metallic m of 0 or 1, what leaves a surfel towards a camera grows with its base color
+b (:mod:`tron.shading.composition`, with E + I received, o S + I mirrored by the lobe of r):
 
-    m = 0    c = b D (E + I) + E_glass (o S + I)
-    m = 1    c = (b A + B) (o S + I)
+    m = 0    c = b (1 - k) (E + I) + k (o S + I)        k = G g(F_glass), of :mod:`tron.brdf.reflectance`
+    m = 1    c = (b A + B) g(F_b) (o S + I)
 
 so each photo of the surfel gives a b for each (r, m); their median is the base color if that were its
 material, and how well it explains all photos says whether it is. A highlight that moves with the camera is
@@ -25,12 +25,13 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import KDTree
 
+from tron.brdf.reflectance import compensation, glass_fresnel, mean_fresnel
+from tron.brdf.table import BrdfTable
 from tron.captures.view import FLOOR
 from tron.color import luminance
 from tron.gaussians import GaussianScene
 from tron.reconstruction.light.surfel_colors import Observations, SurfelColors, grouped_median
 from tron.runtime import aligned, lanes
-from tron.shading.brdf_table import BrdfTable
 from tron.shading.lighting import Lighting
 
 ROUGHNESSES = np.array([0.15, 0.25, 0.35, 0.5, 0.7, 0.95])
@@ -46,6 +47,7 @@ _ROUGH_METAL_LOSS = 5.0
 """Loss of a metal of roughness 1, over a polished one's: it looks like paint, and in a light that is somewhat
 wrong fur looks like it."""
 _METAL_LUMINANCE = 0.2  # a stop and a half below iron: cameras do not expose exactly
+_HALVINGS = 12
 _DARK_METAL_LOSS = 0.3
 """Loss of a metal e times darker than that; it grows with the square of the logarithm."""
 
@@ -121,20 +123,21 @@ def materials_of(
     bases, losses = [], []
     for metal in (False, True):
         for roughness in ROUGHNESSES:
-            scale, bias, diffuse, glass = _table(roughness, cosine)
+            scale, bias, glass, whole = _table(roughness, cosine)
             open_ = received.openness[:, None] * (1 - roughness) + roughness * share
             lobe = open_[surfel] * _prefiltered(lighting, mirrored, roughness) + received.bounced[surfel]
             lobe = np.maximum(lobe, 1e-5)
             if metal:
-                each = (color / lobe - bias[:, None]) / scale[:, None]
+                each = _metal_of(color / lobe, scale[:, None], bias[:, None], whole[:, None])
             else:
-                each = (color - glass[:, None] * lobe) / np.maximum(diffuse[:, None] * total, 1e-5)
+                coat = glass * compensation(np.array(glass_fresnel()), scale + bias, whole)
+                each = (color - coat[:, None] * lobe) / np.maximum((1 - coat[:, None]) * total, 1e-5)
             base = np.clip(grouped_median(each, surfel, count), 0, 2)
             of = base[surfel]
             if metal:
-                wanted = (of * scale[:, None] + bias[:, None]) * lobe
+                wanted = _metal(of, scale[:, None], bias[:, None], whole[:, None]) * lobe
             else:
-                wanted = of * diffuse[:, None] * total + glass[:, None] * lobe
+                wanted = of * (1 - coat[:, None]) * total + coat[:, None] * lobe
             off = np.abs(np.log((color + dark) / (wanted + dark))).mean(1)
             loss = np.bincount(surfel, np.log1p(off / _ROBUST), count)
             bases.append(base)
@@ -197,13 +200,29 @@ def choose(
     )
 
 
+def _metal(base: np.ndarray, scale: np.ndarray, bias: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Albedo of metal, whose base color is held below 1 where it is compensated for."""
+    fresnel = mean_fresnel(np.clip(base, 0, 1))
+    return (base * scale + bias) * compensation(fresnel, scale + bias, whole)
+
+
+def _metal_of(albedo: np.ndarray, scale: np.ndarray, bias: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Base color of metal that has an albedo, by halving: :func:`_metal` grows with it."""
+    low, high = np.zeros_like(albedo), np.full_like(albedo, 2.0)
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        below = _metal(middle, scale, bias, whole) < albedo
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return (low + high) / 2
+
+
 def _nearest(of: np.ndarray, places: np.ndarray) -> np.ndarray:
     """(N, K) indices of the nearest of some places to others."""
     return np.reshape(KDTree(of).query(places, k=min(_LIKE, len(of)))[1], (len(places), -1))
 
 
 def _table(roughness: float, cosine: np.ndarray) -> list[np.ndarray]:
-    """A, B, D and E of :mod:`tron.shading.brdf_table`, (N,) each."""
+    """A, B, G and E of :mod:`tron.brdf.table`, (N,) each."""
     table = BrdfTable.load()
     along = mi.Float(aligned(np.clip(cosine, 0, 1).astype(np.float32)))
     return [np.array(value) for value in table(dr.full(mi.Float, float(roughness), len(cosine)), along)]

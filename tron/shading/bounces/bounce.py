@@ -25,16 +25,15 @@ from functools import cache, cached_property
 import drjit as dr
 import mitsuba as mi
 
+from tron.brdf.reflectance import bounce_albedo
+from tron.brdf.table import BrdfTable
 from tron.errors import TronError
-from tron.estimation import FINAL, Diffuse, Estimation
+from tron.estimation import FINAL, Brdf, Estimation
 from tron.seeds import integer
 from tron.shading.bounces.bounce_rays import Part, SurfelRays, parts
 from tron.shading.bounces.lending import Lending
-from tron.shading.brdf_table import BrdfTable
-from tron.shading.burley import weighed_mean
-from tron.shading.direct.visibility import visibility, visibility_and_directions
+from tron.shading.direct.visibility import visibility
 from tron.shading.lighting import Lighting
-from tron.shading.reflectance import bounce_albedo
 from tron.tracing.hierarchy.first_hit import NOTHING
 from tron.tracing.surface import Surface, centres
 from tron.tracing.tracer import SurfelTracer
@@ -63,9 +62,8 @@ class BouncedLight:
         behind: mi.Color3f, radiance that its back sends out, likewise: by light of its own where rays of
             surfels meet it, else by the indirect light of its front.
         openness: mi.Float in [0, 1], share of the surfel's rays that meet nothing.
-        reaching: gives the share of the unshadowed irradiance that reaches the surfel, by channel, and the
-            mean direction (3 numbers) that it comes from, lent among neighbours
-            (:mod:`tron.shading.bounces.lending`); None where that is not known.
+        reaching: gives the share of the unshadowed irradiance that reaches the surfel, by channel, lent
+            among neighbours (:mod:`tron.shading.bounces.lending`); None where that is not known.
         faces: direct light of all faces, fronts first (:meth:`BounceTransport.direct_of_faces`).
     """
 
@@ -80,7 +78,7 @@ class BouncedLight:
     def values(self, rays: int = FINAL.rays) -> list[mi.Float]:
         """What ``SurfelTracer.gbuffer`` composites, for frames of ``rays`` shadow rays a pixel.
 
-        Indirect light and openness, four numbers a surfel; for frames without rays what reaches, six more.
+        Indirect light and openness, four numbers a surfel; for frames without rays what reaches, three more.
         """
         reaching = [] if rays or self.reaching is None else self.reaching()
         return [*self.indirect, self.openness, *reaching]
@@ -164,9 +162,9 @@ class BounceTransport:
         """(M,) share of each surfel's rays that meet nothing."""
         return _openness(self.rays.met, self.rays.rays, len(self.tracer.scene))
 
-    def albedo(self, diffuse: Diffuse = "principled") -> mi.Color3f:
-        """(M,) :func:`tron.shading.reflectance.bounce_albedo`, differentiable as the tracer is."""
-        return bounce_albedo(self.surfels(), BrdfTable.load(), diffuse)
+    def albedo(self, brdf: Brdf = "conserving") -> mi.Color3f:
+        """(M,) :func:`tron.brdf.reflectance.bounce_albedo`, differentiable as the tracer is."""
+        return bounce_albedo(self.surfels(), BrdfTable.load(), brdf)
 
     def direct(self, lighting: Lighting, estimation: Estimation = DIRECT, seed: int = 0) -> mi.Color3f:
         """(M,) irradiance / pi of direct light at each surfel, shadows included, linear.
@@ -287,21 +285,17 @@ class BounceTransport:
     def reaching(
         self, lighting: Lighting, estimation: Estimation, seed: int = 0, *, lent: bool
     ) -> list[mi.Float]:
-        """(M,) the six numbers that :class:`BouncedLight` calls so, of a surfel's own rays or lent.
+        """(M,) the three numbers that :class:`BouncedLight` calls so, of a surfel's own rays or lent.
 
         Arguments as of :meth:`visible`.
         """
 
         def of(part: Part) -> list[mi.Float]:
             root = integer(seed, "bounce", "direct", part.first)
-            share, sums = visibility_and_directions(self.tracer, part.gbuffer, lighting, estimation, root)
-            return [*share, *sums.total, sums.weight]
+            return [*visibility(self.tracer, part.gbuffer, lighting, estimation, root)]
 
-        found = _of_parts(parts(self.tracer), len(self.tracer.scene), 7, of)
-        *share, x, y, z, weight = self._lending.lent(found) if lent else found
-        mean = weighed_mean(mi.Vector3f(x, y, z), weight)
-        dr.eval(mean)
-        return [*share, *mean]
+        found = _of_parts(parts(self.tracer), len(self.tracer.scene), 3, of)
+        return self._lending.lent(found) if lent else found
 
     @cached_property
     def _lending(self) -> Lending:
@@ -312,7 +306,7 @@ class BounceTransport:
     ) -> BouncedLight:
         """:meth:`bake` of direct light at all faces, differentiable in it and in the materials."""
         bounces = estimation.bounces if bounces is None else bounces
-        albedo = self._of_faces(self.albedo(estimation.diffuse))
+        albedo = self._of_faces(self.albedo(estimation.brdf))
         indirect = self._indirect(direct, albedo, bounces)
         outgoing = [a * (e + i) for a, e, i in zip(albedo, direct, indirect, strict=True)]
         behind = albedo[0] * indirect[0]

@@ -35,7 +35,7 @@ ORIGIN_OFFSET = 0.1
 
 
 class Observer(Protocol):
-    """Sums over rays of their own, such as :class:`tron.shading.burley.BurleySums`.
+    """Sums over rays of their own, such as :class:`tron.shading.direct.noise.NoiseSums`.
 
     Of each fan it is told unit world directions, the light that is looked up along them by its weight, and
     the share of it that arrives.

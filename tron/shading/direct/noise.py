@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from tron.shading.burley import grey
 from tron.shading.direct.neighbours import neighbourhood_mean
 
 if TYPE_CHECKING:
@@ -61,7 +60,7 @@ class NoiseSums:
     ) -> None:
         """Add rays: the linear light along them, and the share that arrives."""
         for value, share in zip(light, visible, strict=True):
-            one = grey(value)
+            one = mi.luminance(value)
             square = one * one
             self.light += one
             self.squares += square
@@ -95,8 +94,8 @@ def without_noise(
     """
 
     def share_of(values: list[mi.Float]) -> mi.Float:
-        light = grey(mi.Color3f(*values[3:]))
-        return dr.select(light > 0, grey(mi.Color3f(*values[:3])) / dr.select(light > 0, light, 1), 1)
+        light = mi.luminance(mi.Color3f(*values[3:]))
+        return dr.select(light > 0, mi.luminance(mi.Color3f(*values[:3])) / dr.select(light > 0, light, 1), 1)
 
     values = [*shadowed, *unshadowed]
     share = share_of(values)

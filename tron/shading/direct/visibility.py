@@ -10,8 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.estimation import Estimation
-from tron.shading.burley import BurleySums, DirectionSums, grey, weighed_mean
-from tron.shading.direct.irradiance import Observer, Occluder, irradiance, visible_share
+from tron.shading.direct.irradiance import Occluder, irradiance, visible_share
 from tron.shading.direct.neighbours import neighbourhood_mean
 from tron.shading.direct.noise import NoiseSums, without_noise
 from tron.shading.lighting import Lighting
@@ -39,55 +38,16 @@ def visibility(
         estimation: how.
         seed: root of the shadow rays' random numbers.
     """
-    return _visibility(tracer, gbuffer, lighting, estimation.of_pixels(), seed, [])
-
-
-def _visibility(
-    tracer: Shadows,
-    gbuffer: GBuffer,
-    lighting: Lighting,
-    estimation: Estimation,
-    seed: int,
-    observers: Sequence[Observer],
-) -> mi.Color3f:
+    estimation = estimation.of_pixels()
     occluder, lanes = tracer.sided(estimation.two_sided), dr.width(gbuffer.opacity)
     narrow = noise = None
     if estimation.filtered and estimation.rays >= RATIO_FROM_RAYS:
         noise = NoiseSums.none(lanes)
     elif estimation.filtered:
         narrow = NarrowSums.none(lighting.light, lanes)
-    observers = [*observers, *(each for each in (narrow, noise) if each is not None)]
+    observers = [each for each in (narrow, noise) if each is not None]
     found = irradiance(occluder, gbuffer, lighting.light, estimation.rays, seed, observers=observers)
     return reaching_share(*found, gbuffer, lighting, occluder.scene.spacing, estimation, narrow, noise)
-
-
-def visibility_and_directions(
-    tracer: Shadows, gbuffer: GBuffer, lighting: Lighting, estimation: Estimation, seed: int
-) -> tuple[mi.Color3f, DirectionSums]:
-    """:func:`visibility`, and sums of the directions that the light which arrives comes from."""
-    sums = DirectionSums.none(gbuffer)
-    return _visibility(tracer, gbuffer, lighting, estimation.of_pixels(), seed, [sums]), sums
-
-
-def visibility_and_terms(
-    tracer: Shadows, gbuffer: GBuffer, lighting: Lighting, estimation: Estimation, seed: int
-) -> tuple[mi.Color3f, mi.Vector3f | None]:
-    """:func:`visibility`, and the means of :func:`tron.shading.burley.burley_terms` over what arrives.
-
-    Those of a pixel's few rays are averaged over its neighbours; None where the material has none.
-    """
-    estimation = estimation.of_pixels()
-    if estimation.diffuse == "lambert":
-        return visibility(tracer, gbuffer, lighting, estimation, seed), None
-    sums = BurleySums.none(gbuffer)
-    share = _visibility(tracer, gbuffer, lighting, estimation, seed, [sums])
-    terms, weight, spacing = sums.total, sums.weight, tracer.sided(estimation.two_sided).scene.spacing
-    if estimation.rays < RATIO_FROM_RAYS:
-        for step in (1, 2) if estimation.filtered else (1,):
-            (*terms, weight), _ = neighbourhood_mean([*terms, weight], gbuffer, spacing, step=step)
-    terms = weighed_mean(mi.Vector3f(terms), weight)
-    dr.eval(terms)
-    return share, terms
 
 
 def reaching_share(
@@ -117,9 +77,9 @@ def reaching_share(
             return share
         detail = mi.Float(0)
         if narrow is not None:
-            all_rays = grey(unshadowed) * (estimation.rays // 2)
+            all_rays = mi.luminance(unshadowed) * (estimation.rays // 2)
             detail = narrow.detail(all_rays, gbuffer, spacing)
-        shadowed, unshadowed = atrous(shadowed, unshadowed, grey(share), gbuffer, spacing, detail)
+        shadowed, unshadowed = atrous(shadowed, unshadowed, mi.luminance(share), gbuffer, spacing, detail)
     return visible_share(shadowed, known if plain else unshadowed)
 
 
@@ -167,7 +127,7 @@ def regressed_share(
         spacing: the scene's surfel spacing, world units.
     """
     blocked = unshadowed - shadowed
-    part, found = _blocked_part_of_noise(grey(blocked), grey(unshadowed), gbuffer, spacing)
+    part, found = _blocked_part_of_noise(mi.luminance(blocked), mi.luminance(unshadowed), gbuffer, spacing)
     # Of a pixel alone g is b / u, and the regression the ratio.
     ratio = visible_share(shadowed, unshadowed)
     lost = blocked + part * (known - unshadowed)
@@ -224,7 +184,7 @@ class NarrowSums:
     ) -> None:
         """Add rays: unit world directions, the linear light along them, and the share that arrives."""
         for direction, value, share in zip(directions, light, visible, strict=True):
-            narrow = dr.select(self.light.pdf(direction) > NARROW, grey(value), 0)
+            narrow = dr.select(self.light.pdf(direction) > NARROW, mi.luminance(value), 0)
             self.shadowed += narrow * share
             self.unshadowed += narrow
         dr.eval(self.shadowed, self.unshadowed)

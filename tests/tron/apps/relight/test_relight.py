@@ -142,7 +142,7 @@ def test_other_settings_in_the_same_folder_are_refused(relight, scene_path, ligh
     assert relight(*base) == 0
     assert relight(*base, "rotation=45") == 2
     assert "rotation=0.0, not 45.0" in capsys.readouterr().err
-    for setting in ("bounces=1", "reflections=2", "supersample=2", "diffuse=lambert"):
+    for setting in ("bounces=1", "reflections=2", "supersample=2", "brdf=lambert"):
         assert relight(*base, setting) == 2
         assert f"{setting.split('=')[0]}=" in capsys.readouterr().err
     assert relight(*base, "rotation=45", "overwrite=true") == 0

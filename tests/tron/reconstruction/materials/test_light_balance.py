@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tron.brdf.bsdf import metallic_roughness
 from tron.cameras import Camera, mitsuba_sensor
 from tron.captures import Capture, View
 from tron.color import linear_to_srgb, luminance
@@ -84,11 +85,7 @@ def box(variant: str, dense_surfels) -> Box:
     world = {
         f"shape{k}": {
             **sheet.mitsuba,
-            "bsdf": {
-                "type": "principled",
-                "base_color": {"type": "rgb", "value": list(color)},
-                "roughness": float(roughness),
-            },
+            "bsdf": metallic_roughness({"type": "rgb", "value": list(color)}, float(roughness), 0.0),
         }
         for k, (sheet, (color, roughness)) in enumerate(zip(sheets, paints))
     }

@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tron.brdf.reflectance import bounce_albedo
+from tron.brdf.table import BrdfTable
 from tron.cameras import Camera, mitsuba_sensor
 from tron.errors import TronError
 from tron.estimation import Estimation
 from tron.gaussians.edit import moved
 from tron.seeds import generator
 from tron.shading.bounces.bounce import BounceTransport
-from tron.shading.brdf_table import BrdfTable
 from tron.shading.environments.cubemap import CubemapLight
 from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.lighting import Lighting, SplitSum
-from tron.shading.reflectance import bounce_albedo
 from tron.tracing import SurfelTracer
 from tron.tracing.parameters import SurfelParameters
 

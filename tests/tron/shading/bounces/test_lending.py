@@ -63,22 +63,8 @@ def test_what_frames_are_given_is_lent(scene, sun_map):
     own = transport.reaching(lit.lighting, shown, seed, lent=False)
     assert lit.bounced is not None
     given = lit.bounced.values(0)[BOUNCED_VALUES:]
-    np.testing.assert_array_equal(np.stack(given[:3]), np.stack(Lending.among(scene).lent(own[:3])))
-    assert np.abs(np.stack(given[:3]) - np.stack(own[:3])).max() > 0.01
-
-
-@pytest.mark.parametrize("behind", [True, False])
-def test_a_rough_floor_under_a_low_sun_knows_where_its_light_comes_from(dense_surfels, behind):
-    """Even light's factor would be 1.2 times and 0.7 times that of rays from pixels."""
-    floor = dense_surfels.plane(half=1.0)
-    rough = dense_surfels.scene(floor, roughness=np.ones(len(floor.points)))
-    image = np.zeros((128, 256, 3), np.float32)
-    image[55, 126:130] = 1000.0  # 12 degrees up, along -y
-    view = Camera.look_at((0, -6 if behind else 6, 2), (0, 0, 0), fov_deg=8, width=24, height=24)
-    lit = Relighter(rough, PREVIEW).under(EnvironmentMap(image))
-    ours, rays = (lit.framed(rays=n, filtered=False).render(view, background=(0, 0, 0)) for n in (0, 64))
-    solid = rays.mask > 0.99
-    assert ours.lit[solid].mean() == pytest.approx(rays.lit[solid].mean(), rel=0.03)
+    np.testing.assert_array_equal(np.stack(given), np.stack(Lending.among(scene).lent(own)))
+    assert np.abs(np.stack(given) - np.stack(own)).max() > 0.01
 
 
 def test_where_nothing_is_baked_pixels_have_two_rays(scene, sun_map):

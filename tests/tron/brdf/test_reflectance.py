@@ -1,0 +1,70 @@
+"""Laws of the table and of reflectance: integrals in float64, energy at every roughness and angle."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tron.brdf.reflectance import glass_fresnel, mean_fresnel, reflectance
+from tron.brdf.table import BrdfTable, brdf_table
+from tron.seeds import generator
+
+
+def monte_carlo_albedo(cosine: float, alpha: float, n: int = 400_000) -> tuple[float, float]:
+    """A and B by sampling half vectors from D n.h, float64; independent of visible normals."""
+    random = generator(6, "brdf")
+    u, phi = random.random(n), random.random(n) * 2 * np.pi
+    cos_h = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))
+    sin_h = np.sqrt(1 - cos_h**2)
+    view = np.array([np.sqrt(1 - cosine**2), 0, cosine])
+    facing = view[0] * sin_h * np.cos(phi) + view[2] * cos_h
+    out = 2 * facing * cos_h - cosine
+
+    def smith(c: np.ndarray | float) -> np.ndarray:
+        return 2 * c / (c + np.sqrt(alpha**2 + (1 - alpha**2) * np.square(c)))
+
+    valid = (out > 0) & (facing > 0)
+    hidden = 1 / smith(np.maximum(out, 1e-9)) + 1 / smith(cosine) - 1  # heights correlated
+    weight = np.where(valid, facing / (hidden * cosine * cos_h), 0)
+    fresnel = (1 - np.clip(facing, 0, 1)) ** 5
+    return float((weight * (1 - fresnel)).mean()), float((weight * fresnel).mean())
+
+
+@pytest.mark.parametrize("row", [20, 64, 200])
+@pytest.mark.parametrize("column", [12, 128, 250])
+def test_table_is_the_albedo_by_monte_carlo(variant: str, row: int, column: int) -> None:
+    expected = monte_carlo_albedo((column + 0.5) / 256, (row / 255) ** 2)
+    np.testing.assert_allclose(brdf_table()[row, column, :2], expected, atol=5e-3)
+
+
+@pytest.mark.parametrize("roughness", [0.05, 0.4, 1.0])
+@pytest.mark.parametrize("metallic", [0.0, 0.5, 1.0])
+def test_white_keeps_all_light_at_every_angle_and_on_average(
+    variant: str, material, roughness: float, metallic: float
+) -> None:
+    cosine = mi.Float(np.linspace(0.01, 1, 60).astype(np.float32))
+    for view in (cosine, None):
+        share = reflectance(material(1.0, roughness, metallic), BrdfTable.load(), view)
+        np.testing.assert_allclose(np.array(share.diffuse + share.specular), 1, atol=2e-3)
+
+
+def test_the_mean_of_fresnel_is_that_of_glass(variant: str) -> None:
+    cosine = np.sqrt((np.arange(100_000, dtype=np.float64) + 0.5) / 100_000)
+    mirrored = np.array(mi.fresnel(mi.Float(cosine.astype(np.float32)), 1.5)[0], np.float64)
+    assert glass_fresnel() == pytest.approx(mirrored.mean(), abs=1e-5)
+    assert mean_fresnel(np.array(0.04)) == pytest.approx(0.04 + 0.96 / 21)
+
+
+def test_the_mean_over_directions_is_that_of_the_table(variant: str) -> None:
+    roughness = mi.Float(np.arange(256) / 255)
+    cosine = (np.arange(256) + 0.5) / 256
+    expected = np.average(brdf_table(), axis=1, weights=cosine)
+    for found, column in zip(BrdfTable.load()(roughness), expected.T):
+        np.testing.assert_allclose(np.array(found), column, rtol=1e-5)
+
+
+def test_lambert_knows_neither_roughness_nor_angle(variant: str, material) -> None:
+    grid = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), -1).reshape(-1, 2)
+    roughness, cosine = grid.T.astype(np.float32)
+    share = reflectance(material(0.8, roughness, 0.25), BrdfTable.load(), mi.Float(cosine), brdf="lambert")
+    np.testing.assert_allclose(np.array(share.diffuse + dr.zeros(mi.Color3f, 81)), 0.6, rtol=1e-6)
