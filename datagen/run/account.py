@@ -22,6 +22,7 @@ from datagen.run.plan import config_sha256
 from datagen.settings.command import Settings
 from datagen.settings.command_line import command_line
 from tron.errors import TronError
+from tron.estimation import MATERIAL
 from tron.report.charts import Histogram, histograms_png
 from tron.shards.manifest import MANIFEST_NAME, Manifest
 from tron.storage import write_if_changed
@@ -82,7 +83,9 @@ def write_account(
     finished = {record.name: record.quarantined for record in made}
     failures = record_failures(output, settings, items, failed, finished)
     shards = sorted((entry for record in made for entry in record.shards), key=lambda entry: entry.name)
-    manifest = Manifest(config_sha256=config_sha256(settings), shards=shards, failures=failures)
+    manifest = Manifest(
+        config_sha256=config_sha256(settings), shards=shards, failures=failures, material=MATERIAL
+    )
     rows = [row for record in made for row in record.clips]
 
     listed = source_list(settings, sources)

@@ -83,10 +83,8 @@ class BrdfTable:
 
     @classmethod
     def load(cls) -> BrdfTable:
-        """The table for the active variant."""
-        table = brdf_table()
-        means = np.average(table, axis=1, weights=_CENTRES).astype(np.float32)
-        return cls(*(mi.Float(aligned(values.ravel())) for values in (table, means)))
+        """The table for the active variant; one for all who ask."""
+        return _loaded(str(mi.variant()))
 
     def __call__(self, roughness: mi.Float, cosine: mi.Float | None = None) -> mi.Vector4f:
         """A, B, G and E, linear between entries; differentiable.
@@ -108,6 +106,13 @@ class BrdfTable:
             upper = dr.lerp(texel(first), texel(first + 1), fx)
             lower = dr.lerp(texel(first + TABLE_SIZE), texel(first + TABLE_SIZE + 1), fx)
         return dr.lerp(upper, lower, fy)
+
+
+@cache
+def _loaded(_variant: str) -> BrdfTable:
+    table = brdf_table()
+    means = np.average(table, axis=1, weights=_CENTRES).astype(np.float32)
+    return BrdfTable(*(mi.Float(aligned(values.ravel())) for values in (table, means)))
 
 
 def _between(x: mi.Float) -> tuple[mi.UInt32, mi.Float]:

@@ -26,6 +26,7 @@ from scipy.special import expit
 
 from tron.color import srgb_to_linear
 from tron.errors import TronError
+from tron.estimation import MATERIAL
 from tron.gaussians.fields import FIELDS, MATERIALS
 from tron.gaussians.foreign_files import (
     beginning,
@@ -75,6 +76,7 @@ GUESSED_UP = (0.0, -1.0, 0.0)
 
 _HEADER_LIMIT = 1 << 16
 _PROJECTION = "tron projection "
+_MATERIAL = "tron material "
 _VISIBLE = 1 / 255
 """Opacity below which a splat is not drawn (conventions.md, 6)."""
 _COARSE = 0.25
@@ -338,6 +340,7 @@ def _constants(scene: Mapping[str, Any]) -> list[str]:
     return [
         *(["tron up_guessed 1"] if scene["up_guessed"] else []),
         f"{_PROJECTION}{scene['projection']}",
+        f"{_MATERIAL}{MATERIAL}",
         f"tron kernel_degree {scene['kernel_degree']}",
         f"tron spacing {scene['spacing']!r}",
         f"tron up {' '.join(repr(float(v)) for v in scene['up'])}",
@@ -352,7 +355,7 @@ def _read_constants(comments: list[str], path: Path) -> dict[str, list[float]]:
     constants = {}
     for comment in comments:
         words = comment.split()
-        if len(words) < 3 or words[0] != "tron" or comment.startswith(_PROJECTION):
+        if len(words) < 3 or words[0] != "tron" or comment.startswith((_PROJECTION, _MATERIAL)):
             continue
         try:
             values = [float(word) for word in words[2:]]

@@ -68,7 +68,7 @@ def test_a_surfel_in_shadow_is_dark_and_one_in_the_open_as_bright_as_its_irradia
     roof = replace(roof, points=roof.points + np.array([0, 0, 0.8]))
     count = len(floor.points)
     both = dense_surfels.scene(floor, roof, spacing=SPACING, roughness=np.ones(count + len(roof.points)))
-    light = Relighter(both, Estimation(rays=0, diffuse="lambert", bounces=1)).under(zenith)
+    light = Relighter(both, Estimation(rays=0, brdf="lambert", bounces=1)).under(zenith)
     exposure = 0.3 / zenith.unoccluded(np.array([0.0, 0.0, 1.0])).mean()
     shown = eval_sh(baked(light, exposure, "none").sh[:count], np.array([0.0, 0.0, -1.0]))
     x, y, _ = np.abs(floor.points).T

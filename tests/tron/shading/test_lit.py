@@ -92,7 +92,7 @@ def test_a_convex_object_alone_is_lit_as_if_nothing_bounced(
     assert inside.mean() > 0.1
     difference = np.abs(guidance.lit - guidance.shadowed)[inside]
     # At a box's edges the surfels of one face overhang another.
-    most, mean = (0.6, 2e-3) if shape == "box" else (0.95, 1e-3)
+    most, mean = (0.6, 4e-3) if shape == "box" else (0.95, 1e-3)
     assert np.quantile(difference, most) < 1e-3 * guidance.shadowed[inside].mean()
     assert difference.mean() < mean * guidance.shadowed[inside].mean()
 
@@ -121,7 +121,7 @@ def test_white_surfaces_all_but_vanish_in_a_furnace(
     guidance = shown(scene, EnvironmentMap.constant(1.0), estimation)
     inside = guidance.mask > 0.99
     assert guidance.lit[inside].mean() <= 1.0
-    assert np.quantile(guidance.lit[inside], 0.99) <= 1.07  # shadows and bounces have noise of their own
+    assert np.quantile(guidance.lit[inside], 0.99) <= 1.2  # shadows and bounces have noise of their own
     assert guidance.lit[inside].mean() > least
     assert guidance.shadowed[inside].min() < 0.9 or metallic == 1
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tron.brdf.microfacets import unhidden
-from tron.brdf.reflectance import fresnel, reflectance
+from tron.brdf.reflectance import Layers, fresnel, reflectance
 from tron.brdf.table import BrdfTable
 from tron.seeds import generator
 from tron.shading.reflections import Lobe
@@ -35,7 +35,9 @@ def test_the_mean_weight_of_rays_is_the_albedo_of_the_lobe(
     surface, lobe = material(0.6, roughness, metallic), lobe_of(cosine, roughness)
     out, above = lobe.draw(uniform())
     half = dr.normalize(out + lobe.view)
-    weight = fresnel(surface, dr.dot(half, lobe.view), brdf) * unhidden(lobe.view.z, out.z, lobe.alpha)
+    layers = Layers.of(surface, BrdfTable.load(), mi.Float(cosine)) if brdf == "conserving" else None
+    weight = fresnel(surface, dr.dot(half, lobe.view), brdf, layers)
+    weight *= unhidden(lobe.view.z, out.z, lobe.alpha)
     mean = np.array(dr.select(above, weight, 0)).mean(1)
     share = reflectance(surface, BrdfTable.load(), mi.Float(cosine), brdf)
     np.testing.assert_allclose(mean, np.array(share.specular)[:, 0], atol=4e-3)
