@@ -196,7 +196,8 @@ def _touched_tiles(records: SurfelRecords, camera: Camera) -> _Touched:
     height = dr.maximum(height - ROUNDING * distance, 0)
     near, far = distance - axis_u.w, distance + axis_u.w
     if records.pixel is not None:  # each is met at the depth of its centre
-        normal, height, near, far = mi.Vector3f(0, 0, -1), c.z, mi.Float(0), mi.Float(dr.inf)
+        normal, height = mi.Vector3f(0, 0, -1), c.z
+        near, far = dr.zeros(mi.Float, records.count), dr.full(mi.Float, dr.inf, records.count)
     planes = dr.zeros(mi.Float, 4 * records.count)
     dr.scatter(planes, mi.Vector4f(*normal, height), dr.arange(mi.UInt32, records.count))
     falling, rising = (bounds((1, sign), cx + sign * cy) for sign in (1, -1))
