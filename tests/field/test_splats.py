@@ -122,6 +122,7 @@ def test_what_changes_the_kernel_is_named_in_a_line(tmp_path, caplog, properties
         ([], [], "3dgs"),
         ([], ["SplatRenderMode: default"], "3dgs"),
         ([], ["SplatRenderMode: mip"], "mip"),
+        ([], ["SplatRenderMode: 2dgs"], "2dgs"),
         (["filter_3D"], [], "mip"),
         ([], ["tron spacing 0.1", "tron oriented 0"], "3dgs"),  # TRON's own, before they said it
         ([], ["tron spacing 0.1", "tron oriented 1"], "disks"),
@@ -133,9 +134,9 @@ def test_a_file_says_how_it_is_projected(tmp_path, properties, comments, name):
     assert GaussianScene.load(write(tmp_path / "a.ply", columns, comments)).projection == name
 
 
-def test_splats_of_two_scales_are_disks(tmp_path):
+def test_splats_of_two_scales_are_those_of_2dgs(tmp_path):
     columns = {name: values for name, values in splats().items() if name != "scale_2"}
-    assert GaussianScene.load(write(tmp_path / "a.ply", columns)).projection == "disks"
+    assert GaussianScene.load(write(tmp_path / "a.ply", columns)).projection == "2dgs"
 
 
 def test_a_projection_that_is_not_known_is_refused(tmp_path):

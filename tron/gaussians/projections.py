@@ -7,6 +7,8 @@ the pixel's filter,
     S' = S + v I,     opacity' = opacity sqrt(det S / det S') where compensated, else opacity
 
 (Kerbl et al. 2023, its reference code, whose ``--antialiasing`` compensates; Yu et al. 2024, section 4.2).
+2DGS draws disks in space, and instead of them, where it is larger, a Gaussian of variance ``v`` about the
+projected centre (Huang et al. 2024, equation 11).
 """
 
 from __future__ import annotations
@@ -24,10 +26,12 @@ class Projection(NamedTuple):
     Attributes:
         variance: added to every projected covariance, square pixels.
         compensated: whether opacity is lowered so that a splat keeps its integral.
+        larger: whether the larger of disk and filter is drawn.
     """
 
     variance: float
     compensated: bool
+    larger: bool = False
 
 
 DISKS = "disks"
@@ -36,6 +40,7 @@ PROJECTIONS: dict[str, Projection | None] = {
     "3dgs": Projection(0.3, False),
     "antialiased": Projection(0.3, True),
     "mip": Projection(0.1, True),
+    "2dgs": Projection(0.5, False, larger=True),
 }
 """By name, as scenes have it; surfels of our own are disks in space to cameras as to all other rays."""
 
@@ -43,8 +48,7 @@ PROJECTIONS: dict[str, Projection | None] = {
 def stated_projection(properties: Collection[str], comments: Sequence[str], antialiased: bool = False) -> str:
     """The name of how a file of another program is to be projected, by what it says; "3dgs" if nothing.
 
-    Splats of two scales are 2DGS's, which draws them as disks in space (without its low-pass filter, here).
-
+    Splats of two scales are 2DGS's, as are those of ``SplatRenderMode: 2dgs``, which splat-transform writes.
     Mip-Splatting's files have its ``filter_3D``, Brush's say ``SplatRenderMode: mip``, those of .spz have a
     flag for splats that were learnt antialiased.
 
@@ -55,8 +59,8 @@ def stated_projection(properties: Collection[str], comments: Sequence[str], anti
     modes = [
         comment.lower().split()[1:] for comment in comments if comment.lower().startswith("splatrendermode:")
     ]
-    if "scale_2" not in properties:
-        return DISKS
+    if "scale_2" not in properties or ["2dgs"] in modes:
+        return "2dgs"
     if FILTER in properties or ["mip"] in modes:
         return "mip"
     return "antialiased" if antialiased else "3dgs"

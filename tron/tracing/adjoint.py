@@ -30,6 +30,7 @@ from tron.tracing.kernel import (
     GEOMETRY_PACKETS,
     MAX_ALPHA,
     SH_PACKETS,
+    Filtered,
     SurfelHit,
     SurfelRecords,
     intersect,
@@ -217,7 +218,7 @@ def _replay(
     active = slot < hits.count
     while active:
         index = dr.gather(mi.UInt32, hits.ids, slot * lists + lane, active)
-        hit = intersect(records.geometry, index, origin, direction, records.degree)
+        hit = intersect(records.geometry, index, origin, direction, records.degree, records.pixel)
         weight = remaining * hit.alpha
         projected = outer_depth * hit.t
         for packet in range(MATERIAL_PACKETS):
@@ -289,16 +290,31 @@ def _replay_hit(
     t = n . c / (n . d) with n = a x b and c from the origin to the centre; the offset is t d - c.
     """
     by_alpha = dr.select(hit.unclipped < MAX_ALPHA, by_alpha, 0)
-    q = dr.fma(hit.u, hit.u, hit.v * hit.v)
-    by_q = by_alpha * hit.unclipped * log_response_slope(q, records.degree)
+    by_q = by_alpha * hit.unclipped * log_response_slope(hit.q, records.degree)
+    by_centre = mi.Vector3f(0)
+    if hit.filtered is not None:
+        by_centre = _by_centre(hit.filtered, records.pixel, direction, by_q, by_t)
+        by_t = mi.Float(0)
     by_u, by_v = 2 * hit.u * by_q, 2 * hit.v * by_q
     by_offset = by_u * hit.u_axis + by_v * hit.v_axis
     along = (by_t + dr.dot(by_offset, direction)) / hit.facing
     by_normal = -along * hit.offset
-    by_centre = along * hit.normal - by_offset
+    by_centre += along * hit.normal - by_offset
     by_a = by_u * hit.offset + dr.cross(hit.v_axis, by_normal)
     by_b = by_v * hit.offset + dr.cross(by_normal, hit.u_axis)
     base = index * GEOMETRY_PACKETS
     _add(out.geometry, base, [*by_centre, by_alpha * hit.response], active)
     _add(out.geometry, base + 1, [*by_a, mi.Float(0)], active)
     _add(out.geometry, base + 2, [*by_b, mi.Float(0)], active)
+
+
+def _by_centre(
+    filtered: Filtered, pixel: mi.Vector3f, direction: mi.Vector3f, by_q: mi.Float, by_t: mi.Float
+) -> mi.Vector3f:
+    """Gradient of a centre c from those of q and t where a pixel's filter counts.
+
+    With z = pixel . c, e = d / (pixel . d) and g = e - c / z, q = g^2 and t = z / (pixel . d).
+    """
+    aside, ray = filtered.aside, filtered.slope * direction
+    by_q = dr.select(filtered.larger, 2 * by_q / filtered.depth, 0)
+    return (by_t * filtered.slope + by_q * dr.dot(aside, ray - aside)) * pixel - by_q * aside

@@ -119,7 +119,7 @@ def collect(
     active = walk.open & (hits.count < MAX_HITS)
     while active:
         index = dr.gather(mi.UInt32, entries, walk.cursor)
-        hit = intersect(records.geometry, index, origin, direction, records.degree)
+        hit = intersect(records.geometry, index, origin, direction, records.degree, records.pixel)
         valid = hit.within & hit.front & (hit.t > T_MIN) & (hit.t <= walk.t_cut)
         slot = dr.select(valid, hits.count, mi.UInt32(MAX_HITS))
         hits.t[slot] = hit.t

@@ -102,6 +102,7 @@ class SurfelRecords:
         sh_degree: highest SH degree that is evaluated.
         values: mi.Float, M records of more quantities to composite, up to a whole packet, or None.
         value_count: how many they are.
+        pixel: low-pass filter of the one camera that they are for (:func:`intersect`); None: they have none.
     """
 
     geometry: mi.Float
@@ -112,6 +113,7 @@ class SurfelRecords:
     sh_degree: int
     values: mi.Float | None = None
     value_count: int = 0
+    pixel: mi.Vector3f | None = None
 
     def detached(self) -> SurfelRecords:
         """The same buffers, cut off from automatic differentiation."""
@@ -160,7 +162,8 @@ class SurfelHit:
         radius: of the disk within which the surfel counts, along its longer axis, world units.
         unclipped: opacity before clipping. response: the kernel's value.
         u_axis, v_axis: t_u / s_u and t_v / s_v. normal: their cross product. facing: normal . direction.
-        offset: p - c. u, v: its coordinates in standard deviations.
+        offset: p - c. u, v: its coordinates in standard deviations. q: its squared distance in them.
+        filtered: where there is a pixel's filter, and it is what the ray meets; else None.
     """
 
     t: mi.Float
@@ -177,12 +180,35 @@ class SurfelHit:
     offset: mi.Vector3f
     u: mi.Float
     v: mi.Float
+    q: mi.Float
+    filtered: Filtered | None = None
+
+
+@dataclass
+class Filtered:
+    """One ray against a pixel's filter about a surfel's centre.
+
+    Attributes:
+        depth: of the centre. slope: distance along the ray to depth 1. Both in the pixel's unit.
+        aside: from centre to ray in the image plane, in the filter's standard deviations, world.
+        larger: the filter is larger than the disk here.
+    """
+
+    depth: mi.Float
+    slope: mi.Float
+    aside: mi.Vector3f
+    larger: mi.Bool
 
 
 def intersect(
-    geometry: mi.Float, index: mi.UInt32, origin: mi.Point3f, direction: mi.Vector3f, degree: int
-) -> SurfelHit:
+    geometry: mi.Float, index: mi.UInt32, origin: mi.Point3f, direction: mi.Vector3f, degree: int,
+    pixel: mi.Vector3f | None = None,
+) -> SurfelHit:  # fmt: skip
     """Meet a ray with the surfel ``index`` (formula: module docstring).
+
+    ``pixel`` is the camera's forward axis times a filter's deviation over the focal length. Where it is given
+    counts the larger of the disk and that Gaussian about the projected centre (Huang et al. 2024, equation
+    11), from both sides and at the depth of the centre.
 
     The normal is not stored: ``(t_u / s_u) x (t_v / s_v)`` points the same way and its length cancels in t.
     Reading memory dominates, so a record is three packets and everything else is recomputed.
@@ -200,7 +226,17 @@ def intersect(
     t = dr.dot(normal, to_centre) / facing
     offset = dr.fma(t, direction, -to_centre)
     u, v = dr.dot(offset, u_axis), dr.dot(offset, v_axis)
-    q = dr.fma(u, u, v * v)
+    q, front, filtered = dr.fma(u, u, v * v), facing < 0.0, None
+    if pixel is not None:
+        depth, slope = dr.dot(pixel, to_centre), dr.rcp(dr.dot(pixel, direction))
+        aside = slope * direction - to_centre / depth
+        spread = dr.squared_norm(aside)
+        filtered = Filtered(depth, slope, aside, ~((q <= spread) & (t > 0)))
+        # What is met of a disk that is seen from exactly edge on is no number, nor are its derivatives.
+        q = dr.select(filtered.larger, spread, q)
+        u, v, offset = (dr.select(filtered.larger, 0, each) for each in (u, v, offset))
+        facing = dr.select(filtered.larger, -1, facing)
+        front, t = mi.Bool(True), depth * slope
     value = response(q, degree)
     unclipped = centre[3] * value
     return SurfelHit(
@@ -208,7 +244,7 @@ def intersect(
         # dr.select is a quarter of the cost of dr.minimum on LLVM.
         alpha=dr.select(unclipped < MAX_ALPHA, unclipped, MAX_ALPHA),
         within=q <= axis_v[3],
-        front=facing < 0.0,
+        front=front,
         radius=axis_u[3],
         unclipped=unclipped,
         response=value,
@@ -219,6 +255,8 @@ def intersect(
         offset=offset,
         u=u,
         v=v,
+        q=q,
+        filtered=filtered,
     )
 
 

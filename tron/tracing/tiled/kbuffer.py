@@ -105,7 +105,7 @@ def search_list(
     going = active & (cursor < end)
     while going:
         index = dr.gather(mi.UInt32, entries, cursor, going)
-        hit = intersect(records.geometry, index, origin, direction, records.degree)
+        hit = intersect(records.geometry, index, origin, direction, records.degree, records.pixel)
         kept = _insert(kept, hit, index, going)
         cursor += 1
         going &= cursor < end

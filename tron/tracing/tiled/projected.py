@@ -12,6 +12,9 @@ variance in that plane,
 are the covariance's first row, its determinant without a difference of large numbers, which needles would
 lose, and the distance of a point (X, Y) from the centre. Its two squares are the coordinates that a record
 stands for. The median depth is not that of such a disk: :mod:`tron.tracing.surface`.
+
+2DGS's splats stay disks in space, met at the same depths, with a pixel's filter about their centres
+(:func:`tron.tracing.kernel.intersect`).
 """
 
 from __future__ import annotations
@@ -82,29 +85,33 @@ def projected(
         dr.normalize(dr.cross(dr.normalize(u_axis), dr.normalize(v_axis))), dr.normalize(to_centre)
     )
     seen &= ~(facing > _AWAY)
-    z = dr.select(seen, depth, 1)
-    x, y = (dr.clip(dr.dot(axis, to_centre) / z, -bend, bend) for axis in (right, down))
+    z, opacity, pixel = dr.select(seen, depth, 1), centre.w, None
+    if projection.larger:  # round: pixels that are not square are taken for squares as large
+        along, across, pixel = u_axis, v_axis, forward * dr.sqrt(dr.sqrt(variance_x * variance_y))
+        wide = dr.rcp(dr.squared_norm(u_axis)) + dr.rcp(dr.squared_norm(v_axis))
+    else:
+        x, y = (dr.clip(dr.dot(axis, to_centre) / z, -bend, bend) for axis in (right, down))
 
-    def flat(axis: mi.Vector3f) -> mi.Vector2f:
-        deviation = axis * (dr.rcp(dr.squared_norm(axis)) / z)
-        ahead = dr.dot(forward, deviation)
-        shown = mi.Vector2f(dr.dot(right, deviation) - x * ahead, dr.dot(down, deviation) - y * ahead)
-        length = dr.detach(dr.norm(shown))
-        return shown * dr.select(length > _LARGEST, _LARGEST / length, 1)
+        def flat(axis: mi.Vector3f) -> mi.Vector2f:
+            deviation = axis * (dr.rcp(dr.squared_norm(axis)) / z)
+            ahead = dr.dot(forward, deviation)
+            shown = mi.Vector2f(dr.dot(right, deviation) - x * ahead, dr.dot(down, deviation) - y * ahead)
+            length = dr.detach(dr.norm(shown))
+            return shown * dr.select(length > _LARGEST, _LARGEST / length, 1)
 
-    a, b = flat(u_axis), flat(v_axis)
-    first = dr.fma(a.x, a.x, dr.fma(b.x, b.x, variance_x))
-    mixed, last = dr.fma(a.x, a.y, b.x * b.y), dr.fma(a.y, a.y, b.y * b.y)
-    own = dr.square(a.x * b.y - a.y * b.x)
-    determinant = own + variance_x * last + variance_y * first
-    opacity = centre.w
-    if projection.compensated:
-        opacity *= dr.sqrt(dr.maximum(own / determinant, _LEAST_KEPT))
+        a, b = flat(u_axis), flat(v_axis)
+        first = dr.fma(a.x, a.x, dr.fma(b.x, b.x, variance_x))
+        mixed, last = dr.fma(a.x, a.y, b.x * b.y), dr.fma(a.y, a.y, b.y * b.y)
+        own = dr.square(a.x * b.y - a.y * b.x)
+        determinant = own + variance_x * last + variance_y * first
+        if projection.compensated:
+            opacity *= dr.sqrt(dr.maximum(own / determinant, _LEAST_KEPT))
+        along = right * (dr.rsqrt(first) / z)
+        across = (right * (mixed / first) - down) * (dr.sqrt(first / determinant) / z)
+        wide = dr.square(z) * (first + last + variance_y)
     cut = cut_radius_squared(dr.detach(opacity), records.degree, MIN_ALPHA)
     cut = dr.select(seen, cut, -1)
-    reach = dr.detach(z * dr.sqrt(dr.maximum(cut, 0) * (first + last + variance_y)))
-    along = right * (dr.rsqrt(first) / z)
-    across = (right * (mixed / first) - down) * (dr.sqrt(first / determinant) / z)
+    reach = dr.detach(dr.sqrt(dr.maximum(cut, 0) * wide))
     geometry = interleave([*place, opacity, *along, reach, *across, cut], records.count)
 
     direction = dr.normalize(to_centre)
@@ -117,5 +124,10 @@ def projected(
     features = interleave([*kept[0], *kept[1], *shown], records.count)
     dr.eval(geometry, features)
     return replace(
-        records, geometry=geometry, features=features, harmonics=dr.zeros(mi.Float, 1), sh_degree=0
+        records,
+        geometry=geometry,
+        features=features,
+        harmonics=dr.zeros(mi.Float, 1),
+        sh_degree=0,
+        pixel=pixel,
     )

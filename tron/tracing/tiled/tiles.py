@@ -167,7 +167,8 @@ def _touched_tiles(records: SurfelRecords, camera: Camera) -> _Touched:
     to_centre = mi.Vector3f(centre.x, centre.y, centre.z) - position
     u, v = mi.Vector3f(axis_u.x, axis_u.y, axis_u.z), mi.Vector3f(axis_v.x, axis_v.y, axis_v.z)
     q_cut = axis_v.w
-    facing = dr.dot(dr.cross(u, v), to_centre) < 0  # a flat disk shows one side to a point
+    facing = dr.dot(dr.cross(u, v), to_centre) < 0  # a flat disk shows one side to a point, a filter both
+    facing |= records.pixel is not None
     u, v = half_axes(u, v, q_cut)
 
     def projected(vector: mi.Vector3f) -> mi.Vector3f:
@@ -175,21 +176,34 @@ def _touched_tiles(records: SurfelRecords, camera: Camera) -> _Touched:
 
     c, a, b = projected(to_centre), projected(u), projected(v)
     ahead = c.z + dr.sqrt(a.z * a.z + b.z * b.z) > 0
-    first_x, across = _tile_range(*_screen_bounds(c, a, b, (1, 0), cx), columns)
-    first_y, down_count = _tile_range(*_screen_bounds(c, a, b, (0, 1), cy), rows)
+
+    def bounds(weights: tuple[int, int], principal: mi.Float) -> tuple[mi.Float, mi.Float]:
+        low, high = _screen_bounds(c, a, b, weights, principal)
+        if records.pixel is None:
+            return low, high
+        middle = (weights[0] * c.x + weights[1] * c.y) / c.z + principal
+        reach = dr.hypot(weights[0] * fx, weights[1] * fy) * dr.norm(records.pixel)
+        reach *= (1 + ROUNDING) * dr.sqrt(dr.maximum(q_cut, 0))
+        return dr.minimum(low, middle - reach), dr.maximum(high, middle + reach)
+
+    first_x, across = _tile_range(*bounds((1, 0), cx), columns)
+    first_y, down_count = _tile_range(*bounds((0, 1), cy), rows)
     count = dr.select(facing & ahead & (q_cut >= 0), across * down_count, 0)
     distance = dr.norm(to_centre)
     normal = dr.normalize(dr.cross(u, v))
     normal = mi.Vector3f(dr.dot(right, normal), dr.dot(down, normal), dr.dot(forward, normal))
     height = dr.abs(dr.dot(normal, mi.Vector3f(c.x / fx, c.y / fy, c.z)))
     height = dr.maximum(height - ROUNDING * distance, 0)
+    near, far = distance - axis_u.w, distance + axis_u.w
+    if records.pixel is not None:  # each is met at the depth of its centre
+        normal, height = mi.Vector3f(0, 0, -1), c.z
+        near, far = dr.zeros(mi.Float, records.count), dr.full(mi.Float, dr.inf, records.count)
     planes = dr.zeros(mi.Float, 4 * records.count)
     dr.scatter(planes, mi.Vector4f(*normal, height), dr.arange(mi.UInt32, records.count))
-    falling, rising = (_screen_bounds(c, a, b, (1, sign), cx + sign * cy) for sign in (1, -1))
+    falling, rising = (bounds((1, sign), cx + sign * cy) for sign in (1, -1))
     diagonals = dr.zeros(mi.Float, 4 * records.count)
     dr.scatter(diagonals, mi.Vector4f(*falling, *rising), dr.arange(mi.UInt32, records.count))
-    reach = axis_u.w
-    touched = _Touched(first_x, across, first_y, count, diagonals, planes, distance - reach, distance + reach)
+    touched = _Touched(first_x, across, first_y, count, diagonals, planes, near, far)
     dr.eval(touched)
     return touched
 
