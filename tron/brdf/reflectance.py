@@ -152,6 +152,24 @@ def fresnel(
     return (1 - material.metallic) * glass + material.metallic * metal
 
 
+def lobe_mean(
+    material: Material, table: BrdfTable, normal: mi.Vector3f, to_camera: mi.Vector3f
+) -> mi.Vector3f:
+    """Mean of the directions, world, that a lobe's light comes from; the shorter the wider the lobe.
+
+    Args:
+        material, table: as of :func:`reflectance`.
+        normal, to_camera: unit, world.
+    """
+    normal, to_camera = mi.Vector3f(normal), mi.Vector3f(to_camera)
+    cosine = dr.dot(normal, to_camera)
+    f0 = dr.lerp(DIELECTRIC_F0, mi.luminance(material.base_color), material.metallic)
+    mean = table.mean_direction(material.roughness, cosine, f0)
+    aside = cosine * normal - to_camera
+    aside *= dr.rsqrt(dr.maximum(dr.squared_norm(aside), 1e-12))
+    return mean.x * aside + mean.y * normal
+
+
 def _f0(material: Material) -> mi.Color3f:
     return DIELECTRIC_F0 * (1 - material.metallic) + material.metallic * material.base_color
 

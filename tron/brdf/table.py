@@ -3,6 +3,9 @@
     A, B    of F0 A + B, the albedo of a GGX mirror with Schlick's Fresnel: the split sum (Karis 2013)
     G       albedo of the same mirror on glass of index 1.5, whose F0 is 0.04, with Fresnel's own equations
     E       A + B, the albedo of a perfect mirror, averaged over cosine-distributed n.v
+    T, N    of F0 (T_A, N_A) + (T_B, N_B), the same integral of the directions themselves: along the surface,
+            away from the view, and along the normal. Over the albedo it is the lobe's mean direction, the
+            shorter the wider the lobe
 
 Light that meets one facet is counted alone; :mod:`tron.brdf.reflectance` gives the rest back. G is above
 0.04 A + B by up to 0.02: Schlick's Fresnel is 0.07 at 60 degrees, where glass mirrors 0.09.
@@ -28,7 +31,7 @@ GLASS_INDEX = 1.5
 
 @cache
 def brdf_table() -> np.ndarray:
-    """(roughness, n.v, 4) float32: A, B, G and E, of which E is the same for every n.v. Once a process.
+    """(roughness, n.v, 8) float32: A, B, G, E (the same for every n.v), T_A, N_A, T_B, N_B. Once a process.
 
     Entry (i, j) is of roughness i / 255 and n.v = (j + 1/2) / 256. By midpoint quadrature over the visible
     normals (Heitz 2018, "Sampling the GGX Distribution of Visible Normals").
@@ -37,18 +40,19 @@ def brdf_table() -> np.ndarray:
     cosine = (mi.Float(lane % TABLE_SIZE) + 0.5) / TABLE_SIZE
     roughness = mi.Float(lane // TABLE_SIZE) / (TABLE_SIZE - 1)
     lobes = _directional_albedo(cosine, dr.square(roughness))
-    scale, bias, glass = (np.array(lobe).reshape(TABLE_SIZE, TABLE_SIZE) for lobe in lobes)
-    mean = np.average(scale + bias, axis=1, weights=_CENTRES)
-    return np.stack(np.broadcast_arrays(scale, bias, glass, mean[:, None]), -1).astype(np.float32)
+    scale, bias, glass, *means = (np.array(lobe).reshape(TABLE_SIZE, TABLE_SIZE) for lobe in lobes)
+    whole = np.average(scale + bias, axis=1, weights=_CENTRES)
+    return np.stack(np.broadcast_arrays(scale, bias, glass, whole[:, None], *means), -1).astype(np.float32)
 
 
 _CENTRES = (np.arange(TABLE_SIZE) + 0.5) / TABLE_SIZE
 
 
 @dr.syntax
-def _directional_albedo(cosine: mi.Float, alpha: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
+def _directional_albedo(cosine: mi.Float, alpha: mi.Float) -> tuple[mi.Float, ...]:
     view = mi.Vector3f(dr.safe_sqrt(1 - cosine * cosine), 0, cosine)
     scale, bias, glass, total = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)
+    mean_scale, mean_bias = mi.Vector3f(0), mi.Vector3f(0)
     i = mi.UInt32(0)
     while i < TABLE_SAMPLES * TABLE_SAMPLES:
         # The rim of the disk is the lobe's long tail: points crowd there, by radius^2 = 1 - x^3.
@@ -58,15 +62,19 @@ def _directional_albedo(cosine: mi.Float, alpha: mi.Float) -> tuple[mi.Float, mi
         turn = (mi.Float(i // TABLE_SAMPLES) + 0.5) / (2 * TABLE_SAMPLES)
         half = visible_normal(view, alpha, mi.Point2f(1 - x * x * x, turn - 0.25))
         facing = dr.dot(view, half)
-        out = 2 * facing * half.z - view.z
-        weight = dr.select((out > 0) & (facing > 0), share * unhidden(cosine, out, alpha), 0)
+        out = 2 * facing * half - view
+        weight = dr.select((out.z > 0) & (facing > 0), share * unhidden(cosine, out.z, alpha), 0)
         fresnel = (1 - facing) ** 5
         scale += weight * (1 - fresnel)
         bias += weight * fresnel
+        mean_scale += weight * (1 - fresnel) * out
+        mean_bias += weight * fresnel * out
         glass += weight * mi.fresnel(facing, GLASS_INDEX)[0]
         total += share
         i += 1
-    return scale / total, bias / total, glass / total
+    mean_scale, mean_bias = mean_scale / total, mean_bias / total
+    means = (-mean_scale.x, mean_scale.z, -mean_bias.x, mean_bias.z)
+    return scale / total, bias / total, glass / total, *means
 
 
 @dataclass
@@ -76,10 +84,12 @@ class BrdfTable:
     Attributes:
         texels: A, B, G and E, row-major.
         means: the same of each roughness, averaged over cosine-distributed n.v.
+        directions: T_A, N_A, T_B and N_B, row-major.
     """
 
     texels: mi.Float
     means: mi.Float
+    directions: mi.Float
 
     @classmethod
     def load(cls) -> BrdfTable:
@@ -93,26 +103,47 @@ class BrdfTable:
             roughness: in [0, 1].
             cosine: n.v; None: the mean over cosine-distributed directions.
         """
+        if cosine is not None:
+            return _looked_up(self.texels, roughness, cosine)
         row, fy = _between(roughness * (TABLE_SIZE - 1))
-        if cosine is None:
-            upper, lower = (dr.gather(mi.Vector4f, self.means, row + i) for i in (0, 1))
-        else:
-            column, fx = _between(cosine * TABLE_SIZE - 0.5)
-            first = row * TABLE_SIZE + column
-
-            def texel(index: mi.UInt32) -> mi.Vector4f:
-                return dr.gather(mi.Vector4f, self.texels, index)
-
-            upper = dr.lerp(texel(first), texel(first + 1), fx)
-            lower = dr.lerp(texel(first + TABLE_SIZE), texel(first + TABLE_SIZE + 1), fx)
+        upper, lower = (dr.gather(mi.Vector4f, self.means, row + i) for i in (0, 1))
         return dr.lerp(upper, lower, fy)
+
+    def mean_direction(self, roughness: mi.Float, cosine: mi.Float, f0: mi.Float) -> mi.Vector2f:
+        """Mean of the directions of a lobe's light: along the surface away from the view, and the normal.
+
+        Args:
+            roughness, cosine: as of :meth:`__call__`.
+            f0: reflectance at the normal.
+
+        Returns: the shorter the wider the lobe, 1 of a mirror.
+        """
+        scale, bias, _, _ = self(roughness, cosine)
+        along_a, up_a, along_b, up_b = _looked_up(self.directions, roughness, cosine)
+        albedo = dr.maximum(f0 * scale + bias, 1e-4)
+        return mi.Vector2f(f0 * along_a + along_b, f0 * up_a + up_b) / albedo
 
 
 @cache
 def _loaded(_variant: str) -> BrdfTable:
     table = brdf_table()
-    means = np.average(table, axis=1, weights=_CENTRES).astype(np.float32)
-    return BrdfTable(*(mi.Float(aligned(values.ravel())) for values in (table, means)))
+    albedos, directions = table[..., :4], table[..., 4:]
+    means = np.average(albedos, axis=1, weights=_CENTRES)
+    parts = (np.ascontiguousarray(part, np.float32) for part in (albedos, means, directions))
+    return BrdfTable(*(mi.Float(aligned(part.ravel())) for part in parts))
+
+
+def _looked_up(texels: mi.Float, roughness: mi.Float, cosine: mi.Float) -> mi.Vector4f:
+    row, fy = _between(roughness * (TABLE_SIZE - 1))
+    column, fx = _between(cosine * TABLE_SIZE - 0.5)
+    first = row * TABLE_SIZE + column
+
+    def texel(index: mi.UInt32) -> mi.Vector4f:
+        return dr.gather(mi.Vector4f, texels, index)
+
+    upper = dr.lerp(texel(first), texel(first + 1), fx)
+    lower = dr.lerp(texel(first + TABLE_SIZE), texel(first + TABLE_SIZE + 1), fx)
+    return dr.lerp(upper, lower, fy)
 
 
 def _between(x: mi.Float) -> tuple[mi.UInt32, mi.Float]:

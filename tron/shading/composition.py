@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from tron.brdf.reflectance import reflectance
+from tron.brdf.reflectance import lobe_mean, reflectance
 from tron.estimation import Brdf
 from tron.shading.direct.visibility import shading_normal
 from tron.shading.lighting import SplitSum
@@ -71,7 +71,10 @@ class Response:
         normal, to_camera = shading_normal(surface), -surface.direction
         cosine = dr.dot(normal, to_camera)
         share = reflectance(surface, split_sum.brdf, cosine, brdf)
-        mirrored = split_sum.reflected(normal, to_camera, surface.roughness)
+        if brdf == "lambert":  # as the paper looks it up
+            mirrored = split_sum.reflected(normal, to_camera, surface.roughness)
+        else:
+            mirrored = split_sum.averaged(lobe_mean(surface, split_sum.brdf, normal, to_camera))
         return cls(share.diffuse, share.specular, split_sum.diffuse(normal), mirrored * share.specular)
 
     def open(self) -> mi.Color3f:

@@ -10,6 +10,7 @@ Between levels, texels and faces the lookup is linear. Diffuse light is the roug
 from __future__ import annotations
 
 from copy import copy
+from functools import cache
 
 import drjit as dr
 import mitsuba as mi
@@ -20,12 +21,14 @@ from tron.errors import TronError
 from tron.runtime import aligned
 from tron.shading.environments.cubemap import CubemapLight, bilinear, face_direction
 from tron.shading.environments.environment import EnvironmentLight, EnvironmentMap
-from tron.shading.environments.prefilter import LightTree, ggx_prefilter
+from tron.shading.environments.prefilter import LightTree, ggx_prefilter, lobe_length
 
 CUBEMAP_RESOLUTION = 128
 """Texels along a face edge of the sharpest level."""
 SMALLEST_LEVEL, DIFFUSE_LEVEL = 16, 32
 SHARPEST_ROUGHNESS, MIDDLE_ROUGHNESS = 0.08, 0.5
+WIDTHS = 256
+"""Entries of the table of lobes' widths."""
 
 
 class Lighting:
@@ -102,6 +105,7 @@ class SplitSum:
         self._texels = dr.concat(levels)
         self._offsets = mi.UInt32(aligned(offsets.astype(np.uint32)))
         self._resolutions = mi.UInt32(aligned(np.array(resolutions, np.uint32)))
+        self._widths = mi.Float(aligned(_roughness_by_width()))
         self.brdf = BrdfTable.load()
         dr.eval(self._texels)
 
@@ -129,6 +133,18 @@ class SplitSum:
         normal, to_camera = mi.Vector3f(normal), mi.Vector3f(to_camera)
         return self.prefiltered(2 * dr.dot(normal, to_camera) * normal - to_camera, roughness)
 
+    def averaged(self, mean: mi.Vector3f) -> mi.Color3f:
+        """Mean radiance over a lobe whose directions have the mean ``mean``, world: as wide as that is short.
+
+        It is looked up where the lobe of a level has the same first moment. That is neither along the
+        mirror's direction nor of the surface's roughness: lobes lean to the normal, the horizon cuts them.
+        """
+        length = dr.norm(mean)
+        spread = dr.sqrt(dr.sqrt(dr.clip((1 - length) * 3, 1e-6, 1))) * (WIDTHS - 1)
+        entry = dr.minimum(mi.UInt32(spread), WIDTHS - 2)
+        pair = [dr.gather(mi.Float, self._widths, entry + i) for i in (0, 1)]
+        return self.prefiltered(mean / length, dr.lerp(*pair, spread - mi.Float(entry)))
+
     def prefiltered(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
         """Environment filtered by the lobe of ``roughness``, trilinear, in unit world ``direction``."""
         direction = self._at_rest(mi.Vector3f(direction))
@@ -152,6 +168,14 @@ class SplitSum:
     def _level(self, direction: mi.Vector3f, level: mi.UInt32) -> mi.Color3f:
         resolution = dr.gather(mi.UInt32, self._resolutions, level)
         return bilinear(self._texels, dr.gather(mi.UInt32, self._offsets, level), resolution, direction)
+
+
+@cache
+def _roughness_by_width() -> np.ndarray:
+    """(WIDTHS,) float32: roughness of the lobe of mean length 1 - x^4 / 3, x in [0, 1]."""
+    roughness = np.linspace(0.02, 0.9999, 400)
+    width = np.array([(3 * (1 - lobe_length(each**2))) ** 0.25 for each in roughness])
+    return np.interp(np.linspace(0, 1, WIDTHS), [0, *width, 1], [0, *roughness, 1]).astype(np.float32)
 
 
 def _at_rest(light: EnvironmentLight, widest: int) -> EnvironmentLight:

@@ -27,7 +27,7 @@ def every_case() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_the_table_never_reflects_more_than_all(variant: str) -> None:
     table = brdf_table()
-    assert table.min() >= 0
+    assert table[..., :4].min() >= 0
     assert table[..., :2].sum(-1).max() <= 1 + 1e-5  # float32
 
 

@@ -5,7 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tron.brdf.reflectance import glass_fresnel, mean_fresnel, reflectance
+from tron.brdf.bsdf import metallic_roughness
+from tron.brdf.reflectance import glass_fresnel, lobe_mean, mean_fresnel, reflectance
 from tron.brdf.table import BrdfTable, brdf_table
 from tron.seeds import generator
 
@@ -68,3 +69,23 @@ def test_lambert_knows_neither_roughness_nor_angle(variant: str, material) -> No
     roughness, cosine = grid.T.astype(np.float32)
     share = reflectance(material(0.8, roughness, 0.25), BrdfTable.load(), mi.Float(cosine), brdf="lambert")
     np.testing.assert_allclose(np.array(share.diffuse + dr.zeros(mi.Color3f, 81)), 0.6, rtol=1e-6)
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.6, 1.0])
+@pytest.mark.parametrize("cosine", [0.1, 0.5, 0.95])
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_the_mean_of_a_lobe_is_that_of_the_light_that_the_path_tracer_draws(
+    variant: str, material, roughness: float, cosine: float, metallic: float
+) -> None:
+    """Of a black dielectric or a metal there is nothing but the lobe; the mean is of Schlick's Fresnel."""
+    base = 0.6 if metallic else 0.0
+    bsdf, n = metallic_roughness(base, roughness, metallic), 1 << 18
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.wi = mi.Vector3f(float(np.sqrt(1 - cosine**2)), 0, cosine)
+    random = generator(9, "tests", "lobe mean").random((3, n)).astype(np.float32)
+    drawn, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(random[0]), mi.Point2f(random[1:]))
+    weight = np.array(weight.x, np.float64)
+    expected = (np.array(drawn.wo, np.float64) * weight).sum(1) / weight.sum()
+    up, view = mi.Vector3f(0, 0, 1), mi.Vector3f(float(np.sqrt(1 - cosine**2)), 0, cosine)
+    mean = lobe_mean(material(base, roughness, metallic), BrdfTable.load(), up, view)
+    np.testing.assert_allclose(np.array(mean).ravel(), expected, atol=0.012 if metallic else 0.05)

@@ -5,12 +5,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tron.brdf.reflectance import reflectance
+from tron.brdf.bsdf import metallic_roughness
+from tron.brdf.reflectance import lobe_mean, reflectance
 from tron.errors import TronError
 from tron.seeds import generator
 from tron.shading.environments.cubemap import direction_face, face_direction
 from tron.shading.environments.environment import EnvironmentLight, EnvironmentMap
-from tron.shading.environments.prefilter import LightTree, ggx_prefilter
+from tron.shading.environments.prefilter import LightTree, ggx_prefilter, lobe_length
 from tron.shading.guidance import Lighting
 from tron.shading.lighting import SplitSum
 
@@ -247,3 +248,43 @@ def test_another_light_of_another_size_compiles_nothing_new(variant: str, kernel
 def test_an_odd_resolution_is_refused(variant: str, resolution: int) -> None:
     with pytest.raises(TronError, match=str(resolution)):
         SplitSum(EnvironmentLight(EnvironmentMap.constant(1.0)), resolution)
+
+
+@pytest.mark.parametrize("alpha", [0.01, 0.1, 0.5, 0.95])
+def test_the_length_of_a_lobe_is_that_of_its_integral(alpha: float) -> None:
+    cosine = np.linspace(0, 1, 2_000_001)
+    weight = cosine / (alpha**2 + (1 - alpha**2) * (1 - cosine) / 2) ** 2
+    assert lobe_length(alpha) == pytest.approx((weight * cosine).sum() / weight.sum(), rel=1e-4)
+
+
+@pytest.mark.parametrize(("metallic", "roughness"), [(1.0, 0.5), (1.0, 0.8), (1.0, 1.0), (0.0, 0.8)])
+def test_rough_lobes_are_looked_up_where_their_light_comes_from(
+    variant: str, material, metallic: float, roughness: float
+) -> None:
+    """A lamp on one side: against the BSDF's own integral, mean and mean error over angles of view."""
+    image = np.full((64, 128, 3), 0.1, np.float32)
+    image[12:20, 20:36] = 20.0
+    light = EnvironmentLight(EnvironmentMap(image))
+    split_sum, count = SplitSum(light, 128), 1 << 15
+    bsdf = metallic_roughness(0.8 if metallic else 0.0, roughness, metallic)
+    surface = material(0.8 if metallic else 0.0, roughness, metallic)
+    up = mi.Vector3f(0, 0, 1)
+    found, mirrored, expected = [], [], []
+    for turn in np.linspace(0, 2 * np.pi, 9)[:-1]:
+        for cosine in (0.25, 0.5, 0.8):
+            sine = np.sqrt(1 - cosine**2)
+            view = mi.Vector3f(float(sine * np.cos(turn)), float(sine * np.sin(turn)), cosine)
+            si = dr.zeros(mi.SurfaceInteraction3f, count)
+            si.wi = view
+            direction, density = light.sample(
+                mi.Point2f(generator(4, "tests", "lamp").random((2, count)).astype(np.float32))
+            )
+            value = bsdf.eval(mi.BSDFContext(), si, direction).x * light.radiance(direction).x
+            expected.append(float(np.array(dr.select(density > 0, value / density, 0), np.float64).mean()))
+            share = reflectance(surface, split_sum.brdf, view.z).specular.x
+            mean = lobe_mean(surface, split_sum.brdf, up, view)
+            found.append(float((split_sum.averaged(mean).x * share)[0]))
+            mirrored.append(float((split_sum.reflected(up, view, surface.roughness).x * share)[0]))
+    truth, ours, before = (np.array(values) for values in (expected, found, mirrored))
+    assert ours.mean() == pytest.approx(truth.mean(), rel=0.15)
+    assert np.abs(ours - truth).mean() < 0.7 * np.abs(before - truth).mean()

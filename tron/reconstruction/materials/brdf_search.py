@@ -19,13 +19,14 @@ a metal must be bright, in the unit in which mean irradiance over what is seen i
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.spatial import KDTree
 
-from tron.brdf.reflectance import compensation, glass_fresnel, mean_fresnel
+from tron.brdf.reflectance import compensation, glass_fresnel, lobe_mean, mean_fresnel
 from tron.brdf.table import BrdfTable
 from tron.captures.view import FLOOR
 from tron.color import luminance
@@ -48,6 +49,7 @@ _ROUGH_METAL_LOSS = 5.0
 wrong fur looks like it."""
 _METAL_LUMINANCE = 0.2  # a stop and a half below iron: cameras do not expose exactly
 _HALVINGS = 12
+_METAL_COLOR = 0.7
 _DARK_METAL_LOSS = 0.3
 """Loss of a metal e times darker than that; it grows with the square of the logarithm."""
 
@@ -119,13 +121,15 @@ def materials_of(
     share = np.clip(received.direct / np.maximum(received.unshadowed, 1e-6), 0, 1)
     normal = scene.normals()[surfel]
     cosine = np.einsum("nc,nc->n", normal, found.to_camera)
-    mirrored = 2 * cosine[:, None] * normal - found.to_camera
     bases, losses = [], []
     for metal in (False, True):
         for roughness in ROUGHNESSES:
             scale, bias, glass, whole = _table(roughness, cosine)
             open_ = received.openness[:, None] * (1 - roughness) + roughness * share
-            lobe = open_[surfel] * _prefiltered(lighting, mirrored, roughness) + received.bounced[surfel]
+            lobe = (
+                open_[surfel] * _reflected(lighting, normal, found.to_camera, roughness, metal)
+                + received.bounced[surfel]
+            )
             lobe = np.maximum(lobe, 1e-5)
             if metal:
                 each = _metal_of(color / lobe, scale[:, None], bias[:, None], whole[:, None])
@@ -228,7 +232,14 @@ def _table(roughness: float, cosine: np.ndarray) -> list[np.ndarray]:
     return [np.array(value) for value in table(dr.full(mi.Float, float(roughness), len(cosine)), along)]
 
 
-def _prefiltered(lighting: Lighting, direction: np.ndarray, roughness: float) -> np.ndarray:
-    """(N, 3) mean radiance over lobes about directions."""
-    along = lanes(mi.Vector3f, direction)
-    return np.array(lighting.split_sum.prefiltered(along, dr.opaque(mi.Float, float(roughness)))).T
+def _reflected(
+    lighting: Lighting, normal: np.ndarray, to_camera: np.ndarray, roughness: float, metal: bool
+) -> np.ndarray:
+    """(N, 3) mean radiance over lobes; how far they lean hardly depends on a metal's base color."""
+    material = SimpleNamespace(
+        base_color=mi.Color3f(_METAL_COLOR),
+        roughness=dr.opaque(mi.Float, float(roughness)),
+        metallic=mi.Float(float(metal)),
+    )
+    split_sum, ends = lighting.split_sum, (lanes(mi.Vector3f, normal), lanes(mi.Vector3f, to_camera))
+    return np.array(split_sum.averaged(lobe_mean(material, split_sum.brdf, *ends))).T

@@ -141,6 +141,17 @@ def ggx_prefilter(
     return total / weight
 
 
+def lobe_length(alpha: float) -> float:
+    """Length of the mean direction of that lobe: 1 of a mirror's, 2/3 at alpha = 1."""
+    nodes, weights = np.polynomial.legendre.leggauss(200)
+    # By the logarithm of what D is a square of: the peak of a narrow lobe has as many nodes as its tail.
+    least, most = alpha**2, (1 + alpha**2) / 2
+    lobe = least * (most / least) ** ((nodes + 1) / 2)
+    cosine = 1 - 2 * (lobe - least) / (1 - alpha**2)
+    weights = weights * cosine / lobe
+    return float((weights * cosine).sum() / weights.sum())
+
+
 def unoccluded_irradiance(light: EnvironmentLight | CubemapLight, normal: mi.Vector3f) -> mi.Color3f:
     """Irradiance / pi of unit world normals with nothing in the way: within 1 %, noiseless, differentiable.
 
