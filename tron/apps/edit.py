@@ -50,7 +50,6 @@ class Settings(BaseModel):
         "a folder with a cameras.json or transforms.json; null: cameras.json beside the scene",
     )
     up: Up = None
-    seed: int = Field(0, description="root of all random numbers: of the rays that find what a pixel shows")
 
 
 def main(settings: Settings) -> None:
@@ -146,15 +145,15 @@ def _read(settings: Settings) -> tuple[EditList, str]:
 def _views(settings: Settings, scene: GaussianScene) -> Views:
     path = _cameras_file(settings) or settings.scene.with_name(CAMERAS)
     if settings.cameras is None and not path.is_file():
-        return Views(seed=settings.seed)
+        return Views()
     try:
         cameras = in_frame_of(scene.offset, cameras_of(path), path)
     except TronError as error:
         if settings.cameras is not None:
             raise
         log.warning("%s; edits name no view without it", error)
-        return Views(seed=settings.seed)
-    return Views(cameras, _names(path, len(cameras)), settings.seed)
+        return Views()
+    return Views(cameras, _names(path, len(cameras)))
 
 
 def _names(path: Path, count: int) -> list[str]:

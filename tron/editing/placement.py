@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tron.cameras import Camera
 from tron.editing.views import Views
 from tron.errors import TronError
 from tron.framing import foot_height, upright
@@ -59,10 +58,8 @@ def placed(
 def surface_below(scene: GaussianScene, views: Views, point: np.ndarray) -> np.ndarray:
     """(3,) the point of the scene's surface straight below another; TronError where there is none."""
     at = np.asarray(point, np.float64)
-    level = np.eye(3)[np.abs(scene.up).argmin()]
-    downward = Camera.look_at(at, at - scene.up, up=level, fov_deg=1, width=1, height=1)
-    surfels, distance = views.met(scene, downward)
-    if not len(surfels):
+    distance = views.below(scene, at)
+    if distance is None:
         raise TronError(
             f"nothing lies below {at.tolist()}", mend="give a point above a surface, or standing: false"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -13,18 +13,15 @@ from tron.cameras import Camera
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.io.images import read_image
-from tron.seeds import integer
 
 if TYPE_CHECKING:
     from tron.relighting import Relighter
-    from tron.relighting.beside import BesideMeshes
-    from tron.relighting.proxy import ProxiedTracer
     from tron.tracing import SurfelTracer
 
-PICK_RAYS = 32
-"""Rays of a pick: each meets a surfel by its weight in the picture."""
+PICKED = 0.95
+"""Share of what a picked pixel shows that the picked surfels make up: all of them are thousands, at times."""
 THICKNESS = 2.0
-"""Spacings around the middle of what they meet, within which surfels are picked."""
+"""Spacings, or deviations of its own, from the median of what a pixel's ray meets: farther none is picked."""
 DEPTH_TOLERANCE = 3.0
 """Spacings behind the surface that a view sees, up to which it sees a surfel."""
 
@@ -36,12 +33,10 @@ class Views:
     Attributes:
         cameras: in the scene's frame.
         names: of the cameras, as many; or none.
-        seed: root of the random numbers of rays.
     """
 
     cameras: Sequence[Camera] = ()
     names: Sequence[str] = ()
-    seed: int = 0
     _kept: list[Relighter] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def __getitem__(self, name: str | int) -> Camera:
@@ -75,46 +70,62 @@ class Views:
         if not (0 <= x < camera.width and 0 <= y < camera.height):
             size = f"{camera.width} x {camera.height} pixels"
             raise TronError(f"pixel {list(pixel)} is outside view {view}", mend=f"it has {size}")
-        surfels, _ = self.met(scene, camera.window(x, y, 1, 1))
+        surfels, _ = self.shown(scene, camera, x, y)
         if not len(surfels):
             raise TronError(f"pixel {list(pixel)} of view {view} shows nothing", mend="pick another")
         return surfels
 
-    def met(self, scene: GaussianScene, pixel: Camera) -> tuple[np.ndarray, float]:
-        """Surfels that a camera of one pixel sees, and their distance; none where it is empty.
+    def shown(self, scene: GaussianScene, camera: Camera, x: int, y: int) -> tuple[np.ndarray, np.ndarray]:
+        """Surfels that a pixel of a picture shows, and the point of them that it shows; none if empty.
 
         Args:
             scene: the surfels; where normals have no sign, they are turned to the camera.
-            pixel: the camera.
+            camera: of the picture. x, y: the pixel, from the upper left corner.
 
         Returns:
-            Numbers of the surfels that rays meet within two spacings of the median, and the median distance,
-            world units.
+            Numbers of the surfels that weigh most in the pixel, of those that its ray meets near the median
+            (:data:`THICKNESS`), and the median point, (3,) in world units.
         """
         import drjit as dr
         import mitsuba as mi
 
-        tracer = self._tracer(scene, pixel)
-        from tron.tracing.hierarchy.first_hit import NOTHING, ray_seeds
+        from tron.tracing.surface import depth_along
 
-        lane = dr.arange(mi.UInt32, PICK_RAYS)
-        root = dr.opaque(mi.UInt32, integer(self.seed, "editing", "pick"))
-        start, along = (
-            [dr.full(mi.Float, float(value), PICK_RAYS) for value in vector]
-            for vector in (pixel.position, pixel.rays()[0, 0])
-        )
-        start, along = mi.Point3f(*start), mi.Vector3f(*along)
-        dr.make_opaque(start, along)
-        seeds = ray_seeds(root, lane, dr.opaque(mi.UInt32, 0))
-        (hit,) = tracer.first_hits(start, [along], [dr.full(mi.Bool, True, PICK_RAYS)], [seeds])
-        surfels, distances = np.array(hit.surfel), np.array(hit.distance)
-        found = surfels != NOTHING
-        if 2 * found.sum() < PICK_RAYS:
-            return np.empty(0, int), 0.0
-        # One that was met: the mean of the two in the middle may lie between two layers.
-        middle = float(np.quantile(distances[found], 0.5, method="lower"))
-        near = found & (np.abs(distances - middle) <= THICKNESS * scene.spacing)
-        return np.unique(surfels[near]).astype(int), middle
+        # Projections are those of the whole picture in a stripe along its longer side.
+        wide = camera.width >= camera.height
+        stripe = camera.window(0, y, camera.width, 1) if wide else camera.window(x, 0, 1, camera.height)
+        tracer, place = self._tracer(scene, camera), mi.UInt32(x if wide else y)
+        values = dr.zeros(mi.Float, len(scene))
+        dr.enable_grad(values)
+        seen = tracer.gbuffer(stripe, [values]).rows()
+        distance = float(seen.depth[place[0]])
+        if not distance:
+            return np.empty(0, int), np.zeros(3)
+        # A composited quantity's derivatives by the surfels' own are their weights in the picture.
+        dr.backward(dr.gather(mi.Float, seen.values[0] * dr.detach(seen.opacity), place))
+        weights = np.array(dr.grad(values))
+        weighty = np.flatnonzero(weights)
+        start, along = camera.position.tolist(), [float(each[place[0]]) for each in seen.direction]
+        distances = depth_along(tracer.records, mi.UInt32(weighty), mi.Point3f(start), mi.Vector3f(along))
+        size = np.maximum(np.exp(scene.log_scales[weighty].max(1)), scene.spacing)
+        shown = weighty[np.abs(np.array(distances) - distance) <= THICKNESS * size]
+        shown = shown[np.argsort(-weights[shown], kind="stable")]
+        before = np.cumsum(weights[shown]) - weights[shown]
+        shown = np.sort(shown[before < PICKED * weights[shown].sum()])
+        return shown, camera.position + distance * np.array(along)
+
+    def below(self, scene: GaussianScene, point: np.ndarray) -> float | None:
+        """Distance from a point straight down to the surface, world units; None where there is none.
+
+        A ray's, among disks in space as light meets them: no picture is asked.
+        """
+        import mitsuba as mi
+
+        level = np.eye(3)[np.abs(scene.up).argmin()]
+        downward = Camera.look_at(point, point - scene.up, up=level, fov_deg=1, width=1, height=1)
+        at, along = ([float(value) for value in vector] for vector in (point, -scene.up))
+        seen = self._tracer(scene, downward).trace(mi.Point3f(at), mi.Vector3f(along))
+        return float(seen.depth[0]) or None
 
     def shares(self, scene: GaussianScene, which: np.ndarray, camera: Camera) -> np.ndarray:
         """(H, W) in [0, 1]: how much of each pixel of a camera shows the surfels (M,) bool."""
@@ -160,10 +171,10 @@ class Views:
             votes[framed] += np.where(mask[y, x], 1, -1) * seen * cosine[framed]
         return votes > 0
 
-    def _tracer(self, scene: GaussianScene, camera: Camera) -> SurfelTracer | ProxiedTracer | BesideMeshes:
+    def _tracer(self, scene: GaussianScene, camera: Camera) -> SurfelTracer:
         """A tracer whose rays meet what the camera sees: the scene itself, and no back face."""
         from tron.relighting import Estimation, Relighter
 
         if not self._kept or self._kept[0].scene is not scene:
-            self._kept[:] = [Relighter(scene, Estimation(two_sided=False), self.seed, proxy="never")]
-        return self._kept[0].tracer(camera)
+            self._kept[:] = [Relighter(scene, Estimation(two_sided=False), proxy="never")]
+        return cast("SurfelTracer", self._kept[0].tracer(camera))  # of no proxy and no mesh

@@ -254,12 +254,12 @@ class ProxiedTracer:
     ) -> None:
         self._scan, self.light, self._near = scan, light, _NEAR_VOXELS * voxel
         self.scene, self.records = light.scene, light.records
-        nearest = KDTree(light.scene.means).query(scan.scene.means)[1]
-        normals = light.scene.normals()[nearest]
-        if backdrop is not None:
-            normals[backdrop] = scan.scene.normals()[backdrop]
-        self._nearest = mi.UInt32(aligned(np.asarray(nearest, np.uint32)))
-        self._normals = [mi.Float(aligned(axis)) for axis in normals.T]
+        sides = _sides(scan.scene.means, light.scene, self._near)
+        normals = [light.scene.normals()[side] for side in sides]
+        for each in normals if backdrop is not None else ():
+            each[backdrop] = scan.scene.normals()[backdrop]
+        self._sides = [mi.UInt32(aligned(np.asarray(side, np.uint32))) for side in sides]
+        self._normals = [mi.Vector3f(*(mi.Float(aligned(axis)) for axis in each.T)) for each in normals]
 
     def showing(self, scan: SurfelTracer) -> ProxiedTracer:
         """The same for a camera that sees other sides of the scan's surfels."""
@@ -287,11 +287,16 @@ class ProxiedTracer:
 
         ``limit`` as of :meth:`SurfelTracer.gbuffer`.
         """
-        carried = self._carried(values)
-        scan = self._scan.gbuffer(camera, [*carried, *self._normals], limit)
-        proxy = self.light.gbuffer(camera, values, limit)
         eye, near = mi.Point3f(*(float(v) for v in camera.position)), dr.opaque(mi.Float, self._near)
         dr.make_opaque(eye)
+        # Where a leaf's near side has a hole in the proxy, light on the far side is none of its own.
+        nearest, other = self._normals
+        splat = dr.arange(mi.UInt32, len(self._scan.scene))
+        towards = mi.Vector3f(eye - centres(self._scan.records, splat).position)
+        away = (dr.dot(nearest, towards) < 0) & (dr.dot(other, towards) > 0)
+        carried = self._carried(values, dr.select(away, self._sides[1], self._sides[0]))
+        scan = self._scan.gbuffer(camera, [*carried, *dr.select(away, other, nearest)], limit)
+        proxy = self.light.gbuffer(camera, values, limit)
         use = proxy.opacity > _SOLID
         use &= dr.norm(proxy.position - eye) < dr.norm(scan.position - eye) + near
         normal = _towards(mi.Vector3f(*scan.values[-3:]), scan.direction, scan.normal)
@@ -309,10 +314,12 @@ class ProxiedTracer:
     def surfels(self, values: Sequence[mi.Float] = ()) -> Surface:
         """The scan's surfels at their centres, with the normals and ``values`` of the proxy's nearest."""
         found = centres(self._scan.records, dr.arange(mi.UInt32, len(self._scan.scene)))
-        return replace(found, normal=mi.Normal3f(*self._normals), values=self._carried(values))
+        return replace(
+            found, normal=mi.Normal3f(self._normals[0]), values=self._carried(values, self._sides[0])
+        )
 
-    def _carried(self, values: Sequence[mi.Float]) -> list[mi.Float]:
-        return [dr.gather(mi.Float, value, self._nearest) for value in values]
+    def _carried(self, values: Sequence[mi.Float], lender: mi.UInt32) -> list[mi.Float]:
+        return [dr.gather(mi.Float, value, lender) for value in values]
 
     def first_hits(
         self,
@@ -337,6 +344,22 @@ class ProxiedTracer:
             )
             found.append(through * rest)
         return found
+
+
+def _sides(points: np.ndarray, surfels: GaussianScene, near: float) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) numbers of the surfels nearest to points, and of those nearest that look the other way.
+
+    The latter among points of space and direction: ``near`` away counts as a right angle does. Where none is
+    that near and looks away from the nearest, it is the nearest.
+    """
+    normals = surfels.normals()
+    nearest = np.asarray(KDTree(surfels.means).query(points)[1])
+    apart = np.hypot(1, 1) / near
+    tree = KDTree(np.concatenate([surfels.means * apart, normals], axis=1))
+    other = np.asarray(tree.query(np.concatenate([points * apart, -normals[nearest]], axis=1))[1])
+    there = np.linalg.norm(surfels.means[other] - points, axis=1) < near
+    there &= np.einsum("nk,nk->n", normals[other], normals[nearest]) < 0
+    return nearest, np.where(there, other, nearest)
 
 
 def _towards(carried: mi.Vector3f, direction: mi.Vector3f, otherwise: mi.Normal3f) -> mi.Vector3f:

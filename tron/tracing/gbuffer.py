@@ -26,7 +26,17 @@ from tron.tracing.tiled.kbuffer import (
     lanes_of,
     search_list,
 )
-from tron.tracing.tiled.tiles import TileLists, lanes_of_pixels, tile_pixels
+from tron.tracing.tiled.tiles import (
+    LANES,
+    MOST_ENTRIES,
+    TILE,
+    TileLists,
+    TooManyEntries,
+    build_tiles,
+    lanes_of_pixels,
+    tile_counts,
+    tile_pixels,
+)
 
 KEPT_HITS = 128
 """Most hits a ray for whose ids there is room at once, 4 bytes each."""
@@ -260,3 +270,47 @@ def _rounds(
         full = walk.open & (hits.count == MAX_HITS)
         going &= walk.open & ~full
     return sums, full
+
+
+def trace_view(
+    records: SurfelRecords,
+    camera: Camera,
+    limit: mi.Float | None = None,
+    disks: SurfelRecords | None = None,
+) -> GBuffer:
+    """:func:`trace_gbuffer` by the camera's own lists: in stripes, where these would take gigabytes.
+
+    Raises:
+        TooManyEntries: one row of tiles has more than 32-bit indices can address.
+    """
+    rows = tile_counts(camera.width, camera.height)[1]
+    try:
+        still = records.detached()
+        lists = build_tiles(still, camera, MOST_ENTRIES) if rows > 1 else build_tiles(still, camera)
+    except TooManyEntries:
+        if rows == 1:
+            raise
+    else:
+        return trace_gbuffer(records, lists, camera, limit, disks)
+    upper, width = rows // 2 * TILE, camera.width
+    lanes, parts = 0, []
+    for y, height in ((0, upper), (upper, camera.height - upper)):
+        count = tile_counts(width, height)[0] * tile_counts(width, height)[1] * LANES
+        end = None if limit is None else dr.gather(mi.Float, limit, dr.arange(mi.UInt32, count) + lanes)
+        parts.append(trace_view(records, camera.window(0, y, width, height), end, disks))
+        lanes += count
+    return _joined(*parts)
+
+
+def _joined(upper: GBuffer, lower: GBuffer) -> GBuffer:
+    """One view of two stripes, the upper one of whole tiles; differentiable."""
+
+    def join(above: Any, below: Any) -> Any:
+        if isinstance(above, list):
+            return [join(*each) for each in zip(above, below, strict=True)]
+        if isinstance(above, mi.Float):
+            return dr.concat([above, below])
+        return type(above)(*[join(*each) for each in zip(above, below, strict=True)])
+
+    lanes = {f.name: join(getattr(upper, f.name), getattr(lower, f.name)) for f in fields(Surface)}
+    return GBuffer(**lanes, width=upper.width, height=upper.height + lower.height)

@@ -75,12 +75,12 @@ def surface(sums: Composite, records: SurfelRecords, origin: mi.Point3f, directi
     normal = mi.Normal3f(*channels[0:3])
     squared = dr.squared_norm(normal)
     oriented = squared > 0
-    depth = _depth(records, sums.median, origin, direction)
+    depth = depth_along(records, sums.median, origin, direction)
     distance = dr.select(depth > 0, depth, sums.mean_depth * inverse)
     return Surface(
         position=origin + distance * direction,
         depth=depth,
-        lift=dr.select(depth > 0, depth - _depth(records, sums.begin, origin, direction), 0),
+        lift=dr.select(depth > 0, depth - depth_along(records, sums.begin, origin, direction), 0),
         normal=dr.select(oriented, normal / dr.sqrt(dr.select(oriented, squared, 1)), 0),
         normal_sum=normal,
         base_color=mi.Color3f(*channels[4:7]) * inverse,
@@ -93,7 +93,9 @@ def surface(sums: Composite, records: SurfelRecords, origin: mi.Point3f, directi
     )
 
 
-def _depth(records: SurfelRecords, surfel: mi.UInt32, origin: mi.Point3f, direction: mi.Vector3f) -> mi.Float:
+def depth_along(
+    records: SurfelRecords, surfel: mi.UInt32, origin: mi.Point3f, direction: mi.Vector3f
+) -> mi.Float:
     """Distance along unit rays to the planes of some surfels' disks, detached; 0 where there is no surfel.
 
     No farther from a centre than twice what the disk reaches along the ray: where it is seen edge on, its

@@ -15,7 +15,7 @@ from tron.errors import TronError
 from tron.gaussians.projections import PROJECTIONS
 from tron.runtime import aligned
 from tron.tracing.adjoint import attach, has_gradients
-from tron.tracing.gbuffer import GBuffer, trace_gbuffer
+from tron.tracing.gbuffer import GBuffer, trace_view
 from tron.tracing.hierarchy.bvh import Bvh, build_bvh, refit
 from tron.tracing.hierarchy.first_hit import FirstHit, first_hits, queued_transmittance
 from tron.tracing.hierarchy.transmittance import BackFaces, Fans, transmittance
@@ -24,7 +24,6 @@ from tron.tracing.parameters import SurfelParameters, pack, pack_values
 from tron.tracing.surface import Surface, surface
 from tron.tracing.tiled.kbuffer import RelistedHits, Search, composite_rounds, lanes_of, search_hierarchy
 from tron.tracing.tiled.projected import NEAREST, NEAREST_SPACINGS, projected
-from tron.tracing.tiled.tiles import build_tiles
 
 if TYPE_CHECKING:
     from tron.cameras import Camera
@@ -171,10 +170,10 @@ class SurfelTracer:
         records = pack_values(self.attached(), values)
         projection = PROJECTIONS[self.scene.projection]
         if projection is None:
-            return trace_gbuffer(records, build_tiles(self.records, camera), camera, limit)
+            return trace_view(records, camera, limit)
         nearest = min(NEAREST, NEAREST_SPACINGS * self.scene.spacing)
         seen = projected(records, camera, projection, nearest)
-        return trace_gbuffer(seen, build_tiles(seen.detached(), camera), camera, limit, records)
+        return trace_view(seen, camera, limit, records)
 
     def trace(
         self,

@@ -104,7 +104,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Hit:
-    """What a ray meets first: an object, a point in the frame of the scene's file, and surfels by number."""
+    """What a pixel shows: an object, a point in the frame of the scene's file, and surfels by number."""
 
     object: int
     point: np.ndarray
@@ -293,23 +293,19 @@ class Stage:
             self._selected = scene, clicks, Selection(clicks=clicks).of(scene, self.session.views)
         return self._selected[2]
 
-    def first_hit(self, origin: np.ndarray, direction: np.ndarray) -> Hit | None:
-        """What a ray meets first among what is shown; None if nothing.
+    def shown_at(self, camera: Camera, x: int, y: int) -> Hit | None:
+        """What a pixel of a camera's picture shows; None if nothing.
 
         Args:
-            origin: (3,) where up is +z.
-            direction: (3,) likewise, of any length.
+            camera: where up is +z. x, y: the pixel, from the upper left corner.
         """
         visible = self._visible(frozenset() if self._shown is None else self._shown.hidden)
-        scene, level = visible.left, np.eye(3)[np.abs(direction).argmin()]
-        pixel = Camera.look_at(origin, origin + direction, up=level, fov_deg=0.1, width=1, height=1)
-        (pixel,) = turn_cameras([pixel], self.turn.T)
-        surfels, distance = self.session.views.met(scene, pixel)
+        scene, (camera,) = visible.left, turn_cameras([camera], self.turn.T)
+        surfels, point = self.session.views.shown(scene, camera, x, y)
         if not len(surfels):
             return None
         ids, counts = np.unique(scene.object_id[surfels], return_counts=True)
         numbers = np.flatnonzero(visible.which)[surfels]
-        point = pixel.position + distance * pixel.forward
         return Hit(int(ids[counts.argmax()]), point, tuple(numbers.tolist()))
 
     def objects(self) -> dict[int, int]:

@@ -147,8 +147,8 @@ class Window:
         )  # fmt: skip
         self._server.on_client_connect(self._greet)
         self._server.on_client_disconnect(lambda client: self._part(client.client_id))
-        self._server.scene.on_click()(lambda event: self._pick(event, shift=False))
-        self._server.scene.on_click(modifier="shift")(lambda event: self._pick(event, shift=True))
+        self._server.scene.on_click()(lambda event: self._click(event, shift=False))
+        self._server.scene.on_click(modifier="shift")(lambda event: self._click(event, shift=True))
         threading.Thread(target=self._follow, daemon=True).start()
 
     def close(self) -> None:
@@ -260,12 +260,19 @@ class Window:
         place = tuple(float(value) for value in at)
         self._do(Insert(file=file, at=place, scale=float(self._size.value)))  # pyright: ignore
 
-    def _pick(self, event: viser.SceneClickEvent, shift: bool) -> None:
-        """Choose the object of a click; where clicks select, it is one of those."""
-        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-        found = self._ask(
-            lambda stage: (stage.first_hit(origin, direction), stage.session.scene.up, stage.turn)
+    def _click(self, event: viser.SceneClickEvent, shift: bool) -> None:
+        camera = self._seen_by(event.client)
+        if camera is None:
+            return
+        x, y = (
+            min(max(int(share * size), 0), size - 1)
+            for share, size in zip(event.screen_pos, (camera.width, camera.height), strict=True)
         )
+        self._pick(camera, x, y, shift)
+
+    def _pick(self, camera: Camera, x: int, y: int, shift: bool) -> None:
+        """Choose the object of a pixel; where clicks select, it is one of those."""
+        found = self._ask(lambda stage: (stage.shown_at(camera, x, y), stage.session.scene.up, stage.turn))
         if found is None or found[0] is None:
             return
         hit, up, turn = found

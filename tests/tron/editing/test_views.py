@@ -140,17 +140,75 @@ def test_what_lies_below_a_point_is_found(scene, views):
         surface_below(scene, views, np.array([9.0, 0, 3]))
 
 
-def test_behind_half_a_layer_one_of_both_is_met(dense_surfels):
-    """A sheet that stops about half of all rays hangs one unit above another: never what lies between."""
+def test_behind_a_thin_layer_one_of_both_is_met(dense_surfels):
+    """A sheet hangs one unit above another: never what lies between."""
     floor = dense_surfels.plane(half=0.5)
     scene = dense_surfels.scene(floor, replace(floor, points=floor.points + np.array([0, 0, 1])))
-    upper = scene.means[:, 2] > 0.5
-    scene = replace(scene, opacity_logits=np.where(upper, np.float32(-1.3), scene.opacity_logits))
-    heights = []
-    for seed in range(12):
-        heights.append(surface_below(scene, Views(seed=seed), np.array([0.01, 0.02, 3.0]))[2])
+    upper, heights = scene.means[:, 2] > 0.5, []
+    for logit in np.linspace(-4, 2, 12):
+        logits = np.where(upper, np.float32(logit), scene.opacity_logits)
+        sheet = replace(scene, opacity_logits=logits)
+        heights.append(surface_below(sheet, Views(), np.array([0.01, 0.02, 3.0]))[2])
+    assert [round(height) for height in heights] == sorted(round(height) for height in heights)
     assert {round(height) for height in heights} == {0, 1}, "both are met"
     np.testing.assert_allclose(heights, np.round(heights), atol=1e-3)
+
+
+def scan_of_strings(count: int = 300) -> tuple[GaussianScene, Camera]:
+    """Flat splats in a row that a camera sees edge on, before a wall; as disks they cover nothing."""
+    across, quarter = np.linspace(-1, 1, count), np.sqrt(0.5)
+    strings = np.stack([across, np.zeros(count), np.zeros(count)], axis=1)
+    x, z = (each.ravel() for each in np.meshgrid(*[np.linspace(-1.5, 1.5, 40)] * 2))
+    means = np.concatenate([strings, np.stack([x, np.full_like(x, 1.0), z], axis=1)])
+    flat, upright = np.array([1.0, 0, 0, 0]), np.array([quarter, quarter, 0, 0])
+    thin, number = np.arange(len(means)) < count, len(means)
+    scene = GaussianScene(
+        means=means.astype(np.float32),
+        quats=np.where(thin[:, None], flat, upright).astype(np.float32),
+        log_scales=np.log(np.where(thin, 0.01, 0.05))[:, None].repeat(2, 1).astype(np.float32),
+        opacity_logits=np.full(number, 4, np.float32),
+        sh=np.zeros((number, 16, 3), np.float32),
+        base_color=np.full((number, 3), 0.5, np.float32),
+        roughness=np.full(number, 0.5, np.float32),
+        metallic=np.zeros(number, np.float32),
+        object_id=np.where(thin, 1, 2).astype(np.int32),
+        oriented=False, projection="3dgs", spacing=0.05,
+    )  # fmt: skip
+    scene.validate()
+    return scene, Camera.look_at((0, -4, 0), (0, 0, 0), fov_deg=40, width=64, height=48)
+
+
+def test_what_a_pixel_shows_of_a_scan_is_what_is_picked():
+    """A string that no ray through disks meets: the picture shows it, so clicks on it are on it."""
+    scene, camera = scan_of_strings()
+    views = Views([camera])
+    on_string = views.shares(scene, scene.object_id == 1, camera)
+    y = int(on_string[:, 32].argmax())
+    for x in (20, 32, 41):
+        assert on_string[y, x] > 0.7
+        picked, point = views.shown(scene, camera, x, y)
+        assert (scene.object_id[picked] == 1).all()
+        pixels, _ = camera.project(scene.means[picked])
+        assert np.abs(pixels - (x + 0.5, y + 0.5)).max() < 3
+        np.testing.assert_allclose(camera.project(point[None])[0][0], (x + 0.5, y + 0.5), atol=1e-3)
+        assert abs(point[1]) < 0.1, "on the string, not on the wall"
+        disks = Views([camera]).shown(replace(scene, projection="disks"), camera, x, y)
+        assert (scene.object_id[disks[0]] == 2).all()
+
+
+@pytest.mark.parametrize("size", [(64, 48), (40, 56)])
+@pytest.mark.parametrize("projection", ["3dgs", "disks"])
+def test_picked_surfels_are_most_of_what_the_pixel_shows(size, projection):
+    """By the picture's own compositing of them; one layer is hit."""
+    scene, camera = scan_of_strings()
+    scene = replace(scene, projection=projection)
+    camera = replace(camera, width=size[0], height=size[1])
+    views = Views([camera])
+    for x, y in ((10, 9), (30, 12), (33, 40)):
+        which = np.isin(np.arange(len(scene)), views.picked(scene, 0, (x, y)))
+        assert 0 < which.sum() < 30
+        share, whole = (views.shares(scene, each, camera)[y, x] for each in (which, which | True))
+        assert share > 0.94 * whole
 
 
 @pytest.mark.parametrize(

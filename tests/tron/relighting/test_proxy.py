@@ -192,6 +192,24 @@ def test_a_pixel_lies_on_the_proxy_and_is_made_of_the_scan(sheets):
     np.testing.assert_allclose(np.array(above.normal).T, np.tile([0, 0, 1.0], (64, 1)), atol=1e-4)
 
 
+def test_a_hole_in_one_side_of_a_leaf_has_the_light_of_that_side(dense_surfels):
+    """The far side is nearer to the splats behind the hole; what lies farther off lends nothing."""
+    floor = dense_surfels.plane(SPACING, 1.0)
+    leaf = dense_surfels.scene(floor, spacing=SPACING)
+    thick = np.array([0, 0, 0.5 * SPACING])
+    hole = np.hypot(*floor.points[:, :2].T) > 2 * SPACING
+    under = replace(floor, points=(floor.points - thick)[hole], normals=-floor.normals[hole])
+    upper = replace(floor, points=floor.points + 0.2 * thick)
+    layer = dense_surfels.scene(upper, under, spacing=SPACING)
+    value = mi.Float(np.repeat([5.0, 1.0], [len(upper.points), len(under.points)]).astype(np.float32))
+    camera = Camera.look_at((0, 0, -3), (0, 0, 0), up=(0, 1, 0), fov_deg=2, width=8, height=8)
+    scan = SurfelTracer(leaf.turned_over(leaf.looks_away(camera.position)))
+    for voxel, lent in ((SPACING, 1.0), (0.1 * SPACING, 5.0)):
+        found = ProxiedTracer(scan, SurfelTracer(layer), voxel).gbuffer(camera, [value])
+        np.testing.assert_allclose(np.array(found.values[0]), lent, rtol=1e-5)
+        assert np.array(found.normal)[2].max() < -0.9
+
+
 def test_shadows_beyond_some_voxels_are_the_scans_too(sheets):
     """The roof is nobody's but the scan's: seen from farther below than 4 voxels it shadows, nearer not."""
     scan, layer = sheets

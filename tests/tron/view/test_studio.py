@@ -179,33 +179,39 @@ def test_undo_brings_the_picture_back(open_studio, camera):
     np.testing.assert_array_equal(after.image, before.image)
 
 
-def test_a_ray_meets_the_object_that_is_shown(open_studio, camera, scene):
-    middle = scene.means[scene.object_id == BALL].mean(0)
+def pixel_of(camera, point) -> tuple[int, int]:
+    x, y = camera.project(point[None])[0][0]
+    return int(x), int(y)
+
+
+def test_a_pixel_is_of_the_object_that_it_shows(open_studio, camera, scene):
+    x, y = pixel_of(camera, scene.means[scene.object_id == BALL].mean(0))
     with open_studio() as (studio, _):
-        towards = middle - camera.position
-        found = studio.ask(lambda stage: stage.first_hit(camera.position, towards)).result(60)
+        found = studio.ask(lambda stage: stage.shown_at(camera, x, y)).result(60)
         assert found is not None
         assert found.object == BALL
         assert (scene.object_id[list(found.surfels)] == BALL).all()
         on_ball = scene.means[scene.object_id == BALL]
         assert np.linalg.norm(on_ball - found.point, axis=1).min() < 2 * scene.spacing
         studio.wish(hidden=frozenset([BALL]))
-        behind = studio.ask(lambda stage: stage.first_hit(camera.position, towards)).result(60)
+        behind = studio.ask(lambda stage: stage.shown_at(camera, x, y)).result(60)
         assert behind is None or behind.object != BALL
-        assert studio.ask(lambda stage: stage.first_hit(camera.position, -towards)).result(60) is None
+        assert studio.ask(lambda stage: stage.shown_at(camera, 0, 0)).result(60) is None
 
 
 def test_clicks_inside_and_outside_cut_an_object_out(open_studio, scene, variant):
     """The whole scene is one object; what is marked in the picture is what becomes the new one."""
     camera = Camera.around(scene, azimuth_deg=30, width=160, height=120)
+    x, y = camera.project(scene.means)[0].T
+    framed = (x >= 0) & (x < 160) & (y >= 0) & (y < 120)
     one = replace(scene, object_id=np.zeros(len(scene), np.int32))
     ball = scene.object_id == BALL
 
     def towards(stage, points):
-        hits = [stage.first_hit(camera.position, point - camera.position) for point in points]
+        hits = [stage.shown_at(camera, *pixel_of(camera, point)) for point in points]
         return tuple(dict.fromkeys(n for hit in hits if hit for n in hit.surfels))
 
-    rng, on_ball, around = generator(2, "clicks"), scene.means[ball], scene.means[scene.object_id != BALL]
+    rng, on_ball, around = generator(2, "clicks"), scene.means[ball], scene.means[framed & ~ball]
     facing = on_ball[(on_ball - on_ball.mean(0)) @ (camera.position - on_ball.mean(0)) > 0.2]
     with open_studio(scene=one) as (studio, shown):
         studio.look(0, camera)

@@ -272,10 +272,11 @@ def test_a_broken_model_is_a_notice_and_the_server_goes_on(window):
 
 def test_clicks_and_shift_clicks_cut_an_object_out(window, scene):
     """And the tools for objects have it: its list names it, and it is chosen."""
-    camera = Camera.around(scene.upright(), azimuth_deg=30, width=96, height=80)
+    camera = Camera.around(scene.upright(), azimuth_deg=30, distance=2, width=192, height=160)
 
     def click(at: np.ndarray, shift: bool) -> None:
-        window._pick(SimpleNamespace(ray_origin=camera.position, ray_direction=at - camera.position), shift)
+        x, y = camera.project(at[None])[0][0]
+        window._pick(camera, int(x), int(y), shift)
 
     panel, ball = window._cutting, scene.means[scene.object_id == BALL]
     click(ball.mean(0), False)

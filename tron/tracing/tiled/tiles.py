@@ -29,6 +29,8 @@ TOUCHING = 1e-4
 """Nearest depth of an ellipse as a share of its farthest; below it, the farther bound is none."""
 ROUNDING = 1e-6
 """Some units in the last place of a float32, by which bounds are widened."""
+MOST_ENTRIES = 1 << 25
+"""Entries of one list that are made at once: 50 bytes each, 1.7 GB."""
 TINY = 1e-30
 SLACK = 0.9999
 """Bounds of t are less by rounding than a ray's own t, which may be ill-conditioned."""
@@ -101,18 +103,26 @@ class _Touched:
     far: mi.Float
 
 
-def build_tiles(records: SurfelRecords, camera: Camera) -> TileLists:
+class TooManyEntries(TronError):
+    """Lists of a camera's tiles would be longer than was asked for."""
+
+
+def build_tiles(records: SurfelRecords, camera: Camera, most: int = (1 << 32) - 1) -> TileLists:
     """Make the lists of one camera.
 
+    Args:
+        records: the surfels. camera: the view.
+        most: entries, at most what 32-bit indices can address.
+
     Raises:
-        TronError: more entries than 32-bit indices can address.
+        TooManyEntries: there are more.
     """
     tiles_x, tiles_y = tile_counts(camera.width, camera.height)
     bounds = _touched_tiles(records, camera)
     offset = dr.prefix_sum(bounds.count)  # exclusive
     total = int(dr.sum(mi.UInt64(bounds.count))[0])
-    if total >= 1 << 32:
-        raise TronError(
+    if total > most:
+        raise TooManyEntries(
             f"{records.count:,} surfels touch {total:,} tiles of 4 x 4 pixels, too many to list",
             mend="render the image in parts, or without surfels as large as the view",
         )
