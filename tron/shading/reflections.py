@@ -1,16 +1,19 @@
 """Mirror images of the scene in glossy surfaces: rays of each pixel's lobe that meet it or escape.
 
-Half vectors h are drawn from the normals that the view v sees (Heitz 2018, "Sampling the GGX Distribution of
-Visible Normals"); a ray l then has the density p(l) = D(h) G_1(v) / (4 n.v) and the
-weight w = F(v.h) G_2(v, l) / G_1(v) (:mod:`tron.brdf.microfacets`). With L the environment's radiance, V its
-visibility and R what a surfel sends back along the ray,
+Half vectors are drawn from the normals that the view v sees (Heitz 2018, "Sampling the GGX Distribution of
+Visible Normals"). Of the directions l that they mirror, one is kept with the probability G_2(v, l) / G_1(v),
+that no other facet stops it (:mod:`tron.brdf.microfacets`); else another is drawn. So rays have the density
+p(l) = D(h) G_2(v, l) / (4 n.v e), where e is the albedo of a perfect mirror, and all the same weight but for
+Fresnel's share F. With L the environment's radiance, V its visibility and R what a surfel sends back,
 
-    M = sum_met w R / sum w                  mean radiance over the lobe of what is met
-    o = sum m w L V / sum m w L              share of the environment's light that escapes
+    M = e / (n ks) sum_met F R               mean radiance over the lobe of what is met
+    o = sum m F L V / sum m F L              share of the environment's light that escapes
 
-by channel: the split sum, which has no noise, keeps the light, the rays decide how much of it is hidden. o is
-taken from as many rays again that are drawn from the light: few of the lobe's see a sun, whose highlight
-would stand in shadows. m = p / (p + p_light) is the balance heuristic (Veach 1997), for rays of both kinds.
+by channel, of n rays. The split sum, which has no noise, keeps the light, the rays decide how much of it is
+hidden. o is taken from as many rays again that are drawn from the light: few of the lobe's see a sun, whose
+highlight would stand in shadows. m = p / (p + p_light) is the balance heuristic (Veach 1997), for rays of
+both kinds. A pixel has few rays: were they drawn by the normals alone and weighed afterwards, in a white
+bowl of rough metal a tenth of the light would be missing.
 
 A ray of the lobe is stopped by one surfel (:mod:`tron.tracing.hierarchy.first_hit`). R is the composition of
 :mod:`tron.shading.composition` at the surfel's centre with the bake's light, so a mirror shows highlights of
@@ -26,7 +29,8 @@ import drjit as dr
 import mitsuba as mi
 
 from tron.brdf.microfacets import seen_density, unhidden, visible_normal
-from tron.brdf.reflectance import Material, fresnel
+from tron.brdf.reflectance import LEAST_ALBEDO, Layers, Material, fresnel, reflectance
+from tron.brdf.table import BrdfTable
 from tron.estimation import Brdf, Estimation
 from tron.seeds import integer
 from tron.shading.bounces.bounce import BouncedLight
@@ -42,6 +46,8 @@ if TYPE_CHECKING:
     from tron.tracing import GBuffer, Surface, SurfelTracer
 
 
+TRIALS = 8
+"""Directions drawn for a ray: of the roughest lobes one in a hundred keeps none, and takes the likeliest."""
 SMOOTHEST = 0.02
 """Least roughness of the rays: below, a lobe is narrower than float32 can draw."""
 
@@ -87,12 +93,16 @@ def reflections(
         points = PixelPoints.make(rays, 2, gbuffer.width, seed, "reflections")
         root = dr.opaque(mi.UInt32, integer(seed, "reflections", "stops"))
         offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
-        pixel, lobe = gbuffer.pixel, Lobe.of(gbuffer)
+        table = lighting.split_sum.brdf
+        pixel, lobe = gbuffer.pixel, Lobe.of(gbuffer, table)
         seen = where & (gbuffer.opacity > 0) & (lobe.view.z > 0)
         origin, run = gbuffer.raised(offset), points.run(pixel)
-        dr.eval(pixel, lobe, seen, origin, run)
+        layers = Layers.of(gbuffer, table, lobe.view.z) if brdf == "conserving" else None
+        share = reflectance(gbuffer, table, lobe.view.z, brdf).specular
+        expected = share * (dr.opaque(mi.Float, rays) / lobe.albedo)
+        dr.eval(pixel, lobe, seen, origin, run, layers, expected)
         none = dr.zeros(mi.Color3f, dr.width(pixel))
-        sums = {name: mi.Color3f(none) for name in ("weight", "met", "light", "escaped")}
+        sums = {name: mi.Color3f(none) for name in ("met", "light", "escaped")}
         dr.make_opaque(sums)
         for first in range(0, rays, points.fan):
             fan = [dr.opaque(mi.UInt32, first) + k for k in range(points.fan)]
@@ -103,16 +113,15 @@ def reflections(
             dr.eval(directions, active, seeds)
             hits = tracer.first_hits(origin, directions, active, seeds)
             for direction, counts, hit in zip(directions, active, hits, strict=True):
-                weight, share, radiance = _weights(lobe, direction, counts, gbuffer, lighting, brdf)
+                weight, share, radiance = _weights(lobe, direction, counts, gbuffer, lighting, brdf, layers)
                 met = hit.surfel != NOTHING
                 returned = _returned(tracer, hit, direction, lighting, bounce, brdf)
-                sums["weight"] += weight
                 sums["met"] += dr.select(met, weight * returned, 0)
                 sums["light"] += share * radiance
                 sums["escaped"] += dr.select(met, 0, share * radiance)
             dr.eval(sums)
             directions = [lighting.light.sample(points.point(run, ray, mi.UInt32(1)))[0] for ray in fan]
-            found = [_weights(lobe, d, seen, gbuffer, lighting, brdf) for d in directions]
+            found = [_weights(lobe, d, seen, gbuffer, lighting, brdf, layers) for d in directions]
             values = [share * radiance for _, share, radiance in found]
             active = [dr.max(value) > 0 for value in values]
             dr.eval(directions, values, active)
@@ -120,7 +129,7 @@ def reflections(
                 sums["light"] += value
                 sums["escaped"] += value * visible
             dr.eval(sums)
-        mirror = Mirror(ratio(sums["escaped"], sums["light"], 1), ratio(sums["met"], sums["weight"], 0))
+        mirror = Mirror(ratio(sums["escaped"], sums["light"], 1), ratio(sums["met"], expected, 0))
         dr.eval(mirror)
     return mirror
 
@@ -133,29 +142,44 @@ class Lobe:
         frame: about the normal.
         view: unit, towards the camera, local.
         alpha: of the distribution.
+        albedo: e, a perfect mirror's.
     """
 
     frame: mi.Frame3f
     view: mi.Vector3f
     alpha: mi.Float
+    albedo: mi.Float
 
     @classmethod
-    def of(cls, surface: Surface) -> Lobe:
+    def of(cls, surface: Surface, table: BrdfTable) -> Lobe:
         """The lobe of a surface along its own rays."""
-        frame = mi.Frame3f(surface.normal)
-        alpha = dr.square(dr.maximum(surface.roughness, SMOOTHEST))
-        return cls(frame, frame.to_local(-surface.direction), alpha)
+        frame, roughness = mi.Frame3f(surface.normal), dr.maximum(surface.roughness, SMOOTHEST)
+        view = frame.to_local(-surface.direction)
+        scale, bias, _, _ = table(roughness, view.z)
+        return cls(frame, view, dr.square(roughness), dr.maximum(scale + bias, LEAST_ALBEDO))
 
     def draw(self, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Bool]:
         """A direction, world, and whether it is above the surface."""
-        half = visible_normal(self.view, self.alpha, u)
-        facing = dr.dot(self.view, half)
-        out = 2 * facing * half - self.view
-        return self.frame.to_world(out), (facing > 0) & (out.z > 0)
+        kept, out, best = mi.Bool(False), mi.Vector3f(0, 0, -1), mi.Float(0)
+        bits = [dr.reinterpret_array(mi.UInt32, axis) for axis in u]
+        for trial in range(TRIALS):
+            half = visible_normal(self.view, self.alpha, u)
+            facing = dr.dot(self.view, half)
+            mirrored = 2 * facing * half - self.view
+            above = (facing > 0) & (mirrored.z > 0)
+            share = dr.select(above, unhidden(self.view.z, mirrored.z, self.alpha), 0)
+            better = ~kept & (share > best)
+            out, best = dr.select(better, mirrored, out), dr.select(better, share, best)
+            chance, *fresh = [mi.sample_tea_float32(bits[0], bits[1] + 3 * trial + k) for k in range(3)]
+            out, kept = dr.select(~kept & (chance < share), mirrored, out), kept | (chance < share)
+            u = mi.Point2f(*fresh)  # the first alone is of the pixel's own points
+        return self.frame.to_world(out), out.z > 0
 
-    def density(self, half: mi.Vector3f) -> mi.Float:
-        """Density of :meth:`draw`, by solid angle, where the local half vector is ``half``."""
-        return seen_density(self.view.z, half.z, self.alpha)
+    def density(self, out: mi.Vector3f) -> mi.Float:
+        """Density of :meth:`draw`, by solid angle, of a local direction above the surface."""
+        half = dr.normalize(out + self.view)
+        share = unhidden(self.view.z, dr.maximum(out.z, 0), self.alpha)
+        return seen_density(self.view.z, half.z, self.alpha) * share / self.albedo
 
 
 def _weights(
@@ -165,14 +189,13 @@ def _weights(
     material: Material,
     lighting: Lighting,
     brdf: Brdf,
+    layers: Layers | None,
 ) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f]:
-    """w, m w and L of rays along ``direction``, however they were drawn; w is 0 where inactive."""
+    """F, m F and L of rays along ``direction``, however they were drawn; F is 0 where inactive."""
     out = lobe.frame.to_local(direction)
-    half = dr.normalize(out + lobe.view)
-    facing = dr.dot(lobe.view, half)
-    weight = fresnel(material, facing, brdf) * unhidden(lobe.view.z, out.z, lobe.alpha)
-    weight = dr.select(active & (out.z > 0) & (facing > 0), weight, 0)
-    own, other = lobe.density(half), lighting.light.pdf(direction)
+    facing = dr.dot(lobe.view, dr.normalize(out + lobe.view))
+    weight = dr.select(active & (out.z > 0) & (facing > 0), fresnel(material, facing, brdf, layers), 0)
+    own, other = dr.select(out.z > 0, lobe.density(out), 0), lighting.light.pdf(direction)
     total = own + other
     balance = dr.select(total > 0, own / dr.select(total > 0, total, 1), 0)
     return weight, weight * balance, lighting.light.radiance(direction)
