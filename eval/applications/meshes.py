@@ -18,9 +18,10 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from eval.renderers.paths import path_traced, scene_of
 from eval.report.outcome import Outcome
 from eval.results import Row
-from tron.cameras import Camera, mitsuba_sensor
+from tron.cameras import Camera
 from tron.color import to_display
 from tron.errors import TronError
 from tron.estimation import FINEST, PREVIEW, Estimation
@@ -182,24 +183,6 @@ def _white(part: Part, name: str) -> mi.Mesh:
         bsdf = {"type": "normalmap", "normalmap": texture, "bsdf": bsdf}
     made = mi.load_dict({"type": "twosided", "bsdf": bsdf})
     return mitsuba_mesh(name, made, part.vertices, part.normals, part.faces, part.uv)
-
-
-def scene_of(shapes: Sequence[mi.Mesh], light: EnvironmentMap | None = None) -> mi.Scene:
-    """Meshes with their materials, and a light around them, if any."""
-    lamp = {} if light is None else {"light": light.to_mitsuba()}
-    return mi.load_dict({"type": "scene", **lamp, **{f"shape{k}": shape for k, shape in enumerate(shapes)}})
-
-
-def path_traced(
-    shapes: Sequence[mi.Mesh], light: EnvironmentMap, camera: Camera, depth: int, paths: int, seed: int
-) -> np.ndarray:
-    """(H, W, 3) linear radiance of meshes by Mitsuba's paths of up to ``depth`` edges, ``paths`` a pixel."""
-    sensor = mitsuba_sensor(camera, paths)
-    sensor["sampler"]["type"] = "multijitter"
-    integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": depth})
-    scene, seen = scene_of(shapes, light), mi.load_dict(sensor)
-    image = mi.render(scene, sensor=seen, integrator=integrator, spp=paths, seed=mi.UInt32(seed % 2**32))
-    return np.array(image)[..., :3]
 
 
 def _numbers(shapes: Sequence[mi.Mesh], numbers: Sequence[int]) -> np.ndarray:

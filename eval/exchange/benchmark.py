@@ -15,7 +15,7 @@ from eval.stages import Stages, script_path
 from tron.errors import TronError
 from tron.gaussians.ply import check_header
 
-Part = Literal["splats", "mesh", "viewer"]
+Part = Literal["splats", "mesh", "models", "viewer"]
 
 
 class Exchange(Benchmark):
@@ -31,15 +31,17 @@ class Exchange(Benchmark):
         default=None, description="PlayCanvas's splat-transform; null: the one on PATH, if any"
     )
     blender_python: Path | None = Field(
-        default=None, description="a Python that has bpy, of an environment of its own; null: no mesh"
+        default=None,
+        description="a Python that has bpy, of an environment of its own; null: no mesh, no models",
     )
-    real_data: Path | None = Field(description="folder with assets and hdri; null: no mesh")
+    real_data: Path | None = Field(description="folder with assets and hdri; null: no mesh, no models")
     worlds: PositiveInt = Field(default=3, description="scenes of splats, each under another kind of light")
     surfels: PositiveInt = Field(default=20_000, description="of each scene of splats, about")
     mesh_surfels: PositiveInt = Field(default=60_000, description="of the model that becomes a mesh, about")
     views: PositiveInt = Field(default=3, description="of the mesh")
     width: PositiveInt = Field(default=256, description="of the square views of the mesh")
     paths: PositiveInt = Field(default=144, description="of a pixel of the mesh, by Cycles and by Mitsuba")
+    model_paths: PositiveInt = Field(default=1024, description="of a pixel of a model, by either")
     texture: int = Field(default=2048, ge=64, le=8192, description="pixels of a side of the mesh's textures")
     scans: list[Path] | None = Field(
         default=None, description="plain 3DGS PLYs that viewers show; null: those of real_data/splats"
@@ -55,13 +57,14 @@ class Exchange(Benchmark):
 
     def check(self) -> None:
         """Find the programs that are given."""
-        from eval.exchange.blender import blender_version
         from eval.exchange.readers import find_splat_transform, splat_transform_version
+        from eval.renderers.blender import blender_version
 
         if "splats" in self.parts and (program := find_splat_transform(self.splat_transform)):
             splat_transform_version(program)
         if "mesh" in self.parts:
             script_path("tron-export")
+        if {"mesh", "models"} & set(self.parts):
             if self.real_data is not None and not self.real_data.is_dir():
                 raise TronError("no such folder", self.real_data, "give benchmark.real_data, or null")
             if self.blender_python is not None:
@@ -101,10 +104,11 @@ class Exchange(Benchmark):
             TronError: a program that is given is not there, or Blender cannot read the mesh.
         """
         # The renderer: not for a mistyped key
-        from eval.exchange.blender import blender_version
         from eval.exchange.mesh import Sizes, measure_mesh
+        from eval.exchange.models import measure_models
         from eval.exchange.readers import find_splat_transform, splat_transform_version
         from eval.exchange.splats import find_readers, measure_splats
+        from eval.renderers.blender import blender_version
         from tron.runtime import activate
 
         self.check()
@@ -123,9 +127,12 @@ class Exchange(Benchmark):
                 elif part == "viewer":
                     self._measure_viewer(outcome)
                 else:
-                    if self.blender_python is not None:
-                        outcome.inputs["blender"] = blender_version(self.blender_python)
-                    sizes = Sizes(self.mesh_surfels, self.views, self.width, self.paths, self.texture)
                     data, python = self.real_data, self.blender_python
+                    if python is not None:
+                        outcome.inputs["blender"] = blender_version(python)
+                    if part == "models":
+                        measure_models(data, python, self.model_paths, self.seed, threads, outcome)
+                        continue
+                    sizes = Sizes(self.mesh_surfels, self.views, self.width, self.paths, self.texture)
                     measure_mesh(data, python, sizes, self.seed, threads, outcome, stages)
         return outcome

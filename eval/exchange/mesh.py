@@ -18,8 +18,8 @@ from typing import NamedTuple
 import mitsuba as mi
 import numpy as np
 
-from eval.applications.meshes import path_traced, scene_of
-from eval.exchange.blender import INSTALL, Seen, rendered
+from eval.renderers.blender import INSTALL, Seen, rendered
+from eval.renderers.paths import path_traced, scene_of
 from eval.report.outcome import Outcome
 from eval.results import Row
 from eval.stages import Child, Stages
@@ -127,7 +127,9 @@ def measure_mesh(
         TronError: Blender cannot read or render the mesh.
         StageFailed: tron-export failed.
     """
-    files = [] if real_data is None else [real_data / MODEL, *(_map(real_data, name) for name, _ in LIGHTS)]
+    files = (
+        [] if real_data is None else [real_data / MODEL, *(light_file(real_data, name) for name, _ in LIGHTS)]
+    )
     lacking = [path for path in files if not path.is_file()]
     why = f"benchmark.blender_python is not given: {INSTALL}" if python is None else ""
     if real_data is None or lacking:
@@ -209,7 +211,7 @@ def _views(
     cameras: list[Camera], sizes: Sizes, seed: int, threads: int,
 ) -> list[View]:  # fmt: skip
     """Every view under every light."""
-    lights = [EnvironmentMap.load(_map(real_data, name), turn) for name, turn in LIGHTS]
+    lights = [EnvironmentMap.load(light_file(real_data, name), turn) for name, turn in LIGHTS]
     seen = rendered(
         python, model, cameras, lights, model.parent, samples=sizes.paths, bounces=FINEST.bounces,
         threads=threads, seed=integer(seed, "exchange", "cycles"),
@@ -229,7 +231,8 @@ def _views(
     return found
 
 
-def _map(real_data: Path, name: str) -> Path:
+def light_file(real_data: Path, name: str) -> Path:
+    """The map of a light."""
     return real_data / "hdri" / f"{name}.hdr"
 
 

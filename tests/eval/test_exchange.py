@@ -11,11 +11,12 @@ import pytest
 
 from eval.cli import cli
 from eval.exchange import readers, splats
-from eval.exchange.blender import Seen, lat_long
 from eval.exchange.mesh import FILLED, METRICS, View, mesh_rows, true_maps
+from eval.exchange.models import METRIC, Pair, model_rows
 from eval.exchange.playcanvas import lacking
 from eval.exchange.splats import FORMATS, Baked, alike, draw, equal_share, exchange, find_readers
 from eval.exchange.viewer import measure_viewer
+from eval.renderers.blender import Seen, lat_long
 from eval.report.outcome import Outcome
 from eval.results import Results
 from tron.cameras import Camera
@@ -169,6 +170,19 @@ def test_true_maps_and_rows_of_a_square_are_what_it_is():
     assert rows["mesh.covered"] == 1
 
 
+def test_pairs_of_renderers_are_compared_where_the_model_is():
+    filled, grey = np.arange(64).reshape(8, 8) % 2 == 0, np.full((8, 8, 3), 0.2)
+    pairs = [
+        Pair("Some-Model", "sun", 1.0, np.where(filled[..., None], factor * grey, 9.0), grey, filled)
+        for factor in (1.0, 1.1)
+    ]
+    rows = {row.metric: row.value for row in model_rows(pairs)}
+    assert rows["blender.ratio.some_model_sun"] == pytest.approx(1.1)
+    assert pairs[0].psnr == 100 > pairs[1].psnr > 20
+    assert rows["blender.worst"] == pairs[1].psnr
+    assert rows["blender.psnr"] == pytest.approx((pairs[0].psnr + pairs[1].psnr) / 2)
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
@@ -190,7 +204,16 @@ def test_the_whole_benchmark_runs_and_names_what_is_absent(tmp_path: Path, monke
     monkeypatch.setattr(splats, "SIDE", 48)
     monkeypatch.setattr(splats, "VIEWS", 1)
     monkeypatch.setattr(splats, "ROUNDS", 1)
-    toy = ["worlds=1", "surfels=1500", "mesh_surfels=3000", "views=1", "width=48", "paths=4", "texture=128"]
+    toy = [
+        "worlds=1",
+        "surfels=1500",
+        "mesh_surfels=3000",
+        "views=1",
+        "width=48",
+        "paths=4",
+        "texture=128",
+        "model_paths=4",
+    ]
     write_splats(tmp_path / "scan.ply", Baked.drawn(1, 1500, 9).plain)
     toy += [f"scans=[{tmp_path / 'scan.ply'}]", "scan_views=2", "scan_sides=[40]"]
     toy += [f"real_data={shared_data}", "seed=9"] + ([f"blender_python={BLENDER}"] if BLENDER else [])
@@ -200,7 +223,7 @@ def test_the_whole_benchmark_runs_and_names_what_is_absent(tmp_path: Path, monke
     measured = {row.metric for row in results.rows}
     absent = {target.metric for target in results.targets} - measured
     program = readers.find_splat_transform(None)
-    expected = {"viewer.playcanvas.behind"} | (set() if BLENDER else set(METRICS))
+    expected = {"viewer.playcanvas.behind"} | (set() if BLENDER else {*METRICS, METRIC})
     if program is None:
         expected |= {f"format.{name}" for name in ("ply.psnr", "ply.bit_equal", "spz.psnr", "sog.psnr")}
     assert absent == expected

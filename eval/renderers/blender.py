@@ -1,6 +1,6 @@
 """Blender as a witness: files of ours that it reads and renders, in a process of its own.
 
-Its Python is another than ours (:mod:`eval.exchange.blender_process`); a job and EXR files go between them.
+Its Python is another than ours (:mod:`eval.renderers.blender_process`); a job and EXR files go between them.
 """
 
 from __future__ import annotations

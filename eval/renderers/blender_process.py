@@ -24,7 +24,7 @@ def main(job: str) -> None:
     _set_up(scene, told)
     for material in bpy.data.materials:
         if material.use_nodes:
-            _show_base_color(material.node_tree, told["base_color"])
+            _prepare(material.node_tree, told["base_color"])
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(camera)
     scene.camera = camera
@@ -59,11 +59,25 @@ def _set_up(scene: Any, told: dict[str, Any]) -> None:
     layer.aovs.add().name = told["base_color"]
 
 
-def _show_base_color(tree: Any, name: str) -> None:
-    """Let a material put out what its principled node takes as base color."""
+def _prepare(tree: Any, name: str) -> None:
+    """Leave a material what ours has, and let it put out its base color.
+
+    It is opaque or clear, as alpha is above one half or below, and has no clear coat.
+    """
     principled = next((node for node in tree.nodes if node.type == "BSDF_PRINCIPLED"), None)
     if principled is None:
         return
+    alpha, coat = principled.inputs["Alpha"], principled.inputs["Coat Weight"]
+    if alpha.is_linked:
+        cut = tree.nodes.new("ShaderNodeMath")
+        cut.operation, cut.inputs[1].default_value = "GREATER_THAN", 0.5
+        tree.links.new(alpha.links[0].from_socket, cut.inputs[0])
+        tree.links.new(cut.outputs[0], alpha)
+    else:
+        alpha.default_value = round(alpha.default_value)
+    for link in coat.links:
+        tree.links.remove(link)
+    coat.default_value = 0.0
     shown = tree.nodes.new("ShaderNodeOutputAOV")
     shown.aov_name = name
     taken = principled.inputs["Base Color"]
