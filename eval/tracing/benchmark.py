@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -9,9 +10,11 @@ import numpy as np
 from pydantic import Field, PositiveInt
 
 from eval.benchmark import Benchmark
+from eval.renderers.blender import blender_version
 from eval.report.outcome import Outcome
 from eval.timing import Timed, write_times
 from eval.tracing.accuracy import camera_errors, compare_images, shadow_errors
+from eval.tracing.furnace import measure_furnace
 from eval.tracing.hard_cases import measure_hard_cases
 from eval.tracing.peers import SHAPES, Contenders
 from eval.tracing.scene import LIGHTS
@@ -29,7 +32,7 @@ from tron.errors import TronError
 from tron.report.page import Picture, Pictures
 from tron.runtime import activate
 
-Part = Literal["camera", "shadow", "gradient", "irradiance", "guidance", "error", "bounce"]
+Part = Literal["camera", "shadow", "gradient", "irradiance", "guidance", "error", "bounce", "furnace"]
 Case = tuple[PositiveInt, PositiveInt]
 
 
@@ -52,12 +55,17 @@ class Tracing(Benchmark):
     irradiance: Case = Field(description="(surfels, pixels) of the comparison with Mitsuba's direct")
     error_rays: PositiveInt = Field(default=2000, description="rays held against float64")
     bounce: list[Case] = Field(description="(surfels, pixels) of transport, bake and frames with bounces")
+    blender_python: Path | None = Field(
+        default=None, description="a Python that has bpy, of an environment of its own; null: no Cycles"
+    )
 
     def check(self) -> None:
-        """Refuse sizes that the tile order of the rays cannot take."""
+        """Refuse sizes that the tile order of the rays cannot take, and a Python without Blender."""
         odd = [size for size in self.pixels if size % 4]
         if odd:
             raise TronError(f"images of {odd[0]} pixels", "benchmark.pixels", "give multiples of 4")
+        if "furnace" in self.parts and self.blender_python is not None:
+            blender_version(self.blender_python)
 
     def run(self, output_dir: Path) -> Outcome:
         """Measure part after part; one line on stderr for each figure."""
@@ -99,6 +107,11 @@ class Tracing(Benchmark):
                 case "bounce":
                     for count, size in self.bounce:
                         keep(measure_bounce(Contenders.of(count, self.seed), size, self.rounds))
+                case "furnace":
+                    if self.blender_python is not None:
+                        outcome.inputs["blender"] = blender_version(self.blender_python)
+                    threads = os.cpu_count() or 1
+                    measure_furnace(self.blender_python, self.rounds, self.seed, threads, outcome)
         write_times(output_dir / "times.json", timed)
         return outcome
 

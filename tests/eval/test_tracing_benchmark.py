@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ import pytest
 from eval.cli import cli
 from eval.results import Results
 from eval.timing import Timed, Times, format_count, interleaved
-from eval.tracing import accuracy, hard_cases, peers, scene
+from eval.tracing import accuracy, furnace, hard_cases, peers, scene
 from eval.tracing.benchmark import Tracing
+from eval.tracing.furnace import Material
 from eval.tracing.peers import Contenders
 from eval.tracing.scene import Box, Floor, Sphere, Surface, Torus
 from eval.tracing.speed import shadow_rows
@@ -57,6 +59,9 @@ ROWS = [
     "relighter.overhead.300_32",
     "thin_shadow.deep",
     "sheet.ratio.sun_0.3",
+    "furnace.worst.bake",
+    "furnace.truth.100_0_20",
+    "furnace.seconds_ratio",
 ]
 
 
@@ -80,6 +85,8 @@ def test_the_whole_benchmark_runs_and_every_promised_row_is_there(
     quick = {"PATHS": 4, "REFERENCE": 16, "RAYS": (2,), "TRIALS": 1, "HEIGHTS": (0.3,), "VIEWS": (30.0,)}
     for name, value in (quick | {"SUNS": ((15.0, 0.0),)}).items():
         monkeypatch.setattr(hard_cases, name, value)
+    monkeypatch.setattr(furnace, "MATERIALS", [Material(1.0, 0.0, 0.2), Material(0.5, 1.0, 0.7)])
+    monkeypatch.setattr(furnace, "price", partial(furnace.price, side=16, paths=1))
     with pytest.raises(SystemExit) as end:
         cli(
             [
@@ -98,8 +105,19 @@ def test_the_whole_benchmark_runs_and_every_promised_row_is_there(
     assert error < 1e-4
     assert len(json.loads((tmp_path / "times.json").read_text())["camera 300_32"]["tron"]) == 1
     page = (tmp_path / "report.html").read_text()
-    for anchor in ("camera", "growth", "shadow", "gradient", "irradiance", "guidance", "exactness", "bounce"):
+    for anchor in (
+        "camera",
+        "growth",
+        "shadow",
+        "gradient",
+        "irradiance",
+        "guidance",
+        "exactness",
+        "bounce",
+        "furnace",
+    ):
         assert f'id="{anchor}"' in page
+    assert "blender_python is not given" in results.absent["furnace.cycles_worst"]
     assert (tmp_path / "pictures" / "camera.png").stat().st_size > 0
 
 
