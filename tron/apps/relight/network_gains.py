@@ -18,8 +18,8 @@ import numpy as np
 Quality = Literal["preview", "final"]
 
 GAINS: Mapping[Quality, Mapping[int, float]] = {
-    "preview": {128: 0.62, 256: 0.38, 512: 0.55},
-    "final": {128: 0.25, 256: 0.26, 512: 0.30},
+    "preview": {128: 0.83, 256: 0.60, 512: 0.55},
+    "final": {128: 0.22, 256: 0.29, 512: 0.30},
 }
 """Quality -> width of square frames, pixels -> dB."""
 
