@@ -90,7 +90,8 @@ def reflections(
         pixel, lobe = gbuffer.pixel, Lobe.of(gbuffer)
         seen = where & (gbuffer.opacity > 0) & (lobe.view.z > 0)
         origin, run = gbuffer.raised(offset), points.run(pixel)
-        dr.eval(pixel, lobe, seen, origin, run)
+        normal = mi.Vector3f(gbuffer.normal)
+        dr.eval(pixel, lobe, seen, origin, run, normal)
         none = dr.zeros(mi.Color3f, dr.width(pixel))
         sums = {name: mi.Color3f(none) for name in ("weight", "met", "light", "escaped")}
         dr.make_opaque(sums)
@@ -101,7 +102,7 @@ def reflections(
             active = [seen & counts for _, counts in drawn]
             seeds = [ray_seeds(root, pixel, ray) for ray in fan]
             dr.eval(directions, active, seeds)
-            hits = tracer.first_hits(origin, directions, active, seeds)
+            hits = tracer.first_hits(origin, directions, active, seeds, normal)
             for direction, counts, hit in zip(directions, active, hits, strict=True):
                 weight, share, radiance = _weights(lobe, direction, counts, gbuffer, lighting, brdf)
                 met = hit.surfel != NOTHING
@@ -116,7 +117,9 @@ def reflections(
             values = [share * radiance for _, share, radiance in found]
             active = [dr.max(value) > 0 for value in values]
             dr.eval(directions, values, active)
-            for value, visible in zip(values, tracer.transmittances(origin, directions, active), strict=True):
+            for value, visible in zip(
+                values, tracer.transmittances(origin, directions, active, normal), strict=True
+            ):
                 sums["light"] += value
                 sums["escaped"] += value * visible
             dr.eval(sums)
