@@ -245,7 +245,7 @@ class RestartedShadows:
             going &= found.is_valid()
             surfel = dr.select(going, found.prim_index >> 1, 0)
             hit = intersect(self._geometry, surfel, origin, direction, self._degree)
-            counts = going & blocks(hit, self._back_faces)
+            counts = going & blocks(hit, self._back_faces, mi.Vector3f(0))
             product = dr.select(counts, product * (1 - hit.alpha), product)
             travelled = dr.select(going, travelled + found.t + RESTART_OFFSET, travelled)
             queries += 1

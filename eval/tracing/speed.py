@@ -98,7 +98,11 @@ class Occluder:
     transmittance: Callable[[mi.Point3f, mi.Vector3f, mi.Bool], mi.Float]
 
     def transmittances(
-        self, origin: mi.Point3f, directions: Sequence[mi.Vector3f], active: Sequence[mi.Bool]
+        self,
+        origin: mi.Point3f,
+        directions: Sequence[mi.Vector3f],
+        active: Sequence[mi.Bool],
+        _normal: mi.Vector3f | None = None,
     ) -> list[mi.Float]:
         """One transmittance for each direction."""
         return [self.transmittance(origin, d, a) for d, a in zip(directions, active, strict=True)]

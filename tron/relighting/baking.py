@@ -103,7 +103,9 @@ def _beyond(
     for number in range(DIRECTIONS):
         along, ray = _turned(local, back[number]), dr.opaque(mi.UInt32, number)
         dr.eval(along)
-        (hit,) = tracer.first_hits(origin, [along], [everywhere], [ray_seeds(root, lane, ray)])
+        (hit,) = tracer.first_hits(
+            origin, [along], [everywhere], [ray_seeds(root, lane, ray)], mi.Vector3f(surface.normal)
+        )
         met = np.array(hit.surfel)
         some = met != NOTHING
         shown = eval_sh(world[met[some]], np.array(along).T[some]) - 0.5

@@ -42,12 +42,13 @@ def transmittances_past(
     origin: mi.Point3f,
     directions: Sequence[mi.Vector3f],
     active: Sequence[mi.Bool],
+    normal: mi.Vector3f | None = None,
 ) -> list[mi.Float]:
     """``surfels.transmittances`` of the rays that no mesh blocks; 0 of the others."""
     lanes = [mi.Bool(each) for each in active]
     passing = [each & ~meshes.blocked(origin, along, each) for along, each in zip(directions, lanes)]
     dr.eval(passing)
-    found = surfels.transmittances(origin, directions, passing)
+    found = surfels.transmittances(origin, directions, passing, normal)
     return [dr.select(each & ~free, 0, value) for each, free, value in zip(lanes, passing, found)]
 
 
@@ -82,10 +83,14 @@ class LightTracer(SurfelTracer):
         return other
 
     def transmittances(
-        self, origin: mi.Point3f, directions: Sequence[mi.Vector3f], active: Sequence[mi.Bool]
+        self,
+        origin: mi.Point3f,
+        directions: Sequence[mi.Vector3f],
+        active: Sequence[mi.Bool],
+        normal: mi.Vector3f | None = None,
     ) -> list[mi.Float]:
         """:meth:`SurfelTracer.transmittances`."""
-        return transmittances_past(self.meshes, self.surfels, origin, directions, active)
+        return transmittances_past(self.meshes, self.surfels, origin, directions, active, normal)
 
 
 class BesideMeshes:
@@ -122,15 +127,20 @@ class BesideMeshes:
         directions: Sequence[mi.Vector3f],
         active: Sequence[mi.Bool],
         seeds: Sequence[mi.UInt32],
+        normal: mi.Vector3f | None = None,
     ) -> list[FirstHit]:
         """:meth:`SurfelTracer.first_hits` among the surfels of ``light``."""
-        return self._light.first_hits(origin, directions, active, seeds)
+        return self._light.first_hits(origin, directions, active, seeds, normal)
 
     def transmittances(
-        self, origin: mi.Point3f, directions: Sequence[mi.Vector3f], active: Sequence[mi.Bool]
+        self,
+        origin: mi.Point3f,
+        directions: Sequence[mi.Vector3f],
+        active: Sequence[mi.Bool],
+        normal: mi.Vector3f | None = None,
     ) -> list[mi.Float]:
         """Of the meshes and the surfels that a camera sees."""
-        return transmittances_past(self._light.meshes, self._seen, origin, directions, active)
+        return transmittances_past(self._light.meshes, self._seen, origin, directions, active, normal)
 
 
 def some_of(values: mi.Float, first: int, count: int) -> mi.Float:

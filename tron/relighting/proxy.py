@@ -327,15 +327,20 @@ class ProxiedTracer:
         directions: Sequence[mi.Vector3f],
         active: Sequence[mi.Bool],
         seeds: Sequence[mi.UInt32],
+        normal: mi.Vector3f | None = None,
     ) -> list[FirstHit]:
         """:meth:`SurfelTracer.first_hits` among the proxy's surfels."""
-        return self.light.first_hits(origin, directions, active, seeds)
+        return self.light.first_hits(origin, directions, active, seeds, normal)
 
     def transmittances(
-        self, origin: mi.Point3f, directions: Sequence[mi.Vector3f], active: Sequence[mi.Bool]
+        self,
+        origin: mi.Point3f,
+        directions: Sequence[mi.Vector3f],
+        active: Sequence[mi.Bool],
+        normal: mi.Vector3f | None = None,
     ) -> list[mi.Float]:
         """Of the proxy, and from some voxels on of the scan too."""
-        near = self.light.transmittances(origin, directions, active)
+        near = self.light.transmittances(origin, directions, active, normal)
         off = dr.opaque(mi.Float, self._near)
         found = []
         for along, going, through in zip(directions, active, near, strict=True):

@@ -97,10 +97,11 @@ def reflections(
         pixel, lobe = gbuffer.pixel, Lobe.of(gbuffer, table)
         seen = where & (gbuffer.opacity > 0) & (lobe.view.z > 0)
         origin, run = gbuffer.raised(offset), points.run(pixel)
+        normal = mi.Vector3f(gbuffer.normal)
         layers = Layers.of(gbuffer, table, lobe.view.z) if brdf == "conserving" else None
         share = reflectance(gbuffer, table, lobe.view.z, brdf).specular
         expected = share * (dr.opaque(mi.Float, rays) / lobe.albedo)
-        dr.eval(pixel, lobe, seen, origin, run, layers, expected)
+        dr.eval(pixel, lobe, seen, origin, run, normal, layers, expected)
         none = dr.zeros(mi.Color3f, dr.width(pixel))
         sums = {name: mi.Color3f(none) for name in ("met", "light", "escaped")}
         dr.make_opaque(sums)
@@ -111,7 +112,7 @@ def reflections(
             active = [seen & counts for _, counts in drawn]
             seeds = [ray_seeds(root, pixel, ray) for ray in fan]
             dr.eval(directions, active, seeds)
-            hits = tracer.first_hits(origin, directions, active, seeds)
+            hits = tracer.first_hits(origin, directions, active, seeds, normal)
             for direction, counts, hit in zip(directions, active, hits, strict=True):
                 weight, share, radiance = _weights(lobe, direction, counts, gbuffer, lighting, brdf, layers)
                 met = hit.surfel != NOTHING
@@ -125,7 +126,9 @@ def reflections(
             values = [share * radiance for _, share, radiance in found]
             active = [dr.max(value) > 0 for value in values]
             dr.eval(directions, values, active)
-            for value, visible in zip(values, tracer.transmittances(origin, directions, active), strict=True):
+            for value, visible in zip(
+                values, tracer.transmittances(origin, directions, active, normal), strict=True
+            ):
                 sums["light"] += value
                 sums["escaped"] += value * visible
             dr.eval(sums)

@@ -13,7 +13,12 @@ import numpy as np
 
 from tron.gaussians.harmonics import eval_sh
 from tron.tracing.compositing import STOP_TRANSMITTANCE
-from tron.tracing.hierarchy.transmittance import BACK_FACE_SPACINGS, OPAQUE_TRANSMITTANCE
+from tron.tracing.hierarchy.transmittance import (
+    AGAINST,
+    BACK_FACE_SPACINGS,
+    OPAQUE_TRANSMITTANCE,
+    SHEET_SPACINGS,
+)
 from tron.tracing.kernel import MAX_ALPHA, MIN_ALPHA, MIN_RESPONSE, T_MIN
 
 
@@ -86,6 +91,7 @@ class _Meetings:
         t: distance to the surfel's plane. alpha: opacity there, clipped.
         radius: (M,), of the disk within which the kernel counts, along its longer axis.
         counted: the kernel counts there, on whichever side. front: the ray meets the front.
+        normal: (M, 3). aside: distance of the ray's origin from the surfel's plane.
         margin: distance of response and opacity to their cuts.
     """
 
@@ -94,6 +100,8 @@ class _Meetings:
     radius: np.ndarray
     counted: np.ndarray
     front: np.ndarray
+    normal: np.ndarray
+    aside: np.ndarray
     margin: np.ndarray
 
 
@@ -119,6 +127,8 @@ def _meet(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> _Meeting
         radius=scales.max(1) * _cut(opacities, scene.kernel_degree),
         counted=(response >= MIN_RESPONSE) & (raw >= MIN_ALPHA) & np.isfinite(t),
         front=facing < 0,
+        normal=rotations[:, :, 2],
+        aside=np.abs(np.nan_to_num(t) * facing),
         # A surfel is cut by whichever threshold it falls below first; the other one decides nothing.
         margin=np.abs(np.minimum(response - MIN_RESPONSE, raw - MIN_ALPHA)),
     )
@@ -209,14 +219,21 @@ def _composite_block(
 
 
 def transmittance(
-    scene: Scene, origins: np.ndarray, directions: np.ndarray, *, two_sided: bool = True
+    scene: Scene,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    *,
+    two_sided: bool = True,
+    normals: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Transmittance of shadow rays and its margin to a threshold, both (P,) float64.
 
     Front faces count from t = 0, back faces beyond ``BACK_FACE_SPACINGS`` spacings (never, if one-sided),
-    which are the scene's, and larger by as much as the surfel's radius is larger than the median.
+    which are the scene's, and larger by as much as the surfel's radius is larger than the median. Nearer than
+    that, fronts that face against ``normals`` (P, 3) of the surface that rays leave do not count within
+    ``SHEET_SPACINGS`` spacings of their plane (if two-sided).
     """
-    hit, blocks, nearby = _blocking(scene, origins, directions, two_sided)
+    hit, blocks, nearby = _blocking(scene, origins, directions, two_sided, normals)
     product = np.where(blocks, 1 - hit.alpha, 1.0).prod(1)
     margin = np.minimum(nearby, np.abs(product - OPAQUE_TRANSMITTANCE))
     return np.where(product >= OPAQUE_TRANSMITTANCE, product, 0.0), margin
@@ -236,7 +253,11 @@ def first_hit_probabilities(
 
 
 def _blocking(
-    scene: Scene, origins: np.ndarray, directions: np.ndarray, two_sided: bool
+    scene: Scene,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    two_sided: bool,
+    normals: np.ndarray | None = None,
 ) -> tuple[_Meetings, np.ndarray, np.ndarray]:
     """Meetings of shadow rays, which of them block (P, M), and each ray's margin to where another would."""
     origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
@@ -246,5 +267,12 @@ def _blocking(
     reach = BACK_FACE_SPACINGS * scene.spacing * larger
     blocks = hit.counted & np.where(hit.front, hit.t > 0, two_sided & (hit.t > reach))
     starts = np.where(hit.front, np.abs(hit.t), np.abs(hit.t - reach))
+    if normals is not None and two_sided:
+        along, sheet = normals @ hit.normal.T, SHEET_SPACINGS / BACK_FACE_SPACINGS * reach
+        blocks &= ~(hit.front & (along < -AGAINST) & (hit.aside < sheet) & (hit.t <= reach))
+        near = np.minimum(
+            np.abs(along + AGAINST), np.minimum(np.abs(hit.aside - sheet), np.abs(hit.t - reach))
+        )
+        starts = np.minimum(starts, np.where(hit.front, near, np.inf))
     nearby = np.minimum(hit.margin, np.where(hit.counted, starts, np.inf)).min(1, initial=np.inf)
     return hit, blocks, nearby

@@ -196,13 +196,14 @@ class SurfelTracer:
         directions: Sequence[mi.Vector3f],
         active: Sequence[mi.Bool],
         seeds: Sequence[mi.UInt32],
+        normal: mi.Vector3f | None = None,
     ) -> list[FirstHit]:
         """One surfel a ray, by chance, each as likely as its weight in compositing: see :mod:`.first_hit`.
 
-        For a fan of rays from each origin, as :meth:`transmittances` has them; back faces count as for shadow
+        For a fan of rays from each origin, as :meth:`transmittances` has them; sides count as for shadow
         rays. ``seeds`` of each ray: :func:`tron.tracing.hierarchy.first_hit.ray_seeds`.
         """
-        return first_hits(self.bvh, Fans(origin, directions, active), self.back_faces, seeds)
+        return first_hits(self.bvh, _fans(origin, directions, active, normal), self.back_faces, seeds)
 
     def transmittance(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
@@ -211,15 +212,29 @@ class SurfelTracer:
         return self.transmittances(origin, [direction], [mi.Bool(active)])[0]
 
     def transmittances(
-        self, origin: mi.Point3f, directions: Sequence[mi.Vector3f], active: Sequence[mi.Bool]
+        self,
+        origin: mi.Point3f,
+        directions: Sequence[mi.Vector3f],
+        active: Sequence[mi.Bool],
+        normal: mi.Vector3f | None = None,
     ) -> list[mi.Float]:
         """The same for a fan of rays from each origin: quicker together, the more so the closer they are.
 
+        ``normal`` of the surface that they leave, world: the other side of a thin sheet is not in their way.
         Evaluated at once, unless within a recorded loop.
         """
         recorded = dr.flag(dr.JitFlag.SymbolicScope)
         trace = transmittance if recorded else queued_transmittance
-        return trace(self.bvh, Fans(origin, directions, active), self.back_faces)
+        return trace(self.bvh, _fans(origin, directions, active, normal), self.back_faces)
+
+
+def _fans(
+    origin: mi.Point3f,
+    directions: Sequence[mi.Vector3f],
+    active: Sequence[mi.Bool],
+    normal: mi.Vector3f | None,
+) -> Fans:
+    return Fans(origin, directions, active) if normal is None else Fans(origin, directions, active, normal)
 
 
 def trace_rays(

@@ -37,7 +37,11 @@ class SphereOverPlane:
         return dr.select((under > 0) & (t > 0) & self.sphere, t, dr.inf)
 
     def transmittances(
-        self, origin: mi.Point3f, directions: Sequence[mi.Vector3f], active: Sequence[mi.Bool]
+        self,
+        origin: mi.Point3f,
+        directions: Sequence[mi.Vector3f],
+        active: Sequence[mi.Bool],
+        normal: mi.Vector3f | None = None,
     ) -> list[mi.Float]:
         hits = [lanes & dr.isfinite(self._sphere_hit(origin, d)) for d, lanes in zip(directions, active)]
         return [dr.select(hit, mi.Float(0), 1) for hit in hits]

@@ -441,7 +441,7 @@ class Transport:
             origin = spread(gbuffer.position) + normal * offset
             weight = dr.select(counts, weight, 0) / mi.Float(plan.count)
             dr.eval(direction, weight, origin, counts)
-        (visibility,) = tracer.transmittances(origin, [direction], [counts])
+        (visibility,) = tracer.transmittances(origin, [direction], [counts], mi.Vector3f(normal))
         dr.eval(visibility)
         return cls(direction, weight, visibility, spp)
 

@@ -59,7 +59,9 @@ def visibility_towards(
         active, towards = _in_fans(above)[point, fan], _vectors_in_fans(along)[point, fan]
         going = [mi.Bool(aligned(active[:, k])) for k in range(_FAN)]
         vectors = [lanes(mi.Vector3f, towards[:, k]) for k in range(_FAN)]
-        seen = tracer.transmittances(lanes(mi.Point3f, start[some][point]), vectors, going)
+        seen = tracer.transmittances(
+            lanes(mi.Point3f, start[some][point]), vectors, going, lanes(mi.Vector3f, normal[some][point])
+        )
         block = np.zeros((len(start[some]), -(-rays // _FAN), _FAN), np.float32)
         block[point, fan] = np.stack([np.array(part) for part in seen], -1) * active
         found[some] = block.reshape(len(block), -1)[:, :rays]

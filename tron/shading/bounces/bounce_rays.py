@@ -80,6 +80,10 @@ class _Lanes:
     frame: mi.Frame3f
     run: mi.UInt32
 
+    @property
+    def normal(self) -> mi.Vector3f:
+        return mi.Vector3f(self.frame.n)
+
 
 class SurfelRays:
     """``rays`` rays of each of the M surfels of ``tracer``, below ``seed``.
@@ -142,7 +146,9 @@ class SurfelRays:
             there = dr.full(mi.Bool, True, count)
             dr.eval(lane, there)  # else where they stand in the kernels depends on what was computed before
             for ray, directions, seeds, lanes in other._fans(dr.gather(mi.UInt32, surfel, lane), there):
-                hits = tracer.first_hits(lanes.origin, directions, [there] * len(directions), seeds)
+                hits = tracer.first_hits(
+                    lanes.origin, directions, [there] * len(directions), seeds, mi.Vector3f(lanes.frame.n)
+                )
                 for k, hit in enumerate(hits):
                     dr.scatter(met, _code(hit), (ray + k) * some + lane)
                 dr.eval(met)
@@ -180,7 +186,9 @@ class SurfelRays:
         for part in parts(self.tracer):
             for ray, directions, seeds, lanes in self._fans(part.surfel, part.gbuffer.opacity > 0, track):
                 active = [lanes.active] * len(directions)
-                hits = self.tracer.first_hits(lanes.origin, directions, active, seeds)
+                hits = self.tracer.first_hits(
+                    lanes.origin, directions, active, seeds, mi.Vector3f(lanes.frame.n)
+                )
                 for k, hit in enumerate(hits):
                     dr.scatter(met, _code(hit), (ray + k) * self._count + lanes.surfel, lanes.active)
                 dr.eval(met)
@@ -192,7 +200,7 @@ class SurfelRays:
         for part in parts(self.tracer):
             still = (part.gbuffer.opacity > 0) & ~dr.gather(mi.Bool, changed, part.surfel)
             for ray, directions, seeds, lanes in self._fans(part.surfel, still):
-                fans = Fans(lanes.origin, directions, [still] * len(directions))
+                fans = Fans(lanes.origin, directions, [still] * len(directions), lanes.normal)
                 for k, hit in enumerate(first_hits(few, fans, back_faces, seeds)):
                     place = (ray + k) * self._count + lanes.surfel
                     before = dr.gather(mi.UInt32, self.met, place, still)
@@ -221,7 +229,9 @@ class SurfelRays:
             ray = which // self._count
             lanes = self._lanes(surfel, dr.full(mi.Bool, True, dr.width(lane)))
             direction, seed = self._ray(lanes, ray)
-            (hit,) = self.tracer.first_hits(lanes.origin, [direction], [lanes.active], [seed])
+            (hit,) = self.tracer.first_hits(
+                lanes.origin, [direction], [lanes.active], [seed], mi.Vector3f(lanes.frame.n)
+            )
             dr.scatter(self.met, _code(hit), ray * self._count + surfel)
             dr.eval(self.met)
 

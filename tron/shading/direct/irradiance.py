@@ -55,7 +55,11 @@ class Occluder(Protocol):
     scene: GaussianScene
 
     def transmittances(
-        self, origin: mi.Point3f, directions: Sequence[mi.Vector3f], active: Sequence[mi.Bool]
+        self,
+        origin: mi.Point3f,
+        directions: Sequence[mi.Vector3f],
+        active: Sequence[mi.Bool],
+        normal: mi.Vector3f | None = None,
     ) -> list[mi.Float]: ...
 
 
@@ -101,11 +105,11 @@ def irradiance(
     """
     plan = RayPlan.make(spp, seed, gbuffer.width, strategy)
     # Rays stand still where the surface is differentiated.
-    normal = mi.Normal3f(dr.detach(gbuffer.normal))
+    normal = mi.Vector3f(dr.detach(gbuffer.normal))
     offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
     origin = gbuffer.raised(offset)
-    surface, frame, pixel = dr.detach(gbuffer.opacity) > 0, mi.Frame3f(normal), gbuffer.pixel
-    dr.eval(pixel, surface, frame, origin)
+    surface, frame, pixel = dr.detach(gbuffer.opacity) > 0, mi.Frame3f(mi.Normal3f(normal)), gbuffer.pixel
+    dr.eval(pixel, surface, frame, origin, normal)
     lanes = dr.width(surface)
     shadowed, unshadowed = dr.zeros(mi.Color3f, lanes), dr.zeros(mi.Color3f, lanes)
     dr.make_opaque(shadowed, unshadowed)  # or the first launch would be a kernel of its own
@@ -120,7 +124,7 @@ def irradiance(
             active.append(counts)
             values.append(dr.select(counts, radiance * weight, 0))
         dr.eval(directions, values, active)  # tracers look at the rays more than once
-        visible = tracer.transmittances(origin, directions, active)
+        visible = tracer.transmittances(origin, directions, active, normal)
         unshadowed += sum(values)
         shadowed += sum(value * share for value, share in zip(values, visible, strict=True))
         for observer in observers:

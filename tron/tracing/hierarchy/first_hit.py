@@ -91,7 +91,11 @@ class Stops:
 
 
 def stop(
-    bvh: Bvh, origin: mi.Point3f, directions: Sequence[mi.Vector3f], back_faces: BackFaces
+    bvh: Bvh,
+    origin: mi.Point3f,
+    directions: Sequence[mi.Vector3f],
+    back_faces: BackFaces,
+    normal: mi.Vector3f,
 ) -> Callable[[Stops, mi.UInt32, mi.Bool], Stops]:
     """Visitor of a walk: a surfel may stop each ray."""
 
@@ -102,7 +106,7 @@ def stop(
             chance = mi.Float(hashed(surfel * mi.UInt32(0x9E3779B1) + state.seed[ray]) >> 8) * float(2.0**-24)
             before, found = state.farthest[ray], state.surfel[ray]
             nearer = (hit.t < before) | ((hit.t == before) & (surfel < found))
-            stops = blocks(hit, back_faces) & nearer & (chance < hit.alpha)
+            stops = blocks(hit, back_faces, normal) & nearer & (chance < hit.alpha)
             state.farthest[ray] = dr.select(stops, hit.t, before)
             state.surfel[ray] = dr.select(stops, surfel, found)
             state.front[ray] = dr.select(stops, hit.front, state.front[ray])
@@ -124,7 +128,7 @@ def first_hits(bvh: Bvh, fans: Fans, back_faces: BackFaces, seeds: Sequence[mi.U
     """
     if dr.flag(dr.JitFlag.SymbolicScope):
         start = Stops.none(fans.active, seeds)
-        visit = stop(bvh, fans.origin, fans.directions, back_faces)
+        visit = stop(bvh, fans.origin, fans.directions, back_faces, fans.normal)
         end = walk(bvh, fans.origin, fans.directions, start, visit, any_of(fans.active))
         return [
             FirstHit(surfel, front, dr.select(surfel != NOTHING, distance, dr.inf))
@@ -157,8 +161,8 @@ def _trace(
             [dr.gather(mi.UInt32, seed, fan, going) for seed in seeds],
         )
 
-    def visitor(origin: mi.Point3f, along: Sequence[mi.Vector3f]) -> Callable:
-        return stop(bvh, origin, along, back_faces)
+    def visitor(origin: mi.Point3f, along: Sequence[mi.Vector3f], normal: mi.Vector3f) -> Callable:
+        return stop(bvh, origin, along, back_faces, normal)
 
     def write(state: Stops, fan: mi.UInt32, done: mi.Bool) -> None:
         for ray, hit in enumerate(found):
@@ -195,6 +199,7 @@ def spread(values: Any, width: int) -> Any:
             mi.Point3f(*[spread(dr.detach(v), width) for v in values.origin]),
             [mi.Vector3f(*[spread(dr.detach(v), width) for v in along]) for along in values.directions],
             [spread(mi.Bool(lanes), width) for lanes in values.active],
+            mi.Vector3f(*[spread(dr.detach(v), width) for v in values.normal]),
         )
     if dr.width(values) == width:
         return values
@@ -208,7 +213,9 @@ def serve(
     line: Line,
     state: State,
     begin: Callable[[mi.UInt32, mi.Bool], State],
-    visitor: Callable[[mi.Point3f, Sequence[mi.Vector3f]], Callable[[State, mi.UInt32, mi.Bool], State]],
+    visitor: Callable[
+        [mi.Point3f, Sequence[mi.Vector3f], mi.Vector3f], Callable[[State, mi.UInt32, mi.Bool], State]
+    ],
     write: Callable[[State, mi.UInt32, mi.Bool], None],
 ) -> State:
     """Walk all fans of ``line``: many fans of rays for the lanes that trace them.
@@ -222,12 +229,12 @@ def serve(
         bvh: the hierarchy. fans: as many rays each as ``state`` has intervals. line: their line.
         state: of a walk that is over.
         begin: the state in which the walk of a fan begins, in the lanes given.
-        visitor: of the walk of a fan from its origin along its directions.
+        visitor: of the walk of a fan from its origin along its directions, of its surface's normal.
         write: takes the state in which the walk of a fan ended, in the lanes given.
     """
     rays = range(len(fans.directions))
     fan, going = mi.UInt32(_NO_FAN), line.lane < line.fans
-    origin, along = mi.Point3f(0), [mi.Vector3f(0) for _ in rays]
+    origin, normal, along = mi.Point3f(0), mi.Vector3f(0), [mi.Vector3f(0) for _ in rays]
     slopes = [mi.Vector3f(0) for _ in rays]
     at = Descent.begun()
     while going:
@@ -236,13 +243,14 @@ def serve(
             fan = dr.scatter_inc(line.taken, mi.UInt32(0))
             going = fan < line.fans
             origin = mi.Point3f(*[dr.gather(mi.Float, v, fan, going) for v in fans.origin])
+            normal = mi.Vector3f(*[dr.gather(mi.Float, v, fan, going) for v in fans.normal])
             for ray in rays:
                 along[ray] = mi.Vector3f(*[dr.gather(mi.Float, v, fan, going) for v in fans.directions[ray]])
                 slopes[ray] = slopes_of(along[ray])
             at = Descent.begun()
             state = begin(fan, going)
         at = search(bvh, origin, slopes, state, at, going)
-        at, state = look(at, state, visitor(origin, along), going)
+        at, state = look(at, state, visitor(origin, along, normal), going)
     return state
 
 
@@ -267,8 +275,8 @@ def _products(
     def begin(fan: mi.UInt32, going: mi.Bool) -> Products:
         return Products.clear([dr.gather(mi.Bool, lanes, fan, going) for lanes in fans.active])
 
-    def visitor(origin: mi.Point3f, along: Sequence[mi.Vector3f]) -> Callable:
-        return multiply(bvh, origin, along, back_faces)
+    def visitor(origin: mi.Point3f, along: Sequence[mi.Vector3f], normal: mi.Vector3f) -> Callable:
+        return multiply(bvh, origin, along, back_faces, normal)
 
     def write(state: Products, fan: mi.UInt32, done: mi.Bool) -> None:
         for value, product in zip(found, state.product):

@@ -1,15 +1,20 @@
 """Transmittance along arbitrary rays: a product over hits, so the order in which they are hit is free.
 
 Sidedness (conventions.md, 8): one-sided surfels leak, because undersides that no camera saw do not
-exist; naive two-sided surfels darken their own surface. So front faces block from t = 0, and back faces
-only beyond two surfel spacings, where they can no longer belong to the surface that the ray left. Where
-surfels are larger than the scene's median, their spacing is larger by as much (:class:`BackFaces`).
+exist; naive two-sided surfels darken their own surface. So back faces block only beyond two surfel spacings,
+where they can no longer belong to the surface that the ray left. Where surfels are larger than the scene's
+median, their spacing is larger by as much (:class:`BackFaces`).
+
+Front faces block from t = 0, but for those of a thin sheet's other side. Its surfels lie back to back with
+those that a ray leaves, and jitter puts some on the wrong side: the ray meets their front. They face against
+the surface that it leaves, and its origin is next to their plane: within three quarters of a spacing, such a
+front nearer than those two spacings along the ray does not block.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +27,10 @@ from tron.tracing.kernel import GEOMETRY_PACKETS, RADIUS, SurfelHit, SurfelRecor
 OPAQUE_TRANSMITTANCE = 1e-2
 """Below this a ray counts as blocked: the result is exactly 0, whatever the order of the hits was."""
 BACK_FACE_SPACINGS = 2.0
+SHEET_SPACINGS = 0.75
+"""Distance of a ray's origin from the plane of a front face within which that may be a sheet's other side."""
+AGAINST = 0.5
+"""Least cosine, negated, between the normals of a sheet's sides."""
 
 
 @dataclass
@@ -32,11 +41,13 @@ class Fans:
         origin: world, one a lane.
         directions: unit, world, of the rays that leave it: close to each other, for speed.
         active: the lanes of each direction to trace; transmittance of the others is 1.
+        normal: unit, world, of the surface that they leave; 0 where they leave none.
     """
 
     origin: mi.Point3f
     directions: Sequence[mi.Vector3f]
     active: Sequence[mi.Bool]
+    normal: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))
 
 
 @dataclass
@@ -83,11 +94,18 @@ class BackFaces:
         return BackFaces(dr.opaque(mi.Float, reach), dr.opaque(mi.Float, reach / median))
 
 
-def blocks(hit: SurfelHit, back_faces: BackFaces) -> mi.Bool:
-    """Whether a surfel stands in the ray's way: the rule of sidedness above."""
+def blocks(hit: SurfelHit, back_faces: BackFaces, normal: mi.Vector3f) -> mi.Bool:
+    """Whether a surfel stands in the ray's way: the rule of sidedness above; ``normal`` of :class:`Fans`."""
     local = back_faces.radii * hit.radius
     far = dr.select(local > back_faces.distance, local, back_faces.distance)
-    return hit.within & (hit.t > dr.select(hit.front, 0, far))
+    # By squares, for a stored normal is not unit: the origin's distance from the plane, the angle between.
+    length2, aside, along = dr.squared_norm(hit.normal), hit.t * hit.facing, dr.dot(hit.normal, normal)
+    sheet = SHEET_SPACINGS / BACK_FACE_SPACINGS * far
+    other_side = (
+        (along < 0) & (along * along > AGAINST**2 * length2) & (aside * aside < sheet * sheet * length2)
+    )
+    before = hit.front & (hit.t > 0) & ~(other_side & (far < dr.inf))
+    return hit.within & (before | (hit.t > far))
 
 
 def remaining(product: mi.Float) -> mi.Float:
@@ -96,7 +114,11 @@ def remaining(product: mi.Float) -> mi.Float:
 
 
 def multiply(
-    bvh: Bvh, origin: mi.Point3f, directions: Sequence[mi.Vector3f], back_faces: BackFaces
+    bvh: Bvh,
+    origin: mi.Point3f,
+    directions: Sequence[mi.Vector3f],
+    back_faces: BackFaces,
+    normal: mi.Vector3f,
 ) -> Callable[[Products, mi.UInt32, mi.Bool], Products]:
     """Visitor of a walk: multiplies by what each surfel lets through."""
 
@@ -104,7 +126,7 @@ def multiply(
         for ray, direction in enumerate(directions):
             hit = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
             before = state.product[ray]
-            product = dr.select(blocks(hit, back_faces), before * (1 - hit.alpha), before)
+            product = dr.select(blocks(hit, back_faces, normal), before * (1 - hit.alpha), before)
             state.product[ray] = product
             state.farthest[ray] = dr.select(product >= OPAQUE_TRANSMITTANCE, state.farthest[ray], -dr.inf)
         return state
@@ -118,7 +140,7 @@ def transmittance(bvh: Bvh, fans: Fans, back_faces: BackFaces) -> list[mi.Float]
     mi.Float in [0, 1] for each direction. Within recorded loops too; elsewhere
     :func:`tron.tracing.hierarchy.first_hit.queued_transmittance` is faster.
     """
-    visit = multiply(bvh, fans.origin, fans.directions, back_faces)
+    visit = multiply(bvh, fans.origin, fans.directions, back_faces, fans.normal)
     start, active = Products.clear(fans.active), any_of(fans.active)
     products = walk(bvh, fans.origin, fans.directions, start, visit, active).product
     return [dr.select(lanes, remaining(product), 1) for product, lanes in zip(products, fans.active)]

@@ -336,8 +336,8 @@ def test_surfels_treated_in_parts_meet_what_they_meet_at_once(dense_surfels, whi
 
 @pytest.mark.parametrize("rays", [1, 8])
 def test_few_surfels_and_rays_are_enough(dense_surfels, white, rays: int) -> None:
-    """One surfel, and two that face each other, of any number of rays."""
-    points, normals = np.array([[0, 0, 0], [0, 0, 0.02]]), np.array([[0, 0, 1], [0, 0, -1]])
+    """One surfel, and two that face each other from no sheet's distance, of any number of rays."""
+    points, normals = np.array([[0, 0, 0], [0, 0, 0.045]]), np.array([[0, 0, 1], [0, 0, -1]])
     for count, meets in ((1, False), (2, True)):
         part = SimpleNamespace(points=points[:count], normals=normals[:count])
         baked = BounceTransport.trace(SurfelTracer(dense_surfels.scene(part)), rays=rays).bake(white)

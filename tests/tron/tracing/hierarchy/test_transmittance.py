@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -58,6 +59,48 @@ def test_front_faces_block_from_zero_and_back_faces_beyond_two_spacings(shadows,
         np.testing.assert_allclose(found, expected, rtol=1e-5)
     one_sided = SurfelTracer(disks([[0, 0, 0.25]], [False], opacity=0.8, sigma=0.2)).sided(False)
     assert shadows(one_sided, [[0, 0, 0]], up[:1])[0] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("height", "direction", "leaves", "left"),
+    [
+        (0.05, (0, 0, 1), (0, 0, 1), 1.0),
+        (0.15, (0, 0, 1), (0, 0, 1), 0.2),
+        (0.05, (0.99, 0, 0.141), (0, 0, 1), 0.2),  # beyond two spacings along the ray
+        (0.05, (0, 0, 1), (1, 0, 0), 0.2),  # a corner
+        (0.05, (0, 0, 1), (0, 0, 0), 0.2),  # the ray leaves no surface
+    ],
+)
+def test_fronts_against_the_surface_that_a_ray_leaves_are_a_sheets_other_side(
+    disks, height: float, direction, leaves, left: float
+) -> None:
+    along = np.array(direction) / np.linalg.norm(direction)
+    tracer = SurfelTracer(disks([along * height / along[2]], [True], opacity=0.8, sigma=0.2))
+    for sided, expected in ((True, left), (False, 0.2)):
+        (found,) = tracer.sided(sided).transmittances(
+            mi.Point3f(0), [mi.Vector3f(*along.tolist())], [mi.Bool(True)], mi.Vector3f(*map(float, leaves))
+        )
+        assert found[0] == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_sheets_other_side_is_that_of_float64(random_rays, random_scene):
+    scene = dataclasses.replace(random_scene(300), spacing=0.4)
+    origins, directions = random_rays(1500)
+    normals = unit_rows(seeds.generator(0, "tests", "normals").normal(size=origins.shape))
+    truth, margin = reference.transmittance(scene, origins, directions, normals=normals)
+    plain, _ = reference.transmittance(scene, origins, directions)
+    assert (truth > plain + 0.1).sum() > 20
+    arguments = (np.ascontiguousarray(each.T, np.float32) for each in (origins, directions, normals))
+    origin, direction, normal = (mi.Vector3f(each) for each in arguments)
+    (found,) = SurfelTracer(scene).transmittances(
+        mi.Point3f(origin), [direction], [dr.full(mi.Bool, True, len(origins))], normal
+    )
+    steady = margin > 1e-5
+    np.testing.assert_allclose(np.array(found)[steady], truth[steady], atol=1e-4)
+
+
+def unit_rows(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def test_behind_the_origin_nothing_blocks(shadows, disks):
