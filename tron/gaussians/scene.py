@@ -89,7 +89,8 @@ class GaussianScene:
     log_thickness: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
-        if not len(self.log_thickness):
+        # Flat scenes may be made of others of more or fewer surfels without a word of it.
+        if np.isneginf(self.log_thickness).all():
             self.log_thickness = np.full(len(self.means), -np.inf)
         for name, described in FIELDS.items():
             setattr(self, name, np.ascontiguousarray(getattr(self, name), dtype=described.dtype))
