@@ -188,12 +188,15 @@ def test_a_scan_of_broken_splats_alone_is_refused(tmp_path):
 @pytest.mark.parametrize("thin", [0, 1, 2])
 def test_a_logarithm_of_minus_infinity_is_a_flat_splat(tmp_path, caplog, thin):
     columns = splats()
-    columns[f"scale_{thin}"], columns["scale_2"] = columns["scale_2"], columns[f"scale_{thin}"]
+    thinnest = columns["scale_2"]
+    columns["scale_2"], columns[f"scale_{thin}"] = columns[f"scale_{thin}"], thinnest
     finite = GaussianScene.load(write(tmp_path / "a.ply", columns))
     columns[f"scale_{thin}"] = np.full(COUNT, -np.inf)
     flat = GaussianScene.load(write(tmp_path / "a.ply", columns))
     for name in ("means", "quats", "log_scales"):
         np.testing.assert_array_equal(getattr(flat, name), getattr(finite, name))
+    np.testing.assert_array_equal(finite.log_thickness, thinnest.astype(np.float32))
+    assert np.isneginf(flat.log_thickness).all()
     assert not caplog.messages
 
 
@@ -229,8 +232,8 @@ def test_a_few_round_splats_among_flat_ones_stay_as_they_are(tmp_path, caplog):
     scene = GaussianScene.load(write(tmp_path / "a.ply", columns))
     turned = np.stack([columns[name] for name in ROTATIONS], 1)
     plain = Rotation.from_quat(turned, scalar_first=True).as_matrix()
-    # Of axes of one length the first is dropped.
-    np.testing.assert_allclose(scene.normals()[:3], plain[:3, :, 0], atol=1e-5)
+    # Of axes of one length the last is the normal, as in files of ours.
+    np.testing.assert_allclose(scene.normals()[:3], plain[:3, :, 2], atol=1e-5)
     assert not caplog.messages
 
 

@@ -15,6 +15,7 @@ from tron.gaussians.harmonics import rotate_sh
 from tron.gaussians.scene import GaussianScene, measure_spacing, quats_from_matrices
 
 _TOLERANCE = 1e-4
+_SIZES = ("log_scales", "log_thickness")
 
 KERNEL_WIDTHS = 1.45
 """A kernel of degree 2 with so many times the scales stands for one of degree 4.
@@ -70,8 +71,8 @@ def with_kernel(scene: GaussianScene, degree: int) -> GaussianScene:
     if scene.kernel_degree == degree:
         return scene
     widths = KERNEL_WIDTHS if degree == 2 else 1 / KERNEL_WIDTHS
-    log_scales = scene.log_scales + np.float32(np.log(widths))
-    return replace(scene, log_scales=log_scales, kernel_degree=degree)
+    wider = {name: getattr(scene, name) + np.float32(np.log(widths)) for name in _SIZES}
+    return replace(scene, **wider, kernel_degree=degree)
 
 
 def scaled(scene: GaussianScene, which: np.ndarray, factor: float, pivot: np.ndarray) -> GaussianScene:
@@ -90,10 +91,11 @@ def scaled(scene: GaussianScene, which: np.ndarray, factor: float, pivot: np.nda
     if not (np.isfinite(factor) and factor > 0):
         raise TronError(f"factor is {factor}", mend="give a number above 0")
     about = _vector("pivot", pivot)
-    means, log_scales = scene.means.copy(), scene.log_scales.copy()
+    means, sizes = scene.means.copy(), {name: getattr(scene, name).copy() for name in _SIZES}
     means[selected] = (means[selected].astype(np.float64) - about) * factor + about
-    log_scales[selected] += np.float32(np.log(factor))
-    return replace(scene, means=means, log_scales=log_scales)
+    for each in sizes.values():
+        each[selected] += np.float32(np.log(factor))
+    return replace(scene, means=means, **sizes)
 
 
 def moved(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from tron.gaussians.harmonics import SH_COUNT
 
 LOG_SCALE_LIMIT = 40.0
@@ -18,13 +20,17 @@ class Field:
         shape: of a row.
         properties: names in a PLY, in the order of the row's numbers, of those that a file must have.
         unit: whether its numbers lie in [0, 1].
-        trained: whether it is a float32 parameter, which an optimiser may change; int32 otherwise.
+        trained: whether it is a parameter, which an optimiser may change.
+        dtype: of its numbers.
+        zero: whether they are logarithms that may be -infinity.
     """
 
     shape: tuple[int, ...]
     properties: tuple[str, ...]
     unit: bool = False
     trained: bool = True
+    dtype: type[np.generic] = np.float32
+    zero: bool = False
 
 
 FIELDS = {
@@ -36,7 +42,16 @@ FIELDS = {
     "base_color": Field((3,), ("base_color_0", "base_color_1", "base_color_2"), unit=True),
     "roughness": Field((), ("roughness",), unit=True),
     "metallic": Field((), ("metallic",), unit=True),
-    "object_id": Field((), ("object_id",), trained=False),
+    "object_id": Field((), ("object_id",), trained=False, dtype=np.int32),
+    "log_thickness": Field((), ("scale_2",), trained=False, zero=True),
 }
 PARAMETERS = tuple(name for name, field in FIELDS.items() if field.trained)
 MATERIALS = tuple(name for name, field in FIELDS.items() if field.unit)
+
+FLATNESS = 1e-3
+"""Third scale over the smaller of the others up to which a Gaussian is flat, and far from underflow."""
+
+
+def third_scales(log_scales: np.ndarray, log_thickness: np.ndarray | float = -np.inf) -> np.ndarray:
+    """(M,) third logarithmic scales as files have them, of (M, 2) scales and (M,) thicknesses: none is 0."""
+    return np.maximum(log_thickness, log_scales.min(axis=1) + np.float32(np.log(FLATNESS)))

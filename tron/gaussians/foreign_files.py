@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import log_expit
 
 from tron.errors import TronError
-from tron.gaussians.fields import FIELDS, LOG_SCALE_LIMIT
+from tron.gaussians.fields import FIELDS, LOG_SCALE_LIMIT, third_scales
 from tron.gaussians.formats.registry import FORMATS
 from tron.gaussians.packed_files import PACKED_SPLATS, conversion
 from tron.io.recognised import refuse_by_sight, refuse_placeholder
@@ -40,17 +40,18 @@ ROUND = 0.9
 """Thinnest over middle axis from which neither is a normal."""
 
 
-def flattened(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Drop the smallest of three scales: (M, 4), (M, 2 or 3) -> unit quats, thin axis last, (M, 2).
+def thin_last(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Part the smallest scale from the others: (M, 4), (M, 2 or 3) -> unit quats, (M, 2), (M,).
 
-    Quaternions are finite and not zero; the smallest scale may be -infinity, of a flat splat.
+    The thin axis becomes the last. Its scale is -infinity of splats of two scales, and of flat ones
+    (:data:`tron.gaussians.fields.FLATNESS`). Quaternions are finite and not zero.
     """
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)
     # Unit quaternions are left alone to the last bit: a scene written and read is the same scene.
     quats = np.where(np.abs(lengths - 1) > 1e-6, quats / lengths, quats)
     if log_scales.shape[1] == 2:
-        return quats, log_scales
-    thin = log_scales.argmin(axis=1)
+        return quats, log_scales, np.full(len(quats), -np.inf, np.float32)
+    thin = 2 - log_scales[:, ::-1].argmin(axis=1)  # the last of equals: what we wrote is not turned
     # A third turn about (1, 1, 1) cycles the axes (u, v, n) -> (v, n, u), two of them -> (n, u, v): the thin
     # axis becomes the third column and the frame stays right-handed.
     w, x, y, z = quats.T
@@ -58,7 +59,8 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np
     twice = np.stack([w + x + y + z, -w + x - y + z, -w + x + y - z, -w - x + y + z], axis=-1) / 2
     kept = np.array([[1, 2], [2, 0], [0, 1]])[thin]
     quats = np.choose(thin[:, None], [cycled, twice, quats])
-    return quats.astype(np.float32), np.take_along_axis(log_scales, kept, axis=1)
+    wide, least = np.take_along_axis(log_scales, kept, axis=1), log_scales.min(axis=1)
+    return quats.astype(np.float32), wide, np.where(least > third_scales(wide), least, np.float32(-np.inf))
 
 
 def round_ones(log_scales: np.ndarray) -> np.ndarray:

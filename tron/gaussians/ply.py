@@ -2,8 +2,8 @@
 
 The vertex element holds float32, little endian, in the order of the 3DGS reference code: x y z, nx ny nz,
 f_dc_0..2, f_rest_0..44 (channel-major: 15 red, 15 green, 15 blue), opacity (logit), scale_0..2 (log),
-rot_0..3 (w, x, y, z). A surfel has two scales; the third, along the normal, is written negligibly small for
-readers that expect it. Our materials follow as extra properties that other readers skip: base_color_0..2
+rot_0..3 (w, x, y, z). The third scale is along the normal; of a flat surfel it is written negligibly small
+for readers that expect it. Our materials follow as extra properties that other readers skip: base_color_0..2
 (linear), roughness, metallic and object_id (int). What belongs to the whole scene stands in comments:
 ``comment tron spacing 0.01``.
 
@@ -27,10 +27,9 @@ from scipy.special import expit
 from tron.color import srgb_to_linear
 from tron.errors import TronError
 from tron.estimation import MATERIAL
-from tron.gaussians.fields import FIELDS, MATERIALS
+from tron.gaussians.fields import FIELDS, MATERIALS, third_scales
 from tron.gaussians.foreign_files import (
     beginning,
-    flattened,
     foreign_kernels,
     is_gzipped,
     largest,
@@ -38,6 +37,7 @@ from tron.gaussians.foreign_files import (
     round_ones,
     smoothed,
     stated_up,
+    thin_last,
     usable_splats,
     whole,
 )
@@ -58,7 +58,7 @@ log = logging.getLogger(__name__)
 
 NORMAL = ("nx", "ny", "nz")
 REST = tuple(f"f_rest_{i}" for i in range(3 * (SH_COUNT - 1)))
-THIRD_SCALE = "scale_2"
+(THIRD_SCALE,) = FIELDS["log_thickness"].properties
 MATERIAL_PROPERTIES = tuple(name for material in MATERIALS for name in FIELDS[material].properties)
 REQUIRED = tuple(
     name
@@ -66,8 +66,6 @@ REQUIRED = tuple(
     for name in FIELDS[field].properties
 )
 
-# The third scale of a surfel, as a fraction of its smaller one: flat, yet far from underflow in any reader.
-FLATNESS = 1e-3
 # What a Gaussian without materials is taken to be made of: a rough dielectric in its own colours.
 GUESSED_ROUGHNESS = 0.6
 GUESSED_METALLIC = 0.0
@@ -123,7 +121,7 @@ def write_ply(
         add(REST, sh[:, 1:].transpose(0, 2, 1))
     add(FIELDS["opacity_logits"].properties, scene["opacity_logits"])
     add(FIELDS["log_scales"].properties, log_scales)
-    add([THIRD_SCALE], log_scales.min(axis=1) + np.float32(np.log(FLATNESS)))
+    add([THIRD_SCALE], third_scales(log_scales, scene["log_thickness"]))
     for name in ("quats", *(() if plain else (*MATERIALS, "object_id"))):
         add(FIELDS[name].properties, scene[name])
     kinds = {name: "<f8" if values.dtype == np.float64 else "<f4" for name, values in columns.items()}
@@ -140,8 +138,8 @@ def write_ply(
 def read_splats(path: str | Path) -> dict[str, Any]:
     """Attributes of the GaussianScene in a file of splats; ``spacing`` only if the file says it.
 
-    Of three scales the smallest is dropped and the rotation permuted, so that the surfel's normal is the axis
-    along which the Gaussian was thinnest; ``round_ones`` (M,) bool tells where there is no such axis.
+    Of three scales the smallest is the thickness, and the rotation is permuted, so that the normal is the
+    axis along which the Gaussian was thinnest; ``round_ones`` (M,) bool tells where there is no such axis.
     Quaternions are normalised. f_rest of degree 0 to 3 is accepted. A file without materials gets guessed
     ones (base colour from the mean colour, rough, not metallic) and says so in `materials_guessed`; a file
     that is not TRON's has unoriented normals (`oriented` is False) and kernel degree 2. Up is what a comment
@@ -200,7 +198,7 @@ def read_splats(path: str | Path) -> dict[str, Any]:
     # Where a file of TRON's stands was decided when it was written, but where its coordinates were put back.
     if not constants or columns["x"].dtype == np.float64:
         means, offset = _about_local_origin(columns, path)
-    quats, log_scales = flattened(field("quats"), stack(scales))
+    quats, log_scales, log_thickness = thin_last(field("quats"), stack(scales))
     sh = _harmonics(columns, stack, path)
     guessed = MATERIAL_PROPERTIES[0] not in columns
     stated, oriented = constants.get("up", up), bool(constants.get("oriented", [0])[0])
@@ -208,6 +206,7 @@ def read_splats(path: str | Path) -> dict[str, Any]:
         "means": means,
         "quats": quats,
         "log_scales": log_scales,
+        "log_thickness": log_thickness,
         "round_ones": columns["round_ones"],
         "opacity_logits": field("opacity_logits"),
         "sh": sh,

@@ -1,8 +1,9 @@
 """The Gaussian scene: oriented flat Gaussians (surfels) with radiance and materials.
 
 A surfel is the flat Gaussian of 2D Gaussian Splatting (Huang et al. 2024): a centre, an orientation whose
-third axis is the normal, two standard deviations in the plane, an opacity, and what it looks like. Everything
-is NumPy at rest, in the world frame; trainable copies and device arrays are made by those who need them.
+third axis is the normal, two standard deviations in the plane, an opacity, and what it looks like. A scan's
+splats have a third deviation, which their own projections show and nothing else knows of. Everything is NumPy
+at rest, in the world frame; trainable copies and device arrays are made by those who need them.
 """
 
 from __future__ import annotations
@@ -64,6 +65,8 @@ class GaussianScene:
             means + offset (:mod:`tron.io.local_frame`). Zero in most scenes.
         projection: how cameras see the surfels (:data:`tron.gaussians.projections.PROJECTIONS`): as disks in
             space, or as the program that a scan's splats were learnt with projects them.
+        log_thickness: (M,) natural logarithm of the standard deviation along the normal, world units, the
+            least of three; -infinity, as of all by default, of flat surfels. Only ``projection`` shows it.
     """
 
     means: np.ndarray
@@ -83,11 +86,14 @@ class GaussianScene:
     oriented: bool = True
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     projection: str = DISKS
+    log_thickness: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
+        # Flat scenes may be made of others of more or fewer surfels without a word of it.
+        if np.isneginf(self.log_thickness).all():
+            self.log_thickness = np.full(len(self.means), -np.inf)
         for name, described in FIELDS.items():
-            dtype = np.float32 if described.trained else np.int32
-            setattr(self, name, np.ascontiguousarray(getattr(self, name), dtype=dtype))
+            setattr(self, name, np.ascontiguousarray(getattr(self, name), dtype=described.dtype))
         self.up = np.asarray(self.up, dtype=np.float64)
         self.offset = np.asarray(self.offset, dtype=np.float64)
         self.kernel_degree = int(self.kernel_degree)
@@ -182,8 +188,9 @@ class GaussianScene:
             values, expected = getattr(self, name), (count, *described.shape)
             if values.shape != expected:
                 raise TronError(f"{name} has shape {values.shape}, expected {expected}")
-            if not np.isfinite(values).all():
-                bad = ~np.isfinite(values.reshape(count, -1)).all(axis=1)
+            good = np.isfinite(values) | (np.isneginf(values) & described.zero)
+            if not good.all():
+                bad = ~good.reshape(count, -1).all(axis=1)
                 raise TronError(
                     f"{name} of {bad.sum()} of {count} surfels is not finite (first: {bad.argmax()})"
                 )
@@ -195,6 +202,10 @@ class GaussianScene:
         bad = (np.abs(self.log_scales) > LOG_SCALE_LIMIT).any(axis=1)
         if bad.any():
             raise TronError(f"log_scales of {bad.sum()} surfels are absurd (first: surfel {bad.argmax()})")
+        bad = self.log_thickness > self.log_scales.min(axis=1)
+        if bad.any():
+            what = f"{bad.sum()} surfels are thicker than wide (first: surfel {bad.argmax()})"
+            raise TronError(what, mend="change log_thickness with log_scales")
         lengths = np.linalg.norm(self.quats, axis=1)
         bad = np.abs(lengths - 1) > _TOLERANCE
         if bad.any():

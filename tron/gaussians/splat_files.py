@@ -11,12 +11,12 @@ import plyfile
 from tron.errors import TronError
 from tron.framing import Y_UP, upright
 from tron.gaussians.edit import with_kernel
-from tron.gaussians.fields import FIELDS
+from tron.gaussians.fields import FIELDS, third_scales
 from tron.gaussians.formats.registry import FORMATS
 from tron.gaussians.formats.splats import Splats
 from tron.gaussians.harmonics import dc_to_rgb
 from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS, packed
-from tron.gaussians.ply import FLATNESS, NORMAL, write_ply
+from tron.gaussians.ply import NORMAL, write_ply
 from tron.gaussians.scene import GaussianScene
 from tron.gaussians.spz_precision import refined
 from tron.io.optional import usd
@@ -110,8 +110,8 @@ def write_points(path: Path, scene: GaussianScene) -> int:
 
 def _splats(scene: GaussianScene) -> Splats:
     plain = with_kernel(scene, 2)
-    thin = plain.log_scales.min(axis=1, keepdims=True) + np.float32(np.log(FLATNESS))
-    log_scales = np.concatenate([plain.log_scales, thin], axis=1)
+    third = third_scales(plain.log_scales, plain.log_thickness)
+    log_scales = np.concatenate([plain.log_scales, third[:, None]], axis=1)
     return Splats(plain.means, plain.quats, log_scales, plain.opacity_logits, plain.sh)
 
 

@@ -172,7 +172,9 @@ class SurfelTracer:
         if projection is None:
             return trace_view(records, camera, limit)
         nearest = min(NEAREST, NEAREST_SPACINGS * self.scene.spacing)
-        seen = projected(records, camera, projection, nearest)
+        deviations = np.exp(self.scene.log_thickness)
+        thickness = mi.Float(aligned(deviations) if len(deviations) else 0)
+        seen = projected(records, camera, projection, nearest, thickness)
         return trace_view(seen, camera, limit, records)
 
     def trace(

@@ -1,4 +1,4 @@
-"""Surfels at random, everything about them."""
+"""Surfels at random, everything about them, every other as thick as splats are."""
 
 from collections.abc import Callable
 
@@ -28,6 +28,9 @@ def random_scene() -> Callable[..., GaussianScene]:
             "object_id": np.arange(count) % 3,
             "spacing": 0.1,
         }
-        return GaussianScene(**{**values, **fields}).validate()
+        values |= fields
+        thick = np.asarray(values["log_scales"]).min(1) - rng.uniform(0.1, 2, count)
+        values.setdefault("log_thickness", np.where(np.arange(count) % 2, -np.inf, thick))
+        return GaussianScene(**values).validate()
 
     return make

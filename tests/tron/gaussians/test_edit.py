@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tron.errors import TronError
-from tron.gaussians.edit import moved
+from tron.gaussians.edit import joined, moved, removed, scaled, subset, with_kernel
 from tron.gaussians.harmonics import eval_sh
 from tron.gaussians.scene import GaussianScene
 
@@ -71,3 +71,18 @@ def test_what_cannot_be_moved_is_refused(scene: GaussianScene, which, rotation, 
 def test_where_to_is_three_finite_numbers(scene: GaussianScene, name: str, vector) -> None:
     with pytest.raises(TronError, match=name):
         moved(scene, np.array([0]), **{name: vector})
+
+
+def test_thickness_stays_with_the_surfels(scene: GaussianScene) -> None:
+    part = scene.object_id == 1
+    thick = scene.log_thickness
+    halves = subset(scene, part), removed(scene, part)
+    np.testing.assert_array_equal(halves[0].log_thickness, thick[part])
+    both = joined(*halves).validate()
+    np.testing.assert_array_equal(both.log_thickness, np.concatenate([thick[part], thick[~part]]))
+    larger = np.where(part, np.log(3), 0)
+    found = scaled(scene, part, 3, np.zeros(3)).validate()
+    np.testing.assert_allclose(found.log_thickness, thick + larger, atol=1e-5)
+    found = with_kernel(scene, 4).validate()
+    ratio = thick - scene.log_scales.min(1)
+    np.testing.assert_allclose(found.log_thickness - found.log_scales.min(1), ratio, atol=1e-5)

@@ -42,6 +42,7 @@ def same(found: GaussianScene, wanted: GaussianScene, atol: float = 2e-5) -> Non
     """Both look alike: centres, disks, opacities, and colours from six sides."""
     np.testing.assert_allclose(found.means, wanted.means, atol=atol)
     np.testing.assert_allclose(np.sort(found.log_scales), np.sort(wanted.log_scales), atol=1e-3)
+    np.testing.assert_allclose(np.exp(found.log_thickness), np.exp(wanted.log_thickness), atol=3e-4)
     np.testing.assert_allclose(np.abs((found.normals() * wanted.normals()).sum(1)), 1, atol=1e-3)
     np.testing.assert_allclose(found.opacities(), wanted.opacities(), atol=1e-5)
     for direction in spread_directions(6):
@@ -276,7 +277,7 @@ def test_damaged_files_cost_a_line(random_scene, tmp_path: Path, suffix: str) ->
 
 def layouts(scene: GaussianScene) -> dict[str, object]:
     """What trainings save of a scene."""
-    thin = np.full((len(scene), 1), -12, np.float32)
+    thin = np.maximum(scene.log_thickness, -12)[:, None]
     arrays = {
         "means": scene.means, "scales": np.concatenate([scene.log_scales, thin], axis=1),
         "quats": 3 * scene.quats, "opacities": scene.opacity_logits,

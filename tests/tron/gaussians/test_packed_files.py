@@ -66,6 +66,10 @@ def test_round_trips_keep_what_formats_hold(random_scene, tmp_path, suffix):
     np.testing.assert_allclose(found.means, wanted["means"], atol=2e-3)
     sizes = np.sort(found.log_scales, axis=1), np.sort(wanted["log_scales"], axis=1)
     np.testing.assert_allclose(sizes[0], sizes[1], atol=0.1)
+    thick = np.isfinite(scene.log_thickness[nearest])
+    wanted["log_thickness"] = scene.log_thickness[nearest]
+    np.testing.assert_allclose(found.log_thickness[thick], wanted["log_thickness"][thick], atol=0.1)
+    assert (found.log_thickness < found.log_scales.min(1) - 5)[~thick].all()
     assert np.median(np.abs((found.normals() * scene.normals()[nearest]).sum(1))) > 0.99
     for direction in spread_directions(6):
         seen = np.broadcast_to(direction, found.means.shape)
@@ -79,8 +83,9 @@ def test_round_trips_keep_what_formats_hold(random_scene, tmp_path, suffix):
 def test_spz_keeps_places_and_harmonics_of_any_scene(random_scene, tmp_path, size):
     """gaussforge itself rounds harmonics to sixteenths and eighths, and wraps places beyond 2,048."""
     plain = arranged(random_scene)
-    log_scales = plain.log_scales + min(0, np.log(np.float32(size)))
-    scene = replace(plain, means=plain.means * np.float32(size), log_scales=log_scales)
+    scene = replace(plain, means=plain.means * np.float32(size))
+    for each in (scene.log_scales, scene.log_thickness):
+        each += min(0, np.log(np.float32(size)))
     write_splats(tmp_path / "a.spz", scene)
     found, wanted = GaussianScene.load(tmp_path / "a.spz").rotated(HALF_TURN), scene.rotated(HALF_TURN)
     farthest = float(np.abs(wanted.means).max())

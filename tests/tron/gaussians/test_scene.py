@@ -98,3 +98,13 @@ def test_broken_scenes_are_refused_by_name(random_scene, field, value, words):
     broken = dataclasses.replace(random_scene(), **{field: value})
     with pytest.raises(TronError, match=words):
         broken.validate()
+
+
+@pytest.mark.parametrize(
+    ("thickness", "said"), [(np.nan, "log_thickness of 1 of"), (0.0, "thicker than wide")]
+)
+def test_thickness_is_the_least_of_three_deviations(random_scene, thickness, said):
+    scene = random_scene()
+    scene.log_thickness[3] = thickness
+    with pytest.raises(TronError, match=said):
+        scene.validate()

@@ -269,6 +269,7 @@ def enclosed(scene: GaussianScene, bounds: Bounds, curve: ToneCurve) -> Gaussian
         "roughness": np.full(count, _ROUGHNESS),
         "metallic": np.zeros(count),
         "object_id": np.zeros(count),
+        "log_thickness": np.full(count, -np.inf),
     }
     return replace(scene, **{name: np.concatenate([getattr(scene, name), new[name]]) for name in new})
 

@@ -2,11 +2,12 @@
 
 A splat of 3DGS is drawn as the Gaussian that its covariance projects to (Zwicker et al. 2001, EWA splatting;
 Kerbl et al. 2023), in the order of centres' depths. The same picture comes of a disk through the centre that
-is parallel to the image plane: rays meet all points of it at one depth. With a and b the splat's two axes
-projected into the plane at distance 1, by the Jacobian of the projection at its centre, and k the pixel
-variance in that plane,
+is parallel to the image plane: rays meet all points of it at one depth. With a, b and c the splat's two axes
+and its thickness projected into the plane at distance 1, by the Jacobian of the projection at its centre, k
+the pixel variance in that plane, and L = a_y^2 + b_y^2 + c_y^2,
 
-    A = a_x^2 + b_x^2 + k_x    B = a_x a_y + b_x b_y    D = (a x b)^2 + k_x (a_y^2 + b_y^2) + k_y A
+    A = a_x^2 + b_x^2 + c_x^2 + k_x    B = a_x a_y + b_x b_y + c_x c_y
+    D = (a x b)^2 + (b x c)^2 + (c x a)^2 + k_x L + k_y A
     q = X^2 / A + (Y - X B / A)^2 A / D
 
 are the covariance's first row, its determinant without a difference of large numbers, which needles would
@@ -52,16 +53,17 @@ _AWAY = 1e-3
 
 
 def projected(
-    records: SurfelRecords, camera: Camera, projection: Projection, nearest: float
+    records: SurfelRecords, camera: Camera, projection: Projection, nearest: float, thickness: mi.Float
 ) -> SurfelRecords:
     """The surfels as disks that a camera sees as their projections, coloured as seen along their centres.
 
-    Differentiable in the records.
+    Differentiable in the records; the thickness is a constant.
 
     Args:
         records: disks in space. camera: the view.
         projection: of the program that the splats were learnt with.
         nearest: least depth of a centre that is seen, world units.
+        thickness: deviations along the normals, world units; disks of 2DGS have none.
     """
     eye = mi.Point3f([float(v) for v in camera.position])
     right, down, forward = (mi.Vector3f([float(v) for v in row]) for row in camera.world_to_camera[:3, :3])
@@ -81,10 +83,8 @@ def projected(
     u_axis, v_axis = (mi.Vector3f(*[axis[k] for k in range(3)]) for axis in (axis_u, axis_v))
     depth = dr.dot(forward, to_centre)
     seen = (depth >= near) & (axis_v.w >= 0)
-    facing = dr.dot(
-        dr.normalize(dr.cross(dr.normalize(u_axis), dr.normalize(v_axis))), dr.normalize(to_centre)
-    )
-    seen &= ~(facing > _AWAY)
+    normal = dr.normalize(dr.cross(dr.normalize(u_axis), dr.normalize(v_axis)))
+    seen &= ~(dr.dot(normal, dr.normalize(to_centre)) > _AWAY)
     z, opacity, pixel = dr.select(seen, depth, 1), centre.w, None
     if projection.larger:  # round: pixels that are not square are taken for squares as large
         along, across, pixel = u_axis, v_axis, forward * dr.sqrt(dr.sqrt(variance_x * variance_y))
@@ -92,17 +92,18 @@ def projected(
     else:
         x, y = (dr.clip(dr.dot(axis, to_centre) / z, -bend, bend) for axis in (right, down))
 
-        def flat(axis: mi.Vector3f) -> mi.Vector2f:
-            deviation = axis * (dr.rcp(dr.squared_norm(axis)) / z)
+        def flat(axis: mi.Vector3f, times: mi.Float) -> mi.Vector2f:
+            deviation = axis * (times / z)
             ahead = dr.dot(forward, deviation)
             shown = mi.Vector2f(dr.dot(right, deviation) - x * ahead, dr.dot(down, deviation) - y * ahead)
             length = dr.detach(dr.norm(shown))
             return shown * dr.select(length > _LARGEST, _LARGEST / length, 1)
 
-        a, b = flat(u_axis), flat(v_axis)
-        first = dr.fma(a.x, a.x, dr.fma(b.x, b.x, variance_x))
-        mixed, last = dr.fma(a.x, a.y, b.x * b.y), dr.fma(a.y, a.y, b.y * b.y)
-        own = dr.square(a.x * b.y - a.y * b.x)
+        a, b = (flat(axis, dr.rcp(dr.squared_norm(axis))) for axis in (u_axis, v_axis))
+        c = flat(normal, thickness)
+        first = variance_x + a.x * a.x + b.x * b.x + c.x * c.x
+        mixed, last = a.x * a.y + b.x * b.y + c.x * c.y, a.y * a.y + b.y * b.y + c.y * c.y
+        own = sum(dr.square(p.x * q.y - p.y * q.x) for p, q in ((a, b), (b, c), (c, a)))
         determinant = own + variance_x * last + variance_y * first
         if projection.compensated:
             opacity *= dr.sqrt(dr.maximum(own / determinant, _LEAST_KEPT))
