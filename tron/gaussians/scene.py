@@ -90,7 +90,7 @@ class GaussianScene:
 
     def __post_init__(self) -> None:
         # Flat scenes may be made of others of more or fewer surfels without a word of it.
-        if np.isneginf(self.log_thickness).all():
+        if len(self.log_thickness) != len(self.means) and np.isneginf(self.log_thickness).all():
             self.log_thickness = np.full(len(self.means), -np.inf)
         for name, described in FIELDS.items():
             setattr(self, name, np.ascontiguousarray(getattr(self, name), dtype=described.dtype))
