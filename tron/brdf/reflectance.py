@@ -31,6 +31,8 @@ from tron.estimation import Brdf
 DIELECTRIC_F0 = 0.04
 MOST_ALBEDO = 0.99
 """Largest albedo of a bounce: light dies out."""
+MOST_FRESNEL = 1.001
+"""Of base colors beyond 1, which a float image may hold: a little above 1, where white has its derivative."""
 LEAST_F0 = 1e-3
 """Of a lobe whose mean direction is asked for: black metal has one too."""
 LEAST_ALBEDO = 1e-3
@@ -83,7 +85,7 @@ class Layers:
         scale, bias, glass, whole = table(material.roughness, cosine)
         single = dr.maximum(scale + bias, LEAST_ALBEDO)
         of_glass = compensation(mi.Float(glass_fresnel()), single, whole)
-        of_metal = compensation(mean_fresnel(material.base_color), single, whole)
+        of_metal = compensation(dr.minimum(mean_fresnel(material.base_color), MOST_FRESNEL), single, whole)
         lobe, metallic = glass * of_glass, material.metallic
         return cls(
             material.base_color * (1 - metallic) * (1 - lobe),

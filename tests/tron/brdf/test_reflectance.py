@@ -126,3 +126,10 @@ def test_narrow_lobes_have_the_density_that_they_are_drawn_by(variant: str, alph
     distribution = alpha**2 / (np.pi * (alpha**2 * z**2 + x**2 + y**2) ** 2)
     exact = distribution / (2 * (cosine + np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2)))
     assert np.array(seen_density(view.z, half, mi.Float(alpha))) == pytest.approx(exact, rel=1e-3)
+
+
+def test_base_colors_beyond_one_make_no_lobe_endless(variant: str, material) -> None:
+    """A float image may hold some: at 2 a rough lobe's factor was in the thousands, and negative."""
+    roughness = np.linspace(0, 1, 101)
+    shares = reflectance(material(2.0, roughness, 1.0), BrdfTable.load(), mi.Float(0.5)).specular.x
+    assert 1.5 < np.array(shares).min() <= np.array(shares).max() < 2.1
