@@ -102,7 +102,7 @@ def _registered(_variant: str) -> None:
             """f n.l and the density of :meth:`sample`, of directions above the surface."""
             alpha, half = _alpha(material), dr.normalize(wi + wo)
             mirrored = fresnel(material, dr.dot(wi, half), layers=layers)
-            glossy, diffuse = seen_density(wi.z, half.z, alpha), dr.inv_pi * wo.z
+            glossy, diffuse = seen_density(wi.z, half, alpha), dr.inv_pi * wo.z
             value = mirrored * (glossy * unhidden(wi.z, wo.z, alpha)) + layers.body * diffuse
             return value, dr.lerp(diffuse, glossy, self.glossy_share(layers))
 

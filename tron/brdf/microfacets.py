@@ -32,20 +32,22 @@ def visible_normal(view: mi.Vector3f, alpha: mi.Float, u: mi.Point2f) -> mi.Vect
     return dr.normalize(mi.Vector3f(alpha * normal.x, alpha * normal.y, dr.maximum(normal.z, 1e-6)))
 
 
-def seen_density(view: mi.Float, half: mi.Float, alpha: mi.Float) -> mi.Float:
+def seen_density(view: mi.Float, half: mi.Vector3f, alpha: mi.Float) -> mi.Float:
     """Density by solid angle of directions that :func:`visible_normal` mirrors, D G_1(v) / (4 v_z).
 
     Args:
-        view, half: cosines of the view and of the half vector to the normal; of the view above 0.
+        view: its cosine to the normal, above 0.
+        half: half vector, unit, local.
         alpha: of the distribution.
     """
     return distribution(half, alpha) / (2 * (view + _slope(view, alpha)))
 
 
-def distribution(half: mi.Float, alpha: mi.Float) -> mi.Float:
-    """D at the half vector's cosine to the normal."""
+def distribution(half: mi.Vector3f, alpha: mi.Float) -> mi.Float:
+    """D at a half vector."""
     alpha2 = dr.square(alpha)
-    spread = dr.square(half) * (alpha2 - 1) + 1
+    # By its sine: 1 less the cosine's square has no digits left where a lobe is narrow.
+    spread = alpha2 * dr.square(half.z) + dr.square(half.x) + dr.square(half.y)
     return alpha2 / (dr.pi * dr.square(spread))
 
 

@@ -31,6 +31,10 @@ from tron.estimation import Brdf
 DIELECTRIC_F0 = 0.04
 MOST_ALBEDO = 0.99
 """Largest albedo of a bounce: light dies out."""
+MOST_FRESNEL = 1.001
+"""Of base colors beyond 1, which a float image may hold: a little above 1, where white has its derivative."""
+LEAST_F0 = 1e-3
+"""Of a lobe whose mean direction is asked for: black metal has one too."""
 LEAST_ALBEDO = 1e-3
 """Of the table's e, before it is divided by: at grazing angles a rough lobe has none."""
 
@@ -81,7 +85,7 @@ class Layers:
         scale, bias, glass, whole = table(material.roughness, cosine)
         single = dr.maximum(scale + bias, LEAST_ALBEDO)
         of_glass = compensation(mi.Float(glass_fresnel()), single, whole)
-        of_metal = compensation(mean_fresnel(material.base_color), single, whole)
+        of_metal = compensation(dr.minimum(mean_fresnel(material.base_color), MOST_FRESNEL), single, whole)
         lobe, metallic = glass * of_glass, material.metallic
         return cls(
             material.base_color * (1 - metallic) * (1 - lobe),
@@ -164,10 +168,10 @@ def lobe_mean(
     normal, to_camera = mi.Vector3f(normal), mi.Vector3f(to_camera)
     cosine = dr.dot(normal, to_camera)
     f0 = dr.lerp(DIELECTRIC_F0, mi.luminance(material.base_color), material.metallic)
-    mean = table.mean_direction(material.roughness, cosine, f0)
-    aside = cosine * normal - to_camera
-    aside *= dr.rsqrt(dr.maximum(dr.squared_norm(aside), 1e-12))
-    return mean.x * aside + mean.y * normal
+    mean = table.mean_direction(material.roughness, cosine, dr.maximum(f0, LEAST_F0))
+    # A normal that is seen from behind mirrors away from the surface too.
+    mirrored = (cosine + dr.abs(cosine)) * normal - to_camera
+    return mean.x * mirrored + mean.y * normal
 
 
 def _f0(material: Material) -> mi.Color3f:

@@ -3,9 +3,9 @@
     A, B    of F0 A + B, the albedo of a GGX mirror with Schlick's Fresnel: the split sum (Karis 2013)
     G       albedo of the same mirror on glass of index 1.5, whose F0 is 0.04, with Fresnel's own equations
     E       A + B, the albedo of a perfect mirror, averaged over cosine-distributed n.v
-    T, N    of F0 (T_A, N_A) + (T_B, N_B), the same integral of the directions themselves: along the surface,
-            away from the view, and along the normal. Over the albedo it is the lobe's mean direction, the
-            shorter the wider the lobe
+    R, N    of F0 (R_A, N_A) + (R_B, N_B), the same integral of the directions themselves: along the mirror's
+            direction, and along the normal besides. Over the albedo it is the lobe's mean direction, the
+            shorter the wider the lobe. A mirror has none along the normal, whatever the angle
 
 Light that meets one facet is counted alone; :mod:`tron.brdf.reflectance` gives the rest back. G is above
 0.04 A + B by up to 0.02: Schlick's Fresnel is 0.07 at 60 degrees, where glass mirrors 0.09.
@@ -31,7 +31,7 @@ GLASS_INDEX = 1.5
 
 @cache
 def brdf_table() -> np.ndarray:
-    """(roughness, n.v, 8) float32: A, B, G, E (the same for every n.v), T_A, N_A, T_B, N_B. Once a process.
+    """(roughness, n.v, 8) float32: A, B, G, E (the same for every n.v), R_A, N_A, R_B, N_B. Once a process.
 
     Entry (i, j) is of roughness i / 255 and n.v = (j + 1/2) / 256. By midpoint quadrature over the visible
     normals (Heitz 2018, "Sampling the GGX Distribution of Visible Normals").
@@ -73,7 +73,9 @@ def _directional_albedo(cosine: mi.Float, alpha: mi.Float) -> tuple[mi.Float, ..
         total += share
         i += 1
     mean_scale, mean_bias = mean_scale / total, mean_bias / total
-    means = (-mean_scale.x, mean_scale.z, -mean_bias.x, mean_bias.z)
+    # Both parts are smooth where the surface is faced. Its tangent away from the view is not defined there.
+    mirrored_a, mirrored_b = -mean_scale.x / view.x, -mean_bias.x / view.x
+    means = (mirrored_a, mean_scale.z - cosine * mirrored_a, mirrored_b, mean_bias.z - cosine * mirrored_b)
     return scale / total, bias / total, glass / total, *means
 
 
@@ -84,7 +86,7 @@ class BrdfTable:
     Attributes:
         texels: A, B, G and E, row-major.
         means: the same of each roughness, averaged over cosine-distributed n.v.
-        directions: T_A, N_A, T_B and N_B, row-major.
+        directions: R_A, N_A, R_B and N_B, row-major.
     """
 
     texels: mi.Float
@@ -110,18 +112,17 @@ class BrdfTable:
         return dr.lerp(upper, lower, fy)
 
     def mean_direction(self, roughness: mi.Float, cosine: mi.Float, f0: mi.Float) -> mi.Vector2f:
-        """Mean of the directions of a lobe's light: along the surface away from the view, and the normal.
+        """Mean of the directions of a lobe's light: along the mirror's direction, and the normal besides.
 
         Args:
             roughness, cosine: as of :meth:`__call__`.
-            f0: reflectance at the normal.
+            f0: reflectance at the normal, above 0.
 
-        Returns: the shorter the wider the lobe, 1 of a mirror.
+        Returns: factors on the two unit vectors; 1 and 0 of a mirror.
         """
         scale, bias, _, _ = self(roughness, cosine)
-        along_a, up_a, along_b, up_b = _looked_up(self.directions, roughness, cosine)
-        albedo = dr.maximum(f0 * scale + bias, 1e-4)
-        return mi.Vector2f(f0 * along_a + along_b, f0 * up_a + up_b) / albedo
+        mirrored_a, up_a, mirrored_b, up_b = _looked_up(self.directions, roughness, cosine)
+        return mi.Vector2f(f0 * mirrored_a + mirrored_b, f0 * up_a + up_b) / (f0 * scale + bias)
 
 
 @cache

@@ -182,7 +182,7 @@ class Lobe:
         """Density of :meth:`draw`, by solid angle, of a local direction above the surface."""
         half = dr.normalize(out + self.view)
         share = unhidden(self.view.z, dr.maximum(out.z, 0), self.alpha)
-        return seen_density(self.view.z, half.z, self.alpha) * share / self.albedo
+        return seen_density(self.view.z, half, self.alpha) * share / self.albedo
 
 
 def _weights(

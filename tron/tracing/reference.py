@@ -230,8 +230,8 @@ def transmittance(
 
     Front faces count from t = 0, back faces beyond ``BACK_FACE_SPACINGS`` spacings (never, if one-sided),
     which are the scene's, and larger by as much as the surfel's radius is larger than the median. Nearer than
-    that, fronts that face against ``normals`` (P, 3) of the surface that rays leave do not count within
-    ``SHEET_SPACINGS`` spacings of their plane (if two-sided).
+    two of a surfel's own spacings, smaller where it is, fronts that face against ``normals`` (P, 3) of the
+    surface that rays leave do not count within ``SHEET_SPACINGS`` of their plane (if two-sided).
     """
     hit, blocks, nearby = _blocking(scene, origins, directions, two_sided, normals)
     product = np.where(blocks, 1 - hit.alpha, 1.0).prod(1)
@@ -263,16 +263,14 @@ def _blocking(
     origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
     hit = _meet(scene, origins, directions)
     radii = hit.radius[hit.radius > 0]
-    larger = np.maximum(hit.radius / (np.median(radii) if len(radii) else 1.0), 1)
-    reach = BACK_FACE_SPACINGS * scene.spacing * larger
+    own = BACK_FACE_SPACINGS * scene.spacing * hit.radius / (np.median(radii) if len(radii) else 1.0)
+    reach = np.maximum(own, BACK_FACE_SPACINGS * scene.spacing)
     blocks = hit.counted & np.where(hit.front, hit.t > 0, two_sided & (hit.t > reach))
     starts = np.where(hit.front, np.abs(hit.t), np.abs(hit.t - reach))
     if normals is not None and two_sided:
-        along, sheet = normals @ hit.normal.T, SHEET_SPACINGS / BACK_FACE_SPACINGS * reach
-        blocks &= ~(hit.front & (along < -AGAINST) & (hit.aside < sheet) & (hit.t <= reach))
-        near = np.minimum(
-            np.abs(along + AGAINST), np.minimum(np.abs(hit.aside - sheet), np.abs(hit.t - reach))
-        )
+        along, sheet = normals @ hit.normal.T, SHEET_SPACINGS / BACK_FACE_SPACINGS * own
+        blocks &= ~(hit.front & (along < -AGAINST) & (hit.aside < sheet) & (hit.t <= own))
+        near = np.minimum(np.abs(along + AGAINST), np.minimum(np.abs(hit.aside - sheet), np.abs(hit.t - own)))
         starts = np.minimum(starts, np.where(hit.front, near, np.inf))
     nearby = np.minimum(hit.margin, np.where(hit.counted, starts, np.inf)).min(1, initial=np.inf)
     return hit, blocks, nearby

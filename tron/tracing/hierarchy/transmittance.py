@@ -8,7 +8,8 @@ median, their spacing is larger by as much (:class:`BackFaces`).
 Front faces block from t = 0, but for those of a thin sheet's other side. Its surfels lie back to back with
 those that a ray leaves, and jitter puts some on the wrong side: the ray meets their front. They face against
 the surface that it leaves, and its origin is next to their plane: within three quarters of a spacing, such a
-front nearer than those two spacings along the ray does not block.
+front nearer than two along the ray does not block. Those spacings are the surfel's own, smaller where
+it is: fine things in a coarse scene have gaps of less than the scene's.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ OPAQUE_TRANSMITTANCE = 1e-2
 BACK_FACE_SPACINGS = 2.0
 SHEET_SPACINGS = 0.75
 """Distance of a ray's origin from the plane of a front face within which that may be a sheet's other side."""
-AGAINST = 0.5
+AGAINST = 0.7
 """Least cosine, negated, between the normals of a sheet's sides."""
 
 
@@ -74,7 +75,8 @@ class BackFaces:
 
     Attributes:
         distance: from the ray's origin, world units, for surfels up to the median size.
-        radii: from the ray's origin, in radii of the surfel, for larger ones; infinity in both for never.
+        radii: from the ray's origin, in radii of the surfel, for larger ones, and for a sheet's other side of
+            all; infinity in both for never.
     """
 
     distance: mi.Float
@@ -100,11 +102,11 @@ def blocks(hit: SurfelHit, back_faces: BackFaces, normal: mi.Vector3f) -> mi.Boo
     far = dr.select(local > back_faces.distance, local, back_faces.distance)
     # By squares, for a stored normal is not unit: the origin's distance from the plane, the angle between.
     length2, aside, along = dr.squared_norm(hit.normal), hit.t * hit.facing, dr.dot(hit.normal, normal)
-    sheet = SHEET_SPACINGS / BACK_FACE_SPACINGS * far
+    sheet = SHEET_SPACINGS / BACK_FACE_SPACINGS * local
     other_side = (
         (along < 0) & (along * along > AGAINST**2 * length2) & (aside * aside < sheet * sheet * length2)
     )
-    before = hit.front & (hit.t > 0) & ~(other_side & (far < dr.inf))
+    before = hit.front & (hit.t > 0) & ~(other_side & (hit.t <= local) & (local < dr.inf))
     return hit.within & (before | (hit.t > far))
 
 
