@@ -7,7 +7,7 @@ median, their spacing is larger by as much (:class:`BackFaces`).
 
 Front faces block from t = 0, but for those of a thin sheet's other side. Its surfels lie back to back with
 those that a ray leaves, and jitter puts some on the wrong side: the ray meets their front. They face against
-the surface that it leaves, and its origin is next to their plane: within three quarters of a spacing, such a
+the surface that it leaves, and its origin is next to their plane: within half a spacing, such a
 front nearer than two along the ray does not block. Those spacings are the surfel's own, smaller where
 it is: fine things in a coarse scene have gaps of less than the scene's.
 """
@@ -28,7 +28,7 @@ from tron.tracing.kernel import GEOMETRY_PACKETS, RADIUS, SurfelHit, SurfelRecor
 OPAQUE_TRANSMITTANCE = 1e-2
 """Below this a ray counts as blocked: the result is exactly 0, whatever the order of the hits was."""
 BACK_FACE_SPACINGS = 2.0
-SHEET_SPACINGS = 0.75
+SHEET_SPACINGS = 0.5
 """Distance of a ray's origin from the plane of a front face within which that may be a sheet's other side."""
 AGAINST = 0.7
 """Least cosine, negated, between the normals of a sheet's sides."""

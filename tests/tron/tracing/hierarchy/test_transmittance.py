@@ -64,12 +64,12 @@ def test_front_faces_block_from_zero_and_back_faces_beyond_two_spacings(shadows,
 @pytest.mark.parametrize(
     ("height", "direction", "leaves", "left"),
     [
-        (0.05, (0, 0, 1), (0, 0, 1), 1.0),
+        (0.03, (0, 0, 1), (0, 0, 1), 1.0),
         (0.15, (0, 0, 1), (0, 0, 1), 0.2),
-        (0.05, (0.99, 0, 0.141), (0, 0, 1), 0.2),  # beyond two spacings along the ray
-        (0.05, (0, 0, 1), (1, 0, 0), 0.2),  # a corner
-        (0.05, (0, 0, 1), (0.766, 0, 0.643), 0.2),  # a crevice of 50 degrees
-        (0.05, (0, 0, 1), (0, 0, 0), 0.2),  # the ray leaves no surface
+        (0.03, (0.99, 0, 0.141), (0, 0, 1), 0.2),  # beyond two spacings along the ray
+        (0.03, (0, 0, 1), (1, 0, 0), 0.2),  # a corner
+        (0.03, (0, 0, 1), (0.766, 0, 0.643), 0.2),  # a crevice of 50 degrees
+        (0.03, (0, 0, 1), (0, 0, 0), 0.2),  # the ray leaves no surface
     ],
 )
 def test_fronts_against_the_surface_that_a_ray_leaves_are_a_sheets_other_side(
@@ -87,7 +87,7 @@ def test_fronts_against_the_surface_that_a_ray_leaves_are_a_sheets_other_side(
 @pytest.mark.parametrize(("radius", "left"), [(0.05, 0.2), (0.2, 1.0), (0.4, 1.0)])
 def test_a_sheet_is_as_thin_as_its_own_surfels_are_small(disks, radius: float, left: float) -> None:
     """The gap is half the scene's spacing, two of the smallest surfels': fine things had no shadow in it."""
-    scene = disks([[0, 0, 0.05], [3, 0, 0], [4, 0, 0]], [True] * 3, opacity=0.8, sigma=0.2)
+    scene = disks([[0, 0, 0.03], [3, 0, 0], [4, 0, 0]], [True] * 3, opacity=0.8, sigma=0.2)
     scene.log_scales[0] = np.log(radius)
     (found,) = SurfelTracer(scene).transmittances(
         mi.Point3f(0), [mi.Vector3f(0, 0, 1)], [mi.Bool(True)], mi.Vector3f(0, 0, 1)
