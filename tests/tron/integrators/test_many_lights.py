@@ -149,8 +149,8 @@ def test_paths_end_where_those_of_path_do(depth):
 
 
 @pytest.mark.long
-def test_nothing_is_lost_by_two_thousandths():
-    agree(together(3, 1024, 16), one_by_one(1024, 16), bias=0.002)
+def test_nothing_is_lost_by_four_thousandths():
+    agree(together(3, 1024, 16), one_by_one(1024, 16), bias=0.004)
 
 
 def test_a_white_room_under_white_light_is_white():
