@@ -143,6 +143,15 @@ def test_photographs(variant, tmp_path: Path):
     pictures(tmp_path / "a.jpg")
 
 
+@pytest.mark.long
+@pytest.mark.skipif(
+    "TRON_BLENDER_PYTHON" not in os.environ, reason="TRON_BLENDER_PYTHON names no Python that has bpy"
+)
+def test_blender(shared_data: Path, tmp_path: Path):
+    run("blender.py", shared_data, Path(os.environ["TRON_BLENDER_PYTHON"]), tmp_path / "a.jpg")
+    pictures(tmp_path / "a.jpg")
+
+
 def test_every_script_of_a_picture_is_run():
     tested = re.findall(r'run\("(\w+\.py)"', Path(__file__).read_text())
     assert sorted(tested) == SCRIPTS
