@@ -124,7 +124,9 @@ class SplitSum:
         return self._level(self._at_rest(mi.Vector3f(normal)), self._last + 1)
 
     def reflected(self, normal: mi.Vector3f, to_camera: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
-        """Mean radiance over the unoccluded lobe; times F0 A + B it is the specular reflection.
+        """Mean radiance over the unoccluded lobe, along the mirror's direction as the paper looks it up.
+
+        Times F0 A + B it is the specular reflection; rough lobes are elsewhere (:meth:`averaged`).
 
         Args:
             normal, to_camera: unit, world.
@@ -134,7 +136,7 @@ class SplitSum:
         return self.prefiltered(2 * dr.dot(normal, to_camera) * normal - to_camera, roughness)
 
     def averaged(self, mean: mi.Vector3f) -> mi.Color3f:
-        """Mean radiance over a lobe whose directions have the mean ``mean``, world: as wide as that is short.
+        """Mean radiance, linear, over a lobe whose directions have the mean ``mean``, world: wide where short.
 
         It is looked up where the lobe of a level has the same first moment. That is neither along the
         mirror's direction nor of the surface's roughness: lobes lean to the normal, the horizon cuts them.

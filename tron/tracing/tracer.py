@@ -236,6 +236,7 @@ def _fans(
     active: Sequence[mi.Bool],
     normal: mi.Vector3f | None,
 ) -> Fans:
+    """Rays of a surface, or of none."""
     return Fans(origin, directions, active) if normal is None else Fans(origin, directions, active, normal)
 
 

@@ -24,7 +24,7 @@ from datagen.sources.synthetic import make_scene
 from datagen.world.scene import SceneSpec
 from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
-from tron.estimation import FINAL
+from tron.estimation import FINAL, MATERIAL
 from tron.gaussians.scene import GaussianScene
 from tron.io.images import read_image, write_image
 from tron.shards.manifest import Manifest
@@ -49,6 +49,7 @@ def test_a_dataset_is_whole_and_has_everything_beside_its_shards(dataset):
     assert verify(dataset) == []
     assert validate(dataset) == 0
     manifest = Manifest.load(dataset)
+    assert manifest.material == MATERIAL
     assert manifest.splits() == ["test", "train", "train_b"]
     assert sum(entry.samples for entry in manifest.shards) == 7
     for name in (

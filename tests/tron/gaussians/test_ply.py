@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from tron.color import srgb_to_linear
 from tron.errors import TronError
-from tron.gaussians.ply import MATERIAL_PROPERTIES
+from tron.estimation import MATERIAL
+from tron.gaussians.ply import MATERIAL_PROPERTIES, header_comments
 from tron.gaussians.scene import GaussianScene
 from tron.seeds import generator
 
@@ -278,3 +279,9 @@ def test_a_broken_scene_leaves_no_file(scene, tmp_path):
     with pytest.raises(TronError, match="means"):
         scene.save(tmp_path / "a.ply")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scene_names_the_material_that_it_is_drawn_with(scene, tmp_path):
+    scene.save(tmp_path / "a.ply")
+    assert f"tron material {MATERIAL}" in header_comments(tmp_path / "a.ply")
+    GaussianScene.load(tmp_path / "a.ply")  # no number, as other comments of ours are

@@ -21,7 +21,7 @@ GAINS: Mapping[Quality, Mapping[int, float]] = {
     "preview": {128: 0.83, 256: 0.60, 512: 0.55},
     "final": {128: 0.22, 256: 0.29, 512: 0.30},
 }
-"""Quality -> width of square frames, pixels -> dB."""
+"""Quality -> width of square frames, pixels -> dB. Those of 512 were measured on the material of before."""
 
 
 def quality_of(supersample: int, reflections: int) -> Quality:

@@ -82,6 +82,7 @@ class _Lanes:
 
     @property
     def normal(self) -> mi.Vector3f:
+        """Unit, world, of the surfels."""
         return mi.Vector3f(self.frame.n)
 
 
@@ -147,7 +148,7 @@ class SurfelRays:
             dr.eval(lane, there)  # else where they stand in the kernels depends on what was computed before
             for ray, directions, seeds, lanes in other._fans(dr.gather(mi.UInt32, surfel, lane), there):
                 hits = tracer.first_hits(
-                    lanes.origin, directions, [there] * len(directions), seeds, mi.Vector3f(lanes.frame.n)
+                    lanes.origin, directions, [there] * len(directions), seeds, lanes.normal
                 )
                 for k, hit in enumerate(hits):
                     dr.scatter(met, _code(hit), (ray + k) * some + lane)
@@ -186,9 +187,7 @@ class SurfelRays:
         for part in parts(self.tracer):
             for ray, directions, seeds, lanes in self._fans(part.surfel, part.gbuffer.opacity > 0, track):
                 active = [lanes.active] * len(directions)
-                hits = self.tracer.first_hits(
-                    lanes.origin, directions, active, seeds, mi.Vector3f(lanes.frame.n)
-                )
+                hits = self.tracer.first_hits(lanes.origin, directions, active, seeds, lanes.normal)
                 for k, hit in enumerate(hits):
                     dr.scatter(met, _code(hit), (ray + k) * self._count + lanes.surfel, lanes.active)
                 dr.eval(met)
@@ -229,9 +228,7 @@ class SurfelRays:
             ray = which // self._count
             lanes = self._lanes(surfel, dr.full(mi.Bool, True, dr.width(lane)))
             direction, seed = self._ray(lanes, ray)
-            (hit,) = self.tracer.first_hits(
-                lanes.origin, [direction], [lanes.active], [seed], mi.Vector3f(lanes.frame.n)
-            )
+            (hit,) = self.tracer.first_hits(lanes.origin, [direction], [lanes.active], [seed], lanes.normal)
             dr.scatter(self.met, _code(hit), ray * self._count + surfel)
             dr.eval(self.met)
 
