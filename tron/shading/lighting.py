@@ -136,7 +136,7 @@ class SplitSum:
         return self.prefiltered(2 * dr.dot(normal, to_camera) * normal - to_camera, roughness)
 
     def averaged(self, mean: mi.Vector3f) -> mi.Color3f:
-        """Mean radiance, linear, over a lobe whose directions have the mean ``mean``, world: wide where short.
+        """Mean linear radiance over a lobe whose directions have the mean ``mean``, world: wide where short.
 
         It is looked up where the lobe of a level has the same first moment. That is neither along the
         mirror's direction nor of the surface's roughness: lobes lean to the normal, the horizon cuts them.
