@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tron.cameras import Camera
+from tron.estimation import MATERIAL
 from tron.seeds import generator
 from tron.shards.manifest import Manifest
 from tron.shards.schema import TARGET, Clip, ClipMeta, clip_members, light_members
@@ -135,7 +136,7 @@ def write_dataset() -> Callable[..., Path]:
                             members = [_without_references(frame) for frame in members]
                         writer.write(meta, members)
             entries += writer.entries
-        Manifest(config_sha256="0" * 64, shards=entries).save(folder)
+        Manifest(config_sha256="0" * 64, shards=entries, material=MATERIAL).save(folder)
         return folder
 
     return write

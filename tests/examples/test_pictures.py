@@ -11,6 +11,7 @@ import pytest
 import trimesh
 
 from tron.cameras import Camera
+from tron.estimation import MATERIAL
 from tron.gaussians import GaussianScene
 from tron.io.images import read_image, write_image
 from tron.seeds import generator
@@ -45,7 +46,7 @@ def drawn_split(folder: Path, split: str, clips: dict[str, int], size: int) -> N
                 color_space=dict.fromkeys((*light_members(), TARGET), "linear"),
             )  # fmt: skip
             writer.write(meta, [frame(rng, size) for _ in range(frames)])
-    Manifest(config_sha256="0" * 64, shards=writer.entries).save(folder)
+    Manifest(config_sha256="0" * 64, shards=writer.entries, material=MATERIAL).save(folder)
 
 
 def frame(rng: np.random.Generator, size: int) -> dict[str, np.ndarray]:

@@ -19,6 +19,7 @@ import pytest
 import yaml
 
 from tron import seeds
+from tron.estimation import MATERIAL
 from tron.shards.manifest import Manifest
 from tron.shards.schema import TARGET, ClipMeta, guidance_members, light_members
 from tron.shards.writer import ShardWriter
@@ -236,7 +237,7 @@ def dataset(tmp_path_factory) -> Path:
             one = np.ones((16, 16, 1), np.float32)
             colours = dict.fromkeys((*guidance_members(), TARGET), noise)
             writer.write(meta, [{**colours, "mask": one, "foreground": one}])
-    Manifest(config_sha256="0" * 64, shards=writer.entries).save(folder)
+    Manifest(config_sha256="0" * 64, shards=writer.entries, material=MATERIAL).save(folder)
     return folder
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tron import seeds
+from tron.estimation import MATERIAL
 from tron.shards.manifest import Manifest
 from tron.shards.schema import GUIDANCE, TARGET, ClipMeta, ColorSpace, guidance_members
 from tron.shards.writer import ShardWriter
@@ -54,7 +55,7 @@ def write_dataset(
                 )
                 writer.write(meta, [_frame(random, size, width) for _ in range(frames)])
         entries += writer.entries
-    Manifest(config_sha256="0" * 64, shards=entries).save(folder)
+    Manifest(config_sha256="0" * 64, shards=entries, material=MATERIAL).save(folder)
     return folder
 
 
