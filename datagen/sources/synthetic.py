@@ -200,12 +200,12 @@ def make_surfels(
     made = settings.surfel_budget(spec.split, spec.index)
     seen = _seen(spec, geometry, spec.views(made.views, made.view_width, made.view_height))
     if not made.refine_steps:
-        return surfels_from_gbuffers(seen, count=made.surfels), None
+        return surfels_from_gbuffers(seen, count=made.surfels, detail=True), None
     recipe = settings.split(spec.split)
     folder = scene_folder(settings.output_dir, spec.name)
     seed = integer(spec.seed, spec.split, spec.index, "refinement")
     with ViewSpool(folder) as shown, ViewSpool(folder) as judges:
-        surfels = surfels_from_gbuffers(shown.passing(seen), count=made.surfels)
+        surfels = surfels_from_gbuffers(shown.passing(seen), count=made.surfels, detail=True)
         # Judged at the size that they are made for, which windows show a part of.
         side = made.view_width if recipe.window_of else recipe.width
         cameras = spec.clip(0, recipe.frames, side, round(side * recipe.height / recipe.width))

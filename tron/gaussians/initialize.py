@@ -3,7 +3,8 @@
 All pixels of all views are samples of the surface. A uniform grid, in which a cell also tells apart objects
 and the six directions a surface can face, gathers them; each occupied cell becomes one surfel with the mean
 position, normal and material of its samples. The cell size follows from the wanted count by bisection. A
-surfel's scale is a fixed fraction of the distance to its neighbours on the same sheet.
+surfel's scale is a fixed fraction of the distance to its neighbours on the same sheet, or, with ``detail``,
+of its cell's sides, and cells are halved where they would blur most (:mod:`tron.gaussians.cells`).
 """
 
 from __future__ import annotations
@@ -18,8 +19,14 @@ from scipy.special import logit
 from tron.cameras import Camera
 from tron.color import linear_to_srgb
 from tron.errors import TronError
+from tron.gaussians import cells
 from tron.gaussians.harmonics import SH_COUNT, rgb_to_dc
-from tron.gaussians.scene import GaussianScene, neighbour_distances, quats_from_normals
+from tron.gaussians.scene import (
+    GaussianScene,
+    neighbour_distances,
+    quats_from_matrices,
+    quats_from_normals,
+)
 
 # Fractions of a cell by which the grid is moved: with a cell boundary at 0, a flat floor at z = 0 would fall
 # into two layers of cells by rounding alone.
@@ -77,6 +84,8 @@ def surfels_from_gbuffers(
     scale: float = 0.4,
     opacity: float = 0.99,
     up: Sequence[float] = (0.0, 0.0, 1.0),
+    *,
+    detail: bool = False,
 ) -> GaussianScene:
     """A scene of about ``count`` surfels through the surfaces that the views see.
 
@@ -93,6 +102,8 @@ def surfels_from_gbuffers(
             face the same way; it belongs to the degree: 0.4 for 4, 0.6 for 2.
         opacity: of every surfel, in (0, 1).
         up: (3,) unit, world.
+        detail: surfels are smaller where base color, normals or materials vary, larger elsewhere, and have
+            the shape of what they stand for. It takes half as long again.
 
     Raises:
         TronError: no view sees a surface, maps disagree in shape or are not finite, or only some of the views
@@ -103,7 +114,7 @@ def surfels_from_gbuffers(
     samples = _gather(views, count)
     if not len(samples.weight):
         raise TronError("no view sees any surface, so there are no surfels to make")
-    return _surfels(samples, count, kernel_degree, scale, opacity, up)
+    return _surfels(samples, count, kernel_degree, scale, opacity, up, detail)
 
 
 def surfels_from_points(
@@ -124,26 +135,41 @@ def surfels_from_points(
     """
     given = {name: np.asarray(array, np.float32) for name, array in values.items()}
     number = len(given["position"])
-    samples = _Samples(given, np.ones(number), np.full(number, object_id, np.int64))
+    samples = Samples(given, np.ones(number), np.full(number, object_id, np.int64))
     return _surfels(samples, count, kernel_degree, scale, opacity, up)
 
 
 def _surfels(
-    samples: _Samples, count: int, kernel_degree: int, scale: float, opacity: float, up: Sequence[float]
+    samples: Samples,
+    count: int,
+    kernel_degree: int,
+    scale: float,
+    opacity: float,
+    up: Sequence[float],
+    detail: bool = False,
 ) -> GaussianScene:
     has_rgb = "rgb" in samples.values
-    samples = samples.merged(_cell_size(samples, count))
+    of_grid = round(cells.GRID_SHARE * count) if detail else count
+    cell = samples.cells(_cell_size(samples, of_grid))
+    if detail:
+        cell = cells.halved(samples, cell, count)
+    every, samples = samples, samples.merged(cell)
     means, normals = samples.values["position"], samples.values["normal"]
     distances = _sheet_distances(means, normals)
     spacing = float(np.median(distances)) or _extent(means) or 1.0
-    sigma = scale * np.clip(distances, 1e-3 * spacing, SCALE_CAP * spacing)
+    distances = np.clip(distances, 1e-3 * spacing, SCALE_CAP * spacing)
+    if detail:
+        frames, sides = cells.axes(every, cell, samples, distances)
+        quats = quats_from_matrices(frames)
+    else:
+        quats, sides = quats_from_normals(normals), np.repeat(distances[:, None], 2, axis=1)
     base_color = np.clip(samples.values["base_color"], 0, 1)
     sh = np.zeros((len(means), SH_COUNT, 3))
     sh[:, 0] = rgb_to_dc(samples.values["rgb"] if has_rgb else linear_to_srgb(base_color))
     return GaussianScene(
         means=means,
-        quats=quats_from_normals(normals),
-        log_scales=np.repeat(np.log(sigma)[:, None], 2, axis=1),
+        quats=quats,
+        log_scales=np.log(scale * sides),
         opacity_logits=np.full(len(means), logit(opacity)),
         sh=sh,
         base_color=base_color,
@@ -157,7 +183,7 @@ def _surfels(
 
 
 @dataclass
-class _Samples:
+class Samples:
     """N surface samples: mean values[name] (N, C) float32 of weight (N,) pixels each, and object_id (N,)."""
 
     values: dict[str, np.ndarray]
@@ -175,23 +201,28 @@ class _Samples:
             key = key * size + digit
         return key
 
-    def merged(self, cell: float) -> _Samples:
-        """One sample for each key, ordered by it: weighted means, normals unit again."""
-        _, first, index = np.unique(self.keys(cell), return_index=True, return_inverse=True)
+    def cells(self, size: float) -> np.ndarray:
+        """(N,) number of each one's cell in a grid of that size, by the order of :meth:`keys`."""
+        return np.unique(self.keys(size), return_inverse=True)[1]
+
+    def merged(self, index: np.ndarray) -> Samples:
+        """One sample for each number of ``index`` (N,): weighted means, normals unit again."""
         weight = np.bincount(index, self.weight)
+        owner = np.empty(len(weight), np.int64)
+        owner[index] = self.object_id
         values = {}
         for name, value in self.values.items():
             sums = [np.bincount(index, self.weight * channel) for channel in value.T]
             values[name] = (np.stack(sums, axis=-1) / weight[:, None]).astype(np.float32)
         values["normal"] /= np.linalg.norm(values["normal"], axis=1, keepdims=True)
-        return _Samples(values, weight, self.object_id[first])
+        return Samples(values, weight, owner)
 
     @staticmethod
-    def joined(parts: Sequence[_Samples]) -> _Samples:
+    def joined(parts: Sequence[Samples]) -> Samples:
         """One of all parts, which lose their values to it, channel by channel: both never lie in memory."""
         names = list(parts[0].values)
         values = {name: np.concatenate([part.values.pop(name) for part in parts]) for name in names}
-        return _Samples(
+        return Samples(
             values,
             np.concatenate([part.weight for part in parts]),
             np.concatenate([part.object_id for part in parts]),
@@ -207,10 +238,10 @@ def _bound(count: int) -> int:
     return max(_SAMPLES_AT_ONCE, 3 * _FINE**2 * count)
 
 
-def _gather(views: Iterable[GBufferView], count: int) -> _Samples:
+def _gather(views: Iterable[GBufferView], count: int) -> Samples:
     """All samples of all views; beyond a bound they are merged in cells much finer than the surfels'."""
     bound = _bound(count)
-    parts: list[_Samples] = []
+    parts: list[Samples] = []
     held, with_rgb, index = 0, 0, -1
     for index, view in enumerate(views):
         part = _samples(view, index)
@@ -224,16 +255,16 @@ def _gather(views: Iterable[GBufferView], count: int) -> _Samples:
         held += len(part.weight)
         if held > bound:
             # The cell size only grows with what is still to be seen, so these cells stay fine enough.
-            everything = _Samples.joined(parts)
-            parts = [everything.merged(_cell_size(everything, count) / _FINE)]
+            everything = Samples.joined(parts)
+            parts = [everything.merged(everything.cells(_cell_size(everything, count) / _FINE))]
             held = len(parts[0].weight)
             del everything
     if index < 0:
         raise TronError("no views to make surfels from")
-    return _Samples.joined(parts)
+    return Samples.joined(parts)
 
 
-def _samples(view: GBufferView, index: int) -> _Samples:
+def _samples(view: GBufferView, index: int) -> Samples:
     height, width = view.valid.shape
     valid = np.asarray(view.valid, dtype=bool)
     values = {}
@@ -255,10 +286,10 @@ def _samples(view: GBufferView, index: int) -> _Samples:
     object_id = np.asarray(view.object_id)[valid]
     if len(object_id) and not 0 <= object_id.min() <= object_id.max() < _OBJECTS:
         raise TronError(f"an object_id of view {index} is outside 0..{_OBJECTS - 1}")
-    return _Samples(values, np.ones(len(lengths)), object_id.astype(np.int64))
+    return Samples(values, np.ones(len(lengths)), object_id.astype(np.int64))
 
 
-def _cell_size(samples: _Samples, count: int) -> float:
+def _cell_size(samples: Samples, count: int) -> float:
     """The cell size, world units, for which about `count` cells are occupied.
 
     A surface occupies cells in proportion to the inverse square of their size: the next size follows from
