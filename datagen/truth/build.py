@@ -23,6 +23,7 @@ from datagen.settings.command import Settings
 from datagen.truth import texels
 from datagen.world.lights import LightChoice
 from datagen.world.materials import PhotographedSpec
+from datagen.world.materials.material import Unsaid
 from datagen.world.materials.photographed import Photographed
 from datagen.world.motion import Pose, Share
 from datagen.world.scene import SceneSpec, draw_scene
@@ -145,6 +146,8 @@ def build(
                             "give its folder as textures=...",
                         )
                     material = photographed(material)
+                if item.unsaid:
+                    material = Unsaid(material)
                 solids.append(_Solid(texels.Surface(*split_creases(mesh), material), matrix, number))
             continue
         parts = (models or {}).get(str(item.asset))

@@ -15,13 +15,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from datagen.world.materials import Appearance
+from datagen.world.materials.material import Evaluated
 
 log = logging.getLogger(__name__)
 
@@ -41,12 +41,6 @@ ANGLES = 16
 """Orientations tried for the smallest box around a chart, over a right angle."""
 
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
-
-
-class Evaluated(Protocol):
-    """Source of the look at points (N, 3) of unit normals (N, 3)."""
-
-    def evaluate(self, points: np.ndarray, normals: np.ndarray) -> Appearance: ...
 
 
 class Surface(NamedTuple):

@@ -42,6 +42,8 @@ class ObjectSpec(Spec):
         shape, materials: the shape and what its slots are made of.
         asset: id of a user's model, where there is no shape.
         size: radius in world units of the ball around its origin that it just fits.
+        unsaid: its materials' metallic and roughness are 1 whatever they look like, which is what glTF means
+            by a file that names neither (2.0, 3.9.2).
         placement: from its frame to the world.
     """
 
@@ -49,4 +51,5 @@ class ObjectSpec(Spec):
     materials: tuple[MaterialSpec, ...] = ()
     asset: str | None = None
     size: Number
+    unsaid: bool = False
     placement: Placement

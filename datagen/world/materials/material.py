@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple, Self
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -48,6 +49,24 @@ class Material(Spec):
     def evaluate(self, points: np.ndarray, normals: np.ndarray) -> Appearance:
         """Appearance at points (N, 3) of unit normals (N, 3), the object's frame, world units."""
         raise NotImplementedError
+
+
+class Evaluated(Protocol):
+    """Source of the look at points (N, 3) of unit normals (N, 3)."""
+
+    def evaluate(self, points: np.ndarray, normals: np.ndarray) -> Appearance: ...
+
+
+@dataclass(frozen=True)
+class Unsaid:
+    """A material of a file that names its base color and relief alone: metal of roughness 1 (glTF 2.0)."""
+
+    of: Evaluated
+
+    def evaluate(self, points: np.ndarray, normals: np.ndarray) -> Appearance:
+        """See :meth:`Material.evaluate`."""
+        seen = self.of.evaluate(points, normals)
+        return seen._replace(roughness=np.ones_like(seen.roughness), metallic=np.ones_like(seen.metallic))
 
 
 class Look(NamedTuple):

@@ -1,4 +1,4 @@
-"""Bare metal: brushed, scratched, hammered or cast, its colour the reflectance measured of it."""
+"""Bare metal: brushed, scratched, hammered, cast or blasted, its colour the reflectance measured of it."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ REFLECTANCES: dict[str, Triple] = {
 """Linear reflectance at normal incidence, after Lagarde, "Feeding a physically based shading model" (2011),
 the brightest 0.05 to 0.1 lower for what air leaves on them."""
 
-Finish = Literal["brushed", "scratched", "hammered", "cast"]
-FINISHES: tuple[Finish, ...] = ("brushed", "scratched", "hammered", "cast")
+Finish = Literal["brushed", "scratched", "hammered", "cast", "blasted"]
+FINISHES: tuple[Finish, ...] = ("brushed", "scratched", "hammered", "cast", "blasted")
 
 
 class MetalSpec(Solid):
@@ -69,6 +69,7 @@ class MetalSpec(Solid):
             "scratched": (0.15, 0.4),
             "hammered": (0.15, 0.45),
             "cast": (0.4, 0.7),
+            "blasted": (0.65, 0.95),
         }
         return cls(
             offset=draw_offset(rng),

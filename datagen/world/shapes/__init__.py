@@ -16,6 +16,7 @@ from datagen.world.shapes.lathes import LATHES
 from datagen.world.shapes.plants import PLANTS
 from datagen.world.shapes.primitives import PRIMITIVES
 from datagen.world.shapes.shape import Kind, Piece, Role, ShapeSpec, fit, frame, split_creases
+from datagen.world.shapes.sheets import SHEETS
 from datagen.world.shapes.solids import Parts
 from datagen.world.shapes.surroundings import SURROUNDINGS, Standing
 from datagen.world.shapes.wires import WIRES
@@ -46,6 +47,7 @@ SHAPES: dict[str, Kind] = {
     **WIRES,
     **PLANTS,
     **CLOTH,
+    **SHEETS,
     **FURNITURE,
     **SURROUNDINGS,
 }

@@ -1,4 +1,4 @@
-"""Plants: leaves with a thickness on stems, branches and in pots; tufts of grass."""
+"""Plants: leaves on stems, branches and in pots, with a thickness or without; tufts of grass."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from datagen.world.shapes.solids import (
     Parts,
     between,
     count,
+    layers,
     rod,
     sheet,
     smooth_profile,
@@ -24,16 +25,15 @@ GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 """Angle between one leaf and the next around a stem (phyllotaxis)."""
 
 
-def leaf(
-    length: float, width: float, droop: float, fold: float, thickness: float, grid: tuple[int, int] = (15, 7)
-) -> Manifold:
-    """Leaf from the origin along x, its upper side towards z: pointed, folded at its midrib, bent down.
+def blade(
+    length: float, width: float, droop: float, fold: float, grid: tuple[int, int] = (15, 7)
+) -> np.ndarray:
+    """Grid (n, m, 3) of a leaf from the origin along x, its upper side towards z: pointed, folded, bent down.
 
     Args:
         length, width: of the blade.
         droop: angle in radians by which the tip is lower than the base.
         fold: angle in radians by which each half rises from the midrib.
-        thickness: of the blade.
         grid: points along and across it; across an odd number.
     """
     n, m = grid
@@ -44,19 +44,28 @@ def leaf(
     x = np.concatenate([[0.0], np.cumsum(step * np.cos(angle[1:]))])
     z = -np.concatenate([[0.0], np.cumsum(step * np.sin(angle[1:]))])
     lift = np.abs(u) * half * np.sin(fold)
-    points = np.stack(
+    return np.stack(
         [x[:, None] + lift * np.sin(angle)[:, None], u * half * np.cos(fold), z[:, None] + lift], -1
     )
-    return sheet(points, thickness)
+
+
+def leaf(
+    length: float, width: float, droop: float, fold: float, thickness: float, grid: tuple[int, int] = (15, 7)
+) -> Manifold:
+    """Leaf of a thickness about a :func:`blade`."""
+    return sheet(blade(length, width, droop, fold, grid), thickness)
+
+
+def _turn(azimuth: float, rise: float, roll: float = 0.0) -> np.ndarray:
+    return Rotation.from_euler("ZYX", [azimuth, -rise, roll]).as_matrix()
 
 
 def _placed(solid: Manifold, at: np.ndarray, azimuth: float, rise: float, roll: float = 0.0) -> Manifold:
-    turn = Rotation.from_euler("ZYX", [azimuth, -rise, roll]).as_matrix()
-    return solid.transform(np.column_stack([turn, at]))
+    return solid.transform(np.column_stack([_turn(azimuth, rise, roll), at]))
 
 
-def plant(p: np.ndarray, rng: np.random.Generator) -> Parts:
-    """Pot with soil, stems that lean outwards, leaves around each in the golden angle."""
+def _potted(p: np.ndarray, rng: np.random.Generator) -> tuple[Parts, list[tuple[np.ndarray, np.ndarray]]]:
+    """Pot with soil and stems that lean outwards; a blade and where it goes (3, 4) for each of its leaves."""
     high = between(p[0], 0.6, 0.95)
     pot = vessel(smooth_profile([0.0, 0.8 * high, 0.81 * high, high], [0.42, 0.6, 0.68, 0.7], 40), 0.06)
     soil = turned(
@@ -76,9 +85,22 @@ def plant(p: np.ndarray, rng: np.random.Generator) -> Parts:
             place = 0.35 + 0.65 * (k + 1) / 9
             at = np.array([np.interp(place, t, path[:, d]) for d in range(3)])
             size = long * rng.uniform(0.7, 1.1) * (1.15 - 0.5 * place)
-            blade = leaf(size, slim * size, rng.uniform(0.4, 1.3), rng.uniform(0.1, 0.4), 0.012)
-            leaves.append(_placed(blade, at, azimuth + k * GOLDEN, rng.uniform(0.0, 0.9), rng.normal(0, 0.2)))
-    return [(pot, 0), (soil, 1), (union(stems), 2), (union(leaves), 3)]
+            points = blade(size, slim * size, rng.uniform(0.4, 1.3), rng.uniform(0.1, 0.4))
+            turn = _turn(azimuth + k * GOLDEN, rng.uniform(0.0, 0.9), rng.normal(0, 0.2))
+            leaves.append((points, np.column_stack([turn, at])))
+    return [(pot, 0), (soil, 1), (union(stems), 2)], leaves
+
+
+def plant(p: np.ndarray, rng: np.random.Generator) -> Parts:
+    """Potted plant, its leaves around each stem in the golden angle."""
+    parts, leaves = _potted(p, rng)
+    return [*parts, (union([sheet(points, 0.012).transform(place) for points, place in leaves]), 3)]
+
+
+def foliage(p: np.ndarray, rng: np.random.Generator) -> Parts:
+    """The same whose leaves are layers without a thickness."""
+    parts, leaves = _potted(p, rng)
+    return [*parts, (layers([points @ place[:, :3].T + place[:, 3] for points, place in leaves]), 3)]
 
 
 def branch(p: np.ndarray, rng: np.random.Generator) -> Parts:
@@ -150,6 +172,7 @@ def tree(p: np.ndarray, rng: np.random.Generator) -> Parts:
 
 PLANTS: dict[str, Kind] = {
     "plant": Kind(plant, upright=True, roles=("ceramic", "ground", "bark", "leaf")),
+    "foliage": Kind(foliage, upright=True, roles=("ceramic", "ground", "bark", "leaf")),
     "branch": Kind(branch, upright=True, roles=("bark", "leaf")),
     "grass": Kind(grass, upright=True, roles=("leaf",)),
     "tree": Kind(tree, upright=True, roles=("bark", "leaf")),

@@ -203,6 +203,21 @@ def slab(top: np.ndarray, bottom: np.ndarray) -> Manifold:
     return closed(vertices, np.concatenate([faces, faces[:, ::-1] + under, *sides]))
 
 
+def layers(grids: Iterable[np.ndarray]) -> Trimesh:
+    """Sheets without a thickness through grids of points (n, m, 3), none sharing a vertex with another."""
+    vertices, faces, first = [], [], 0
+    for points in grids:
+        n, m = points.shape[:2]
+        index = first + np.arange(n * m).reshape(n, m)
+        a, b, c, d = (
+            part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:])
+        )
+        faces += [np.column_stack([a, b, c]), np.column_stack([a, c, d])]
+        vertices.append(points.reshape(-1, 3))
+        first += n * m
+    return Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
+
+
 def _triple(vector: np.ndarray) -> tuple[float, float, float]:
     x, y, z = vector
     return float(x), float(y), float(z)

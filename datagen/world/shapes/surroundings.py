@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from manifold3d import Manifold
 from scipy.ndimage import map_coordinates
+from scipy.spatial import KDTree
 from trimesh import Trimesh
 
 from datagen.world.shapes.shape import Kind
@@ -16,6 +17,7 @@ from datagen.world.shapes.solids import (
     Parts,
     between,
     count,
+    layers,
     rounded_box,
     slab,
     smooth_profile,
@@ -28,6 +30,9 @@ WALL = 0.2
 
 TERRAIN = 113
 """Points a side of a terrain's grid."""
+
+COBBLES = 161
+"""Points a side of the grid of a paved floor: four or more a stone."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,24 @@ def floor(_p: np.ndarray, _rng: np.random.Generator) -> Parts:
     """A square in the plane z = 0; its half side is its size over the root of two."""
     corners = [[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]]
     return [(Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False), 0)]
+
+
+def cobbles(p: np.ndarray, rng: np.random.Generator) -> Parts:
+    """The same square paved with stones, their tops at z = 0 or less: relief that is geometry."""
+    pitch, depth = between(p[0], 0.06, 0.13), between(p[1], 0.008, 0.03)
+    line = np.arange(-1.0 - pitch, 1.0 + 2 * pitch, pitch)
+    stones = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
+    stones += between(p[2], 0.15, 0.45) * pitch * rng.uniform(-1.0, 1.0, stones.shape)
+    sunk, tilt = rng.random(len(stones)), rng.normal(0.0, 0.3, stones.shape)
+    line = np.linspace(-1.0, 1.0, COBBLES)
+    grid = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1)
+    (first, second), nearest = (found.transpose(2, 0, 1) for found in KDTree(stones).query(grid, k=2))
+    stone = nearest[0]
+    rim = np.clip((second - first) / (between(p[3], 0.3, 0.8) * pitch), 0.0, 1.0)
+    leant = ((grid - stones[stone]) * tilt[stone]).sum(axis=-1) / pitch
+    top = -depth * np.clip(0.2 * (sunk[stone] + leant), 0.0, 1.0)
+    heights = -depth + (top + depth) * np.sqrt(rim * (2.0 - rim))
+    return [(layers([np.concatenate([grid, heights[..., None]], axis=-1)]), 0)]
 
 
 def _top_sides(p: np.ndarray) -> tuple[float, float, float]:
@@ -229,6 +252,7 @@ def _terrain_space(p: np.ndarray, rng: np.random.Generator) -> Standing:
 
 SURROUNDINGS: dict[str, Surrounding] = {
     "floor": Surrounding(floor, upright=True, roles=("ground",), seeded=False),
+    "cobbles": Surrounding(cobbles, upright=True, roles=("stone",)),
     "table_top": Surrounding(
         table_top,
         upright=True,

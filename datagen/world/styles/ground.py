@@ -11,6 +11,7 @@ from datagen.world.styles.things import (
     CRATES,
     FOUND,
     GREEN,
+    SHEETS,
     STONEWORK,
     WIRE,
     Choice,
@@ -43,7 +44,7 @@ def ground(streams: Streams, choice: Choice) -> Composition:
     low, high = choice.objects or COUNT
     number = int(rng.integers(low, high + 1))
     large = (number + 2) // 3
-    groups = (STONEWORK, FOUND, GREEN, CRATES, WIRE)
+    groups = (STONEWORK, FOUND, GREEN, CRATES, WIRE, SHEETS)
     things = draw_things(rng, (large, large), (*groups, ("tree", "bench", "chair")), LARGE, choice)
     things += draw_things(rng, (number - large, number - large), groups, SMALL, choice)
     rest = settle(streams("layout"), [thing.body for thing in things], land.ground, radius=REACH)

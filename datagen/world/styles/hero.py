@@ -12,6 +12,7 @@ from datagen.world.styles.things import (
     GREEN,
     HARDWARE,
     PAPER,
+    SHEETS,
     SIMPLE,
     SOFT,
     STONEWORK,
@@ -27,10 +28,16 @@ from datagen.world.styles.things import (
     top_of,
 )
 
-GROUPS = (VESSELS, HARDWARE, TOYS, SIMPLE, PAPER, FOUND, SOFT, GREEN, WIRE, FURNITURE, STONEWORK, ("tree",))
+GROUPS = (
+    *(VESSELS, HARDWARE, TOYS, SIMPLE, PAPER, FOUND, SOFT, GREEN, WIRE, FURNITURE, STONEWORK, ("tree",)),
+    *(SHEETS, SHEETS),
+)
 SIZE = (0.9, 1.3)
 FLOOR = 2.4
 """Half side of the floor, world units."""
+
+UNDER = ("floor", "floor", "floor", "cobbles")
+"""What it stands on, one as likely as another."""
 
 
 def hero(streams: Streams, choice: Choice) -> Composition:
@@ -40,7 +47,8 @@ def hero(streams: Streams, choice: Choice) -> Composition:
         TronError: nothing came to rest.
     """
     things = draw_things(streams("objects"), choice.objects or (1, 1), GROUPS, SIZE, choice)
-    floor = fixture(streams("surroundings"), "floor", FLOOR * np.sqrt(2.0), choice)
+    rng = streams("surroundings")
+    floor = fixture(rng, UNDER[int(rng.integers(len(UNDER)))], FLOOR * np.sqrt(2.0), choice)
     rest = settle(streams("layout"), [thing.body for thing in things], floor.ground, radius=0.3 * len(things))
     objects, left_out = placed(things, rest)
     target = (0.0, 0.0, 0.5 * top_of(objects))

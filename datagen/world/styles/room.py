@@ -15,6 +15,7 @@ from datagen.world.styles.things import (
     FURNITURE,
     GREEN,
     PAPER,
+    SHEETS,
     SOFT,
     VESSELS,
     Choice,
@@ -48,7 +49,7 @@ def room(streams: Streams, choice: Choice) -> Composition:
     large = (number + 1) // 2
     things = draw_things(rng, (large, large), (FURNITURE,), LARGE, choice)
     things += draw_things(
-        rng, (number - large, number - large), (CRATES, GREEN, PAPER, SOFT, VESSELS), SMALL, choice
+        rng, (number - large, number - large), (CRATES, GREEN, PAPER, SHEETS, SOFT, VESSELS), SMALL, choice
     )
     reach = 0.8 * float(np.abs([*shell.ground.low[:2], *shell.ground.high[:2]]).min())
     rest = settle(streams("layout"), [thing.body for thing in things], shell.ground, radius=reach)

@@ -12,6 +12,7 @@ from datagen.world.styles.things import (
     GREEN,
     HARDWARE,
     PAPER,
+    SHEETS,
     SIMPLE,
     SOFT,
     TOYS,
@@ -25,14 +26,20 @@ from datagen.world.styles.things import (
     placed,
 )
 
-GROUPS = (VESSELS, VESSELS, HARDWARE, TOYS, SIMPLE, PAPER, FOUND, SOFT, GREEN, WIRE, CRATES)
+GROUPS = (VESSELS, VESSELS, HARDWARE, TOYS, SIMPLE, PAPER, FOUND, SOFT, GREEN, WIRE, CRATES, SHEETS, SHEETS)
 SIZE = (0.28, 0.7)
 COUNT = (4, 9)
 REACH = 1.3
 """Radius of the disk that things are dropped over, world units."""
 
 TARGET = (0.0, 0.0, 0.25)
-UNDER = (("floor", 2.8 * 2**0.5), ("table_top", 2.6), ("round_table", 2.9), ("backdrop", 3.4))
+UNDER = (
+    ("floor", 2.8 * 2**0.5),
+    ("cobbles", 2.8 * 2**0.5),
+    ("table_top", 2.6),
+    ("round_table", 2.9),
+    ("backdrop", 3.4),
+)
 """What things stand on, and how large it is."""
 
 

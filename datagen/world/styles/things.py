@@ -30,10 +30,15 @@ PAPER = ("book", "books", "parcel", "carton")
 FOUND = ("rock", "pebble", "fruit", "pumpkin", "sponge", "coral")
 SOFT = ("cushion", "rumpled", "folded", "draped")
 GREEN = ("plant", "branch", "grass")
+SHEETS = ("card", "throw", "open_box", "screen", "foliage")
 WIRE = ("grille", "basket", "cage", "lantern")
 FURNITURE = ("chair", "stool", "table", "bench", "shelf", "sofa", "cabinet", "floor_lamp")
 CRATES = ("crate", "carton", "basket", "stool", "desk_lamp")
 STONEWORK = ("rock", "arch", "baluster", "urn", "drilled")
+
+UNSAID = 0.1
+"""Share of things of which nothing is said of metal and roughness (:class:`ObjectSpec`), where the recipe
+names no materials: exporters leave it out, and scans and conversions by hand never had it."""
 
 
 class Fixture(NamedTuple):
@@ -48,7 +53,7 @@ class Thing:
     """A thing that has no place yet.
 
     Attributes:
-        shape, materials, asset, size: as an ObjectSpec has them.
+        shape, materials, asset, size, unsaid: as an ObjectSpec has them.
         body: what it comes to rest with.
     """
 
@@ -57,6 +62,7 @@ class Thing:
     asset: str | None
     size: float
     body: Body
+    unsaid: bool = False
 
     def at(self, placement: Placement) -> ObjectSpec:
         """The object that it is at a place."""
@@ -65,6 +71,7 @@ class Thing:
             materials=self.materials,
             asset=self.asset,
             size=self.size,
+            unsaid=self.unsaid,
             placement=placement,
         )
 
@@ -97,7 +104,8 @@ def draw_thing(
     kind = SHAPES[shape.kind]
     materials = tuple(draw_material(rng, role, large=large, families=choice.materials) for role in kind.roles)
     pieces = [piece.mesh for piece in make_pieces(shape, COARSE_EDGE)]
-    return Thing(shape, materials, None, shape.size, Body(pieces, upright=kind.upright))
+    unsaid = not choice.materials and rng.random() < UNSAID
+    return Thing(shape, materials, None, shape.size, Body(pieces, upright=kind.upright), unsaid)
 
 
 def fixture(

@@ -22,7 +22,7 @@ def draw(seed=0, split="train", index=0, **changes):
 
 def test_a_specification_is_the_same_bytes_on_every_machine():
     text = draw().to_json()
-    assert hashlib.sha256(text.encode()).hexdigest()[:16] == "6f7afcccc270f024", (
+    assert hashlib.sha256(text.encode()).hexdigest()[:16] == "915a656e32a6a928", (
         "the distribution changed: is that meant?"
     )
 

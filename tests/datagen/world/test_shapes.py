@@ -38,6 +38,8 @@ from datagen.world.shapes.solids import (
 from tron.errors import TronError
 from tron.seeds import generator
 
+OPEN = {"foliage": {3}, "card": {0}, "throw": {0}, "open_box": {0}, "screen": {0}, "cobbles": {0}}
+"""Slots of kinds that are sheets of single polygons."""
 NEW = [kind for kind in SHAPES if kind not in PRIMITIVES and kind != "floor"]
 EDGE = 0.2
 HALF = (0.5, 0.5, 0.5, 0.5)
@@ -66,9 +68,13 @@ def check(shape):
     assert np.linalg.norm(vertices, axis=1).max() == pytest.approx(shape.size, rel=1e-9)
     np.testing.assert_allclose(vertices.max(axis=0), -vertices.min(axis=0), atol=1e-9 * shape.size)
     for mesh, slot in pieces:
-        assert mesh.is_watertight
         assert mesh.is_winding_consistent
-        assert mesh.volume > 0
+        if slot in OPEN.get(shape.kind, ()):
+            assert not mesh.is_watertight
+            assert np.bincount(mesh.faces_unique_edges.ravel()).max() <= 2
+        else:
+            assert mesh.is_watertight
+            assert mesh.volume > 0
         assert len(mesh.faces) <= MOST_TRIANGLES
         assert 0 <= slot < len(SHAPES[shape.kind].roles)
     return pieces
@@ -250,7 +256,7 @@ def test_cloth_lies_outside_of_what_it_is_draped_over_and_keeps_its_threads():
         assert cloth.bounds[1, 2] > body.bounds[1, 2]
 
 
-@pytest.mark.parametrize("kind", [kind for kind in SURROUNDINGS if kind != "floor"])
+@pytest.mark.parametrize("kind", [kind for kind in SURROUNDINGS if kind not in ("floor", "cobbles")])
 def test_things_stand_on_the_surface_where_the_mesh_has_it(kind):
     for seed in range(3):
         shape = drawn(kind, seed, 4.0)
@@ -274,6 +280,18 @@ def test_a_floor_is_flat_and_things_stand_on_it():
     assert (mesh.vertices[:, 2] == 0.0).all()
     np.testing.assert_allclose(mesh.face_normals, np.tile([0.0, 0.0, 1.0], (len(mesh.faces), 1)))
     np.testing.assert_allclose([space.low[:2], space.high[:2]], mesh.bounds[:, :2])
+
+
+def test_cobbles_are_relief_that_things_stand_on_top_of():
+    for seed in range(3):
+        shape = drawn("cobbles", seed, 4.0)
+        space, mesh = standing(shape), make_pieces(shape, np.inf)[0].mesh
+        top, low = mesh.vertices[:, 2].max(), mesh.vertices[:, 2].min()
+        assert space.low[2] - 0.01 < top <= space.low[2] + 1e-9
+        assert 0.015 < top - low < 0.1, "world units, under stones of 0.2"
+        slopes = np.degrees(np.arccos(np.clip(mesh.face_normals[:, 2], -1, 1)))
+        assert (mesh.face_normals[:, 2] > 0).all()
+        assert 5 < np.average(slopes, weights=mesh.area_faces) < 40
 
 
 def test_a_room_is_a_shell_with_openings_that_let_light_in():
