@@ -9,14 +9,10 @@ as wide as its samples are spread.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from tron.color import linear_to_srgb
-
-if TYPE_CHECKING:
-    from tron.gaussians.initialize import Samples
+from tron.gaussians.samples import Samples
 
 GRID_SHARE = 0.8
 """Share of the surfels that are cells of the grid before any is halved."""

@@ -93,8 +93,8 @@ def cobbles(p: np.ndarray, rng: np.random.Generator) -> Parts:
     sunk, tilt = rng.random(len(stones)), rng.normal(0.0, 0.3, stones.shape)
     line = np.linspace(-1.0, 1.0, COBBLES)
     grid = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1)
-    (first, second), nearest = (found.transpose(2, 0, 1) for found in KDTree(stones).query(grid, k=2))
-    stone = nearest[0]
+    distances, nearest = KDTree(stones).query(grid, k=2)
+    first, second, stone = distances[..., 0], distances[..., 1], np.asarray(nearest)[..., 0]
     rim = np.clip((second - first) / (between(p[3], 0.3, 0.8) * pitch), 0.0, 1.0)
     leant = ((grid - stones[stone]) * tilt[stone]).sum(axis=-1) / pitch
     top = -depth * np.clip(0.2 * (sunk[stone] + leant), 0.0, 1.0)

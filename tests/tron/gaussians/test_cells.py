@@ -8,7 +8,8 @@ import pytest
 from tests.tron.gaussians.test_initialize import ring, view
 from tron.gaussians import cells
 from tron.gaussians.fields import FIELDS
-from tron.gaussians.initialize import Samples, surfels_from_gbuffers
+from tron.gaussians.initialize import surfels_from_gbuffers
+from tron.gaussians.samples import Samples
 from tron.seeds import generator
 from tron.tracing import SurfelTracer
 

@@ -9,7 +9,7 @@ import pytest
 from tron.cameras import Camera
 from tron.color import linear_to_srgb
 from tron.errors import TronError
-from tron.gaussians import initialize
+from tron.gaussians import initialize, samples
 from tron.gaussians.fields import FIELDS
 from tron.gaussians.harmonics import dc_to_rgb
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
@@ -90,7 +90,7 @@ def test_rounding_does_not_split_a_flat_floor_in_two(monkeypatch):
         return np.quantile(neighbour_distances(scene.means, neighbours=1), 0.05) / scene.spacing
 
     assert closest(surfels_from_gbuffers(views, count=1000)) > 0.4
-    monkeypatch.setattr(initialize, "GRID_SHIFT", np.zeros(3))
+    monkeypatch.setattr(samples, "GRID_SHIFT", np.zeros(3))
     assert closest(surfels_from_gbuffers(views, count=1000)) < 0.2  # the law can fail
 
 
