@@ -81,7 +81,7 @@ PEERS |= MESHES
 ASKED_FOR = {
     ("tron.apps.relight.command", "tron.neural.weights"),
     ("tron.apps.relight.clip", "tron.neural.renderer"),
-    ("tron.apps.view", "tron.neural.weights"),  # where the extra `network` is installed
+    ("tron.view.opening", "tron.neural.weights"),  # where the extra `network` is installed
     ("tron.view.finishing", "tron.neural.renderer"),
     ("tron.apps.relight.scan_materials", "tron.reconstruction.film"),
     ("tron.apps.relight.scan_materials", "tron.reconstruction.materials.carried"),

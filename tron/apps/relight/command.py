@@ -30,7 +30,6 @@ from tron.apps.relight.camera_files import (
     stated,
 )
 from tron.apps.relight.clip import DEPTH, Clip, trace
-from tron.apps.relight.network_gains import expected_gain, quality_of
 from tron.apps.relight.scan_materials import proxy_file, with_materials
 from tron.apps.relight.settings import Settings
 from tron.apps.relit import RelitPicture
@@ -53,7 +52,7 @@ from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
 from tron.io.recognised import refuse_by_sight
 from tron.neural.clips import check_frames
-from tron.neural.shipped import DEFAULT, SHIPPED, checkpoint_file
+from tron.neural.shipped import DEFAULT, SHIPPED, checkpoint_file, expected_gain, quality_of
 from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
 from tron.shards.schema import GUIDANCE
 from tron.storage import locked, require_free_space, sha256, write_atomic
@@ -362,7 +361,7 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     A checkpoint that was asked for has to fit. That of checkpoint=auto gives way with a line in the log:
     where the libraries of networks or its file are not installed; where nothing bounces and it is given lit;
     where radiance is asked for, which a network does not draw; where Open Image Denoise is; and where it does
-    not surely gain at that size and quality (:mod:`tron.apps.relight.network_gains`). Where window, overlap,
+    not surely gain at that size and quality (:mod:`tron.neural.shipped`). Where window, overlap,
     reproject or weights are chosen, it has to fit too.
 
     Raises:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from tron.apps.capture_light import LIGHT
-from tron.apps.machine import Variant
 from tron.apps.relight.camera_files import CAMERAS, cameras_of, frame_size
 from tron.apps.relit import Background
 from tron.apps.scene_file import SeenAs, Up
@@ -17,10 +16,11 @@ from tron.apps.surroundings import DESCRIPTION, Treatment
 from tron.color import Look
 from tron.editing.models import PlacedModel
 from tron.errors import TronError
-from tron.estimation import FINAL, FINEST, PREVIEW, Brdf, Estimation, Estimator, require_bounces
+from tron.estimation import FINAL, QUALITY, Brdf, Estimation, Estimator, require_bounces
 from tron.neural.clips import Overlap
 from tron.neural.configs import check_sizes
 from tron.neural.shipped import AUTO, DEFAULT, SHIPPED
+from tron.runtime import Variant
 from tron.shards.schema import guidance_members, light_members
 from tron.trajectories import TrajectoryName
 
@@ -36,8 +36,6 @@ else:
     BufferName = Literal[BUFFERS]
 LONGER_SIDE = 512
 """Pixels of the longer side of a frame, unless the settings say it."""
-
-QUALITY = {"preview": PREVIEW, "final": FINEST}
 
 ProxyChoice = Literal["auto", "always", "never"]
 Side = Annotated[int, Field(ge=8, le=8192)]
