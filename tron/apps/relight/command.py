@@ -46,9 +46,8 @@ from tron.editing.motion import Motion
 from tron.editing.moving import in_motion
 from tron.errors import TronError, located
 from tron.framing import upright
-from tron.gaussians.foreign_files import refuse_foreign
+from tron.gaussians.formats.registry import check_header, refuse_foreign
 from tron.gaussians.kept import KeptFiles
-from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
 from tron.io.recognised import refuse_by_sight
 from tron.neural.clips import check_frames
