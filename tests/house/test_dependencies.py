@@ -93,7 +93,7 @@ ASKED_FOR = {
     ("tron.tracing.meshes", "tron.models.surfels"),
     ("tron.apps.export", "tron.meshing.textures"),  # where a mesh is made: the same extra
     ("tron.apps.export", "tron.models.write"),
-    ("tron.apps.camera_formats", "tron.captures.formats.colmap"),  # pycolmap, of the extra `surfels`
+    ("tron.io.cameras.colmap", "tron.io.colmap"),  # pycolmap, of the extra `surfels`
     ("tron.reconstruction.priors.rgbx", "diffusers"),
     ("tron.reconstruction.priors.rgbx", "transformers"),
 }

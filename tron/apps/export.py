@@ -9,8 +9,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.apps.camera_formats import UPRIGHT, check_camera_file, write_camera_file
-from tron.apps.relight.camera_files import cameras_of, filmed_with, in_frame_of
+from tron.apps.relight.camera_files import filmed_with, in_frame_of
 from tron.apps.scene_file import SeenAs, Up, check_output, check_scene_files, load_scene
 from tron.apps.splat_file import SceneFile
 from tron.apps.surroundings import treat_surroundings
@@ -23,6 +22,7 @@ from tron.gaussians.edit import KERNEL_WIDTHS
 from tron.gaussians.formats.registry import WRITTEN
 from tron.gaussians.scene import GaussianScene
 from tron.gaussians.splat_files import check_suffix, write_points, write_splats
+from tron.io.cameras.registry import UPRIGHT, cameras_of, check_camera_file, write_camera_file
 from tron.io.local_frame import moved_cameras
 from tron.runtime import Threads, Variant, activate
 from tron.trajectories import turn_cameras

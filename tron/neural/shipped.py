@@ -1,23 +1,13 @@
 """Checkpoints that come with the package, by name. Loads no torch.
 
 Their files lie in the folder `shipped` beside this one as NAME.safetensors; its README has a model card each.
-``checkpoint=auto`` takes the network where it gains on validation scenes, by size and quality.
 """
 
 from __future__ import annotations
 
-import logging
-import math
-from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
-from typing import Literal
-
-import numpy as np
 
 from tron.errors import TronError
-
-log = logging.getLogger(__name__)
 
 FOLDER = Path(__file__).with_name("shipped")
 SHIPPED = {
@@ -25,26 +15,10 @@ SHIPPED = {
     "paper": "of pbr and irradiance, the paper's buffers",
 }
 """Name -> what the network is given."""
-FORMER_NAMES = {"lit": "surfaces", "pair": "paper"}
-"""Name that a checkpoint had in version 0.1 -> its name; these go with the next release."""
 DEFAULT = "surfaces"
 """The one that ``auto`` means."""
 AUTO = "auto"
 """What tron-relight is told unless it is told otherwise: :data:`DEFAULT` where that fits, otherwise none."""
-
-Quality = Literal["preview", "final"]
-
-GAINS: Mapping[Quality, Mapping[int, float]] = {
-    "preview": {128: 0.83, 256: 0.60, 512: 0.55},
-    "final": {128: 0.22, 256: 0.29, 512: 0.30},
-}
-"""Quality -> width of square frames, pixels -> dB; those of 512 were measured on the material of before.
-
-They are foreground PSNR of ``surfaces`` less that of ``lit`` on procedural scenes that neither trained nor
-judge it: lower ends of the intervals over scenes (95 % of six at 128, the worst of four and three at 256 and
-512), for a gain that is not sure is none. ``tron-eval benchmark=renderer benchmark.parts=[validation]``
-measures them anew; whoever ships another checkpoint writes its own here.
-"""
 
 
 def installed() -> dict[str, Path]:
@@ -75,31 +49,4 @@ def checkpoint_file(checkpoint: str | Path) -> Path:
     this installation.
     """
     name = str(checkpoint)
-    if name in FORMER_NAMES:
-        _say_renamed(name)
-    name = FORMER_NAMES.get(name, name)
     return shipped(name) if name in SHIPPED else Path(checkpoint)
-
-
-@cache
-def _say_renamed(name: str) -> None:
-    log.warning(
-        "checkpoint '%s' is called '%s' now; the old name goes with the next release",
-        name,
-        FORMER_NAMES[name],
-    )
-
-
-def quality_of(supersample: int, reflections: int) -> Quality:
-    """The one of the two that a frame is like: final where it has sub-pixels, or rays for reflections."""
-    return "final" if supersample > 1 or reflections > 0 else "preview"
-
-
-def expected_gain(quality: Quality, width: int, height: int) -> float:
-    """What the network gains over lit at least, dB, between the sizes of GAINS by the logarithm of the side.
-
-    The side is that of a square of as many pixels. Beyond the sizes that were measured the nearest holds.
-    """
-    known = GAINS[quality]
-    side = math.log2(math.sqrt(width * height))
-    return float(np.interp(side, [math.log2(each) for each in known], list(known.values())))

@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 
 from tron.estimation import QUALITY
-from tron.neural import shipped
-from tron.neural.shipped import GAINS, expected_gain, quality_of
+from tron.neural import network_gains
+from tron.neural.network_gains import GAINS, expected_gain, quality_of
 
 
 @pytest.fixture(autouse=True)
 def measured(monkeypatch):
-    monkeypatch.setattr(shipped, "GAINS", {"preview": {128: 2.0, 512: -1.0}, "final": {128: 1.0, 512: 0.5}})
+    monkeypatch.setattr(
+        network_gains, "GAINS", {"preview": {128: 2.0, 512: -1.0}, "final": {128: 1.0, 512: 0.5}}
+    )
 
 
 def test_a_size_between_two_gains_what_lies_between_by_octaves():

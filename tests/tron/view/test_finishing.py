@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tron.color import agx
-from tron.neural import shipped
+from tron.neural import network_gains
 from tron.neural.shipped import DEFAULT, installed
 from tron.seeds import generator
 from tron.view import opening
@@ -102,7 +102,7 @@ def test_the_network_is_waited_for_no_longer_than_somebody_looks(frame):
 def test_it_is_chosen_as_checkpoint_auto_chooses(monkeypatch):
     pytest.importorskip("torch")
     gains = {"preview": {128: 1.0}, "final": {128: -1.0, 512: 1.0}}
-    monkeypatch.setattr(shipped, "GAINS", gains)
+    monkeypatch.setattr(network_gains, "GAINS", gains)
     monkeypatch.setattr(opening, "_load", lambda *_: None)
     monkeypatch.setattr(opening, "installed", lambda: {DEFAULT: None})
     monkeypatch.setattr(opening, "find_spec", lambda _: True)

@@ -12,7 +12,7 @@ import torch
 from tron.apps.relight.clip import Clip
 from tron.apps.relight.settings import Settings
 from tron.io.images import read_image
-from tron.neural import shipped
+from tron.neural import network_gains, shipped
 from tron.neural.configs import PAPER_GUIDANCE, RendererConfig, UNetConfig
 from tron.neural.renderer import NeuralRenderer
 from tron.neural.weights import save_renderer
@@ -156,7 +156,7 @@ def test_the_default_checkpoint_gives_way_where_it_does_not_fit(
     run, checkpoints, tmp_path, monkeypatch, caplog, settings, words
 ):
     monkeypatch.setattr(shipped, "FOLDER", checkpoints if settings else tmp_path)
-    monkeypatch.setattr(shipped, "GAINS", GAINS)
+    monkeypatch.setattr(network_gains, "GAINS", GAINS)
     with caplog.at_level("INFO"):
         assert run(tmp_path / "out", "checkpoint=auto", "frames=1", *settings) == 0
     assert words in caplog.text
@@ -182,7 +182,7 @@ def test_the_default_checkpoint_draws_where_it_gains_and_says_so(
     run, checkpoints, tmp_path, monkeypatch, caplog
 ):
     monkeypatch.setattr(shipped, "FOLDER", checkpoints)
-    monkeypatch.setattr(shipped, "GAINS", GAINS)
+    monkeypatch.setattr(network_gains, "GAINS", GAINS)
     with caplog.at_level("INFO"):
         assert run(tmp_path, "checkpoint=auto") == 0
     assert (
