@@ -16,6 +16,7 @@ from tron.cli.command_line import command
 from tron.cli.progress import working
 from tron.errors import TronError
 from tron.framing import upright
+from tron.io.lights import LIGHT_SUFFIXES
 from tron.runtime import Threads, Variant, activate
 
 if TYPE_CHECKING:
@@ -88,7 +89,6 @@ def opened(settings: Settings) -> Window:
     """
     # viser and Mitsuba: not for --help
     from tron.shading.environments.environment import EnvironmentMap
-    from tron.shading.environments.light_files import LIGHT_SUFFIXES
     from tron.view.opening import files_of, finish_of, first_light, home_of
     from tron.view.window import Window, require_free_port
 

@@ -17,12 +17,12 @@ from tron.cameras import Camera
 from tron.cli.installation import missing_libraries, require_extra
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
+from tron.io.lights import LIGHT_SUFFIXES
 from tron.neural.network_gains import expected_gain
 from tron.neural.shipped import DEFAULT, checkpoint_file, installed
 from tron.relighting import Relighter
 from tron.runtime import activate, set_torch_threads, torch_device
 from tron.shading.environments.environment import EnvironmentMap
-from tron.shading.environments.light_files import LIGHT_SUFFIXES
 from tron.view.finishing import Denoised, Drawn, Finish
 
 if TYPE_CHECKING:

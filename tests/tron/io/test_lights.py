@@ -13,9 +13,9 @@ from tron.errors import TronError
 from tron.io.cube_files import open_cube
 from tron.io.images import encode_png, read_image, write_image
 from tron.io.jpeg_xl import jpeg_xl_size
+from tron.io.lat_long import directions
+from tron.io.lights import lat_long_of_ball, lat_long_of_cube, read_light
 from tron.shading.environments.environment import EnvironmentMap
-from tron.shading.environments.lat_long import directions
-from tron.shading.environments.light_files import lat_long_of_ball, lat_long_of_cube, read_light
 
 imagecodecs = pytest.importorskip("imagecodecs", reason="pip install 'tron-relight[lights]'")
 
