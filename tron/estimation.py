@@ -103,6 +103,8 @@ PREVIEW = Estimation(rays=0, filtered=True)
 """``quality=preview`` of tron-relight, its default."""
 FINEST = Estimation(filtered=True, reflections=4, supersample=2)
 """``quality=final`` of tron-relight."""
+QUALITY = {"preview": PREVIEW, "final": FINEST}
+"""By the name that ``quality=`` takes."""
 
 OCTAVES = (-8.0, 4.0)
 """Logarithms to base 2 of a pixel's footprint over the spacing of surfels that ``sampling`` tells apart."""

@@ -14,11 +14,17 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
+from pydantic import Field
 
 from tron.errors import TronError
+
+Variant = Annotated[
+    Literal["llvm_ad_rgb", "cuda_ad_rgb"], Field(description="Mitsuba variant: processor or NVIDIA GPU")
+]
+Threads = Annotated[int | None, Field(ge=1, description="threads of the renderer; null: all")]
 
 MINIMUM_LLVM = 17
 """Below it a kernel with min or max aborts the whole process ("Cannot select: fminimum")."""

@@ -27,11 +27,11 @@ from eval.applications.worlds import GROUND, World, draw_thing, draw_world, move
 from eval.report.outcome import Outcome
 from eval.results import Row, mean_row
 from eval.tracing.scene import LIGHTS
-from tron.apps.relight.settings import QUALITY
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.color import to_display
 from tron.editing import EditList, Insert
+from tron.estimation import QUALITY
 from tron.gaussians.scene import GaussianScene
 from tron.metrics import capped_psnr
 from tron.reconstruction.materials.joint_fit import JointSettings, fit_jointly

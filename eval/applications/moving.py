@@ -19,11 +19,11 @@ from eval.renderer.shadows import CHANGE_GAIN, change_sums, correlation, slope, 
 from eval.report.outcome import Outcome
 from eval.results import Row, mean_row
 from eval.tracing.scene import LIGHTS
-from tron.apps.relight.settings import QUALITY
 from tron.cameras import Camera
 from tron.color import to_display
 from tron.editing.motion import Motion
 from tron.editing.moving import in_motion
+from tron.estimation import QUALITY
 from tron.metrics import capped_psnr
 from tron.relighting import Relighter
 from tron.report.page import Picture, Pictures

@@ -13,7 +13,7 @@ from eval.benchmark import Benchmark
 from eval.report.outcome import Outcome
 from eval.stages import Stages, script_path
 from tron.errors import TronError
-from tron.gaussians.ply import check_header
+from tron.gaussians.formats.registry import check_header
 
 Part = Literal["splats", "mesh", "models", "viewer"]
 

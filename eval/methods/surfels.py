@@ -26,13 +26,13 @@ from eval.relighting.buffers import Buffers
 from eval.relighting.fits import product_terms
 from eval.relighting.networks import Network, load_networks
 from eval.stages import Child, Stages, script_path
-from tron.apps.relight.settings import QUALITY
 from tron.cameras import Camera
 from tron.captures.folder import read_capture_folder
 from tron.cli.installation import require_own_packages
 from tron.color import from_agx
 from tron.denoising import require_oidn
 from tron.errors import TronError
+from tron.estimation import QUALITY
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
 from tron.gaussians.scene import GaussianScene
 from tron.relighting import Illumination, Relighter

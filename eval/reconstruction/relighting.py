@@ -16,11 +16,10 @@ import numpy as np
 
 from eval.light_scale import COVERED, fitted_factor
 from tron.apps.relight.camera_files import filmed_with
-from tron.apps.relight.settings import QUALITY
 from tron.captures import Capture
 from tron.captures.folder import read_capture_folder
 from tron.color import to_display
-from tron.estimation import Estimation
+from tron.estimation import QUALITY, Estimation
 from tron.gaussians.scene import GaussianScene
 from tron.metrics import capped_psnr
 from tron.relighting import Illumination, Relighter

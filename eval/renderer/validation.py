@@ -1,7 +1,7 @@
 """What tron-relight's ``checkpoint=auto`` goes by: gains over ``lit`` on validation scenes.
 
 They are measured by size and quality, on scenes by which no figure of the benchmark is judged, and stand in
-:mod:`tron.apps.relight.network_gains`.
+:mod:`tron.neural.network_gains`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from eval.relighting.buffers import MEMBERS, Buffers, region_mask
 from eval.relighting.networks import Network
 from eval.results import Row, mean_row
 from tron import metrics
-from tron.apps.relight.network_gains import quality_of
+from tron.neural.network_gains import quality_of
 from tron.shards.reader import read_clips
 from tron.shards.schema import TARGET
 

@@ -16,9 +16,9 @@ from train.curriculum import learning_rate_factor
 from train.optimizers import make_optimizer
 from train.run import build_renderer
 from train.settings import Settings as TrainSettings
-from tron.apps.relight.settings import QUALITY
 from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
+from tron.estimation import QUALITY
 from tron.metrics import LPIPS
 from tron.neural.losses import RendererLoss
 from tron.neural.weights import load_cosmos

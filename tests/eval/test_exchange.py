@@ -21,9 +21,10 @@ from eval.report.outcome import Outcome
 from eval.results import Results
 from tron.cameras import Camera
 from tron.errors import TronError
+from tron.gaussians.formats.registry import WRITTEN
 from tron.gaussians.harmonics import eval_sh, spread_directions
 from tron.gaussians.scene import GaussianScene
-from tron.gaussians.splat_files import SUFFIXES, write_splats
+from tron.gaussians.splat_files import write_splats
 from tron.models.parts import Part
 from tron.models.shapes import textured
 from tron.shading.environments.environment import EnvironmentMap
@@ -47,7 +48,7 @@ def world() -> Baked:
 
 
 def test_every_format_that_is_written_is_exchanged():
-    assert {each.suffix for each in FORMATS if each.ours} == set(SUFFIXES)
+    assert {each.suffix for each in FORMATS if each.ours} == set(WRITTEN)
     assert {each.reader for each in FORMATS} == set(find_readers(None))
 
 

@@ -40,7 +40,7 @@ def test_the_notebook_runs_and_shows_frames_and_the_viewer(tmp_path, monkeypatch
     pictures = []
     for cell in cells():
         for call in (each for each in ast.walk(cell) if isinstance(each, ast.Call)):
-            if isinstance(call.func, ast.Attribute) and call.func.attr == "show":  # 8080 may be in use here
+            if isinstance(call.func, ast.Name) and call.func.id == "show":  # 8080 may be in use here
                 call.keywords.append(ast.keyword("port", ast.Constant(port)))
         shown = run(ast.fix_missing_locations(cell), names)
         if hasattr(shown, "_repr_png_"):

@@ -20,7 +20,7 @@ from tron.apps.splat_file import splat_file
 from tron.captures import load_capture
 from tron.captures.photos.photo_files import decode_photo, inspect_photo
 from tron.errors import TronError
-from tron.gaussians.ply import check_header
+from tron.gaussians.formats.registry import check_header
 from tron.gaussians.scene import GaussianScene
 from tron.gaussians.splat_files import write_splats
 from tron.models.load import load_model

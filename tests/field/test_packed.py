@@ -9,11 +9,11 @@ import numpy as np
 import plyfile
 import pytest
 
+from tron.gaussians.formats.packed import packed
+from tron.gaussians.formats.spz import read_header
 from tron.gaussians.harmonics import eval_sh, spread_directions
-from tron.gaussians.packed_files import PACKED_SPLATS, packed
-from tron.gaussians.ply import read_splats
+from tron.gaussians.reading import read_splats
 from tron.gaussians.scene import GaussianScene
-from tron.gaussians.spz_header import read_header
 from tron.seeds import generator
 
 COUNT = 30
@@ -38,7 +38,7 @@ def plain(folder):
 
 def spz(path, number=None, flags=0):
     """The bytes of a PLY as .spz of version 3, with an extension that states a frame, or other flags."""
-    content = bytearray(gzip.decompress(packed(path.read_bytes(), PACKED_SPLATS[".spz"])))
+    content = bytearray(gzip.decompress(packed(path.read_bytes(), "spz")))
     content[14] |= flags | (2 if number is not None else 0)
     if number is not None:
         content += struct.pack("<II4s", 0xDEAD0001, 4, b"else") + struct.pack("<III", 0xADBE0003, 4, number)

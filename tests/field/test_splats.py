@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tron.errors import TronError
-from tron.gaussians.foreign_files import smoothed, stated_up
-from tron.gaussians.ply import check_header
+from tron.gaussians.formats.registry import check_header
+from tron.gaussians.reading import smoothed, stated_up
 from tron.gaussians.scene import GaussianScene
 from tron.seeds import generator
 
@@ -264,7 +264,7 @@ def test_damaged_gzip_costs_a_line(tmp_path, damage, words):
 
 
 def test_hostile_gzip_is_not_expanded(tmp_path, monkeypatch):
-    monkeypatch.setattr("tron.gaussians.foreign_files._ALWAYS_ALLOWED", 1 << 16)
+    monkeypatch.setattr("tron.gaussians.ply._ALWAYS_ALLOWED", 1 << 16)
     rows = 100_000
     columns = {name: np.zeros(rows) for name in splats()}
     plain = write(tmp_path / "a.ply", columns)

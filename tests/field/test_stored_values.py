@@ -13,9 +13,9 @@ from scipy.special import expit, logit
 
 from tron.errors import TronError
 from tron.gaussians.formats import gltf
+from tron.gaussians.formats.registry import check_header
 from tron.gaussians.formats.splats import Splats
 from tron.gaussians.harmonics import dc_to_rgb
-from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
 from tron.seeds import generator
 

@@ -12,12 +12,12 @@ import pytest
 from PIL import Image
 
 from tron.captures import load_capture
-from tron.captures.photos.distortion import Lens, impossible
 from tron.captures.photos.photo_files import inspect_photo
 from tron.captures.posing import video
 from tron.captures.posing.structure_from_motion import pose_photos
 from tron.captures.posing.wide_pictures import equirectangular, refuse_discs, refuse_video
 from tron.errors import TronError
+from tron.lenses import Lens, impossible
 from tron.seeds import generator
 
 HEIGHT = 64

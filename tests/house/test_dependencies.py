@@ -81,7 +81,7 @@ PEERS |= MESHES
 ASKED_FOR = {
     ("tron.apps.relight.command", "tron.neural.weights"),
     ("tron.apps.relight.clip", "tron.neural.renderer"),
-    ("tron.apps.view", "tron.neural.weights"),  # where the extra `network` is installed
+    ("tron.view.opening", "tron.neural.weights"),  # where the extra `network` is installed
     ("tron.view.finishing", "tron.neural.renderer"),
     ("tron.apps.relight.scan_materials", "tron.reconstruction.film"),
     ("tron.apps.relight.scan_materials", "tron.reconstruction.materials.carried"),
@@ -93,7 +93,7 @@ ASKED_FOR = {
     ("tron.tracing.meshes", "tron.models.surfels"),
     ("tron.apps.export", "tron.meshing.textures"),  # where a mesh is made: the same extra
     ("tron.apps.export", "tron.models.write"),
-    ("tron.apps.camera_formats", "tron.captures.formats.colmap"),  # pycolmap, of the extra `surfels`
+    ("tron.io.cameras.colmap", "tron.io.colmap"),  # pycolmap, of the extra `surfels`
     ("tron.reconstruction.priors.rgbx", "diffusers"),
     ("tron.reconstruction.priors.rgbx", "transformers"),
 }

@@ -157,3 +157,51 @@ def test_what_runs_a_module_stands_last_in_it():
     }
     assert any(any(guards) for guards in guarded.values())
     assert [str(path) for path, guards in guarded.items() if any(guards[:-1])] == []
+
+
+LAUNCHER = ROOT / "tron" / "cli" / "installation.py"
+"""Commands are looked at before they are imported: this table names them, above all floors."""
+
+
+def named_imports(source: str, module: str) -> list[str]:
+    """Imports by a string, unseen by import-linter, as `line: what`: of ours, but for the own package."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call) or not node.args:
+            continue
+        name = ast.unparse(node.func).rpartition(".")[2]
+        if name not in ("import_module", "__import__", "run_module"):
+            continue
+        what = ast.unparse(node.args[0]).removeprefix("f").strip("'\"")
+        of_own = what.startswith(("{__name__}.", f"{module.rpartition('.')[0]}."))
+        known = isinstance(node.args[0], ast.Constant) and what.partition(".")[0] not in PACKAGES
+        if not (of_own or known):
+            found.append(f"{node.lineno}: {what}")
+    return found
+
+
+@pytest.mark.parametrize(
+    ("source", "caught"),
+    [
+        ("from importlib import import_module\nimport_module('tron.apps.view').show()", True),
+        ("import importlib\nimportlib.import_module(name)", True),
+        ("__import__('eval.cli')", True),
+        ("import_module(f'tron.apps.{name}')", True),
+        ("import_module(f'{__name__}.writer')", False),
+        ("import_module('tron.relighting.proxy')", False),
+        ("import_module('pxr.Sdf')", False),
+    ],
+)
+def test_the_check_of_imports_by_a_string(source, caught):
+    assert bool(named_imports(source, "tron.relighting.relighter")) == caught
+
+
+def test_nothing_is_imported_by_a_string_from_another_package_of_ours():
+    found = {
+        str(path.relative_to(ROOT)): named_imports(
+            path.read_text("utf-8"), ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        )
+        for path in SOURCES
+        if path != LAUNCHER
+    }
+    assert {path: lines for path, lines in found.items() if lines} == {}

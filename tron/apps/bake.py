@@ -11,7 +11,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from tron.apps.capture_light import over_scene
-from tron.apps.machine import Threads, Variant
 from tron.apps.relight.camera_files import filmed_orbit, filmed_with
 from tron.apps.relight.scan_materials import proxy_file, with_materials
 from tron.apps.scene_file import SeenAs, Up, check_scene_files, load_scene
@@ -23,10 +22,11 @@ from tron.cli.progress import track, working
 from tron.color import Look
 from tron.estimation import PREVIEW
 from tron.framing import upright
+from tron.gaussians.formats.registry import WRITTEN
 from tron.gaussians.kept import KeptFiles
 from tron.gaussians.scene import GaussianScene
-from tron.gaussians.splat_files import SUFFIXES, check_count, check_suffix, write_splats
-from tron.runtime import activate
+from tron.gaussians.splat_files import check_count, check_suffix, write_splats
+from tron.runtime import Threads, Variant, activate
 from tron.trajectories import plan_cameras
 
 log = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ class Settings(BaseModel):
         "tron-environment reads"
     )
     output: Path = Field(
-        description=f"file to write, or to replace, not the scene's own: {', '.join(SUFFIXES)}"
+        description=f"file to write, or to replace, not the scene's own: {', '.join(WRITTEN)}"
     )
     rotation: float = Field(
         0.0, description="turn of the environment about up, degrees, counter-clockwise seen from above"

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from tron.apps.capture_light import LIGHT
-from tron.apps.relight.camera_files import CAMERAS, cameras_of, in_frame_of
+from tron.apps.relight.camera_files import CAMERAS, in_frame_of
 from tron.apps.relight.scan_materials import with_known_materials
 from tron.apps.scene_file import Up, check_scene_files, load_scene
 from tron.apps.splat_file import SceneFile
@@ -22,6 +22,7 @@ from tron.editing import Edit, EditList, Insert, Material, Views
 from tron.errors import TronError
 from tron.gaussians.kept import KeptFiles
 from tron.gaussians.scene import GaussianScene
+from tron.io.cameras.registry import cameras_of
 from tron.storage import write_atomic
 
 log = logging.getLogger(__name__)

@@ -13,6 +13,7 @@ from tron.apps.scene_file import check_output
 from tron.cli.command_line import command
 from tron.cli.progress import working
 from tron.errors import TronError
+from tron.io.lights import ENCODINGS, lat_long_of_ball, read_picture
 
 if TYPE_CHECKING:
     from tron.shading.environments.environment import EnvironmentMap
@@ -30,9 +31,9 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     environment: Path = Field(
-        description="the light: a lat-long picture, a cube map's cross or strip, .dds or .ktx2 with six "
-        "faces, a folder of six faces (px, nx, py, ny, pz, nz, or right, left, top, bottom, front, back), "
-        ".jxl, a JPEG with a gain map, or a photo of a mirror ball"
+        description="the light: a lat-long picture, a cube map's cross or strip, a folder of six faces (px, "
+        "nx, py, ny, pz, nz, or right, left, top, bottom, front, back), "
+        f"{', '.join(each.holds for each in ENCODINGS)}, or a photo of a mirror ball"
     )
     output: Path | None = Field(None, description="lat-long .exr or .hdr to write, or to replace")
     picture: Path | None = Field(
@@ -73,7 +74,6 @@ def main(settings: Settings) -> None:
     # Mitsuba: not for --help or a mistyped key
     from tron.io.images import write_image
     from tron.shading.environments.environment import EnvironmentMap
-    from tron.shading.environments.light_files import lat_long_of_ball, read_picture
 
     for path, suffixes in ((settings.output, MAPS), (settings.picture, (".png",))):
         if path is not None:

@@ -9,9 +9,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.apps.camera_formats import UPRIGHT, check_camera_file, write_camera_file
-from tron.apps.machine import Threads, Variant
-from tron.apps.relight.camera_files import cameras_of, filmed_with, in_frame_of
+from tron.apps.relight.camera_files import filmed_with, in_frame_of
 from tron.apps.scene_file import SeenAs, Up, check_output, check_scene_files, load_scene
 from tron.apps.splat_file import SceneFile
 from tron.apps.surroundings import treat_surroundings
@@ -21,10 +19,12 @@ from tron.cli.progress import track, working
 from tron.errors import TronError
 from tron.framing import upright
 from tron.gaussians.edit import KERNEL_WIDTHS
+from tron.gaussians.formats.registry import WRITTEN
 from tron.gaussians.scene import GaussianScene
-from tron.gaussians.splat_files import SUFFIXES, check_suffix, write_points, write_splats
+from tron.gaussians.splat_files import check_suffix, write_points, write_splats
+from tron.io.cameras.registry import UPRIGHT, cameras_of, check_camera_file, write_camera_file
 from tron.io.local_frame import moved_cameras
-from tron.runtime import activate
+from tron.runtime import Threads, Variant, activate
 from tron.trajectories import turn_cameras
 
 log = logging.getLogger(__name__)
@@ -42,7 +42,7 @@ class Settings(BaseModel):
     scene: SceneFile = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats")
     output: Path = Field(
         description=f"file to write, or to replace, not the scene's own; its name says the format: "
-        f"{', '.join(MESHES)}, a mesh with textures; {', '.join(SUFFIXES)}, splats; .ply, points too"
+        f"{', '.join(MESHES)}, a mesh with textures; {', '.join(WRITTEN)}, splats; .ply, points too"
     )
     kind: Kind | None = Field(None, description="null: a mesh in .glb and .usdz, splats in all others")
     cameras: Path | None = Field(
@@ -85,7 +85,7 @@ def main(settings: Settings) -> None:
     check_suffix(settings.output)
     suffix = settings.output.suffix.lower()
     kind = settings.kind or ("mesh" if suffix in MESHES else "splats")
-    fitting = {"mesh": MESHES, "splats": SUFFIXES, "points": POINTS}[kind]
+    fitting = {"mesh": MESHES, "splats": WRITTEN, "points": POINTS}[kind]
     if suffix not in fitting:
         raise TronError(f"{suffix} holds no {kind}", settings.output, f"{kind}: {', '.join(fitting)}")
     check_scene_files(settings.scene, settings.output)

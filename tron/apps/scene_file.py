@@ -12,8 +12,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from tron.errors import TronError
-from tron.gaussians.foreign_files import refuse_foreign
-from tron.gaussians.ply import check_header
+from tron.gaussians.formats.registry import check_header, refuse_foreign
 from tron.gaussians.scene import GaussianScene
 from tron.io.recognised import refuse_by_sight
 

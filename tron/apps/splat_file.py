@@ -12,9 +12,8 @@ from typing import IO, Annotated
 from pydantic import AfterValidator
 
 from tron.errors import TronError
-from tron.gaussians.formats.registry import named_as_splats
+from tron.gaussians.formats.registry import check_header, named_as_splats
 from tron.gaussians.formats.sog import sog_file
-from tron.gaussians.ply import check_header
 from tron.storage import atomic_path
 
 log = logging.getLogger(__name__)

@@ -4,41 +4,26 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future
-from importlib.util import find_spec
 from pathlib import Path
-from tempfile import mkdtemp
-from threading import Thread
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from tron.apps.capture_light import is_of_capture, over_scene
-from tron.apps.machine import Threads, Variant
-from tron.apps.relight.network_gains import expected_gain
 from tron.apps.scene_file import SeenAs, Up, check_scene_files, load_scene
 from tron.apps.splat_file import SceneFile
-from tron.cameras import Camera
 from tron.cli.command_line import command
-from tron.cli.installation import missing_libraries, require_extra
 from tron.cli.progress import working
 from tron.errors import TronError
 from tron.framing import upright
-from tron.gaussians.scene import GaussianScene
-from tron.neural.shipped import DEFAULT, checkpoint_file, installed
-from tron.runtime import activate, set_torch_threads, torch_device
+from tron.io.lights import LIGHT_SUFFIXES
+from tron.runtime import Threads, Variant, activate
 
 if TYPE_CHECKING:
-    from tron.neural.protocols import Renderer
-    from tron.shading.environments.environment import EnvironmentMap
-    from tron.view.finishing import Finish
     from tron.view.window import Window
 
 log = logging.getLogger(__name__)
 
-TRIED = 8
-"""Maps that are read to find the brightest of them: 4,096 x 2,048 texels take half a second each."""
 LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
@@ -56,7 +41,7 @@ class Settings(BaseModel):
     light: str | None = Field(
         None,
         description="the map to begin with, by its name without suffix; null: the light of the capture, else "
-        f"the brightest of the first {TRIED}",
+        "the brightest of the first 8",
     )
     models: Path | None = Field(None, description="folder of PLYs that may be inserted; null: none")
     output_dir: Path = Field(
@@ -104,184 +89,28 @@ def opened(settings: Settings) -> Window:
     """
     # viser and Mitsuba: not for --help
     from tron.shading.environments.environment import EnvironmentMap
-    from tron.shading.environments.light_files import LIGHT_SUFFIXES
+    from tron.view.opening import files_of, finish_of, first_light, home_of
     from tron.view.window import Window, require_free_port
 
     output = settings.output_dir
     if output.exists() and not output.is_dir():
         raise TronError("output_dir is a file", output, "give a folder, which need not exist")
     check_scene_files(settings.scene, output / "scene.ply")
-    lights = _files(settings.environments, LIGHT_SUFFIXES, "environment map")
-    models = {} if settings.models is None else _files(settings.models, (".ply",), "PLY")
-    first = _first_light(settings, lights)
+    lights = files_of(settings.environments, LIGHT_SUFFIXES, "environment map")
+    models = {} if settings.models is None else files_of(settings.models, (".ply",), "PLY")
+    own = {name: file for name, file in lights.items() if is_of_capture(file, settings.scene)}
+    first = first_light(lights, settings.light, own, settings.environments)
     require_free_port(settings.host, settings.port)
-    logging.getLogger("websockets").setLevel(logging.WARNING)  # it says who comes and goes
     activate(settings.variant, settings.threads)
     with working("reading the scene"):
         scene = load_scene(settings.scene, settings.up, "as_is", settings.projection)
-        home, turn = _home(scene), upright(scene.up)
-        own = {name: file for name, file in lights.items() if is_of_capture(file, settings.scene)}
+        home, turn = home_of(scene), upright(scene.up)
         turned = {k: over_scene(EnvironmentMap.load(f), f, settings.scene, turn) for k, f in own.items()}
-    finish = _finish(settings.threads)
     return Window(
-        scene, settings.scene, lights, models, output, settings.host, settings.port, home, turned,
-        first, seed=settings.seed, variant=settings.variant, threads=settings.threads, finish=finish,
+        scene, settings.scene, lights, models, output, settings.host, settings.port, home, turned, first,
+        seed=settings.seed, variant=settings.variant, threads=settings.threads,
+        finish=finish_of(settings.threads),
     )  # fmt: skip
-
-
-def _first_light(settings: Settings, lights: Mapping[str, Path]) -> str:
-    """The name of the map to begin with; the others are read, or refused, when they are chosen.
-
-    Raises:
-        TronError: it cannot be read, or there is none of that name.
-    """
-    from tron.shading.environments.environment import EnvironmentMap
-
-    own = [name for name, file in lights.items() if is_of_capture(file, settings.scene)]
-    tried = list(lights)[:TRIED] if settings.light is None and not own else [settings.light or own[0]]
-    if tried[0] not in lights:
-        raise TronError(
-            f"light: no map is called {tried[0]}", settings.environments, f"give one of {', '.join(lights)}"
-        )
-    bright: dict[str, float] = {}
-    for name in tried:
-        try:
-            bright[name] = 1 / EnvironmentMap.load(lights[name]).exposure()
-        except TronError as error:
-            if len(tried) == 1 or (name == tried[-1] and not bright):
-                raise
-            log.warning("%s", error)
-    return max(bright, key=bright.__getitem__)
-
-
-def _finish(threads: int | None) -> Callable[[int, int], Finish | None]:
-    """What pictures at rest of a width and height are finished by.
-
-    As checkpoint=auto of tron-relight has it, a network where it is sure to gain; else Open Image Denoise,
-    where it is installed.
-    """
-    from tron.view.finishing import Denoised, Drawn
-
-    drawn = denoised = None
-    if not missing_libraries("network") and DEFAULT in installed():
-        loaded: Future[Renderer] = Future()
-        Thread(target=_load, args=(loaded, threads), daemon=True).start()
-        drawn = Drawn(loaded)
-    if find_spec("pyoidn") is not None:
-        denoised = Denoised()
-
-    def finish(width: int, height: int) -> Finish | None:
-        return drawn if drawn and expected_gain("final", width, height) > 0 else denoised
-
-    return finish
-
-
-def _load(soon: Future[Renderer], threads: int | None) -> None:
-    """The shipped network, while the scene is looked at: torch takes seconds."""
-    try:
-        from tron.neural.weights import load_renderer
-
-        if threads is not None:
-            set_torch_threads(threads)
-        soon.set_result(load_renderer(checkpoint_file(DEFAULT)).to(torch_device()))
-    except Exception as error:
-        soon.set_exception(error)
-
-
-def show(
-    scene: str | Path | GaussianScene,
-    environments: str | Path | EnvironmentMap | Mapping[str, EnvironmentMap],
-    height: int = 640,
-    **settings: Any,
-) -> Shown:
-    """Watch and change a scene in a notebook's cell.
-
-    Args:
-        scene: PLY; or surfels, valid.
-        environments: folder of environment maps, or one of them; or maps, by name.
-        height: of the frame in the page, pixels.
-        settings: of tron-view by name, such as ``models`` or ``port``; without a port, the
-            first free one. What is no file yet is kept in a folder ``shown-...`` in ``output_dir``, where the
-            command lines that film it find it.
-
-    Raises:
-        TronError: viser is not installed, a setting is wrong, or as :func:`opened`.
-    """
-    require_extra("the viewer", "view")
-    where = {"scene": Path("scene.ply"), "environments": Path()}
-    try:
-        chosen = Settings.model_validate(where | settings)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise TronError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}", "show") from error
-    chosen = chosen.model_copy(update=_kept(scene, environments, chosen.output_dir))
-    if "port" not in settings:  # a cell that is run twice leaves its first window open
-        from tron.view.window import free_port
-
-        chosen = chosen.model_copy(update={"port": free_port(chosen.host, chosen.port)})
-    return Shown(opened(chosen), height)
-
-
-def _kept(
-    scene: str | Path | GaussianScene,
-    environments: str | Path | EnvironmentMap | Mapping[str, EnvironmentMap],
-    folder: Path,
-) -> dict[str, Path]:
-    """Files of a scene and of its lights, written where they are none."""
-    from tron.shading.environments.environment import EnvironmentMap
-
-    if isinstance(environments, EnvironmentMap):
-        environments = {"light": environments}
-    of_files = not isinstance(scene, GaussianScene), isinstance(environments, str | Path)
-    if not all(of_files):
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            folder = Path(mkdtemp(prefix="shown-", dir=folder))
-        except OSError as error:
-            raise TronError(f"cannot be written: {error.strerror or error}", folder) from error
-    if isinstance(scene, GaussianScene):
-        scene.save(folder / "scene.ply")
-        scene = folder / "scene.ply"
-    if isinstance(environments, Mapping):
-        for name, light in environments.items():
-            if Path(name).name != name:
-                raise TronError("the name of a light is that of its file", name, "leave out / and ..")
-            light.save(folder / f"{name}.exr")
-        environments = folder
-    return {"scene": Path(scene), "environments": Path(environments)}
-
-
-class Shown:
-    """A window in a notebook; it shows itself, and serves until :meth:`close` or the end of the notebook."""
-
-    def __init__(self, window: Window, height: int) -> None:
-        self.window, self._height = window, height
-
-    def close(self) -> None:
-        """End it."""
-        self.window.close()
-
-    def _repr_html_(self) -> str:
-        return f'<iframe src="{self.window.address}" width="100%" height="{self._height}"></iframe>'
-
-
-def _home(scene: GaussianScene) -> Camera:
-    """The first view."""
-    view = {"azimuth_deg": -60.0, "elevation_deg": 20.0, "distance": 1.1}
-    return Camera.around(scene.upright(), **view, width=960, height=800)
-
-
-def _files(where: Path, suffixes: tuple[str, ...], kind: str) -> dict[str, Path]:
-    """Files of some kinds in a folder by their names without suffix, in order; or the one file."""
-    if where.is_file():
-        return {where.stem: where}
-    if not where.is_dir():
-        raise TronError("there is no such folder", where)
-    found = sorted(path for path in where.iterdir() if path.suffix.lower() in suffixes and path.is_file())
-    if not found:
-        raise TronError(f"the folder holds no {kind}", where, f"give one with {', '.join(suffixes)}")
-    twice = len({path.stem for path in found}) < len(found)
-    return {path.name if twice else path.stem: path for path in found}
 
 
 cli = command(

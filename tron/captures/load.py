@@ -36,8 +36,7 @@ from tron.captures.posing.structure_from_motion import (
 from tron.captures.posing.video import is_video, read_video
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
-from tron.gaussians.foreign_files import VIDEOS
-from tron.io.recognised import foreign_poses, refuse_by_sight
+from tron.io.recognised import VIDEOS, foreign_poses, refuse_by_sight
 
 log = logging.getLogger(__name__)
 

@@ -8,53 +8,32 @@ for readers that expect it. Our materials follow as extra properties that other 
 ``comment tron spacing 0.01``.
 
 The header of a file is held against the file's size before anything is allocated, so that a few hostile bytes
-cannot ask for terabytes.
+cannot ask for terabytes. A file may be compressed by gzip.
 """
 
 from __future__ import annotations
 
-import logging
+import gzip
+import io
 import math
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+import re
+import zlib
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import plyfile
-from scipy.special import expit
 
-from tron.color import srgb_to_linear
 from tron.errors import TronError
 from tron.estimation import MATERIAL
 from tron.gaussians.fields import FIELDS, MATERIALS, third_scales
-from tron.gaussians.foreign_files import (
-    beginning,
-    foreign_kernels,
-    is_gzipped,
-    largest,
-    refuse_foreign,
-    round_ones,
-    smoothed,
-    stated_up,
-    thin_last,
-    usable_splats,
-    whole,
-)
-from tron.gaussians.foreign_properties import plain_columns, refuse_points
-from tron.gaussians.formats.registry import FORMATS, Format
-from tron.gaussians.formats.splats import Splats
-from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
-from tron.gaussians.packed_files import PACKED_SPLATS, Packing, packing, unpacked
-from tron.gaussians.ply_arrays import columns_in
-from tron.gaussians.projections import DISKS, FILTER, PROJECTIONS, stated_projection
-from tron.gaussians.spz_header import read_header
-from tron.gaussians.stored_values import as_3dgs_stores
-from tron.io.local_frame import local_origin, said
-from tron.io.recognised import refuse_placeholder
+from tron.gaussians.foreign_properties import refuse_points
+from tron.gaussians.harmonics import SH_COUNT
+from tron.gaussians.projections import DISKS, PROJECTIONS, stated_projection
 from tron.storage import atomic_path
-
-log = logging.getLogger(__name__)
 
 NORMAL = ("nx", "ny", "nz")
 REST = tuple(f"f_rest_{i}" for i in range(3 * (SH_COUNT - 1)))
@@ -65,32 +44,46 @@ REQUIRED = tuple(
     for field in ("means", "sh", "opacity_logits", "log_scales", "quats")
     for name in FIELDS[field].properties
 )
-
-# What a Gaussian without materials is taken to be made of: a rough dielectric in its own colours.
-GUESSED_ROUGHNESS = 0.6
-GUESSED_METALLIC = 0.0
-# Up in a file that does not say: 3DGS keeps COLMAP's world, whose y axis points down where photos are level.
 GUESSED_UP = (0.0, -1.0, 0.0)
+"""Up where a file says none: 3DGS keeps COLMAP's world, whose y axis points down where photos are level."""
+EXPORT = "is it a Gaussian scene? export it as an uncompressed 3DGS or 2DGS PLY"
 
-_HEADER_LIMIT = 1 << 16
+HEADER_LIMIT = 1 << 16
 _PROJECTION = "tron projection "
 _MATERIAL = "tron material "
-_VISIBLE = 1 / 255
-"""Opacity below which a splat is not drawn (conventions.md, 6)."""
-_COARSE = 0.25
-"""Steps of stored positions, in widths of splats, from which they are seen."""
 _TYPE_BYTES = {
     **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
     **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
     **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
     **dict.fromkeys(("double", "float64"), 8),
 }
-NOT_READ = "not read, so that it may look different here"
-_EXPORT = "is it a Gaussian scene? export it as an uncompressed 3DGS or 2DGS PLY"
+_END = re.compile(rb"end_header\r?\n")
+_COUNT = re.compile(rb"^(element[ \t]+\S+[ \t]+)(\d+)", re.MULTILINE)
+
+
+class Stored(NamedTuple):
+    """What a file of splats holds, by the names of 3DGS' properties.
+
+    Attributes:
+        columns: (M,) each.
+        comments: of a PLY's header.
+        up: (3,) that the file states; None where it does not.
+        turn: (3, 3) from the file's frame to that of 3DGS' PLYs, where the format has another: a rotation, or
+            a mirror image.
+        up_known: whether ``up`` is stated; False where it is the format's usual one.
+        antialiased: whether the splats are to be drawn with Mip-Splatting's filter of the screen.
+    """
+
+    columns: dict[str, np.ndarray]
+    comments: Sequence[str] = ()
+    up: np.ndarray | None = None
+    turn: np.ndarray = np.eye(3)
+    up_known: bool = True
+    antialiased: bool = False
 
 
 def write_ply(
-    path: str | Path,
+    target: str | Path | BinaryIO,
     scene: Mapping[str, Any],
     comments: Sequence[str] = (),
     plain: bool = False,
@@ -99,7 +92,7 @@ def write_ply(
     """Write what a valid scene holds, by the names of GaussianScene's attributes, and its ``normals`` (M, 3).
 
     Args:
-        path: the file.
+        target: the file, or a stream.
         scene: its values.
         comments: that stand in the header, after those of the scene.
         plain: the properties of 3DGS alone, without materials and objects.
@@ -129,133 +122,84 @@ def write_ply(
     for name, values in columns.items():
         rows[name] = values
     element = plyfile.PlyElement.describe(rows, "vertex")
-    with atomic_path(path) as temporary:
-        plyfile.PlyData([element], byte_order="<", comments=[*_constants(scene), *comments]).write(
-            str(temporary)
-        )
+    data = plyfile.PlyData([element], byte_order="<", comments=[*_constants(scene), *comments])
+    if not isinstance(target, str | Path):
+        data.write(target)
+        return
+    with atomic_path(target) as temporary:
+        data.write(str(temporary))
 
 
-def read_splats(path: str | Path) -> dict[str, Any]:
-    """Attributes of the GaussianScene in a file of splats; ``spacing`` only if the file says it.
-
-    Of three scales the smallest is the thickness, and the rotation is permuted, so that the normal is the
-    axis along which the Gaussian was thinnest; ``round_ones`` (M,) bool tells where there is no such axis.
-    Quaternions are normalised. f_rest of degree 0 to 3 is accepted. A file without materials gets guessed
-    ones (base colour from the mean colour, rough, not metallic) and says so in `materials_guessed`; a file
-    that is not TRON's has unoriented normals (`oriented` is False) and kernel degree 2. Up is what a comment
-    says, TRON's or another's (:mod:`tron.gaussians.foreign_files`); where none does it is -y, and
-    `up_guessed` is True. Mip-Splatting's ``filter_3D`` is folded in. An opacity logit of +infinity means
-    opaque; splats that are broken are left out (:mod:`tron.gaussians.foreign_files`). The middle of large
-    coordinates is taken away in float64, and is in `offset` (:mod:`tron.io.local_frame`). Each of these says
-    so in one line.
-
-    The file may be compressed by gzip, packed (:mod:`tron.gaussians.packed_files`), or of another program
-    (:mod:`tron.gaussians.formats`). ``turn`` (3, 3) leads from the frame of a file of .spz into that of 3DGS'
-    PLYs (:mod:`tron.gaussians.spz_header`): a rotation or a mirror image. Where the file does not state its
-    frame, `up_guessed` is True. glTF and USD say which way is up.
+def read(path: Path) -> Stored:
+    """What a PLY holds.
 
     Raises:
-        TronError: files that are missing, are neither a PLY nor packed splats, lack properties (named),
-            declare more than they hold, expand without limit, or hold no splat.
+        TronError: it is none, declares more than it holds, or expands without limit.
     """
-    path = Path(path)
-    known = check_header(path)
-    if isinstance(known, Format):
-        splats = known.read(path)
-        columns, comments, up = _columns(splats), [], splats.up
-    else:
-        columns, comments = _parsed(path, known)
-        up = stated_up(comments)
-    turn, up_stated, antialiased = np.eye(3), True, False
-    if known == PACKED_SPLATS[".spz"]:
-        header = read_header(path.read_bytes())
-        turn, up_stated, antialiased = header.turn, header.stated, header.antialiased
-        up = GUESSED_UP @ turn
-    constants = _read_constants(comments, path)
-    columns = plain_columns(columns, bool(constants), path)
-    _check_properties(columns, comments, path)
-    scales = [name for name in (*FIELDS["log_scales"].properties, THIRD_SCALE) if name in columns]
-    if not constants:
-        columns = as_3dgs_stores(columns, scales, path)
-    # Before they are smoothed: a filter much wider than a splat hides its axes, not where it faces.
-    columns["round_ones"] = round_ones(np.stack([columns[name] for name in scales], axis=-1))
-    if FILTER in columns:
-        columns = _filtered(columns, scales, path)
-    colors = [name for name in (*FIELDS["sh"].properties, *REST) if name in columns]
-    columns = usable_splats(columns, scales, colors, path)
-
-    def stack(names: Sequence[str]) -> np.ndarray:
-        return np.stack([np.asarray(columns[name], dtype=np.float32) for name in names], axis=-1)
-
-    def field(name: str) -> np.ndarray:
-        values = stack(FIELDS[name].properties)
-        return values if FIELDS[name].shape else values[:, 0]
-
-    if not len(columns["x"]):
-        raise TronError("the scene has no surfels", path)
-    offset = constants.get("offset", [0.0, 0.0, 0.0])
-    means = field("means")
-    # Where a file of TRON's stands was decided when it was written, but where its coordinates were put back.
-    if not constants or columns["x"].dtype == np.float64:
-        means, offset = _about_local_origin(columns, path)
-    quats, log_scales, log_thickness = thin_last(field("quats"), stack(scales))
-    sh = _harmonics(columns, stack, path)
-    guessed = MATERIAL_PROPERTIES[0] not in columns
-    stated, oriented = constants.get("up", up), bool(constants.get("oriented", [0])[0])
-    return {
-        "means": means,
-        "quats": quats,
-        "log_scales": log_scales,
-        "log_thickness": log_thickness,
-        "round_ones": columns["round_ones"],
-        "opacity_logits": field("opacity_logits"),
-        "sh": sh,
-        **(_guess(sh) if guessed else {name: field(name) for name in MATERIALS}),
-        "object_id": _object_id(columns, len(means), path),
-        "kernel_degree": int(constants.get("kernel_degree", [2])[0]),
-        **({"spacing": constants["spacing"][0]} if "spacing" in constants else {}),
-        "turn": turn,
-        "up": np.array(GUESSED_UP if stated is None else stated),
-        "up_guessed": stated is None or not up_stated or bool(constants.get("up_guessed", [0])[0]),
-        "materials_guessed": guessed or bool(constants.get("materials_guessed", [0])[0]),
-        "oriented": oriented,
-        "offset": np.array(offset),
-        "projection": _projection(columns, comments, bool(constants) and oriented, antialiased, path),
-    }
-
-
-def check_header(path: Path) -> Packing | Format | None:
-    """Look at the first bytes of a scene's file alone: a wrong one is found before anything is loaded.
-
-    Returns the format of packed splats or of another program's, None of a PLY.
-
-    Raises:
-        TronError: it cannot be opened, is no PLY of Gaussians as far as its header tells, or is shorter than
-            the header says.
-    """
-    refuse_placeholder(path)
-    other = FORMATS.get(path.suffix.lower())
-    if other is not None:
-        refuse_foreign(path)
-        other.check(path)
-        return other
-    try:
-        with open(path, "rb") as stream:
-            packed = packing(path, stream.read(_HEADER_LIMIT))
-        if packed in PACKED_SPLATS.values():
-            return packed
+    with _readable(path):
         if is_gzipped(path):
-            head, size = beginning(path, _HEADER_LIMIT), largest(path)
-        else:
-            with open(path, "rb") as stream:
-                head, size = stream.read(_HEADER_LIMIT), os.fstat(stream.fileno()).st_size
+            columns, comments = columns_in(_whole(path), path)
+            return Stored(columns, comments)
+        data = plyfile.PlyData.read(str(path))
+        vertex = data["vertex"]
+        return Stored({each.name: vertex[each.name] for each in vertex.properties}, data.comments)
+
+
+def columns_in(content: bytes, path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns of the vertex element of a PLY in memory, and the comments of its header.
+
+    They are read as one array where rows are of one size: plyfile maps files, and reads what lies in memory
+    value by value: 150,000 packed splats took 8.4 s, 0.5 s so.
+
+    Args:
+        content: a whole PLY.
+        path: what it was made from, for the line.
+
+    Raises:
+        TronError: it is no PLY of splats, or declares more than it holds.
+    """
+    check_sizes(content[:HEADER_LIMIT], len(content), path)
+    with _readable(path):
+        end = _END.search(content)
+        if end is not None:
+            # plyfile knows the grammar of headers: it reads this one, of an empty file.
+            header = plyfile.PlyData.read(io.BytesIO(_COUNT.sub(rb"\g<1>0", content[: end.end()])))
+            first = header.elements[0] if header.elements else None
+            counts = [int(each[2]) for each in _COUNT.finditer(content[: end.end()])]
+            plain = first is not None and not any(
+                isinstance(each, plyfile.PlyListProperty) for each in first.properties
+            )
+            if first is not None and plain and first.name == "vertex" and not header.text:
+                kind = np.dtype(first.dtype(header.byte_order))
+                rows = np.frombuffer(content, kind, counts[0], end.end())
+                return {name: rows[name] for name in kind.names or ()}, list(header.comments)
+        data = plyfile.PlyData.read(io.BytesIO(content))
+        vertex = data["vertex"]
+        return {each.name: vertex[each.name] for each in vertex.properties}, list(data.comments)
+
+
+def beginning(path: Path) -> tuple[bytes, int]:
+    """The first bytes of a PLY, of what it holds where it is gzipped, and the most bytes that it may have.
+
+    Raises:
+        TronError: it cannot be read, or the gzip is damaged.
+    """
+    with _readable(path):
+        if is_gzipped(path):
+            return _expanded(path, HEADER_LIMIT), _largest(path)
+        with open(path, "rb") as stream:
+            return stream.read(HEADER_LIMIT), os.fstat(stream.fileno()).st_size
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """What plyfile raises becomes a TronError of the file."""
+    try:
+        yield
     except OSError as error:
         raise TronError(f"cannot read: {error.strerror or error}", path) from error
-    if not head.startswith(b"ply"):
-        refuse_foreign(path)
-        raise TronError("not a PLY file", path, _EXPORT)
-    _check_sizes(head, size, path)
-    return packed
+    except (plyfile.PlyParseError, ValueError) as error:  # ValueError: text that is no number
+        raise TronError(f"not a readable PLY: {error}", path) from error
 
 
 def header_comments(path: Path) -> list[str]:
@@ -271,118 +215,13 @@ def header_elements(path: Path) -> set[str]:
 def _header(path: Path) -> list[str]:
     try:
         with path.open("rb") as file:
-            header, end, _ = file.read(_HEADER_LIMIT).decode("ascii", "replace").partition("end_header")
+            header, end, _ = file.read(HEADER_LIMIT).decode("ascii", "replace").partition("end_header")
     except OSError:
         return []
     return header.splitlines() if end else []
 
 
-def _parsed(path: Path, packed: Packing | None) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Columns of the vertex element, and comments of the header."""
-    try:
-        if packed is None and not is_gzipped(path):
-            data = plyfile.PlyData.read(str(path))
-            return {each.name: data["vertex"][each.name] for each in data["vertex"].properties}, data.comments
-        content = whole(path) if packed is None else unpacked(path, packed)
-        _check_sizes(content[:_HEADER_LIMIT], len(content), path)
-        return columns_in(content)
-    except OSError as error:
-        raise TronError(f"cannot read: {error.strerror or error}", path) from error
-    except (plyfile.PlyParseError, ValueError) as error:  # ValueError: text that is no number
-        raise TronError(f"not a readable PLY: {error}", path) from error
-
-
-def _columns(splats: Splats) -> dict[str, np.ndarray]:
-    """By the names of 3DGS' properties."""
-    rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(len(splats.sh), -1).T
-    return {
-        **dict(zip(FIELDS["means"].properties, splats.means.T)),
-        **dict(zip(FIELDS["sh"].properties, splats.sh[:, 0].T)),
-        **dict(zip(REST, rest)),
-        "opacity": splats.opacity_logits,
-        **dict(zip((*FIELDS["log_scales"].properties, THIRD_SCALE), splats.log_scales.T)),
-        **dict(zip(FIELDS["quats"].properties, splats.quats.T)),
-    }
-
-
-def _filtered(columns: dict[str, np.ndarray], scales: Sequence[str], path: Path) -> dict[str, np.ndarray]:
-    """The columns with the 3D smoothing filter in scales and opacity."""
-    log_scales = np.stack([columns[name] for name in scales], axis=-1)
-    widened, logits = smoothed(log_scales, columns["opacity"], columns[FILTER])
-    before, after = (float(np.nanmedian(expit(each))) for each in (columns["opacity"], logits))
-    log.log(
-        logging.INFO if after >= _VISIBLE else logging.WARNING,
-        "%s: %s of Mip-Splatting is taken into scales and opacities, whose median goes from %.2g to %.2g%s",
-        path, FILTER, before, after, "" if after >= _VISIBLE else ": most splats cannot be seen",
-    )  # fmt: skip
-    return columns | dict(zip(scales, widened.T)) | {"opacity": logits}
-
-
-def _about_local_origin(columns: Mapping[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(M, 3) float32 positions about a local origin, and the (3,) float64 offset that was taken away."""
-    stored = [columns[axis] for axis in FIELDS["means"].properties]
-    positions = np.stack(stored, axis=-1).astype(np.float64)
-    wide = float(np.median(np.exp(np.asarray(columns["scale_0"], np.float64))))
-    offset = local_origin(positions, _COARSE * wide)
-    if offset.any():
-        log.info("%s: large coordinates: %s is taken away from them and kept", path, said(offset))
-        step = max(float(np.spacing(np.abs(each).max())) for each in stored)
-        if step > _COARSE * wide:
-            log.warning(
-                "%s: its positions are stored in steps of %.2g, its splats are %.2g wide: surfaces fall into "
-                "slices; export it with positions in doubles or about a local origin", path, step, wide,
-            )  # fmt: skip
-    return (positions - offset).astype(np.float32), offset
-
-
-def _constants(scene: Mapping[str, Any]) -> list[str]:
-    return [
-        *(["tron up_guessed 1"] if scene["up_guessed"] else []),
-        f"{_PROJECTION}{scene['projection']}",
-        f"{_MATERIAL}{MATERIAL}",
-        f"tron kernel_degree {scene['kernel_degree']}",
-        f"tron spacing {scene['spacing']!r}",
-        f"tron up {' '.join(repr(float(v)) for v in scene['up'])}",
-        f"tron oriented {int(scene['oriented'])}",
-        f"tron materials_guessed {int(scene['materials_guessed'])}",
-        *([f"tron offset {' '.join(map(repr, scene['offset'].tolist()))}"] if scene["offset"].any() else []),
-    ]
-
-
-def _read_constants(comments: list[str], path: Path) -> dict[str, list[float]]:
-    """{name: numbers} of the comments that are ours, those that we do not know included."""
-    constants = {}
-    for comment in comments:
-        words = comment.split()
-        if len(words) < 3 or words[0] != "tron" or comment.startswith((_PROJECTION, _MATERIAL)):
-            continue
-        try:
-            values = [float(word) for word in words[2:]]
-        except ValueError:
-            values = [math.nan]
-        if not all(map(math.isfinite, values)):
-            raise TronError(f"comment '{comment[:60]}' does not hold finite numbers", path)
-        if words[1] in ("up", "offset") and len(values) != 3:
-            raise TronError(f"comment '{comment[:60]}' does not hold three numbers", path)
-        constants[words[1]] = values
-    return constants
-
-
-def _projection(
-    properties: Collection[str], comments: Sequence[str], ours: bool, antialiased: bool, path: Path
-) -> str:
-    """By what the file says; ``ours``: of TRON, with signed normals, which before was all that it said."""
-    said = [comment[len(_PROJECTION) :].strip() for comment in comments if comment.startswith(_PROJECTION)]
-    if said:
-        if said[-1] not in PROJECTIONS:
-            raise TronError(
-                f"comment '{_PROJECTION}{said[-1][:40]}' names none", path, f"use {', '.join(PROJECTIONS)}"
-            )
-        return said[-1]
-    return DISKS if ours else stated_projection(properties, comments, antialiased)
-
-
-def _check_sizes(head: bytes, size: int, path: Path) -> None:
+def check_sizes(head: bytes, size: int, path: Path) -> None:
     """Raise TronError unless the elements that the header declares fit into the bytes that follow it.
 
     `head` holds the first bytes of the file, `size` is the file's length. Only sizes are judged here; the
@@ -407,7 +246,7 @@ def _check_sizes(head: bytes, size: int, path: Path) -> None:
             kind = words[2] if words[1] == "list" else words[1]
             elements[-1] = (name, count, row + (2 if ascii_body else _TYPE_BYTES.get(kind, 1)))
     if "vertex" not in [name for name, _, _ in elements]:
-        raise TronError("the PLY has no vertex element", path, _EXPORT)
+        raise TronError("the PLY has no vertex element", path, EXPORT)
     refuse_points([name for name, _, _ in elements], vertex, path)
     if any(row == 0 and count for _, count, row in elements):
         raise TronError("the PLY declares an element without properties", path)
@@ -422,54 +261,82 @@ def _check_sizes(head: bytes, size: int, path: Path) -> None:
         )
 
 
-def _check_properties(columns: dict[str, np.ndarray], comments: Sequence[str], path: Path) -> None:
-    foreign = ", ".join(foreign_kernels(columns, comments))
-    missing = [name for name in REQUIRED if name not in columns]
-    if missing:
-        made = f"made for {foreign}: export it as plain 3DGS" if foreign else _EXPORT
-        raise TronError(f"the PLY lacks {', '.join(missing)}", path, made)
-    read = (*REQUIRED, *REST, *MATERIAL_PROPERTIES, THIRD_SCALE, FILTER, "object_id")
-    for name, values in columns.items():
-        if values.dtype == object and name in read:
-            raise TronError(f"property {name} is a list", path, _EXPORT)
-    if foreign:
-        log.warning("%s: %s: %s", path, NOT_READ, foreign)
-    present = [name for name in MATERIAL_PROPERTIES if name in columns]
-    if present and len(present) < len(MATERIAL_PROPERTIES):
-        absent = ", ".join(name for name in MATERIAL_PROPERTIES if name not in columns)
-        raise TronError(f"the PLY has {present[0]} but lacks {absent}", path, "write all materials or none")
+def _constants(scene: Mapping[str, Any]) -> list[str]:
+    return [
+        *(["tron up_guessed 1"] if scene["up_guessed"] else []),
+        f"{_PROJECTION}{scene['projection']}",
+        f"{_MATERIAL}{MATERIAL}",
+        f"tron kernel_degree {scene['kernel_degree']}",
+        f"tron spacing {scene['spacing']!r}",
+        f"tron up {' '.join(repr(float(v)) for v in scene['up'])}",
+        f"tron oriented {int(scene['oriented'])}",
+        f"tron materials_guessed {int(scene['materials_guessed'])}",
+        *([f"tron offset {' '.join(map(repr, scene['offset'].tolist()))}"] if scene["offset"].any() else []),
+    ]
 
 
-def _guess(sh: np.ndarray) -> dict[str, np.ndarray]:
-    """Materials of Gaussians known by colour alone."""
-    return {
-        "base_color": srgb_to_linear(np.clip(dc_to_rgb(sh[:, 0]), 0, 1)),
-        "roughness": np.full(len(sh), GUESSED_ROUGHNESS),
-        "metallic": np.full(len(sh), GUESSED_METALLIC),
-    }
+def constants_of(comments: Sequence[str], path: Path) -> dict[str, list[float]]:
+    """{name: numbers} of the comments that are ours, those that we do not know included."""
+    constants = {}
+    for comment in comments:
+        words = comment.split()
+        if len(words) < 3 or words[0] != "tron" or comment.startswith((_PROJECTION, _MATERIAL)):
+            continue
+        try:
+            values = [float(word) for word in words[2:]]
+        except ValueError:
+            values = [math.nan]
+        if not all(map(math.isfinite, values)):
+            raise TronError(f"comment '{comment[:60]}' does not hold finite numbers", path)
+        if words[1] in ("up", "offset") and len(values) != 3:
+            raise TronError(f"comment '{comment[:60]}' does not hold three numbers", path)
+        constants[words[1]] = values
+    return constants
 
 
-def _harmonics(
-    columns: dict[str, np.ndarray], stack: Callable[[Sequence[str]], np.ndarray], path: Path
-) -> np.ndarray:
-    """(M, 16, 3) coefficients; degrees that the file does not have are zero."""
-    dc = stack(FIELDS["sh"].properties)
-    sh = np.zeros((len(dc), SH_COUNT, 3), np.float32)
-    sh[:, 0] = dc
-    count = sum(name.startswith("f_rest_") for name in columns)
-    if count not in (0, 9, 24, 45) or any(name not in columns for name in REST[:count]):
-        raise TronError(f"the PLY has {count} f_rest properties", path, "degrees 0 to 3 have 0, 9, 24 or 45")
-    bands = count // 3
-    if bands:
-        sh[:, 1 : 1 + bands] = stack(REST[: 3 * bands]).reshape(len(dc), 3, bands).transpose(0, 2, 1)
-    return sh
+def projection_of(
+    properties: Collection[str], comments: Sequence[str], ours: bool, antialiased: bool, path: Path
+) -> str:
+    """By what the file says; ``ours``: of TRON, with signed normals, which before was all that it said."""
+    said = [comment[len(_PROJECTION) :].strip() for comment in comments if comment.startswith(_PROJECTION)]
+    if said:
+        if said[-1] not in PROJECTIONS:
+            raise TronError(
+                f"comment '{_PROJECTION}{said[-1][:40]}' names none", path, f"use {', '.join(PROJECTIONS)}"
+            )
+        return said[-1]
+    return DISKS if ours else stated_projection(properties, comments, antialiased)
 
 
-def _object_id(columns: dict[str, np.ndarray], count: int, path: Path) -> np.ndarray:
-    if "object_id" not in columns:
-        return np.zeros(count, np.int32)
-    values = np.asarray(columns["object_id"], dtype=np.float64)
-    whole = np.abs(values) < 2**31
-    if not whole.all():
-        raise TronError(f"object_id of surfel {int((~whole).argmax())} is no 32-bit number", path)
-    return values.astype(np.int32)
+_MAGIC = b"\x1f\x8b"
+_MOST_EXPANDED = 100
+"""Times its size that a file may expand to; splats expand to 2 to 10 times theirs."""
+_ALWAYS_ALLOWED = 1 << 26
+
+
+def is_gzipped(path: Path) -> bool:
+    """Whether a file begins as gzip's do; OSError if it cannot be read."""
+    with open(path, "rb") as stream:
+        return stream.read(len(_MAGIC)) == _MAGIC
+
+
+def _largest(path: Path) -> int:
+    """The most bytes that a gzipped file may expand to."""
+    return max(_ALWAYS_ALLOWED, _MOST_EXPANDED * path.stat().st_size)
+
+
+def _whole(path: Path) -> bytes:
+    """Content of a gzipped file; TronError if it is damaged or expands beyond its limit."""
+    limit = _largest(path)
+    data = _expanded(path, limit + 1)
+    if len(data) > limit:
+        raise TronError(f"expands to more than {_MOST_EXPANDED} times its size", path, "gunzip it yourself")
+    return data
+
+
+def _expanded(path: Path, n_bytes: int) -> bytes:
+    try:
+        with gzip.open(path) as stream:
+            return stream.read(n_bytes)
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise TronError(f"gzip file is cut short or damaged: {error}", path) from error

@@ -21,8 +21,9 @@ from tron.errors import TronError, located
 from tron.framing import upright
 from tron.gaussians.fields import FIELDS, LOG_SCALE_LIMIT, MATERIALS
 from tron.gaussians.harmonics import rotate_sh
-from tron.gaussians.ply import read_splats, write_ply
+from tron.gaussians.ply import write_ply
 from tron.gaussians.projections import DISKS, PROJECTIONS
+from tron.gaussians.reading import read_splats
 
 log = logging.getLogger(__name__)
 
@@ -245,7 +246,7 @@ class GaussianScene:
     def load(cls, path: str | Path) -> GaussianScene:
         """Read a TRON, 2DGS or 3DGS PLY, or another file of splats (docs/guides/formats.md).
 
-        What files leave out: :func:`tron.gaussians.ply.read_splats`.
+        What files leave out: :func:`tron.gaussians.reading.read_splats`.
 
         A file that says no spacing has it measured. Where a scan is made of round Gaussians, as those of
         SplaTAM and MonoGS, which have no axis for a normal, they get that of their neighbourhood.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -11,24 +10,18 @@ import plyfile
 from tron.errors import TronError
 from tron.framing import Y_UP, upright
 from tron.gaussians.edit import with_kernel
-from tron.gaussians.fields import FIELDS, third_scales
-from tron.gaussians.formats.registry import FORMATS
-from tron.gaussians.formats.splats import Splats
+from tron.gaussians.fields import FIELDS
+from tron.gaussians.formats.packed import changing
+from tron.gaussians.formats.registry import BY_SUFFIX, WRITTEN
 from tron.gaussians.harmonics import dc_to_rgb
-from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS, packed
-from tron.gaussians.ply import NORMAL, write_ply
+from tron.gaussians.ply import NORMAL
 from tron.gaussians.scene import GaussianScene
-from tron.gaussians.spz_precision import refined
 from tron.io.optional import usd
 from tron.storage import atomic_path, write_atomic
 
-SUFFIXES = (".ply", *PACKED_SPLATS, *(suffix for suffix, each in FORMATS.items() if each.write))
-"""Of files that :func:`write_splats` writes."""
 MOST_SOG = 64_000
 """Splats with harmonics beyond degree 0 that gaussforge packs as .sog within a minute. From 65,000 on it
 gathers them around 65,536 others, and 100,000 were not done after ten minutes."""
-_CHANGING = 1e-4
-"""Coefficient beyond degree 0 from which packed files hold harmonics; 8 bits of display are 4e-3."""
 _SEEN = 0.1
 """Opacity from which a surfel is a point."""
 
@@ -36,8 +29,8 @@ _SEEN = 0.1
 def check_suffix(path: Path) -> None:
     """Raise TronError unless :func:`write_splats` knows a file's suffix, and what writes it is there."""
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        known = ", ".join(SUFFIXES)
+    if suffix not in WRITTEN:
+        known = ", ".join(WRITTEN)
         raise TronError("its name does not say a format", path, f"let it end with one of {known}")
     if suffix.startswith(".usd"):
         usd(str(path))
@@ -65,23 +58,17 @@ def write_splats(path: Path, scene: GaussianScene) -> None:
     if not len(scene):
         raise TronError("there are no surfels to write", path)
     suffix = path.suffix.lower()
-    other = FORMATS.get(suffix)
-    if other is not None and other.write is not None:
-        write_atomic(path, other.write(_splats(scene.rotated(Y_UP @ upright(scene.up))), suffix))
-        return
-    kind = PACKED_SPLATS.get(suffix)
-    if kind is None:
-        _write_plain(path, scene)
-        return
-    changing = bool(np.abs(scene.sh[:, 1:]).max() > _CHANGING)
-    if changing:
+    known = BY_SUFFIX[suffix]
+    assert known.write is not None
+    if changing(scene.sh):
         check_count(path, len(scene))
-    with tempfile.TemporaryDirectory(prefix="tron-") as folder:
-        plain = Path(folder) / "plain.ply"
-        turned = scene.rotated(HALF_TURN) if kind.half_turned else scene
-        _write_plain(plain, turned, changing)
-        content = packed(plain.read_bytes(), kind)
-    write_atomic(path, refined(content, turned.means, turned.sh) if suffix == ".spz" else content)
+    if known.y_up:
+        scene = scene.rotated(Y_UP @ upright(scene.up))
+    elif known.turn is not None:
+        scene = scene.rotated(known.turn)
+    plain = with_kernel(scene, 2)
+    values = vars(plain) | {"normals": plain.normals(), "materials_guessed": True}
+    write_atomic(path, known.write(values, suffix))
 
 
 def write_points(path: Path, scene: GaussianScene) -> int:
@@ -106,16 +93,3 @@ def write_points(path: Path, scene: GaussianScene) -> int:
     with atomic_path(path) as temporary:
         plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
     return len(rows)
-
-
-def _splats(scene: GaussianScene) -> Splats:
-    plain = with_kernel(scene, 2)
-    third = third_scales(plain.log_scales, plain.log_thickness)
-    log_scales = np.concatenate([plain.log_scales, third[:, None]], axis=1)
-    return Splats(plain.means, plain.quats, log_scales, plain.opacity_logits, plain.sh)
-
-
-def _write_plain(path: Path, scene: GaussianScene, changing: bool = True) -> None:
-    plain = with_kernel(scene, 2)
-    values = vars(plain) | {"normals": plain.normals(), "materials_guessed": True}
-    write_ply(path, values, plain=True, changing=changing)

@@ -11,13 +11,14 @@ import base64
 import binascii
 import json
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tron.errors import TronError
 
@@ -245,6 +246,26 @@ def _slice(data: memoryview, start: Any, size: Any, what: str) -> memoryview:
     if start + size > len(data):
         raise TronError(f"model's {what} ends at byte {start + size:,} of {len(data):,}")
     return data[start : start + size]
+
+
+def node_matrix(node: Mapping[str, Any]) -> np.ndarray:
+    """(4, 4) from a node's frame to its parent's (glTF 2.0, section 3.5.2)."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    matrix = np.eye(4)
+    turn = Rotation.from_quat(node.get("rotation", (0.0, 0.0, 0.0, 1.0))).as_matrix()
+    matrix[:3, :3] = turn * np.asarray(node.get("scale", (1.0, 1.0, 1.0)), np.float64)
+    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+    return matrix
+
+
+def binary_file(tree: Mapping[str, Any], binary: bytes) -> bytes:
+    """A .glb (glTF 2.0, section 4.4) of a JSON and of its buffer, of whole times 4 bytes."""
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary))
+    head += struct.pack("<I4s", len(text), b"JSON")
+    return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
 
 
 def _mapped(path: Path) -> memoryview:

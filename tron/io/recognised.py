@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 from tron.errors import TronError
 
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts")
+
 
 class Sight(NamedTuple):
     """Something that is known by sight.

@@ -19,7 +19,8 @@ from tron.models.gltf.meshes import read_parts
 from tron.models.obj import read_obj
 from tron.models.parts import Part, split_mirrored, without_slivers
 
-SUFFIXES = (".gltf", ".glb", ".obj")
+READERS = {".gltf": read_parts, ".glb": read_parts, ".obj": read_obj}
+SUFFIXES = tuple(READERS)
 MOST_TRIANGLES = 5_000_000
 
 NEEDLE = 1e-3
@@ -45,11 +46,7 @@ def load_model(path: str | Path, up: str = "y", *, fitted: bool = True) -> list[
         raise TronError("model not found", path)
     refuse_placeholder(path)
     try:
-        parts = (
-            read_obj(path, MOST_TRIANGLES)
-            if path.suffix.lower() == ".obj"
-            else read_parts(path, MOST_TRIANGLES)
-        )
+        parts = READERS.get(path.suffix.lower(), read_parts)(path, MOST_TRIANGLES)
         return _standing(parts, up, fitted)
     except TronError as error:
         raise TronError(error.what, error.where or path, error.mend) from error

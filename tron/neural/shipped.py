@@ -5,13 +5,9 @@ Their files lie in the folder `shipped` beside this one as NAME.safetensors; its
 
 from __future__ import annotations
 
-import logging
-from functools import cache
 from pathlib import Path
 
 from tron.errors import TronError
-
-log = logging.getLogger(__name__)
 
 FOLDER = Path(__file__).with_name("shipped")
 SHIPPED = {
@@ -19,8 +15,6 @@ SHIPPED = {
     "paper": "of pbr and irradiance, the paper's buffers",
 }
 """Name -> what the network is given."""
-FORMER_NAMES = {"lit": "surfaces", "pair": "paper"}
-"""Name that a checkpoint had in version 0.1 -> its name; these go with the next release."""
 DEFAULT = "surfaces"
 """The one that ``auto`` means."""
 AUTO = "auto"
@@ -55,16 +49,4 @@ def checkpoint_file(checkpoint: str | Path) -> Path:
     this installation.
     """
     name = str(checkpoint)
-    if name in FORMER_NAMES:
-        _say_renamed(name)
-    name = FORMER_NAMES.get(name, name)
     return shipped(name) if name in SHIPPED else Path(checkpoint)
-
-
-@cache
-def _say_renamed(name: str) -> None:
-    log.warning(
-        "checkpoint '%s' is called '%s' now; the old name goes with the next release",
-        name,
-        FORMER_NAMES[name],
-    )

@@ -17,11 +17,10 @@ surfels without a sign are turned to each of them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -276,33 +275,6 @@ class Relighter:
     def stands_as(self, scene: GaussianScene) -> bool:
         """Whether a scene is this one but for materials and radiance."""
         return len(scene) == len(self.scene) and _same(self.scene, scene, (*REACH, "means", "quats"))
-
-    def show(
-        self,
-        lights: str | Path | EnvironmentMap | Mapping[str, EnvironmentMap],
-        height: int = 640,
-        **settings: Any,
-    ) -> Any:
-        """Watch and change the scene in a notebook's cell: the window of tron-view, which shows itself.
-
-        It is a copy: what is changed there stays there, until it is saved. It estimates light as tron-view
-        does, and decides by itself whether light sees a proxy.
-
-        Args:
-            lights: to choose from: maps by name, one map, or a folder of files.
-            height: of the cell's frame, pixels.
-            settings: of tron-view by name, such as ``models``, ``port``, ``output_dir``.
-
-        Returns:
-            :class:`tron.apps.view.Shown`, which ``close()`` ends.
-
-        Raises:
-            TronError: viser is not installed, a setting is wrong, or there are meshes, which it cannot show.
-        """
-        if self.meshes is not None:
-            raise TronError("the viewer shows no meshes", mend="insert them as surfels (tron.editing.Insert)")
-        # By name: it stands above all floors, and whoever lights a scene needs no viser.
-        return import_module("tron.apps.view").show(self.scene, lights, height, **settings)
 
     def changed(
         self,

@@ -133,6 +133,7 @@ class Window:
         self._last: dict[int, Picture] = {}
         self._pictures = threading.Condition()
         self._about, self._shape = "reading the scene", (home.width, home.height)
+        logging.getLogger("websockets").setLevel(logging.WARNING)  # it says who comes and goes
         with redirect_stdout(io.StringIO()):  # viser's banner
             self._server = viser.ViserServer(host=host, port=port, label="TRON", verbose=False)
         # A client may ask for a tunnel through viser's own host, button or not: nobody listens from outside.

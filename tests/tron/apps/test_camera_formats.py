@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tron.apps.camera_formats import UPRIGHT, write_camera_file
 from tron.apps.export import cli
-from tron.apps.relight.camera_files import cameras_of
 from tron.cameras import Camera
 from tron.errors import TronError
+from tron.io.cameras.registry import UPRIGHT, cameras_of, write_camera_file
 from tron.io.optional import usd
 
 SIZE = (96, 64)

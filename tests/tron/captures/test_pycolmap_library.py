@@ -9,7 +9,7 @@ import pytest
 
 PROGRAM = """
 import os, signal, threading
-from tron.captures.photos.distortion import load_pycolmap
+from tron.lenses import load_pycolmap
 {before}
 thread = threading.Thread(target=load_pycolmap)  # as a worker of tron-datagen does
 thread.start()

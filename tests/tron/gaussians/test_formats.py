@@ -25,13 +25,9 @@ from tron.color import linear_to_srgb
 from tron.errors import TronError
 from tron.framing import Y_UP, upright
 from tron.gaussians.edit import KERNEL_WIDTHS
-from tron.gaussians.foreign_files import refuse_foreign
-from tron.gaussians.formats.registry import FORMATS
+from tron.gaussians.formats.registry import READ, WRITTEN, check_header, refuse_foreign
 from tron.gaussians.harmonics import dc_to_rgb, eval_sh, spread_directions
-from tron.gaussians.packed_files import PACKED_SPLATS
-from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
-from tron.gaussians.splat_files import SUFFIXES as SUFFIXES_OUT
 from tron.gaussians.splat_files import write_points, write_splats
 
 SUFFIXES = (".glb", ".usda", ".usdc", ".usdz")
@@ -365,7 +361,7 @@ def test_points_stand_on_the_map_in_their_colours(random_scene, tmp_path: Path) 
 def test_the_page_of_formats_has_every_suffix(pytestconfig: pytest.Config) -> None:
     rows = (pytestconfig.rootpath / "docs/guides/formats.md").read_text().splitlines()
     cells = [row.split("|")[1:4] for row in rows if row.startswith("| `")]
-    for column, known in ((1, {".ply", *PACKED_SPLATS, *FORMATS}), (2, {*SUFFIXES_OUT, *MESHES})):
+    for column, known in ((1, set(READ)), (2, {*WRITTEN, *MESHES})):
         said = {
             suffix
             for row in cells

@@ -15,11 +15,12 @@ from scipy.spatial import KDTree
 
 from tron.errors import TronError
 from tron.gaussians import splat_files
+from tron.gaussians.formats.packed import packed
+from tron.gaussians.formats.registry import PACKED
+from tron.gaussians.formats.spz import BITS, HALF_TURN, refined
 from tron.gaussians.harmonics import eval_sh, spread_directions
-from tron.gaussians.packed_files import HALF_TURN, PACKED_SPLATS, packed
 from tron.gaussians.scene import GaussianScene
 from tron.gaussians.splat_files import write_splats
-from tron.gaussians.spz_precision import BITS, refined
 
 
 @pytest.mark.parametrize(
@@ -49,7 +50,7 @@ def arranged(random_scene) -> GaussianScene:
     return scene
 
 
-@pytest.mark.parametrize("suffix", PACKED_SPLATS)
+@pytest.mark.parametrize("suffix", PACKED)
 def test_round_trips_keep_what_formats_hold(random_scene, tmp_path, suffix):
     scene = arranged(random_scene)
     path = tmp_path / f"a{suffix}"
@@ -93,7 +94,7 @@ def test_spz_keeps_places_and_harmonics_of_any_scene(random_scene, tmp_path, siz
     assert np.abs(found.means - wanted.means).max() < 0.51 * steps
     assert np.abs(found.sh - wanted.sh)[:, 1:].max() < 0.5 / 2 ** (BITS - 1) + 1 / 256 + 1e-6
     write_splats(tmp_path / "a.ply", wanted)
-    coarse = packed((tmp_path / "a.ply").read_bytes(), PACKED_SPLATS[".spz"])
+    coarse = packed((tmp_path / "a.ply").read_bytes(), "spz")
     fine, before = (gzip.decompress(each) for each in ((tmp_path / "a.spz").read_bytes(), coarse))
     others = slice(16 + 9 * len(scene), len(fine) - 45 * len(scene))
     assert fine[others] == before[others]
@@ -128,7 +129,7 @@ def test_what_spz_cannot_hold_is_one_line(random_scene, tmp_path):
     scene = arranged(random_scene)
     with pytest.raises(TronError, match="no place as far out"):
         write_splats(tmp_path / "a.spz", replace(scene, means=scene.means * np.float32(1e8)))
-    content = packed(_plain_file(scene, tmp_path), PACKED_SPLATS[".spz"])
+    content = packed(_plain_file(scene, tmp_path), "spz")
     with pytest.raises(TronError, match="not known here"):
         refined(content, scene.means[:-1], scene.sh[:-1])
     assert not (tmp_path / "a.spz").exists()
@@ -142,7 +143,7 @@ def _plain_file(scene: GaussianScene, folder: Path) -> bytes:
 @pytest.mark.skipif(
     shutil.which("splat-transform") is None, reason="npm install -g @playcanvas/splat-transform"
 )
-@pytest.mark.parametrize("suffix", PACKED_SPLATS)
+@pytest.mark.parametrize("suffix", PACKED)
 def test_another_reader_sees_the_same(random_scene, tmp_path, suffix):
     scene = arranged(random_scene)
     write_splats(tmp_path / f"a{suffix}", scene)
@@ -173,7 +174,7 @@ def test_the_frame_of_spz_is_a_half_turn_away(random_scene, tmp_path):
     np.testing.assert_allclose(held, scene.means @ HALF_TURN, atol=2e-3)
 
 
-@pytest.mark.parametrize("suffix", PACKED_SPLATS)
+@pytest.mark.parametrize("suffix", PACKED)
 def test_damaged_files_cost_a_line(random_scene, tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     write_splats(path, arranged(random_scene))

@@ -22,11 +22,8 @@ def test_a_shipped_checkpoint_is_given_what_its_name_says_and_has_a_card(name: s
     assert f"sha256 `{sha256(path)[:8]}...`" in card.partition("\n## ")[0]
 
 
-def test_former_names_still_mean_them_and_say_so_once(caplog):
-    shipped._say_renamed.cache_clear()
-    for former, name in (("lit", "surfaces"), ("pair", "paper")):
-        assert [shipped.checkpoint_file(former) for _ in range(2)] == [shipped.shipped(name)] * 2
-        assert caplog.text.count(f"'{former}' is called '{name}' now") == 1
+def test_a_name_is_its_file_and_a_path_itself():
+    assert shipped.checkpoint_file("paper") == shipped.shipped("paper")
     assert shipped.checkpoint_file("lit.safetensors").name == "lit.safetensors"
 
 

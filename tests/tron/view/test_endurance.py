@@ -226,10 +226,10 @@ def test_a_minute_of_random_input_leaves_memory_as_it_was(variant, scene, tmp_pa
 if __name__ == "__main__":
     from tempfile import TemporaryDirectory
 
-    from tron.apps.view import _finish
+    from tron.view.opening import finish_of
 
     with TemporaryDirectory() as made:
-        chosen = _finish(2)(96, 72)
+        chosen = finish_of(2)(96, 72)
         found = endure(float(sys.argv[1]), 7, Path(made), make_scene(0.06), chosen)
     for at, megabytes in found.samples[:: max(1, len(found.samples) // 30)]:
         print(f"{at:7.0f} s {megabytes:7.0f} MB")

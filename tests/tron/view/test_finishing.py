@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tron.apps import view
-from tron.apps.relight import network_gains
 from tron.color import agx
+from tron.neural import network_gains
 from tron.neural.shipped import DEFAULT, installed
 from tron.seeds import generator
+from tron.view import opening
 from tron.view.finishing import Denoised, Drawn
 
 SIDE = 64
@@ -38,7 +38,7 @@ def network() -> Future[Any]:
     if DEFAULT not in installed():
         pytest.skip("the package came without its network")
     loaded: Future[Any] = Future()
-    view._load(loaded, 1)
+    opening._load(loaded, 1)
     return loaded
 
 
@@ -103,13 +103,13 @@ def test_it_is_chosen_as_checkpoint_auto_chooses(monkeypatch):
     pytest.importorskip("torch")
     gains = {"preview": {128: 1.0}, "final": {128: -1.0, 512: 1.0}}
     monkeypatch.setattr(network_gains, "GAINS", gains)
-    monkeypatch.setattr(view, "_load", lambda *_: None)
-    monkeypatch.setattr(view, "installed", lambda: {DEFAULT: None})
-    monkeypatch.setattr(view, "find_spec", lambda _: True)
-    finish = view._finish(None)
+    monkeypatch.setattr(opening, "_load", lambda *_: None)
+    monkeypatch.setattr(opening, "installed", lambda: {DEFAULT: None})
+    monkeypatch.setattr(opening, "find_spec", lambda _: True)
+    finish = opening.finish_of(None)
     assert isinstance(finish(128, 128), Denoised), "a loss where it is small"
     assert isinstance(finish(512, 512), Drawn)
-    monkeypatch.setattr(view, "find_spec", lambda _: None)
-    assert view._finish(None)(128, 128) is None
-    monkeypatch.setattr(view, "missing_libraries", lambda _: ["torch"])
-    assert view._finish(None)(512, 512) is None
+    monkeypatch.setattr(opening, "find_spec", lambda _: None)
+    assert opening.finish_of(None)(128, 128) is None
+    monkeypatch.setattr(opening, "missing_libraries", lambda _: ["torch"])
+    assert opening.finish_of(None)(512, 512) is None

@@ -18,11 +18,11 @@ import scipy.stats
 from tron.apps.reconstruct.pictures import chosen_views, view_pictures
 from tron.apps.reconstruct.settings import ReportSettings
 from tron.apps.relight.camera_files import filmed_orbit, frame_size
-from tron.apps.relight.settings import QUALITY
 from tron.cameras import Camera
 from tron.captures import Capture
 from tron.cli.progress import track
 from tron.color import to_display
+from tron.estimation import QUALITY
 from tron.framing import upright
 from tron.gaussians.scene import GaussianScene
 from tron.io.video import VideoWriter

@@ -7,11 +7,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.apps.machine import Variant
 from tron.apps.reconstruct.splat_capture import SplatSettings
 from tron.captures import LoadSettings
 from tron.captures.load import CaptureSettings
 from tron.reconstruction.settings import FitSettings, ReconstructionSettings
+from tron.runtime import Variant
 
 
 class Paths(BaseModel):

@@ -25,9 +25,7 @@ from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.errors import TronError
-from tron.gaussians.foreign_files import refuse_foreign
-from tron.gaussians.formats.registry import named_as_splats
-from tron.gaussians.ply import check_header
+from tron.gaussians.formats.registry import check_header, named_as_splats, refuse_foreign
 from tron.gaussians.scene import GaussianScene
 from tron.seeds import generator
 from tron.trajectories import film_around, film_with

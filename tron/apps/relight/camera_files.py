@@ -1,7 +1,5 @@
 """Cameras that a scene was filmed with, paths between them, and paths from files.
 
-Files are TRON's own lists, those of 3DGS, transforms.json and nerfstudio's viewer's, and others'.
-
 Either the cameras or the scene may have had its large coordinates taken away: :func:`in_frame_of`.
 """
 
@@ -9,29 +7,19 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tron.apps.camera_formats import (
-    UPRIGHT,
-    of_supersplat,
-    read_colmap,
-    read_gltf,
-    read_usd,
-    supersplat_document,
-)
 from tron.apps.relight.one_view import one_view
-from tron.cameras import Camera, focus_of, opengl_to_opencv, rigid_pose
-from tron.errors import TronError, located
+from tron.cameras import Camera, focus_of
+from tron.errors import TronError
+from tron.io.cameras.registry import UPRIGHT, cameras_of
 from tron.io.local_frame import ORIGIN, moved_cameras
-from tron.io.recognised import refuse_by_sight
-from tron.io.transforms_json import cameras_of_transforms
 from tron.storage import write_atomic
 from tron.trajectories import keyframed, turn_cameras
 
@@ -41,25 +29,16 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_MEND = (
-    'give a list, {"cameras": [...]} as in relight.json, cameras.json of a 3DGS model, a transforms.json, '
-    "nerfstudio's camera_path.json, SuperSplat's project, COLMAP's images.txt, or a .glb or .usda"
-)
 CAMERAS = "cameras.json"
 _AROUND_DEG = 60.0
 _KERNEL_DEG = 15.0
 
 
 def read_cameras(path: Path, width: int, height: int, fps: float = 24.0) -> list[Camera]:
-    """Cameras of a file, resized.
+    """Cameras of a file (:func:`tron.io.cameras.registry.cameras_of`), resized.
 
-    A JSON is a list of cameras (Camera.to_dict), or an object with such a list as "cameras", as
-    relight.json and the metadata of shards have it; the cameras.json of a 3DGS model; a transforms.json, in
-    the world of its capture (:func:`cameras_of_transforms`); or nerfstudio's camera_path.json, whose world is
-    that of the scene that nerfstudio exports (`ns-export gaussian-splat`). Others are those of
-    :mod:`tron.apps.camera_formats`.
-
-    Raises TronError if the file is missing, is no such file, holds no camera, or has another aspect ratio.
+    Raises:
+        TronError: as there, or they have another aspect ratio.
     """
     cameras = cameras_of(path, (width, height), fps)
     for camera in cameras:
@@ -77,86 +56,6 @@ def frame_size(shape: tuple[int, int], longer: int) -> tuple[int, int]:
     """Even width and height of a frame in the ``shape`` of another, its ``longer`` side in pixels."""
     width, height = (max(8, 2 * round(longer * side / max(shape) / 2)) for side in shape)
     return width, height
-
-
-def cameras_of(path: Path, size: tuple[int, int] = (512, 512), fps: float = 24.0) -> list[Camera]:
-    """Cameras of a file (see :func:`read_cameras`) at their own size; TronError likewise.
-
-    Args:
-        path: the file.
-        size: (width, height) in pixels of cameras that have none, as those of NeRF's transforms.json.
-        fps: frames a second that cameras which move are taken at.
-    """
-    suffix = path.suffix.lower()
-    if suffix in UPRIGHT:
-        if not path.is_file():
-            raise TronError("cannot read: no such file", path)
-        return (read_gltf if suffix in (".glb", ".gltf") else read_usd)(path, size, fps)
-    if suffix == ".ssproj":
-        return of_supersplat(supersplat_document(path), size)
-    refuse_by_sight(path, "cameras are a JSON file")
-    if suffix in (".txt", ".bin"):
-        return read_colmap(path)
-    try:
-        content = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise TronError(f"cannot read: {error.strerror or error}", path) from error
-    except ValueError as error:
-        raise TronError(f"not JSON: {error}", path, _MEND) from error
-    if isinstance(content, dict) and "frames" in content and "cameras" not in content:
-        return cameras_of_transforms(path, size)
-    if isinstance(content, dict) and "poseSets" in content:
-        with located(path):
-            return of_supersplat(content, size)
-    saved_by_viewer = isinstance(content, dict) and "camera_path" in content
-    key = "camera_path" if saved_by_viewer else "cameras"
-    entries = content.get(key) if isinstance(content, dict) else content
-    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
-        raise TronError("no cameras found", path, _MEND)
-    with located(path):
-        if saved_by_viewer:
-            return _nerfstudio(content)
-        return [_graphdeco(each) if "rotation" in each else Camera.from_dict(each) for each in entries]
-
-
-def _graphdeco(entry: dict[str, Any]) -> Camera:
-    """Camera of 3DGS' cameras.json: centre, rows of the rotation camera-to-world (OpenCV), focal lengths.
-
-    The principal point is the middle, as 3DGS renders it (`camera_to_JSON` of its utils/camera_utils.py).
-    """
-    try:
-        to_world = np.eye(4)
-        to_world[:3, :3], to_world[:3, 3] = entry["rotation"], entry["position"]
-        fx, fy = float(entry["fx"]), float(entry["fy"])
-        width, height = int(entry["width"]), int(entry["height"])
-    except KeyError as error:
-        raise TronError(f"camera of a 3DGS model lacks the field {error.args[0]!r}") from error
-    except (TypeError, ValueError) as error:
-        raise TronError(f"camera of a 3DGS model has an unreadable field: {error}") from error
-    return Camera(fx, fy, width / 2, height / 2, width, height, np.linalg.inv(rigid_pose(to_world)))
-
-
-def _nerfstudio(content: dict[str, Any]) -> list[Camera]:
-    """Cameras of nerfstudio's camera_path.json.
-
-    Each has 16 numbers camera-to-world, row-major, in OpenGL's axes, and the vertical field of view, degrees.
-    """
-    kind = content.get("camera_type", "perspective")
-    if kind != "perspective":
-        raise TronError(f"nerfstudio's camera path is {kind}", mend="save a perspective one")
-    try:
-        width, height = int(content["render_width"]), int(content["render_height"])
-        return [_camera(entry, width, height) for entry in content["camera_path"]]
-    except KeyError as error:
-        raise TronError(f"nerfstudio's camera path lacks {error.args[0]!r}") from error
-    except (TypeError, ValueError, ZeroDivisionError) as error:
-        raise TronError(f"nerfstudio's camera path has an unreadable field: {error}") from error
-
-
-def _camera(entry: dict[str, Any], width: int, height: int) -> Camera:
-    to_world = opengl_to_opencv(np.asarray(entry["camera_to_world"], np.float64).reshape(4, 4))
-    focal = 0.5 * height / math.tan(0.5 * math.radians(float(entry["fov"])))
-    return Camera(focal, focal, width / 2, height / 2, width, height, np.linalg.inv(to_world))
 
 
 def in_frame_of(offset: np.ndarray, cameras: Sequence[Camera], path: Path) -> list[Camera]:

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import tron
-from tron.apps.camera_formats import UPRIGHT
 from tron.apps.capture_light import LIGHT, is_of_capture, over_scene
 from tron.apps.frame_folder import FrameFolder
 from tron.apps.relight.camera_files import (
@@ -30,7 +29,6 @@ from tron.apps.relight.camera_files import (
     stated,
 )
 from tron.apps.relight.clip import DEPTH, Clip, trace
-from tron.apps.relight.network_gains import expected_gain, quality_of
 from tron.apps.relight.scan_materials import proxy_file, with_materials
 from tron.apps.relight.settings import Settings
 from tron.apps.relit import RelitPicture
@@ -47,12 +45,13 @@ from tron.editing.motion import Motion
 from tron.editing.moving import in_motion
 from tron.errors import TronError, located
 from tron.framing import upright
-from tron.gaussians.foreign_files import refuse_foreign
+from tron.gaussians.formats.registry import check_header, refuse_foreign
 from tron.gaussians.kept import KeptFiles
-from tron.gaussians.ply import check_header
 from tron.gaussians.scene import GaussianScene
+from tron.io.cameras.registry import UPRIGHT
 from tron.io.recognised import refuse_by_sight
 from tron.neural.clips import check_frames
+from tron.neural.network_gains import expected_gain, quality_of
 from tron.neural.shipped import DEFAULT, SHIPPED, checkpoint_file
 from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
 from tron.shards.schema import GUIDANCE
@@ -362,7 +361,7 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     A checkpoint that was asked for has to fit. That of checkpoint=auto gives way with a line in the log:
     where the libraries of networks or its file are not installed; where nothing bounces and it is given lit;
     where radiance is asked for, which a network does not draw; where Open Image Denoise is; and where it does
-    not surely gain at that size and quality (:mod:`tron.apps.relight.network_gains`). Where window, overlap,
+    not surely gain at that size and quality (:mod:`tron.neural.network_gains`). Where window, overlap,
     reproject or weights are chosen, it has to fit too.
 
     Raises:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from tron.apps.capture_light import LIGHT
-from tron.apps.machine import Variant
-from tron.apps.relight.camera_files import CAMERAS, cameras_of, frame_size
+from tron.apps.relight.camera_files import CAMERAS, frame_size
 from tron.apps.relit import Background
 from tron.apps.scene_file import SeenAs, Up
 from tron.apps.splat_file import SceneFile
@@ -17,10 +16,12 @@ from tron.apps.surroundings import DESCRIPTION, Treatment
 from tron.color import Look
 from tron.editing.models import PlacedModel
 from tron.errors import TronError
-from tron.estimation import FINAL, FINEST, PREVIEW, Brdf, Estimation, Estimator, require_bounces
+from tron.estimation import FINAL, QUALITY, Brdf, Estimation, Estimator, require_bounces
+from tron.io.cameras.registry import cameras_of
 from tron.neural.clips import Overlap
 from tron.neural.configs import check_sizes
 from tron.neural.shipped import AUTO, DEFAULT, SHIPPED
+from tron.runtime import Variant
 from tron.shards.schema import guidance_members, light_members
 from tron.trajectories import TrajectoryName
 
@@ -36,8 +37,6 @@ else:
     BufferName = Literal[BUFFERS]
 LONGER_SIDE = 512
 """Pixels of the longer side of a frame, unless the settings say it."""
-
-QUALITY = {"preview": PREVIEW, "final": FINEST}
 
 ProxyChoice = Literal["auto", "always", "never"]
 Side = Annotated[int, Field(ge=8, le=8192)]
@@ -182,7 +181,7 @@ class Settings(BaseModel):
         f"({', '.join(SHIPPED)}): the relit picture is then the neural renderer's; auto: {DEFAULT} where it "
         "makes the picture better, which the log says, otherwise none; null: no network. A network wants "
         "pip install 'tron-relight[network]'",
-        examples=["pair"],
+        examples=["paper"],
     )
     window: int | None = Field(
         None,

@@ -23,12 +23,12 @@ from xml.etree import ElementTree  # expat limits what entities expand to, and f
 import numpy as np
 
 from tron.cameras import rigid_pose
-from tron.captures.photos.distortion import Lens, opencv_lens
 from tron.captures.photos.image_folder import ImageFolder
 from tron.captures.photos.panoramas import Panorama
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError, located
+from tron.lenses import Lens, opencv_lens
 
 log = logging.getLogger(__name__)
 

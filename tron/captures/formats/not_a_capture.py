@@ -9,9 +9,8 @@ from typing import Any
 
 from tron.captures.photos.photo_files import SUFFIXES
 from tron.errors import TronError
-from tron.gaussians.foreign_files import VIDEOS
-from tron.gaussians.packed_files import PACKED_SPLATS
-from tron.io.recognised import recognised
+from tron.gaussians.formats.registry import PACKED
+from tron.io.recognised import VIDEOS, recognised
 
 _PHOTO = ("one photo", "give the folder of all photos of the scene")
 _ENVIRONMENT = ("an environment map, not a capture", "tron-relight environment=FILE takes it")
@@ -79,7 +78,7 @@ def _kind(file: Path) -> tuple[str, str] | None:
     suffix = file.suffix.lower()
     if suffix in VIDEOS:
         return "a video", f"give the file itself, capture={quote(str(file))}"
-    if suffix in PACKED_SPLATS:
+    if suffix in PACKED:
         mend = f"they are a scene already: tron-relight scene={quote(file.name)}"
         return "packed splats, not photos", mend
     if suffix in _KINDS:

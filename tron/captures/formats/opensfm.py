@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tron.captures.photos.distortion import Lens, opencv_lens
 from tron.captures.photos.image_folder import ImageFolder
 from tron.captures.photos.panoramas import Panorama
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError, located
 from tron.io.transforms_json import number, read_list
+from tron.lenses import Lens, opencv_lens
 
 _SPHERICAL = ("spherical", "equirectangular")
 _NAMES = ("reconstruction.json", "opensfm/reconstruction.json")

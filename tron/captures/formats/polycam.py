@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from tron.cameras import opengl_to_opencv, rigid_pose
-from tron.captures.photos.distortion import Lens, opencv_lens
 from tron.captures.photos.image_folder import photos_in
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError, located
 from tron.io.transforms_json import number, read_json
+from tron.lenses import Lens, opencv_lens
 
 UP = np.array([0.0, 1.0, 0.0])
 """ARKit's."""

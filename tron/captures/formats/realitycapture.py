@@ -22,11 +22,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tron.cameras import opengl_to_opencv
-from tron.captures.photos.distortion import Lens, opencv_lens
 from tron.captures.photos.image_folder import ImageFolder
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
+from tron.lenses import Lens, opencv_lens
 
 _LARGEST = 100_000_000
 _START = 4096

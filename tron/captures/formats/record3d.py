@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from tron.cameras import opengl_to_opencv
 from tron.captures.formats.polycam import UP
-from tron.captures.photos.distortion import Lens, opencv_lens
 from tron.captures.photos.image_folder import photos_in
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError, located
 from tron.io.transforms_json import number, read_json
+from tron.lenses import Lens, opencv_lens
 
 _NAMES = ("metadata.json", "metadata")
 

@@ -21,12 +21,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tron.captures.formats.polycam import UP
-from tron.captures.photos.distortion import Lens, opencv_lens
 from tron.captures.photos.image_folder import photos_in
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
 from tron.captures.photos.video_frames import FRAMES, holds_frames, keep_frames, sharpest
 from tron.errors import TronError
 from tron.io.video import frames_of
+from tron.lenses import Lens, opencv_lens
 from tron.storage import locked, sha256
 
 log = logging.getLogger(__name__)

@@ -14,11 +14,11 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from tron.cameras import opengl_to_opencv, rigid_pose
-from tron.captures.photos.distortion import Lens, opencv_lens
 from tron.captures.photos.image_folder import relative_parts
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
 from tron.errors import TronError
 from tron.io.transforms_json import read_json
+from tron.lenses import Lens, opencv_lens
 
 TRAIN_LIGHT = "sunset"
 _CURVE = 2.2

@@ -28,7 +28,6 @@ from tron.cameras import opengl_to_opencv, rigid_pose
 from tron.captures.folder import read_points
 from tron.captures.formats.colmap import model_folder
 from tron.captures.formats.not_a_capture import require_poses_of_photos
-from tron.captures.photos.distortion import Lens, opencv_lens
 from tron.captures.photos.image_folder import ImageFolder, relative_parts
 from tron.captures.photos.panoramas import Panorama
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
@@ -43,6 +42,7 @@ from tron.io.transforms_json import (
     read_json,
     to_original,
 )
+from tron.lenses import Lens, opencv_lens
 
 log = logging.getLogger(__name__)
 
@@ -194,7 +194,7 @@ def _points(root: Path, name: str, transform: np.ndarray) -> tuple[np.ndarray, n
 
 def _colmap_points(root: Path, photos: Sequence[PosedPhoto]) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Points and colours of a COLMAP model beside the file, if its cameras stand where the file's do."""
-    from tron.captures.formats.colmap import points_of, posed_by, read_model
+    from tron.io.colmap import points_of, posed_by, read_model
 
     folder = model_folder(root)
     if folder is None:

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from tron.cameras import Camera
-from tron.captures.photos.distortion import Lens
 from tron.captures.photos.panoramas import Face
 from tron.errors import TronError
+from tron.lenses import Lens
 
 _SHAPE_TOLERANCE = 0.02
 

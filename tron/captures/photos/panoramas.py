@@ -65,7 +65,7 @@ class Panorama:
 
 @dataclass(frozen=True)
 class Face:
-    """One face of a panorama's cube, in the place of a lens (:class:`tron.captures.photos.distortion.Lens`).
+    """One face of a panorama's cube, in the place of a lens (:class:`tron.lenses.Lens`).
 
     Attributes:
         panorama: the photo's camera.

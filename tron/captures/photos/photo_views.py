@@ -14,7 +14,6 @@ import numpy as np
 from tron.cameras import rigid_pose
 from tron.captures.masks import MaskMeaning, beside_reduced, find_mask
 from tron.captures.photos.depth_files import DepthReader, nearest, require_depth
-from tron.captures.photos.distortion import Lens
 from tron.captures.photos.panoramas import Face, Panorama
 from tron.captures.photos.photo_files import PhotoHeader, inspect_photo
 from tron.captures.photos.photographs import Decode, PhotoCache, PhotoReader, PosedPhoto
@@ -22,6 +21,7 @@ from tron.captures.settings import PhotoSettings
 from tron.captures.view import Pixels, View
 from tron.color import luminance, srgb_to_linear
 from tron.errors import TronError
+from tron.lenses import Lens
 
 _SHAPE_TOLERANCE = 0.02
 

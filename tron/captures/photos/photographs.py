@@ -16,9 +16,9 @@ import numpy as np
 from cachetools import LRUCache
 
 from tron.captures.masks import MaskMeaning, mask_values
-from tron.captures.photos.distortion import Lens
 from tron.captures.photos.panoramas import Face, Panorama, bordered
 from tron.captures.photos.photo_files import PhotoHeader, decode_photo
+from tron.lenses import Lens
 
 _OVERSAMPLED = 3
 """A panorama is reduced to so many times the resolution of the faces, before these are cut out."""

@@ -25,9 +25,8 @@ from PIL import Image, ImageOps
 from pydantic import BaseModel, Field
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from tron.captures.formats.colmap import INPUT, points_of, posed_by, read_model
+from tron.captures.formats.colmap import INPUT, lens_of
 from tron.captures.masks import mask_values
-from tron.captures.photos.distortion import impossible, load_pycolmap
 from tron.captures.photos.image_folder import photos_in
 from tron.captures.photos.photo_files import (
     PhotoHeader,
@@ -42,6 +41,8 @@ from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
 from tron.captures.posing.wide_pictures import equirectangular, refuse_discs
 from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
+from tron.io.colmap import points_of, posed_by, read_model
+from tron.lenses import impossible, load_pycolmap
 from tron.storage import locked, sha256, write_atomic
 
 if TYPE_CHECKING:
@@ -156,7 +157,7 @@ def pose_photos(path: Path, settings: PosingSettings, progress: Progress = log.i
     posed = []
     for copy, camera_to_world, lens in posed_by(model):
         name, wrong = copies[copy], impossible(lens)
-        posed.append(PosedPhoto(name, by_name.pop(name), camera_to_world, lens, refused=wrong))
+        posed.append(PosedPhoto(name, by_name.pop(name), camera_to_world, lens_of(lens), refused=wrong))
     skipped |= dict.fromkeys(by_name, "not posed: too few features in common with the others")
     points, colors = points_of(model)
     return PosedPhotos(folder, posed, points, colors, skipped=skipped, upright=True)

@@ -22,7 +22,7 @@ from tron.captures.photos.video_frames import (
 from tron.captures.posing.structure_from_motion import PosingSettings, pose_photos
 from tron.captures.posing.wide_pictures import refuse_video
 from tron.errors import TronError
-from tron.gaussians.foreign_files import VIDEOS
+from tron.io.recognised import VIDEOS
 from tron.io.video import duration_of, frames_of
 from tron.storage import locked, sha256
 

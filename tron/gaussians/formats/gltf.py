@@ -6,21 +6,18 @@ coefficient of the harmonics an attribute. Values are display-referred sRGB; y i
 
 from __future__ import annotations
 
-import json
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from tron.color import srgb_to_linear
 from tron.errors import TronError
 from tron.gaussians.formats.splats import Y_UP, Splats, joined, logarithms, logits, one_line
 from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
-from tron.io.gltf_document import Document, read_document
+from tron.io.gltf_document import Document, binary_file, node_matrix, read_document
 
 EXTENSION = "KHR_gaussian_splatting"
 _SPACE = "srgb_rec709_display"
@@ -92,11 +89,7 @@ def write(splats: Splats) -> bytes:
         "meshes": [{"primitives": [primitive | {"extensions": {EXTENSION: _KERNEL}}]}],
         "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": len(binary)}],
     }  # fmt: skip
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    length = 12 + 8 + len(text) + 8 + len(binary)
-    head = struct.pack("<4sII", b"glTF", 2, length) + struct.pack("<I4s", len(text), b"JSON")
-    return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + bytes(binary)
+    return binary_file(tree, bytes(binary))
 
 
 def _primitives(document: Document) -> Iterator[dict[str, Any]]:
@@ -109,24 +102,13 @@ def _of_node(document: Document, number: Any, above: np.ndarray, depth: int) -> 
     if depth > _DEEPEST:
         raise TronError(f"nodes stand more than {_DEEPEST} deep in one another")
     node = document.item("nodes", number)
-    matrix = above @ _matrix(node)
+    matrix = above @ node_matrix(node)
     if "mesh" in node:
         for primitive in document.item("meshes", node["mesh"]).get("primitives", []):
             if EXTENSION in primitive.get("extensions", {}):
                 yield _of_primitive(document, primitive).placed(matrix)
     for child in node.get("children", []):
         yield from _of_node(document, child, matrix, depth + 1)
-
-
-def _matrix(node: dict[str, Any]) -> np.ndarray:
-    """(4, 4) of a node (glTF 2.0, section 3.5.2)."""
-    if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    matrix = np.eye(4)
-    turn = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix()
-    matrix[:3, :3] = turn * np.array(node.get("scale", [1, 1, 1]), np.float64)
-    matrix[:3, 3] = node.get("translation", [0, 0, 0])
-    return matrix
 
 
 def _of_primitive(document: Document, primitive: dict[str, Any]) -> Splats:

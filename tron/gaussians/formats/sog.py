@@ -18,15 +18,14 @@ import numpy as np
 
 from tron.errors import TronError
 from tron.gaussians.fields import FIELDS
+from tron.gaussians.formats.packed import unpacked
 from tron.gaussians.formats.splats import Splats, joined, one_line
-from tron.gaussians.packed_files import PACKED_SPLATS, plain_ply
-from tron.gaussians.ply_arrays import columns_in
+from tron.gaussians.ply import columns_in
 
 META, LEVELS = "meta.json", "lod-meta.json"
 _LARGEST = 1 << 26
 """Bytes of a JSON: those of streamed SOG have a line for some thousand splats."""
 _DEEPEST = 64
-_SOG = PACKED_SPLATS[".sog"]
 
 
 def sog_file(folder: Path) -> Path | None:
@@ -89,7 +88,7 @@ def _splats(path: Path) -> Splats:
     """Of a ``meta.json`` with its pictures, or of a file of .sog."""
     content = path.read_bytes() if path.suffix.lower() == ".sog" else _zipped(path)
     with one_line(path):
-        columns, _ = columns_in(plain_ply(content, _SOG, path))
+        columns, _ = columns_in(unpacked(content, "sog", path), path)
 
         def stack(names: list[str]) -> np.ndarray:
             return np.stack([columns[name] for name in names], axis=-1)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tron.errors import TronError
+from tron.gaussians.fields import FIELDS, third_scales
 from tron.gaussians.harmonics import SH_COUNT, rotate_sh
+from tron.gaussians.ply import REST, THIRD_SCALE, Stored
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +63,26 @@ class Splats:
             raise TronError(
                 f"harmonics of its splats have shape {self.sh.shape}", mend="degrees 0 to 3 are read"
             )
+
+    @classmethod
+    def of(cls, scene: Mapping[str, Any]) -> Splats:
+        """Those of what a scene of kernel degree 2 holds."""
+        third = third_scales(scene["log_scales"], scene["log_thickness"])
+        log_scales = np.concatenate([scene["log_scales"], third[:, None]], axis=1)
+        return cls(scene["means"], scene["quats"], log_scales, scene["opacity_logits"], scene["sh"])
+
+    def stored(self) -> Stored:
+        """By the names of 3DGS' properties."""
+        rest = self.sh[:, 1:].transpose(0, 2, 1).reshape(len(self.sh), -1).T
+        columns = {
+            **dict(zip(FIELDS["means"].properties, self.means.T)),
+            **dict(zip(FIELDS["sh"].properties, self.sh[:, 0].T)),
+            **dict(zip(REST, rest)),
+            "opacity": self.opacity_logits,
+            **dict(zip((*FIELDS["log_scales"].properties, THIRD_SCALE), self.log_scales.T)),
+            **dict(zip(FIELDS["quats"].properties, self.quats.T)),
+        }
+        return Stored(columns, up=None if self.up is None else np.array(self.up))
 
     def placed(self, matrix: np.ndarray) -> Splats:
         """The splats under an affine (4, 4) matrix that turns, shifts, and scales all axes alike.

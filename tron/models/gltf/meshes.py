@@ -6,19 +6,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import DracoPy
 import numpy as np
 import trimesh
-from scipy.spatial.transform import Rotation
 
 from tron.errors import TronError
-from tron.io.gltf_document import Document, read_document
+from tron.io.gltf_document import Document, node_matrix, read_document
 from tron.models.alpha import without_clear
-from tron.models.gltf.draco import decode_draco
 from tron.models.gltf.materials import Material, Materials, TextureUse
 from tron.models.parts import Part, Sampling, Wrap, joined
 
 MOST_NODES = 20_000
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_DRACO_METADATA = 0x8000
 _SURFACES = (_TRIANGLES, _STRIP, _FAN)
 
 
@@ -80,24 +80,13 @@ def _instances(document: Document) -> list[tuple[int, np.ndarray]]:
         seen.add(index)
         if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
             raise TronError("model uses EXT_mesh_gpu_instancing, which is not read", mend="export it without")
-        matrix = above @ _local(node)
+        matrix = above @ node_matrix(node)
         if not np.isfinite(matrix).all():
             raise TronError("model has a node whose transform is not finite")
         if "mesh" in node and abs(np.linalg.det(matrix[:3, :3])) > 0:  # scaled to nothing is how some hide
             found.append((node["mesh"], matrix))
         waiting += [(child, matrix) for child in reversed(node.get("children", []))]
     return found
-
-
-def _local(node: dict[str, Any]) -> np.ndarray:
-    """(4, 4) from a node's frame to its parent's."""
-    if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    matrix = np.eye(4)
-    rotation = Rotation.from_quat(node.get("rotation", (0.0, 0.0, 0.0, 1.0))).as_matrix()
-    matrix[:3, :3] = rotation * np.asarray(node.get("scale", (1.0, 1.0, 1.0)), np.float64)
-    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
-    return matrix
 
 
 def _require_few(document: Document, instances: list[tuple[int, np.ndarray]], most: int) -> None:
@@ -137,7 +126,7 @@ def _read_primitive(document: Document, primitive: dict[str, Any]) -> _Geometry:
     if packed is not None:
         ids = {name: number for name, number in packed["attributes"].items() if name in wanted}
         blob = bytes(document.view(packed["bufferView"]))
-        faces, decoded = decode_draco(blob, ids, _triangles(document, primitive))
+        faces, decoded = _of_draco(blob, ids, _triangles(document, primitive))
         attributes = {name: document.meant(wanted[name], values) for name, values in decoded.items()}
     for name, index in wanted.items():
         if name not in attributes:
@@ -271,3 +260,67 @@ def _wrap(wrap: tuple[Wrap, Wrap], uv: np.ndarray) -> Wrap:
     """One way to continue an image, for Mitsuba has one for both axes: that of the axis that leaves it."""
     leaves = [bool(len(uv)) and bool((uv[:, i].min() < 0) or (uv[:, i].max() > 1)) for i in range(2)]
     return wrap[1] if leaves[1] and not leaves[0] else wrap[0]
+
+
+def _of_draco(
+    blob: bytes, ids: dict[str, int], most_triangles: int
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Decode a primitive of KHR_draco_mesh_compression by DracoPy.
+
+    Args:
+        blob: the compressed buffer view.
+        ids: glTF attribute -> Draco's unique id.
+        most_triangles: that the primitive's accessors say there are.
+
+    Returns:
+        faces (F, 3) int64, and glTF attribute -> (V, C) values as stored.
+
+    Raises:
+        TronError: damaged data, more triangles than announced, or an attribute that is not there.
+    """
+    # Draco allocates what the header says before it reads on.
+    triangles = _announced_triangles(blob)
+    if triangles > most_triangles:
+        raise TronError(f"Draco mesh announces {triangles:,} triangles, its accessors {most_triangles:,}")
+    try:
+        mesh = DracoPy.decode(blob)
+    except Exception as error:  # DracoPy has no exception of its own for damaged data
+        raise TronError(f"Draco mesh cannot be decoded: {error}") from error
+    faces = getattr(mesh, "faces", None)
+    if faces is None:
+        raise TronError("Draco buffer holds points, not triangles")
+    stored = {attribute["unique_id"]: attribute["data"] for attribute in mesh.attributes}
+    if missing := [name for name, number in ids.items() if number not in stored]:
+        raise TronError(f"Draco mesh lacks the attribute {missing[0]}")
+    values = {name: np.asarray(stored[number]) for name, number in ids.items()}
+    columns = {name: each[:, None] if each.ndim == 1 else each for name, each in values.items()}
+    return np.asarray(faces, np.int64).reshape(-1, 3), columns
+
+
+def _announced_triangles(blob: bytes) -> int:
+    """Number of triangles in Draco's header (Draco bitstream specification 2.2, sections 3 and 4)."""
+    try:
+        if blob[:5] != b"DRACO" or blob[7] != 1:
+            raise TronError("Draco buffer holds no mesh")
+        major, minor, edgebreaker = blob[5], blob[6], blob[8]
+        if (major, minor) < (2, 2):
+            raise TronError(f"Draco bitstream {major}.{minor} is older than 2.2")
+        if int.from_bytes(blob[9:11], "little") & _DRACO_METADATA:
+            raise TronError("Draco mesh with metadata is not read", mend="compress it without")
+        if not edgebreaker:
+            return _varint(blob, 11)[0]
+        _, place = _varint(blob, 12)  # a byte of traversal type, then the number of vertices
+        return _varint(blob, place)[0]
+    except IndexError as error:
+        raise TronError("Draco buffer is too short") from error
+
+
+def _varint(blob: bytes, place: int) -> tuple[int, int]:
+    """Unsigned LEB128 number, and where it ends."""
+    value = shift = 0
+    while True:
+        byte = blob[place]
+        value |= (byte & 0x7F) << shift
+        place, shift = place + 1, shift + 7
+        if byte < 0x80 or shift > 63:
+            return value, place

@@ -24,9 +24,9 @@ import numpy as np
 from tron.color import luminance
 from tron.errors import TronError
 from tron.io.images import write_image
+from tron.io.lat_long import directions, resampled, row_integrals
+from tron.io.lights import read_light
 from tron.runtime import aligned
-from tron.shading.environments.lat_long import directions, resampled, row_integrals
-from tron.shading.environments.light_files import read_light
 
 PDF_WIDTH = 512
 """Widest grid, in cells, that directions are drawn from: finer maps are averaged down to it."""

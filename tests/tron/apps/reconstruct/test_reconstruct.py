@@ -14,12 +14,12 @@ import yaml
 from tron.apps.reconstruct import run as app
 from tron.apps.reconstruct.command import cli
 from tron.apps.reconstruct.pictures import sheet_estimation
-from tron.apps.relight.camera_files import cameras_of
 from tron.apps.relight.command import cli as relight_cli
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import write_capture
 from tron.gaussians import GaussianScene
+from tron.io.cameras.registry import cameras_of
 from tron.io.images import read_image, write_image
 from tron.reconstruction.geometry import training
 from tron.shading.environments.environment import EnvironmentMap

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from tron.apps.relight import network_gains
 from tron.apps.relight.clip import Clip
 from tron.apps.relight.settings import Settings
 from tron.io.images import read_image
-from tron.neural import shipped
+from tron.neural import network_gains, shipped
 from tron.neural.configs import PAPER_GUIDANCE, RendererConfig, UNetConfig
 from tron.neural.renderer import NeuralRenderer
 from tron.neural.weights import save_renderer

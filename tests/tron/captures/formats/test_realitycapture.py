@@ -7,8 +7,8 @@ import pytest
 
 from tron.captures import LoadSettings, load_capture
 from tron.captures.formats.realitycapture import read_realitycapture, registration_file
-from tron.captures.photos.distortion import Lens
 from tron.errors import TronError
+from tron.lenses import Lens
 
 PLACES = "#name,x,y,alt,heading,pitch,roll"
 TITLES = f"{PLACES},f,px,py,k1,k2,k3,k4,t1,t2"

@@ -10,10 +10,10 @@ import pytest
 from PIL import Image, ImageOps
 
 from tron.captures import LoadSettings, load_capture
-from tron.captures.photos.distortion import Lens
 from tron.captures.photos.photo_files import inspect_photo
 from tron.captures.photos.photographs import PhotoCache, PhotoReader
 from tron.errors import TronError
+from tron.lenses import Lens
 from tron.seeds import generator
 
 

@@ -6,18 +6,17 @@ import numpy as np
 import pytest
 
 from examples.stage import make_scene
-from tron.apps.view import show
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.relighting import Relighter
 from tron.shading.environments.environment import EnvironmentMap
+from tron.view import show
 
 
 @pytest.fixture
 def given(tmp_path, variant):
-    make_scene(0.3).save(tmp_path / "scene.ply")
     EnvironmentMap(np.ones((8, 16, 3), np.float32)).save(tmp_path / "sky.exr")
-    named = {"scene": tmp_path / "scene.ply", "environments": tmp_path / "sky.exr", "variant": variant}
+    named = {"relighter": Relighter(make_scene(0.3)), "lights": tmp_path / "sky.exr"}
     return named | {"output_dir": tmp_path / "saved"}
 
 
@@ -47,9 +46,9 @@ def test_a_second_window_beside_one_that_was_not_closed(given):
 
 def test_a_relighter_shows_itself(given, tmp_path):
     """Without a file of the scene or of the light; what it writes is what it was given."""
-    scene, sky = make_scene(0.3), EnvironmentMap.load(given["environments"])
+    scene, sky = make_scene(0.3), EnvironmentMap.load(given["lights"])
     folder = tmp_path / "kept"
-    shown = Relighter(scene).show({"sky": sky, "dusk": sky}, output_dir=folder, variant=given["variant"])
+    shown = show(Relighter(scene), {"sky": sky, "dusk": sky}, output_dir=folder)
     try:
         assert answers(shown.window.address)
         (kept,) = folder.iterdir()
@@ -63,16 +62,16 @@ def test_a_relighter_shows_itself(given, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("lights", "settings", "said"),
+    ("changed", "said"),
     [
-        ({"../sky": None}, {}, "the name of a light is that of its file"),
-        ("nowhere", {}, "there is no such folder"),
-        ("nowhere", {"prt": 1}, "prt: Extra inputs are not permitted"),
+        ({"lights": {"../sky": None}}, "the name of a light is that of its file"),
+        ({"lights": "nowhere"}, "there is no such folder"),
+        ({"light": "dusk"}, "no map is called dusk"),
     ],
 )
-def test_what_a_relighter_cannot_show_is_one_line(given, tmp_path, lights, settings, said):
+def test_what_cannot_be_shown_is_one_line(given, changed, said):
     with pytest.raises(TronError, match=said):
-        Relighter(make_scene(0.3)).show(lights, output_dir=tmp_path / "kept", **settings)
+        show(**{**given, **changed})
 
 
 def test_without_viser_it_says_what_to_install(given, monkeypatch):

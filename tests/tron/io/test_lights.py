@@ -13,9 +13,9 @@ from tron.errors import TronError
 from tron.io.cube_files import open_cube
 from tron.io.images import encode_png, read_image, write_image
 from tron.io.jpeg_xl import jpeg_xl_size
+from tron.io.lat_long import directions
+from tron.io.lights import lat_long_of_ball, lat_long_of_cube, read_light
 from tron.shading.environments.environment import EnvironmentMap
-from tron.shading.environments.lat_long import directions
-from tron.shading.environments.light_files import lat_long_of_ball, lat_long_of_cube, read_light
 
 imagecodecs = pytest.importorskip("imagecodecs", reason="pip install 'tron-relight[lights]'")
 
@@ -225,7 +225,8 @@ def test_the_command_turns_measures_and_shows(tmp_path: Path, faces, caplog):
     image[8, 16] = 5000  # a sun at u = 0.26, 47 degrees from the zenith
     write_image(tmp_path / "a.exr", image, half=False)
     out, shown = tmp_path / "b.exr", tmp_path / "b.png"
-    main(Settings(environment=tmp_path / "a.exr", output=out, picture=shown, rotation=90))
+    given = {"environment": tmp_path / "a.exr", "output": out}
+    main(Settings.model_validate(given | {"picture": shown, "rotation": 90}))
     np.testing.assert_allclose(read_image(out), np.roll(image, -16, axis=1), rtol=1e-6)
     assert "(high)" in caplog.text
     assert "brightest towards [" in caplog.text
@@ -233,7 +234,7 @@ def test_the_command_turns_measures_and_shows(tmp_path: Path, faces, caplog):
     assert picture.shape == (768, 1024, 3)
     assert picture[600, 512:].max() > 0.2  # the white ball is lit
     with pytest.raises(TronError, match="unknown format"):
-        main(Settings(environment=tmp_path / "a.exr", output=tmp_path / "b.jpg"))
+        main(Settings.model_validate(given | {"output": tmp_path / "b.jpg"}))
 
 
 def test_png_faces_are_decoded(tmp_path: Path):

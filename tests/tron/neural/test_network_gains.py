@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from tron.apps.relight import network_gains
-from tron.apps.relight.network_gains import GAINS, expected_gain, quality_of
-from tron.apps.relight.settings import QUALITY
+from tron.estimation import QUALITY
+from tron.neural import network_gains
+from tron.neural.network_gains import GAINS, expected_gain, quality_of
 
 
 @pytest.fixture(autouse=True)

@@ -1,17 +1,12 @@
-"""Cameras of other programs, in and out: glTF, USD, COLMAP, SuperSplat; 3DGS', nerfstudio's, transforms.json.
+"""Cameras of modellers, glTF and USD: they stand upright.
 
-Files for modellers (glTF, USD) stand upright: their world is that of the mesh that tron-export writes, z up
-in USD's way of saying so, y up in glTF's. All others are in the frame of the scene's file. Focal lengths that
-differ, and principal points off the middle, are what some formats cannot say.
+Their world is that of the mesh that tron-export writes, z up in USD's way of saying so, y up in glTF's.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import math
-import struct
-import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,18 +16,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tron.cameras import Camera, opencv_to_opengl, opengl_to_opencv
 from tron.errors import TronError, located
-from tron.io.gltf_document import Document, read_document
+from tron.io.cameras.lists import say_centred
+from tron.io.gltf_document import Document, binary_file, node_matrix, read_document
 from tron.io.optional import usd
-from tron.storage import write_atomic
 
 log = logging.getLogger(__name__)
 
-UPRIGHT = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
 _Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From a world that is z up to glTF's."""
-_SUPERSPLAT = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""From the frame of a PLY to the world that SuperSplat shows it in, y up (its src/file-handler.ts)."""
-_LARGEST_DOCUMENT = 64 * 2**20
 _MOST_SAMPLES = 100_000
 
 
@@ -100,19 +91,8 @@ def _yfov(camera: dict[str, Any]) -> float:
 
 def _local(node: dict[str, Any], number: int, tracks: dict, time: float) -> np.ndarray:
     """(4, 4) of a node alone, at a time."""
-    if "matrix" in node:
-        return np.reshape(np.array(node["matrix"], np.float64), (4, 4)).T
-    defaults = ([0.0, 0, 0], [0.0, 0, 0, 1], [1.0, 1, 1])
-    shift, turn, scale = (
-        tracks[number, kind](time)
-        if (number, kind) in tracks
-        else np.array(node.get(kind, usual), np.float64)
-        for kind, usual in zip(_PATHS, defaults)
-    )
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(turn).as_matrix() * scale
-    matrix[:3, 3] = shift
-    return matrix
+    moved = {kind: tracks[number, kind](time) for kind in _PATHS if (number, kind) in tracks}
+    return node_matrix({**node, **moved})
 
 
 def _track(times: np.ndarray, values: np.ndarray, kind: str, path: str) -> Callable[[float], np.ndarray]:
@@ -188,72 +168,6 @@ def read_usd(path: Path, size: tuple[int, int], fps: float) -> list[Camera]:
     return cameras
 
 
-def read_colmap(path: Path) -> list[Camera]:
-    """Cameras of the COLMAP model that a file is of; lenses without their distortion."""
-    from tron.captures.formats.colmap import posed_by, read_model
-
-    try:
-        posed = posed_by(read_model(path.parent))
-    except ModuleNotFoundError as error:
-        raise TronError("COLMAP's models need pycolmap", path, "pip install pycolmap") from error
-    cameras, distorted = [], 0
-    for _, pose, lens in posed:
-        if callable(lens):
-            raise TronError("camera of 360 degrees, which is no one view", path, "choose another path")
-        numbers, two = lens.parameters, lens.model in _TWO_FOCAL
-        fx, fy, cx, cy = numbers[:4] if two else (numbers[0], numbers[0], *numbers[1:3])
-        distorted += any(numbers[4 if two else 3 :])
-        cameras.append(Camera(fx, fy, cx, cy, round(lens.width), round(lens.height), np.linalg.inv(pose)))
-    if distorted:
-        log.info("%s: the lenses of %d cameras are taken without their distortion", path, distorted)
-    return cameras
-
-
-_TWO_FOCAL = (
-    *("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"),
-    "RAD_TAN_THIN_PRISM_FISHEYE",
-)
-"""COLMAP's models whose first four numbers are fx, fy, cx, cy; others have f, cx, cy."""
-
-
-def supersplat_document(path: Path) -> dict[str, Any]:
-    """The JSON inside SuperSplat's project, .ssproj, a ZIP; nothing is unpacked."""
-    try:
-        with zipfile.ZipFile(path) as archive, archive.open("document.json") as stream:
-            text = stream.read(_LARGEST_DOCUMENT + 1)
-        if len(text) > _LARGEST_DOCUMENT:
-            raise TronError("project's document is too large", path)
-        return json.loads(text)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
-        raise TronError(f"not a readable project of SuperSplat: {error}", path) from error
-
-
-def of_supersplat(document: dict[str, Any], size: tuple[int, int]) -> list[Camera]:
-    """Key poses of SuperSplat's timeline, in the order of their frames; it goes through them on a spline.
-
-    A pose is where the camera is and what it looks at, y up; the field of view is that of the longer side.
-    """
-    sets = document.get("poseSets") or []
-    poses = sorted((pose for each in sets for pose in each["poses"]), key=lambda pose: pose.get("frame", 0))
-    if not poses:
-        raise TronError("SuperSplat's project holds no camera poses", mend="add keys to its timeline")
-    common = (document.get("camera") or document.get("view") or {}).get("fov", 60.0)
-    width, height = size
-    cameras = []
-    try:
-        for pose in poses:
-            longer = math.radians(float(pose.get("fov", common)))
-            fov = 2 * math.degrees(math.atan(math.tan(longer / 2) * width / max(width, height)))
-            camera = Camera.look_at(
-                pose["position"], pose["target"], up=(0, 1, 0), fov_deg=fov, width=width, height=height
-            )
-            matrix = camera.world_to_camera @ _SUPERSPLAT
-            cameras.append(Camera(camera.fx, camera.fy, camera.cx, camera.cy, width, height, matrix))
-    except (KeyError, TypeError, ValueError) as error:
-        raise TronError(f"SuperSplat's pose has an unreadable field: {error}") from error
-    return cameras
-
-
 def _of_vertical(pose: np.ndarray, yfov: float, size: tuple[int, int], turn: np.ndarray) -> Camera:
     """Camera of an OpenGL camera-to-world matrix, without its scale, and a vertical angle in radians."""
     pose = turn @ pose
@@ -265,103 +179,9 @@ def _of_vertical(pose: np.ndarray, yfov: float, size: tuple[int, int], turn: np.
     return Camera(focal, focal, width / 2, height / 2, width, height, np.linalg.inv(opengl_to_opencv(pose)))
 
 
-def write_camera_file(path: Path, cameras: Sequence[Camera], fps: float = 24.0) -> None:
-    """Write cameras in the format that a name says, whole or not at all.
-
-    ``transforms.json`` (NeRF, instant-ngp), ``cameras.json`` (3DGS'), ``camera_path.json`` (nerfstudio's),
-    ``images.txt`` (COLMAP, with cameras.txt and an empty points3D.txt beside it), .glb and .usda (one camera
-    that moves, at ``fps`` frames a second).
-    """
-    write = _writer(path)
-    files = write(path, list(cameras), fps)
-    for name, data in files.items():
-        write_atomic(path.with_name(name), data)
-
-
-def _writer(path: Path) -> Callable[[Path, list[Camera], float], dict[str, str | bytes]]:
-    named = {
-        "transforms.json": _transforms,
-        "cameras.json": _graphdeco,
-        "camera_path.json": _nerfstudio,
-        "images.txt": _colmap,
-    }
-    suffixes = {".glb": _glb, ".usda": _usda}
-    found = named.get(path.name.lower()) or suffixes.get(path.suffix.lower())
-    if found is None:
-        mend = f"use {', '.join(named)}, or NAME{', NAME'.join(suffixes)}"
-        raise TronError("name says no format of cameras", path, mend)
-    return found
-
-
-def check_camera_file(path: Path) -> None:
-    """TronError unless a name says a format that cameras are written in."""
-    _writer(path)
-
-
-def _json(content: Any) -> str:
-    return json.dumps(content, indent=1) + "\n"
-
-
-def _transforms(path: Path, cameras: list[Camera], _fps: float) -> dict[str, str | bytes]:
-    frames = [
-        {
-            "file_path": f"images/{n:05d}.png", "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy,
-            "w": c.width, "h": c.height, "transform_matrix": opencv_to_opengl(c.camera_to_world).tolist(),
-        }
-        for n, c in enumerate(cameras)
-    ]  # fmt: skip
-    return {path.name: _json({"camera_model": "PINHOLE", "frames": frames})}
-
-
-def _graphdeco(path: Path, cameras: list[Camera], _fps: float) -> dict[str, str | bytes]:
-    _say_centred(cameras)
-    return {
-        path.name: _json([
-            {
-                "id": n, "img_name": f"{n:05d}", "width": c.width, "height": c.height, "fx": c.fx, "fy": c.fy,
-                "position": c.position.tolist(), "rotation": c.camera_to_world[:3, :3].tolist(),
-            }
-            for n, c in enumerate(cameras)
-        ])
-    }  # fmt: skip
-
-
-def _nerfstudio(path: Path, cameras: list[Camera], fps: float) -> dict[str, str | bytes]:
-    _say_centred(cameras, square=True)
-    first = cameras[0]
-    entries = [
-        {
-            "camera_to_world": opencv_to_opengl(c.camera_to_world).ravel().tolist(),
-            "fov": math.degrees(2 * math.atan(c.height / 2 / c.fy)), "aspect": c.width / c.height,
-        }
-        for c in cameras
-    ]  # fmt: skip
-    return {
-        path.name: _json({
-            "camera_type": "perspective", "render_width": first.width, "render_height": first.height,
-            "fps": fps, "seconds": len(cameras) / fps, "smoothness_value": 0, "is_cycle": False, "crop": None,
-            "keyframes": [], "camera_path": entries,
-        })
-    }  # fmt: skip
-
-
-def _colmap(path: Path, cameras: list[Camera], _fps: float) -> dict[str, str | bytes]:
-    lenses, images = [], []
-    for n, c in enumerate(cameras, 1):
-        lenses.append(f"{n} PINHOLE {c.width} {c.height} {c.fx!r} {c.fy!r} {c.cx!r} {c.cy!r}")
-        x, y, z, w = Rotation.from_matrix(c.world_to_camera[:3, :3]).as_quat().tolist()
-        shift = " ".join(map(repr, c.world_to_camera[:3, 3].tolist()))
-        images.append(f"{n} {w!r} {x!r} {y!r} {z!r} {shift} {n} {n - 1:05d}.png\n")
-    return {
-        "cameras.txt": "\n".join(lenses) + "\n",
-        path.name: "\n".join(images) + "\n",
-        "points3D.txt": "# none\n",
-    }
-
-
-def _glb(path: Path, cameras: list[Camera], fps: float) -> dict[str, str | bytes]:
+def glb(path: Path, cameras: list[Camera], fps: float) -> bytes:
     """One camera with LINEAR tracks (glTF 2.0, sections 3.10.3 and 3.11), in a world that is y up."""
-    _say_centred(cameras, square=True)
+    say_centred(cameras, square=True)
     if len({round(c.fy / c.height, 9) for c in cameras}) > 1:
         log.warning("%s: glTF's cameras do not zoom: all have the first one's field of view", path)
     poses = [_Y_UP @ opencv_to_opengl(c.camera_to_world) for c in cameras]
@@ -396,18 +216,12 @@ def _glb(path: Path, cameras: list[Camera], fps: float) -> dict[str, str | bytes
         "bufferViews": views, "buffers": [{"byteLength": start}],
     }  # fmt: skip
     tree["accessors"][0] |= {"min": [float(times[0])], "max": [float(times[-1])]}
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    binary = b"".join(part.tobytes() for part in parts)
-    chunks = (
-        struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
-    )
-    return {path.name: struct.pack("<3I", 0x46546C67, 2, 12 + len(chunks)) + chunks}
+    return binary_file(tree, b"".join(part.tobytes() for part in parts))
 
 
-def _usda(path: Path, cameras: list[Camera], fps: float) -> dict[str, str | bytes]:
+def usda(_path: Path, cameras: list[Camera], fps: float) -> str:
     """One UsdGeomCamera with a time sample a frame; matrices are row vectors', lengths of film in tenths."""
-    _say_centred(cameras, square=True)
+    say_centred(cameras, square=True)
     width = 20.955  # millimetres, USD's own default
 
     def samples(values: Sequence[str]) -> str:
@@ -416,8 +230,7 @@ def _usda(path: Path, cameras: list[Camera], fps: float) -> dict[str, str | byte
     rows = [opencv_to_opengl(c.camera_to_world).T.tolist() for c in cameras]
     poses = ["( " + ", ".join(f"({', '.join(map(repr, row))})" for row in pose) + " )" for pose in rows]
     first = cameras[0]
-    return {
-        path.name: f"""#usda 1.0
+    return f"""#usda 1.0
 (
     defaultPrim = "camera"
     startTimeCode = 0
@@ -439,15 +252,3 @@ def Camera "camera"
     uniform token[] xformOpOrder = ["xformOp:transform"]
 }}
 """
-    }
-
-
-def _say_centred(cameras: Sequence[Camera], square: bool = False) -> None:
-    """A line in the log where what a format cannot say is lost."""
-    off = max(max(abs(c.cx - c.width / 2) / c.width, abs(c.cy - c.height / 2) / c.height) for c in cameras)
-    wide = max(abs(c.fx / c.fy - 1) for c in cameras) if square else 0.0
-    if max(off, wide) > 1e-6:
-        log.warning(
-            "this format has centred lenses%s: the middle is off by up to %.2g of the picture",
-            " and square pixels" if square else "", max(off, wide),
-        )  # fmt: skip

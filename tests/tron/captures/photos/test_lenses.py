@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tron.captures import LoadSettings, load_capture
-from tron.captures.photos.distortion import Lens, opencv_lens
 from tron.errors import TronError
+from tron.lenses import Lens, opencv_lens
 
 SIZE = (320, 240)
 K = np.array([[250.0, 0, 163.2], [0, 247.0, 117.7], [0, 0, 1]])

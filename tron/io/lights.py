@@ -16,6 +16,7 @@ import logging
 from collections.abc import Callable
 from mimetypes import guess_type
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -27,10 +28,9 @@ from tron.io.cube_files import DDS, KTX2, open_cube
 from tron.io.image_headers import AGAIN, MAX_DECODED_BYTES, check_size
 from tron.io.images import read_image
 from tron.io.jpeg_xl import JXL, jpeg_xl_size
+from tron.io.lat_long import directions, resampled
 from tron.io.optional import codecs
-from tron.shading.environments.lat_long import directions, resampled
 
-LIGHT_SUFFIXES = (".hdr", ".exr", ".dds", ".ktx2", ".jxl", ".png", ".jpg", ".jpeg")
 _RADIANCE, _DISPLAY = (".hdr", ".exr"), (".png", ".jpg", ".jpeg")
 _WIDTH_OFF = 2
 """Columns that a width may be off twice the height: stitchers and croppers leave out one."""
@@ -113,18 +113,13 @@ def read_picture(path: Path) -> tuple[np.ndarray, list[str]]:
             head = file.read(_HEAD)
             if size > MAX_DECODED_BYTES:
                 raise TronError(f"image file of {size / 1e9:.1f} GB is too large", path)
-            foreign = head.startswith((DDS, KTX2, *JXL)) or _has_gain_map(head)
-            data = head + file.read() if foreign else b""
+            known = next((each for each in ENCODINGS if each.tells(head)), None)
+            data = head + file.read() if known else b""
     except OSError as error:
         raise TronError(f"cannot read image: {error.strerror or error}", path) from error
-    with located(path):
-        if head.startswith((DDS, KTX2)):
-            faces, display = open_cube(data)
-            return faces, [_CLIPPED] if display else []
-        if head.startswith(JXL):
-            return _open_jpeg_xl(data)
-        if _has_gain_map(head):
-            return _open_gain_map(data)
+    if known is not None:
+        with located(path):
+            return known.open(data)
     if path.suffix.lower() not in _RADIANCE + _DISPLAY:
         is_video = (guess_type(path.name)[0] or "").startswith("video/")
         kind = "a video" if is_video else path.suffix or "a file without suffix"
@@ -275,6 +270,11 @@ def _bilinear(images: np.ndarray, which: np.ndarray, x: np.ndarray, y: np.ndarra
     return (1 - fy) * upper + fy * lower
 
 
+def _open_cube_file(data: bytes) -> tuple[np.ndarray, list[str]]:
+    faces, display = open_cube(data)
+    return faces, [_CLIPPED] if display else []
+
+
 def _has_gain_map(head: bytes) -> bool:
     return head.startswith(b"\xff\xd8\xff") and any(each in head for each in _GAIN_MAP)
 
@@ -344,3 +344,32 @@ def _usable(image: np.ndarray) -> tuple[np.ndarray, list[str]]:
         image = np.maximum(image, 0)
         notes.append(f"{negative} of {texels} texels are negative (down to {least:.3g}) and are set to zero")
     return image, notes
+
+
+class Encoding(NamedTuple):
+    """An encoding that the first bytes of a file tell.
+
+    Attributes:
+        holds: what such a file is, for help.
+        suffixes: by which folders are searched for lights.
+        tells: whether a file that begins so is one.
+        open: linear (H, W, 3) float32, or (6, R, R, 3) of a cube map, and what to say of it.
+    """
+
+    holds: str
+    suffixes: tuple[str, ...]
+    tells: Callable[[bytes], bool]
+    open: Callable[[bytes], tuple[np.ndarray, list[str]]]
+
+
+ENCODINGS = (
+    Encoding(
+        ".dds or .ktx2 with six faces",
+        (".dds", ".ktx2"),
+        lambda head: head.startswith((DDS, KTX2)),
+        _open_cube_file,
+    ),
+    Encoding(".jxl", (".jxl",), lambda head: head.startswith(JXL), _open_jpeg_xl),
+    Encoding("a JPEG with a gain map", (), _has_gain_map, _open_gain_map),
+)
+LIGHT_SUFFIXES = (*_RADIANCE, *(suffix for each in ENCODINGS for suffix in each.suffixes), *_DISPLAY)
