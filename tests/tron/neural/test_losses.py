@@ -8,7 +8,7 @@ import torch
 
 from tron import metrics
 from tron.errors import TronError
-from tron.neural.losses import PSNR_FLOOR, RendererLoss, psnr_per_frame
+from tron.neural.losses import PSNR_FLOOR, RendererLoss, gradient_error, psnr_per_frame
 
 
 def pair(frames: int = 2, size: int = 16):
@@ -79,3 +79,22 @@ def test_a_frame_without_foreground_has_no_psnr():
     a, b = pair()
     mask = torch.zeros(2, 1, 2, 16, 16)
     assert torch.isnan(psnr_per_frame(a, b, mask)).all()
+
+
+def test_gradients_are_the_mean_difference_of_neighbours_by_either_axis(caplog):
+    a, b = pair()
+    error = a.numpy() - b.numpy()
+    by_axis = [np.abs(np.diff(error, axis=axis)).mean() for axis in (3, 4)]
+    with caplog.at_level(logging.INFO):
+        loss = RendererLoss(l2=0.0, gradient=3.0)
+    assert "3 gradients" in caplog.text
+    np.testing.assert_allclose(loss(a, b).item(), 3 * sum(by_axis), rtol=1e-5)
+    assert gradient_error(a + 0.25, a).item() == pytest.approx(0, abs=1e-6), "light that is off has the edges"
+
+
+def test_an_edge_that_is_blurred_costs_and_an_edge_that_stands_does_not():
+    edge = torch.cat([torch.zeros(1, 1, 1, 8, 4), torch.ones(1, 1, 1, 8, 4)], -1)
+    blurred = edge.clone()
+    blurred[..., 3], blurred[..., 4] = 0.25, 0.75
+    # Of seven differences in a row one falls by a half, and two rise by a quarter.
+    assert gradient_error(blurred, edge).item() == pytest.approx(1 / 7)
