@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tron.apps.capture_light import is_of_capture, over_scene
 from tron.apps.machine import Threads, Variant
-from tron.apps.relight.network_gains import expected_gain
+from tron.apps.relight.network_gains import Way, best_first
 from tron.apps.scene_file import SeenAs, Up, check_scene_files, load_scene
 from tron.apps.splat_file import SceneFile
 from tron.cameras import Camera
@@ -157,8 +157,8 @@ def _first_light(settings: Settings, lights: Mapping[str, Path]) -> str:
 def _finish(threads: int | None) -> Callable[[int, int], Finish | None]:
     """What pictures at rest of a width and height are finished by.
 
-    As checkpoint=auto of tron-relight has it, a network where it is sure to gain; else Open Image Denoise,
-    where it is installed.
+    As checkpoint=auto of tron-relight has it, by the network or Open Image Denoise, whichever surely gains
+    more. Where neither does Open Image Denoise, if installed, still takes the passes' noise out.
     """
     from tron.view.finishing import Denoised, Drawn
 
@@ -169,9 +169,11 @@ def _finish(threads: int | None) -> Callable[[int, int], Finish | None]:
         drawn = Drawn(loaded)
     if find_spec("pyoidn") is not None:
         denoised = Denoised()
+    there: list[Way] = [*(["network"] if drawn else []), *(["oidn"] if denoised else [])]
 
     def finish(width: int, height: int) -> Finish | None:
-        return drawn if drawn and expected_gain("final", width, height) > 0 else denoised
+        best, gain = next(iter(best_first(there, "final", width, height).items()), (None, 0.0))
+        return drawn if best == "network" and gain > 0 else denoised
 
     return finish
 
