@@ -58,6 +58,12 @@ class LossSettings(BaseModel):
         description="Weight of the negative PSNR in dB, frame by frame: a good frame's errors count as "
         "much as a bad one's, in proportion (the loss of NAFNet).",
     )
+    psnr_ceiling: float = Field(
+        default=50.0,
+        gt=0,
+        description="dB that the loss's PSNR nears and never reaches: nothing is gained beyond. Lower it "
+        "with data.mend, or samples that are right have all the say.",
+    )
     gradient: float = Field(
         default=0.0,
         ge=0,

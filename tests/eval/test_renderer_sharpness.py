@@ -90,6 +90,7 @@ def test_a_network_is_judged_by_what_it_makes_of_the_truth(
     others = {name: clip.frames[name] for name in ("pbr", "albedo")}
 
     def show(self: Network, buffers: Buffers) -> np.ndarray:
+        assert buffers["lit"] is clip.frames[TARGET]
         assert all(buffers[name] is each for name, each in others.items())
         return buffers.displayed("lit") + 0.01
 

@@ -215,11 +215,6 @@ class RendererConfig(GuidedConfig):
         description="Pixels between the points of a second predicted kernel of that side, which filters what "
         "the first left and begins as nothing: noise that is wider than the first. 0: none.",
     )
-    skip_gate: bool = Field(
-        default=False,
-        description="Whether the network predicts for each pixel how much of its change of the start counts, "
-        "0 to 2 times, once at first: what is right can pass as it is. It goes with a skip_kernel.",
-    )
     scales: Literal[1, 2] = Field(
         default=1,
         description="2: the network draws the picture at half its size too, and what is coarse is taken from "
@@ -256,8 +251,6 @@ class RendererConfig(GuidedConfig):
             raise ValueError("skip_kernel goes with codec=pixels and a skip_blur above 0, which it begins as")
         if self.skip_holes and not self.skip_kernel:
             raise ValueError("skip_holes are those of a second kernel: they go with a skip_kernel")
-        if self.skip_gate and (not self.skip_kernel or self.sigma is not None):
-            raise ValueError("skip_gate scales what kernels change: give a skip_kernel, no sigma")
         if self.scales == 2 and self.codec != "pixels":
             raise ValueError("scales=2 goes with codec=pixels")
         if self.skip_detail is not None and not self.skip_kernel:

@@ -12,9 +12,6 @@ from tron.metrics import LPIPS
 
 log = logging.getLogger(__name__)
 
-PSNR_FLOOR = 1e-5
-"""Mean square that is added for the loss's PSNR: 50 dB, beyond which nothing is gained."""
-
 
 class RendererLoss:
     """l2 * mean squared error + lpips * LPIPS (VGG) - psnr * PSNR + gradient * error of gradients.
@@ -23,7 +20,8 @@ class RendererLoss:
 
     PSNR is in dB, of each frame by itself (Chen et al., "Simple Baselines for Image Restoration", 2022): a
     frame that is nearly right counts as much as one that is far off, where the mean squared error hears the
-    latter alone. The error of gradients is :func:`gradient_error`.
+    latter alone. A mean square is added that keeps it below ``psnr_ceiling``: a frame that is right by itself
+    would have all say otherwise. The error of gradients is :func:`gradient_error`.
 
     Without `vgg_weights` (torchvision's vgg16-397923af.pth) the LPIPS term is absent, and the log says so:
     a random VGG is never used silently. LPIPS is no module here, so that its frozen weights stay out of
@@ -37,8 +35,10 @@ class RendererLoss:
         vgg_weights: str | Path | None = None,
         psnr: float = 0.0,
         gradient: float = 0.0,
+        psnr_ceiling: float = 50.0,
     ):
         self.l2, self.lpips, self.psnr, self.gradient = l2, lpips, psnr, gradient
+        self.floor = 10 ** (-psnr_ceiling / 10)
         self.perceptual = LPIPS.load(vgg_weights) if vgg_weights is not None and lpips > 0 else None
         if self.perceptual is None:
             log.info("Loss: %s. LPIPS is absent: loss.vgg_weights names no VGG-16 file.", self._terms())
@@ -54,7 +54,7 @@ class RendererLoss:
         squares = (predicted - target).square()
         loss = self.l2 * squares.mean()
         if self.psnr:
-            loss = loss + self.psnr * torch.log10(squares.mean((1, 3, 4)) / 4 + PSNR_FLOOR).mean() * 10
+            loss = loss + self.psnr * torch.log10(squares.mean((1, 3, 4)) / 4 + self.floor).mean() * 10
         if self.gradient:
             loss = loss + self.gradient * gradient_error(predicted, target)
         if self.perceptual is not None:

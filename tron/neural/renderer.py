@@ -45,10 +45,10 @@ def _backbone(shape: UNetConfig | BackboneConfig, given: int, predicted: int) ->
 
 
 def predicted(config: RendererConfig, channels: int) -> list[int]:
-    """Numbers a pixel that the backbone predicts: colour, kernel, shares of detail, holed kernel, gate."""
+    """Numbers a pixel that the backbone predicts: colour, kernel, shares of detail, kernel with holes."""
     taps = config.skip_kernel**2
     detail = 0 if config.skip_detail is None else channels
-    return [channels, taps, detail, taps if config.skip_holes else 0, int(config.skip_gate)]
+    return [channels, taps, detail, taps if config.skip_holes else 0]
 
 
 class NeuralRenderer(Renderer):
@@ -114,14 +114,11 @@ class NeuralRenderer(Renderer):
             change = self.backbone(fused, PLAIN_TIMESTEP)
         else:
             change = -t * self.backbone((1 - t) * fused, t).float()
-        change, kernels, shares, wide, gate = change.split(self._predicted, 1)
+        change, kernels, shares, wide = change.split(self._predicted, 1)
         if self.config.skip == MEAN:
             start = mean
         elif self.config.skip_kernel:
             start = self._refiltered(videos, kernels, shares, wide)
-            if self.config.skip_gate:
-                drawn = start + change
-                return drawn + gate.tanh() * (drawn - latents[self.config.guidance.index(self.config.skip)])
         else:
             index = self.config.guidance.index(self.config.skip)
             start = self._blurred(videos[index]) if self.config.skip_blur else latents[index]

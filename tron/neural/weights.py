@@ -112,7 +112,7 @@ def restore_renderer(path: str | Path, renderer: Renderer) -> None:
 def _new(given: RendererConfig, renderer: NeuralRenderer) -> list[str]:
     """What a network has that the one of configuration ``given`` had not."""
     config = renderer.config
-    parts = ("skip_detail", "skip_holes", "skip_gate")
+    parts = ("skip_detail", "skip_holes")
     new = [name for name in config.guidance if name not in given.guidance]
     return new + [name for name in parts if getattr(config, name) and not getattr(given, name)]
 
@@ -215,8 +215,8 @@ def _widened(weight: Tensor, latents: int, config: BackboneConfig, codec: Codec)
 
 
 # What is added begins at zero: columns of the first layer for the new buffers, and rows of the last for
-# shares of detail, kernels with holes and gates. So the wider network draws what the other did (with kernels
-# with holes nearly so), and learns from there what the new is worth.
+# shares of detail and kernels with holes. So the wider network draws what the other did (with kernels with
+# holes nearly so), and learns from there what the new is worth.
 
 FIRST, LAST = "backbone.embed.weight", ("backbone.out.weight", "backbone.out.bias")
 
@@ -225,10 +225,10 @@ def widened(state: dict[str, Tensor], narrow: RendererConfig, wide: NeuralRender
     """The state of a U-Net of configuration ``narrow`` as one of ``wide``.
 
     The same state where nothing is added, or where they differ in more than guidance, scales, and a
-    ``skip_detail``, ``skip_holes`` or ``skip_gate`` that is new.
+    ``skip_detail`` or ``skip_holes`` that is new.
     """
     config, shape = wide.config, wide.config.backbone
-    may_differ = ("guidance", "skip_detail", "skip_holes", "skip_gate", "scales", "window")
+    may_differ = ("guidance", "skip_detail", "skip_holes", "scales", "window")
     added = {name: getattr(narrow, name) for name in may_differ}
     if (
         not isinstance(shape, UNetConfig)
@@ -237,7 +237,6 @@ def widened(state: dict[str, Tensor], narrow: RendererConfig, wide: NeuralRender
         or not set(narrow.guidance) <= set(config.guidance)
         or narrow.skip_detail not in (None, config.skip_detail)
         or narrow.skip_holes not in (0, config.skip_holes)
-        or narrow.skip_gate > config.skip_gate
         or (narrow.guidance, predicted(narrow, 1)) == (config.guidance, predicted(config, 1))
     ):
         return state

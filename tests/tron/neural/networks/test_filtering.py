@@ -107,28 +107,6 @@ def test_a_kernel_with_holes_brings_what_lies_beyond_the_first():
     torch.testing.assert_close(made(given), above, atol=1e-4, rtol=0)
 
 
-def test_a_gate_begins_open_and_lets_the_start_pass_as_it_is_where_it_is_shut():
-    """The same weights with and without it: bit by bit the same picture, until it is told to shut."""
-    filtering = {"skip_blur": 0.6, "skip_kernel": 3, "skip_detail": "pbr", "skip_holes": 1}
-    made, gated, given = renderer(**filtering), renderer(**filtering, skip_gate=True), buffers()
-    for parameter in made.parameters():
-        torch.nn.init.normal_(parameter, std=0.1)
-    without, with_gate = made.state_dict(), gated.state_dict()
-    parts = 3 + 9 + 3 + 9
-    for name, tensor in without.items():
-        if tensor.shape == with_gate[name].shape:
-            with_gate[name].copy_(tensor)
-        else:  # the last layer: four sub-pixels of a patch, the gate the last number of each
-            with_gate[name].zero_().unflatten(0, (4, -1))[:, :parts] = tensor.unflatten(0, (4, -1))
-    assert torch.equal(gated(given), made(given))
-    gate = gated.backbone.get_parameter("out.bias").data.view(4, parts + 1)[:, parts]
-    gate.fill_(-30.0)
-    torch.testing.assert_close(gated(given), given["lit"], atol=1e-6, rtol=0)
-    gate.fill_(30.0)
-    twice = given["lit"] + 2 * (made(given) - given["lit"])
-    torch.testing.assert_close(gated(given), twice, atol=1e-5, rtol=0)
-
-
 def test_kernels_do_not_see_other_frames():
     made, given = renderer(skip_blur=0.6, skip_kernel=3), buffers(2)
     torch.nn.init.normal_(made.backbone.get_parameter("out.weight"), std=0.1)
@@ -145,11 +123,6 @@ def test_kernels_do_not_see_other_frames():
         ({"skip_kernel": 4, "skip_blur": 0.6, "codec": "pixels"}, "skip_kernel"),
         ({"skip_blur": -1.0}, "skip_blur"),
         ({"skip_detail": "pbr"}, "skip_kernel"),
-        ({"skip_gate": True, "skip_blur": 0.6}, "skip_kernel"),
-        (
-            {"skip_gate": True, "skip_kernel": 3, "skip_blur": 0.6, "codec": "pixels", "sigma": 0.2},
-            "no sigma",
-        ),
         ({"skip_kernel": 3, "skip_blur": 0.6, "codec": "pixels", "skip_detail": "albedo"}, "one of guidance"),
     ],
 )
