@@ -58,6 +58,17 @@ class LossSettings(BaseModel):
         description="Weight of the negative PSNR in dB, frame by frame: a good frame's errors count as "
         "much as a bad one's, in proportion (the loss of NAFNet).",
     )
+    psnr_ceiling: float = Field(
+        default=50.0,
+        gt=0,
+        description="dB that the loss's PSNR nears and never reaches: nothing is gained beyond. Lower it "
+        "with data.mend, or samples that are right have all the say.",
+    )
+    gradient: float = Field(
+        default=0.0,
+        ge=0,
+        description="Weight of the absolute error of differences between neighbours: edges and relief.",
+    )
     lpips: float = Field(default=1.0, ge=0, description="Weight of LPIPS (VGG); needs vgg_weights.")
     vgg_weights: Path | None = Field(
         default=None, description="Local vgg16-397923af.pth; without it LPIPS is absent and the log says so."
@@ -102,6 +113,13 @@ class DataSettings(BaseModel):
         ge=0,
         le=1,
         description="Share of the samples that show their scene under two of its lights at once.",
+    )
+    mend: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Share of the samples whose lit is the truth (half of them) or lies between the "
+        "two, so that a network learns to leave what is right as it is.",
     )
     damaged_limit: float = Field(
         default=0.01,

@@ -22,9 +22,8 @@ class Measure(NamedTuple):
 
 
 MEASURES = (
-    *(Measure(each.name, each.unit, each.title, "more") for each in METRICS),
+    *(Measure(each.name, each.unit, each.title, each.better) for each in METRICS),
     Measure("lpips", "1", "LPIPS ↓", "less"),
-    Measure("flip", "1", "FLIP ↓", "less"),
     Measure("hdr_flip", "1", "HDR-FLIP ↓", "less"),
 )
 MAP_MEASURES = (

@@ -11,7 +11,6 @@ favour who left out what is hard.
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +22,7 @@ from eval.light_scale import COVERED, fitted_factor
 from eval.protocol.method import Method, MethodFolder, write_method
 from eval.protocol.pictures import Fault
 from eval.protocol.suite import Suite, SuiteScene
+from eval.relighting.flip import INSTALLED, flip
 from eval.relighting.scores import METRICS
 from tron.color import linear_to_srgb, srgb_to_linear
 from tron.errors import TronError
@@ -199,8 +199,6 @@ def picture_figures(
     least = min(image.shape[:2])
     small = {"ssim"} if least < 6 else set()
     figures = {each.name: each.measure(image, truth, mask) for each in METRICS if each.name not in small}
-    if importlib.util.find_spec("flip_evaluator"):
-        figures["flip"] = _flip(image, truth, mask, "LDR")
     if lpips is not None and least >= LPIPS_LEAST_SIDE:
         figures["lpips"] = _lpips(lpips, image, truth)
     return figures
@@ -211,26 +209,14 @@ def hdr_figures(exposed: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dic
 
     HDR-FLIP finds its range of exposures from the reference, where black surroundings would mislead it.
     """
-    if not importlib.util.find_spec("flip_evaluator"):
+    if not INSTALLED:
         return {}
     around = np.median(truth[mask], axis=0)
     if not around.max() > 0:
         return {}
     a, b = (np.where(mask[..., None], np.maximum(image, 0), around) for image in (exposed, truth))
-    value = _flip(a, b, mask, "HDR")
+    value = flip(a, b, mask, "HDR")
     return {"hdr_flip": value} if np.isfinite(value) else {}
-
-
-def _flip(
-    image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None, kind: Literal["LDR", "HDR"]
-) -> float:
-    """Mean over the mask of NVIDIA's FLIP, 67 pixels a degree, tone mapper ACES where HDR; 0 is identical."""
-    import flip_evaluator
-
-    reference, test = (np.ascontiguousarray(each, np.float32) for each in (truth, image))
-    error, _, _ = flip_evaluator.evaluate(reference, test, kind, kind == "LDR", False, False, {})
-    error = error[..., 0]
-    return float(error[mask].mean() if mask is not None else error.mean())
 
 
 def _lpips(lpips: LPIPS, image: np.ndarray, truth: np.ndarray) -> float:

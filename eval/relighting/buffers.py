@@ -15,8 +15,10 @@ from tron.neural.clips import Motion
 from tron.shards.moving import KEY, Moving
 from tron.shards.schema import TARGET, Clip, displayed, guidance_members
 
-Region = Literal["foreground", "frame"]
+Region = Literal["foreground", "frame", "metal", "rest"]
 REGIONS: tuple[Region, Region] = ("foreground", "frame")
+MATERIALS: tuple[Region, Region] = ("metal", "rest")
+"""Parts of the foreground: where the surfels are metallic by more than a half, and where they are not."""
 MEMBERS = (*guidance_members(), TARGET, "mask", "foreground")
 """Members of a clip that predictions and their scores need."""
 SURFELS_DEPTH = "depth"
@@ -83,6 +85,11 @@ def _motion(clip: Clip) -> Motion:
 
 
 def region_mask(clip: Clip, region: Region) -> np.ndarray:
-    """Pixels of a region, (K, H, W) bool: the ground-truth foreground, or the whole frame."""
+    """Pixels of a region, (K, H, W) bool: the ground-truth foreground, its metals, its rest, or all."""
     foreground = clip.frames["foreground"][..., 0] > 0.5
-    return foreground if region == "foreground" else np.ones_like(foreground)
+    if region == "frame":
+        return np.ones_like(foreground)
+    if region == "foreground":
+        return foreground
+    metal = clip.frames["surface"][..., 2] > 0.5
+    return foreground & (metal if region == "metal" else ~metal)

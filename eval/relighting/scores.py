@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -30,7 +30,8 @@ from eval.relighting.baselines import (
     SIMPLE,
     Method,
 )
-from eval.relighting.buffers import REGIONS, Region, region_mask
+from eval.relighting.buffers import MATERIALS, REGIONS, Region, region_mask
+from eval.relighting.flip import INSTALLED, flip
 from eval.results import Row, mean_row
 from tron import metrics
 from tron.shards.schema import Clip
@@ -45,6 +46,8 @@ class Metric(NamedTuple):
         unit: of its rows.
         measure: (image, truth, mask or None) -> the figure; images (H, W, 3) in [0, 1], mask (H, W) bool.
         what: how to read it, a sentence or two.
+        better: the good side; gains are towards it.
+        regions: where it is measured.
     """
 
     name: str
@@ -52,6 +55,8 @@ class Metric(NamedTuple):
     unit: str
     measure: Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]
     what: str
+    better: Literal["more", "less"] = "more"
+    regions: tuple[Region, ...] = REGIONS
 
 
 METRICS = (
@@ -64,8 +69,27 @@ METRICS = (
         "brightness, 30 dB of 3%, and 6 dB more halve it.",
     ),
     Metric("ssim", "SSIM ↑", "1", metrics.ssim, "SSIM compares structure; 1 is identical."),
+    *(
+        [
+            Metric(
+                "flip",
+                "FLIP ↓",
+                "1",
+                flip,
+                "FLIP is the difference that one sees where two pictures alternate; 0 is none.",
+                "less",
+                ("foreground",),  # half a second a frame of 512 x 512
+            )
+        ]
+        if INSTALLED
+        else []
+    ),
 )
+LEAST_PIXELS = 64
+"""Pixels of a material that a frame needs to be judged by it."""
 UNITS = {metric.name: metric.unit for metric in METRICS}
+SIGNS = {metric.name: 1 if metric.better == "more" else -1 for metric in METRICS}
+"""What makes more the better side."""
 BEST_OF_ALL = "best_of_all"
 """Group of everything but the networks that are judged, dearer forms of lit included: the best is of those
 that were scored, whatever was not given."""
@@ -97,13 +121,14 @@ class Where(NamedTuple):
 
     @property
     def tail(self) -> str:
-        """End of the rows' names: ``_full`` for frames, ``.FAMILY`` or ``.STYLE`` for one of them."""
+        """End of the rows' names: ``_full`` of frames, ``_metal``, ``_rest``; ``.FAMILY`` or ``.STYLE``."""
         return self.tail_after("")
 
     def tail_after(self, size: str) -> str:
         """The same with something between the region and the kind."""
         kind = self.family or self.style
-        return ("_full" if self.region == "frame" else "") + size + (f".{kind}" if kind else "")
+        region = {"foreground": "", "frame": "_full"}.get(self.region, f"_{self.region}")
+        return region + size + (f".{kind}" if kind else "")
 
 
 ALL = Where()
@@ -127,29 +152,52 @@ class Scores:
     Attributes:
         kept: (method, region) -> one for each frame.
         tail: end of the rows' names, after those of :class:`Where`.
+        materials: whether PSNRs of MATERIALS are taken besides.
+        more: figures besides of a frame's foreground: of (clip, number of the frame, picture, pixels).
     """
 
     tail: str = ""
+    materials: bool = False
+    more: Callable[[Clip, int, np.ndarray, np.ndarray], Mapping[str, float]] | None = None
     kept: defaultdict[tuple[str, Region], list[Score]] = field(default_factory=lambda: defaultdict(list))
 
     def add(self, clip: Clip, shown: dict[Region, dict[str, np.ndarray]], truth: np.ndarray) -> None:
         """Score a clip's predictions; a frame without foreground has no foreground score.
 
         Args:
-            clip: its meta and ``foreground`` member are used.
+            clip: its meta and ``foreground`` member are used; for materials ``surface`` too.
             shown: region -> method -> (K, H, W, 3) display values.
             truth: (K, H, W, 3) display values.
         """
-        meta, style = clip.meta, str(clip.meta.extra.get("style", ""))
+        if self.materials:
+            shown = {**shown, **dict.fromkeys(MATERIALS, shown["foreground"])}
         for region, images in shown.items():
             inside = region_mask(clip, region)
             for method, frames in images.items():
-                for image, target, mask in zip(frames, truth, inside):
-                    if mask.any():
-                        where = None if region == "frame" else mask
-                        figures = {metric.name: metric.measure(image, target, where) for metric in METRICS}
-                        score = Score(meta.light_family, meta.scene, meta.key, figures, style)
-                        self.kept[method, region].append(score)
+                for number, (image, target, mask) in enumerate(zip(frames, truth, inside)):
+                    if mask.sum() >= (LEAST_PIXELS if region in MATERIALS else 1):
+                        self._add(clip, region, method, number, image, target, mask)
+
+    def _add(
+        self,
+        clip: Clip,
+        region: Region,
+        method: str,
+        number: int,
+        image: np.ndarray,
+        target: np.ndarray,
+        inside: np.ndarray,
+    ) -> None:
+        meta, style = clip.meta, str(clip.meta.extra.get("style", ""))
+        if region in MATERIALS:
+            figures = {"psnr": metrics.capped_psnr(image, target, inside)}
+        else:
+            there = [metric for metric in METRICS if region in metric.regions]
+            mask = None if region == "frame" else inside
+            figures = {metric.name: metric.measure(image, target, mask) for metric in there}
+        if self.more is not None and region == "foreground":
+            figures |= self.more(clip, number, image, inside)
+        self.kept[method, region].append(Score(meta.light_family, meta.scene, meta.key, figures, style))
 
     @property
     def clips(self) -> list[str]:
@@ -199,22 +247,26 @@ class Scores:
         return next((method for method in self.methods if method in NETWORKS), None)
 
     def best(self, methods: Sequence[str], where: Where = ALL, figure: str = "psnr") -> str | None:
-        """The method with the highest mean of a metric; None unless all were scored that are not OPTIONAL.
+        """The method with the best mean of a metric; None unless all were scored that are not OPTIONAL.
 
         Of all methods (BEST_OF_ALL) it is the best of those that were scored.
         """
         means = {method: self.mean(method, where, figure) for method in methods}
         known = {method: mean for method, mean in means.items() if mean is not None}
         missing = set() if methods == GROUPS[BEST_OF_ALL] else means.keys() - known.keys() - OPTIONAL
-        return max(known, key=known.__getitem__) if known and not missing else None
+        best = max(known, key=lambda method: SIGNS[figure] * known[method], default=None)
+        return None if missing else best
 
     def gain(
         self, method: str, over: Sequence[str], where: Where = ALL, figure: str = "psnr"
     ) -> float | None:
-        """Mean of a metric of a method minus that of the best of others; None where one is not known."""
+        """How much better the mean of a metric of a method is than that of the best of others.
+
+        None where one is not known.
+        """
         ours, best = self.mean(method, where, figure), self.best(over, where, figure)
         reached = None if best is None else self.mean(best, where, figure)
-        return None if ours is None or reached is None else ours - reached
+        return None if ours is None or reached is None else SIGNS[figure] * (ours - reached)
 
     def rows(self, seed: int = 0) -> Iterator[Row]:
         """``METHOD.METRIC`` and ``METHOD.gain_over_RIVAL`` of GAINS, each with the tail of :class:`Where`.
@@ -227,6 +279,8 @@ class Scores:
             for method in self.methods:
                 scores = self.of(method.name, where)
                 for metric in METRICS if scores else ():
+                    if where.region not in metric.regions:
+                        continue
                     name = f"{method.name}.{metric.name}{where.tail}{self.tail}"
                     found = ((score.scene, score.figures[metric.name]) for score in scores)
                     yield mean_row(name, metric.unit, found, seed)
@@ -282,7 +336,8 @@ class Scores:
         Likewise where one scene is left out.
         """
         by_method = [scores for name in (method, *over) if (scores := self.of(name, where))]
-        found = [[score.figures[figure] for score in scores] for scores in by_method]
+        sign = SIGNS[figure]
+        found = [[sign * score.figures[figure] for score in scores] for scores in by_method]
         scenes = [score.scene for score in by_method[0]]
         per_scene = scene_sums(scenes, np.array([*found, [1.0] * len(scenes)]).T)
 

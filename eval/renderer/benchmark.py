@@ -6,6 +6,7 @@ import logging
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,8 +28,10 @@ from eval.renderer.datasets import (
     require_data,
 )
 from eval.renderer.gains import between, everywhere, gain_rows, over_lit, time_rows
+from eval.renderer.identity import Identity, least_identity
 from eval.renderer.pictures import comparison
 from eval.renderer.shadows import measure_shadows
+from eval.renderer.sharpness import Gradients
 from eval.renderer.truths import TRUTH, Truths
 from eval.renderer.validation import validation_rows
 from eval.report.outcome import Outcome
@@ -84,7 +87,7 @@ class Renderer(RendererSettings):
         if run.gains:
             worst = min(run.gains, key=lambda row: row.value)
             run.outcome.add([worst.model_copy(update={"metric": "renderer.lit.worst_family_gain_db"})])
-        run.outcome.add([*everywhere(run.outcome.rows)])
+        run.outcome.add([*everywhere(run.outcome.rows), *least_identity(run.outcome.rows)])
         run.outcome.inputs |= {
             f"{KINDS[name]}_sha256": sha256(each.path) for name, each in run.networks.items()
         }
@@ -137,8 +140,12 @@ class Run:
     def _models_of(self, size: int, quality: Quality, few: bool, dataset: Path, truths: Truths) -> Judged:
         """Rows of one size, quality and number of surfels; pictures of the largest as they are by default."""
         first = size == min(self.settings.models) and quality == "preview"
-        judged = self._judged(dataset, TEST, FIT, truths, per_pixel=first)
+        network = self.networks.get(NEURAL_LIT.name)
+        identity = None if network is None else Identity(network, truths.linear)
+        judged = self._judged(dataset, TEST, FIT, truths, first, identity)
         prefix = (FEW if few else "") + PREFIX[quality]
+        if identity is not None:
+            self.outcome.add(identity.rows(f"renderer.{prefix}", f".{size}", self.settings.seed))
         self._add(prefix, {size: judged}, every_size=True)
         clips = read_clips(dataset, TEST, ("foreground",))
         self.outcome.add(truths.rows(clips, f"renderer.{prefix}psnr.{TRUTH}", f".{size}", self.settings.seed))
@@ -165,7 +172,7 @@ class Run:
         measure_shadows(dataset, TEST, self._by_kind(), self.settings.seed, self.outcome)
 
     def validation(self) -> None:
-        """Gains that checkpoint=auto goes by, of the network that starts from lit."""
+        """Gains that checkpoint=auto goes by, of the network that starts from lit and of its rival there."""
         if network := self.networks.get(NEURAL_LIT.name):
             for size in self.settings.validation:
                 dataset = self.datasets.validation(size)
@@ -199,21 +206,27 @@ class Run:
         fit_split: str,
         truths: Truths | None = None,
         per_pixel: bool = True,
+        identity: Identity | None = None,
     ) -> Judged:
-        """Every method on one data set; truths: its mean; per_pixel: whether per-pixel networks learn it."""
+        """Every method on one data set, materials too; per_pixel: whether per-pixel networks learn it.
+
+        Truths are the mean of all renders, and tell sharpness; identity joins the clips.
+        """
         paths = self.datasets.pixel_mlps(dataset, fit_split) if per_pixel else []
         trained = [load_networks("pixel_mlp", [path]) for path in paths]
         shown = {name: net.show for nets in (*trained, self.networks) for name, net in nets.items()}
         fits = fitted(dataset, split, fit_split, self.settings.seed)
-        truth = {} if truths is None else {"truth": truths.displayed}
+        known: dict[str, Any] = {} if truths is None else {"truth": truths.displayed}
+        if identity is not None:
+            known["look"] = identity.add
         return judge(
             dataset,
             split,
             lambda scene: {**fits[scene], **shown},
             self.settings.pictures,
-            Scores(),
+            Scores(materials=True, more=None if truths is None else Gradients(truths)),
             MEMBERS,
-            **truth,
+            **known,
         )
 
 

@@ -14,9 +14,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from eval.confidence import quotient, scene_sums, without_one
-from eval.relighting.baselines import DIRECT, NEURAL, NEURAL_LIT, ON_LIT
-from eval.relighting.buffers import REGIONS
+from eval.relighting.baselines import DIRECT, NEURAL, NEURAL_LIT, OIDN, ON_LIT
+from eval.relighting.buffers import MATERIALS, REGIONS
 from eval.relighting.scores import GROUPS, Scores, Where
+from eval.renderer.sharpness import sharpness_rows
 from eval.results import Row, mean_row
 from tron.errors import TronError
 
@@ -33,12 +34,14 @@ LIT_RIVALS: dict[str, list[str]] = {
     "gain_db": ["lit", *GROUPS[ON_LIT]],
     "gain_over_pixelwise_db": PIXELWISE,
     "gain_over_lit_db": ["lit"],
+    "gain_over_oidn_db": [OIDN.name],
 }
 RIVALS = {NEURAL.name: ("renderer", PAIR_RIVALS), NEURAL_LIT.name: ("renderer.lit", LIT_RIVALS)}
 """Method -> beginning of its rows, and what its gains are over by the end of their names."""
 INPUT = {NEURAL.name: "pbr", NEURAL_LIT.name: "lit"}
 """Method -> what it starts from."""
 WORST, WORST_OVER_INPUT, KEPT = "worst_scene_gain_db", "worst_scene_over_input_db", "gain_kept"
+WORST_OVER_OIDN = "worst_scene_over_oidn_db"
 """Ends of the names of rows on single scenes; see :func:`scene_rows`."""
 
 
@@ -67,15 +70,18 @@ def gain_rows(prefix: str, sizes: Mapping[int, Scores], seed: int, every_size: b
                 if row := scores.mean_row(name, method, where, seed):
                     yield row
         yield from scene_rows(prefix, scores, of_size, seed)
-        yield from ssim_rows(prefix, scores, of_size, seed)
+        yield from seen_rows(prefix, scores, of_size, seed)
+        yield from material_rows(prefix, scores, of_size, seed)
+        there = [each for each in LIT_RIVALS["gain_db"] if each in known]
+        yield from sharpness_rows(prefix, scores, there, of_size, seed)
 
 
 def scene_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row]:
     """What single scenes make of the gain over the best rival, foreground.
 
     The gain without the scene that raises it most, and the share of it that this keeps (0 where there is no
-    gain); the least gain of a scene over the rival that is the best there, and over what the network starts
-    from.
+    gain); the least gain of a scene over the rival that is the best there, over what the network starts
+    from, and, with lit, over Open Image Denoise.
     """
     for method, (start, rivals) in RIVALS.items():
         known = {each.name for each in scores.methods}
@@ -89,26 +95,50 @@ def scene_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Ro
             yield Row(metric=gain.metric, value=left, unit="dB", n=count)
             kept = left / gain.value if gain.value > 0 else 0.0
             yield Row(metric=f"{name}{KEPT}{tail}", value=kept, unit="fraction", n=count)
-        for end, others in ((WORST, over), (WORST_OVER_INPUT, [INPUT[method]])):
+        ends = {WORST: over, WORST_OVER_INPUT: [INPUT[method]]}
+        if method == NEURAL_LIT.name:
+            ends[WORST_OVER_OIDN] = [OIDN.name]
+        for end, others in ends.items():
             by_scene = scores.scene_gains(method, others)
             if by_scene:
                 value, count = min(by_scene.values()), len(by_scene)
                 yield Row(metric=f"{name}{end}{tail}", value=value, unit="dB", n=count)
 
 
-def ssim_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row]:
-    """SSIM, which does not pay for blur as PSNR does: of every method, and gains over the best by it."""
+def seen_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row]:
+    """SSIM and FLIP, which do not pay for blur as PSNR does: of every method, gains over the best by each."""
+    known = {each.name: scores.of(each.name, Where()) for each in scores.methods}
+    for figure in ("ssim", "flip"):
+        if not all(figure in score.figures for found in known.values() for score in found):
+            continue  # FLIP is not installed
+        for method in known:
+            name = f"renderer.{prefix}{figure}.{method.replace('.', '_')}{tail}"
+            if row := scores.mean_row(name, method, seed=seed, figure=figure):
+                yield row
+        for method, (start, rivals) in RIVALS.items():
+            there = [each for each in rivals["gain_db"] if each in known]
+            name = f"{start}.{prefix}{figure}_gain{tail}"
+            if row := scores.gain_row(name, method, there, seed=seed, figure=figure):
+                yield row
+
+
+def material_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row]:
+    """Of metals and of the rest by themselves, over frames that have both, or one: PSNRs and gains.
+
+    What carries a mean is seen: ``rest`` is the gain without metals. PSNRs are those of the networks, lit and
+    Open Image Denoise.
+    """
     known = {each.name for each in scores.methods}
-    for method in (each.name for each in scores.methods):
-        name = f"renderer.{prefix}ssim.{method.replace('.', '_')}{tail}"
-        if row := scores.mean_row(name, method, seed=seed, figure="ssim"):
-            yield row
-    for method, (start, rivals) in RIVALS.items():
-        there = [each for each in rivals["gain_db"] if each in known]
-        if row := scores.gain_row(
-            f"{start}.{prefix}ssim_gain{tail}", method, there, seed=seed, figure="ssim"
-        ):
-            yield row
+    for where in map(Where, MATERIALS):
+        end = where.tail_after(tail)
+        for method, (start, rivals) in RIVALS.items():
+            for gain, over in rivals.items():
+                there = [each for each in over if each in known]
+                if row := scores.gain_row(f"{start}.{prefix}{gain}{end}", method, there, where, seed):
+                    yield row
+        for method in (*RIVALS, "lit", OIDN.name):
+            if row := scores.mean_row(f"renderer.{prefix}psnr.{method}{end}", method, where, seed):
+                yield row
 
 
 def between(metric: str, method: str, scores: Scores, other: Scores, seed: int) -> Row | None:
@@ -142,7 +172,7 @@ def time_rows(prefix: str, seconds: Mapping[str, Sequence[float]], size: int) ->
 def everywhere(rows: Iterable[Row]) -> Iterator[Row]:
     """The least of each row on single scenes of the network that starts from lit, of all that was judged."""
     found = list(rows)
-    for end in (WORST, WORST_OVER_INPUT, KEPT):
+    for end in (WORST, WORST_OVER_INPUT, WORST_OVER_OIDN, KEPT):
         pattern = re.compile(rf"renderer\.lit\.([a-z]+_)*{end}(\.\d+)?")
         if there := [row for row in found if pattern.fullmatch(row.metric)]:
             least = min(there, key=lambda row: row.value)

@@ -53,9 +53,13 @@ class Truths:
                     known.append(rgb)
         return found
 
+    def linear(self, clip: Clip) -> np.ndarray:
+        """Mean of the renders of a clip: (K, H, W, 3) linear."""
+        return np.mean(self.renders[clip.meta.key], axis=0)
+
     def displayed(self, clip: Clip) -> np.ndarray:
-        """Mean of the renders of a clip as displayed under its exposure: (K, H, W, 3) in [0, 1]."""
-        return displayed(TARGET, np.mean(self.renders[clip.meta.key], axis=0), clip.meta.exposure)
+        """The same as displayed under its exposure, in [0, 1]."""
+        return displayed(TARGET, self.linear(clip), clip.meta.exposure)
 
     def rows(self, clips: Iterable[Clip], metric: str, tail: str, seed: int) -> list[Row]:
         """PSNR that a perfect picture has against the mean, by the noise of displayed values left in it.

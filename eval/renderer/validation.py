@@ -10,8 +10,10 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
+from eval.relighting.baselines import BASELINES, OIDN, show_oidn
 from eval.relighting.buffers import MEMBERS, Buffers, region_mask
 from eval.relighting.networks import Network
+from eval.renderer.identity import Identity
 from eval.results import Row, mean_row
 from tron import metrics
 from tron.neural.network_gains import quality_of
@@ -20,18 +22,26 @@ from tron.shards.schema import TARGET
 
 
 def validation_rows(dataset: Path, split: str, network: Network, size: int, seed: int) -> Iterator[Row]:
-    """Mean gain of a network over lit of the clips of each quality, foreground, dB.
+    """Mean gains over lit of the clips of each quality, foreground, dB; and what becomes of the truth.
 
-    checkpoint=auto goes by the lower end of its interval. ``seed`` draws the scenes of that.
+    Of a network (``QUALITY_gain_db``) and of Open Image Denoise, where it is installed
+    (``QUALITY_oidn_gain_db``). checkpoint=auto goes by the lower ends of their intervals. ``seed`` draws the
+    scenes of those.
     """
-    found: dict[str, list[tuple[str, float]]] = defaultdict(list)
+    ways = {"": network.show} | ({"oidn_": show_oidn} if OIDN in BASELINES else {})
+    found: dict[tuple[str, str], list[tuple[str, float]]] = defaultdict(list)
+    kept: dict[str, Identity] = {}
     for clip in read_clips(dataset, split, MEMBERS):
         quality = quality_of(clip.meta.extra["sub_pixels"], clip.meta.spp.get("reflections", 0))
         buffers, truth = Buffers.of(clip), clip.displayed(TARGET)
-        shown = network.show(buffers), buffers.displayed("lit")
-        for number, inside in enumerate(region_mask(clip, "foreground")):
-            if inside.any():
-                ours, lit = (metrics.capped_psnr(each[number], truth[number], inside) for each in shown)
-                found[quality].append((clip.meta.scene, ours - lit))
-    for quality, gains in sorted(found.items()):
-        yield mean_row(f"renderer.validation.{quality}_gain_db.{size}", "dB", gains, seed)
+        shown, masks = buffers.displayed("lit"), region_mask(clip, "foreground")
+        for way, show in ways.items():
+            for ours, lit, right, inside in zip(show(buffers), shown, truth, masks):
+                if inside.any():
+                    first, second = (metrics.capped_psnr(each, right, inside) for each in (ours, lit))
+                    found[quality, way].append((clip.meta.scene, first - second))
+        kept.setdefault(quality, Identity(network, lambda clip: clip.frames[TARGET])).add(clip)
+    for (quality, way), gains in sorted(found.items()):
+        yield mean_row(f"renderer.validation.{quality}_{way}gain_db.{size}", "dB", gains, seed)
+    for quality, identity in sorted(kept.items()):
+        yield from identity.rows(f"renderer.validation.{quality}_", f".{size}", seed)

@@ -115,10 +115,17 @@ def drawn_clip() -> Callable[..., Clip]:
 def write_dataset() -> Callable[..., Path]:
     """Write a data set: write_dataset(folder, size=32, frames=2); train, train_b and test splits.
 
-    judged: name of the last one, such as test_relit.
+    judged: name of the last one, such as test_relit. noise: share of the truth's radiance.
     """
 
-    def write(folder: Path, size: int = 32, frames: int = 2, scenes: int = 2, judged: str = "test") -> Path:
+    def write(
+        folder: Path,
+        size: int = 32,
+        frames: int = 2,
+        scenes: int = 2,
+        judged: str = "test",
+        noise: float = 0.0,
+    ) -> Path:
         entries = []
         for split, first, lights, count in (
             ("train", 0, ("noon", "softbox", "grey"), 1),
@@ -132,6 +139,11 @@ def write_dataset() -> Callable[..., Path]:
                             f"s{seed:06d}-{light}", split, f"s{seed:06d}", light, count, size
                         )
                         members = [draw_frame(size, seed, light, k) for k in range(count)]
+                        for frame in members if noise else ():
+                            rng = generator(seed, "drawn", "truth", light)
+                            frame[TARGET] = frame[TARGET] * np.float32(
+                                1 + noise * rng.standard_normal(frame[TARGET].shape)
+                            )
                         if split != judged:
                             members = [_without_references(frame) for frame in members]
                         writer.write(meta, members)

@@ -74,7 +74,9 @@ def test_models_and_captures_are_judged_on_their_own_splits(
     """Untrained networks: gains over what they start from are zero."""
     captures = write_dataset(tmp_path / "captures", frames=1, scenes=3, judged="test_relit")
     names = [f"models_{size}_{quality}" for size in ("128", "256", "512", "512_few") for quality in QUALITIES]
-    made = ",".join(f"{name}: {dataset}" for name in names)
+    again = write_dataset(tmp_path / "again", noise=0.02)
+    of = dict.fromkeys(names, dataset) | {"models_512_final": again}
+    made = ",".join(f"{name}: {folder}" for name, folder in of.items())
     code = run(
         f"output_dir={tmp_path / 'out'}",
         "benchmark.parts=[models,captures]",
@@ -100,6 +102,13 @@ def test_models_and_captures_are_judged_on_their_own_splits(
     for name in ("ood_ssim.lit_filtered.128", "final_seconds.neural_lit.256", "lit.few_final_ssim_gain.512"):
         assert results.find(f"renderer.{name}") is not None
     assert results.find("renderer.ood_psnr.truth.128") is None, "two data sets that are one hold one truth"
+    assert results.find("renderer.ood_sharpness.lit.128") is None, "so its noise is not known"
+    lit = results.value("renderer.ood_sharpness.lit.512")
+    assert lit is not None
+    assert 0.5 < lit < 1, "a little less contrast than the truth's"
+    assert results.value("renderer.ood_sharpness.neural_lit.512") == pytest.approx(lit, rel=1e-3)
+    assert results.value("renderer.identity_psnr") == 100, "an untrained network lets pass what it is given"
+    assert results.value("renderer.lit.few_final_gain_over_lit_db_rest.512") == pytest.approx(0, abs=1e-3)
     page = (tmp_path / "out" / "report.html").read_text()
     for section in ("models", "captures"):
         assert f'<section id="{section}">' in page

@@ -9,17 +9,17 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 CODE = {
     "tron": (2_900, 17),
-    "tron/apps": (4_100, 26),
+    "tron/apps": (4_150, 26),
     "tron/brdf": (800, 7),
     "tron/captures": (5_200, 34),
     "tron/cli": (1_500, 8),
     "tron/editing": (2_050, 13),
-    "tron/gaussians": (3_550, 25),
+    "tron/gaussians": (3_750, 27),
     "tron/integrators": (1_000, 5),
     "tron/io": (3_800, 22),
     "tron/meshing": (350, 3),
     "tron/models": (2_000, 12),
-    "tron/neural": (2_250, 22),
+    "tron/neural": (2_300, 22),
     "tron/reconstruction": (6_800, 35),
     "tron/relighting": (1_300, 6),
     "tron/report": (650, 5),
@@ -29,7 +29,7 @@ CODE = {
     "tron/view": (2_500, 12),
     "conf": (50, 12),
     "datagen": (20_050, 129),
-    "train": (3_200, 22),
+    "train": (3_250, 22),
     "eval": (18_200, 117),
 }
 """Package -> its lines, its files."""
@@ -42,7 +42,7 @@ TESTS = {
     "tests/house": 1_200,
     "tests/robustness": 2_500,
     "tests/slurm": 300,
-    "tests/train": 3_000,
+    "tests/train": 3_100,
     "tests/tron": 33_150,
 }
 """Tests of a package -> their lines."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,6 +14,9 @@ from train.settings import DataSettings
 from tron.color import luminance
 from tron.errors import TronError
 from tron.shards.schema import MEMBERS, TARGET, encoded
+
+START = "lit"
+"""Buffer that is the picture, but for what a network mends."""
 
 
 def augmented(
@@ -25,7 +29,7 @@ def augmented(
     luminance of white, so that the exposure rule still holds; a random exposure, a gain on all channels,
     leaves that rule on purpose. Samples with display members keep their colours. A turned picture is what a
     rolled camera sees: no buffer holds a direction that would have to turn with it. Reflectance has its
-    colours exchanged, and no light to scale; what is no colour stays.
+    colours exchanged, and no light to scale; what is no colour stays. Last, lit is mended in a share of all.
     """
     height, width = sample.buffers[TARGET].shape[-2:]
     rows, columns = slice(None), slice(None)
@@ -51,7 +55,22 @@ def augmented(
         space = None if sample.display else MEMBERS[name].color_space
         video = video if space is None else video[order.tolist()]
         buffers[name] = video * gains if space == "linear" else video
-    return Sample(buffers, sample.display)
+    return mended(Sample(buffers, sample.display), random, settings.mend)
+
+
+def mended(sample: Sample, random: np.random.Generator, share: float) -> Sample:
+    """A sample, in a share of all cases with a ``lit`` that is less wrong: w truth + (1 - w) lit, linear.
+
+    w is 1 in half of them, else uniform in [0, 1]. The truth's noise comes with it and is what is asked for:
+    such a sample says that nothing is to be done. Samples without lit, and photographs, stay.
+    """
+    if not share or random.random() >= share:
+        return sample
+    weight, names = min(1.0, 2 * random.random()), {START, TARGET}
+    if names & sample.display or not names <= sample.buffers.keys():
+        return sample
+    lit, truth = (sample.buffers[name] for name in (START, TARGET))
+    return replace(sample, buffers=sample.buffers | {START: torch.lerp(lit, truth, weight)})
 
 
 def _quarter_turns(random: np.random.Generator, probability: float, size: tuple[int, int]) -> int:

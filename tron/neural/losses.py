@@ -1,4 +1,4 @@
-"""The loss of training: squared error of display values, PSNR, and LPIPS if its weights are given."""
+"""The loss of training: errors of display values and their gradients, PSNR, LPIPS if there are weights."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from tron.metrics import LPIPS
 
 log = logging.getLogger(__name__)
 
-PSNR_FLOOR = 1e-5
-"""Mean square that is added for the loss's PSNR: 50 dB, beyond which nothing is gained."""
-
 
 class RendererLoss:
-    """l2 * mean squared error + lpips * LPIPS (VGG) - psnr * PSNR, on values in [-1, 1] (paper: 1, 1, 0).
+    """l2 * mean squared error + lpips * LPIPS (VGG) - psnr * PSNR + gradient * error of gradients.
+
+    On values in [-1, 1] (paper: 1, 1, 0, 0).
 
     PSNR is in dB, of each frame by itself (Chen et al., "Simple Baselines for Image Restoration", 2022): a
     frame that is nearly right counts as much as one that is far off, where the mean squared error hears the
-    latter alone.
+    latter alone. A mean square is added that keeps it below ``psnr_ceiling``: a frame that is right by itself
+    would have all say otherwise. The error of gradients is :func:`gradient_error`.
 
     Without `vgg_weights` (torchvision's vgg16-397923af.pth) the LPIPS term is absent, and the log says so:
     a random VGG is never used silently. LPIPS is no module here, so that its frozen weights stay out of
@@ -29,9 +29,16 @@ class RendererLoss:
     """
 
     def __init__(
-        self, l2: float = 1.0, lpips: float = 1.0, vgg_weights: str | Path | None = None, psnr: float = 0.0
+        self,
+        l2: float = 1.0,
+        lpips: float = 1.0,
+        vgg_weights: str | Path | None = None,
+        psnr: float = 0.0,
+        gradient: float = 0.0,
+        psnr_ceiling: float = 50.0,
     ):
-        self.l2, self.lpips, self.psnr = l2, lpips, psnr
+        self.l2, self.lpips, self.psnr, self.gradient = l2, lpips, psnr, gradient
+        self.floor = 10 ** (-psnr_ceiling / 10)
         self.perceptual = LPIPS.load(vgg_weights) if vgg_weights is not None and lpips > 0 else None
         if self.perceptual is None:
             log.info("Loss: %s. LPIPS is absent: loss.vgg_weights names no VGG-16 file.", self._terms())
@@ -39,18 +46,35 @@ class RendererLoss:
             log.info("Loss: %s + %g LPIPS (VGG)", self._terms(), lpips)
 
     def _terms(self) -> str:
-        return f"{self.l2:g} L2" + (f" - {self.psnr:g} PSNR" if self.psnr else "")
+        more = f" - {self.psnr:g} PSNR" if self.psnr else ""
+        return f"{self.l2:g} L2{more}" + (f" + {self.gradient:g} gradients" if self.gradient else "")
 
     def __call__(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Loss (scalar) of (B, 3, K, H, W) in [-1, 1]; the prediction is not clamped."""
         squares = (predicted - target).square()
         loss = self.l2 * squares.mean()
         if self.psnr:
-            loss = loss + self.psnr * torch.log10(squares.mean((1, 3, 4)) / 4 + PSNR_FLOOR).mean() * 10
+            loss = loss + self.psnr * torch.log10(squares.mean((1, 3, 4)) / 4 + self.floor).mean() * 10
+        if self.gradient:
+            loss = loss + self.gradient * gradient_error(predicted, target)
         if self.perceptual is not None:
             frames = (video.transpose(1, 2).flatten(0, 1) for video in (predicted, target))
             loss = loss + self.lpips * self.perceptual(*frames).mean()
         return loss
+
+
+def gradient_error(predicted: Tensor, target: Tensor) -> Tensor:
+    """Mean |D predicted - D target|, D the difference of neighbours: along rows plus along columns (scalar).
+
+    The L1 loss of gradients of Chaitanya et al., "Interactive Reconstruction of Monte Carlo Image Sequences
+    using a Recurrent Denoising Autoencoder" (2017), with neighbours' differences in place of a Laplacian of a
+    Gaussian: squared errors of values hardly hear edges and relief, which are few pixels, or small.
+
+    Args:
+        predicted, target: (B, C, K, H, W), H and W at least 2.
+    """
+    error = predicted - target
+    return error.diff(dim=-1).abs().mean() + error.diff(dim=-2).abs().mean()
 
 
 def psnr_per_frame(predicted: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -1,27 +1,34 @@
-"""Where ``checkpoint=auto`` takes the network: where it gains on validation scenes, by size and quality.
+"""What ``checkpoint=auto`` draws pictures by: what gains most on validation scenes, by size and quality.
 
-GAINS are foreground PSNR of ``surfaces`` less that of ``lit`` on procedural scenes that neither trained nor
-judge it: lower ends of the intervals over scenes (95 % of six at 128, the worst of four and three at 256 and
-512), for a gain that is not sure is none. ``tron-eval
-benchmark=renderer benchmark.parts=[validation]`` measures them anew; whoever ships another checkpoint writes
-its own here.
+GAINS are foreground PSNR less that of ``lit`` on procedural scenes that neither trained nor judge a network:
+lower ends of the intervals over scenes (95 % of six at 128, the worst of four and two at 256 and 512), for
+a gain that is not sure is none. ``tron-eval benchmark=renderer benchmark.parts=[validation]`` measures them
+anew; whoever ships another checkpoint writes its own here.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Literal
 
 import numpy as np
 
 Quality = Literal["preview", "final"]
+Way = Literal["network", "oidn"]
+"""The shipped network, or Open Image Denoise; the third way is ``lit`` as it is."""
 
-GAINS: Mapping[Quality, Mapping[int, float]] = {
-    "preview": {128: 0.83, 256: 0.60, 512: 0.55},
-    "final": {128: 0.22, 256: 0.29, 512: 0.30},
+GAINS: Mapping[Way, Mapping[Quality, Mapping[int, float]]] = {
+    "network": {
+        "preview": {128: 0.83, 256: 0.60, 512: 0.27},
+        "final": {128: 0.22, 256: 0.29, 512: 0.29},
+    },
+    "oidn": {
+        "preview": {128: 0.15, 256: 0.02, 512: 0.03},
+        "final": {128: 0.16, 256: 0.18, 512: 0.15},
+    },
 }
-"""Quality -> width of square frames, pixels -> dB. Those of 512 were measured on the material of before."""
+"""Way -> quality -> width of square frames, pixels -> dB. Those of 512: two scenes."""
 
 
 def quality_of(supersample: int, reflections: int) -> Quality:
@@ -29,11 +36,17 @@ def quality_of(supersample: int, reflections: int) -> Quality:
     return "final" if supersample > 1 or reflections > 0 else "preview"
 
 
-def expected_gain(quality: Quality, width: int, height: int) -> float:
-    """What the network gains over lit at least, dB, between the sizes of GAINS by the logarithm of the side.
+def expected_gain(way: Way, quality: Quality, width: int, height: int) -> float:
+    """What a way gains over lit at least, dB, between the sizes of GAINS by the logarithm of the side.
 
     The side is that of a square of as many pixels. Beyond the sizes that were measured the nearest holds.
     """
-    known = GAINS[quality]
+    known = GAINS[way][quality]
     side = math.log2(math.sqrt(width * height))
     return float(np.interp(side, [math.log2(each) for each in known], list(known.values())))
+
+
+def best_first(ways: Iterable[Way], quality: Quality, width: int, height: int) -> dict[Way, float]:
+    """Ways -> what they gain at least, dB; the one that gains most comes first."""
+    gains: dict[Way, float] = {way: expected_gain(way, quality, width, height) for way in ways}
+    return dict(sorted(gains.items(), key=lambda each: -each[1]))

@@ -18,7 +18,7 @@ SHIPPED = {
 DEFAULT = "surfaces"
 """The one that ``auto`` means."""
 AUTO = "auto"
-"""What tron-relight is told unless it is told otherwise: :data:`DEFAULT` where that fits, otherwise none."""
+"""What tron-relight is told unless it is told otherwise: :data:`DEFAULT`, or what surely gains more."""
 
 
 def installed() -> dict[str, Path]:

@@ -18,7 +18,7 @@ from tron.cli.installation import missing_libraries, require_extra
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.io.lights import LIGHT_SUFFIXES
-from tron.neural.network_gains import expected_gain
+from tron.neural.network_gains import Way, best_first
 from tron.neural.shipped import DEFAULT, checkpoint_file, installed
 from tron.relighting import Relighter
 from tron.runtime import activate, set_torch_threads, torch_device
@@ -84,8 +84,8 @@ def first_light(lights: Mapping[str, Path], wanted: str | None, own: Collection[
 def finish_of(threads: int | None) -> Callable[[int, int], Finish | None]:
     """What pictures at rest of a width and height are finished by.
 
-    As checkpoint=auto of tron-relight has it, a network where it is sure to gain; else Open Image Denoise,
-    where it is installed.
+    As checkpoint=auto of tron-relight has it, by the network or Open Image Denoise, whichever surely gains
+    more. Where neither does Open Image Denoise, if installed, still takes the passes' noise out.
     """
     drawn = denoised = None
     if not missing_libraries("network") and DEFAULT in installed():
@@ -94,9 +94,11 @@ def finish_of(threads: int | None) -> Callable[[int, int], Finish | None]:
         drawn = Drawn(loaded)
     if find_spec("pyoidn") is not None:
         denoised = Denoised()
+    there: list[Way] = [*(["network"] if drawn else []), *(["oidn"] if denoised else [])]
 
     def finish(width: int, height: int) -> Finish | None:
-        return drawn if drawn and expected_gain("final", width, height) > 0 else denoised
+        best, gain = next(iter(best_first(there, "final", width, height).items()), (None, 0.0))
+        return drawn if best == "network" and gain > 0 else denoised
 
     return finish
 

@@ -8,7 +8,7 @@ import torch
 
 from tron import metrics
 from tron.errors import TronError
-from tron.neural.losses import PSNR_FLOOR, RendererLoss, psnr_per_frame
+from tron.neural.losses import RendererLoss, gradient_error, psnr_per_frame
 
 
 def pair(frames: int = 2, size: int = 16):
@@ -33,7 +33,7 @@ def test_psnr_is_the_mean_over_frames_and_the_better_frame_counts_as_much(caplog
     a.requires_grad_()
     value = loss(a, b)
     unclamped = [
-        -10 * np.log10(np.mean(((x - y) / 2) ** 2) + PSNR_FLOOR)
+        -10 * np.log10(np.mean(((x - y) / 2) ** 2) + 1e-5)
         for x, y in zip(a.detach().movedim(2, 1).flatten(0, 1).numpy(), b.movedim(2, 1).flatten(0, 1).numpy())
     ]
     np.testing.assert_allclose(value.item(), -0.5 * np.mean(unclamped), rtol=1e-5)
@@ -79,3 +79,39 @@ def test_a_frame_without_foreground_has_no_psnr():
     a, b = pair()
     mask = torch.zeros(2, 1, 2, 16, 16)
     assert torch.isnan(psnr_per_frame(a, b, mask)).all()
+
+
+def test_beyond_its_ceiling_a_frame_gains_nothing_and_has_no_more_say(caplog):
+    """Of two frames of 30 and 60 dB: at a ceiling of 40 the better one has a hundredth of its say."""
+    target = torch.zeros(2, 3, 1, 8, 8)
+    off = 2 * torch.tensor([10 ** (-30 / 20), 10 ** (-60 / 20)]).view(2, 1, 1, 1, 1)
+    gradients = {}
+    for ceiling in (40.0, 100.0):
+        a = (target + off).requires_grad_()
+        value = RendererLoss(l2=0, psnr=1.0, psnr_ceiling=ceiling)(a, target)
+        expected = [-10 * np.log10(10 ** (-dB / 10) + 10 ** (-ceiling / 10)) for dB in (30, 60)]
+        np.testing.assert_allclose(value.item(), -np.mean(expected), rtol=1e-5)
+        value.backward()
+        assert a.grad is not None
+        gradients[ceiling] = a.grad.flatten(1).norm(dim=1)
+    assert gradients[40.0][0] == pytest.approx(gradients[100.0][0].item() / 1.1, rel=1e-3)
+    assert gradients[40.0][1] == pytest.approx(gradients[100.0][1].item() / 101, rel=1e-2)
+
+
+def test_gradients_are_the_mean_difference_of_neighbours_by_either_axis(caplog):
+    a, b = pair()
+    error = a.numpy() - b.numpy()
+    by_axis = [np.abs(np.diff(error, axis=axis)).mean() for axis in (3, 4)]
+    with caplog.at_level(logging.INFO):
+        loss = RendererLoss(l2=0.0, gradient=3.0)
+    assert "3 gradients" in caplog.text
+    np.testing.assert_allclose(loss(a, b).item(), 3 * sum(by_axis), rtol=1e-5)
+    assert gradient_error(a + 0.25, a).item() == pytest.approx(0, abs=1e-6), "light that is off has the edges"
+
+
+def test_an_edge_that_is_blurred_costs_and_an_edge_that_stands_does_not():
+    edge = torch.cat([torch.zeros(1, 1, 1, 8, 4), torch.ones(1, 1, 1, 8, 4)], -1)
+    blurred = edge.clone()
+    blurred[..., 3], blurred[..., 4] = 0.25, 0.75
+    # Of seven differences in a row one falls by a half, and two rise by a quarter.
+    assert gradient_error(blurred, edge).item() == pytest.approx(1 / 7)

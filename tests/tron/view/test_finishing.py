@@ -101,7 +101,10 @@ def test_the_network_is_waited_for_no_longer_than_somebody_looks(frame):
 
 def test_it_is_chosen_as_checkpoint_auto_chooses(monkeypatch):
     pytest.importorskip("torch")
-    gains = {"preview": {128: 1.0}, "final": {128: -1.0, 512: 1.0}}
+    gains = {
+        "network": {"preview": {128: 1.0}, "final": {128: -1.0, 512: 1.0, 1024: 0.2}},
+        "oidn": {"preview": {128: 2.0}, "final": {128: -2.0, 512: 0.3}},
+    }
     monkeypatch.setattr(network_gains, "GAINS", gains)
     monkeypatch.setattr(opening, "_load", lambda *_: None)
     monkeypatch.setattr(opening, "installed", lambda: {DEFAULT: None})
@@ -109,6 +112,7 @@ def test_it_is_chosen_as_checkpoint_auto_chooses(monkeypatch):
     finish = opening.finish_of(None)
     assert isinstance(finish(128, 128), Denoised), "a loss where it is small"
     assert isinstance(finish(512, 512), Drawn)
+    assert isinstance(finish(1024, 1024), Denoised), "the lesser gain"
     monkeypatch.setattr(opening, "find_spec", lambda _: None)
     assert opening.finish_of(None)(128, 128) is None
     monkeypatch.setattr(opening, "missing_libraries", lambda _: ["torch"])

@@ -51,7 +51,7 @@ from tron.gaussians.scene import GaussianScene
 from tron.io.cameras.registry import UPRIGHT
 from tron.io.recognised import refuse_by_sight
 from tron.neural.clips import check_frames
-from tron.neural.network_gains import expected_gain, quality_of
+from tron.neural.network_gains import Way, best_first, quality_of
 from tron.neural.shipped import DEFAULT, SHIPPED, checkpoint_file
 from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
 from tron.shards.schema import GUIDANCE
@@ -65,6 +65,8 @@ if TYPE_CHECKING:
 
 
 log = logging.getLogger(__name__)
+
+TITLES: dict[Way, str] = {"network": DEFAULT, "oidn": "Open Image Denoise"}
 
 
 def main(settings: Settings) -> None:
@@ -358,10 +360,11 @@ def _report(
 def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     """The settings as they will be followed, and the network on its device, or None without one.
 
-    A checkpoint that was asked for has to fit. That of checkpoint=auto gives way with a line in the log:
-    where the libraries of networks or its file are not installed; where nothing bounces and it is given lit;
-    where radiance is asked for, which a network does not draw; where Open Image Denoise is; and where it does
-    not surely gain at that size and quality (:mod:`tron.neural.network_gains`). Where window, overlap,
+    A checkpoint that was asked for has to fit. checkpoint=auto takes what surely gains most at that size and
+    quality (:mod:`tron.neural.network_gains`): the shipped network, Open Image Denoise where it is
+    installed and light bounces, or neither; a line in the log says which, and by how much. The network gives
+    way where its libraries or its file are not installed; where nothing bounces and it is given lit; where
+    radiance is asked for, which a network does not draw; where denoise=oidn is. Where window, overlap,
     reproject or weights are chosen, it has to fit too.
 
     Raises:
@@ -371,29 +374,55 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
         return settings, None
     if not settings.takes_default:
         return settings, _loaded(settings)
-    try:
-        if settings.denoise == "oidn":
-            raise TronError("denoise=oidn draws the pictures")
-        if "relit" in settings.buffers:
-            raise TronError("buffers ask for relit.exr, and a network draws display values")
-        estimation, (width, height) = settings.estimation(), settings.size
-        quality = quality_of(estimation.supersample, estimation.reflections)
-        gain = expected_gain(quality, width, height)
-        said = f"{gain:+.2f} dB at least on validation scenes, {quality} at {width} x {height}"
-        if gain <= 0:
-            raise TronError(
-                f"{DEFAULT} gains nothing for sure: {said}",
-                mend=f"give checkpoint={DEFAULT} to have it all the same",
-            )
-        settings = settings.model_copy(update={"checkpoint": Path(DEFAULT)})
-        loaded = _loaded(settings)
-        log.info("%s draws the pictures: %s", DEFAULT, said)
-        return settings, loaded
-    except TronError as error:
-        if settings.tuned:
-            raise
-        log.info("No network: %s", error)
-        return settings.model_copy(update={"checkpoint": None}), None
+    estimation, (width, height) = settings.estimation(), settings.size
+    quality = quality_of(estimation.supersample, estimation.reflections)
+    gains = best_first(_ways(settings), quality, width, height)
+    found = f"at least on validation scenes, {quality} at {width} x {height}"
+    for way, gain in gains.items():
+        others = [f"; {TITLES[each]} {dB:+.2f}" for each, dB in gains.items() if each != way]
+        said = "".join([f"{gain:+.2f} dB {found}", *others])
+        if way == "oidn" and gain > 0:
+            log.info("%s draws the pictures: %s", TITLES[way], said)
+            return settings.model_copy(update={"checkpoint": None, "denoise": "oidn"}), None
+        if way == "oidn":
+            continue
+        try:
+            chosen = _default_network(settings, gain, said)
+        except TronError as error:
+            if settings.tuned:
+                raise
+            log.info("No network: %s", error)
+        else:
+            log.info("%s draws the pictures: %s", TITLES[way], said)
+            return chosen
+    return settings.model_copy(update={"checkpoint": None}), None
+
+
+def _ways(settings: Settings) -> list[Way]:
+    """What checkpoint=auto chooses from: Open Image Denoise is no answer to settings of a network."""
+    ways: list[Way] = ["network"]
+    if settings.bounces and settings.denoise is True and not settings.tuned:
+        try:
+            require_oidn("checkpoint=auto")
+        except TronError:  # not installed here, or not for this machine
+            return ways
+        ways.append("oidn")
+    return ways
+
+
+def _default_network(settings: Settings, gain: float, said: str) -> tuple[Settings, Renderer]:
+    """The shipped network where it gains and fits; TronError says why not."""
+    if settings.denoise == "oidn":
+        raise TronError("denoise=oidn draws the pictures")
+    if "relit" in settings.buffers:
+        raise TronError("buffers ask for relit.exr, and a network draws display values")
+    if gain <= 0:
+        raise TronError(
+            f"{DEFAULT} gains nothing for sure: {said}",
+            mend=f"give checkpoint={DEFAULT} to have it all the same",
+        )
+    settings = settings.model_copy(update={"checkpoint": Path(DEFAULT)})
+    return settings, _loaded(settings)
 
 
 def averaged_frames_of(settings: Settings, frames: int) -> int:

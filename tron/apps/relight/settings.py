@@ -178,9 +178,9 @@ class Settings(BaseModel):
     checkpoint: Path | None = Field(
         Path(AUTO),
         description="renderer.safetensors, or the name of a checkpoint that comes with the package "
-        f"({', '.join(SHIPPED)}): the relit picture is then the neural renderer's; auto: {DEFAULT} where it "
-        "makes the picture better, which the log says, otherwise none; null: no network. A network wants "
-        "pip install 'tron-relight[network]'",
+        f"({', '.join(SHIPPED)}): the relit picture is then the neural renderer's; auto: {DEFAULT}, or "
+        "denoise=oidn where it is installed, whichever surely makes the picture better, or neither, as the "
+        "log says; null: no network. A network wants pip install 'tron-relight[network]'",
         examples=["paper"],
     )
     window: int | None = Field(

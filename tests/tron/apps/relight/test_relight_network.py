@@ -3,6 +3,7 @@
 import json
 import pickle
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,11 @@ from tron.neural.renderer import NeuralRenderer
 from tron.neural.weights import save_renderer
 from tron.storage import sha256
 
-GAINS = {"preview": {16: 2.0, 64: -0.1}, "final": {128: -0.4}}
-"""In place of those of the shipped network, which change with it."""
+GAINS = {
+    "network": {"preview": {16: 2.0, 64: -0.1}, "final": {128: -0.4}},
+    "oidn": {"preview": {16: 0.0}, "final": {128: 0.0}},
+}
+"""In place of those that were measured, which change with the shipped network."""
 SMALL = UNetConfig(widths=(4, 6), blocks=(1, 1), blocks_up=(1,))
 
 
@@ -192,6 +196,59 @@ def test_the_default_checkpoint_draws_where_it_gains_and_says_so(
     report = json.loads((tmp_path / "relight.json").read_text())
     assert report["relit"] == "neural"
     assert report["network"]["checkpoint"] == "surfaces"
+
+
+CLOSER = {
+    "network": {"preview": {16: 2.0}, "final": {16: 0.3}},
+    "oidn": {"preview": {16: 0.5}, "final": {16: 0.45}},
+}
+
+
+@pytest.mark.parametrize(
+    ("settings", "relit", "words"),
+    [
+        (
+            (),
+            "neural",
+            "surfaces draws the pictures: +2.00 dB at least on validation scenes, preview at 16 x 16",
+        ),
+        ((), "neural", "preview at 16 x 16; Open Image Denoise +0.50"),
+        (
+            ("quality=final",),
+            "denoised",
+            "Open Image Denoise draws the pictures: +0.45 dB at least on validation scenes, final at 16 x 16"
+            "; surfaces +0.30",
+        ),
+        (("buffers=[relit]",), "denoised", "Open Image Denoise draws the pictures: +0.50 dB"),
+        (("quality=final", "denoise=false"), "neural", "surfaces draws the pictures: +0.30 dB"),
+        (("quality=final", "reproject=1"), "neural", "surfaces draws the pictures: +0.30 dB"),
+        (("bounces=0",), "plain", "no bounced light with bounces=0"),
+    ],
+)
+def test_auto_takes_what_gains_most_and_says_by_how_much(
+    run, checkpoints, tmp_path, monkeypatch, caplog, settings, relit, words
+):
+    """Open Image Denoise has no say where nothing bounces, noise is asked for, or a network is tuned."""
+    pytest.importorskip("pyoidn", reason="pip install 'tron-relight[oidn]'")
+    monkeypatch.setattr(shipped, "FOLDER", checkpoints)
+    monkeypatch.setattr(network_gains, "GAINS", CLOSER)
+    with caplog.at_level("INFO"):
+        assert run(tmp_path, "checkpoint=auto", "frames=1", *settings) == 0
+    assert words in caplog.text
+    report = json.loads((tmp_path / "relight.json").read_text())
+    assert (report["relit"] == "neural") == (relit == "neural")
+    assert (report["settings"]["denoise"] == "oidn") == (relit == "denoised")
+    assert ("through Open Image Denoise" in caplog.text) == (relit == "denoised")
+
+
+def test_auto_goes_without_a_denoiser_that_is_not_installed(run, checkpoints, tmp_path, monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    monkeypatch.setattr(shipped, "FOLDER", checkpoints)
+    monkeypatch.setattr(network_gains, "GAINS", CLOSER)
+    with caplog.at_level("INFO"):
+        assert run(tmp_path, "checkpoint=auto", "quality=final", "frames=1") == 0
+    assert "surfaces draws the pictures: +0.30 dB" in caplog.text
+    assert "Open Image Denoise" not in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,108 @@
+"""Sharpness: mean squared gradient of a picture over that of the truth, of displayed values.
+
+The gradient is the differences of neighbouring pixels, along rows and along columns. The truth's own is the
+mean product of the gradients of two renders of it (of every two, where there are more): their noise is
+independent, so that the product's mean is the square of what they have in common, and a truth without noise
+is what is meant. A picture's noise counts as its sharpness: read it beside the PSNR.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from eval.confidence import interval, scene_sums
+from eval.relighting.baselines import NEURAL_LIT, OIDN
+from eval.relighting.scores import Score, Scores, Where
+from eval.renderer.truths import Truths
+from eval.results import Row
+from tron.shards.schema import TARGET, Clip, displayed
+
+OWN, TRUE = "squared_gradient", "true_squared_gradient"
+"""Names among the figures of a score."""
+BEST_RIVAL = "best_rival"
+
+
+def gradient_product(a: np.ndarray, b: np.ndarray, inside: np.ndarray) -> float:
+    """Mean product of two pictures' differences of neighbours, along rows plus along columns.
+
+    Args:
+        a, b: (H, W, 3).
+        inside: (H, W) bool; pairs of neighbours count that both lie inside.
+    """
+    total = 0.0
+    for axis in (0, 1):
+        products = np.diff(a, axis=axis) * np.diff(b, axis=axis)
+        pairs = np.diff(inside.astype(np.int8), axis=axis) == 0
+        pairs &= inside[1:] if axis == 0 else inside[:, 1:]
+        total += float(products[pairs].mean()) if pairs.any() else 0.0
+    return total
+
+
+@dataclass
+class Gradients:
+    """Squared gradients of a frame and of its truth, as :attr:`Scores.more`.
+
+    Attributes:
+        truths: renders of the clips; of one alone the noise is not known, and nothing is said.
+    """
+
+    truths: Truths
+    _true: dict[tuple[str, int], float] = field(default_factory=dict, init=False, repr=False)
+
+    def __call__(self, clip: Clip, number: int, image: np.ndarray, inside: np.ndarray) -> dict[str, float]:
+        """Figures of one displayed frame (H, W, 3) on the pixels ``inside`` (H, W)."""
+        renders, place = self.truths.renders[clip.meta.key], (clip.meta.key, number)
+        if len(renders) < 2:
+            return {}
+        if place not in self._true:
+            shown = [displayed(TARGET, each[number], clip.meta.exposure) for each in renders]
+            products = [gradient_product(a, b, inside) for a, b in combinations(shown, 2)]
+            self._true[place] = float(np.mean(products))
+        return {OWN: gradient_product(image, image, inside), TRUE: self._true[place]}
+
+
+def sharpness_rows(prefix: str, scores: Scores, rivals: Sequence[str], tail: str, seed: int) -> Iterator[Row]:
+    """Sharpness of the network that starts from lit, of lit, of Open Image Denoise, and of the best rival.
+
+    And the network's over Open Image Denoise's.
+
+    Args:
+        prefix: before the word in the rows' names.
+        scores: with :class:`Gradients`; without them there are no rows.
+        rivals: the best of which by PSNR is meant.
+        tail: end of the names.
+        seed: draws the scenes of the intervals.
+    """
+    found = {name: of for name in (NEURAL_LIT.name, "lit", OIDN.name) if (of := _known(scores, name))}
+    if (best := scores.best(rivals)) is not None and (of := _known(scores, best)):
+        found[BEST_RIVAL] = of
+    for name, of in found.items():
+        yield from _ratio(f"renderer.{prefix}sharpness.{name}{tail}", of, _figures(of, TRUE), seed)
+    if {NEURAL_LIT.name, OIDN.name} <= found.keys():
+        ours, theirs = found[NEURAL_LIT.name], _figures(found[OIDN.name], OWN)
+        yield from _ratio(f"renderer.lit.{prefix}sharpness_over_oidn{tail}", ours, theirs, seed)
+
+
+def _known(scores: Scores, method: str) -> list[Score]:
+    return [each for each in scores.of(method, Where()) if OWN in each.figures]
+
+
+def _figures(scores: Sequence[Score], name: str) -> list[float]:
+    return [each.figures[name] for each in scores]
+
+
+def _ratio(metric: str, scores: Sequence[Score], over: Sequence[float], seed: int) -> Iterator[Row]:
+    """Sum of squared gradients over that of others: frames of contrast say most, flat ones nothing."""
+    sums = np.array([_figures(scores, OWN), over]).T
+    if sums[:, 1].sum() <= 0:
+        return
+
+    def ratio(sums: np.ndarray) -> np.ndarray:
+        return sums[..., 0] / np.maximum(sums[..., 1], 1e-12)
+
+    row = Row(metric=metric, value=float(ratio(sums.sum(0))), unit="x", n=len(sums))
+    yield row.within(interval(scene_sums([each.scene for each in scores], sums), ratio, seed))
