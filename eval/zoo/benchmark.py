@@ -1,4 +1,4 @@
-"""Benchmark `zoo`: `lit` beside path tracing on every kind of material and shape under every kind of light."""
+"""Benchmark `zoo`: `lit` beside path tracing, on every kind of material, shape and light."""
 
 from __future__ import annotations
 

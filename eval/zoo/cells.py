@@ -82,6 +82,10 @@ class Cell:
         """Mean absolute difference from the truth over the truth's mean."""
         return float(np.abs(self.lit[way] - self.truth)[self.counts].mean() / self.truth[self.counts].mean())
 
+    def judge(self, way: str, shown: np.ndarray) -> None:
+        """Keep the PSNR of (H, W, 3) display values."""
+        self.psnr[way] = capped_psnr(shown, to_display(self.truth, self.exposure), self.counts)
+
 
 def measured(
     shape: Shape,
@@ -130,11 +134,9 @@ def measured(
                 if oidn:
                     cell.lit[f"{quality}_oidn"] = _whole(traced.denoised(albedo[k]["albedo"]))
                 for name, network in networks.items():
-                    shown = drawn(network, framed, [shape.camera], exposure, rays)[0]
-                    cell.psnr[f"{quality}_{name}"] = capped_psnr(shown, to_display(truth, exposure), cell.counts)
+                    cell.judge(f"{quality}_{name}", drawn(network, framed, [shape.camera], exposure, rays)[0])
             for way, image in cell.lit.items():
-                shown = [to_display(each, exposure) for each in (image, truth)]
-                cell.psnr[way] = capped_psnr(*shown, cell.counts)
+                cell.judge(way, to_display(image, exposure))
             yield cell
     seconds, count = time.perf_counter() - start, len(materials) * len(lights)
     log.info("%s %d: %d cells in %.0f s", shape.kind, shape.number, count, seconds)

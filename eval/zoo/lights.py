@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -23,17 +24,20 @@ SUN_SHARE = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """A light of the zoo, prepared once.
+    """A light of the zoo.
 
     Attributes:
         name: in metrics.
         environment: around the shapes.
-        lighting: the same, prepared for frames.
     """
 
     name: str
     environment: EnvironmentMap
-    lighting: Lighting
+
+    @cached_property
+    def lighting(self) -> Lighting:
+        """The same, prepared for frames when first asked for."""
+        return Lighting(self.environment)
 
     @property
     def even(self) -> bool:
@@ -62,7 +66,7 @@ def draw_lights(maps: Path | None, seed: int) -> list[Light]:
         drawn = {f"drawn{n}": _windows(rng) for n in range(1, 5)}
     drawn |= {SUN: _sun(rng), EVEN: EnvironmentMap.constant(1.0)}
     turned = {name: each.rotated(float(rng.uniform(0, 360))) for name, each in drawn.items()}
-    return [Light(name, each, Lighting(each)) for name, each in turned.items()]
+    return [Light(name, each) for name, each in turned.items()]
 
 
 def photographed(lights: Sequence[Light]) -> bool:
@@ -99,5 +103,7 @@ def _windows(rng: np.random.Generator) -> EnvironmentMap:
     for _ in range(3):
         radius = float(np.exp(rng.uniform(np.log(4), np.log(25))))
         lamp = disc(rng.uniform(-20, 80), rng.uniform(0, 360), radius)
-        light = light + lamp[..., None] * rng.uniform(0.3, 3) * (20 / radius) ** 2 * (1 + rng.uniform(-0.2, 0.2, 3))
+        light = light + lamp[..., None] * rng.uniform(0.3, 3) * (20 / radius) ** 2 * (
+            1 + rng.uniform(-0.2, 0.2, 3)
+        )
     return EnvironmentMap(light)

@@ -19,7 +19,15 @@ BRIGHTNESS = {
 """Kind of a base color -> range of its largest channel, linear."""
 POLISHED, ROUGH = 0.2, 0.3
 """Roughness up to which a material counts as polished, and from which as rough."""
-STRATA = ((0.05, 0.12), (0.12, POLISHED), (POLISHED, ROUGH), (ROUGH, 0.5), (0.5, 0.7), (0.7, 0.95), (1.0, 1.0))
+STRATA = (
+    (0.05, 0.12),
+    (0.12, POLISHED),
+    (POLISHED, ROUGH),
+    (ROUGH, 0.5),
+    (0.5, 0.7),
+    (0.7, 0.95),
+    (1.0, 1.0),
+)
 """Of a ball's roughness; the last is glTF's default."""
 WIDE_STRATA = ((0.05, 0.25), (0.25, 0.6), (0.6, 1.0))
 """Of the other shapes'."""
@@ -55,7 +63,9 @@ def draw_materials(
     while len(kinds) < count:
         kinds += rng.permutation(list(BRIGHTNESS)).tolist()
     return [
-        Material(color, _base_color(rng, color), float(rng.uniform(*strata[n // each % len(strata)])), metallic)
+        Material(
+            color, _base_color(rng, color), float(rng.uniform(*strata[n // each % len(strata)])), metallic
+        )
         for n, (color, metallic) in enumerate(zip(kinds, np.repeat([1.0, 0.0], count // 2).tolist()))
     ]
 

@@ -14,9 +14,7 @@ BALL, COLORS = "ball", 2
 """Materials of a ball of either metallic and each stratum."""
 
 
-def individuals(
-    kinds: Sequence[str], most: int | None, seed: int
-) -> Iterator[tuple[Shape, list[Material]]]:
+def individuals(kinds: Sequence[str], most: int | None, seed: int) -> Iterator[tuple[Shape, list[Material]]]:
     """Shapes with their materials, in the order of the wall.
 
     Args:

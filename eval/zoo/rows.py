@@ -77,5 +77,5 @@ def group(cell: Cell) -> str:
     return f"{'metal' if cell.material.metallic else 'dielectric'}_{width}"
 
 
-def _row(name: str, value: float, n: int, unit: str = "fraction") -> Row:
+def _row(name: str, value: float | np.floating, n: int, unit: str = "fraction") -> Row:
     return Row(metric=f"zoo.{name}", value=float(value), unit=unit, n=n)

@@ -98,7 +98,7 @@ class _Drawn:
 
 def of_material(part: Part, material: Material) -> Part:
     """The part, of a material."""
-    color = np.asarray(part.base_color * np.float32(material.base_color), np.float32)
+    color = (part.base_color * np.array(material.base_color)).astype(np.float32)
     return replace(part, base_color=color, roughness=material.roughness, metallic=material.metallic)
 
 
@@ -258,7 +258,9 @@ def _cuboid(middle: np.ndarray, half: np.ndarray) -> list[Part]:
         for sign in (1.0, -1.0):
             n, a, b = sign * np.eye(3)[axis], np.eye(3)[(axis + 1) % 3], sign * np.eye(3)[(axis + 2) % 3]
             found.append(
-                polygon([middle + half * (n + i * a + j * b) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+                polygon(
+                    [middle + half * (n + i * a + j * b) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+                )
             )
     return found
 
@@ -296,7 +298,9 @@ def _fog(scene: GaussianScene, rng: np.random.Generator) -> GaussianScene:
     normals = many.normals()
     means = many.means + normals * rng.normal(0, DEEP * SPACING, (len(many), 1))
     tilted = normals + rng.normal(0, TILTED, normals.shape)
-    tilted *= np.where(rng.random((len(many), 1)) < 0.5, -1, 1) / np.linalg.norm(tilted, axis=1, keepdims=True)
+    tilted *= np.where(rng.random((len(many), 1)) < 0.5, -1, 1) / np.linalg.norm(
+        tilted, axis=1, keepdims=True
+    )
     return replace(
         many,
         means=means.astype(np.float32),

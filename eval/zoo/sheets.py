@@ -119,7 +119,12 @@ def measured_sheets(seed: int) -> Iterator[Sheet]:
                 )
                 share = (lit / truth).mean(-1)[inner(above)]
                 yield Sheet(
-                    gap, jitter, quality, float(share.mean()), float((share < DARK).mean()), float(through / lamps)
+                    gap,
+                    jitter,
+                    quality,
+                    float(share.mean()),
+                    float((share < DARK).mean()),
+                    float(through / lamps),
                 )
 
 

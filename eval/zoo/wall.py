@@ -1,4 +1,4 @@
-"""The wall: every cell as a small picture on the colour of its mean, and the worst of them beside the truth."""
+"""The wall: every cell, small, on the colour of its mean, and the worst of them beside the truth."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ MEANS, ERRORS = 0.25, 0.4
 WORST, CLOSE_UP = 8, 128
 """Of the worst, a row by mean and a row by error; pixels of each of their pictures."""
 NEUTRAL, BRIGHT, DIM, WRONG = (
-    np.array([int(h[k : k + 2], 16) / 255 for k in (0, 2, 4)]) for h in ("e9eaec", "d1352b", "2467b3", "5b1a7a")
+    np.array([int(h[k : k + 2], 16) / 255 for k in (0, 2, 4)])
+    for h in ("e9eaec", "d1352b", "2467b3", "5b1a7a")
 )
 """Right; too bright; too dark; the colour of errors."""
 INK = "#22252a"
@@ -35,7 +36,7 @@ INK = "#22252a"
 
 def mean_color(mean: float) -> np.ndarray:
     """(3,) display: neutral at 1, red above, blue below, full at a quarter."""
-    share = np.clip(abs(np.log(max(mean, 1e-3))) / np.log(1 + MEANS), 0, 1) ** 0.8
+    share = np.clip(abs(np.log(max(mean, 1e-3))) / np.log(1 + MEANS), 0, 1)
     return NEUTRAL + share * ((BRIGHT if mean > 1 else DIM) - NEUTRAL)
 
 
@@ -62,8 +63,10 @@ def tile(cell: Cell) -> np.ndarray:
     return found
 
 
-def worst(cells: Sequence[Cell], badness: Callable[[Cell, str], float], most: int = WORST) -> list[tuple[Cell, str]]:
-    """Cells, and the quality that is worse, by descending badness; of a material on a shape the worst alone."""
+def worst(
+    cells: Sequence[Cell], badness: Callable[[Cell, str], float], most: int = WORST
+) -> list[tuple[Cell, str]]:
+    """Cells with their worse quality, by descending badness; of a material on a shape the worst alone."""
     pairs = [(cell, max(QUALITIES, key=lambda quality: badness(cell, quality))) for cell in cells]
     found: dict[Any, tuple[Cell, str]] = {}
     for cell, quality in sorted(pairs, key=lambda pair: -badness(*pair)):
@@ -80,7 +83,9 @@ def draw_wall(cells: Sequence[Cell]) -> np.ndarray:
     """(H, W, 3) display: blocks of shapes, a column a material, a row a light; below them the worst."""
     kinds = list(dict.fromkeys(cell.shape for cell in cells))
     lights = list(dict.fromkeys(cell.light for cell in cells))
-    columns = {kind: list(dict.fromkeys((c.number, c.material) for c in cells if c.shape == kind)) for kind in kinds}
+    columns = {
+        kind: list(dict.fromkeys((c.number, c.material) for c in cells if c.shape == kind)) for kind in kinds
+    }
     rows: list[list[str]] = [[]]
     for kind in kinds:
         if rows[-1] and sum(len(columns[each]) for each in [*rows[-1], kind]) > ACROSS:
@@ -119,12 +124,17 @@ def draw_wall(cells: Sequence[Cell]) -> np.ndarray:
             x, y = 6 + n * (2 * CLOSE_UP + BLOCK_GAP), top + 20
             for k, image in enumerate((cell.truth, cell.lit[quality])):
                 shown = _resized(to_display(image, cell.exposure), CLOSE_UP, Image.Resampling.NEAREST)
-                share = _resized(np.repeat(cell.covered[..., None], 3, -1), CLOSE_UP, Image.Resampling.NEAREST)
+                share = _resized(np.repeat(cell.counts[..., None], 3, -1), CLOSE_UP, Image.Resampling.NEAREST)
                 at = canvas[y : y + CLOSE_UP, x + k * CLOSE_UP : x + (k + 1) * CLOSE_UP]
                 at[:] = 0.35 + share * (shown - 0.35)
             words = f"{cell.shape} · {cell.material.words}"
-            figures = f"{cell.light}, {quality}: mean {cell.mean(quality):.2f}, error {cell.error(quality):.2f}"
-            texts += [(x, y + CLOSE_UP + 3, words, 10, "normal"), (x, y + CLOSE_UP + 18, figures, 10, "normal")]
+            figures = (
+                f"{cell.light}, {quality}: mean {cell.mean(quality):.2f}, error {cell.error(quality):.2f}"
+            )
+            texts += [
+                (x, y + CLOSE_UP + 3, words, 10, "normal"),
+                (x, y + CLOSE_UP + 18, figures, 10, "normal"),
+            ]
         top += close
     return _lettered(canvas, texts)
 
@@ -132,20 +142,24 @@ def draw_wall(cells: Sequence[Cell]) -> np.ndarray:
 def _legend(canvas: np.ndarray, texts: list[Any], top: int) -> None:
     """What colours mean."""
     scales = (
-        ("mean over truth", lambda s: mean_color((1 + MEANS) ** (2 * s - 1)), (f"{1 / (1 + MEANS):.2f}", "1", f"{1 + MEANS:.2f}")),
-        ("bar: error", lambda s: error_color(s * ERRORS), ("0", f"{ERRORS / 2:.1f}", f"{ERRORS:.1f}")),
-    )  # fmt: skip
+        (
+            "mean over truth",
+            lambda s: mean_color((1 + MEANS) ** (2 * s - 1)),
+            (1 / (1 + MEANS), 1, 1 + MEANS),
+        ),
+        ("bar: error", lambda s: error_color(s * ERRORS), (0, ERRORS / 2, ERRORS)),
+    )
     x = LEFT
     for title, color, marks in scales:
         texts.append((x, top + 4, title, 10, "normal"))
         for k in range(200):
             canvas[top + 6 : top + 18, x + 110 + k] = color(k / 199)
         for k, mark in enumerate(marks):
-            texts.append((x + 104 + k * 94, top + 20, mark, 9, "normal"))
+            texts.append((x + 104 + k * 94, top + 20, f"{mark:.3g}", 9, "normal"))
         x += 350
     said = (
-        "A column is a material (metals first), a row a light. The cell's picture is the final frame; its left half has",
-        "the colours of the preview, its right half those of the final frame. Below: path tracing left, lit right.",
+        "Columns are materials (metals first), rows lights. A cell shows its final frame; its left half has",
+        "the colours of the preview, its right half those of the final frame. Below: path tracing, then lit.",
     )
     for k, line in enumerate(said):
         texts.append((x, top + 3 + 15 * k, line, 10, "normal"))
