@@ -67,8 +67,8 @@ class Zoo(Benchmark):
         from eval.relighting.networks import load_networks
         from eval.zoo.cells import measured
         from eval.zoo.lights import draw_lights, photographed
-        from eval.zoo.plan import individuals
         from eval.zoo.rows import zoo_rows
+        from eval.zoo.shapes import individuals
         from eval.zoo.wall import draw_wall
         from eval.zoo.witness import chosen, witness_rows, witnessed
         from tron.denoising import require_oidn

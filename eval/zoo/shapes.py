@@ -6,7 +6,7 @@ otherwise, and seen from elsewhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 from scipy.special import logit
 
-from eval.zoo.materials import Material
+from eval.zoo.materials import STRATA, WIDE_STRATA, Material, draw_materials
 from tron.cameras import Camera
 from tron.gaussians.edit import subset
 from tron.gaussians.scene import GaussianScene, quats_from_normals
@@ -29,9 +29,14 @@ SPACING = 0.034
 """Of surfels: a pixel of what faces the camera."""
 _SCALE = np.tan(np.arcsin(1 / AWAY)) / FILLED
 FOV_DEG = float(2 * np.degrees(np.arctan(_SCALE)))
-LAYERS, DEEP, TILTED, OPACITY = 3, 1.2, 0.35, (0.25, 0.75)
-"""A scan-like fog: splats a surfel, their deviation along the normal in spacings, that of their normals in
-radians, and their opacities."""
+LAYERS, DEEP, WIDER, TILTED, OPACITY = 4, 0.8, 1.6, 0.35, (0.3, 0.9)
+"""A scan-like fog: splats a surfel, their deviation along the normal in spacings, their size over a surfel's,
+the deviation of their normals in radians, and their opacities."""
+
+INDIVIDUALS = 2
+"""Of a kind but of balls, whose only proportion is one; they share the kind's materials."""
+BALL, COLORS = "ball", 2
+"""Materials of a ball of either metallic and each stratum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +75,29 @@ class Shape:
             return _fog(scene, generator(self.seed, "fog"))
         off = generator(self.seed, "jitter").normal(0, self.jitter * SPACING, (len(scene), 1))
         return replace(scene, means=np.asarray(scene.means + off * scene.normals(), np.float32))
+
+
+def individuals(kinds: Sequence[str], most: int | None, seed: int) -> Iterator[tuple[Shape, list[Material]]]:
+    """Shapes with their materials, in the order of the wall.
+
+    Args:
+        kinds: of shapes.
+        most: materials of an individual; None: all.
+        seed: root of all random numbers.
+    """
+    for kind in kinds:
+        rng = generator(seed, "zoo", "materials", kind)
+        if kind == BALL:
+            yield draw_shape(kind, 0, seed), _some(draw_materials(rng, STRATA, COLORS), most)
+            continue
+        materials = draw_materials(rng, WIDE_STRATA)
+        for number in range(INDIVIDUALS):
+            yield draw_shape(kind, number, seed), _some(materials[number::INDIVIDUALS], most)
+
+
+def _some(materials: list[Material], most: int | None) -> list[Material]:
+    """At most so many, evenly."""
+    return materials if most is None else materials[:: -(-len(materials) // most)]
 
 
 def draw_shape(kind: str, number: int, seed: int) -> Shape:
@@ -211,7 +239,7 @@ def _relief(rng: np.random.Generator, _: int) -> _Drawn:
     texels = 256
     fields = [gaussian_filter(rng.normal(size=(texels, texels)), sigma) for sigma in (16, 6, 1.5)]
     coarse, middle, grain = (each / each.std() for each in fields)
-    height = 0.05 * np.maximum(coarse, -0.3) + 0.02 * np.maximum(middle, 0) + 0.004 * grain
+    height = 0.03 * np.maximum(coarse, -0.3) + 0.01 * np.maximum(middle, 0) + 0.0015 * grain
     side = (np.arange(texels) + 0.5) / texels
     u, v = np.meshgrid(side, side, indexing="ij")
     part = _sheet_of(np.stack([2 * u - 1, 2 * v - 1, height], -1))
@@ -305,6 +333,7 @@ def _fog(scene: GaussianScene, rng: np.random.Generator) -> GaussianScene:
         many,
         means=means.astype(np.float32),
         quats=quats_from_normals(tilted.astype(np.float32)),
+        log_scales=many.log_scales + np.float32(np.log(WIDER)),
         opacity_logits=logit(rng.uniform(*OPACITY, len(many))).astype(np.float32),
         oriented=False,
     ).validate()
