@@ -8,7 +8,7 @@ from pathlib import Path
 
 from PIL import Image
 
-WIDTH, QUALITY = 1400, 72
+WIDTH, QUALITY = 1150, 45
 
 
 def main(zoo: Path, out: Path) -> None:

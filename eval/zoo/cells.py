@@ -33,6 +33,8 @@ log = logging.getLogger("tron.eval")
 QUALITIES = {"preview": PREVIEW, "final": FINEST}
 PATHS, EVEN_PATHS = 256, 64
 """A pixel's, of the truth."""
+TRIED = 3
+"""One cell in so many is shown by denoisers and networks too, of every material and of every light."""
 FINE = 4
 """Rays along a pixel's side that decide whether the shape fills it."""
 HOLE = 0.5
@@ -102,8 +104,8 @@ def measured(
         materials: on it.
         lights: around it.
         seed: root of all random numbers.
-        oidn: whether Open Image Denoise is tried.
-        networks: by name, tried too.
+        oidn: whether Open Image Denoise is tried, in one cell of :data:`TRIED`.
+        networks: by name, tried there too.
     """
     start, first, baked = time.perf_counter(), None, dict[str, Illumination]()
     share = covered(shape)
@@ -115,7 +117,8 @@ def measured(
         first = first or relighter.prepare()
         meshes = [textured(part, f"part{n}").shape for n, part in enumerate(shape.of(material))]
         albedo = relighter.surface_maps(shape.camera, *QUALITIES.values()) if oidn else []
-        for light in lights:
+        for place, light in enumerate(lights):
+            tried = (number + place) % TRIED == 0
             names = ("zoo", shape.kind, shape.number, number, light.name)
             paths = EVEN_PATHS if light.even else PATHS
             depth, rays = FINEST.bounces + 2, integer(seed, *names, "rays")
@@ -131,9 +134,9 @@ def measured(
                 framed = replace(under, estimation=estimation)
                 traced = framed.trace(shape.camera, rays)
                 cell.lit[quality] = _whole(traced)
-                if oidn:
+                if oidn and tried:
                     cell.lit[f"{quality}_oidn"] = _whole(traced.denoised(albedo[k]["albedo"]))
-                for name, network in networks.items():
+                for name, network in networks.items() if tried else ():
                     cell.judge(f"{quality}_{name}", drawn(network, framed, [shape.camera], exposure, rays)[0])
             for way, image in cell.lit.items():
                 cell.judge(way, to_display(image, exposure))

@@ -35,9 +35,10 @@ def zoo_rows(cells: Sequence[Cell]) -> Iterator[Row]:
             error = np.mean([cell.error(quality) for cell in of_kind])
             yield _row(f"error.{kind}.{quality}", error, len(of_kind))
     yield _row("worst_shape", max(abs(mean - 1) for mean in means.values()), len(kinds))
-    for way in dict.fromkeys(name for cell in cells for name in cell.psnr):
-        found = [cell.psnr[way] for cell in cells if way in cell.psnr]
-        yield _row(f"psnr.{way}", np.mean(found), len(found), "dB")
+    ways = dict.fromkeys(name for cell in cells for name in cell.psnr)
+    shown = [cell for cell in cells if cell.psnr.keys() == ways.keys()]  # by every way
+    for way in ways:
+        yield _row(f"psnr.{way}", np.mean([cell.psnr[way] for cell in shown]), len(shown), "dB")
     balls = [cell for cell in cells if cell.shape == BALL]
     if balls:
         yield from _ball_rows(balls, lights)

@@ -203,6 +203,13 @@ def test_the_worst_are_the_worst_of_all_and_shapes_are_means():
     assert not [name for name in found if ".ball" in name]
 
 
+def test_ways_are_compared_on_the_cells_that_all_have():
+    both, one = cell(), cell()
+    both.psnr, one.psnr = {"preview": 20.0, "preview_oidn": 25.0}, {"preview": 40.0}
+    found = values(zoo_rows([both, one]))
+    assert (found["zoo.psnr.preview"], found["zoo.psnr.preview_oidn"]) == (20, 25)
+
+
 def test_balls_are_held_by_roughness_and_light():
     rough, shiny = GREY._replace(roughness=1.0), GREY._replace(roughness=0.1, metallic=1.0)
     found = values(
