@@ -1,0 +1,168 @@
+"""Cells of the zoo: one material on one shape under one light, by paths and by every way of TRON's.
+
+What counts are pixels that the shape fills: 16 rays of a pixel meet it. A pixel of the silhouette holds
+background too, by another filter in each renderer, and is left out; what the camera sees aslant is not. What
+surfels let through is divided out (:data:`HOLE`), so that a hole is dark only where most of a pixel is one.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import mitsuba as mi
+import numpy as np
+
+from eval.relighting.networks import Network, drawn
+from eval.renderers.paths import path_traced, scene_of
+from eval.zoo.lights import Light
+from eval.zoo.materials import Material
+from eval.zoo.shapes import Shape
+from tron.color import to_display
+from tron.estimation import FINEST, PREVIEW
+from tron.metrics import capped_psnr
+from tron.models.shapes import textured
+from tron.relighting import Illumination, Relighter
+from tron.relighting.relighter import TracedFrame
+from tron.seeds import integer
+
+log = logging.getLogger("tron.eval")
+
+QUALITIES = {"preview": PREVIEW, "final": FINEST}
+PATHS, EVEN_PATHS = 256, 64
+"""A pixel's, of the truth."""
+TRIED = 3
+"""One cell in so many is shown by denoisers and networks too, of every material and of every light."""
+FINE = 4
+"""Rays along a pixel's side that decide whether the shape fills it."""
+HOLE = 0.5
+"""Opacity below which a pixel counts as so opaque."""
+
+
+@dataclass(eq=False)
+class Cell:
+    """One cell, measured.
+
+    Attributes:
+        shape: its kind. number: of the individual.
+        material: on it. light: name of the light.
+        exposure: of its pictures.
+        covered: (H, W) share of a pixel's rays that meet the shape.
+        truth: (H, W, 3) linear.
+        lit: quality -> (H, W, 3) linear, what the surfels let through divided out; ``preview_oidn`` and
+            ``final_oidn`` too, where it is there.
+        psnr: way -> dB of display values, those of the network among them.
+    """
+
+    shape: str
+    number: int
+    material: Material
+    light: str
+    exposure: float
+    covered: np.ndarray
+    truth: np.ndarray
+    lit: dict[str, np.ndarray]
+    psnr: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def words(self) -> str:
+        """Such as ``leaf, metal 0.87 saturated, studio``."""
+        return f"{self.shape}, {self.material.words}, {self.light}"
+
+    @property
+    def counts(self) -> np.ndarray:
+        """(H, W) bool, pixels that count."""
+        return self.covered == 1
+
+    def mean(self, way: str) -> float:
+        """Mean of ``lit`` over the truth's."""
+        return float(self.lit[way][self.counts].mean() / self.truth[self.counts].mean())
+
+    def error(self, way: str) -> float:
+        """Mean absolute difference from the truth over the truth's mean."""
+        return float(np.abs(self.lit[way] - self.truth)[self.counts].mean() / self.truth[self.counts].mean())
+
+    def judge(self, way: str, shown: np.ndarray) -> None:
+        """Keep the PSNR of (H, W, 3) display values."""
+        self.psnr[way] = capped_psnr(shown, to_display(self.truth, self.exposure), self.counts)
+
+
+def measured(
+    shape: Shape,
+    materials: Sequence[Material],
+    lights: Sequence[Light],
+    seed: int,
+    oidn: bool,
+    networks: Mapping[str, Network],
+) -> Iterator[Cell]:
+    """Cells of an individual: every material under every light, whose shadows are traced once.
+
+    Args:
+        shape: the individual.
+        materials: on it.
+        lights: around it.
+        seed: root of all random numbers.
+        oidn: whether Open Image Denoise is tried, in one cell of :data:`TRIED`.
+        networks: by name, tried there too.
+    """
+    start, first, baked = time.perf_counter(), None, dict[str, Illumination]()
+    share = covered(shape)
+    for number, material in enumerate(materials):
+        scene = shape.surfels(material)
+        root = integer(seed, "zoo", "light", shape.kind, shape.number)
+        choice = "always" if shape.fog else "never"
+        relighter = first.changed(scene) if first else Relighter(scene, PREVIEW, root, proxy=choice)
+        first = first or relighter.prepare()
+        meshes = [textured(part, f"part{n}").shape for n, part in enumerate(shape.of(material))]
+        albedo = relighter.surface_maps(shape.camera, *QUALITIES.values()) if oidn else []
+        for place, light in enumerate(lights):
+            tried = (number + place) % TRIED == 0
+            names = ("zoo", shape.kind, shape.number, number, light.name)
+            paths = EVEN_PATHS if light.even else PATHS
+            depth, rays = FINEST.bounces + 2, integer(seed, *names, "rays")
+            truth = path_traced(
+                meshes, light.environment, shape.camera, depth, paths, integer(seed, *names, "truth")
+            )
+            under = relighter.still_under(baked[light.name]) if number else relighter.under(light.lighting)
+            if not number:
+                baked[light.name] = under
+            exposure = light.environment.exposure()
+            cell = Cell(shape.kind, shape.number, material, light.name, exposure, share, truth, {})
+            for k, (quality, estimation) in enumerate(QUALITIES.items()):
+                framed = replace(under, estimation=estimation)
+                traced = framed.trace(shape.camera, rays)
+                cell.lit[quality] = _whole(traced)
+                if oidn and tried:
+                    cell.lit[f"{quality}_oidn"] = _whole(traced.denoised(albedo[k]["albedo"]))
+                for name, network in networks.items() if tried else ():
+                    cell.judge(f"{quality}_{name}", drawn(network, framed, [shape.camera], exposure, rays)[0])
+            for way, image in cell.lit.items():
+                cell.judge(way, to_display(image, exposure))
+            yield cell
+    seconds, count = time.perf_counter() - start, len(materials) * len(lights)
+    log.info("%s %d: %d cells in %.0f s", shape.kind, shape.number, count, seconds)
+
+
+def covered(shape: Shape) -> np.ndarray:
+    """(H, W) share of a pixel's rays that meet the shape.
+
+    Raises:
+        ValueError: no pixel is covered (a defect of the shape).
+    """
+    camera = shape.camera
+    fine = camera.resized(FINE * camera.width, FINE * camera.height)
+    along = mi.Vector3f(fine.rays().reshape(-1, 3).T.astype(np.float32))
+    meshes = [textured(part, f"part{n}").shape for n, part in enumerate(shape.parts)]
+    met = scene_of(meshes).ray_test(mi.Ray3f(mi.Point3f(*camera.position.tolist()), along))
+    found = np.array(met).reshape(camera.height, FINE, camera.width, FINE).mean((1, 3))
+    if not (found == 1).any():
+        raise ValueError(f"{shape.kind} {shape.number} fills no pixel")
+    return found
+
+
+def _whole(frame: TracedFrame) -> np.ndarray:
+    """``lit`` of a frame as if its surfels were opaque."""
+    dark, bright = (frame.shade([behind] * 3).lit for behind in (0.0, 1.0))
+    return dark / np.maximum(1 - (bright - dark), HOLE)
