@@ -150,5 +150,5 @@ def test_flip_is_nothing_between_equals_and_one_between_black_and_white():
     even, half = np.full((24, 24, 3), 0.5, np.float32), np.zeros((24, 24), bool)
     assert flip.measure(even, even, None) == 0
     half[:12] = True
-    green, blue = (np.broadcast_to(np.float32(each), even.shape) for each in ((0, 1, 0), (0, 0, 1)))
+    green, blue = (np.broadcast_to(np.array(each, np.float32), even.shape) for each in ((0, 1, 0), (0, 0, 1)))
     assert flip.measure(green, blue, half) == pytest.approx(1, abs=0.02)

@@ -156,10 +156,12 @@ def fresnel(
     return (1 - material.metallic) * glass + material.metallic * metal
 
 
-def lobe_mean(
+def lobe_parts(
     material: Material, table: BrdfTable, normal: mi.Vector3f, to_camera: mi.Vector3f
-) -> mi.Vector3f:
-    """Mean of the directions, world, that a lobe's light comes from; the shorter the wider the lobe.
+) -> list[tuple[mi.Float, mi.Vector3f]]:
+    """Parts of a lobe: share of its light, and the mean of the directions, world, that it comes from.
+
+    A mean is the shorter the wider its part (:mod:`tron.brdf.table`). Shares sum to 1.
 
     Args:
         material, table: as of :func:`reflectance`.
@@ -168,10 +170,16 @@ def lobe_mean(
     normal, to_camera = mi.Vector3f(normal), mi.Vector3f(to_camera)
     cosine = dr.dot(normal, to_camera)
     f0 = dr.lerp(DIELECTRIC_F0, mi.luminance(material.base_color), material.metallic)
-    mean = table.mean_direction(material.roughness, cosine, dr.maximum(f0, LEAST_F0))
+    f0 = dr.maximum(f0, LEAST_F0)
+    along, (share, apart, longer) = table.lobe(material.roughness, cosine, f0)
     # A normal that is seen from behind mirrors away from the surface too.
     mirrored = (cosine + dr.abs(cosine)) * normal - to_camera
-    return mean.x * mirrored + mean.y * normal
+    mean = along.x * mirrored + along.y * normal
+    length2 = dr.squared_norm(mean)
+    spread = dr.maximum(1 - length2, 1e-12)
+    lean = normal - dr.dot(normal, mean) / length2 * mean
+    off = apart * dr.sqrt(spread) * lean + longer * spread * dr.rsqrt(length2) * mean
+    return [(share, mean + off), (1 - share, mean - share / (1 - share) * off)]
 
 
 def _f0(material: Material) -> mi.Color3f:

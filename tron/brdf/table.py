@@ -7,6 +7,9 @@
             direction, and along the normal besides. Over the albedo it is the lobe's mean direction, the
             shorter the wider the lobe. A mirror has none along the normal, whatever the angle
 
+A lobe that is seen aslant is long and narrow. Two round ones stand for it, whose means are the lobe's
+together; ``lobe_parts.npy`` says how far apart they are, fitted to the integral by ``dev/lobe_parts.py``.
+
 Light that meets one facet is counted alone; :mod:`tron.brdf.reflectance` gives the rest back. G is above
 0.04 A + B by up to 0.02: Schlick's Fresnel is 0.07 at 60 degrees, where glass mirrors 0.09.
 """
@@ -15,10 +18,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.interpolate import RectBivariateSpline
 
 from tron.brdf.microfacets import unhidden, visible_normal
 from tron.runtime import aligned
@@ -27,6 +32,9 @@ TABLE_SIZE = 256
 TABLE_SAMPLES = 32
 """Quadrature points along each of the two dimensions of the visible normals."""
 GLASS_INDEX = 1.5
+PARTS_FILE = Path(__file__).with_name("lobe_parts.npy")
+PARTS_F0, PARTS_SMOOTHEST = 0.04, 0.2
+"""Lower of the two F0 that the file has, the other is 1, and its least roughness: below, lobes are alike."""
 
 
 @cache
@@ -79,6 +87,25 @@ def _directional_albedo(cosine: mi.Float, alpha: mi.Float) -> tuple[mi.Float, ..
     return scale / total, bias / total, glass / total, *means
 
 
+@cache
+def parts_table() -> np.ndarray:
+    """(2, roughness, n.v, 4) float32: w, x, y, 0 of F0 0.04 and of F0 1; entries as of :func:`brdf_table`.
+
+    w is the first part's share of the light. With the mean m of the lobe, its unit vector u and s^2 = 1 -
+    |m|^2 its own mean is m + d, d = x s (n - (n.u) u) + y s^2 u, and the other's m - w / (1 - w) d.
+    """
+    fitted = np.load(PARTS_FILE)
+    rows, columns = fitted.shape[1:3]
+    at = np.linspace(PARTS_SMOOTHEST, 1, rows), (np.arange(columns) + 0.5) / columns
+    roughness = np.clip(np.arange(TABLE_SIZE) / (TABLE_SIZE - 1), *at[0][[0, -1]])
+    cosine = np.clip(_CENTRES, *at[1][[0, -1]])
+    table = np.zeros((2, TABLE_SIZE, TABLE_SIZE, 4), np.float32)
+    for f0 in range(2):
+        for k in range(3):
+            table[f0, ..., k] = RectBivariateSpline(*at, fitted[f0, ..., k])(roughness, cosine)
+    return table
+
+
 @dataclass
 class BrdfTable:
     """:func:`brdf_table` on the device.
@@ -87,11 +114,14 @@ class BrdfTable:
         texels: A, B, G and E, row-major.
         means: the same of each roughness, averaged over cosine-distributed n.v.
         directions: R_A, N_A, R_B and N_B, row-major.
+        glass_parts, mirror_parts: :func:`parts_table`, row-major.
     """
 
     texels: mi.Float
     means: mi.Float
     directions: mi.Float
+    glass_parts: mi.Float
+    mirror_parts: mi.Float
 
     @classmethod
     def load(cls) -> BrdfTable:
@@ -111,18 +141,25 @@ class BrdfTable:
         upper, lower = (dr.gather(mi.Vector4f, self.means, row + i) for i in (0, 1))
         return dr.lerp(upper, lower, fy)
 
-    def mean_direction(self, roughness: mi.Float, cosine: mi.Float, f0: mi.Float) -> mi.Vector2f:
-        """Mean of the directions of a lobe's light: along the mirror's direction, and the normal besides.
+    def lobe(self, roughness: mi.Float, cosine: mi.Float, f0: mi.Float) -> tuple[mi.Vector2f, mi.Vector3f]:
+        """Where a lobe's light comes from.
 
         Args:
             roughness, cosine: as of :meth:`__call__`.
             f0: reflectance at the normal, above 0.
 
-        Returns: factors on the two unit vectors; 1 and 0 of a mirror.
+        Returns: the mean of its directions as factors on the mirror's direction and on the normal, both unit,
+        1 and 0 of a mirror; and w, x and y of :func:`parts_table`, between whose two F0 lobes are mixed as
+        their Fresnel is.
         """
         scale, bias, _, _ = self(roughness, cosine)
+        whole = dr.rcp(f0 * scale + bias)
         mirrored_a, up_a, mirrored_b, up_b = _looked_up(self.directions, roughness, cosine)
-        return mi.Vector2f(f0 * mirrored_a + mirrored_b, f0 * up_a + up_b) / (f0 * scale + bias)
+        mean = mi.Vector2f(f0 * mirrored_a + mirrored_b, f0 * up_a + up_b) * whole
+        glass, mirror = (_looked_up(of, roughness, cosine) for of in (self.glass_parts, self.mirror_parts))
+        of_glass = dr.clip((1 - f0) / (1 - PARTS_F0) * (PARTS_F0 * scale + bias) * whole, 0, 1)
+        share, apart, longer, _ = dr.lerp(mirror, glass, of_glass)
+        return mean, mi.Vector3f(share, apart, longer)
 
 
 @cache
@@ -130,7 +167,7 @@ def _loaded(_variant: str) -> BrdfTable:
     table = brdf_table()
     albedos, directions = table[..., :4], table[..., 4:]
     means = np.average(albedos, axis=1, weights=_CENTRES)
-    parts = (np.ascontiguousarray(part, np.float32) for part in (albedos, means, directions))
+    parts = (np.ascontiguousarray(part, np.float32) for part in (albedos, means, directions, *parts_table()))
     return BrdfTable(*(mi.Float(aligned(part.ravel())) for part in parts))
 
 

@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from tron.brdf.reflectance import lobe_mean, reflectance
+from tron.brdf.reflectance import lobe_parts, reflectance
 from tron.estimation import Brdf
 from tron.shading.direct.visibility import shading_normal
 from tron.shading.lighting import SplitSum
@@ -74,7 +74,7 @@ class Response:
         if brdf == "lambert":  # as the paper looks it up
             mirrored = split_sum.reflected(normal, to_camera, surface.roughness)
         else:
-            mirrored = split_sum.averaged(lobe_mean(surface, split_sum.brdf, normal, to_camera))
+            mirrored = split_sum.averaged(lobe_parts(surface, split_sum.brdf, normal, to_camera))
         return cls(share.diffuse, share.specular, split_sum.diffuse(normal), mirrored * share.specular)
 
     def open(self) -> mi.Color3f:

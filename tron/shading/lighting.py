@@ -9,6 +9,7 @@ Between levels, texels and faces the lookup is linear. Diffuse light is the roug
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from functools import cache
 
@@ -135,17 +136,21 @@ class SplitSum:
         normal, to_camera = mi.Vector3f(normal), mi.Vector3f(to_camera)
         return self.prefiltered(2 * dr.dot(normal, to_camera) * normal - to_camera, roughness)
 
-    def averaged(self, mean: mi.Vector3f) -> mi.Color3f:
-        """Mean linear radiance over a lobe whose directions have the mean ``mean``, world: wide where short.
+    def averaged(self, parts: Sequence[tuple[mi.Float, mi.Vector3f]]) -> mi.Color3f:
+        """Mean linear radiance over a lobe of :func:`tron.brdf.reflectance.lobe_parts`.
 
-        It is looked up where the lobe of a level has the same first moment. That is neither along the
+        Each part is looked up where the lobe of a level has the same first moment. That is neither along the
         mirror's direction nor of the surface's roughness: lobes lean to the normal, the horizon cuts them.
         """
-        length = dr.norm(mean)
-        spread = dr.sqrt(dr.sqrt(dr.clip((1 - length) * 3, 1e-6, 1))) * (WIDTHS - 1)
-        entry = dr.minimum(mi.UInt32(spread), WIDTHS - 2)
-        pair = [dr.gather(mi.Float, self._widths, entry + i) for i in (0, 1)]
-        return self.prefiltered(mean / length, dr.lerp(*pair, spread - mi.Float(entry)))
+        looked_up = []
+        for share, mean in parts:
+            length = dr.norm(mean)
+            spread = dr.sqrt(dr.sqrt(dr.clip((1 - length) * 3, 1e-6, 1))) * (WIDTHS - 1)
+            entry = dr.minimum(mi.UInt32(spread), WIDTHS - 2)
+            pair = [dr.gather(mi.Float, self._widths, entry + i) for i in (0, 1)]
+            roughness = dr.lerp(*pair, spread - mi.Float(entry))
+            looked_up.append(share * self.prefiltered(mean / length, roughness))
+        return sum(looked_up, mi.Color3f(0))
 
     def prefiltered(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
         """Environment filtered by the lobe of ``roughness``, trilinear, in unit world ``direction``."""

@@ -13,7 +13,8 @@ by channel, of n rays. The split sum, which has no noise, keeps the light, the r
 hidden. o is taken from as many rays again that are drawn from the light: few of the lobe's see a sun, whose
 highlight would stand in shadows. m = p / (p + p_light) is the balance heuristic (Veach 1997), for rays of
 both kinds. A pixel has few rays: were they drawn by the normals alone and weighed afterwards, in a white
-bowl of rough metal a tenth of the light would be missing.
+bowl of rough metal a tenth of the light would be missing. And the ratio of a few rays is not right in the
+mean: what the rougher lobes find is averaged over the pixels about before it is divided.
 
 A ray of the lobe is stopped by one surfel (:mod:`tron.tracing.hierarchy.first_hit`). R is the composition of
 :mod:`tron.shading.composition` at the surfel's centre with the bake's light, so a mirror shows highlights of
@@ -50,6 +51,10 @@ TRIALS = 8
 """Directions drawn for a ray: of the roughest lobes one in a hundred keeps none, and takes the likeliest."""
 SMOOTHEST = 0.02
 """Least roughness of the rays: below, a lobe is narrower than float32 can draw."""
+ROUGH = 0.2
+"""Roughness from which on neighbours' rays count in full; a mirror keeps its own."""
+UNLIKE = 10.0
+"""Inverse of the difference in roughness at which a neighbour counts for 1 / e."""
 
 
 @dataclass
@@ -132,9 +137,22 @@ def reflections(
                 sums["light"] += value
                 sums["escaped"] += value * visible
             dr.eval(sums)
-        mirror = Mirror(ratio(sums["escaped"], sums["light"], 1), ratio(sums["met"], expected, 0))
+        sums["met"] = ratio(sums["met"], expected, 0)
+        mirror = _pooled(sums, seen, gbuffer, tracer.scene.spacing)
         dr.eval(mirror)
     return mirror
+
+
+def _pooled(sums: dict[str, mi.Color3f], seen: mi.Bool, gbuffer: GBuffer, spacing: float) -> Mirror:
+    """Findings of a pixel, and of its neighbours where it is rough: the rougher, the more they count."""
+    own = [dr.select(seen, value, 0) for color in sums.values() for value in color]
+    own.append(dr.select(seen, mi.Float(1), 0))
+    dr.eval(own)
+    means, _ = neighbourhood_mean(own, gbuffer, spacing, guide=gbuffer.roughness, stop=UNLIKE)
+    share = dr.select(seen, dr.clip(gbuffer.roughness / ROUGH, 0, 1), 0)
+    *values, weight = [dr.lerp(one, mean, share) for one, mean in zip(own, means, strict=True)]
+    met, light, escaped = (mi.Color3f(*values[k : k + 3]) for k in (0, 3, 6))
+    return Mirror(ratio(escaped, light, 1), met / dr.maximum(weight, 1e-6))
 
 
 @dataclass
@@ -238,12 +256,9 @@ def _returned(
 
 # A metal shows nothing but reflections, so the bounced light around it will not do: a room of metal is 1.02,
 # 1.17 and 1.51 of the truth by channel, with one ray 0.89, 0.96 and 1.10. Other surfaces keep that light, and
-# scenes without metals cost nothing. The rougher a metal, the more its neighbours' rays count; a mirror keeps
-# its own.
+# scenes without metals cost nothing.
 
 RAYS = 1
-ROUGH = 0.2
-"""Roughness from which on neighbours count in full."""
 
 
 def metal_share(surface: Surface) -> mi.Float:
@@ -263,17 +278,7 @@ def metal_reflections(
     metal = (gbuffer.opacity > 0) & (metal_share(gbuffer) > 0)
     if not dr.any(metal):
         return None
-    found = reflections(tracer, gbuffer, lighting, bounce, RAYS, seed, estimation.brdf, metal)
-    own = [*found.openness, *found.radiance]
-    values = [dr.select(metal, value, 0) for value in own] + [dr.select(metal, mi.Float(1), 0)]
-    dr.eval(values)
-    (*means, weight), _ = neighbourhood_mean(values, gbuffer, tracer.scene.spacing)
-    rough = dr.clip(gbuffer.roughness / ROUGH, 0, 1)
-    weight = dr.select(metal, weight, 1)
-    smooth = [dr.lerp(value, mean / weight, rough) for value, mean in zip(own, means, strict=True)]
-    mirror = Mirror(mi.Color3f(*smooth[:3]), mi.Color3f(*smooth[3:]))
-    dr.eval(mirror)
-    return mirror
+    return reflections(tracer, gbuffer, lighting, bounce, RAYS, seed, estimation.brdf, metal)
 
 
 def with_metals(even: Bounced, mirror: Mirror, surface: Surface) -> Bounced:

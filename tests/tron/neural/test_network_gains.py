@@ -5,7 +5,7 @@ import pytest
 
 from tron.estimation import QUALITY
 from tron.neural import network_gains
-from tron.neural.network_gains import GAINS, best_first, expected_gain, quality_of
+from tron.neural.network_gains import GAINS, Way, best_first, expected_gain, quality_of
 
 
 @pytest.fixture(autouse=True)
@@ -30,7 +30,7 @@ def test_beyond_what_was_measured_the_nearest_size_holds():
 
 
 def test_what_gains_most_at_that_size_and_quality_comes_first():
-    both = ["network", "oidn"]
+    both: list[Way] = ["network", "oidn"]
     assert list(best_first(both, "preview", 128, 128).items()) == [("network", 2.0), ("oidn", 0.5)]
     assert list(best_first(both, "preview", 512, 512).items()) == [("oidn", 0.5), ("network", -1.0)]
     assert list(best_first(both, "final", 512, 512)) == ["oidn", "network"]

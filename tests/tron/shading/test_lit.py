@@ -112,9 +112,12 @@ def test_white_surfaces_all_but_vanish_in_a_furnace(
         roughness=np.full(count, roughness),
         metallic=np.full(count, metallic),
     )
-    guidance = shown(scene, EnvironmentMap.constant(1.0), PREVIEW if quality == "preview" else FINEST)
+    light, estimation = EnvironmentMap.constant(1.0), PREVIEW if quality == "preview" else FINEST
+    # One ray a pixel of metal leaves noise of 0.003 in the mean of one frame.
+    guidance, *others = [shown(scene, light, estimation, seed) for seed in range(4)]
     inside = guidance.mask > 0.99
-    assert guidance.lit[inside].mean() == pytest.approx(1, abs=0.01)
+    means = [frame.lit[inside].mean() for frame in (guidance, *others)]
+    assert np.mean(means) == pytest.approx(1, abs=0.01)
     assert np.quantile(guidance.lit[inside], 0.99) <= 1.2  # shadows and bounces have noise of their own
     assert guidance.shadowed[inside].min() < 0.9 or metallic == 1
 

@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import KDTree
 
-from tron.brdf.reflectance import compensation, glass_fresnel, lobe_mean, mean_fresnel
+from tron.brdf.reflectance import compensation, glass_fresnel, lobe_parts, mean_fresnel
 from tron.brdf.table import BrdfTable
 from tron.captures.view import FLOOR
 from tron.color import luminance
@@ -242,4 +242,4 @@ def _reflected(
         metallic=mi.Float(float(metal)),
     )
     split_sum, ends = lighting.split_sum, (lanes(mi.Vector3f, normal), lanes(mi.Vector3f, to_camera))
-    return np.array(split_sum.averaged(lobe_mean(material, split_sum.brdf, *ends))).T
+    return np.array(split_sum.averaged(lobe_parts(material, split_sum.brdf, *ends))).T

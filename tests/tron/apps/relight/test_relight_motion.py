@@ -94,7 +94,7 @@ def test_a_stop_is_twice_the_light_and_a_fade_the_mean_of_two(film, light_path, 
     first, bright, last = (read_image(frames / f"000{n}.lit.exr") for n in range(3))
     ratio = bright[first > 0.01] / first[first > 0.01]
     np.testing.assert_allclose(np.quantile(ratio, [0.05, 0.5, 0.95]), 2, rtol=0.02)  # rays choose by floats
-    np.testing.assert_allclose(last, first, rtol=0.2, atol=1e-3)
+    np.testing.assert_allclose(last, first, rtol=0.1, atol=1e-3)
     keys = [{"time": 0}, {"time": 1, "environment": str(other)}]
     fade = film({"light": keys}, "background=[0,0,0]", "quality=final", name="fade")
     first, half, last = (read_image(fade / f"000{n}.lit.exr") for n in range(3))
