@@ -48,7 +48,13 @@ def spec():
         size=RADIUS,
         placement=Placement(quaternion=(0.9, 0.1, 0.3, 0.2), position=(0.2, -0.1, RADIUS)),
     )
-    floor = drawn.surroundings[0].model_copy(update={"materials": (Plain(color=(0.3, 0.4, 0.5)),)})
+    floor = drawn.surroundings[0].model_copy(
+        update={
+            "shape": ShapeSpec(kind="floor", size=3.4, parameters=(0.5, 0.5, 0.5, 0.5)),
+            "placement": Placement(quaternion=(1, 0, 0, 0), position=(0, 0, 0)),
+            "materials": (Plain(color=(0.3, 0.4, 0.5)),),
+        }
+    )
     ball = ball.model_copy(update={"materials": (Plain(color=(0.9, 0.5, 0.1), metallic=1.0),)})
     return drawn.model_copy(update={"objects": (ball,), "surroundings": (floor,)})
 
