@@ -224,8 +224,8 @@ def test_a_given_environment_takes_the_place_of_the_scenes(surfels, light, tmp_p
         assert (np.abs(seen - truth) > 2e-3).mean() < 0.01
 
 
-STEP = 0.01
-"""Small: the levels have a kink at roughness 0.5, and lobes seen from aslant are wider than the surface's."""
+STEP = 0.001
+"""Small: lookups are linear between texels, levels and the table's nodes. Sums are in float64 therefore."""
 
 
 @pytest.mark.parametrize("buffer", ["pbr", "lit"])
@@ -235,8 +235,10 @@ def test_gradients_of_materials_are_the_finite_differences(surfels, light, buffe
     parameters = mi.traverse(integrator)
     weight = generator(0, "tests", "weight").normal(size=(24, 36, 3)).astype(np.float32)
     parameters["roughness"] = mi.Float(
-        np.full(len(surfels), 0.4, np.float32)
-    )  # the levels have a kink at 0.5
+        np.full(len(surfels), 0.3, np.float32)
+    )  # the levels have a kink at 0.5, the table one at each of its nodes
+    # Between the two F0 that lobes are fitted for: at metallic 0 their parts have a kink.
+    parameters["metallic"] = mi.Float(np.full(len(surfels), 0.3, np.float32))
 
     def loss(**seeds: int) -> mi.TensorXf:
         image = mi.render(scene, parameters, integrator=integrator, spp=1, **seeds)
@@ -250,13 +252,14 @@ def test_gradients_of_materials_are_the_finite_differences(surfels, light, buffe
         for sign in (1, -1):
             parameters[name] = mi.Float((start + sign * STEP * towards).astype(np.float32))
             parameters.update()
-            ends.append(float(loss(seed=1).array[0]))
+            image = mi.render(scene, parameters, integrator=integrator, spp=1, seed=1)
+            ends.append(float((np.array(image, np.float64)[..., :3] * weight).sum()))
         parameters[name] = mi.Float(start)
         dr.enable_grad(parameters[name])
         parameters.update()
         dr.backward(loss(seed=0, seed_grad=1))
         found = np.array(dr.grad(parameters[name]), np.float64) @ towards
-        assert found == pytest.approx((ends[0] - ends[1]) / (2 * STEP), rel=within, abs=0.02), name
+        assert found == pytest.approx((ends[0] - ends[1]) / (2 * STEP), rel=within, abs=0.1), name
         dr.disable_grad(parameters[name])
         parameters.update()
 
