@@ -20,10 +20,11 @@ from tron.shards.manifest import Manifest
 
 REQUIRED = [
     *(
-        f"{method}.{metric}{region}"
+        f"{method}.{metric.name}{region}"
         for method in (each.name for each in METHODS)
-        for metric in (each.name for each in METRICS)
+        for metric in METRICS
         for region in ("", "_full")
+        if region == "" or "frame" in metric.regions
     ),
     *(
         f"{network}.gain_over_{group}{region}{family}"

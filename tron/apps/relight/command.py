@@ -364,8 +364,8 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     quality (:mod:`tron.neural.network_gains`): the shipped network, Open Image Denoise where it is
     installed and light bounces, or neither; a line in the log says which, and by how much. The network gives
     way where its libraries or its file are not installed; where nothing bounces and it is given lit; where
-    radiance is asked for, which a network does not draw; where denoise=oidn is. Where window, overlap,
-    reproject or weights are chosen, it has to fit too.
+    denoise=oidn is. Radiance that is asked for stays as it was traced. Where window, overlap, reproject or
+    weights are chosen, the network has to fit too.
 
     Raises:
         TronError: the checkpoint is missing, damaged, or does not fit the settings.
@@ -399,9 +399,13 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
 
 
 def _ways(settings: Settings) -> list[Way]:
-    """What checkpoint=auto chooses from: Open Image Denoise is no answer to settings of a network."""
+    """What checkpoint=auto chooses from.
+
+    Open Image Denoise is no answer to settings of a network, and leaves radiance that is asked for as it is.
+    """
     ways: list[Way] = ["network"]
-    if settings.bounces and settings.denoise is True and not settings.tuned:
+    asked = settings.tuned or "relit" in settings.buffers
+    if settings.bounces and settings.denoise is True and not asked:
         try:
             require_oidn("checkpoint=auto")
         except TronError:  # not installed here, or not for this machine

@@ -219,7 +219,7 @@ CLOSER = {
             "Open Image Denoise draws the pictures: +0.45 dB at least on validation scenes, final at 16 x 16"
             "; surfaces +0.30",
         ),
-        (("buffers=[relit]",), "denoised", "Open Image Denoise draws the pictures: +0.50 dB"),
+        (("buffers=[relit]",), "plain", "buffers ask for relit.exr"),
         (("quality=final", "denoise=false"), "neural", "surfaces draws the pictures: +0.30 dB"),
         (("quality=final", "reproject=1"), "neural", "surfaces draws the pictures: +0.30 dB"),
         (("bounces=0",), "plain", "no bounced light with bounces=0"),
@@ -228,7 +228,7 @@ CLOSER = {
 def test_auto_takes_what_gains_most_and_says_by_how_much(
     run, checkpoints, tmp_path, monkeypatch, caplog, settings, relit, words
 ):
-    """Open Image Denoise has no say where nothing bounces, noise is asked for, or a network is tuned."""
+    """Open Image Denoise has no say: nothing bounces, noise or radiance is asked for, a network is tuned."""
     pytest.importorskip("pyoidn", reason="pip install 'tron-relight[oidn]'")
     monkeypatch.setattr(shipped, "FOLDER", checkpoints)
     monkeypatch.setattr(network_gains, "GAINS", CLOSER)
