@@ -145,7 +145,7 @@ def test_clips_and_shadows_from_seeds(weights: Path, tmp_path: Path):
     ("arguments", "words"),
     [
         (["renderer=nowhere.safetensors"], "weights not found"),
-        (["renderer=[paper,pair]"], "two weights of neural"),
+        (["renderer=[paper,paper]"], "two weights of neural"),
         (["benchmark.data={synthetic_128: nowhere}"], "no data set synthetic_128"),
         (["benchmark.data={synthetic: .}"], "no data set is called 'synthetic'"),
         (["benchmark.parts=[synthetics]"], "parts"),
