@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from tron.io.lat_long import directions
 from tron.seeds import generator
 from tron.shading.environments.environment import EnvironmentMap
-from tron.shading.environments.lat_long import directions
 from tron.shading.lighting import Lighting
 
 ROWS = 128

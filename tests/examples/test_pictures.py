@@ -153,6 +153,13 @@ def test_blender(shared_data: Path, tmp_path: Path):
     pictures(tmp_path / "a.jpg")
 
 
+def test_the_zoos_wall_is_made_smaller(tmp_path):
+    (tmp_path / "pictures").mkdir()
+    write_image(tmp_path / "pictures" / "wall.png", np.full((200, 2300, 3), 0.5, np.float32))
+    run("zoo.py", tmp_path, tmp_path / "zoo.jpg")
+    assert read_image(tmp_path / "zoo.jpg").shape == (100, 1150, 3)
+
+
 def test_every_script_of_a_picture_is_run():
     tested = re.findall(r'run\("(\w+\.py)"', Path(__file__).read_text())
     assert sorted(tested) == SCRIPTS

@@ -8,10 +8,10 @@ import pytest
 from tron.brdf.bsdf import metallic_roughness
 from tron.brdf.reflectance import lobe_parts, reflectance
 from tron.errors import TronError
+from tron.io.lat_long import directions, row_integrals
 from tron.seeds import generator
 from tron.shading.environments.cubemap import direction_face, face_direction
 from tron.shading.environments.environment import EnvironmentLight, EnvironmentMap
-from tron.shading.environments.lat_long import directions, row_integrals
 from tron.shading.environments.prefilter import LightTree, ggx_prefilter, lobe_length
 from tron.shading.guidance import Lighting
 from tron.shading.lighting import SplitSum
