@@ -37,7 +37,7 @@ FLOOR = 2.4
 """Half side of the floor, world units."""
 
 UNDER = ("floor", "floor", "floor", "cobbles")
-"""What it stands on, one as likely as another."""
+"""What it stands on, one as likely as another; a floor where the recipe names materials: they may be even."""
 
 
 def hero(streams: Streams, choice: Choice) -> Composition:
@@ -48,7 +48,8 @@ def hero(streams: Streams, choice: Choice) -> Composition:
     """
     things = draw_things(streams("objects"), choice.objects or (1, 1), GROUPS, SIZE, choice)
     rng = streams("surroundings")
-    floor = fixture(rng, UNDER[int(rng.integers(len(UNDER)))], FLOOR * np.sqrt(2.0), choice)
+    kind = "floor" if choice.materials else UNDER[int(rng.integers(len(UNDER)))]
+    floor = fixture(rng, kind, FLOOR * np.sqrt(2.0), choice)
     rest = settle(streams("layout"), [thing.body for thing in things], floor.ground, radius=0.3 * len(things))
     objects, left_out = placed(things, rest)
     target = (0.0, 0.0, 0.5 * top_of(objects))

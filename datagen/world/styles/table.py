@@ -40,7 +40,7 @@ UNDER = (
     ("round_table", 2.9),
     ("backdrop", 3.4),
 )
-"""What things stand on, and how large it is."""
+"""What things stand on, and how large it is; no cobbles where the recipe names materials: it may be even."""
 
 
 def table(streams: Streams, choice: Choice) -> Composition:
@@ -54,24 +54,25 @@ def table(streams: Streams, choice: Choice) -> Composition:
     """
     things = draw_things(streams("objects"), choice.objects or COUNT, GROUPS, SIZE, choice)
     rng = streams("surroundings")
-    kind, size = UNDER[int(rng.integers(len(UNDER)))]
-    under = fixture(rng, kind, size, choice)
+    under = [each for each in UNDER if each[0] != "cobbles" or not choice.materials]
+    kind, size = under[int(rng.integers(len(under)))]
+    top = fixture(rng, kind, size, choice)
     rng = streams("layout")
-    reach = min(REACH, 0.9 * float(np.abs([*under.ground.low[:2], *under.ground.high[:2]]).min()))
+    reach = min(REACH, 0.9 * float(np.abs([*top.ground.low[:2], *top.ground.high[:2]]).min()))
     heaped = int(len(things) * rng.choice([0.0, 0.5, 0.7]))
     how = "pile" if rng.random() < 0.6 else "stack"
     angle, far = rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, 0.4) * reach
     heap = settle(
         rng,
         [thing.body for thing in things[:heaped]],
-        under.ground,
+        top.ground,
         arrangement=how,
         centre=(far * np.cos(angle), far * np.sin(angle)),
         radius=0.35 * reach,
     )
     fixed = [(thing.body, spot) for thing, spot in zip(things, heap) if spot is not None]
-    rest = settle(rng, [thing.body for thing in things[heaped:]], under.ground, radius=reach, fixed=fixed)
+    rest = settle(rng, [thing.body for thing in things[heaped:]], top.ground, radius=reach, fixed=fixed)
     objects, left_out = placed(things, [*heap, *rest])
     rng = streams("cameras")
     film = around(rng, TARGET, rng.uniform(1.2, 2.0), (20.0, 55.0), lowest_deg=6.0)
-    return Composition((under.item,), objects, left_out, (from_all_sides(rng, TARGET, 2.0, 34.0),), film)
+    return Composition((top.item,), objects, left_out, (from_all_sides(rng, TARGET, 2.0, 34.0),), film)
