@@ -23,14 +23,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tron.brdf.table import PARTS_F0, PARTS_SMOOTHEST
 from tron.shading.environments.prefilter import lobe_length
 
 DEGREE = 48
 NODES = 12
 """Along roughness and n.v each."""
-SMOOTHEST = 0.2
-"""Least roughness of the fit. Below, lobes have one shape, and x and y are in units of their width."""
-F0 = (0.04, 1.0)
+F0 = (PARTS_F0, 1.0)
 POINTS = 64
 STEPS, RATE, SMOOTH = 400, 0.02, 2e-2
 Pair = tuple[int, int]
@@ -145,7 +144,7 @@ def parts(found: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def fitted() -> np.ndarray:
     """(2, NODES, NODES, 3) float32: w, x and y by F0, roughness and n.v."""
-    roughness = np.linspace(SMOOTHEST, 1, NODES)
+    roughness = np.linspace(PARTS_SMOOTHEST, 1, NODES)
     cosine = (np.arange(NODES) + 0.5) / NODES
     shape, mean = seen_lobes(roughness, cosine)
     round_lobes = RoundLobes()
