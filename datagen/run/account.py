@@ -25,6 +25,7 @@ from tron.errors import TronError
 from tron.estimation import MATERIAL
 from tron.report.charts import Histogram, histograms_png
 from tron.shards.manifest import MANIFEST_NAME, Manifest
+from tron.shards.schema import META_SCHEMA_NAME, meta_schema
 from tron.storage import write_if_changed
 
 LIST_NAME = "failures.jsonl"
@@ -35,6 +36,7 @@ ACCOUNT = (
     CARD_NAME,
     SOURCES_NAME,
     METADATA_NAME,
+    META_SCHEMA_NAME,
     SHEET_NAME,
     VARIETY_NAME,
     PAGE_NAME,
@@ -91,6 +93,7 @@ def write_account(
     listed = source_list(settings, sources)
     write_if_changed(output / SOURCES_NAME, listed.model_dump_json(indent=1) + "\n")
     write_if_changed(output / METADATA_NAME, metadata_parquet(rows))
+    write_if_changed(output / META_SCHEMA_NAME, json.dumps(meta_schema(), indent=1) + "\n")
     sheet = scenes_sheet(output, rows)
     if sheet is not None:
         write_if_changed(output / SHEET_NAME, sheet)

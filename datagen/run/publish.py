@@ -3,7 +3,7 @@
 The card and metadata.parquet are those of the dataset; what only its maker needs (scenes, records, logs, the
 resolved configuration with its paths) stays behind. Shards are linked where one file system holds both
 folders. croissant.json is in the format of MLCommons' Croissant 1.0: shards and table as files with their
-hashes, and a record a clip from the table's columns.
+hashes, a record a clip from the table's columns, and a record a picture from the tars.
 """
 
 from __future__ import annotations
@@ -27,12 +27,14 @@ from tron.errors import TronError
 from tron.shards.index import index_name
 from tron.shards.manifest import MANIFEST_NAME, Manifest
 from tron.shards.reader import verify
+from tron.shards.schema import MEMBERS
 from tron.storage import sha256, write_atomic
 
 log = logging.getLogger(__name__)
 
 CROISSANT_NAME = "croissant.json"
 _FRONT = re.compile(r"\A---\n(.*?\n)---\n", re.DOTALL)
+_FORMATS = {"exr": "image/x-exr", "png": "image/png"}
 _TYPES = {"string": "sc:Text", "double": "sc:Float", "int32": "sc:Integer"}
 _CONTEXT = {
     "@language": "en", "@vocab": "https://schema.org/", "sc": "https://schema.org/",
@@ -95,7 +97,7 @@ def publish(settings: Settings) -> None:
 
 
 def croissant(folder: Path, manifest: Manifest, described: Mapping[str, Any]) -> dict[str, Any]:
-    """The JSON-LD of a dataset: its files, and a record a clip.
+    """The JSON-LD of a dataset: its files, a record a clip, and a record a picture of members of all clips.
 
     Args:
         folder: of the dataset. manifest: its own. described: the card's front matter.
@@ -121,16 +123,39 @@ def croissant(folder: Path, manifest: Manifest, described: Mapping[str, Any]) ->
         }
         for column in COLUMNS
     ]  # fmt: skip
+    pictures = [
+        {
+            "@type": "cr:FileSet", "@id": name, "name": name, "includes": f"*.{name}.{member.extension}",
+            "containedIn": [{"@id": entry.name} for entry in manifest.shards],
+            "encodingFormat": _FORMATS[member.extension],
+            "description": f"{member.meaning}; colours: {member.color_space or 'none'}",
+        }
+        for name, member in MEMBERS.items() if member.clips == "all"
+    ]  # fmt: skip
+    frames = [
+        {
+            "@type": "cr:RecordSet", "@id": f"{each['@id']}_frames", "name": f"{each['@id']}_frames",
+            "description": f"a record a frame: {each['description']}",
+            "field": [
+                {"@type": "cr:Field", "@id": f"{each['@id']}_frames/{what}",
+                 "name": f"{each['@id']}_frames/{what}", "dataType": kind,
+                 "source": {"fileSet": {"@id": each["@id"]}, "extract": {"fileProperty": what}}}
+                for what, kind in (("filename", "sc:Text"), ("content", "sc:Text"))
+            ],
+        }
+        for each in pictures
+    ]  # fmt: skip
     return {
         "@context": _CONTEXT, "@type": "sc:Dataset", "conformsTo": "http://mlcommons.org/croissant/1.0",
         "name": re.sub(r"[^A-Za-z0-9_-]+", "_", described["pretty_name"]),
         "description": "Clips of relit surfels: guidance buffers and the truth, for TRON's neural renderer.",
         "license": licence if isinstance(licence, str) else licence[0],
         "keywords": described.get("tags", []), "version": f"{manifest.schema_version}.0.0",
-        "distribution": [index, *shards],
+        "distribution": [index, *shards, *pictures],
         "recordSet": [
             {"@type": "cr:RecordSet", "@id": "clips", "name": "clips", "description": "a record a clip",
              "key": {"@id": "clips/key"}, "field": fields},
+            *frames,
         ],
     }  # fmt: skip
 

@@ -19,6 +19,7 @@ import pytest
 import yaml
 
 from tron import seeds
+from tron.cameras import Camera
 from tron.estimation import MATERIAL
 from tron.shards.manifest import Manifest
 from tron.shards.schema import TARGET, ClipMeta, guidance_members, light_members
@@ -229,7 +230,7 @@ def dataset(tmp_path_factory) -> Path:
                 frames=1,
                 width=16,
                 height=16,
-                cameras=[{}],
+                cameras=[Camera.look_at((0, -4, 1), (0, 0, 0), fov_deg=35, width=16, height=16).to_dict()],
                 exposure=1.0,
                 color_space=dict.fromkeys((*light_members(), TARGET), "linear"),
             )

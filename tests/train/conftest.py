@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tron import seeds
+from tron.cameras import Camera
 from tron.estimation import MATERIAL
 from tron.shards.manifest import Manifest
 from tron.shards.schema import GUIDANCE, TARGET, ClipMeta, ColorSpace, guidance_members
@@ -49,7 +50,12 @@ def write_dataset(
                     frames=frames,
                     width=width,
                     height=size,
-                    cameras=[{"view": view} if views else {}] * frames,
+                    cameras=[  # type: ignore[arg-type]
+                        Camera.look_at(
+                            (0, -4, view), (0, 0, 0), fov_deg=35, width=width, height=size
+                        ).to_dict()
+                    ]
+                    * frames,
                     exposure=1.0,
                     color_space=colors | (spaces or {}),
                 )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import get_type_hints
 
 from tron.errors import TronError
@@ -39,7 +40,7 @@ def kind_of(renderer: Renderer) -> str:
     return kind
 
 
-def renderer_class(kind: str, where: object = None) -> type[Renderer]:
+def renderer_class(kind: str, where: Path | None = None) -> type[Renderer]:
     """The class that a weights file names.
 
     Args:

@@ -10,10 +10,11 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from typing_extensions import TypedDict
 
 from tron.color import agx, linear_to_srgb
 from tron.errors import TronError
@@ -135,6 +136,8 @@ def color_spaces(reference: bool) -> dict[str, ColorSpace]:
 
 
 META_SUFFIX = "meta.json"
+META_SCHEMA_NAME = "meta.schema.json"
+"""File of a dataset that says what a meta.json holds, as a JSON Schema."""
 
 KEY_PATTERN = re.compile(r"[A-Za-z0-9_-]{1,60}")
 SPLIT_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,30}")
@@ -155,51 +158,67 @@ def members_table() -> str:
     return "\n".join(rows) + "\n"
 
 
-class ClipMeta(BaseModel):
-    """Metadata of a clip (meta.json).
+_Row = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
+_Side = Annotated[int, Field(ge=1, le=16_384)]
 
-    Attributes:
-        scene: name of the scene; the split's other clips show it under other lights.
-        light: name of the light.
-        cameras: `Camera.to_dict()` of each frame, OpenCV, pixels, world-to-camera.
-        exposure: factor on linear values before AgX, one a light (conventions.md, 5).
-        color_space: of each member that holds colours; photographs are "display".
-        seeds: root seed, and the first frame's seed of each kind of randomness.
-        spp: samples a pixel of each kind.
-        extra: anything else that is worth knowing of the clip.
+
+class CameraRecord(TypedDict):
+    """A pinhole camera, as `Camera.to_dict` gives it: OpenCV axes (x right, y down, z forward).
+
+    fx, fy, cx, cy are in pixels; the centre of column i, row j is at (i + 0.5, j + 0.5). world_to_camera is a
+    rigid 4 x 4 matrix, row after row.
     """
+
+    __pydantic_config__ = ConfigDict(extra="forbid")  # type: ignore[misc]
+
+    fx: Annotated[FiniteFloat, Field(gt=0)]
+    fy: Annotated[FiniteFloat, Field(gt=0)]
+    cx: FiniteFloat
+    cy: FiniteFloat
+    width: _Side
+    height: _Side
+    world_to_camera: Annotated[list[_Row], Field(min_length=4, max_length=4)]
+
+
+class ClipMeta(BaseModel):
+    """Metadata of a clip: its meta.json."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    schema_version: int = SCHEMA_VERSION
-    key: str
-    scene: str
-    light: str
-    light_family: str = Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")
-    split: str
-    frames: int = Field(ge=1, le=10_000)
-    width: int = Field(ge=1, le=16_384)
-    height: int = Field(ge=1, le=16_384)
-    cameras: list[dict[str, Any]]
-    exposure: float = Field(gt=0)
-    color_space: dict[str, ColorSpace]
-    seeds: dict[str, int] = Field(default_factory=dict)
-    spp: dict[str, int] = Field(default_factory=dict)
-    extra: dict[str, Any] = Field(default_factory=dict)
+    schema_version: int = Field(default=SCHEMA_VERSION, description="Version of this schema.")
+    key: str = Field(
+        pattern=rf"^{KEY_PATTERN.pattern}$", description="Name of the clip, with which its files begin."
+    )
+    scene: str = Field(description="Name of the scene; other clips show it under other lights.")
+    light: str = Field(description="Name of the light.")
+    light_family: str = Field(
+        pattern=r"^[a-z][a-z0-9_]{0,30}$", description="Kind of the light, such as sun or studio."
+    )
+    split: str = Field(pattern=rf"^{SPLIT_PATTERN.pattern}$", description="Split that the clip is of.")
+    frames: int = Field(ge=1, le=10_000, description="Number of frames.")
+    width: _Side = Field(description="Pixels of each frame.")
+    height: _Side = Field(description="Pixels of each frame.")
+    cameras: list[CameraRecord] = Field(description="The camera of each frame, in order.")
+    exposure: float = Field(
+        gt=0, description="Factor on linear values before AgX, the same for all clips of a scene and light."
+    )
+    color_space: dict[str, ColorSpace] = Field(
+        description="Of each member that holds colours: linear radiance; display, which photographs are; "
+        "reflectance, linear base color."
+    )
+    seeds: dict[str, int] = Field(
+        default_factory=dict, description="Root seed, and the first frame's seed of each kind of randomness."
+    )
+    spp: dict[str, int] = Field(default_factory=dict, description="Samples a pixel of each kind.")
+    extra: dict[str, Any] = Field(
+        default_factory=dict,
+        description="Anything else: style, contrast, the light's specification, motion of an object.",
+    )
 
-    @field_validator("key")
-    @classmethod
-    def _key_without_dots(cls, value: str) -> str:
-        if not KEY_PATTERN.fullmatch(value):
-            raise ValueError("a key is 1-60 letters, digits, '-' and '_'")
-        return value
 
-    @field_validator("split")
-    @classmethod
-    def _split_name(cls, value: str) -> str:
-        if not SPLIT_PATTERN.fullmatch(value):
-            raise ValueError("a split is lower-case letters, digits and '_'")
-        return value
+def meta_schema() -> dict[str, Any]:
+    """The JSON Schema of a meta.json, which lies in every dataset; `ClipMeta` checks the same."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **ClipMeta.model_json_schema()}
 
 
 @dataclass

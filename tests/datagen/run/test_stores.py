@@ -16,6 +16,7 @@ from eval.relighting.benchmark import Relighting
 from train.curriculum import Stage
 from train.examples.data import TrainingData
 from train.settings import DataSettings, ValidationSettings
+from tron.cameras import Camera
 from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
 from tron.seeds import generator
@@ -139,7 +140,10 @@ def write_clips(folder: Path) -> None:
                     "width": 16,
                     "height": 16,
                 },
-                cameras=[{"number": frame} for frame in range(5)],
+                cameras=[
+                    Camera.look_at((0, -4, n), (0, 0, 0), fov_deg=35, width=16, height=16).to_dict()
+                    for n in range(5)
+                ],
                 exposure=1.0,
                 color_space={},
             )

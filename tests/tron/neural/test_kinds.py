@@ -38,10 +38,9 @@ def forget():
 
 @pytest.fixture
 def weights(installed, tmp_path) -> Path:
-    from dilated.net import Dilated, DilatedConfig  # type: ignore[import-not-found]
-
+    network_class = renderer_class("dilated.net:Dilated")
     torch.manual_seed(1)
-    network = Dilated(DilatedConfig(width=5))
+    network = network_class(config_class(network_class)(width=5))  # type: ignore[call-arg]
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.normal_(0, 0.1)

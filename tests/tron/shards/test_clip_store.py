@@ -14,6 +14,7 @@ import pytest
 from webdataset.compat import WebDataset
 
 from tron import seeds
+from tron.cameras import Camera
 from tron.errors import TronError
 from tron.shards import MEMBERS, Clip, ClipMeta, ClipStore, Manifest, ShardWriter, clip_members, read_clips
 from tron.shards import clip_store as clip_store_module
@@ -37,7 +38,8 @@ def write(folder: Path, clips: int = 3, per_shard: int = 2, reference: bool = Fa
                 frames=FRAMES,
                 width=8,
                 height=6,
-                cameras=[{}] * FRAMES,
+                cameras=[Camera.look_at((0, -4, 1), (0, 0, 0), fov_deg=35, width=8, height=6).to_dict()]  # type: ignore[arg-type]
+                * FRAMES,
                 exposure=1.0,
                 color_space={},
             )

@@ -1,19 +1,24 @@
 """Shards: what goes in comes out, the bytes are a function of the clips, and damage or malice is found."""
 
 import io
+import json
+import re
 import shutil
 import tarfile
 from pathlib import Path
+from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 
 from tron import seeds
+from tron.cameras import Camera
 from tron.errors import TronError
 from tron.estimation import MATERIAL, MATERIAL_BEFORE
 from tron.shards import MEMBERS, ClipMeta, Manifest, ShardWriter, clip_members, read_clips, verify
 from tron.shards.reader import decode_clip, decode_meta, group_clips, tar_files
-from tron.shards.schema import SCHEMA_VERSION, members_table, parse_name
+from tron.shards.schema import SCHEMA_VERSION, members_table, meta_schema, parse_name
 
 
 def meta(key: str, split: str = "train", frames: int = 2) -> ClipMeta:
@@ -26,7 +31,7 @@ def meta(key: str, split: str = "train", frames: int = 2) -> ClipMeta:
         frames=frames,
         width=8,
         height=6,
-        cameras=[{"fx": 1.0}] * frames,
+        cameras=[Camera.look_at((0, -4, 1), (0, 0, 0), fov_deg=35, width=8, height=6).to_dict()] * frames,  # type: ignore[arg-type]
         exposure=0.37,
         color_space={"rgb": "linear"},
         seeds={"scene": 7},
@@ -314,3 +319,54 @@ def test_the_table_of_the_documentation_is_the_schemas():
     text = (Path(__file__).resolve().parents[3] / "docs" / "guides" / "datasets.md").read_text()
     begin, end = "<!-- tron.shards.schema.members_table() -->\n", "<!-- end -->"
     assert text.split(begin)[1].split(end)[0] == members_table()
+
+
+def test_the_loader_of_the_page_reads_every_member_without_us(tmp_path):
+    page = (Path(__file__).parents[3] / "docs/guides/datasets.md").read_text("utf-8")
+    (loader,) = re.findall(r"## Without TRON\n.*?```python\n(.*?)```", page, re.DOTALL)
+    assert len([line for line in loader.splitlines() if line]) <= 26
+    assert "tron" not in loader
+    names: dict[str, Any] = {}
+    exec(compile(loader, "datasets.md", "exec"), names)
+    manifest = write(tmp_path, reference=True)
+    read = [clip for entry in manifest.shards for clip in names["clips"](tmp_path / entry.name)]
+    ours = list(read_clips(tmp_path, "train"))
+    assert len(read) == len(ours) == 3
+    for (meta, members), clip in zip(read, ours):
+        assert ClipMeta.model_validate(meta) == clip.meta
+        assert members.keys() == clip.frames.keys() == set(clip_members(reference=True))
+        for name, image in members.items():
+            np.testing.assert_array_equal(image, clip.frames[name])
+
+
+CAMERA = meta("a").cameras[0]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"key": "a.b"},
+        {"key": None},
+        {"split": "Train"},
+        {"light_family": ""},
+        {"frames": 0},
+        {"width": 8.5},
+        {"exposure": 0},
+        {"cameras": [{}]},
+        {"cameras": [{**CAMERA, "fx": -1}]},
+        {"cameras": [{**CAMERA, "world_to_camera": [[1, 0, 0]] * 4}]},
+        {"cameras": [{**CAMERA, "skew": 0.0}]},
+        {"color_space": {"rgb": "srgb"}},
+        {"seeds": {"scene": "seven"}},
+        {"unknown": 1},
+    ],
+)
+def test_the_schema_and_the_reader_refuse_the_same_metadata(change):
+    """A second library, jsonschema, reads the schema that lies in every dataset."""
+    good = json.loads(meta("a").model_dump_json())
+    check = jsonschema.Draft202012Validator(json.loads(json.dumps(meta_schema())))
+    check.check_schema(check.schema)
+    assert check.is_valid(good)
+    assert not check.is_valid(good | change)
+    with pytest.raises(TronError, match=r"meta\.json is damaged"):
+        decode_meta(json.dumps(good | change).encode())
