@@ -66,19 +66,15 @@ def source(request: pytest.FixtureRequest, tiny_scenes: list[str]) -> Source:
     if request.param == "synthetic":
         maker = datagen.sources.synthetic, "make_scene"
         return Source("synthetic", tiny_scenes, maker, ("train.frames=94", "train.frames"))
-    captures = request.getfixturevalue("tiny_captures")
-    words = ["source=captured", f"captures={captures}", "prior=ground_truth"]
-    words += request.getfixturevalue("quick_reconstruction")
+    words = request.getfixturevalue("pair_words")
     maker = datagen.sources.captured, "make_capture"
     return Source("captured", words, maker, ("captured.frames=0", "captured.frames"))
 
 
 @pytest.fixture(scope="module")
-def dataset(source: Source, variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(source: Source, request: pytest.FixtureRequest) -> Path:
     """A whole dataset of the source; nobody writes into it."""
-    output = tmp_path_factory.mktemp(source.name) / "dataset"
-    assert make(source.settings(output)) == 0
-    return output
+    return request.getfixturevalue("tiny_dataset" if source.name == "synthetic" else "tiny_pairs")
 
 
 def names(dataset: Path) -> list[str]:
@@ -128,9 +124,9 @@ def test_2_resumable_what_is_missing_is_made_again_and_nothing_else(
         raise AssertionError("nothing is left to make")
 
     monkeypatch.setattr(*source.maker, never)
-    before = {path: os.stat(dataset / path).st_mtime_ns for path in files_of(dataset)}
-    assert make(source.settings(dataset)) == 0
-    assert {path: os.stat(dataset / path).st_mtime_ns for path in files_of(dataset)} == before
+    before = {path: os.stat(broken / path).st_mtime_ns for path in files_of(broken)}
+    assert make(source.settings(broken)) == 0
+    assert {path: os.stat(broken / path).st_mtime_ns for path in files_of(broken)} == before
 
 
 @pytest.mark.long
