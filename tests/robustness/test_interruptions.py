@@ -21,7 +21,7 @@ from tron import seeds
 
 pytestmark = pytest.mark.long
 
-MOMENTS = 3
+MOMENTS = 2
 """Ten were measured (dev/LOG.md), which takes eight minutes."""
 KEPT = re.compile(r"stopped: step (\d+)(?: of stage (\w+))? is kept")
 

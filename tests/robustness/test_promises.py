@@ -61,6 +61,12 @@ class Source:
         return check(compose_recipe("conf.datagen", Settings, words), Settings)
 
 
+ONE_DATA_ENGINE = pytest.mark.parametrize(
+    "source", ["synthetic", pytest.param("captured", marks=pytest.mark.long)], indirect=True
+)
+"""For what both sources leave to the same code: the second is asked in the long tests."""
+
+
 @pytest.fixture(scope="module", params=["synthetic", "captured"])
 def source(request: pytest.FixtureRequest, tiny_scenes: list[str]) -> Source:
     if request.param == "synthetic":
@@ -130,11 +136,13 @@ def test_2_resumable_what_is_missing_is_made_again_and_nothing_else(
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("source", ["synthetic"], indirect=True)
 def test_2_resumable_after_sigkill_at_any_moment(
     source: Source, dataset: Path, tmp_path: Path, files_of: Callable
 ) -> None:
+    """Captures are killed in each phase of theirs in tests/datagen/sources/test_captured.py."""
     output, killed = tmp_path / "killed", 0
-    for attempt in range(8):
+    for attempt in range(5):
         with subprocess.Popen(
             [SCRIPT, *source.words, "cluster=none", f"output_dir={output}"], stderr=subprocess.DEVNULL
         ) as process:
@@ -143,7 +151,7 @@ def test_2_resumable_after_sigkill_at_any_moment(
             while not (output / "config.yaml").is_file() and process.poll() is None:
                 assert time.monotonic() < deadline
                 time.sleep(0.02)
-            time.sleep(0.4 * attempt)
+            time.sleep(0.6 * attempt)
             if process.poll() is None:
                 process.send_signal(signal.SIGKILL)
                 killed += 1
@@ -171,6 +179,7 @@ def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
         subprocess.run(["umount", "--lazy", folder], check=True)
 
 
+@ONE_DATA_ENGINE
 def test_3_atomic_a_full_disk_leaves_nothing_half_written(
     source: Source,
     dataset: Path,
@@ -233,6 +242,7 @@ def test_4_accounted_for_validation_finds_what_is_damaged(
     assert (entry.name if damage != "record" else names(copy)[0]) in caplog.text
 
 
+@ONE_DATA_ENGINE
 def test_5_failures_are_data_with_a_command_that_tries_again(
     source: Source,
     dataset: Path,
@@ -266,6 +276,7 @@ def test_5_failures_are_data_with_a_command_that_tries_again(
     assert files_of(output) == files_of(dataset)
 
 
+@ONE_DATA_ENGINE
 def test_6_finite_a_clip_with_nan_is_set_aside_and_never_in_a_shard(
     source: Source, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -297,10 +308,10 @@ def test_7_bounded_two_runs_of_one_folder_do_not_mix(source: Source, tmp_path: P
 
 @pytest.mark.long
 def test_7_bounded_memory_stays_flat_over_many_scenes(tiny_scenes: list[str], tmp_path: Path) -> None:
-    """60 scenes, three lives of each worker; the last fifth of the run beside the second."""
-    output, count = tmp_path / "soak", 60
+    """30 scenes, three lives of each worker; the last fifth of the run beside the second."""
+    output, count = tmp_path / "soak", 30
     words = [each for each in tiny_scenes if not each.startswith("train.scenes")]
-    words += ["recycle_after=10", f"train.scenes={count}", "workers=2", f"output_dir={output}"]
+    words += ["recycle_after=5", f"train.scenes={count}", "workers=2", f"output_dir={output}"]
     times, samples = output / "logs" / "times.jsonl", []
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen([SCRIPT, *words], stdout=log, stderr=log)
@@ -339,6 +350,7 @@ def test_9_wrong_configuration_fails_before_anything_in_a_line_that_names_the_ke
     assert not (tmp_path / "out").exists()
 
 
+@ONE_DATA_ENGINE
 def test_10_visible_sheets_page_card_and_a_bar(
     source: Source, dataset: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

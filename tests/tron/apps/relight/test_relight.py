@@ -149,22 +149,6 @@ def test_other_settings_in_the_same_folder_are_refused(relight, scene_path, ligh
     assert relight(*base, "rotation=45", "overwrite=true") == 0
 
 
-def test_frames_of_an_older_release_keep_the_defaults_of_settings_that_it_lacked(
-    relight, scene_path, light_path, tmp_path, capsys
-):
-    out = tmp_path / "out"
-    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=1"]
-    assert relight(*base) == 0
-    record = out / "frames" / "settings.json"
-    whole = json.loads(record.read_text())
-    record.write_text(json.dumps({key: whole[key] for key in whole if key not in ("estimator", "denoise")}))
-    assert relight(*base, "estimator=plain") == 2
-    assert "frames made with estimator=ratio, not plain" in capsys.readouterr().err
-    assert relight(*base) == 0
-    assert json.loads((out / "relight.json").read_text())["frames_rendered"] == 0
-    assert json.loads(record.read_text()) == whole
-
-
 @pytest.mark.long
 def test_a_plain_3dgs_file_is_relit_with_a_warning(
     relight, scene_path, light_path, tmp_path, caplog, monkeypatch
