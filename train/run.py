@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import hydra.utils
 import lightning
 import torch
 import yaml
@@ -36,7 +37,7 @@ from train.checkpoints import (
 )
 from train.curriculum import Stage, StageClock
 from train.examples.data import TrainingData
-from train.examples.requirements import require_renderer
+from train.examples.requirements import require_drawing, require_renderer
 from train.examples.splits import manifest_hash, split_hashes
 from train.loggers import RunLoggers
 from train.module import RendererModule
@@ -49,10 +50,11 @@ from tron import seeds
 from tron.cli.instantiation import make
 from tron.cli.recipes import model_defaults
 from tron.errors import TronError
+from tron.neural.kinds import config_class
 from tron.neural.losses import RendererLoss
 from tron.neural.protocols import Renderer
 from tron.neural.shipped import checkpoint_file
-from tron.neural.weights import restore_renderer, save_renderer
+from tron.neural.weights import require_saved, restore_renderer, save_renderer
 from tron.run_folder import RunFolder
 from tron.runtime import set_torch_threads
 from tron.storage import locked, sha256
@@ -163,6 +165,7 @@ def _make_module(
     renderer = build_renderer(settings.renderer)
     for stage in stages:
         require_renderer(stage, renderer)
+    require_drawing(renderer, stages)
     if position == Position(0) and settings.start_from is not None:
         restore_renderer(checkpoint_file(settings.start_from), renderer)
     apply_options(renderer, settings)
@@ -186,11 +189,44 @@ def _calibrate(renderer: Renderer, data: TrainingData, stages: list[Stage], proc
 
 
 def build_renderer(recipe: dict[str, Any]) -> Renderer:
-    """Make the renderer that a recipe's `_target_` names; TronError where the recipe does not fit it."""
-    renderer = make(recipe, "renderer")
+    """Make the renderer that a recipe's `_target_` names, ours or of one's own.
+
+    Raises:
+        TronError: the recipe does not fit it, it is no Renderer, or its weights could not be read again.
+    """
+    renderer = make(_with_settings(recipe), "renderer")
     if not isinstance(renderer, Renderer):
-        raise TronError(f"renderer._target_ makes a {type(renderer).__name__}, not a renderer")
+        raise TronError(
+            f"renderer._target_ makes a {type(renderer).__name__}, not a renderer",
+            mend="derive its class from tron.neural.protocols.Renderer",
+        )
+    require_saved(renderer)
     return renderer
+
+
+def _with_settings(recipe: dict[str, Any]) -> dict[str, Any]:
+    """A recipe whose `config` says of which class it is, where its `_target_` is a renderer that knows.
+
+    Raises:
+        TronError: it says that it is of another class, such as the default network's.
+    """
+    config = recipe.get("config")
+    try:
+        cls = hydra.utils.get_class(recipe["_target_"])
+        given = hydra.utils.get_class(config["_target_"]) if config and "_target_" in config else None
+    except Exception:  # whoever makes it says what is wrong
+        return recipe
+    if not isinstance(config, dict) or not issubclass(cls, Renderer):
+        return recipe
+    settings = config_class(cls)
+    if given is None:
+        return {**recipe, "config": {"_target_": f"{settings.__module__}.{settings.__qualname__}", **config}}
+    if not issubclass(given, settings):
+        raise TronError(
+            f"{recipe['_target_']} takes settings of {settings.__name__}, not {given.__name__}",
+            mend="write renderer/NAME.yaml with its _target_ and config in a folder for --config-dir",
+        )
+    return recipe
 
 
 def _run_stage(

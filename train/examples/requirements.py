@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
+
 from train.curriculum import Stage
 from train.examples.framing import covering_size
 from train.examples.sources import MOST_TRIES
 from tron.errors import TronError
+from tron.neural.kinds import OURS, kind_of
 from tron.neural.protocols import Renderer
 from tron.shards.clip_store import ClipStore
 from tron.shards.schema import ClipMeta
@@ -98,4 +101,34 @@ def require_renderer(stage: Stage, renderer: Renderer) -> None:
             raise TronError(
                 f"stage {stage.name} has a {key} of {odd[0]} pixels, the renderer takes multiples of {block}",
                 mend=f"give it {max(block, odd[0] // block * block)}",
+            )
+
+
+def require_drawing(renderer: Renderer, stages: Sequence[Stage]) -> None:
+    """TronError unless a network of one's own draws what it is given: same size, finite, with gradients.
+
+    Ours have their tests. It is given half grey of each stage's crop (else 64 x 64) and frames.
+    """
+    kind = kind_of(renderer)
+    if kind in OURS:
+        return
+    for frames, side in sorted({(stage.frames, stage.crop or 64) for stage in stages}):
+        given = {name: torch.zeros(1, 3, frames, side, side) for name in renderer.config.guidance}
+        try:
+            drawn = renderer(given)
+        except TronError:
+            raise
+        except Exception as error:
+            raise TronError(f"{kind} fails on {frames} x {side} x {side} pixels: {error}") from error
+        shape = (1, 3, frames, side, side)
+        if not isinstance(drawn, torch.Tensor) or drawn.shape != shape:
+            got = tuple(drawn.shape) if isinstance(drawn, torch.Tensor) else type(drawn).__name__
+            raise TronError(
+                f"{kind} returns {got} for buffers of {shape}", mend="return the shape of a buffer"
+            )
+        if not torch.isfinite(drawn).all():
+            raise TronError(f"{kind} returns NaN or infinity for half grey", mend="begin near its guidance")
+        if not drawn.requires_grad:
+            raise TronError(
+                f"{kind} returns a picture without gradients", mend="do not detach what is trained"
             )

@@ -38,12 +38,20 @@ class Codec(Protocol):
 
 
 class Renderer(nn.Module):
-    """Network from guidance to the picture; `window` frames are 1 + temporal_factor * n."""
+    """Network from guidance to the picture.
+
+    One of your own defines `config`, whose type is the class of its settings, and `forward`; the rest has
+    defaults. It is made from its settings alone: `MyNetwork(config)`.
+
+    Attributes:
+        config: `guidance` names the buffers it is given, `window` the frames of a clip it draws at once.
+        temporal_factor: it takes 1 + temporal_factor * n frames.
+    """
 
     config: GuidedConfig
     temporal_factor: int = 1
     space_block: int = 1
-    """Pixels that both sides of a training crop must be multiples of; other frames are padded."""
+    """Pixels that both sides of a training crop must be multiples of; `forward` itself pads other frames."""
 
     @property
     def reach(self) -> int | None:
@@ -70,8 +78,8 @@ class Renderer(nn.Module):
             raise TronError(f"a {type(self).__name__} has no latents to weigh", mend="leave weights out")
 
     def hidden_matrices(self) -> list[nn.Parameter]:
-        """Weights between hidden layers, 2-D, which Muon may optimise."""
-        raise NotImplementedError
+        """Weights between hidden layers, 2-D, which Muon may optimise; here none, so that AdamW takes all."""
+        return []
 
     def temporal_weights(self) -> dict[str, nn.Parameter]:
         """Parameters by name of the paths between frames, which start from adding nothing; here none."""

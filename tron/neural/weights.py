@@ -29,11 +29,11 @@ from tron.neural.configs import (
     PAPER_GUIDANCE,
     BackboneConfig,
     CosmosConfig,
-    PixelMLPConfig,
+    GuidedConfig,
     RendererConfig,
     UNetConfig,
 )
-from tron.neural.networks.pixel_mlp import PixelMLP
+from tron.neural.kinds import OURS, config_class, kind_of, renderer_class
 from tron.neural.protocols import Codec, Renderer
 from tron.neural.renderer import NeuralRenderer, predicted
 from tron.storage import write_atomic
@@ -47,22 +47,50 @@ COSMOS_FILE = "model.pt of nvidia/Cosmos-Predict2-0.6B-Text2Image (or its diffus
 
 
 def save_renderer(path: str | Path, renderer: Renderer) -> None:
-    """Write a NeuralRenderer or PixelMLP with its configuration into one .safetensors file, atomically."""
-    kinds = {NeuralRenderer: "neural", PixelMLP: "pixel_mlp"}
-    if type(renderer) not in kinds:
-        raise TypeError(f"no file format for a {type(renderer).__name__}")
-    config = renderer.config.model_dump(mode="json")
-    header = {"format": FORMAT, "kind": kinds[type(renderer)], "config": config}
+    """Write a renderer, the name of its class and its configuration into one .safetensors file, atomically.
+
+    Raises:
+        TronError: the class could not be found again (`kind_of`).
+    """
+    header = {"format": FORMAT, "kind": kind_of(renderer), "config": _plain(renderer.config)}
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in renderer.state_dict().items()}
     # One key, since safetensors writes several in the order of a hash that changes from run to run.
     write_atomic(path, serialize(state, {METADATA_KEY: json.dumps(header)}))
+
+
+def require_saved(renderer: Renderer) -> None:
+    """TronError unless what `save_renderer` writes of a renderer makes one of the same weights again.
+
+    For a network of one's own, before it is trained: a mistake would otherwise show at the end.
+    """
+    kind = kind_of(renderer)
+    if kind in OURS:
+        return
+    try:
+        again = _build(kind, _plain(renderer.config), None)
+    except Exception as error:
+        raise TronError(
+            f"{kind} cannot be made from its settings alone: {error}",
+            mend="its __init__ takes config and nothing else",
+        ) from error
+    shapes, those = ({name: t.shape for name, t in each.state_dict().items()} for each in (renderer, again))
+    if shapes != those:
+        name = next(n for n in [*shapes, *those] if shapes.get(n) != those.get(n))
+        raise TronError(
+            f"{kind} made again from its settings has another '{name}'", mend="let config decide every shape"
+        )
+
+
+def _plain(config: GuidedConfig) -> dict[str, Any]:
+    return json.loads(json.dumps(config.model_dump(mode="json")))
 
 
 def load_renderer(path: str | Path, vae: str | Path | None = None) -> Renderer:
     """Read a renderer that `save_renderer` wrote, in eval mode on the CPU.
 
     vae: the WAN VAE, needed where the renderer's codec is "wan" (it is frozen and never stored again). Raises
-    TronError where the file is missing, damaged, or not a renderer.
+    TronError where the file is missing, damaged, or not a renderer, or its class is not known here
+    (`tron.neural.kinds`).
     """
     path = Path(path)
     state, metadata = _read(path)
@@ -70,7 +98,7 @@ def load_renderer(path: str | Path, vae: str | Path | None = None) -> Renderer:
         header = json.loads(metadata.get(METADATA_KEY, "{}"))
         if header.get("format") != FORMAT:
             raise TronError("safetensors file holds no TRON renderer", str(path), MEND)
-        renderer = _build(header["kind"], header["config"], vae)
+        renderer = _build(str(header["kind"]), header["config"], vae, path)
     except ValidationError as error:
         first = error.errors()[0]
         key, said = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
@@ -132,15 +160,14 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     return safetensors_state(path, MEND)
 
 
-def _build(kind: str, config: dict[str, Any], vae: str | Path | None) -> Renderer:
-    # The file chooses among these two and nothing else: a name to import would be code in a data file.
-    config = {"guidance": PAPER_GUIDANCE, **config}  # files before schema 2 do not name it
-    if kind == "pixel_mlp":
-        return PixelMLP(PixelMLPConfig.model_validate(config))
-    if kind == "neural":
-        parsed = RendererConfig.model_validate(config)
+def _build(kind: str, config: dict[str, Any], vae: str | Path | None, where: Path | None = None) -> Renderer:
+    cls = renderer_class(kind, where)
+    # Files before schema 2 do not name their guidance.
+    parsed = config_class(cls).model_validate({"guidance": PAPER_GUIDANCE, **config})
+    if cls is NeuralRenderer:
+        assert isinstance(parsed, RendererConfig)
         return NeuralRenderer(parsed, CODECS[parsed.codec](vae))
-    raise ValueError(kind)
+    return cls(parsed)
 
 
 def load_cosmos(

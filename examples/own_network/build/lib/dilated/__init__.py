@@ -1,0 +1,1 @@
+"""A neural renderer of one's own."""
