@@ -1,7 +1,7 @@
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-long test-narrow docs lint format clean
+.PHONY: help setup demo quick test test-long test-narrow docs lint format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -12,6 +12,9 @@ setup:  ## make .venv, install the pinned dependencies, check LLVM
 demo: setup  ## from a procedural scene to an evaluated neural renderer (13 to 26 minutes on two cores)
 	$(BIN)/tron-eval benchmark=demo output_dir=outputs/demo
 	@echo "report: $(CURDIR)/outputs/demo/report.html"
+
+quick: setup  ## the tests that neither render nor start a process, in two processes
+	$(BIN)/python -m pytest -m "not long and not render and not process" -n 2 --dist loadfile
 
 test: setup  ## the fast tests, in two processes
 	$(BIN)/python -m pytest -m "not long" -n 2 --dist loadfile

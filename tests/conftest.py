@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import struct
+import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,14 +23,29 @@ SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "shared: wants the real data of ../shared; set here")
+    config.addinivalue_line("markers", "render: asks for a Mitsuba variant; set here")
+    config.addinivalue_line("markers", "process: of a module that imports subprocess; set here")
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what asks for the fixture `shared_data`, so that `-m shared` chooses it."""
+    """Mark tests by what they ask for, so that `-m` chooses them: `shared`, `render` and `process`."""
     for item in items:
-        if "shared_data" in getattr(item, "fixturenames", ()):
+        fixtures = getattr(item, "fixturenames", ())
+        if "shared_data" in fixtures:
             item.add_marker("shared")
+        if "variant" in fixtures:
+            item.add_marker("render")
+        if getattr(getattr(item, "module", None), "subprocess", None) is subprocess:
+            item.add_marker("process")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say the processor time of this process and of all that it waited for, which no other work changes."""
+    spent = os.times()
+    seconds = spent.user + spent.system + spent.children_user + spent.children_system
+    terminalreporter.write_line(f"processor time: {seconds / 60:.1f} minutes")
 
 
 def has_cuda() -> bool:
@@ -227,6 +243,35 @@ def quick_reconstruction() -> list[str]:
         *(f"captured.reconstruction.{value}" for value in surfels),
         *(f"captured.light.{value}" for value in light),
     ]
+
+
+@pytest.fixture(scope="session")
+def pair_words(tiny_captures: Path, quick_reconstruction: list[str]) -> list[str]:
+    """Overrides of `tron-datagen` for the pairs of the tiny captures, made in this process."""
+    words = ["source=captured", f"captures={tiny_captures}", "prior=ground_truth", "cluster=none"]
+    return [*words, *quick_reconstruction]
+
+
+def make_dataset(words: Sequence[str], output: Path) -> None:
+    from datagen.run.dataset import make
+    from datagen.settings.command import Settings
+    from tron.cli.recipes import check, compose_recipe
+
+    recipe = compose_recipe("conf.datagen", Settings, [*words, f"output_dir={output}"])
+    assert make(check(recipe, Settings)) == 0
+
+
+@pytest.fixture(scope="session")
+def tiny_dataset(variant: str, made_once, tiny_scenes: list[str]) -> Path:
+    """The two tiny scenes as one process makes them; nobody writes into it."""
+    words = [*tiny_scenes, "cluster=none"]
+    return made_once(f"tiny_dataset-{variant}", lambda output: make_dataset(words, output))
+
+
+@pytest.fixture(scope="session")
+def tiny_pairs(variant: str, made_once, pair_words: list[str]) -> Path:
+    """The pairs of the three tiny captures, one a split; nobody writes into it."""
+    return made_once(f"tiny_pairs-{variant}", lambda output: make_dataset(pair_words, output))
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,7 @@ def run(*arguments: str, **changed: object) -> int:
     return end.value.code  # type: ignore[return-value]
 
 
+@pytest.mark.long
 def test_one_choice_varies_and_the_others_stay(weights: Path, tmp_path: Path):
     pair, lit = weights / "tiny_of_two.safetensors", weights / "tiny.safetensors"
     parts = "[rays,surfels,bounces,supersampling,seeds,network,weights]"

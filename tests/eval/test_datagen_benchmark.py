@@ -40,7 +40,8 @@ def test_frames_are_counted_of_what_the_command_makes(tmp_path: Path):
         *("mesh_edge=0.2", "environment_height=32", "objects=[1,1]", "refine_steps=2"),
     ]
     typed = json.dumps(recipe).replace(", ", ",")
-    run(f"benchmark.throughput={typed}", 'benchmark.sizes={16: ["train.frames=2"]}', f"output_dir={tmp_path}")
+    sizes = ["~benchmark.sizes", '+benchmark.sizes={16: ["train.frames=2"]}']  # else those of the recipe too
+    run(f"benchmark.throughput={typed}", *sizes, f"output_dir={tmp_path}")
     results = Results.load(tmp_path / "results.json")
     for metric in ("frames_per_hour.16", "seconds_per_frame.path_trace.16"):
         assert (results.value(metric) or 0) > 0

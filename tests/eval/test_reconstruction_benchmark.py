@@ -277,6 +277,7 @@ def test_every_scene_in_every_way_and_the_fox_are_run_once(stand_ins: Path, tmp_
     assert stand_ins.read_text().splitlines() == commands
 
 
+@pytest.mark.long
 def test_photographs_and_scans_are_relit_and_have_rows(stand_ins: Path, tmp_path: Path):
     parts = "benchmark.parts=[scenes,photos,splats]"
     assert run(tmp_path, parts, "~benchmark.ways.depth_init") == 0

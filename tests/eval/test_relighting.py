@@ -223,6 +223,7 @@ def test_two_weights_of_one_method_are_refused_by_name(dataset: Path, weights: P
         Relighting(dataset=dataset, renderer=twice).run(tmp_path)
 
 
+@pytest.mark.long
 def test_data_of_another_kind_gives_rows_of_its_own_by_the_same_fits(
     outcome: Outcome, dataset: Path, weights: Path, write_dataset: Callable[..., Path], tmp_path: Path
 ):

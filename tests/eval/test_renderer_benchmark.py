@@ -68,6 +68,7 @@ def test_untrained_networks_gain_nothing_over_the_buffer_that_they_start_from(
     assert read_image(strips[0]).shape == (256 + 4 + 256, 7 * 256, 3)
 
 
+@pytest.mark.long
 def test_models_and_captures_are_judged_on_their_own_splits(
     dataset: Path, weights: Path, write_dataset: Callable[..., Path], tmp_path: Path
 ):

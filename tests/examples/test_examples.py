@@ -85,6 +85,7 @@ def test_relight_shows_the_users_scene_in_the_users_light(run, tmp_path: Path):
     assert warmth[1] < -0.01, "red and blue of the light are exchanged"
 
 
+@pytest.mark.long
 def test_the_relit_picture_has_no_fireflies(run, tmp_path: Path, monkeypatch):
     """Off the metal ring no pixel jumps from one seed of its rays to another.
 
@@ -114,6 +115,7 @@ def load_stage() -> tuple[GaussianScene, EnvironmentMap]:
     return make_scene(0.08), make_light()
 
 
+@pytest.mark.long
 def test_orbit_films_every_frame_and_they_differ(run, tmp_path: Path, read_video):
     run("orbit", tmp_path / "orbit.jpg")
     film = read_video(tmp_path / "orbit.mp4").astype(float)
@@ -132,6 +134,7 @@ def test_material_edit_makes_the_ring_blue_and_leaves_the_floor(run, tmp_path: P
     assert changed[-6:, :10].max() < 0.1, "the floor is not, and has what the ball throws on it"
 
 
+@pytest.mark.long
 def test_the_edited_ball_mirrors_the_floor_that_it_stands_on(run, tmp_path: Path):
     """What it shows below its middle are dark and bright tiles, not the one colour of the light's ground."""
     run("edit_materials", tmp_path / "edit.png")
@@ -150,6 +153,7 @@ def test_gradient_leads_back_to_where_the_ball_was(run, tmp_path: Path):
     assert np.abs(found - wanted).mean() < 0.3 * np.abs(start - wanted).mean()
 
 
+@pytest.mark.long
 def test_fit_light_finds_the_sun(run, tmp_path: Path):
     run("fit_light", tmp_path / "light.png")
     found, true = np.split(read_image(tmp_path / "light.png"), 2, axis=1)

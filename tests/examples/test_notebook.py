@@ -29,6 +29,7 @@ def run(cell: ast.Module, names: dict) -> Any:
     return None if last is None else eval(compile(ast.Expression(last.value), str(NOTEBOOK), "eval"), names)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("variant")
 def test_the_notebook_runs_and_shows_frames_and_the_viewer(tmp_path, monkeypatch):
     pytest.importorskip("viser", reason="pip install 'tron-relight[view]'")

@@ -170,7 +170,11 @@ def lit(surrounded, camera):
     return relighter.under(EnvironmentMap(np.full((16, 32, 3), 0.7, np.float32))).render(camera)
 
 
-@pytest.mark.parametrize("position", [(3, -3, 3), (40, -40, 30)], ids=["inside", "outside"])
+@pytest.mark.parametrize(
+    "position",
+    [(3, -3, 3), pytest.param((40, -40, 30), marks=pytest.mark.long)],
+    ids=["inside", "outside"],
+)
 def test_what_surrounds_is_in_no_light_s_way(domed, position, tmp_path):
     camera = Camera.look_at(position, (0, 0, 0.4), fov_deg=50 if position[0] < 9 else 5, width=32, height=32)
     alone = lit(treat_surroundings(scene_of(*SUBJECT), "drop", tmp_path), camera)

@@ -39,6 +39,7 @@ def plane_view() -> GBufferView:
     )
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("variant")
 def test_the_python_examples_do_what_they_say(tmp_path, monkeypatch):
     (six,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)

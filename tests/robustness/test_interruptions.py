@@ -17,14 +17,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from datagen.run.dataset import make
-from datagen.settings.command import Settings
 from tron import seeds
-from tron.cli.recipes import check, compose_recipe
 
 pytestmark = pytest.mark.long
 
-MOMENTS = 3
+MOMENTS = 2
 """Ten were measured (dev/LOG.md), which takes eight minutes."""
 KEPT = re.compile(r"stopped: step (\d+)(?: of stage (\w+))? is kept")
 
@@ -65,16 +62,13 @@ class Interrupted:
 
 
 @pytest.fixture(scope="module")
-def train(tiny_scenes, tmp_path_factory) -> Interrupted:
-    dataset = tmp_path_factory.mktemp("scenes") / "dataset"
-    recipe = compose_recipe("conf.datagen", Settings, [*tiny_scenes, "cluster=none", f"output_dir={dataset}"])
-    assert make(check(recipe, Settings)) == 0
+def train(tiny_dataset: Path) -> Interrupted:
     stages = (
         "stages=[{name: one, split: train, steps: 500, batch_size: 1, crop: 12},"
         "{name: two, split: train, steps: 300, batch_size: 1, crop: 12}]"
     )
-    words = ("tron-train", f"dataset={dataset}", stages, "validation.split=null", "checkpoint_every=1000",
-             "threads=1", "renderer=pixel_mlp")  # fmt: skip
+    words = ("tron-train", f"dataset={tiny_dataset}", stages, "validation.split=null",
+             "checkpoint_every=1000", "threads=1", "renderer=pixel_mlp")  # fmt: skip
     return Interrupted(words, ["renderer.safetensors"], "from step {}")
 
 

@@ -92,6 +92,7 @@ def test_ssh_needs_hosts(tiny, tmp_path):
         tiny(tmp_path, "cluster=ssh")
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("variant")
 def test_a_cluster_without_workers_is_not_waited_for_longer_than_told(tiny, tmp_path, empty_scheduler):
     with pytest.raises(TronError, match=r"no worker came within worker_timeout=1 s"):
@@ -116,6 +117,7 @@ def refused(**_: object) -> SpecCluster:
     return SpecCluster(scheduler=scheduler, worker={"cls": NeverStarts})
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("variant")
 def test_workers_that_never_start_leave_the_line_that_says_so(tiny, tmp_path):
     cluster = {"_target_": f"{__name__}.refused"}
@@ -125,6 +127,7 @@ def test_workers_that_never_start_leave_the_line_that_says_so(tiny, tmp_path):
     assert {job.status.name for job in NeverStarts.made} == {"created"}, "Dask met one that had not ended"
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("variant")
 def test_a_scheduler_that_is_not_there_is_one_line(tiny, tmp_path):
     address = ["cluster=address", "cluster.address=tcp://127.0.0.1:9", "cluster.timeout=1"]
@@ -182,8 +185,9 @@ def test_help_lists_the_keys_of_the_chosen_kind(capsys):
 
 @pytest.mark.long
 @pytest.mark.usefixtures("variant")
-def test_a_running_scheduler_makes_the_bytes_of_this_process_and_goes_on_running(tiny, files_of, tmp_path):
-    assert make(tiny(tmp_path / "here", "cluster=none")) == 0
+def test_a_running_scheduler_makes_the_bytes_of_this_process_and_goes_on_running(
+    tiny, tiny_dataset, files_of, tmp_path
+):
     with (
         LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
         Client(cluster) as client,
@@ -192,4 +196,4 @@ def test_a_running_scheduler_makes_the_bytes_of_this_process_and_goes_on_running
         address = ["cluster=address", f"cluster.address={client.scheduler_info()['address']}"]
         assert make(tiny(tmp_path / "there", *address, "recycle_after=1")) == 0
         assert list(client.scheduler_info()["workers"]) == [before], "another's workers are not restarted"
-    assert files_of(tmp_path / "here") == files_of(tmp_path / "there")
+    assert files_of(tmp_path / "there") == files_of(tiny_dataset)

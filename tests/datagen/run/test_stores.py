@@ -39,16 +39,19 @@ def bucket(s3_server) -> str:
     return s3_server.bucket()
 
 
-def test_shards_leave_for_the_store_and_are_read_there(tiny_scenes, bucket, s3_server, files_of, tmp_path):
-    local, output, url = tmp_path / "local", tmp_path / "out", f"{bucket}/set"
-    recipe = [*tiny_scenes, "cluster=none", f"output_dir={local}"]
-    assert make(check(compose_recipe("conf.datagen", Settings, recipe), Settings)) == 0
+def test_shards_leave_for_the_store_and_are_read_there(
+    tiny_scenes, tiny_dataset, bucket, s3_server, files_of, tmp_path
+):
+    local, output, url = tiny_dataset, tmp_path / "out", f"{bucket}/set"
     assert make(stored(tiny_scenes, output, url)) == 0
     assert not list(output.glob("*.tar"))
     here = files_of(local)
     assert files_of(output) == {
         name: data for name, data in here.items() if not name.endswith((".tar", ".idx"))
     }
+    for name, data in files_of(output).items():
+        assert bucket.encode() not in data, name
+        assert b"tron-test-secret" not in data, name
     there = DatasetFolder(url)
     for name, data in here.items():
         if not name.startswith("scenes/"):
@@ -174,14 +177,6 @@ def test_loader_processes_train_from_the_store(bucket, s3_server, tmp_path):
 
 def test_baselines_may_be_fitted_on_a_dataset_in_a_store(bucket):
     assert Relighting(dataset=None, fitted_on=f"{bucket}/set").fitted_on == f"{bucket}/set"
-
-
-def test_credentials_and_the_store_are_in_no_file_of_the_dataset(tiny_scenes, bucket, files_of, tmp_path):
-    output, url = tmp_path / "out", f"{bucket}/set"
-    assert make(stored(tiny_scenes, output, url)) == 0
-    for name, data in files_of(output).items():
-        assert bucket.encode() not in data, name
-        assert b"tron-test-secret" not in data, name
 
 
 def test_a_closed_port_is_one_line(tiny_scenes, tmp_path, monkeypatch, s3_server):

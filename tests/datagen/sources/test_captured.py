@@ -54,22 +54,18 @@ def settings_of(*overrides: str) -> Settings:
 
 
 @pytest.fixture(scope="module")
-def recipe(variant, tiny_captures, quick_reconstruction) -> Recipe:
+def recipe(variant, tiny_captures, pair_words) -> Recipe:
     """Settings of the tiny captures' pairs in a folder."""
 
     def recipe(output: Path, *overrides: str, captures: Path = tiny_captures) -> Settings:
-        wanted = ["source=captured", f"captures={captures}", f"output_dir={output}", "cluster=none"]
-        return settings_of(*wanted, "prior=ground_truth", *quick_reconstruction, *overrides)
+        return settings_of(*pair_words, f"captures={captures}", f"output_dir={output}", *overrides)
 
     return recipe
 
 
 @pytest.fixture(scope="module")
-def pairs(recipe: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The pairs of the three captures, one a split; nobody writes into it."""
-    output = tmp_path_factory.mktemp("pairs") / "pairs"
-    assert make(recipe(output)) == 0
-    return output
+def pairs(tiny_pairs: Path) -> Path:
+    return tiny_pairs
 
 
 def test_every_capture_is_wholly_in_one_split_and_all_of_it_is_accounted_for(pairs: Path):
@@ -106,6 +102,7 @@ def test_clips_hold_neighbouring_photos_as_display_values_and_all_guidance(pairs
                 assert (camera.width, camera.height) == (20, 16)
 
 
+@pytest.mark.long
 def test_captures_are_lit_at_a_quality_of_tron_relight(recipe: Recipe, pairs: Path, tmp_path: Path):
     wanted = recipe(tmp_path / "final", "captured.guidance_spp=final", f"captured.reconstructed={pairs}")
     assert make(wanted) == 0
@@ -164,6 +161,7 @@ def test_captures_are_drawn_from_no_seed(pairs: Path):
     assert read_source_list(pairs).splits == ()
 
 
+@pytest.mark.long
 def test_a_run_that_ends_before_its_clips_goes_on_to_the_same_bytes(
     pairs, recipe, tmp_path, monkeypatch, files_of
 ):
@@ -415,15 +413,12 @@ def test_a_photo_in_a_frame_shows_points_where_its_camera_says():
 @pytest.mark.long
 @pytest.mark.parametrize("phase", PHASES)
 def test_a_run_that_is_killed_in_any_phase_goes_on_to_the_same_bytes(
-    phase, variant, pairs, recipe, tiny_captures, quick_reconstruction, tmp_path, files_of
+    phase, pairs, recipe, pair_words, tmp_path, files_of
 ):
     output, log = tmp_path / "again", tmp_path / "log"
-    wanted = [
-        *("source=captured", f"captures={tiny_captures}", f"output_dir={output}", "cluster=none"),
-        *("prior=ground_truth", *quick_reconstruction),
-    ]
     with log.open("wb") as file:
-        command = [sys.executable, "-c", "from datagen.cli import cli; cli()", *wanted]
+        command = [sys.executable, "-c", "from datagen.cli import cli; cli()"]
+        command += [*pair_words, f"output_dir={output}"]
         process = subprocess.Popen(command, stdout=file, stderr=file, start_new_session=True)
         while PHASES[phase].encode() not in log.read_bytes():
             assert process.poll() is None, log.read_text()

@@ -128,6 +128,7 @@ def test_guidance_is_of_the_surfels_under_that_light(pairs: Path):
     np.testing.assert_allclose(two, 2 * one, rtol=2e-3, atol=1e-3)
 
 
+@pytest.mark.long
 def test_base_color_is_brought_to_the_scale_of_the_truth(
     pairs: Path, recipe: Recipe, tiny_captures: Path, tmp_path: Path
 ):
@@ -177,6 +178,7 @@ def test_another_captures_truth_is_refused_before_the_reconstruction(
         recipe(tmp_path / "x", f"captured.truth={tmp_path}", "captured.relit=null")
 
 
+@pytest.mark.long
 def test_a_run_that_ends_before_the_relit_clips_goes_on_to_the_same_bytes(
     pairs: Path, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files_of
 ):

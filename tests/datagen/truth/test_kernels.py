@@ -131,7 +131,9 @@ def test_another_light_of_a_family_is_baked_by_the_same_kernels(variant, family)
         assert baked(number) <= first
 
 
-@pytest.mark.parametrize("shared", [False, True], ids=["own paths", "shared path"])
+@pytest.mark.parametrize(
+    "shared", [pytest.param(False, marks=pytest.mark.long), True], ids=["own paths", "shared path"]
+)
 def test_a_second_scene_of_a_split_brings_no_kernel(variant, shared, tmp_path: Path):
     """Surfels, their refinement, guidance, frames, references: all of a scene.
 

@@ -148,7 +148,15 @@ def test_held_out_views_are_looked_at_for_scores_alone(painted_capture: Capture)
     assert found.light is None, "none was asked for"
 
 
-@pytest.mark.parametrize("cut", [("radiance", 13), ("materials", 2), ("materials", 5)], ids=str)
+@pytest.mark.parametrize(
+    "cut",
+    [
+        ("radiance", 13),
+        pytest.param(("materials", 2), marks=pytest.mark.long),
+        pytest.param(("materials", 5), marks=pytest.mark.long),
+    ],
+    ids=str,
+)
 def test_an_interrupted_run_is_the_uninterrupted_one_bit_by_bit(
     painted_capture, one_thread, tmp_path: Path, whole: Reconstruction, cut: tuple[str, int]
 ) -> None:
@@ -163,7 +171,11 @@ def test_an_interrupted_run_is_the_uninterrupted_one_bit_by_bit(
     assert same(found.scene, whole.scene)
 
 
-@pytest.mark.parametrize("cut", [6, 9, 13], ids=["after a size's last step", "amid a size", "whole photos"])
+@pytest.mark.parametrize(
+    "cut",
+    [pytest.param(6, marks=pytest.mark.long), 9, pytest.param(13, marks=pytest.mark.long)],
+    ids=["after a size's last step", "amid a size", "whole photos"],
+)
 def test_a_run_from_coarse_to_fine_outlives_an_interruption_bit_by_bit(
     painted_capture, one_thread, tmp_path: Path, cut: int
 ) -> None:
@@ -199,6 +211,7 @@ def test_small_photos_have_room_for_fewer_surfels(painted_capture, one_thread, w
     assert 290 < len(found.scene) <= 310 < len(whole.scene)
 
 
+@pytest.mark.long
 def test_surfels_that_close_a_room_outlive_an_interruption(
     painted_capture, one_thread, tmp_path: Path, whole: Reconstruction
 ) -> None:

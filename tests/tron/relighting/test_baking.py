@@ -78,7 +78,7 @@ def test_a_surfel_in_shadow_is_dark_and_one_in_the_open_as_bright_as_its_irradia
     np.testing.assert_allclose(np.median(shown[open_], axis=0), bright, atol=0.05)
 
 
-@pytest.mark.parametrize("proxy", ["never", "always"])
+@pytest.mark.parametrize("proxy", ["never", pytest.param("always", marks=pytest.mark.long)])
 def test_pictures_that_no_fit_saw_are_those_of_the_light(scene, sun, proxy, short_film):
     """At 33 dB; the constant alone, which viewers without harmonics show, is worse on metal."""
     relighter = Relighter(scene, Estimation(rays=64), proxy=proxy)

@@ -213,7 +213,7 @@ def test_without_meshes_every_bit_is_the_same(dense_surfels, sun):
         np.testing.assert_array_equal(frames[0][name], frames[1][name], err_msg=name)
 
 
-@pytest.mark.parametrize("kind", ["signless", "proxied"])
+@pytest.mark.parametrize("kind", ["signless", pytest.param("proxied", marks=pytest.mark.long)])
 def test_meshes_stand_in_scans_too(dense_surfels, sun, short_film, kind):
     ball = dense_surfels.sphere(0.08, 0.4, -0.6)
     floor = dense_surfels.plane(0.08, 1.2)

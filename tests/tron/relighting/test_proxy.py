@@ -104,6 +104,7 @@ def test_the_proxy_is_one_layer_of_the_scans_surface_and_materials(proxy):
     np.testing.assert_allclose(np.median(surfels.base_color[level], 0), 0.5, atol=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("short_film")
 def test_a_narrow_pit_is_closed(fog):
     """Behind gloss splats lie too deep here and there; light would see a well with black walls."""
@@ -266,6 +267,7 @@ def test_a_proxy_that_is_cut_off_says_that_it_begins_anew(fog, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("short_film")
 def test_a_file_that_cannot_be_written_stops_nothing(fog, tmp_path, caplog):
     caplog.set_level("INFO")
     (tmp_path / "file").touch()
@@ -273,6 +275,7 @@ def test_a_file_that_cannot_be_written_stops_nothing(fog, tmp_path, caplog):
     assert "not kept" in caplog.text
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("short_film")
 def test_a_changed_scan_is_filmed_anew(fog, light):
     before = Relighter(fog, Estimation(rays=8), 3).prepare()
@@ -283,6 +286,7 @@ def test_a_changed_scan_is_filmed_anew(fog, light):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("short_film")
 def test_paint_asks_for_no_film_and_no_ray(fog, light, monkeypatch):
     """And is lit as a scan that had it from the start, to the bit."""
@@ -311,6 +315,7 @@ def test_fog_that_shows_no_surface_is_lit_itself(clean, light, caplog):
     assert np.isfinite(lit.render(VIEW).lit).all()
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("short_film")
 def test_a_backdrop_is_no_part_of_the_proxy_and_faces_as_it_did(fog, dense_surfels):
     """A wall of sky behind the ball, turned to it."""

@@ -74,7 +74,9 @@ def assert_same(one: Guidance, other: Guidance) -> None:
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
 
-@pytest.mark.parametrize("two_sided", [True, False], ids=["two-sided", "one-sided"])
+@pytest.mark.parametrize(
+    "two_sided", [True, pytest.param(False, marks=pytest.mark.long)], ids=["two-sided", "one-sided"]
+)
 def test_every_part_has_the_same_settings(scene, light, two_sided):
     """Sides, bounces, reflections: as of a fresh bake by hand; a clean scene has no proxy."""
     for bounces, reflections in ((0, 0), (1, 0), (4, 0), (4, 2)):
@@ -133,6 +135,7 @@ def test_normals_without_a_sign_get_the_light_of_the_side_that_a_camera_sees(lig
         assert error < 0.12, f"relative error {error:.3f}"
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("short_film")
 def test_mirrors_show_the_light_of_the_side_that_they_see(light, scene):
     """A far side that no camera sees is seen in the mirror below it, by its own light."""
@@ -195,7 +198,15 @@ CHANGES = {
 
 
 @pytest.mark.parametrize(
-    ("change", "signed"), [*((change, True) for change in CHANGES), ("moved", False), ("parted", False)]
+    ("change", "signed"),
+    [
+        ("moved", True),
+        ("painted", True),
+        *(
+            pytest.param(*each, marks=pytest.mark.long)
+            for each in (("thinned", True), ("parted", True), ("moved", False), ("parted", False))
+        ),
+    ],
 )
 def test_a_changed_scene_is_lit_as_if_it_were_new(light, scene, change, signed):
     """A frame to the noise of a bake, none where nothing has moved; rays to the bit, drawn in one order."""
@@ -307,6 +318,7 @@ def test_frames_are_written_as_pictures_and_as_light(light, scene, tmp_path):
         frame.write(tmp_path / "none.png", "none")
 
 
+@pytest.mark.long
 def test_a_denoised_frame_is_nearer_to_many_rays_and_keeps_what_has_no_noise(light, scene):
     pytest.importorskip("pyoidn", reason="pip install 'tron-relight[oidn]'")
     lit = Relighter(scene, Estimation(rays=2)).under(light)

@@ -77,6 +77,7 @@ def test_the_last_picture_is_that_of_a_fresh_studio(open_studio, camera, edits):
     np.testing.assert_array_equal(used.image, expected.image)
 
 
+@pytest.mark.long
 def test_pictures_are_of_the_wish_of_the_moment_once_at_rest(open_studio, scene):
     """Refinement grows from 0 to 1 for each wish, and never shows a wish that is past."""
     camera, rng = Camera.around(scene, azimuth_deg=30, width=320, height=240), generator(1, "haste")
@@ -102,6 +103,7 @@ def test_pictures_are_of_the_wish_of_the_moment_once_at_rest(open_studio, scene)
     assert past == []
 
 
+@pytest.mark.long
 def test_a_wish_in_the_middle_of_a_pass_is_drawn_next(open_studio, scene, monkeypatch):
     """The band that is under way ends, and no other begins."""
     drawn: list[int] = []
@@ -199,6 +201,7 @@ def test_a_pixel_is_of_the_object_that_it_shows(open_studio, camera, scene):
         assert studio.ask(lambda stage: stage.shown_at(camera, 0, 0)).result(60) is None
 
 
+@pytest.mark.long
 def test_clicks_inside_and_outside_cut_an_object_out(open_studio, scene, variant):
     """The whole scene is one object; what is marked in the picture is what becomes the new one."""
     camera = Camera.around(scene, azimuth_deg=30, width=160, height=120)
@@ -257,6 +260,7 @@ def differs(image: np.ndarray, other: np.ndarray) -> float:
     return float(np.abs(image.astype(int) - other).mean())
 
 
+@pytest.mark.long
 def test_left_of_the_divider_is_what_was_chosen(open_studio, camera):
     """Against pictures of that alone; the seeds of noise are other ones."""
     column, red = 24, {"edits": EDITS[3:]}
@@ -322,6 +326,7 @@ def test_a_picture_at_rest_ends_with_its_finish(open_studio, camera):
     assert np.ptp(both.image[:, :31]) == np.ptp(both.image[:, 33:]) == 0
 
 
+@pytest.mark.long
 def test_a_finish_is_given_up_once_it_is_out_of_date(open_studio, camera):
     finish = Finish()
     finish.slow = True
@@ -339,6 +344,7 @@ def test_a_finish_is_given_up_once_it_is_out_of_date(open_studio, camera):
         assert np.ptp(shown.final(studio, camera).image) == 0
 
 
+@pytest.mark.long
 def test_a_finish_that_fails_leaves_the_passes_as_they_are(open_studio, camera, caplog):
     def broken(frame, exposure, watch):
         raise OSError("no such library")
@@ -356,6 +362,7 @@ def test_a_finish_that_fails_leaves_the_passes_as_they_are(open_studio, camera, 
     assert shown.notices == []
 
 
+@pytest.mark.long
 def test_close_ends_the_thread_in_the_middle_of_work(open_studio, scene):
     with open_studio() as (studio, shown):
         studio.look(0, Camera.around(scene, width=1024, height=1024))

@@ -270,6 +270,7 @@ def test_a_broken_model_is_a_notice_and_the_server_goes_on(window):
     assert len(window.objects.numbers) == 4
 
 
+@pytest.mark.long
 def test_clicks_and_shift_clicks_cut_an_object_out(window, scene):
     """And the tools for objects have it: its list names it, and it is chosen."""
     camera = Camera.around(scene.upright(), azimuth_deg=30, distance=2, width=192, height=160)

@@ -246,6 +246,7 @@ def test_an_interrupted_run_goes_on_where_it_was_saved(
     assert report["test"]["psnr"] > 18
 
 
+@pytest.mark.long
 def test_signals_keep_the_step_in_hand_and_one_thread_repeats_bit_by_bit(
     variant: str, reconstruct, steps, tmp_path: Path, monkeypatch, capfd, caplog
 ):
@@ -315,6 +316,7 @@ def test_other_settings_are_refused_and_change_nothing_unless_told_to(
     assert json.loads((out / "metrics.json").read_text())["light"] is None
 
 
+@pytest.mark.long
 def test_photos_replaced_under_their_names_are_another_capture(
     reconstruct, steps, capture_path, copied: Path, tmp_path: Path, capsys
 ):
@@ -336,6 +338,7 @@ def test_photos_replaced_under_their_names_are_another_capture(
     )
 
 
+@pytest.mark.long
 def test_without_priors_for_light_there_is_no_light_and_it_is_said(
     reconstruct, capture_path, tmp_path: Path, caplog
 ):
@@ -363,6 +366,7 @@ def test_the_default_prior_needs_nothing_but_photos(reconstruct, tmp_path: Path)
     assert light.image.min() >= 0 < light.image.max()
 
 
+@pytest.mark.long
 def test_without_held_out_views_the_others_are_shown(reconstruct, capture_path, tmp_path: Path):
     from dataclasses import replace
 

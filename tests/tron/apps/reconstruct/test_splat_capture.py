@@ -202,6 +202,7 @@ def few_views(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"tron.relighting.proxy.{name}", value)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("few_views", "variant")
 def test_the_command_keeps_every_surfel_and_finds_the_light(plain, tmp_path, caplog):
     """From the folder's own cameras.json, whose views are filmed again."""

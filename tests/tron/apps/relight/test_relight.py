@@ -88,6 +88,7 @@ def test_the_papers_fidelity_gives_other_frames(relight, scene_path, light_path,
     assert steps["paper"] > 1.5 * steps["ours"]
 
 
+@pytest.mark.long
 def test_rotating_light_and_camera_together_changes_nothing_else(
     relight, orbit_of_four, scene_path, light_path, tmp_path
 ):
@@ -148,22 +149,7 @@ def test_other_settings_in_the_same_folder_are_refused(relight, scene_path, ligh
     assert relight(*base, "rotation=45", "overwrite=true") == 0
 
 
-def test_frames_of_an_older_release_keep_the_defaults_of_settings_that_it_lacked(
-    relight, scene_path, light_path, tmp_path, capsys
-):
-    out = tmp_path / "out"
-    base = [f"scene={scene_path}", f"environment={light_path}", f"output_dir={out}", "frames=1"]
-    assert relight(*base) == 0
-    record = out / "frames" / "settings.json"
-    whole = json.loads(record.read_text())
-    record.write_text(json.dumps({key: whole[key] for key in whole if key not in ("estimator", "denoise")}))
-    assert relight(*base, "estimator=plain") == 2
-    assert "frames made with estimator=ratio, not plain" in capsys.readouterr().err
-    assert relight(*base) == 0
-    assert json.loads((out / "relight.json").read_text())["frames_rendered"] == 0
-    assert json.loads(record.read_text()) == whole
-
-
+@pytest.mark.long
 def test_a_plain_3dgs_file_is_relit_with_a_warning(
     relight, scene_path, light_path, tmp_path, caplog, monkeypatch
 ):
@@ -336,6 +322,7 @@ def test_cameras_of_a_report_repeat_its_frames(relight, scene_path, light_path, 
         assert np.abs(a - b).mean() < 1e-3
 
 
+@pytest.mark.long
 def test_a_scene_lying_on_its_side_is_stood_up(relight, ball_on_floor, light_path, tmp_path):
     upright = ball_on_floor()
     lying = upright.rotated(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))  # up is now -y
@@ -399,6 +386,7 @@ def test_mistakes_are_one_line_and_leave_nothing(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_the_captures_own_light_stands_as_the_scene_does(
     relight, ball_on_floor, light_path, tmp_path, capsys
 ):

@@ -88,6 +88,7 @@ def test_a_painted_ball_comes_back_from_its_photos(truth: Capture, found: Stereo
     assert found.confident > 0.3
 
 
+@pytest.mark.long
 def test_depths_that_nobody_confirms_count_a_little_where_a_mask_tells_of_a_surface(truth: Capture) -> None:
     """Of twelve planes, some depths are confirmed by no photo: they are left out, or fill the surface."""
     few = SETTINGS.model_copy(update={"planes": 12, "smooth_large": 0.0, "confident": 0.8})

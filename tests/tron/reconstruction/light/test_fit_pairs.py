@@ -190,6 +190,7 @@ def test_shadows_tell_where_the_sun_is(scene, transport) -> None:
     assert error_over_normals(found, environment) < 0.06
 
 
+@pytest.mark.long
 def test_a_sun_is_told_from_a_soft_light_and_metals_do_not_count(scene, transport) -> None:
     nothing = PhotographedSky(np.zeros((6 * 64, 3)), np.zeros(6 * 64))
     # This sun explains 9 to 23 % of the differences; none, up to 3.1 %, where 3.6 % are asked for.
