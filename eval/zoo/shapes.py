@@ -20,6 +20,7 @@ from tron.cameras import Camera
 from tron.gaussians.edit import subset
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.models.parts import Part
+from tron.models.sides import two_sided
 from tron.models.surfels import surfels_of_model
 from tron.seeds import generator, integer
 
@@ -49,7 +50,6 @@ class Shape:
         camera: its view.
         jitter: deviation of its surfels along their normals, in spacings.
         fog: whether its surfels are those of a scan.
-        single: whether its polygons are single; surfels then stand on either side of them.
         seed: root of its surfels' random numbers.
     """
 
@@ -59,7 +59,6 @@ class Shape:
     camera: Camera
     jitter: float
     fog: bool
-    single: bool
     seed: int
 
     def of(self, material: Material) -> list[Part]:
@@ -69,8 +68,7 @@ class Shape:
     def surfels(self, material: Material) -> GaussianScene:
         """Surfels on it; of another material only their materials differ."""
         parts = self.of(material)
-        sides = [*parts, *map(_flipped, parts)] if self.single else parts
-        scene = surfels_of_model(sides, SPACING, seed=self.seed)
+        scene = surfels_of_model(two_sided(parts), SPACING, seed=self.seed)
         if self.fog:
             return _fog(scene, generator(self.seed, "fog"))
         off = generator(self.seed, "jitter").normal(0, self.jitter * SPACING, (len(scene), 1))
@@ -109,7 +107,7 @@ def draw_shape(kind: str, number: int, seed: int) -> Shape:
     eye = AWAY * np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
     camera = Camera.look_at(eye, (0, 0, 0), fov_deg=FOV_DEG, width=SIDE, height=SIDE)
     root = integer(seed, "zoo", "surfels", kind, number)
-    return Shape(kind, number, fitted(drawn.parts), camera, drawn.jitter, drawn.fog, drawn.single, root)
+    return Shape(kind, number, fitted(drawn.parts), camera, drawn.jitter, drawn.fog, root)
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,6 @@ class _Drawn:
     elevation_deg: tuple[float, float]
     jitter: float = 0.0
     fog: bool = False
-    single: bool = False
 
 
 def of_material(part: Part, material: Material) -> Part:
@@ -206,7 +203,7 @@ def _leaf(rng: np.random.Generator, number: int) -> _Drawn:
     points = np.stack([np.sin(angle) / bend, across, np.cos(angle) / bend + fold * across**2], -1)
     part = _sheet_of(points if number % 2 == 0 else points[::-1])
     turn = trimesh.transformations.euler_matrix(rng.uniform(-0.5, 0.5), 0, rng.uniform(0, 2 * np.pi))
-    return _Drawn([part.moved(turn)], 0.0, (30, 70), rng.uniform(0, 0.25), single=True)
+    return _Drawn([part.moved(turn)], 0.0, (30, 70), rng.uniform(0, 0.25))
 
 
 def _wire(rng: np.random.Generator, _: int) -> _Drawn:
@@ -226,7 +223,7 @@ def _room(rng: np.random.Generator, number: int) -> _Drawn:
     """Five single polygons, seen from within; each other one has its normals outward."""
     walls = _cuboid(np.zeros(3), rng.uniform(0.6, 1, 3))[1:]
     walls = [_flipped(wall) for wall in walls] if number % 2 else walls
-    return _Drawn(walls, rng.uniform(-25, 25), (-5, 30), single=True)
+    return _Drawn(walls, rng.uniform(-25, 25), (-5, 30))
 
 
 def _crate(rng: np.random.Generator, number: int) -> _Drawn:
