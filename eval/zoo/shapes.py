@@ -30,9 +30,10 @@ SPACING = 0.034
 """Of surfels: a pixel of what faces the camera."""
 _SCALE = np.tan(np.arcsin(1 / AWAY)) / FILLED
 FOV_DEG = float(2 * np.degrees(np.arctan(_SCALE)))
-LAYERS, DEEP, WIDER, TILTED, OPACITY = 4, 0.8, 1.6, 0.35, (0.3, 0.9)
-"""A scan-like fog: splats a surfel, their deviation along the normal in spacings, their size over a surfel's,
-the deviation of their normals in radians, and their opacities."""
+LAYERS, DEEP, SUNK, WIDER, TILTED, OPACITY = 4, 0.8, 0.65, 1.6, 0.35, (0.3, 0.9)
+"""A scan-like fog: splats a surfel, their deviation along the normal and how far their middle lies within, in
+spacings (cameras see half of the fog's depth on the shape, as training on photos leaves it; around the shape it
+was a ball 2 % larger), their size over a surfel's, the deviation of their normals in radians, their opacities."""
 
 INDIVIDUALS = 2
 """Of a kind but of balls, whose only proportion is one; they share the kind's materials."""
@@ -321,7 +322,7 @@ def _fog(scene: GaussianScene, rng: np.random.Generator) -> GaussianScene:
     """Splats around surfels, as training leaves them: thick, half transparent, of no sign."""
     many = subset(scene, np.tile(np.arange(len(scene)), LAYERS))
     normals = many.normals()
-    means = many.means + normals * rng.normal(0, DEEP * SPACING, (len(many), 1))
+    means = many.means + normals * rng.normal(-SUNK * SPACING, DEEP * SPACING, (len(many), 1))
     tilted = normals + rng.normal(0, TILTED, normals.shape)
     tilted *= np.where(rng.random((len(many), 1)) < 0.5, -1, 1) / np.linalg.norm(
         tilted, axis=1, keepdims=True
