@@ -32,8 +32,8 @@ _SCALE = np.tan(np.arcsin(1 / AWAY)) / FILLED
 FOV_DEG = float(2 * np.degrees(np.arctan(_SCALE)))
 LAYERS, DEEP, SUNK, WIDER, TILTED, OPACITY = 4, 0.8, 0.65, 1.6, 0.35, (0.3, 0.9)
 """A scan-like fog: splats a surfel, their deviation along the normal and how far their middle lies within, in
-spacings (cameras see half of the fog's depth on the shape, as training on photos leaves it; around the shape it
-was a ball 2 % larger), their size over a surfel's, the deviation of their normals in radians, their opacities."""
+spacings, their size over a surfel's, the deviation of their normals in radians, and their opacities. Sunk so,
+cameras see half of its depth on the shape, as training leaves it; not sunk it was a ball 2 % larger."""
 
 INDIVIDUALS = 2
 """Of a kind but of balls, whose only proportion is one; they share the kind's materials."""
