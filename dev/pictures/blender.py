@@ -21,7 +21,8 @@ from tron.color import to_display  # noqa: E402
 from tron.estimation import FINEST  # noqa: E402
 from tron.io.images import write_image  # noqa: E402
 from tron.models.load import load_model  # noqa: E402
-from tron.models.surfels import areas, surfels_of_model  # noqa: E402
+from tron.models.sides import spacing_of, two_sided  # noqa: E402
+from tron.models.surfels import surfels_of_model  # noqa: E402
 from tron.relighting import EnvironmentMap, Relighter  # noqa: E402
 
 SIDE, PATHS, SURFELS = 384, 144, 600_000
@@ -35,8 +36,8 @@ def main(data: Path, python: Path, output: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         (pair,) = both(python, file, {name: light}, Path(folder), PATHS, 0, 2, SIDE)
     parts = load_model(file, fitted=False)
-    spacing = float(np.sqrt(sum(areas(part).sum() for part in parts) / SURFELS))
-    relighter = Relighter(surfels_of_model(parts, spacing), FINEST, proxy="never")
+    sides = two_sided(parts)
+    relighter = Relighter(surfels_of_model(sides, spacing_of(sides, SURFELS)), FINEST, proxy="never")
     lit = relighter.under(light).render(before(parts, SIDE)).lit
     cycles = np.where(pair.filled[..., None], pair.cycles, lit)  # it has no world behind it
     rows, columns = np.nonzero(pair.filled)

@@ -31,7 +31,8 @@ from tron.metrics import psnr
 from tron.models.load import load_model
 from tron.models.parts import Part
 from tron.models.shapes import mitsuba_mesh, mitsuba_texture, textured
-from tron.models.surfels import areas, surfels_of_model
+from tron.models.sides import spacing_of, two_sided
+from tron.models.surfels import surfels_of_model
 from tron.relighting import Guidance, Illumination, Relighter
 from tron.report.page import Picture, Pictures
 from tron.seeds import integer
@@ -145,8 +146,8 @@ def _slab() -> Part:
 
 def _surfels(parts: Sequence[Part], name: str, seed: int) -> GaussianScene:
     count = SURFELS if name == TABLE else SURFELS / len(MODELS)
-    spacing = float(np.sqrt(sum(areas(part).sum() for part in parts) / count))
-    return surfels_of_model(parts, spacing, seed=integer(seed, "meshes", name))
+    sides = two_sided(parts)
+    return surfels_of_model(sides, spacing_of(sides, count), seed=integer(seed, "meshes", name))
 
 
 @dataclass(frozen=True)

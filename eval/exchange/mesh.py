@@ -30,7 +30,8 @@ from tron.gaussians.scene import GaussianScene
 from tron.metrics import angular_error_deg, capped_psnr
 from tron.models.load import load_model
 from tron.models.shapes import Shape, materials_at, surface_points, textured
-from tron.models.surfels import areas, surfels_of_model
+from tron.models.sides import spacing_of, two_sided
+from tron.models.surfels import surfels_of_model
 from tron.relighting import Relighter
 from tron.report.page import Picture, Pictures
 from tron.runtime import lanes
@@ -139,8 +140,9 @@ def measure_mesh(
             outcome.lack(metric, why)
         return
     parts = load_model(real_data / MODEL)
-    spacing = float(np.sqrt(sum(areas(part).sum() for part in parts) / sizes.surfels))
-    scene = surfels_of_model(parts, spacing, seed=integer(seed, "exchange", "mesh"))
+    sides = two_sided(parts)
+    spacing = spacing_of(sides, sizes.surfels)
+    scene = surfels_of_model(sides, spacing, seed=integer(seed, "exchange", "mesh"))
     folder = outcome.folder.absolute() / "mesh"
     folder.mkdir(parents=True, exist_ok=True)
     surfels, model = folder / "surfels.ply", folder / "mesh.glb"

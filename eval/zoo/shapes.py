@@ -20,6 +20,7 @@ from tron.cameras import Camera
 from tron.gaussians.edit import subset
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.models.parts import Part
+from tron.models.sides import two_sided
 from tron.models.surfels import surfels_of_model
 from tron.seeds import generator, integer
 
@@ -29,9 +30,10 @@ SPACING = 0.034
 """Of surfels: a pixel of what faces the camera."""
 _SCALE = np.tan(np.arcsin(1 / AWAY)) / FILLED
 FOV_DEG = float(2 * np.degrees(np.arctan(_SCALE)))
-LAYERS, DEEP, WIDER, TILTED, OPACITY = 4, 0.8, 1.6, 0.35, (0.3, 0.9)
-"""A scan-like fog: splats a surfel, their deviation along the normal in spacings, their size over a surfel's,
-the deviation of their normals in radians, and their opacities."""
+LAYERS, DEEP, SUNK, WIDER, TILTED, OPACITY = 4, 0.8, 0.65, 1.6, 0.35, (0.3, 0.9)
+"""A scan-like fog: splats a surfel, their deviation along the normal and how far their middle lies within, in
+spacings, their size over a surfel's, the deviation of their normals in radians, and their opacities. Sunk so,
+cameras see half of its depth on the shape, as training leaves it; not sunk it was a ball 2 % larger."""
 
 INDIVIDUALS = 2
 """Of a kind but of balls, whose only proportion is one; they share the kind's materials."""
@@ -49,7 +51,6 @@ class Shape:
         camera: its view.
         jitter: deviation of its surfels along their normals, in spacings.
         fog: whether its surfels are those of a scan.
-        single: whether its polygons are single; surfels then stand on either side of them.
         seed: root of its surfels' random numbers.
     """
 
@@ -59,7 +60,6 @@ class Shape:
     camera: Camera
     jitter: float
     fog: bool
-    single: bool
     seed: int
 
     def of(self, material: Material) -> list[Part]:
@@ -69,8 +69,7 @@ class Shape:
     def surfels(self, material: Material) -> GaussianScene:
         """Surfels on it; of another material only their materials differ."""
         parts = self.of(material)
-        sides = [*parts, *map(_flipped, parts)] if self.single else parts
-        scene = surfels_of_model(sides, SPACING, seed=self.seed)
+        scene = surfels_of_model(two_sided(parts), SPACING, seed=self.seed)
         if self.fog:
             return _fog(scene, generator(self.seed, "fog"))
         off = generator(self.seed, "jitter").normal(0, self.jitter * SPACING, (len(scene), 1))
@@ -109,7 +108,7 @@ def draw_shape(kind: str, number: int, seed: int) -> Shape:
     eye = AWAY * np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
     camera = Camera.look_at(eye, (0, 0, 0), fov_deg=FOV_DEG, width=SIDE, height=SIDE)
     root = integer(seed, "zoo", "surfels", kind, number)
-    return Shape(kind, number, fitted(drawn.parts), camera, drawn.jitter, drawn.fog, drawn.single, root)
+    return Shape(kind, number, fitted(drawn.parts), camera, drawn.jitter, drawn.fog, root)
 
 
 @dataclass(frozen=True)
@@ -121,7 +120,6 @@ class _Drawn:
     elevation_deg: tuple[float, float]
     jitter: float = 0.0
     fog: bool = False
-    single: bool = False
 
 
 def of_material(part: Part, material: Material) -> Part:
@@ -206,7 +204,7 @@ def _leaf(rng: np.random.Generator, number: int) -> _Drawn:
     points = np.stack([np.sin(angle) / bend, across, np.cos(angle) / bend + fold * across**2], -1)
     part = _sheet_of(points if number % 2 == 0 else points[::-1])
     turn = trimesh.transformations.euler_matrix(rng.uniform(-0.5, 0.5), 0, rng.uniform(0, 2 * np.pi))
-    return _Drawn([part.moved(turn)], 0.0, (30, 70), rng.uniform(0, 0.25), single=True)
+    return _Drawn([part.moved(turn)], 0.0, (30, 70), rng.uniform(0, 0.25))
 
 
 def _wire(rng: np.random.Generator, _: int) -> _Drawn:
@@ -226,7 +224,7 @@ def _room(rng: np.random.Generator, number: int) -> _Drawn:
     """Five single polygons, seen from within; each other one has its normals outward."""
     walls = _cuboid(np.zeros(3), rng.uniform(0.6, 1, 3))[1:]
     walls = [_flipped(wall) for wall in walls] if number % 2 else walls
-    return _Drawn(walls, rng.uniform(-25, 25), (-5, 30), single=True)
+    return _Drawn(walls, rng.uniform(-25, 25), (-5, 30))
 
 
 def _crate(rng: np.random.Generator, number: int) -> _Drawn:
@@ -324,7 +322,7 @@ def _fog(scene: GaussianScene, rng: np.random.Generator) -> GaussianScene:
     """Splats around surfels, as training leaves them: thick, half transparent, of no sign."""
     many = subset(scene, np.tile(np.arange(len(scene)), LAYERS))
     normals = many.normals()
-    means = many.means + normals * rng.normal(0, DEEP * SPACING, (len(many), 1))
+    means = many.means + normals * rng.normal(-SUNK * SPACING, DEEP * SPACING, (len(many), 1))
     tilted = normals + rng.normal(0, TILTED, normals.shape)
     tilted *= np.where(rng.random((len(many), 1)) < 0.5, -1, 1) / np.linalg.norm(
         tilted, axis=1, keepdims=True

@@ -18,7 +18,7 @@ CODE = {
     "tron/integrators": (1_000, 5),
     "tron/io": (3_800, 22),
     "tron/meshing": (350, 3),
-    "tron/models": (2_000, 12),
+    "tron/models": (2_150, 13),
     "tron/neural": (2_400, 23),
     "tron/reconstruction": (6_800, 35),
     "tron/relighting": (1_300, 6),

@@ -195,9 +195,11 @@ class Insert(Part):
                 )
             return GaussianScene.load(self.file)
         parts = read_model(self.file)
-        from tron.models.surfels import MOST, areas, surfels_of_model  # after it has said what is missing
+        from tron.models.sides import spacing_of, two_sided  # after it has said what is missing
+        from tron.models.surfels import MOST, surfels_of_model
 
-        of_many = float(np.sqrt(sum(areas(part).sum() for part in parts) / SURFELS))
+        parts = two_sided(parts)
+        of_many = spacing_of(parts, SURFELS)
         spacing = max(min(scene.spacing / self.scale, of_many), of_many * (SURFELS / MOST) ** 0.5 * 1.01)
         spacing = spacing if self.spacing is None else self.spacing / self.scale
         made = surfels_of_model(parts, spacing, kernel_degree=scene.kernel_degree)

@@ -2,7 +2,8 @@
 
 No camera and no fit. Points are drawn evenly by area, many a surfel, and gathered in cells, so that a surfel
 has the mean of the texture that it covers. Detail of normal maps is finer than surfels and left out. Surfels
-within, which nobody sees, are made too.
+within, which nobody sees, are made too. They face as the triangles' normals do; backs that are seen are made
+triangles of their own by :mod:`tron.models.sides`.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def surfels_of_model(
     """Surfels of a model, z up.
 
     Args:
-        parts: of :func:`tron.models.load.load_model`.
+        parts: of :func:`tron.models.load.load_model`, or of :func:`tron.models.sides.two_sided`.
         spacing: between neighbours, in the model's units.
         kernel_degree: 2 or 4.
         object_id: of all of them.
@@ -64,14 +65,20 @@ def areas(part: Part) -> np.ndarray:
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
-def _points(part: Part, sizes: np.ndarray, number: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Points of a part, even by area (one random number stratifies the triangles), with its materials."""
+def spread(sizes: np.ndarray, number: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Points on triangles of areas ``sizes`` (F,), even by area: (N,) triangles, (N, 3) shares of corners."""
     ends = np.cumsum(sizes)
     place = (np.arange(number) + rng.random(number)) / number * ends[-1]
-    face = part.faces[np.minimum(np.searchsorted(ends, place, side="right"), len(sizes) - 1)]
+    face = np.minimum(np.searchsorted(ends, place, side="right"), len(sizes) - 1)
     u, v = rng.random((2, number))
     root = np.sqrt(u)
-    weights = np.stack([1 - root, root * (1 - v), root * v], axis=1)  # Turk 1990
+    return face, np.stack([1 - root, root * (1 - v), root * v], axis=1)  # Turk 1990
+
+
+def _points(part: Part, sizes: np.ndarray, number: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Points of a part, even by area, with its materials."""
+    chosen, weights = spread(sizes, number, rng)
+    face = part.faces[chosen]
 
     def mean(values: np.ndarray) -> np.ndarray:
         return np.einsum("nk,nkc->nc", weights, values[face])

@@ -82,14 +82,18 @@ class _Model:
 
     @classmethod
     def of(cls, parts: Sequence[Part], name: str, surfels: int, seed: int) -> _Model:
-        from tron.models.surfels import areas, surfels_of_model  # trimesh: for meshes alone
+        from tron.models.sides import spacing_of, two_sided  # trimesh: for meshes alone
+        from tron.models.surfels import surfels_of_model
 
         if not sum(len(part.faces) for part in parts):
             raise TronError("a mesh has no triangles", mend="leave it out")
         shapes = tuple(textured(part, f"{name}-{number}") for number, part in enumerate(parts))
-        spacing = float(np.sqrt(sum(areas(part).sum() for part in parts) / surfels))
-        made = surfels_of_model(parts, spacing, seed=seed)
+        sides = two_sided(parts)
+        made = surfels_of_model(sides, spacing_of(sides, surfels), seed=seed)
         made = replace(made, means=_onto(shapes, made))
+        if len(sides) > len(parts):
+            backs = [textured(part, f"back{n}") for n, part in enumerate(sides[len(parts) :])]
+            made = replace(made, means=_onto(backs, made))
         middles = np.concatenate([part.vertices[part.faces].mean(axis=1) for part in parts])
         nearest = KDTree(made.means).query(middles)[1].astype(np.uint32)
         return cls(tuple(parts), shapes, made, nearest)

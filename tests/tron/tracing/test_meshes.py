@@ -30,7 +30,7 @@ def quad(height: float, half: float = 1.0, tilt: float = 0.0, down: bool = False
 
 @pytest.fixture(autouse=True)
 def few_stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(meshes_module, "STAND_INS", 600)
+    monkeypatch.setattr(meshes_module, "STAND_INS", 1200)
 
 
 @pytest.fixture
@@ -99,14 +99,26 @@ def test_beside_a_mesh_all_is_as_without_it(card, camera):
 def test_a_mesh_shows_values_of_its_own_surfels(card, camera):
     meshes = Meshes([[quad(-5, half=3)], [quad(0.5)]])
     x = mi.Float(np.ascontiguousarray(meshes.stand_ins.means[:, 0]))
-    # Its surfels are met from above alone: seen from below, each triangle has what its nearest one has.
     found = view(card(0.9), meshes, camera, [mi.Float(7), x])
     place = camera.rays()[..., 0] / -camera.rays()[..., 2] * 1.5
     np.testing.assert_allclose(found["values"][..., 0], place, atol=0.08)
     below = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, 1, 0), fov_deg=30, width=11, height=9)
     seen = view(card(0.9), meshes, below, [mi.Float(7), x])["values"][..., 0]
+    np.testing.assert_allclose(seen, below.rays()[..., 0] / below.rays()[..., 2] * 2.5, atol=0.08)
+
+
+def test_inside_a_closed_mesh_triangles_show_their_nearest_surfel(card):
+    trimesh = pytest.importorskip("trimesh")
+    box = trimesh.creation.box((2, 2, 2))
+    faces = np.arange(36).reshape(-1, 3)
+    part = Part(np.array(box.triangles.reshape(-1, 3)), np.repeat(box.face_normals, 3, axis=0), faces, None,
+                np.ones(3, np.float32), 0.5, 0.0, None)  # fmt: skip
+    meshes = Meshes([[part]])
+    x = mi.Float(np.ascontiguousarray(meshes.stand_ins.means[:, 0]))
+    within = Camera.look_at((0, 0, -0.9), (0, 0, 0), up=(0, 1, 0), fov_deg=30, width=11, height=9)
+    seen = view(card(0.9), meshes, within, [mi.Float(7), x])["values"][..., 0]
     assert len(np.unique(seen)) == 2
-    np.testing.assert_allclose(np.abs(seen), 1 / 3, atol=0.08)
+    np.testing.assert_allclose(np.abs(seen), 1 / 3, atol=0.15)
 
 
 @pytest.mark.parametrize("down", [False, True])
