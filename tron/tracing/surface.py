@@ -22,7 +22,7 @@ from tron.tracing.kernel import FEATURE_PACKETS, GEOMETRY_PACKETS, SurfelRecords
 
 BEYOND = 2.0
 """Times its own reach that a disk's plane is followed: a projection is wider by its pixel's filter."""
-EVEN, FACES = 0.985, 0.6
+EVEN, FACES = 0.98, 0.6
 """Two faces are seen where normals of either are of one mind, as their mean's length tells, and the cosine
 between them is less: not on a wire four pixels thick, nor in a scan's fog."""
 GRAZING = 0.05

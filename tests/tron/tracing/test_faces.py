@@ -93,7 +93,7 @@ def test_a_pixel_of_a_crease_has_the_normal_of_the_face_that_its_ray_meets(sign:
     [
         ({"radius": 0.5}, 0.0),
         ({"radius": 0.08}, 0.0),  # two pixels
-        ({"radius": 0.5, "layers": 4, "tilt": FOG, "depth": 0.8}, 0.01),
+        ({"radius": 0.5, "layers": 4, "tilt": FOG, "depth": 0.8}, 0.02),
     ],
     ids=["ball", "bead", "fog"],
 )
