@@ -7,7 +7,7 @@ not zero. The median is where the ray meets the plane of the surfel's own disk, 
 projection, which lies at one depth: light falls where the surface is.
 
 Where a ray meets two faces of an edge, a mean of their normals mirrors lamps that neither sees. The normal is
-one face's there, unless it is differentiated: :func:`_of_one_face`.
+one face's there, and on a ridge so is the point, unless they are differentiated: :func:`_of_one_face`.
 """
 
 from __future__ import annotations
@@ -80,11 +80,15 @@ def surface(sums: Composite, records: SurfelRecords, origin: mi.Point3f, directi
     inverse = dr.select(hit, dr.rcp(dr.select(hit, opacity, 1)), 0)
     channels = sums.channels
     normal_sum = mi.Normal3f(*channels[0:3])
-    normal = normal_sum if dr.grad_enabled(normal_sum) else _of_one_face(sums, records, origin, direction)
+    normal, ridge = normal_sum, mi.UInt32(NO_SURFEL)
+    if not dr.grad_enabled(normal_sum):
+        normal, ridge = _of_one_face(sums, records, origin, direction)
     squared = dr.squared_norm(normal)
     oriented = squared > 0
     depth = depth_along(records, sums.median, origin, direction)
     distance = dr.select(depth > 0, depth, sums.mean_depth * inverse)
+    # Rays that left a surfel's end in the air by the other face's normal would meet its neighbours.
+    distance = dr.select(ridge != NO_SURFEL, depth_along(records, ridge, origin, direction), distance)
     return Surface(
         position=origin + distance * direction,
         depth=depth,
@@ -103,8 +107,10 @@ def surface(sums: Composite, records: SurfelRecords, origin: mi.Point3f, directi
 
 def _of_one_face(
     sums: Composite, records: SurfelRecords, origin: mi.Point3f, direction: mi.Vector3f
-) -> mi.Normal3f:
+) -> tuple[mi.Normal3f, mi.UInt32]:
     """Sum of ``w n`` over the face that a ray meets, where it meets two; else over all hits. Detached.
+
+    Of ridges, also the surfel whose plane it meets; ``NO_SURFEL`` elsewhere.
 
     Of two faces it is the one that hides more. But if each lies behind the other's plane, their edge is a
     ridge, and surfels reach past it into the air: a ray enters what is convex by the later of the planes.
@@ -127,7 +133,8 @@ def _of_one_face(
     )  # of the first face over the plane of the other, where the ray meets it
     ridge = (dr.dot(front, apart) < 0) & (dr.dot(rest, apart) > 0) & (dr.abs(height) < dr.maximum(*radii))
     first = dr.select(ridge, height < 0, weight >= others)
-    return dr.select(two, dr.select(first, front, rest), every)
+    entered = dr.select(two & ridge, dr.select(first, sums.first, sums.other), mi.UInt32(NO_SURFEL))
+    return dr.select(two, dr.select(first, front, rest), every), entered
 
 
 def depth_along(

@@ -86,6 +86,9 @@ def test_a_pixel_of_a_crease_has_the_normal_of_the_face_that_its_ray_meets(sign:
     assert inside.mean() > 0.3
     assert (off(mean_normals(seen), truth)[inside] > 5).mean() > (0.03 if sign > 0 else 0.005)
     assert (off(seen["normal"], truth)[inside] > 5).mean() < 0.002
+    if sign > 0:  # light is gathered where the ray enters, not on surfels that reach past the ridge
+        away = np.linalg.norm(seen["position"] - eye - along * camera.rays(), axis=-1)
+        assert (away[inside] > 0.1 * SPACING).mean() < 0.002
 
 
 @pytest.mark.parametrize(
