@@ -343,6 +343,22 @@ def test_a_ball_under_even_light_is_right_and_holes_are_not_its_lights(
     assert crossed.mean("final") == pytest.approx(0.5, abs=0.05)
 
 
+@pytest.mark.usefixtures("variant")
+def test_an_edge_mirrors_no_lamp_that_neither_of_its_faces_does(monkeypatch: pytest.MonkeyPatch):
+    """The lamp stands where a mean of both faces' normals mirrors it; path tracing does not see it."""
+    monkeypatch.setattr(zoo_cells, "PATHS", 64)
+    shape = draw_shape("box", 0, 3)
+    eye = np.asarray(shape.camera.position) / np.linalg.norm(shape.camera.position)
+    faces = sorted({tuple(np.round(part.normals[0])) for part in shape.parts}, key=lambda n: -(eye @ n))
+    mixed = np.add(*faces[:2]) / np.sqrt(2)
+    x, y, z = 2 * (mixed @ eye) * mixed - eye
+    lamp = disc(np.degrees(np.arcsin(z)), np.degrees(np.arctan2(y, x)), 8.0)[..., None] * np.full(3, 100.0)
+    light = Light("lamp", EnvironmentMap(lamp + 0.3))
+    (found,) = measured(shape, [Material("grey", (0.5, 0.5, 0.5), 0.1, 1.0)], [light], 3, False, {})
+    for quality in QUALITIES:
+        assert found.mean(quality) == pytest.approx(1, abs=0.03)
+
+
 def run(*arguments: str) -> int:
     with pytest.raises(SystemExit) as end:
         cli(["benchmark=zoo", *arguments])

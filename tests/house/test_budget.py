@@ -25,7 +25,7 @@ CODE = {
     "tron/report": (650, 5),
     "tron/shading": (4_850, 24),
     "tron/shards": (1_980, 10),
-    "tron/tracing": (4_700, 23),
+    "tron/tracing": (4_800, 23),
     "tron/view": (2_500, 12),
     "conf": (50, 12),
     "datagen": (20_050, 129),

@@ -21,6 +21,8 @@ STOP_TRANSMITTANCE = 1e-3
 MEDIAN_TRANSMITTANCE = 0.5
 BEGIN_TRANSMITTANCE = 0.9
 """Transmittance below which a surface has begun: a scan's fog before it lifts it off its median."""
+APART = 0.7
+"""Mean cosine to the normals of a ray's first hits below which a hit is of another face."""
 NO_SURFEL = 0xFFFFFFFF
 MOST_HITS = ceil(log(STOP_TRANSMITTANCE) / log(1 - MIN_ALPHA)) + 1
 """Most hits that any ray composites, one of them for rounding: 1764 of the faintest stop it."""
@@ -95,6 +97,8 @@ class Composite:
     Attributes:
         channels: 11 floats: normal, roughness, base color, metallic, rgb of SH radiance; then the records'
             values.
+        front: 4 floats: sum of ``w n`` of the hits that face as the first do (:data:`APART`), and of ``w``.
+        first, other: the first surfel, and the first that faces otherwise; ``NO_SURFEL`` if there is none.
         mean_depth: sum of ``w t``.
         transmittance: T after the last composited hit.
         median: the surfel after which T < 0.5 first; ``NO_SURFEL`` where T stays above.
@@ -103,18 +107,21 @@ class Composite:
     """
 
     channels: list[mi.Float]
+    front: list[mi.Float]
     mean_depth: mi.Float
     transmittance: mi.Float
     median: mi.UInt32
     begin: mi.UInt32
+    first: mi.UInt32
+    other: mi.UInt32
     count: mi.UInt32
 
     @staticmethod
     def start(values: int = 0) -> Composite:
         """Nothing hit yet, of surfels with so many more values."""
-        channels = [mi.Float(0) for _ in range(CHANNELS + values)]
-        nothing = mi.UInt32(NO_SURFEL)
-        return Composite(channels, mi.Float(0), mi.Float(1), nothing, mi.UInt32(nothing), mi.UInt32(0))
+        channels, front = ([mi.Float(0) for _ in range(count)] for count in (CHANNELS + values, 4))
+        none = [mi.UInt32(NO_SURFEL) for _ in range(4)]
+        return Composite(channels, front, mi.Float(0), mi.Float(1), *none, mi.UInt32(0))
 
 
 def harmonic_sums(
@@ -184,6 +191,14 @@ def composite(
             channels += [packet[k] for k in range(4)]
         for k in range(len(sums.channels)):
             sums.channels[k] = dr.fma(weight, channels[k], sums.channels[k])
+        facing = -APART * sums.front[3]
+        for k in range(3):
+            facing = dr.fma(channels[k], sums.front[k], facing)
+        alike = facing >= 0  # so is the first
+        added = dr.select(alike, weight, 0)
+        for k in range(3):
+            sums.front[k] = dr.fma(added, channels[k], sums.front[k])
+        sums.front[3] += added
         sums.mean_depth = dr.fma(weight, t, sums.mean_depth)
         after = sums.transmittance * (1 - alpha)
         crossed = (sums.transmittance >= MEDIAN_TRANSMITTANCE) & (after < MEDIAN_TRANSMITTANCE)
@@ -191,6 +206,8 @@ def composite(
         begun = (sums.transmittance >= BEGIN_TRANSMITTANCE) & (after < BEGIN_TRANSMITTANCE)
         sums.begin = dr.select(begun, index, sums.begin)
         sums.transmittance = after
+        sums.first = dr.select(sums.count == 0, index, sums.first)
+        sums.other = dr.select(alike | (sums.other != NO_SURFEL), sums.other, index)
         sums.count += 1
         slot += 1
         active &= (slot < hits.count) & (after >= STOP_TRANSMITTANCE)

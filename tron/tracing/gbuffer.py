@@ -193,9 +193,9 @@ def trace_tiles(
 
 def _overwrite(sums: Composite, some: Composite, ray: mi.UInt32) -> None:
     """Overwrite the sums of the rays ``ray``."""
-    for target, source in zip(sums.channels, some.channels, strict=True):
+    for target, source in zip(sums.channels + sums.front, some.channels + some.front, strict=True):
         dr.scatter(target, source, ray)
-    for name in ("mean_depth", "transmittance", "median", "begin", "count"):
+    for name in ("mean_depth", "transmittance", "median", "begin", "first", "other", "count"):
         dr.scatter(getattr(sums, name), getattr(some, name), ray)
     dr.eval(sums)
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from tron.gaussians.harmonics import eval_sh
-from tron.tracing.compositing import STOP_TRANSMITTANCE
+from tron.tracing.compositing import APART, STOP_TRANSMITTANCE
 from tron.tracing.hierarchy.transmittance import (
     AGAINST,
     BACK_FACE_SPACINGS,
@@ -20,6 +20,7 @@ from tron.tracing.hierarchy.transmittance import (
     SHEET_SPACINGS,
 )
 from tron.tracing.kernel import MAX_ALPHA, MIN_ALPHA, MIN_RESPONSE, T_MIN
+from tron.tracing.surface import EVEN, FACES
 
 
 class Scene(Protocol):
@@ -43,13 +44,14 @@ class ReferenceHits:
 
     Attributes:
         normal, base_color, rgb: (P, 3).
+        face: (P, 3), the part of ``normal`` that belongs to the face that is met, where two are; else all.
         roughness, metallic, mean_depth: (P,).
         transmittance: (P,) after the last counted hit.
         median_depth: (P,) distance of the first hit after which T < 0.5, or 0.
         lift: (P,) distance from the first hit after which T < 0.9 to that one, or 0.
         hits: (P,) int, number of composited hits.
         margin: (P,) smallest distance of any value that the ray compares before it stops to its threshold
-            (T_MIN, alpha cut, stop, median, lift): pixels with a tiny margin may differ in float32.
+            (T_MIN, alpha cut, stop, median, lift, faces): pixels with a tiny one may differ in float32.
         gap: (P,) smallest distance along the ray between two composited hits that are neighbours; where it is
             tiny, rounding may order them otherwise.
         candidates: (P,) int, surfels whose kernel counts where the ray hits them, on either side.
@@ -57,6 +59,7 @@ class ReferenceHits:
     """
 
     normal: np.ndarray
+    face: np.ndarray
     base_color: np.ndarray
     rgb: np.ndarray
     roughness: np.ndarray
@@ -179,6 +182,7 @@ def _composite_block(
     out = np.zeros((rays, 12))
     remaining, median, begin, hits = np.ones(rays), np.zeros(rays), np.zeros(rays), np.zeros(rays, int)
     last, margin, gap = np.zeros(rays), np.full(rays, np.inf), np.full(rays, np.inf)
+    lists: list[list[tuple[int, float]]] = [[] for _ in range(rays)]
     for slot in range(most):
         ray = np.flatnonzero((visible.sum(1) > slot) & (remaining >= STOP_TRANSMITTANCE))
         surfel = order[ray, slot]
@@ -187,6 +191,8 @@ def _composite_block(
         before, after = remaining[ray], remaining[ray] * (1 - alpha)
         values = np.concatenate([materials[surfel], rgb, t[:, None]], 1)
         out[ray] += (before * alpha)[:, None] * values
+        for r, number, weight in zip(ray, surfel, before * alpha, strict=True):
+            lists[r].append((int(number), float(weight)))
         median[ray] = np.where((before >= 0.5) & (after < 0.5), t, median[ray])
         begin[ray] = np.where((before >= 0.9) & (after < 0.9), t, begin[ray])
         if slot > 0:
@@ -195,6 +201,8 @@ def _composite_block(
             margin[ray] = np.minimum(margin[ray], np.abs(after - threshold))
         remaining[ray], last[ray] = after, t
         hits[ray] += 1
+    met = [_face(scene, normals, hit.radius, *each) for each in zip(lists, origins, directions, strict=True)]
+    margin = np.minimum(margin, [close for _, close in met])
     # What lies behind the hit that stopped a ray is never compared with anything.
     reached = np.where(remaining < STOP_TRANSMITTANCE, last, np.inf)
     compared = hit.front & (hit.t > 0) & (hit.t <= reached[:, None] + 1e-5)
@@ -202,6 +210,7 @@ def _composite_block(
     starts = np.where(hit.counted & hit.front, np.abs(hit.t - T_MIN), np.inf).min(1, initial=np.inf)
     return ReferenceHits(
         normal=out[:, 0:3],
+        face=np.array([face for face, _ in met]).reshape(rays, 3),
         base_color=out[:, 3:6],
         roughness=out[:, 6],
         metallic=out[:, 7],
@@ -216,6 +225,39 @@ def _composite_block(
         candidates=(hit.counted & (hit.t > T_MIN)).sum(1),
         front=visible.sum(1),
     )
+
+
+def _face(
+    scene: Scene, normals: np.ndarray, radii: np.ndarray, hits: list[tuple[int, float]], origin: np.ndarray,
+    direction: np.ndarray,
+) -> tuple[np.ndarray, float]:  # fmt: skip
+    """Sum of ``w n`` of the face that a ray meets, and its margin to where that would be another."""
+    groups: tuple[list[int], list[int]] = ([], [])
+    total, weights, margin = np.zeros((2, 3)), np.zeros(2), np.inf
+    for surfel, weight in hits:
+        own = 0
+        if groups[0]:
+            cosine = normals[surfel] @ total[0] / weights[0]
+            margin, own = min(margin, abs(cosine - APART)), int(cosine < APART)
+        groups[own].append(surfel)
+        total[own] += weight * normals[surfel]
+        weights[own] += weight
+    if not groups[1]:
+        return total[0], margin
+    lengths = np.linalg.norm(total, axis=1)
+    unit = total / lengths[:, None]
+    cosine, even = unit[0] @ unit[1], lengths / weights
+    margin = min(margin, abs(cosine - FACES), *np.abs(even - EVEN))
+    if cosine >= FACES or even.min() <= EVEN:
+        return total.sum(0), margin
+    a, b = (np.asarray(scene.means[group[0]], np.float64) for group in groups)
+    point = origin + direction * (unit[0] @ (a - origin)) / (unit[0] @ direction)
+    height, reach = unit[1] @ (point - b), max(radii[group[0]] for group in groups)
+    behind = np.array([unit[0] @ (b - a), unit[1] @ (a - b)])
+    margin = min(margin, *np.abs(behind), abs(abs(height) - reach))
+    ridge = bool((behind < 0).all()) and abs(height) < reach
+    margin = min(margin, abs(height if ridge else weights[0] - weights[1]))
+    return total[int(height >= 0 if ridge else weights[1] > weights[0])], margin
 
 
 def transmittance(

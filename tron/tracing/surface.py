@@ -5,6 +5,9 @@ back to unit length (conventions.md, 7). The surface point is at the median dept
 never falls below one half there is no median, and the alpha-weighted mean depth stands in where opacity is
 not zero. The median is where the ray meets the plane of the surfel's own disk, also where a camera sees its
 projection, which lies at one depth: light falls where the surface is.
+
+Where a ray meets two faces of an edge, a mean of their normals mirrors lamps that neither sees. The normal is
+one face's there, and on a ridge so is the point, unless they are differentiated: :func:`_of_one_face`.
 """
 
 from __future__ import annotations
@@ -19,6 +22,9 @@ from tron.tracing.kernel import FEATURE_PACKETS, GEOMETRY_PACKETS, SurfelRecords
 
 BEYOND = 2.0
 """Times its own reach that a disk's plane is followed: a projection is wider by its pixel's filter."""
+EVEN, FACES = 0.98, 0.6
+"""Two faces are seen where normals of either are of one mind, as their mean's length tells, and the cosine
+between them is less: not on a wire four pixels thick, nor in a scan's fog."""
 GRAZING = 0.05
 """Cosine to the ray of normals that looked away and are bent."""
 
@@ -33,7 +39,8 @@ class Surface:
             Not differentiated.
         lift: mi.Float, distance to it from the first hit after which less than 0.9 of the light is left: how
             thick what stands for a surface is, world units; 0 where there is none. Not differentiated.
-        normal: mi.Normal3f, unit, world, geometric; zero where opacity is 0.
+        normal: mi.Normal3f, unit, world, geometric; zero where opacity is 0. Where faces meet it is that of
+            one; differentiated, it is the mean.
         normal_sum: mi.Normal3f, sum of ``w n`` before it is brought to unit length: shorter than the opacity
             where the surfels of a ray face several ways.
         base_color: mi.Color3f, linear.
@@ -72,17 +79,22 @@ def surface(sums: Composite, records: SurfelRecords, origin: mi.Point3f, directi
     # Divisors of empty rays are replaced before dividing: 0 times an infinite derivative would be NaN.
     inverse = dr.select(hit, dr.rcp(dr.select(hit, opacity, 1)), 0)
     channels = sums.channels
-    normal = mi.Normal3f(*channels[0:3])
+    normal_sum = mi.Normal3f(*channels[0:3])
+    normal, ridge = normal_sum, mi.UInt32(NO_SURFEL)
+    if not dr.grad_enabled(normal_sum):
+        normal, ridge = _of_one_face(sums, records, origin, direction)
     squared = dr.squared_norm(normal)
     oriented = squared > 0
     depth = depth_along(records, sums.median, origin, direction)
     distance = dr.select(depth > 0, depth, sums.mean_depth * inverse)
+    # Rays that left a surfel's end in the air by the other face's normal would meet its neighbours.
+    distance = dr.select(ridge != NO_SURFEL, depth_along(records, ridge, origin, direction), distance)
     return Surface(
         position=origin + distance * direction,
         depth=depth,
         lift=dr.select(depth > 0, depth - depth_along(records, sums.begin, origin, direction), 0),
         normal=dr.select(oriented, normal / dr.sqrt(dr.select(oriented, squared, 1)), 0),
-        normal_sum=normal,
+        normal_sum=normal_sum,
         base_color=mi.Color3f(*channels[4:7]) * inverse,
         roughness=channels[3] * inverse,
         metallic=channels[7] * inverse,
@@ -91,6 +103,38 @@ def surface(sums: Composite, records: SurfelRecords, origin: mi.Point3f, directi
         direction=direction,
         values=[value * inverse for value in channels[CHANNELS:]],
     )
+
+
+def _of_one_face(
+    sums: Composite, records: SurfelRecords, origin: mi.Point3f, direction: mi.Vector3f
+) -> tuple[mi.Normal3f, mi.UInt32]:
+    """Sum of ``w n`` over the face that a ray meets, where it meets two; else over all hits. Detached.
+
+    Of ridges, also the surfel whose plane it meets; ``NO_SURFEL`` elsewhere.
+
+    Of two faces it is the one that hides more. But if each lies behind the other's plane, their edge is a
+    ridge, and surfels reach past it into the air: a ray enters what is convex by the later of the planes.
+    """
+    every, front = mi.Normal3f(*sums.channels[0:3]), mi.Normal3f(*sums.front[0:3])
+    weight, rest = sums.front[3], every - front
+    others = 1 - sums.transmittance - weight
+    long, short = dr.norm(front), dr.norm(rest)
+    two = (long > EVEN * weight) & (short > EVEN * others) & (dr.dot(front, rest) < FACES * long * short)
+    geometry, places, radii = dr.detach(records.geometry), [], []
+    for surfel in (sums.first, sums.other):
+        base = surfel * GEOMETRY_PACKETS
+        centre, axis = (dr.gather(mi.Vector4f, geometry, base + k, two) for k in range(2))
+        places.append(mi.Vector3f(*[centre[k] for k in range(3)]))
+        radii.append(axis.w)
+    apart = places[1] - places[0]
+    met = dr.dot(front, places[0] - origin) / dr.dot(front, direction) * direction - (places[1] - origin)
+    height = (
+        dr.dot(rest, met) / short
+    )  # of the first face over the plane of the other, where the ray meets it
+    ridge = (dr.dot(front, apart) < 0) & (dr.dot(rest, apart) > 0) & (dr.abs(height) < dr.maximum(*radii))
+    first = dr.select(ridge, height < 0, weight >= others)
+    entered = dr.select(two & ridge, dr.select(first, sums.first, sums.other), mi.UInt32(NO_SURFEL))
+    return dr.select(two, dr.select(first, front, rest), every), entered
 
 
 def depth_along(

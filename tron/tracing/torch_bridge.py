@@ -67,7 +67,8 @@ def render(
     Returns:
         The fields of :class:`tron.tracing.surface.Surface`: rgb, normal, normal_sum, base_color and position
         (H, W, 3); opacity, roughness, metallic and depth (H, W). rgb is premultiplied by opacity, over black.
-        depth has no gradient; position has one where it is at the mean depth.
+        depth has no gradient; position has one where it is at the mean depth. The normal is the mean over a
+        pixel, where tensors have gradients.
 
     Raises:
         TronError: a tensor is missing, or has another shape, dtype, layout or device than the ones above.

@@ -40,10 +40,10 @@ def compare(scene, camera, tolerance=1e-4):
         if name in ("base_color", "roughness", "metallic"):
             found = found * (opacity if found.ndim == 1 else opacity[:, None])
         np.testing.assert_allclose(found[steady], expected[steady], atol=tolerance, err_msg=name)
-    lengths = np.linalg.norm(truth.normal, axis=1)
+    lengths = np.linalg.norm(truth.face, axis=1)
     clear = steady & (lengths > 1e-2)
     np.testing.assert_allclose(
-        flat["normal"][clear], truth.normal[clear] / lengths[clear, None], atol=tolerance
+        flat["normal"][clear], truth.face[clear] / lengths[clear, None], atol=tolerance
     )
     return truth
 
