@@ -25,13 +25,11 @@ import mitsuba as mi
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
-from tron.brdf.microfacets import unhidden, visible_normal
 from tron.runtime import aligned
 
 TABLE_SIZE = 256
-TABLE_SAMPLES = 32
-"""Quadrature points along each of the two dimensions of the visible normals."""
 GLASS_INDEX = 1.5
+TABLE_FILE = Path(__file__).with_name("albedos.npy")
 PARTS_FILE = Path(__file__).with_name("lobe_parts.npy")
 PARTS_F0, PARTS_SMOOTHEST = 0.04, 0.2
 """Lower of the two F0 that the file has, the other is 1, and its least roughness: below, lobes are alike."""
@@ -41,50 +39,15 @@ PARTS_F0, PARTS_SMOOTHEST = 0.04, 0.2
 def brdf_table() -> np.ndarray:
     """(roughness, n.v, 8) float32: A, B, G, E (the same for every n.v), R_A, N_A, R_B, N_B. Once a process.
 
-    Entry (i, j) is of roughness i / 255 and n.v = (j + 1/2) / 256. By midpoint quadrature over the visible
-    normals (Heitz 2018, "Sampling the GGX Distribution of Visible Normals").
+    Entry (i, j) is of roughness i / 255 and n.v = (j + 1/2) / 256; as ``dev/brdf_table.py`` integrated them.
     """
-    lane = dr.arange(mi.UInt32, TABLE_SIZE * TABLE_SIZE)
-    cosine = (mi.Float(lane % TABLE_SIZE) + 0.5) / TABLE_SIZE
-    roughness = mi.Float(lane // TABLE_SIZE) / (TABLE_SIZE - 1)
-    lobes = _directional_albedo(cosine, dr.square(roughness))
-    scale, bias, glass, *means = (np.array(lobe).reshape(TABLE_SIZE, TABLE_SIZE) for lobe in lobes)
-    whole = np.average(scale + bias, axis=1, weights=_CENTRES)
-    return np.stack(np.broadcast_arrays(scale, bias, glass, whole[:, None], *means), -1).astype(np.float32)
+    table = np.load(TABLE_FILE)
+    whole = np.average(table[..., 0] + table[..., 1], axis=1, weights=_CENTRES)
+    whole = np.broadcast_to(whole[:, None, None], (*table.shape[:2], 1))
+    return np.concatenate([table[..., :3], whole, table[..., 3:]], -1, dtype=np.float32)
 
 
 _CENTRES = (np.arange(TABLE_SIZE) + 0.5) / TABLE_SIZE
-
-
-@dr.syntax
-def _directional_albedo(cosine: mi.Float, alpha: mi.Float) -> tuple[mi.Float, ...]:
-    view = mi.Vector3f(dr.safe_sqrt(1 - cosine * cosine), 0, cosine)
-    scale, bias, glass, total = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)
-    mean_scale, mean_bias = mi.Vector3f(0), mi.Vector3f(0)
-    i = mi.UInt32(0)
-    while i < TABLE_SAMPLES * TABLE_SAMPLES:
-        # The rim of the disk is the lobe's long tail: points crowd there, by radius^2 = 1 - x^3.
-        x = (mi.Float(i % TABLE_SAMPLES) + 0.5) / TABLE_SAMPLES
-        share = 3 * x * x
-        # Mirror symmetry about the plane of incidence: half a turn is enough.
-        turn = (mi.Float(i // TABLE_SAMPLES) + 0.5) / (2 * TABLE_SAMPLES)
-        half = visible_normal(view, alpha, mi.Point2f(1 - x * x * x, turn - 0.25))
-        facing = dr.dot(view, half)
-        out = 2 * facing * half - view
-        weight = dr.select((out.z > 0) & (facing > 0), share * unhidden(cosine, out.z, alpha), 0)
-        fresnel = (1 - facing) ** 5
-        scale += weight * (1 - fresnel)
-        bias += weight * fresnel
-        mean_scale += weight * (1 - fresnel) * out
-        mean_bias += weight * fresnel * out
-        glass += weight * mi.fresnel(facing, GLASS_INDEX)[0]
-        total += share
-        i += 1
-    mean_scale, mean_bias = mean_scale / total, mean_bias / total
-    # Both parts are smooth where the surface is faced. Its tangent away from the view is not defined there.
-    mirrored_a, mirrored_b = -mean_scale.x / view.x, -mean_bias.x / view.x
-    means = (mirrored_a, mean_scale.z - cosine * mirrored_a, mirrored_b, mean_bias.z - cosine * mirrored_b)
-    return scale / total, bias / total, glass / total, *means
 
 
 @cache
