@@ -72,7 +72,7 @@ class Estimation(BaseModel):
         default=0,
         ge=0,
         description="rays per pixel that find what glossy surfaces mirror; 0: the bounced light around them, "
-        "and one ray for metals and strong highlights where filtered",
+        "and one ray for metals where filtered",
     )
     supersample: Literal[1, 2] = Field(
         default=1, description="2: 2 x 2 sub-pixels with a quarter of the rays each, averaged"

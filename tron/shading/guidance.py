@@ -39,7 +39,6 @@ from tron.shading.bounces.bounce import BOUNCED_VALUES, SHOWN_RAYS, BouncedLight
 from tron.shading.composition import Bounced, Response, evenly_bounced, over_background
 from tron.shading.direct.irradiance import Occluder
 from tron.shading.direct.visibility import Shadows, visibility
-from tron.shading.highlights import Highlights, highlights, with_highlights
 from tron.shading.lighting import Lighting
 from tron.shading.reflections import Mirror, metal_reflections, metal_share, reflections, with_mirror
 
@@ -142,19 +141,17 @@ class Arriving:
         visibility: share of the unshadowed irradiance that arrives, by channel.
         mirror: by reflection rays; None without.
         metals: by those of metals alone, in previews (:mod:`tron.shading.reflections`); None without.
-        highlights: of other smooth surfaces, in previews; None where nothing may hide any.
         behind: radiance behind the surfels (:class:`tron.relighting.ground.Ground`); None: the environment's.
     """
 
     visibility: mi.Color3f
     mirror: Mirror | None = None
     metals: Mirror | None = None
-    highlights: Highlights | None = None
     behind: mi.Color3f | None = None
 
     def in_rows(self, gbuffer: GBuffer) -> Arriving:
         """Of pixels row by row, where lanes are those of ``gbuffer``."""
-        found = (self.visibility, self.mirror, self.metals, self.highlights, self.behind)
+        found = (self.visibility, self.mirror, self.metals, self.behind)
         return Arriving(*(None if value is None else gbuffer.in_rows(value) for value in found))
 
 
@@ -229,9 +226,6 @@ def arriving_light(
     elif bounce is not None and estimation.bounces and estimation.filtered:
         occluder = tracer.sided(estimation.two_sided)
         arriving.metals = metal_reflections(occluder, gbuffer, lighting, bounce, estimation, seed)
-        arriving.highlights = highlights(
-            occluder, gbuffer, lighting, arriving.visibility, seed, estimation.brdf
-        )
     return arriving
 
 
@@ -282,8 +276,6 @@ def bounced_light(surface: Surface, arriving: Arriving) -> Bounced | None:
     indirect, openness = mi.Color3f(*surface.values[:3]), surface.values[BOUNCED_VALUES - 1]
     if arriving.mirror is None:
         even = evenly_bounced(indirect, openness, arriving.visibility, surface.roughness)
-        if arriving.highlights is not None:
-            even = with_highlights(even, arriving.highlights)
         return even if arriving.metals is None else with_mirror(even, arriving.metals, metal_share(surface))
     return Bounced(indirect, arriving.mirror.openness, arriving.mirror.radiance)
 
