@@ -100,10 +100,10 @@ def thin_shadows(case: Case) -> tuple[dict[int, float], ...]:
 
 
 def over_truth(case: Case, estimation: Estimation) -> np.ndarray:
-    """(3,) mean of ``lit`` over the path tracer's, where the pixels are solid."""
+    """(3,) mean of ``lit`` over the path tracer's of as many bounces, where the pixels are solid."""
     found = Relighter(case.scene(), estimation, proxy="never").under(case.light).render(case.camera)
     solid = found.mask > 0.99
-    return found.lit[solid].mean(0) / case.path_traced(PATHS, 16)[solid].mean(0)
+    return found.lit[solid].mean(0) / case.path_traced(PATHS, estimation.bounces + 2)[solid].mean(0)
 
 
 def metal_times(rounds: int, size: int = 256) -> dict[str, Times]:

@@ -39,10 +39,12 @@ def test_a_rough_floor_under_a_low_sun_is_right_on_both_sides(azimuth: float, ba
     np.testing.assert_allclose(ratio, 1, atol=0.06)
 
 
-def test_a_box_of_metals_is_right_by_channel_in_a_preview() -> None:
-    """0.79, 0.85 and 0.94 of the truth, as with 64 rays: light that metals mirror twice is missing."""
-    ratio = hard_cases.over_truth(metal_box(sunny(50, 30, 4), size=40), PREVIEW)
-    np.testing.assert_allclose(ratio, 1, atol=0.25)
+@pytest.mark.parametrize("light", ["sun", "overcast"])
+def test_a_box_of_metals_is_right_by_channel_in_a_preview(light: str) -> None:
+    """Overcast 0.88, 0.86 and 0.88 of the truth where metals that are mirrored showed bounced light alone."""
+    way = sunny(50, 30, 4) if light == "sun" else overcast()
+    ratio = hard_cases.over_truth(metal_box(way, size=40), PREVIEW)
+    np.testing.assert_allclose(ratio, 1, atol=0.1)
 
 
 def test_one_reflection_ray_is_as_right_in_the_mean_as_many() -> None:

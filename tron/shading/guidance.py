@@ -40,7 +40,7 @@ from tron.shading.composition import Bounced, Response, evenly_bounced, over_bac
 from tron.shading.direct.irradiance import Occluder
 from tron.shading.direct.visibility import Shadows, visibility
 from tron.shading.lighting import Lighting
-from tron.shading.reflections import Mirror, metal_reflections, reflections, with_metals
+from tron.shading.reflections import Mirror, metal_reflections, metal_share, reflections, with_mirror
 
 if TYPE_CHECKING:
     from tron.tracing import GBuffer, Surface
@@ -276,7 +276,7 @@ def bounced_light(surface: Surface, arriving: Arriving) -> Bounced | None:
     indirect, openness = mi.Color3f(*surface.values[:3]), surface.values[BOUNCED_VALUES - 1]
     if arriving.mirror is None:
         even = evenly_bounced(indirect, openness, arriving.visibility, surface.roughness)
-        return even if arriving.metals is None else with_metals(even, arriving.metals, surface)
+        return even if arriving.metals is None else with_mirror(even, arriving.metals, metal_share(surface))
     return Bounced(indirect, arriving.mirror.openness, arriving.mirror.radiance)
 
 

@@ -18,7 +18,8 @@ mean: what the rougher lobes find is averaged over the pixels about before it is
 
 A ray of the lobe is stopped by one surfel (:mod:`tron.tracing.hierarchy.first_hit`). R is the composition of
 :mod:`tron.shading.composition` at the surfel's centre with the bake's light, so a mirror shows highlights of
-what it mirrors. A back face shows what ``BouncedLight.behind`` says.
+what it mirrors. A back face shows what ``BouncedLight.behind`` says. Where a metal is met, one ray of its own
+lobe goes on; what that meets has the bake's light alone.
 """
 
 from __future__ import annotations
@@ -51,6 +52,8 @@ TRIALS = 8
 """Directions drawn for a ray: of the roughest lobes one in a hundred keeps none, and takes the likeliest."""
 SMOOTHEST = 0.02
 """Least roughness of the rays: below, a lobe is narrower than float32 can draw."""
+EVEN = (0.6, 0.9)
+"""Roughness up to which a metal that is met sends a ray on, and from which on bounced light is as good."""
 ROUGH = 0.2
 """Roughness from which on neighbours' rays count in full; a mirror keeps its own."""
 UNLIKE = 10.0
@@ -96,7 +99,9 @@ def reflections(
     """
     with dr.suspend_grad():
         points = PixelPoints.make(rays, 2, gbuffer.width, seed, "reflections")
-        root = dr.opaque(mi.UInt32, integer(seed, "reflections", "stops"))
+        root, again = (
+            dr.opaque(mi.UInt32, integer(seed, "reflections", name)) for name in ("stops", "again")
+        )
         offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
         table = lighting.split_sum.brdf
         pixel, lobe = gbuffer.pixel, Lobe.of(gbuffer, table)
@@ -118,16 +123,19 @@ def reflections(
             seeds = [ray_seeds(root, pixel, ray) for ray in fan]
             dr.eval(directions, active, seeds)
             hits = tracer.first_hits(origin, directions, active, seeds, normal)
-            for direction, counts, hit in zip(directions, active, hits, strict=True):
-                weight, share, radiance = _weights(lobe, direction, counts, gbuffer, lighting, brdf, layers)
+            for ray, direction, counts, hit in zip(fan, directions, active, hits, strict=True):
+                weight, share, radiance = ray_weights(
+                    lobe, direction, counts, gbuffer, lighting, brdf, layers
+                )
                 met = hit.surfel != NOTHING
-                returned = _returned(tracer, hit, direction, lighting, bounce, brdf)
+                further = ray_seeds(again, pixel, ray)
+                returned = _returned(tracer, hit, direction, lighting, bounce, brdf, further)
                 sums["met"] += dr.select(met, weight * returned, 0)
                 sums["light"] += share * radiance
                 sums["escaped"] += dr.select(met, 0, share * radiance)
             dr.eval(sums)
             directions = [lighting.light.sample(points.point(run, ray, mi.UInt32(1)))[0] for ray in fan]
-            found = [_weights(lobe, d, seen, gbuffer, lighting, brdf, layers) for d in directions]
+            found = [ray_weights(lobe, d, seen, gbuffer, lighting, brdf, layers) for d in directions]
             values = [share * radiance for _, share, radiance in found]
             active = [dr.max(value) > 0 for value in values]
             dr.eval(directions, values, active)
@@ -203,7 +211,7 @@ class Lobe:
         return seen_density(self.view.z, half, self.alpha) * share / self.albedo
 
 
-def _weights(
+def ray_weights(
     lobe: Lobe,
     direction: mi.Vector3f,
     active: mi.Bool,
@@ -235,8 +243,12 @@ def _returned(
     lighting: Lighting,
     bounce: BouncedLight,
     brdf: Brdf,
+    seeds: mi.UInt32 | None = None,
 ) -> mi.Color3f:
-    """Radiance that what is met sends back along ``direction``; 0 where nothing is."""
+    """Radiance that what is met sends back along ``direction``; 0 where nothing is.
+
+    ``seeds``: of the rays that metals which are met send on; None: they send none.
+    """
     met = hit.surfel != NOTHING
     front = met & hit.front
 
@@ -250,8 +262,54 @@ def _returned(
     openness = dr.gather(mi.Float, bounce.openness, hit.surfel, front)
     visibility = ratio(direct, response.unshadowed, 1)
     bounced = evenly_bounced(indirect, openness, visibility, surface.roughness)
+    further = metal_share(surface) * dr.clip((EVEN[1] - surface.roughness) / (EVEN[1] - EVEN[0]), 0, 1)
+    metal = front & (further > 0)
+    if seeds is not None and dr.any(metal):
+        mirror = _mirrored(tracer, hit.surfel, direction, metal, visibility, lighting, bounce, brdf, seeds)
+        bounced = with_mirror(bounced, mirror, further)
     shown = response.lit(direct, bounced)
     return dr.select(hit.front, shown, of(bounce.behind, met & ~hit.front))
+
+
+def _mirrored(
+    tracer: SurfelTracer,
+    surfel: mi.UInt32,
+    direction: mi.Vector3f,
+    active: mi.Bool,
+    visibility: mi.Color3f,
+    lighting: Lighting,
+    bounce: BouncedLight,
+    brdf: Brdf,
+    seeds: mi.UInt32,
+) -> Mirror:
+    """The view of the lobes of ``surfel`` along ``direction``, of one ray each; nothing where inactive.
+
+    Of the environment what the ray says escapes, of a rough lobe what reaches the surfel: ``visibility``.
+    """
+    lane = dr.compress(active)
+    surface = centres(tracer.records, dr.gather(mi.UInt32, surfel, lane))
+    surface.direction = dr.gather(mi.Vector3f, direction, lane)
+    arriving, seed = dr.gather(mi.Color3f, visibility, lane), dr.gather(mi.UInt32, seeds, lane)
+    table = lighting.split_sum.brdf
+    lobe, offset = Lobe.of(surface, table), dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
+    number = [mi.sample_tea_float32(seed, mi.UInt32(k)) for k in range(2)]
+    along, above = lobe.draw(mi.Point2f(*number))
+    above &= lobe.view.z > 0
+    origin, normal = surface.raised(offset), mi.Vector3f(surface.normal)
+    dr.eval(lobe, along, above, origin, normal, seed, arriving, surface)
+    (hit,) = tracer.first_hits(origin, [along], [above], [seed], normal)
+    layers = Layers.of(surface, table, lobe.view.z) if brdf == "conserving" else None
+    expected = reflectance(surface, table, lobe.view.z, brdf).specular / lobe.albedo
+    weight = ray_weights(lobe, along, above, surface, lighting, brdf, layers)[0]
+    radiance = ratio(weight * _returned(tracer, hit, along, lighting, bounce, brdf), expected, 0)
+    free = dr.select(hit.surfel == NOTHING, mi.Float(1), 0)
+    open_share = dr.lerp(mi.Color3f(free), dr.minimum(arriving, 1), surface.roughness)
+    found = Mirror(dr.zeros(mi.Color3f, dr.width(active)), dr.zeros(mi.Color3f, dr.width(active)))
+    for target, value in ((found.openness, open_share), (found.radiance, radiance)):
+        for channel, of_lanes in zip(target, value, strict=True):
+            dr.scatter(channel, of_lanes, lane)
+    dr.eval(found)
+    return found
 
 
 # A metal shows nothing but reflections, so the bounced light around it will not do: a room of metal is 1.02,
@@ -281,9 +339,8 @@ def metal_reflections(
     return reflections(tracer, gbuffer, lighting, bounce, RAYS, seed, estimation.brdf, metal)
 
 
-def with_metals(even: Bounced, mirror: Mirror, surface: Surface) -> Bounced:
-    """Light that bounced; metals show what their rays found."""
-    share = metal_share(surface)
+def with_mirror(even: Bounced, mirror: Mirror, share: mi.Float) -> Bounced:
+    """Light that bounced; by ``share``, such as :func:`metal_share`, surfaces show what their rays found."""
     return Bounced(
         even.indirect,
         dr.lerp(even.openness, mirror.openness, share),

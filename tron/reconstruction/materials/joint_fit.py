@@ -28,6 +28,7 @@ from tron.relighting import Relighter
 from tron.runtime import aligned
 from tron.seeds import generator
 from tron.shading.bounces.bounce import BounceTransport
+from tron.shading.bounces.bounce_rays import OWN
 from tron.shading.environments.cubemap import CubemapLight
 from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.lighting import Lighting
@@ -309,10 +310,11 @@ def photographed_bounces(transport: BounceTransport, shown: np.ndarray) -> np.nd
     code = np.array(transport.rays.met).reshape(-1, len(shown))
     sent = np.concatenate([shown, np.zeros((1, 3), shown.dtype)])
     total = np.zeros_like(shown)
+    itself = np.arange(len(shown))
     for ray in code:
-        there = ray != NOTHING
-        share = np.where(ray & 1, _BACK, 1.0).astype(np.float32)
-        total += share[:, None] * sent[np.where(there, ray >> 1, len(shown))]
+        own, met = (ray & OWN) > 0, (ray & (OWN - 1)) >> 1
+        share = np.where(((ray & 1) > 0) & ~own, _BACK, 1.0).astype(np.float32)
+        total += share[:, None] * sent[np.where(ray == NOTHING, len(shown), np.where(own, itself, met))]
     return total / len(code)
 
 

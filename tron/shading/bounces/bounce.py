@@ -30,7 +30,7 @@ from tron.brdf.table import BrdfTable
 from tron.errors import TronError
 from tron.estimation import FINAL, Brdf, Estimation
 from tron.seeds import integer
-from tron.shading.bounces.bounce_rays import Part, SurfelRays, parts
+from tron.shading.bounces.bounce_rays import OWN, Part, SurfelRays, parts, surfel_met
 from tron.shading.bounces.lending import Lending
 from tron.shading.direct.visibility import visibility
 from tron.shading.lighting import Lighting
@@ -373,10 +373,12 @@ def _gathered(
     ray, end, total = mi.UInt32(0), dr.opaque(mi.UInt32, rays), mi.Color3f(0)
     while dr.hint(ray < end, max_iterations=-1):
         code = dr.gather(mi.UInt32, met, ray * faces + face)
-        there, surfel, back = code != NOTHING, code >> 1, (code & 1) != over
+        there, surfel, back = code != NOTHING, surfel_met(code), (code & 1) != over
+        own = there & ((code & OWN) != 0)
         behind = dr.gather(mi.UInt32, place, surfel, there & back)
-        there &= ~back | (behind != NOTHING)
-        value = dr.gather(mi.Vector4f, sent, dr.select(back, behind + fronts, surfel), there)
+        there &= own | ~back | (behind != NOTHING)
+        met_face = dr.select(back, behind + fronts, surfel)
+        value = dr.gather(mi.Vector4f, sent, dr.select(own, face + over * fronts, met_face), there)
         total += mi.Color3f(value.x, value.y, value.z)
         ray += 1
     return total / mi.Float(end)
@@ -422,11 +424,11 @@ class Undersides:
     def of(cls, rays: SurfelRays) -> Undersides | None:
         """Trace as many rays from each back that ``rays`` meet; None where they meet none."""
         count = len(rays.tracer.scene)
-        behind = (rays.met != NOTHING) & ((rays.met & 1) == 1)
+        behind = (rays.met != NOTHING) & ((rays.met & 1) == 1) & ((rays.met & OWN) == 0)
         times = dr.zeros(mi.UInt32, count)
         # Left to itself Dr.Jit makes copies for each thread, in a kernel for each number of surfels.
         direct = dr.ReduceMode.Direct
-        dr.scatter_reduce(dr.ReduceOp.Add, times, mi.UInt32(1), rays.met >> 1, behind, direct)
+        dr.scatter_reduce(dr.ReduceOp.Add, times, mi.UInt32(1), surfel_met(rays.met), behind, direct)
         order = rays.tracer.bvh.order
         which = dr.compress(dr.gather(mi.UInt32, times, order) >= FEWEST)
         if dr.width(which) == 0:
