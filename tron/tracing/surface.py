@@ -128,9 +128,8 @@ def _of_one_face(
         radii.append(axis.w)
     apart = places[1] - places[0]
     met = dr.dot(front, places[0] - origin) / dr.dot(front, direction) * direction - (places[1] - origin)
-    height = (
-        dr.dot(rest, met) / short
-    )  # of the first face over the plane of the other, where the ray meets it
+    # Of the first face over the plane of the other, where the ray meets it.
+    height = dr.dot(rest, met) / short
     ridge = (dr.dot(front, apart) < 0) & (dr.dot(rest, apart) > 0) & (dr.abs(height) < dr.maximum(*radii))
     first = dr.select(ridge, height < 0, weight >= others)
     entered = dr.select(two & ridge, dr.select(first, sums.first, sums.other), mi.UInt32(NO_SURFEL))
