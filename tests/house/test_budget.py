@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 CODE = {
     "tron": (2_900, 17),
-    "tron/apps": (4_150, 26),
+    "tron/apps": (3_500, 21),
     "tron/brdf": (800, 7),
     "tron/captures": (5_200, 34),
     "tron/cli": (1_500, 8),
@@ -21,8 +21,9 @@ CODE = {
     "tron/models": (2_000, 12),
     "tron/neural": (2_300, 22),
     "tron/reconstruction": (6_800, 35),
-    "tron/relighting": (1_300, 6),
+    "tron/relighting": (1_350, 6),
     "tron/report": (650, 5),
+    "tron/scans": (850, 6),
     "tron/shading": (4_850, 24),
     "tron/shards": (1_950, 10),
     "tron/tracing": (4_700, 23),

@@ -35,7 +35,7 @@ from tron.estimation import FINAL, Estimation
 from tron.gaussians.edit import subset
 from tron.gaussians.scene import GaussianScene
 from tron.relighting.beside import BesideMeshes, LightTracer, some_of
-from tron.relighting.ground import Ground
+from tron.relighting.ground import GroundOf
 from tron.relighting.proxy import THICK, Choice, ProxiedTracer, Proxy, fingerprint, make_proxy, thickness
 from tron.runtime import activate
 from tron.shading.bounces.bounce import BouncedLight, BounceTransport
@@ -79,7 +79,8 @@ class Relighter:
         cameras: that the scene was filmed with, to film its proxy; None: from around it.
         proxy_file: PLY that keeps the proxy; taken where it was made from the same, else written.
         filming: wraps the loop over the proxy's views, to show progress.
-        ground: what the scene stands on and throws shadows on, where frames show the environment.
+        ground: what the scene stands on and throws shadows on, where frames show the environment; or what
+            says that of each camera.
         meshes: models, each as :func:`tron.models.load.load_model` reads it, where they stand, in the scene's
             world and units: opaque things beside the surfels (:mod:`tron.tracing.meshes`).
     """
@@ -96,7 +97,7 @@ class Relighter:
         cameras: Sequence[Camera] | None = None,
         proxy_file: Path | None = None,
         filming: Callable[[range], Iterable[int]] = iter,
-        ground: Ground | None = None,
+        ground: GroundOf = None,
         meshes: Sequence[Sequence[Part]] = (),
     ) -> None:
         if mi.variant() is None:
@@ -106,6 +107,7 @@ class Relighter:
         self._choice, self._cameras, self._proxy_file, self._filming = proxy, cameras, proxy_file, filming
         self._tracer = SurfelTracer(scene, backdrop=backdrop).sided(estimation.two_sided)
         self._turned_to: tuple[bytes, SurfelTracer] | None = None
+        self.frame_seed = 0  # of frames that are given none
         self.meshes = Meshes(meshes, seed) if meshes else None
 
     def tracer(self, camera: Camera) -> SurfelTracer | ProxiedTracer | BesideMeshes:
@@ -373,20 +375,23 @@ class Illumination:
         other = Estimation.model_validate(self.estimation.model_dump() | wanted)
         return Illumination(self.relighter, self.lighting, other, self.seed, self.bounced)
 
-    def trace(self, camera: Camera, seed: int = 0, view: GBuffer | None = None) -> TracedFrame:
+    def trace(self, camera: Camera, seed: int | None = None, view: GBuffer | None = None) -> TracedFrame:
         """Trace all rays of a frame; see :meth:`render`."""
+        seed = self.relighter.frame_seed if seed is None else seed
         tracer, bounce = self.relighter.tracer(camera), self.bounced
         if view is None:
             (view,) = trace_views(tracer, camera, self.estimation, [bounce])
         arriving = arriving_light(tracer, view, self.lighting, self.estimation, seed, bounce)
-        if ground := self.relighter.ground:
+        ground = self.relighter.ground
+        ground = ground(camera) if callable(ground) else ground
+        if ground is not None:
             arriving.behind = ground.behind(tracer, view, camera, self.lighting, self.estimation, seed)
         return TracedFrame(self.lighting, self.estimation, view, arriving)
 
     def render(
         self,
         camera: Camera,
-        seed: int = 0,
+        seed: int | None = None,
         background: Sequence[float] | None = None,
         view: GBuffer | None = None,
         denoise: Literal["oidn"] | None = None,
@@ -395,7 +400,7 @@ class Illumination:
 
         Args:
             camera: the view.
-            seed: root of the random numbers of its rays.
+            seed: root of the random numbers of its rays; None: the relighter's ``frame_seed``, which is 0.
             background: linear RGB radiance behind the surfels; None: the environment.
             view: what the camera sees, where it is traced already (:func:`views_under`).
             denoise: "oidn": as :meth:`TracedFrame.denoised`.

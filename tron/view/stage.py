@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import drjit as dr
 import numpy as np
@@ -163,6 +163,8 @@ class Stage:
         seed: root of all random numbers.
         watch: called between pieces of long work that may be given up; it raises then.
         busy: called with what long work is about, and the share of it that is done.
+        about: more arguments of the :class:`tron.relighting.Relighter` of the scene as it was opened, such as
+            its ground, its cameras and where its proxy is kept.
     """
 
     def __init__(
@@ -173,13 +175,16 @@ class Stage:
         seed: int = 0,
         watch: Callable[[], None] = lambda: None,
         busy: Callable[[str, float], None] = lambda *_: None,
+        about: Mapping[str, Any] | None = None,
     ) -> None:
+        self._about = dict(about or {})
         self.session, self.turn = Session(scene), upright(scene.up)
         self._lights, self._seed, self._watch, self._busy = lights, seed, watch, busy
         self._home = home.resized(METERED, max(1, round(METERED * home.height / home.width)))
         self._original = scene
         self._yields = False  # whether what is under way may be given up
         self._base = self._lit_anew(scene.upright(), "auto")
+        self._about.pop("proxy_file", None)  # edits have proxies of their own
         self._prepared: dict[str, tuple[Lighting, float]] = {}
         self._shown: _Visible | None = None
         self._selected: tuple[GaussianScene, Clicks, np.ndarray] | None = None
@@ -386,7 +391,8 @@ class Stage:
 
     def _lit_anew(self, scene: GaussianScene, proxy: Choice) -> Relighter:
         rays, film = self._watched("tracing light"), self._watched("filming the scan for light")
-        return Relighter(scene, PREVIEW, self._seed, proxy=proxy, track=rays, filming=film)
+        watched = {"track": rays, "filming": film}
+        return Relighter(scene, PREVIEW, self._seed, proxy=proxy, **watched, **self._about)
 
     def _surface(self, part: Part, camera: Camera) -> np.ndarray:
         buffer, relighter = part.buffer, self._base if part.before else self._relighter

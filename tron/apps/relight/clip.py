@@ -16,7 +16,6 @@ import numpy as np
 
 from tron import seeds
 from tron.apps.frame_folder import FrameFolder
-from tron.apps.relight.settings import ProxyChoice
 from tron.apps.relit import RelitPicture, surfels_alone
 from tron.cameras import Camera
 from tron.cli.progress import track, working
@@ -24,19 +23,15 @@ from tron.color import LOOKS, from_agx
 from tron.editing.motion import LightNow
 from tron.editing.moving import MovingScene
 from tron.errors import TronError
-from tron.estimation import Estimation
 from tron.flow import surface_motion
-from tron.gaussians.scene import GaussianScene
 from tron.io.images import write_image
 from tron.neural.clips import Overlap, averaged_frames
 from tron.shards.schema import GUIDANCE, displayed, surface_members
 from tron.storage import write_atomic
 
 if TYPE_CHECKING:
-    from tron.models.parts import Part
     from tron.neural.protocols import Renderer
     from tron.relighting import Illumination, Relighter
-    from tron.relighting.ground import Ground
     from tron.shading.environments.environment import EnvironmentMap
     from tron.shading.guidance import Guidance
     from tron.shading.lighting import Lighting
@@ -202,45 +197,22 @@ class Clip:
 
 
 def trace(
-    scene: GaussianScene,
+    relighter: Relighter,
     cameras: Sequence[Camera],
     clips: Sequence[Clip],
-    *,
-    estimation: Estimation,
     seed: int,
-    backdrop: np.ndarray | None = None,
-    proxy: ProxyChoice = "auto",
-    filmed: Sequence[Camera] | None = None,
-    proxy_file: Path | None = None,
-    ground: Ground | None = None,
     moving: MovingScene | None = None,
     times: Sequence[float] = (),
-    meshes: Sequence[Sequence[Part]] = (),
 ) -> None:
     """Trace the frames that are missing, and write the pictures of all.
 
     Args:
-        scene: the surfels.
+        relighter: the scene.
         cameras: one a frame.
         clips: one a light.
-        estimation: of the light.
-        seed: root of its random numbers; a frame's do not depend on the environment.
-        backdrop: (M,) bool, surfels that are in no light's way (:class:`tron.relighting.Relighter`).
-        proxy, filmed, proxy_file: whether light sees a proxy, cameras to film it, and where it is kept, as
-            there.
-        ground: what the scene stands on, as there.
+        seed: root of the random numbers; a frame's do not depend on the environment.
         moving: the scene's motion, if it has one, and the seconds of each frame.
-        meshes: models beside the surfels, as there.
     """
-    from tron.relighting import Relighter
-
-    bounces, rays = seeds.integer(seed, "relight", "bounces"), partial(track, label="where light bounces")
-    with working("surfels of the models") if meshes else nullcontext():
-        relighter = Relighter(
-            scene, estimation, bounces, backdrop=backdrop, track=rays,
-            proxy=proxy, cameras=filmed, proxy_file=proxy_file,
-            filming=partial(track, label="filming a proxy for light"), ground=ground, meshes=meshes,
-        )  # fmt: skip
     for clip in clips:
         if lacking := clip.folder.lacking(len(cameras)):
             log.info("frames that have no %s yet are traced again", ", ".join(lacking))
@@ -250,7 +222,8 @@ def trace(
     for index, camera in enumerate(track(cameras, "guidance")):
         if follow and not all(clip.folder.finished(index) and clip.metered for clip in clips):
             relighter = follow.to(times[index])
-        surfaces = cache(partial(relighter.surface_maps, camera, estimation))  # alike under all lights
+        # Alike under all lights.
+        surfaces = cache(partial(relighter.surface_maps, camera, relighter.estimation))
         for clip in clips:
             if not clip.folder.finished(index) or not clip.metered:
                 started = time.perf_counter()
